@@ -1,0 +1,97 @@
+"""The arrays of one docked shape: what estimator, controller and allocator need to know of a body. Frozen.
+
+Built by `prepare.assembly` from vehicle files; a merge or split swaps one Body for another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThrusterSet:
+    """n thrusters of a body, in module order, eight to a module where the vehicle has eight.
+
+    Attributes:
+        matrix: (6, n) wrench of unit forces: [direction; position x direction] about the centre of mass.
+        pinv: (n, 6) Moore-Penrose inverse.
+        f_min, f_max: (n,) N.
+        forward, reverse: (n, 5) force polynomials; power_forward, power_reverse: (n, 5) power polynomials (W over |N|).
+        deadband_n, lag_s, voltage_v, rpm_at_full: (n,).
+        module: (n,) index within the body of the module that it belongs to; channel: (n,) its number there.
+    """
+
+    matrix: np.ndarray
+    pinv: np.ndarray
+    f_min: np.ndarray
+    f_max: np.ndarray
+    forward: np.ndarray
+    reverse: np.ndarray
+    power_forward: np.ndarray
+    power_reverse: np.ndarray
+    deadband_n: np.ndarray
+    lag_s: np.ndarray
+    voltage_v: np.ndarray
+    rpm_at_full: np.ndarray
+    module: np.ndarray
+    channel: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DragTable:
+    """Drag of a shape over flow direction, on the six sides of a cube (core.drag_lookup).
+
+    Attributes:
+        nodes: (6, n, n, 4) per node: force per squared speed 1/2 rho Cd A (N s^2/m^2), centre of pressure (3,) from the centre of mass, m.
+        rotational: (3,) quadratic damping about the body axes, N m s^2.
+        linear: (6,) linear damping, N s/m and N m s.
+    """
+
+    nodes: np.ndarray
+    rotational: np.ndarray
+    linear: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """One rigid body of m modules.
+
+    Attributes:
+        modules: fleet indices of its modules.
+        r_bm: (m, 3) module origins from the centre of mass, body frame; q_bm: (m, 4) module frame to body frame.
+        r_bi: (m, 3) IMUs from the centre of mass.
+        mass: (6, 6) rigid, entrained and added mass about the centre of mass; mass_inv: its inverse.
+        rigid_mass_kg: dry and entrained mass; dry_kg: dry mass.
+        righting: (3,) sum of dry weight times (centre of buoyancy - centre of mass), body frame, N m.
+        thrusters, drag: see there.
+        tag_ids: (t,) ids; tag_module: (t,) index within the body; r_bt: (t, 3); q_bt: (t, 4) tag frame to body frame.
+        tag_module and r_bt follow the order of tag_ids.
+        supply_power_w: (m,) what each module's supply gives to its thrusters and magnets.
+        cells: (m, 3) lattice cells; name: for people.
+    """
+
+    name: str
+    modules: tuple[int, ...]
+    cells: np.ndarray
+    r_bm: np.ndarray
+    q_bm: np.ndarray
+    r_bi: np.ndarray
+    mass: np.ndarray
+    mass_inv: np.ndarray
+    rigid_mass_kg: float
+    dry_kg: float
+    righting: np.ndarray
+    thrusters: ThrusterSet
+    drag: DragTable
+    tag_ids: np.ndarray
+    tag_module: np.ndarray
+    r_bt: np.ndarray
+    q_bt: np.ndarray
+    supply_power_w: np.ndarray
+
+    @property
+    def index(self) -> int:
+        """The body's number: that of its leader, its first module."""
+        return self.modules[0]

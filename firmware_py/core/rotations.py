@@ -1,0 +1,131 @@
+"""Rotations: quaternions scalar first, q_ab turns vectors of frame b into frame a. Compiled; used by every stage."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+V = "float64[::1]"
+M = "float64[:,::1]"
+
+
+@njit(f"{V}({V},{V})", cache=True)
+def multiply(a, b):  # type: ignore[no-untyped-def]
+    """Hamilton product a * b, (4,)."""
+    return np.array([
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ])
+
+
+@njit(f"{V}({V})", cache=True)
+def conjugate(q):  # type: ignore[no-untyped-def]
+    """Inverse of a unit quaternion, (4,)."""
+    return np.array([q[0], -q[1], -q[2], -q[3]])
+
+
+@njit(f"{V}({V})", cache=True)
+def normalise(q):  # type: ignore[no-untyped-def]
+    """q / |q| with a scalar part that is not negative."""
+    n = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    return q / (n if q[0] >= 0.0 else -n)
+
+
+@njit(f"{M}({V})", cache=True)
+def to_matrix(q):  # type: ignore[no-untyped-def]
+    """(3, 3) rotation matrix of a unit quaternion."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])
+
+
+@njit(f"{V}({M})", cache=True)
+def from_matrix(r):  # type: ignore[no-untyped-def]
+    """Unit quaternion of a (3, 3) rotation matrix (Shepperd's method: the largest component is found first)."""
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    squares = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
+    k = np.argmax(squares)
+    q = np.empty(4)
+    if k == 0:
+        q[0] = 1.0 + trace
+        q[1], q[2], q[3] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    else:
+        i = k - 1
+        j, m = (i + 1) % 3, (i + 2) % 3
+        q[1 + i] = 1.0 + r[i, i] - r[j, j] - r[m, m]
+        q[0] = r[m, j] - r[j, m]
+        q[1 + j] = r[j, i] + r[i, j]
+        q[1 + m] = r[m, i] + r[i, m]
+    return normalise(q)
+
+
+@njit(f"{V}({V})", cache=True)
+def exp(v):  # type: ignore[no-untyped-def]
+    """Unit quaternion of a rotation vector, (3,) rad -> (4,)."""
+    angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+    s = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
+    return np.array([math.cos(0.5 * angle), s * v[0], s * v[1], s * v[2]])
+
+
+@njit(f"{V}({V})", cache=True)
+def log(q):  # type: ignore[no-untyped-def]
+    """Rotation vector of a unit quaternion, (4,) -> (3,) rad, angle at most pi."""
+    sign = 1.0 if q[0] >= 0.0 else -1.0
+    s = math.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    k = 2.0 * sign if s < 1e-9 else 2.0 * math.atan2(s, sign * q[0]) * sign / s
+    return np.array([k * q[1], k * q[2], k * q[3]])
+
+
+@njit(f"{V}({V},{V})", cache=True)
+def difference(a, b):  # type: ignore[no-untyped-def]
+    """Rotation vector, in frame b, that turns attitude b into attitude a: log(b^-1 a)."""
+    return log(multiply(conjugate(b), a))
+
+
+@njit(f"{M}({V})", cache=True)
+def skew(v):  # type: ignore[no-untyped-def]
+    """(3, 3) S with S u = v x u."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@njit(f"{V}({V},{V})", cache=True)
+def cross(a, b):  # type: ignore[no-untyped-def]
+    """a x b, (3,)."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(f"{V}({V},{V})", cache=True)
+def rotate(q, v):  # type: ignore[no-untyped-def]
+    """q v q^-1, (3,)."""
+    t = 2.0 * cross(q[1:].copy(), v)
+    return v + q[0] * t + cross(q[1:].copy(), t)
+
+
+@njit(f"{V}({V},{V})", cache=True)
+def rotate_back(q, v):  # type: ignore[no-untyped-def]
+    """q^-1 v q, (3,)."""
+    return rotate(conjugate(q), v)
+
+
+def from_euler(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Unit quaternion of the aerospace sequence yaw, pitch, roll (z, y', x'')."""
+    half = 0.5 * np.array([roll, pitch, yaw])
+    qx = np.array([math.cos(half[0]), math.sin(half[0]), 0.0, 0.0])
+    qy = np.array([math.cos(half[1]), 0.0, math.sin(half[1]), 0.0])
+    qz = np.array([math.cos(half[2]), 0.0, 0.0, math.sin(half[2])])
+    return np.asarray(multiply(multiply(qz, qy), qx))
+
+
+def to_euler(q: np.ndarray) -> tuple[float, float, float]:
+    """Roll, pitch, yaw of the aerospace sequence, for people and MAVLink only; nothing controls on them."""
+    w, x, y, z = (float(c) for c in q)
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

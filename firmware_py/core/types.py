@@ -1,0 +1,228 @@
+"""The values that pass between the stages of a tick. Everything else about a stage stays in its own file.
+
+One tick: Inputs -> (Estimate, Setpoint, Wrench, Thrust per body) -> Outputs. World NED, body FRD, SI units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Array = np.ndarray
+
+
+# ---------------------------------------------------------------- what comes in
+
+
+class TagObservation(NamedTuple):
+    """One tag seen once: both TAG frames of it, paired."""
+
+    tag_id: int
+    quality: int
+    capture_ns: int
+    """Time of the picture, on the firmware's clock."""
+    p_wt: Array
+    """(3,) tag centre in the world, m."""
+    q_wt: Array
+    """(4,) tag frame to world."""
+
+
+class EscFeedback(NamedTuple):
+    """Both ESCs of one feedback frame."""
+
+    first: int
+    """Index of its first thruster in the module."""
+    rpm: tuple[float, float]
+    current_a: tuple[float, float]
+    status: tuple[int, int]
+
+
+@dataclass(slots=True)
+class ModuleInputs:
+    """What one module's frames said since the previous tick; None or empty where nothing fresh came."""
+
+    gyro: Array | None = None
+    """(3,) angular rate, module frame, rad/s."""
+    accel: Array | None = None
+    """(3,) specific force, module frame, m/s^2."""
+    pressure_pa: float | None = None
+    tags: list[TagObservation] = field(default_factory=list)
+    dock_current_ma: list[float | None] = field(default_factory=lambda: [None] * 6)
+    relay_echo: list[int | None] = field(default_factory=lambda: [None] * 6)
+    esc: list[EscFeedback] = field(default_factory=list)
+    voltage_v: float | None = None
+    current_a: float | None = None
+    cabin_temperature_c: float | None = None
+    cabin_pressure_pa: float | None = None
+    leak: bool | None = None
+    mcu_state: int | None = None
+    mcu_errors: int = 0
+    answered: bool = False
+    """Its MCU_STATUS of this tick is in."""
+    heard: bool = False
+    """Any frame of the module came."""
+
+
+class Action(IntEnum):
+    """What a person or program may ask of a body."""
+
+    ARM = 1
+    DISARM = 2
+    HOLD = 3
+    TRACK = 4
+    ESTOP = 5
+    CLEAR_ESTOP = 6
+
+
+class Request(NamedTuple):
+    """One request that enters a tick: from a ground station, a scenario or the command line."""
+
+    action: Action
+    body: int = 0
+    argument: Any = None
+    """TRACK: a Trajectory; HOLD: None holds here, else a Setpoint."""
+
+
+@dataclass(slots=True)
+class Inputs:
+    """Everything that enters one tick."""
+
+    tick: int
+    time_ns: int
+    modules: list[ModuleInputs]
+    requests: list[Request] = field(default_factory=list)
+    estop: bool = False
+    """An ESTOP frame came since the previous tick."""
+    dropped_frames: int = 0
+    """Frames dropped by the codec so far, all kinds."""
+
+
+# ---------------------------------------------------------------- between the stages
+
+
+class Measured(NamedTuple):
+    """Sensors of all modules of a body, fused, in the body frame."""
+
+    gyro: Array | None
+    """(3,) rad/s."""
+    accel: Array | None
+    """(3,) specific force at the centre of mass, m/s^2."""
+    depth_m: float | None
+    """Depth of the centre of mass by pressure, without the datum's bias."""
+    tags: list[BodyPose]
+
+
+class BodyPose(NamedTuple):
+    """The pose of a body by one observation of one tag."""
+
+    capture_ns: int
+    p_wb: Array
+    q_wb: Array
+    lever_b: Array
+    """(3,) tag centre from the centre of mass, body frame, m."""
+    module: int
+    tag_id: int
+
+
+class Estimate(NamedTuple):
+    """What the estimator believes at the tick's time."""
+
+    p_wb: Array
+    q_wb: Array
+    nu: Array
+    """(6,) velocity of the centre of mass and angular rate, body frame."""
+    force_w: Array
+    """(3,) disturbance force, world, N."""
+    moment_b: Array
+    """(3,) disturbance moment, body, N m."""
+    sigma_p: Array
+    """(3,) standard deviation of the position, world, m."""
+    sigma_q: Array
+    """(3,) standard deviation of the attitude, body axes, rad."""
+    tag_age_ns: int
+    """Time since the last accepted tag observation was taken; very large before the first."""
+    nis: float
+    """Normalised innovation squared of the tag updates of this tick, summed; NaN without one."""
+    nis_dof: int
+    """Its degrees of freedom."""
+    rejected: int
+    """Tag observations refused by the gate so far."""
+    ready: bool
+    """A pose has been found."""
+
+
+class Setpoint(NamedTuple):
+    """Wanted motion at one time."""
+
+    p_wb: Array
+    q_wb: Array
+    v_w: Array
+    """(3,) velocity, world, m/s."""
+    w_b: Array
+    """(3,) angular rate, wanted body frame, rad/s."""
+    a_w: Array
+    """(3,) acceleration, world."""
+    alpha_b: Array
+    """(3,) angular acceleration, wanted body frame."""
+
+
+class Thrust(NamedTuple):
+    """Result of the allocation."""
+
+    force_n: Array
+    """(n,) force of each thruster, N."""
+    achieved: Array
+    """(6,) wrench that these forces give."""
+    scale: tuple[float, float]
+    """Share of the wanted force and moment that is kept, 0 to 1."""
+
+
+# ---------------------------------------------------------------- what goes out
+
+
+class ModuleCommand(NamedTuple):
+    """What one module is told in this tick."""
+
+    armed: bool
+    thrusters: Array
+    """(8,) share of full command, -1 to 1."""
+    relays: tuple[int, ...] | None
+    """Six wanted relay states, or None when DOCK_CMD is not due."""
+
+
+class Event(NamedTuple):
+    """Something a person may want to read."""
+
+    severity: int
+    """syslog: 2 critical, 4 warning, 6 information."""
+    text: str
+
+
+class BodyRecord(NamedTuple):
+    """Every internal signal of one body in one tick, as the recorder stores it."""
+
+    body: int
+    state: int
+    estimate: Estimate
+    setpoint: Setpoint
+    wrench: Array
+    """(6,) wanted wrench, body."""
+    thrust: Thrust
+    commanded_n: Array
+    """(n,) force of each thruster after the limiter."""
+
+
+@dataclass(slots=True)
+class Outputs:
+    """Everything that leaves one tick."""
+
+    tick: int
+    time_ns: int
+    modules: list[ModuleCommand]
+    estop: bool
+    """The firmware raises ESTOP."""
+    events: list[Event]
+    records: list[BodyRecord]

@@ -1,0 +1,1 @@
+"""What the robot is: frozen descriptions, read once at start."""

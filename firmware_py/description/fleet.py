@@ -1,0 +1,61 @@
+"""The fleet: which modules one firmware process controls, on which buses, and how they start out docked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Module:
+    """One cube: its number on its bus, and where it sits in its body at the start."""
+
+    number: int = quantity(low=1, high=29, help="number on the bus")
+    bus: int = quantity(0, low=0, high=15, help="index into `buses`")
+    vehicle: str = quantity("modcube", help="vehicle name or file")
+    body: int = quantity(-1, low=-1, high=63, help="modules with the same number start docked; -1: alone")
+    cell: np.ndarray = quantity([0, 0, 0], unit="lattice", low=-64, high=64, shape=(3,), help="place in its body")
+    rotation: int = quantity(0, low=0, high=23, help="which of the 24 rotations of the cube (prepare.lattice)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fleet:
+    """All modules of one process, in the order in which they are indexed everywhere."""
+
+    module: tuple[Module, ...] = quantity()
+    buses: tuple[str, ...] = quantity(("virtual:modcube",), help="bus of each index")
+    rate_hz: int = quantity(100, unit="Hz", low=50, high=400, help="tick rate")
+    pitch_m: float = quantity(0.21, unit="m", low=0.01, high=2.0, help="lattice pitch")
+    latitude_deg: float = quantity(30.2084, unit="deg", low=-90, high=90, help="geodetic origin of the tank")
+    longitude_deg: float = quantity(120.1614, unit="deg", low=-180, high=180, help="geodetic origin of the tank")
+    altitude_m: float = quantity(0.0, unit="m", low=-500, high=9000, help="geodetic origin of the tank")
+
+    def __post_init__(self) -> None:
+        addresses = [(m.bus, m.number) for m in self.module]
+        if not addresses:
+            raise DescriptionError("has no [[module]] table; a fleet needs at least one")
+        if len(set(addresses)) != len(addresses):
+            raise DescriptionError("two modules have the same bus and number")
+        if max(m.bus for m in self.module) >= len(self.buses):
+            raise DescriptionError(f"a module names a bus beyond the {len(self.buses)} in `buses`")
+
+    @property
+    def period_ns(self) -> int:
+        """Length of a tick."""
+        return 1_000_000_000 // self.rate_hz
+
+
+def load_fleet(path: Path) -> Fleet:
+    """The fleet in `path`. Raises DescriptionError, one line."""
+    table, source = read_toml(path)
+    fleet: Fleet = build(Fleet, table, source)
+    return fleet
+
+
+def single(vehicle: str = "modcube", bus: str = "virtual:modcube", rate_hz: int = 100) -> Fleet:
+    """A fleet of one module, number 1."""
+    return Fleet(module=(Module(number=1, vehicle=vehicle, cell=frozen_array([0, 0, 0])),), buses=(bus,), rate_hz=rate_hz)

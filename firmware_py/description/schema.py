@@ -1,0 +1,239 @@
+"""TOML <-> frozen dataclass: every field carries unit, range and help; anything else is refused with file, line and range.
+
+Used once at start, by whoever reads a vehicle, fleet, parameter or scenario file. Nothing here runs in a tick.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import tomllib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+class DescriptionError(ValueError):
+    """A description is wrong; the message is one line: where, what, and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a field may hold.
+
+    Attributes:
+        unit: unit of the value, empty when it has none.
+        low, high: inclusive range of every number in the field.
+        help: one sentence.
+        shape: required shape of an array field, where -1 is any length.
+        choices: the permitted words of a text field.
+        mavlink: name of the parameter on MAVLink, empty when it is not exposed.
+    """
+
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    help: str = ""
+    shape: tuple[int, ...] = ()
+    choices: tuple[str, ...] = ()
+    mavlink: str = ""
+
+
+def quantity(
+    default: Any = dataclasses.MISSING,
+    *,
+    unit: str = "",
+    low: float = -math.inf,
+    high: float = math.inf,
+    help: str = "",
+    shape: tuple[int, ...] = (),
+    choices: tuple[str, ...] = (),
+    mavlink: str = "",
+) -> Any:
+    """A dataclass field with its `Limits`; arrays given as lists become read-only float64 arrays."""
+    limits = Limits(unit, low, high, help, shape, choices, mavlink)
+    metadata = {"limits": limits}
+    if default is dataclasses.MISSING:
+        return dataclasses.field(metadata=metadata)
+    if isinstance(default, list):
+        return dataclasses.field(default_factory=lambda: frozen_array(default), metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def frozen_array(values: Any) -> np.ndarray:
+    """A read-only, C-contiguous float64 copy of `values`."""
+    array = np.array(values, dtype=np.float64, order="C")
+    array.flags.writeable = False
+    return array
+
+
+def limits_of(cls: type, name: str) -> Limits:
+    """The `Limits` of field `name` of dataclass `cls`."""
+    limits = cls.__dataclass_fields__[name].metadata.get("limits", Limits())  # type: ignore[attr-defined]
+    assert isinstance(limits, Limits)
+    return limits
+
+
+_HEADER = re.compile(r"^\s*\[(?P<array>\[)?\s*(?P<name>[^\[\]#]+?)\s*\]")
+_KEY = re.compile(r"^\s*(?P<name>[\w.\"-]+)\s*=")
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a table came from, so that an error can name file and line."""
+
+    path: str
+    text: str
+
+    def line_of(self, keys: Sequence[str | int]) -> int:
+        """1-based line of the key or table that `keys` lead to; the nearest enclosing one when it is not written out."""
+        best_line, best_depth = 1, 0
+        table: tuple[str | int, ...] = ()
+        count: dict[tuple[str | int, ...], int] = {}
+        for number, line in enumerate(self.text.splitlines(), 1):
+            if match := _HEADER.match(line):
+                table = tuple(match["name"].replace('"', "").split("."))
+                if match["array"]:
+                    count[table] = count.get(table, -1) + 1
+                    table = (*table, count[table])
+                path = table
+            elif match := _KEY.match(line):
+                path = (*table, *match["name"].replace('"', "").split("."))
+            else:
+                continue
+            if len(path) > best_depth and path == tuple(keys[: len(path)]):
+                best_line, best_depth = number, len(path)
+        return best_line
+
+    def error(self, keys: Sequence[str | int], what: str) -> DescriptionError:
+        """The error for `keys`: `file:line: a.b: what`."""
+        name = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
+        return DescriptionError(f"{self.path}:{self.line_of(keys)}: {name}: {what}")
+
+
+def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
+    """The table in `path` and its source. Raises DescriptionError for a file that is missing or is no TOML."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    try:
+        return tomllib.loads(text), Source(str(path), text)
+    except tomllib.TOMLDecodeError as error:
+        match = re.search(r"line (\d+)", str(error))
+        raise DescriptionError(f"{path}:{match.group(1) if match else 1}: not valid TOML: {error}") from None
+
+
+def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str | int, ...] = ()) -> Any:
+    """An instance of dataclass `cls` from `table`; refuses unknown, missing, ill-typed and out-of-range keys.
+
+    Raises:
+        DescriptionError: one line with file, line, key and what would be right.
+    """
+    hints = typing.get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
+    for key in table:
+        if key not in fields:
+            known = ", ".join(sorted(fields))
+            raise source.error((*keys, key), f"unknown key; permitted here: {known}")
+    values: dict[str, Any] = {}
+    for name, field in fields.items():
+        if name in table:
+            values[name] = _value(hints[name], limits_of(cls, name), table[name], source, (*keys, name))
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise source.error((*keys, name), f"missing key; it needs {describe(limits_of(cls, name))}")
+    try:
+        return cls(**values)
+    except DescriptionError as error:
+        raise source.error(keys, str(error)) from None
+
+
+def describe(limits: Limits) -> str:
+    """What a field may hold, in words."""
+    if limits.choices:
+        return "one of " + ", ".join(limits.choices)
+    unit = f" {limits.unit}" if limits.unit else ""
+    if math.isfinite(limits.low) or math.isfinite(limits.high):
+        return f"{limits.low:g} to {limits.high:g}{unit}"
+    return f"a value{f' in{unit}' if unit else ''}"
+
+
+def _value(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[str | int, ...]) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (types.UnionType, typing.Union):
+        hint = next(a for a in typing.get_args(hint) if a is not type(None))
+        origin = typing.get_origin(hint)
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, Mapping):
+            raise source.error(keys, "must be a table")
+        return build(typing.cast(type, hint), value, source, keys)
+    if origin is tuple:
+        item = typing.get_args(hint)[0]
+        if not isinstance(value, list):
+            raise source.error(keys, "must be a list")
+        return tuple(_value(item, limits, v, source, (*keys, i)) for i, v in enumerate(value))
+    if hint is np.ndarray or origin is np.ndarray:
+        return _array(limits, value, source, keys)
+    return _scalar(hint, limits, value, source, keys)
+
+
+def _array(limits: Limits, value: Any, source: Source, keys: tuple[str | int, ...]) -> np.ndarray:
+    try:
+        array = frozen_array(value)
+    except (TypeError, ValueError):
+        raise source.error(keys, "must be numbers only, in rows of equal length") from None
+    shape = limits.shape
+    if shape and (array.ndim != len(shape) or any(s not in (-1, n) for s, n in zip(shape, array.shape, strict=True))):
+        raise source.error(keys, f"has shape {array.shape}; needs {shape} (-1: any)")
+    if not np.all(np.isfinite(array)):
+        raise source.error(keys, "must be finite numbers, not NaN or infinity")
+    if array.size and (array.min() < limits.low or array.max() > limits.high):
+        raise source.error(keys, f"{value} is out of range; permitted: {describe(limits)}")
+    return array
+
+
+def _scalar(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[str | int, ...]) -> Any:
+    if hint is bool or isinstance(value, bool):
+        if hint is not bool or not isinstance(value, bool):
+            raise source.error(keys, f"{value!r} is not {'true or false' if hint is bool else describe(limits)}")
+        return value
+    if hint is str:
+        if not isinstance(value, str):
+            raise source.error(keys, f"{value!r} is not text")
+        if limits.choices and value not in limits.choices:
+            raise source.error(keys, f"{value!r} is unknown; permitted: {describe(limits)}")
+        return value
+    if not isinstance(value, int | float) or (hint is int and not isinstance(value, int)):
+        raise source.error(keys, f"{value!r} is not {'a whole number' if hint is int else 'a number'}")
+    if not math.isfinite(value) or not limits.low <= value <= limits.high:
+        raise source.error(keys, f"{value!r} is out of range; permitted: {describe(limits)}")
+    return hint(value)
+
+
+def to_toml(value: Any) -> str:
+    """The TOML text of a dataclass of scalars, arrays and one level of tables, with units as comments."""
+    head, tail = [], []
+    for field in dataclasses.fields(value):
+        item = getattr(value, field.name)
+        if dataclasses.is_dataclass(item):
+            tail.append(f"\n[{field.name}]\n{to_toml(item)}")
+        else:
+            unit = limits_of(type(value), field.name).unit
+            head.append(f"{field.name} = {_literal(item)}{f'  # {unit}' if unit else ''}\n")
+    return "".join(head + tail)
+
+
+def _literal(item: Any) -> str:
+    if isinstance(item, bool):
+        return "true" if item else "false"
+    if isinstance(item, np.ndarray):
+        return repr(item.tolist())
+    if isinstance(item, str):
+        return '"' + item.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return repr(item)

@@ -1,0 +1,193 @@
+"""One module (or any other thruster vehicle) as a frozen description, read from `vehicles/NAME.toml`.
+
+Positions and directions are in the module frame: FRD, origin at the hull's centre, metres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
+
+FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
+"""Faces A..F of the bus, in order; also the tag ids of tags that sit on a face."""
+
+FACE_NORMALS = frozen_array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+"""(6, 3) outward normals of the faces, module frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Hull:
+    """The outside."""
+
+    size_m: np.ndarray = quantity(unit="m", low=0.01, high=10.0, shape=(3,), help="edges of the box along x, y, z")
+    mesh: str = quantity("", help="file of a closed mesh beside the vehicle file, in place of the box")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Inertial:
+    """Masses. A free-flooding module moves entrained and added water besides its own mass."""
+
+    dry_kg: float = quantity(unit="kg", low=0.01, high=5000.0, help="mass in air")
+    entrained_kg: float = quantity(0.0, unit="kg", low=0.0, high=5000.0, help="water that moves with the hull")
+    com_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-5, high=5, shape=(3,), help="centre of mass, water included")
+    inertia: np.ndarray = quantity(
+        unit="kg m^2", low=-1e4, high=1e4, shape=(3, 3), help="dry and entrained, about the centre of mass"
+    )
+    added: np.ndarray = quantity(
+        [0, 0, 0, 0, 0, 0], unit="kg, kg m^2", low=0, high=1e4, shape=(6,), help="diagonal added mass and inertia"
+    )
+    righting_arm_m: float = quantity(
+        0.0, unit="m", low=-0.5, high=0.5, help="centre of buoyancy above the centre of mass, times dry weight a moment"
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Drag:
+    """Coefficients of the drag table: F = -1/2 rho Cd(d) A(d) |v| v."""
+
+    cd_face: float = quantity(unit="", low=0.0, high=5.0, help="drag coefficient of flow normal to a face")
+    cd_edge: float = quantity(unit="", low=0.0, high=5.0, help="drag coefficient of flow onto an edge")
+    rotational_cd: float = quantity(1.1, low=0.0, high=10.0, help="coefficient of the rotational damping integral")
+    linear: np.ndarray = quantity(
+        [0, 0, 0, 0, 0, 0], unit="N s/m, N m s", low=0, high=1e4, shape=(6,), help="linear damping, diagonal"
+    )
+    quadratic: np.ndarray = quantity(
+        [], unit="N s^2/m^2, N m s^2", low=0, high=1e5, shape=(-1,), help="published quadratic damping, in place of areas"
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ThrusterCurve:
+    """Force and power of one thruster at `voltage_v`, as the paper's fifth-order polynomials, one per sign.
+
+    force(u) = sum forward[i] u^(i+1) for u > 0, reverse likewise in |u|; power(f) = sum power_w[i] |f|^(i+1).
+    """
+
+    voltage_v: float = quantity(unit="V", low=1.0, high=100.0, help="supply at which the curve was taken")
+    forward: np.ndarray = quantity(unit="N", low=-1e4, high=1e4, shape=(5,), help="force over command 0..1")
+    reverse: np.ndarray = quantity(unit="N", low=-1e4, high=1e4, shape=(5,), help="force size over command 0..-1")
+    power_forward: np.ndarray = quantity(unit="W", low=-1e6, high=1e6, shape=(5,), help="power over force size")
+    power_reverse: np.ndarray = quantity(unit="W", low=-1e6, high=1e6, shape=(5,), help="power over force size")
+    deadband_n: float = quantity(0.0, unit="N", low=0.0, high=10.0, help="forces asked below this give none")
+    lag_s: float = quantity(unit="s", low=0.0, high=2.0, help="first-order lag of the force")
+    rpm_at_full: float = quantity(3000.0, unit="1/min", low=1.0, high=1e5, help="speed at command 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Thruster:
+    """Where a thruster sits and which way it pushes the vehicle at a positive command."""
+
+    position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="propeller centre")
+    direction: np.ndarray = quantity(low=-1.001, high=1.001, shape=(3,), help="unit vector of positive force")
+
+    def __post_init__(self) -> None:
+        if abs(float(np.linalg.norm(self.direction)) - 1.0) > 0.01:
+            raise DescriptionError(f"direction {self.direction.tolist()} has not length 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tag:
+    """A fiducial tag. Its frame: z into the face (away from the camera), x and y in the face."""
+
+    id: int = quantity(low=0, high=15, help="number in the TAG frames; the face's number when it sits on a face")
+    position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="tag centre")
+    quaternion: np.ndarray = quantity(low=-1, high=1, shape=(4,), help="scalar first, tag frame to module frame")
+
+    def __post_init__(self) -> None:
+        if abs(float(np.linalg.norm(self.quaternion)) - 1.0) > 1e-3:
+            raise DescriptionError(f"quaternion {self.quaternion.tolist()} has not length 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Supply:
+    """Battery or tether."""
+
+    voltage_v: float = quantity(12.0, unit="V", low=1.0, high=400.0, help="nominal")
+    current_a: float = quantity(10.0, unit="A", low=0.1, high=1000.0, help="most that it gives")
+    idle_w: float = quantity(8.0, unit="W", low=0.0, high=1000.0, help="drawn by the electronics")
+    magnet_w: float = quantity(6.0, unit="W", low=0.0, high=500.0, help="drawn by one energised docking magnet")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Vehicle:
+    """One module: everything that the controller believes about it."""
+
+    name: str = quantity(help="short name")
+    source: str = quantity(help="where the figures come from")
+    hull: Hull = quantity()
+    inertial: Inertial = quantity()
+    drag: Drag = quantity()
+    curve: ThrusterCurve = quantity()
+    thruster: tuple[Thruster, ...] = quantity()
+    tag: tuple[Tag, ...] = quantity(())
+    supply: Supply = quantity(Supply())
+    assumption: str = quantity("", help="what is assumed and not measured; shown wherever the vehicle is shown")
+    faces: str = quantity("PDPDPD", help="one letter a face, A to F: P probe, D drogue, - none")
+    force_max_n: float = quantity(unit="N", low=0.1, high=1e4, help="forward limit of each thruster")
+    force_min_n: float = quantity(unit="N", low=-1e4, high=-0.1, help="reverse limit of each thruster")
+    passive_dof: tuple[str, ...] = quantity(
+        (), choices=("surge", "sway", "heave", "roll", "pitch", "yaw"), help="degrees of freedom left to buoyancy"
+    )
+    depth_rating_m: float = quantity(50.0, unit="m", low=0.1, high=11000, help="deepest permitted")
+
+    def __post_init__(self) -> None:
+        if not self.thruster:
+            raise DescriptionError("has no [[thruster]] table; a vehicle needs at least one")
+        if len(self.faces) != 6 or set(self.faces) - set("PD-"):
+            raise DescriptionError(f"faces {self.faces!r} needs six letters out of P, D and -")
+        if len({tag.id for tag in self.tag}) != len(self.tag):
+            raise DescriptionError("two [[tag]] tables have the same id")
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(n, 3) thruster positions, module frame, m."""
+        return np.array([t.position_m for t in self.thruster])
+
+    @property
+    def directions(self) -> np.ndarray:
+        """(n, 3) unit directions of positive thrust, module frame."""
+        return np.array([t.direction / np.linalg.norm(t.direction) for t in self.thruster])
+
+    @property
+    def cd_corner(self) -> float:
+        """Drag coefficient along a space diagonal, from the face and edge values (quartic cubic harmonic)."""
+        return (4.0 * self.drag.cd_edge - self.drag.cd_face) / 3.0
+
+
+def vehicle_names() -> list[str]:
+    """Names of the vehicle files that the package carries."""
+    folder = resources.files("firmware_py") / "vehicles"
+    return sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml"))
+
+
+def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
+    """The vehicle called `name`, or the file at the path `name`.
+
+    Raises:
+        DescriptionError: no such vehicle, or its file is wrong; one line.
+    """
+    if name.endswith(".toml"):
+        path = Path(name) if folder is None else folder / name
+    elif name in vehicle_names():
+        path = Path(str(resources.files("firmware_py") / "vehicles" / f"{name}.toml"))
+    else:
+        raise DescriptionError(f"vehicle {name!r} is unknown; there are {', '.join(vehicle_names())}, or give a .toml file")
+    table, source = read_toml(path)
+    vehicle: Vehicle = build(Vehicle, table, source)
+    return vehicle
+
+
+def flu_to_frd(vectors: np.ndarray) -> np.ndarray:
+    """(..., 3) positions or directions from FLU to FRD: diag(1, -1, -1), a half-turn about x."""
+    return np.asarray(vectors) * np.array([1.0, -1.0, -1.0])
+
+
+def is_right_handed(matrix: np.ndarray) -> bool:
+    """Whether a (3, 3) change of frame keeps handedness."""
+    return math.isclose(float(np.linalg.det(matrix)), 1.0, abs_tol=1e-9)
