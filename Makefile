@@ -28,7 +28,7 @@ setup: $(STAMP) ## make .venv from the lock (nothing to do when up to date)
 $(STAMP): requirements.lock pyproject.toml
 	@echo 'setup 1/3: virtual environment .venv'
 	$(call make_venv,.venv)
-	@echo 'setup 2/3: packages of requirements.lock (about 400 MB, a minute or two)'
+	@echo 'setup 2/3: packages of requirements.lock (1.3 GB on disk, a minute or two)'
 	@$(PY) $(PIP_INSTALL) --require-hashes -r requirements.lock
 	@echo 'setup 3/3: modcube itself, editable'
 	@$(PY) $(PIP_INSTALL) --no-build-isolation --editable .

@@ -116,15 +116,17 @@ class Measured(NamedTuple):
 
 
 class BodyPose(NamedTuple):
-    """The pose of a body by one observation of one tag."""
+    """What one or more tags of a body, seen in one picture, say of its pose."""
 
     capture_ns: int
-    p_wb: Array
-    q_wb: Array
+    p_wt: Array
+    """(3,) mean of the tag centres, world, m."""
     lever_b: Array
-    """(3,) tag centre from the centre of mass, body frame, m."""
-    module: int
-    tag_id: int
+    """(3,) mean of the tag centres from the centre of mass, body frame, m."""
+    q_wb: Array
+    """(4,) attitude of the body."""
+    count: int
+    """Tags that went into it; the noise falls with its root."""
 
 
 class Estimate(NamedTuple):

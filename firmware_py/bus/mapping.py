@@ -1,0 +1,270 @@
+"""Frames <-> the values of a tick: InputCollector makes Inputs of what came, OutputEncoder makes frames of Outputs.
+
+Stands at both ends of a tick, between the ports and the pipeline. No clock: the loop says when SYNC went out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from firmware_py.bus.codec import Codec, Frame, Received, Receiver, unpack_quaternion
+from firmware_py.core.types import EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.description.fleet import Fleet
+
+STALE_NS = 500_000_000
+"""A tag picture older than this is dropped (DESIGN section 5)."""
+NS_PER_MS = 1_000_000
+REMEMBERED_TICKS = 256
+"""CaptureTick has 8 bits."""
+OFFSET_SATURATED_MS = 25.5
+"""Largest CaptureOffset: the camera missed SYNCs, so the time of the picture is unknown."""
+USABLE_STATUS = (0, 1)
+"""Sensor status OK and SATURATED; a stale or failed sensor's values are not passed on."""
+SENSOR_FAULT = 15
+THRUSTERS_OF_A_FRAME = 4
+CHANNELS = 8
+ESTOP_PERIOD_NS = 50_000_000
+"""ESTOP goes out at 20 Hz while it is raised."""
+
+Values = tuple[Any, ...]
+
+
+class InputCollector:
+    """Collects the frames of all buses; `collect` hands over what came since the call before, as one Inputs.
+
+    Attributes:
+        faults: frames that passed the codec's checks and were not used, by kind: `module` (not in the fleet),
+            `tag_unpaired`, `tag_stale`, `tag_future`, `sensor` (its status says fault or stale), `foreign_sync` and
+            `foreign_command` (somebody else controls this bus).
+        heartbeats: last node state by (bus, number).
+    """
+
+    def __init__(self, fleet: Fleet, codec: Codec) -> None:
+        self._receivers = [Receiver(codec) for _ in fleet.buses]
+        self._index = {(module.bus, module.number): index for index, module in enumerate(fleet.module)}
+        self._modules = [ModuleInputs() for _ in fleet.module]
+        self._status_ticks: list[int | None] = [None] * len(fleet.module)
+        self._sync_ns: list[int | None] = [None] * REMEMBERED_TICKS
+        self._halves: dict[tuple[int, int], tuple[str, Values, int]] = {}
+        self._collections = 0
+        self._estop = False
+        kinds = ("module", "tag_unpaired", "tag_stale", "tag_future", "sensor", "foreign_sync", "foreign_command")
+        self.faults: dict[str, int] = dict.fromkeys(kinds, 0)
+        self.heartbeats: dict[tuple[int, int], int] = {}
+        self._handlers = self._make_handlers()
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Frames dropped by the codec so far, by kind, all buses together."""
+        kinds = self._receivers[0].dropped
+        return {kind: sum(receiver.dropped[kind] for receiver in self._receivers) for kind in kinds}
+
+    def sync_sent(self, tick: int, time_ns: int) -> None:
+        """SYNC `tick` went out at `time_ns`: what the capture times of tags count from."""
+        self._sync_ns[tick % REMEMBERED_TICKS] = time_ns
+
+    def take(self, bus: int, frame: Frame) -> None:
+        """Takes one frame that came on bus `bus`, whatever it holds."""
+        received = self._receivers[bus].accept(frame)
+        if received is None:
+            return
+        name = received.message.name
+        handler = self._handlers.get(name)
+        if handler is None:
+            self._take_other(bus, received)
+            return
+        index = self._index.get((bus, received.number))
+        if index is None:
+            self.faults["module"] += 1
+            return
+        # TAG frames come from the camera, so they are no sign of life of the module whose number they carry.
+        if name not in ("TAG_POSITION", "TAG_ATTITUDE"):
+            self._modules[index].heard = True
+        handler(index, self._modules[index], received)
+
+    def all_answered(self, tick: int) -> bool:
+        """Whether MCU_STATUS of `tick` of every module is in: the inputs of the tick may close."""
+        wanted = tick & 0xFFFF
+        return all(status == wanted for status in self._status_ticks)
+
+    def collect(self, tick: int, time_ns: int, requests: Sequence[Request] = ()) -> Inputs:
+        """Everything since the call before, as the Inputs of `tick`; the collector is empty afterwards."""
+        modules, self._modules = self._modules, [ModuleInputs() for _ in self._modules]
+        wanted = tick & 0xFFFF
+        for module, status in zip(modules, self._status_ticks, strict=True):
+            module.answered = status == wanted
+            if module.tags:
+                module.tags = [tag for tag in module.tags if self._is_timely(tag, time_ns)]
+        self._expire_halves()
+        estop, self._estop = self._estop, False
+        dropped = sum(sum(receiver.dropped.values()) for receiver in self._receivers)
+        return Inputs(tick, time_ns, modules, list(requests), estop, dropped)
+
+    def _make_handlers(self) -> dict[str, Callable[[int, ModuleInputs, Received], None]]:
+        handlers: dict[str, Callable[[int, ModuleInputs, Received], None]] = {
+            "TAG_POSITION": self._take_tag,
+            "TAG_ATTITUDE": self._take_tag,
+            "GYRO": self._take_gyro,
+            "ACCEL": self._take_accel,
+            "DEPTH": self._take_depth,
+            "DOCK_CURRENT_ABC": self._take_dock_abc,
+            "DOCK_CURRENT_DEF": self._take_dock_def,
+            "POWER": self._take_power,
+            "ENVIRONMENT": self._take_environment,
+            "MCU_STATUS": self._take_status,
+        }
+        for pair in range(4):
+            handlers[f"ESC_FEEDBACK_{pair + 1}"] = _esc_handler(2 * pair)
+        return handlers
+
+    def _take_other(self, bus: int, received: Received) -> None:
+        name = received.message.name
+        if name == "ESTOP":
+            self._estop = True
+        elif name == "HEARTBEAT":
+            self.heartbeats[bus, received.number] = received.values[0]
+        else:
+            self.faults["foreign_sync" if name == "SYNC" else "foreign_command"] += 1
+
+    def _take_gyro(self, index: int, module: ModuleInputs, received: Received) -> None:
+        x, y, z, status = received.values
+        if self._is_usable(status):
+            module.gyro = np.array((x, y, z))
+
+    def _take_accel(self, index: int, module: ModuleInputs, received: Received) -> None:
+        x, y, z, status = received.values
+        if self._is_usable(status):
+            module.accel = np.array((x, y, z))
+
+    def _take_depth(self, index: int, module: ModuleInputs, received: Received) -> None:
+        pressure, _, status = received.values
+        if self._is_usable(status):
+            module.pressure_pa = float(pressure)
+
+    def _take_dock_abc(self, index: int, module: ModuleInputs, received: Received) -> None:
+        module.dock_current_ma[:3] = [float(current) for current in received.values[:3]]
+        module.relay_echo[:3] = received.values[3:]
+
+    def _take_dock_def(self, index: int, module: ModuleInputs, received: Received) -> None:
+        module.dock_current_ma[3:] = [float(current) for current in received.values[:3]]
+        module.relay_echo[3:] = received.values[3:]
+
+    def _take_power(self, index: int, module: ModuleInputs, received: Received) -> None:
+        voltage, current, status = received.values
+        if status == SENSOR_FAULT:
+            self.faults["sensor"] += 1
+            return
+        module.voltage_v, module.current_a = voltage, current
+
+    def _take_environment(self, index: int, module: ModuleInputs, received: Received) -> None:
+        temperature, pressure, leak = received.values
+        module.cabin_temperature_c, module.cabin_pressure_pa, module.leak = temperature, float(pressure), bool(leak)
+
+    def _take_status(self, index: int, module: ModuleInputs, received: Received) -> None:
+        tick, _, errors, state = received.values
+        self._status_ticks[index] = tick
+        module.mcu_errors |= errors
+        module.mcu_state = state
+
+    def _take_tag(self, index: int, module: ModuleInputs, received: Received) -> None:
+        """Halves of one observation share the counter, and nothing else says that they belong together."""
+        key = (index, received.counter)
+        name, values = received.message.name, received.values
+        other = self._halves.pop(key, None)
+        if other is None or other[0] == name:
+            self.faults["tag_unpaired"] += other is not None
+            self._halves[key] = (name, values, self._collections)
+            return
+        position, attitude = (values, other[1]) if name == "TAG_POSITION" else (other[1], values)
+        self._take_observation(module, position, attitude)
+
+    def _take_observation(self, module: ModuleInputs, position: Values, attitude: Values) -> None:
+        largest, a, b, c, tag_id, quality, capture_tick, offset_ms = attitude
+        sync_ns = self._sync_ns[capture_tick]
+        if sync_ns is None or offset_ms >= OFFSET_SATURATED_MS:
+            self.faults["tag_stale"] += 1
+            return
+        capture_ns = sync_ns + round(offset_ms * NS_PER_MS)
+        p_wt, q_wt = np.array(position), unpack_quaternion(largest, a, b, c)
+        module.tags.append(TagObservation(tag_id, quality, capture_ns, p_wt, q_wt))
+
+    def _is_timely(self, tag: TagObservation, time_ns: int) -> bool:
+        age_ns = time_ns - tag.capture_ns
+        if 0 <= age_ns <= STALE_NS:
+            return True
+        self.faults["tag_stale" if age_ns > 0 else "tag_future"] += 1
+        return False
+
+    def _is_usable(self, status: int) -> bool:
+        if status in USABLE_STATUS:
+            return True
+        self.faults["sensor"] += 1
+        return False
+
+    def _expire_halves(self) -> None:
+        """The halves of an observation may fall to either side of one tick's end; a half older than that is alone."""
+        if self._halves:
+            old = [key for key, half in self._halves.items() if half[2] < self._collections]
+            for key in old:
+                del self._halves[key]
+            self.faults["tag_unpaired"] += len(old)
+        self._collections += 1
+
+
+def _esc_handler(first: int) -> Callable[[int, ModuleInputs, Received], None]:
+    def take(index: int, module: ModuleInputs, received: Received) -> None:
+        rpm1, current1, status1, rpm2, current2, status2 = received.values
+        feedback = EscFeedback(first, (float(rpm1), float(rpm2)), (current1, current2), (status1, status2))
+        module.esc.append(feedback)
+
+    return take
+
+
+class OutputEncoder:
+    """Frames of what the pipeline says, each with the bus that it goes out on."""
+
+    def __init__(self, fleet: Fleet, codec: Codec) -> None:
+        self._buses = range(len(fleet.buses))
+        self._addresses = [(module.bus, module.number) for module in fleet.module]
+        self._sync = codec.message("SYNC")
+        self._estop = codec.message("ESTOP")
+        self._dock = codec.message("DOCK_CMD")
+        self._heartbeat = codec.message("HEARTBEAT")
+        self._thrusters = (codec.message("THRUSTER_CMD_A"), codec.message("THRUSTER_CMD_B"))
+        self._dock_counters = [0] * len(fleet.module)
+        self._estop_ns: int | None = None
+
+    def sync(self, tick: int) -> list[tuple[int, Frame]]:
+        """SYNC of `tick` (modulo 2^32), one per bus."""
+        frame = self._sync.encode(0, (tick & 0xFFFFFFFF,))
+        return [(bus, frame) for bus in self._buses]
+
+    def frames(self, outputs: Outputs) -> list[tuple[int, Frame]]:
+        """Frames of one tick: ESTOP when due, then of every module its thrusters and, when due, its docking relays."""
+        frames: list[tuple[int, Frame]] = []
+        if self._estop_is_due(outputs):
+            frames += [(bus, self._estop.encode(0)) for bus in self._buses]
+        counter = outputs.tick & 15
+        half_a, half_b = self._thrusters
+        for index, ((bus, number), command) in enumerate(zip(self._addresses, outputs.modules, strict=True)):
+            mode = int(command.armed)
+            shares = command.thrusters.tolist()
+            shares += [0.0] * (CHANNELS - len(shares))
+            frames.append((bus, half_a.encode(number, (*shares[:THRUSTERS_OF_A_FRAME], mode), counter)))
+            frames.append((bus, half_b.encode(number, (*shares[THRUSTERS_OF_A_FRAME:], mode), counter)))
+            if command.relays is not None:
+                frames.append((bus, self._dock.encode(number, command.relays, self._dock_counters[index])))
+                self._dock_counters[index] = self._dock_counters[index] + 1 & 15
+        return frames
+
+    def _estop_is_due(self, outputs: Outputs) -> bool:
+        if not outputs.estop:
+            self._estop_ns = None
+            return False
+        if self._estop_ns is not None and outputs.time_ns - self._estop_ns < ESTOP_PERIOD_NS:
+            return False
+        self._estop_ns = outputs.time_ns
+        return True

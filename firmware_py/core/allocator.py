@@ -1,0 +1,80 @@
+"""Stage 6 of a tick: from a wrench to the force of each thruster (paper, Eq. 6), within limits.
+
+Where the pseudo-inverse stays within limits it is the answer. Otherwise a box-constrained least-squares problem (daqp) keeps the directions of
+force and moment and gives way in the force first.
+"""
+
+from __future__ import annotations
+
+from ctypes import c_int
+
+import daqp
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.types import Thrust
+from firmware_py.description.parameters import Allocation
+
+MOMENT_PRIORITY = 100.0
+"""How much more a lost share of the moment costs than a lost share of the force."""
+SHARE_WEIGHT = 1e4
+"""Cost of losing the whole force against one N^2 in one thruster."""
+EQUALITY = 5
+"""daqp's mark of an equality row."""
+SOLVED = (1, 2)
+"""daqp's exit flags for optimal, and optimal with slack."""
+
+
+class Allocator:
+    """Allocates for one body. `alive` leaves thrusters out of the problem at once."""
+
+    def __init__(self, body: Body, parameters: Allocation) -> None:
+        self._clip_only = parameters.mode == "pseudo_inverse"
+        self._thrusters = body.thrusters
+        n = body.thrusters.f_max.size
+        self._f_min, self._f_max = body.thrusters.f_min.copy(), body.thrusters.f_max.copy()
+        self._matrix = np.ascontiguousarray(body.thrusters.matrix)
+        self._pinv = np.ascontiguousarray(body.thrusters.pinv)
+        self._h = np.diag(np.r_[np.full(n, 2.0), 2 * SHARE_WEIGHT, 2 * SHARE_WEIGHT * MOMENT_PRIORITY])
+        self._f = np.r_[np.zeros(n), -2 * SHARE_WEIGHT, -2 * SHARE_WEIGHT * MOMENT_PRIORITY]
+        self._sense = np.array([0] * (n + 2) + [EQUALITY] * 6, dtype=c_int)
+
+    def set_alive(self, alive: np.ndarray) -> None:
+        """(n,) bool: thrusters that may be used from now on."""
+        t = self._thrusters
+        self._matrix = np.ascontiguousarray(t.matrix * alive)
+        self._pinv = np.ascontiguousarray(np.linalg.pinv(self._matrix))
+        self._f_min, self._f_max = t.f_min * alive, t.f_max * alive
+
+    def step(self, wrench: np.ndarray) -> Thrust:
+        """The thruster forces for a wanted (6,) wrench, body frame."""
+        force = self._pinv @ wrench
+        if bool(np.all(force <= self._f_max) and np.all(force >= self._f_min)):
+            return Thrust(force, self._matrix @ force, (1.0, 1.0))
+        if self._clip_only:
+            force = np.clip(force, self._f_min, self._f_max)
+            return Thrust(force, self._matrix @ force, (1.0, 1.0))
+        return self._saturated(wrench)
+
+    def _saturated(self, wrench: np.ndarray) -> Thrust:
+        """min |f|^2 + w_f (1 - a)^2 + w_m (1 - b)^2, J f = [a F; b M], f within limits, 0 <= a, b <= 1."""
+        n = self._f_max.size
+        rows = np.zeros((6, n + 2))
+        rows[:, :n] = self._matrix
+        rows[:3, n] = -wrench[:3]
+        rows[3:, n + 1] = -wrench[3:]
+        upper = np.r_[self._f_max, 1.0, 1.0, np.zeros(6)]
+        lower = np.r_[self._f_min, 0.0, 0.0, np.zeros(6)]
+        x, _, flag, _ = daqp.solve(self._h, self._f, rows, upper, lower, self._sense)
+        if flag not in SOLVED:
+            share = self._common_share(wrench)
+            force = self._pinv @ wrench * share
+            return Thrust(force, self._matrix @ force, (share, share))
+        force = np.clip(x[:n], self._f_min, self._f_max)
+        return Thrust(force, self._matrix @ force, (float(x[n]), float(x[n + 1])))
+
+    def _common_share(self, wrench: np.ndarray) -> float:
+        """Largest share of the pseudo-inverse's answer that is within limits."""
+        force = self._pinv @ wrench
+        limit = np.where(force > 0, self._f_max, -self._f_min)
+        return float(1.0 / max(1.0, np.max(np.abs(force) / np.maximum(limit, 1e-9))))

@@ -1,0 +1,77 @@
+"""Stage 5 of a tick: PD with model feed-forward (paper, Eq. 4), attitude error on SO(3), gains times the body's mass matrix.
+
+tau = M (Kp e + Kd de/dt + dnu_d/dt) + C(nu) nu + D(nu) nu + g - disturbance. K_P = M w^2, K_D = 2 z w M.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from firmware_py.core.body import Body
+from firmware_py.core.drag_lookup import drag_wrench
+from firmware_py.core.propagation import PLANT
+from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
+from firmware_py.core.rotations import V, cross, difference, rotate, rotate_back
+from firmware_py.core.types import Estimate, Setpoint
+from firmware_py.description.parameters import Control
+
+SETPOINT = f"{V},{V},{V},{V},{V},{V}"
+"""Types of a Setpoint's fields."""
+
+
+class Controller:
+    """Pure: no state. All gains are worked out at construction."""
+
+    def __init__(self, body: Body, parameters: Control) -> None:
+        p = parameters
+        self._plant = (
+            body.mass, body.mass_inv, body.righting, body.drag.nodes, body.drag.rotational, body.drag.linear,
+        )  # fmt: skip
+        self._kp = np.repeat([p.position_bandwidth**2, p.attitude_bandwidth**2], 3)
+        self._kd = np.repeat(
+            [2 * p.position_damping * p.position_bandwidth, 2 * p.attitude_damping * p.attitude_bandwidth], 3
+        )
+        self._law = np.array([float(p.law == "model"), p.drag_feedforward, p.disturbance_feedforward])
+
+    def step(self, now: Setpoint, ahead: Setpoint, estimate: Estimate) -> np.ndarray:
+        """The wanted wrench, (6,), body frame.
+
+        Args:
+            now: set-point of this tick, for the errors.
+            ahead: set-point a thruster lag later, for the feed-forward.
+            estimate: of this tick.
+        """
+        e = estimate
+        return np.asarray(
+            _wrench(*now, *ahead, e.p_wb, e.q_wb, e.nu, e.force_w, e.moment_b, self._kp, self._kd, self._law, *self._plant)
+        )
+
+
+@njit(f"{V}({V},{V},{V},{V})", cache=True)
+def _body_velocity(q_set, v_w, w_b, q):  # type: ignore[no-untyped-def]
+    """(6,) wanted velocity in the present body frame."""
+    out = np.empty(6)
+    out[:3] = rotate_back(q, v_w)
+    out[3:] = rotate_back(q, rotate(q_set, w_b))
+    return out
+
+
+@njit(f"{V}({SETPOINT},{SETPOINT},{V},{V},{V},{V},{V},{V},{V},{V},{PLANT})", cache=True)
+def _wrench(  # type: ignore[no-untyped-def]
+    p0, q0, v0, w0, a0, alpha0, p1, q1, v1, w1, a1, alpha1, p, q, nu, force_w, moment_b, kp, kd, law,
+    mass, mass_inv, righting, nodes, rotational, linear,
+):  # fmt: skip
+    error = np.empty(6)
+    error[:3] = rotate_back(q, p0 - p)
+    error[3:] = difference(q0, q)
+    ahead = _body_velocity(q1, v1, w1, q)
+    rate = kp * error + kd * (_body_velocity(q0, v0, w0, q) - nu)
+    # w x v is taken off because the Coriolis term holds it
+    rate[:3] += rotate_back(q, a1) - cross(ahead[3:].copy(), ahead[:3].copy())
+    rate[3:] += rotate_back(q, rotate(q1, alpha1))
+    modelled = ahead if law[0] > 0.5 else nu
+    tau = mass @ rate + coriolis_wrench(mass, modelled) - law[1] * drag_wrench(nodes, rotational, linear, modelled)
+    tau[:3] -= law[2] * rotate_back(q, force_w)
+    tau[3:] -= law[2] * (moment_b + restoring_moment(righting, q))
+    return tau

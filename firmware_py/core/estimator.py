@@ -1,0 +1,286 @@
+"""Stage 2 of a tick: an error-state Kalman filter (filterpy) of pose, velocity, sensor biases and one lumped disturbance.
+
+The filter stands at its anchor: the time of the newest tag picture, or half a second ago when none came. Everything is fused once, in the
+order in which it happened; from the anchor the state is carried to now through the stored thruster wrenches and gyro readings.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from filterpy.kalman import predict, update
+
+from firmware_py.core import observation, propagation
+from firmware_py.core.body import Body
+from firmware_py.core.history import WINDOW_S, History
+from firmware_py.core.propagation import ERRORS, STATES
+from firmware_py.core.rotations import conjugate, exp, log, multiply, rotate
+from firmware_py.core.types import BodyPose, Estimate, Measured
+from firmware_py.description.parameters import Estimation
+
+NEVER_NS = 1 << 60
+"""Age of the last tag before the first one."""
+READY_AFTER = 10
+"""Tag observations to accept before the pose is believed."""
+UNKNOWN_VARIANCE = np.full(6, 1e6)
+"""Of the pose before the first tag, m^2 and rad^2."""
+RESET_AFTER = 30
+"""Observations refused one after the other (half a second) until the filter believes them and not itself."""
+INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
+"""Of position m, attitude rad, velocity m/s, rate rad/s, gyro bias, accelerometer bias, disturbance over mass, over inertia, depth bias."""
+
+
+class Estimator:
+    """One body's estimator. Same inputs, same outputs; time comes in."""
+
+    def __init__(self, body: Body, parameters: Estimation, period_ns: int) -> None:
+        self._body = body
+        self._p = parameters
+        self._plant = (
+            body.mass, body.mass_inv, body.righting, body.drag.nodes, body.drag.rotational, body.drag.linear,
+        )  # fmt: skip
+        self._dt = period_ns * 1e-9
+        self._history = History(period_ns)
+        self._x = np.zeros(STATES)
+        self._x[3] = 1.0
+        self._now = self._x
+        self._covariance = np.eye(ERRORS)
+        self._zero = np.zeros(ERRORS)
+        self._density = self._process_noise()
+        self._noise = np.diag(self._density)
+        p = parameters
+        self._inertial_sigma = np.array([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m])
+        self._tag_variance = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2
+        self._anchor_ns = 0
+        self._accepted = 0
+        self._refused_in_row = 0
+        self._rejected = 0
+        self._last_tag_ns = -NEVER_NS
+        self._nis = math.nan
+        self._nis_dof = 0
+
+    @property
+    def q_wb(self) -> np.ndarray:
+        """(4,) latest attitude."""
+        return np.ascontiguousarray(self._now[3:7])
+
+    def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:
+        """The estimate at `time_ns`.
+
+        Args:
+            time_ns: time of this tick.
+            measured: fused sensors.
+            tau: (6,) mean thruster wrench since the previous tick, body frame.
+        """
+        self._nis, self._nis_dof = math.nan, 0
+        self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
+        for pose in measured.tags:
+            self._take(pose)
+        if self._accepted:
+            self._advance(max(self._anchor_ns, time_ns - int(WINDOW_S * 1e9)))
+            self._carry()
+        return self._estimate(time_ns)
+
+    # ------------------------------------------------------------ fusion at the anchor
+
+    def _take(self, pose: BodyPose) -> None:
+        if not self._accepted:
+            self._start(pose)
+        elif pose.capture_ns >= self._anchor_ns:
+            self._advance(min(pose.capture_ns, self._history.newest_ns))
+            self._fuse_tag(pose)
+        else:
+            self._rejected += 1
+
+    def _start(self, pose: BodyPose) -> None:
+        self._x = np.zeros(STATES)
+        self._x[3:7] = pose.q_wb
+        self._x[:3] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
+        inertia = np.diag(self._body.mass)
+        sigma = np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1])
+        sigma[18:24] *= inertia
+        self._covariance = np.diag(sigma**2)
+        self._anchor_ns = pose.capture_ns
+        self._last_tag_ns = pose.capture_ns
+        self._accepted, self._refused_in_row = 1, 0
+
+    def _advance(self, to_ns: int) -> None:
+        """Moves the filter to `to_ns`, fusing the inertial and depth measurements on the way."""
+        index = self._history.first_after(self._anchor_ns)
+        while self._anchor_ns < to_ns:
+            tick_ns = self._history.time_of(index)
+            until = min(tick_ns, to_ns)
+            self._predict(self._history.tau(index), (until - self._anchor_ns) * 1e-9)
+            self._anchor_ns = until
+            if until == tick_ns:
+                self._fuse_inertial(index)
+                index += 1
+
+    def _predict(self, tau: np.ndarray, dt: float) -> None:
+        transition = propagation.transition(self._x, tau, dt, *self._plant)
+        self._x = propagation.step(self._x, tau, dt, *self._plant)
+        _, self._covariance = predict(self._zero, self._covariance, transition, self._noise * dt)
+
+    def _fuse_inertial(self, index: int) -> None:
+        residual, h, noise = observation.inertial(self._x, *self._history.inertial(index), self._inertial_sigma)
+        if residual.size:
+            self._correct(residual, noise, h)
+
+    def _fuse_tag(self, pose: BodyPose) -> None:
+        variance = self._tag_variance / pose.count
+        residual, h, noise = observation.tag(self._x, pose.p_wt, pose.lever_b, pose.q_wb, variance)
+        nis = observation.normalised_square(residual, h, noise, self._covariance)
+        if nis > self._p.tag_gate**2:
+            self._refuse(pose)
+            return
+        self._correct(residual, noise, h)
+        self._nis = nis if math.isnan(self._nis) else self._nis + nis
+        self._nis_dof += 6
+        self._accepted += 1
+        self._refused_in_row = 0
+        self._last_tag_ns = pose.capture_ns
+
+    def _refuse(self, pose: BodyPose) -> None:
+        self._rejected += 1
+        self._refused_in_row += 1
+        if self._refused_in_row >= RESET_AFTER:
+            self._start(pose)
+
+    def _correct(self, residual: np.ndarray, noise: np.ndarray, h: np.ndarray) -> None:
+        error, self._covariance = update(self._zero, self._covariance, residual, noise, h)
+        self._x = propagation.inject(self._x, error)
+
+    # ------------------------------------------------------------ from the anchor to now
+
+    def _carry(self) -> None:
+        index = self._history.first_after(self._anchor_ns)
+        if index > self._history.newest:
+            self._now = self._x
+            return
+        taus, gyros = self._history.since(index)
+        rest = (self._history.time_of(index) - self._anchor_ns) * 1e-9
+        self._now = propagation.carry(self._x, taus, gyros, self._dt, rest, *self._plant)
+
+    def _estimate(self, time_ns: int) -> Estimate:
+        lag = (time_ns - self._anchor_ns) * 1e-9
+        variance = self._pose_variance(lag) if self._accepted else UNKNOWN_VARIANCE
+        x = self._now
+        return Estimate(
+            p_wb=x[:3].copy(),
+            q_wb=x[3:7].copy(),
+            nu=x[7:13].copy(),
+            force_w=x[19:22].copy(),
+            moment_b=x[22:25].copy(),
+            sigma_p=np.sqrt(variance[:3]),
+            sigma_q=np.sqrt(variance[3:]),
+            tag_age_ns=time_ns - self._last_tag_ns,
+            nis=self._nis,
+            nis_dof=self._nis_dof,
+            rejected=self._rejected,
+            ready=self._accepted >= READY_AFTER,
+        )
+
+    def _pose_variance(self, lag: float) -> np.ndarray:
+        return np.asarray(
+            observation.carried_pose_variance(
+                self._x, self._covariance, self._density, self._body.mass_inv, lag, self._p.gyro_sigma**2 * self._dt
+            )
+        )
+
+    def _process_noise(self) -> np.ndarray:
+        """(25,) spectral density of the process noise, per second."""
+        p = self._p
+        inertia = np.diag(self._body.mass)
+        density = np.zeros(ERRORS)
+        density[6:9] = p.accel_process
+        density[9:12] = p.alpha_process
+        density[12:15] = p.gyro_bias_walk
+        density[15:18] = p.accel_bias_walk
+        density[18:21] = p.force_walk * inertia[:3]
+        density[21:24] = p.moment_walk * inertia[3:]
+        density[24] = p.depth_bias_walk
+        return density**2
+
+
+class TagOnlyEstimator:
+    """The paper's: a constant-velocity Kalman filter on tag poses alone, no delay made up, no disturbance. State: pose, velocity.
+
+    Position and attitude are filtered apart, each with the error state [pose 0:3, velocity 3:6].
+    """
+
+    def __init__(self, body: Body, parameters: Estimation, period_ns: int) -> None:
+        self._p = parameters
+        self._dt = period_ns * 1e-9
+        dt = self._dt
+        self._f = np.eye(6)
+        self._f[:3, 3:] = dt * np.eye(3)
+        shape = np.block([[dt**3 / 3 * np.eye(3), dt**2 / 2 * np.eye(3)], [dt**2 / 2 * np.eye(3), dt * np.eye(3)]])
+        self._q_position = shape * PAPER_ACCEL_DENSITY**2
+        self._q_attitude = shape * PAPER_ALPHA_DENSITY**2
+        self._h = np.eye(3, 6)
+        self._position = np.zeros(6)
+        self._p_position = np.eye(6)
+        self._p_attitude = np.eye(6)
+        self._q_wb = np.array([1.0, 0.0, 0.0, 0.0])
+        self._rate_b = np.zeros(3)
+        self._accepted = 0
+        self._rejected = 0
+        self._last_tag_ns = -NEVER_NS
+
+    @property
+    def q_wb(self) -> np.ndarray:
+        """(4,) latest attitude."""
+        return self._q_wb
+
+    def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:
+        """The estimate at `time_ns` from the tags of `measured` alone."""
+        if self._accepted:
+            self._position, self._p_position = predict(self._position, self._p_position, self._f, self._q_position)
+            self._q_wb = multiply(self._q_wb, exp(self._rate_b * self._dt))
+            _, self._p_attitude = predict(np.zeros(6), self._p_attitude, self._f, self._q_attitude)
+        for pose in measured.tags:
+            self._fuse(pose)
+        nu = np.concatenate([rotate(conjugate(self._q_wb), self._position[3:].copy()), self._rate_b])
+        return Estimate(
+            p_wb=self._position[:3].copy(),
+            q_wb=self._q_wb.copy(),
+            nu=nu,
+            force_w=np.zeros(3),
+            moment_b=np.zeros(3),
+            sigma_p=np.sqrt(self._p_position.diagonal()[:3]),
+            sigma_q=np.sqrt(self._p_attitude.diagonal()[:3]),
+            tag_age_ns=time_ns - self._last_tag_ns,
+            nis=math.nan,
+            nis_dof=0,
+            rejected=self._rejected,
+            ready=self._accepted >= READY_AFTER,
+        )
+
+    def _fuse(self, pose: BodyPose) -> None:
+        p_wb = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
+        self._last_tag_ns = pose.capture_ns
+        if not self._accepted:
+            self._position[:3] = p_wb
+            self._q_wb = pose.q_wb
+            self._accepted = 1
+            return
+        turn = log(multiply(conjugate(self._q_wb), pose.q_wb))
+        if float(np.linalg.norm(turn)) > PAPER_FLIP_RAD and self._accepted > READY_AFTER:
+            self._rejected += 1
+            return
+        along, angle = self._p.tag_sigma_axis_m, self._p.tag_sigma_rad
+        noise = np.diag(np.array([self._p.tag_sigma_m, self._p.tag_sigma_m, along]) ** 2)
+        self._position, self._p_position = update(self._position, self._p_position, p_wb, noise, self._h)
+        error, self._p_attitude = update(np.zeros(6), self._p_attitude, turn, np.eye(3) * angle**2, self._h)
+        self._q_wb = multiply(self._q_wb, exp(error[:3].copy()))
+        self._rate_b = self._rate_b + error[3:]
+        self._accepted += 1
+
+
+PAPER_ACCEL_DENSITY = 0.05
+"""Acceleration noise of the constant-velocity model, m/s^2/sqrt(Hz); synthetic, the paper gives none."""
+PAPER_ALPHA_DENSITY = 0.5
+"""Angular likewise, rad/s^2/sqrt(Hz); synthetic."""
+PAPER_FLIP_RAD = 0.5
+"""A tag that jumps further than this is a flip; any working tag tracker refuses it."""

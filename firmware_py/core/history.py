@@ -1,0 +1,64 @@
+"""What the estimator keeps of the last half second: per tick the thruster wrench and the inertial and depth measurements."""
+
+from __future__ import annotations
+
+import numpy as np
+
+WINDOW_S = 0.5
+"""Tag poses older than this are refused on the bus already."""
+
+
+class History:
+    """A ring of samples, one a tick, written twice so that the newest k are always one contiguous slice."""
+
+    def __init__(self, period_ns: int) -> None:
+        self.period_ns = period_ns
+        self.length = int(WINDOW_S * 1e9) // period_ns + 2
+        self._rows = np.full((2 * self.length, 4), np.nan)
+        self._tau = np.zeros((2 * self.length, 6))
+        self._gyro = np.full((2 * self.length, 3), np.nan)
+        self.newest = -1
+        """Index of the newest sample, counted from the start."""
+        self.newest_ns = 0
+
+    def push(
+        self, time_ns: int, tau: np.ndarray, gyro: np.ndarray | None, accel: np.ndarray | None, depth_m: float | None
+    ) -> None:
+        """Appends the sample of the tick at `time_ns`; ticks that were skipped are filled with the same wrench and no sensors."""
+        while self.newest >= 0 and time_ns - self.newest_ns >= 2 * self.period_ns:
+            self._write(self.newest_ns + self.period_ns, tau, None, None, None)
+        self._write(time_ns, tau, gyro, accel, depth_m)
+
+    def _write(
+        self, time_ns: int, tau: np.ndarray, gyro: np.ndarray | None, accel: np.ndarray | None, depth_m: float | None
+    ) -> None:
+        self.newest += 1
+        self.newest_ns = time_ns
+        for row in (self.newest % self.length, self.newest % self.length + self.length):
+            self._tau[row] = tau
+            self._gyro[row] = np.nan if gyro is None else gyro
+            self._rows[row, :3] = np.nan if accel is None else accel
+            self._rows[row, 3] = np.nan if depth_m is None else depth_m
+
+    def time_of(self, index: int) -> int:
+        """Time of sample `index`, ns."""
+        return self.newest_ns - (self.newest - index) * self.period_ns
+
+    def first_after(self, time_ns: int) -> int:
+        """Index of the first sample later than `time_ns`."""
+        return self.newest - (self.newest_ns - time_ns - 1) // self.period_ns if time_ns < self.newest_ns else self.newest + 1
+
+    def tau(self, index: int) -> np.ndarray:
+        """(6,) mean thruster wrench of the tick that ended with sample `index`."""
+        return np.asarray(self._tau[index % self.length])
+
+    def inertial(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Gyro (3,), accelerometer (3,) and depth of sample `index`; NaN where none came."""
+        row = index % self.length
+        return self._gyro[row], self._rows[row, :3], float(self._rows[row, 3])
+
+    def since(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Wrenches (k, 6) and gyro readings (k, 3) of the samples from `index` to the newest."""
+        count = self.newest - index + 1
+        last = self.newest % self.length + self.length + 1
+        return self._tau[last - count : last], self._gyro[last - count : last]

@@ -1,0 +1,79 @@
+"""Last stage of a tick, after everything else: per thruster force, slew and arm state, per module supply power; then the command.
+
+Whatever asks for a force, nothing leaves that this file has not passed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.thruster import commands, total_power
+from firmware_py.description.parameters import Limiter as LimiterParameters
+
+VOLTAGE_EXPONENT = 1.2
+"""Force over supply voltage at a fixed command: T200 at 16 V against 12 V, 5.25 / 3.71 kgf (t200_16v.csv, t200_12v.csv)."""
+VOLTAGE_RANGE = (0.6, 1.4)
+"""Share of the nominal voltage outside of which a reading is not believed."""
+POWER_HALVINGS = 12
+"""Bisections of the share that meets the supply limit."""
+
+
+class Limiter:
+    """Limits one body's thrusters. Remembers the last forces for the slew limit."""
+
+    def __init__(self, body: Body, parameters: LimiterParameters, dt_s: float) -> None:
+        t = body.thrusters
+        self._t = t
+        self._low, self._high = t.f_min * parameters.force_share, t.f_max * parameters.force_share
+        self._step = parameters.slew_n_per_s * dt_s
+        self._supply = body.supply_power_w
+        self._of_module = [np.flatnonzero(t.module == m) for m in range(len(body.modules))]
+        self._power = [
+            (np.ascontiguousarray(t.power_forward[i]), np.ascontiguousarray(t.power_reverse[i])) for i in self._of_module
+        ]
+        self._curves = (t.forward, t.reverse, t.deadband_n)
+        self._full = np.ones(t.f_max.size)
+        self._scale = np.ones(t.f_max.size)
+        self.force_n = np.zeros(t.f_max.size)
+
+    def step(self, wanted_n: np.ndarray, armed: bool, voltage_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Limited forces (n,) N and commands (n,) in -1..1.
+
+        Args:
+            wanted_n: (n,) N; a value that is not finite counts as zero.
+            armed: without it every command is zero in this very tick.
+            voltage_v: (m,) measured supply of each module.
+        """
+        if not armed:
+            self.force_n = np.zeros_like(self.force_n)
+            return self.force_n, np.zeros_like(self.force_n)
+        wanted = np.where(np.isfinite(wanted_n), wanted_n, 0.0)
+        wanted = np.clip(wanted, self.force_n - self._step, self.force_n + self._step)
+        wanted = np.clip(wanted, self._low, self._high)
+        for module in range(len(self._of_module)):
+            self._limit_power(wanted, module)
+        self.force_n = wanted
+        out = np.empty_like(wanted)
+        commands(wanted, self._voltage_scale(voltage_v), *self._curves, self._full, out)
+        return wanted, out
+
+    def _limit_power(self, wanted: np.ndarray, module: int) -> None:
+        """Scales the forces of one module down until its supply can give their power."""
+        index = self._of_module[module]
+        force = wanted[index]
+        forward, reverse = self._power[module]
+        if total_power(force, forward, reverse) <= self._supply[module]:
+            return
+        low, high = 0.0, 1.0
+        for _ in range(POWER_HALVINGS):
+            share = 0.5 * (low + high)
+            if total_power(force * share, forward, reverse) <= self._supply[module]:
+                low = share
+            else:
+                high = share
+        wanted[index] = force * low
+
+    def _voltage_scale(self, voltage_v: np.ndarray) -> np.ndarray:
+        ratio = np.clip(voltage_v[self._t.module] / self._t.voltage_v, *VOLTAGE_RANGE)
+        return np.asarray(ratio**VOLTAGE_EXPONENT)

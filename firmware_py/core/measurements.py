@@ -1,0 +1,95 @@
+"""Stage 1 of a tick: the sensors of all modules of a body become one set of measurements in the body frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.observation import GRAVITY
+from firmware_py.core.rotations import conjugate, difference, exp, multiply, to_matrix
+from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservation
+
+WATER_DENSITY = 1000.0
+"""kg/m^3, fresh water."""
+ATMOSPHERE_PA = 101_325.0
+"""Standard atmosphere; what the weather adds is the estimator's depth bias."""
+FLIP_RAD = 0.35
+"""Tags of one picture that disagree with their median by more are flipped and left out (20 deg; noise is 0.5)."""
+
+
+class Measurements:
+    """Fuses what the modules of one body say. Holds nothing but geometry."""
+
+    def __init__(self, body: Body) -> None:
+        self._modules = body.modules
+        self._rotations = np.array([to_matrix(np.ascontiguousarray(q)) for q in body.q_bm])
+        self._r_bi = body.r_bi
+        self._single = len(body.modules) == 1
+        self._tags = {
+            (int(m), int(i)): (np.ascontiguousarray(r), conjugate(np.ascontiguousarray(q)))
+            for m, i, r, q in zip(body.tag_module, body.tag_ids, body.r_bt, body.q_bt, strict=True)
+        }
+
+    def fuse(self, modules: Sequence[ModuleInputs], q_wb: np.ndarray) -> Measured:
+        """One measurement of each kind.
+
+        Args:
+            modules: inputs of the whole fleet, by fleet index.
+            q_wb: (4,) latest attitude, for the height of each pressure sensor above the centre of mass.
+        """
+        mine = [modules[i] for i in self._modules]
+        gyro = self._mean(mine, "gyro")
+        accel = self._mean(mine, "accel")
+        return Measured(gyro, accel, self._depth(mine, q_wb), self._poses(mine))
+
+    def _mean(self, mine: list[ModuleInputs], name: str) -> np.ndarray | None:
+        heard = [(i, v) for i, v in enumerate(getattr(m, name) for m in mine) if v is not None]
+        if not heard:
+            return None
+        values = np.array([v for _, v in heard])
+        rotations = self._rotations if len(heard) == len(mine) else self._rotations[[i for i, _ in heard]]
+        return np.asarray(np.einsum("mij,mj->i", rotations, values) / len(heard))
+
+    def _depth(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> float | None:
+        heard = [(i, m.pressure_pa) for i, m in enumerate(mine) if m.pressure_pa is not None]
+        if not heard:
+            return None
+        down_b = to_matrix(q_wb)[2]
+        below = sum(float(self._r_bi[i] @ down_b) for i, _ in heard) / len(heard)
+        pressure = sum(p for _, p in heard) / len(heard)
+        return (pressure - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - below
+
+    def _poses(self, mine: list[ModuleInputs]) -> list[BodyPose]:
+        """One pose for each picture, oldest first."""
+        pictures: dict[int, list[tuple[TagObservation, np.ndarray, np.ndarray]]] = {}
+        for index, module in enumerate(mine):
+            for tag in module.tags:
+                known = self._tags.get((index, tag.tag_id))
+                if known is not None:
+                    pictures.setdefault(tag.capture_ns, []).append((tag, known[0], multiply(tag.q_wt, known[1])))
+        return [_one_pose(capture, seen) for capture, seen in sorted(pictures.items())]
+
+
+def _one_pose(capture_ns: int, seen: list[tuple[TagObservation, np.ndarray, np.ndarray]]) -> BodyPose:
+    """Mean of the tags of one picture; of three or more, those far from the attitude most agree on are left out."""
+    if len(seen) > 2:
+        seen = _agreeing(seen)
+    if len(seen) == 1:
+        tag, lever, q_wb = seen[0]
+        return BodyPose(capture_ns, tag.p_wt, lever, q_wb, 1)
+    reference = seen[0][2]
+    mean = np.mean([difference(q, reference) for _, _, q in seen], axis=0)
+    q_wb = multiply(reference, exp(mean))
+    p_wt = np.mean([t.p_wt for t, _, _ in seen], axis=0)
+    return BodyPose(capture_ns, p_wt, np.mean([r for _, r, _ in seen], axis=0), q_wb, len(seen))
+
+
+def _agreeing(
+    seen: list[tuple[TagObservation, np.ndarray, np.ndarray]],
+) -> list[tuple[TagObservation, np.ndarray, np.ndarray]]:
+    attitudes = np.array([q for _, _, q in seen])
+    agreement = np.abs(attitudes @ attitudes.T) > np.cos(0.5 * FLIP_RAD)
+    best = int(np.argmax(agreement.sum(axis=1)))
+    return [s for s, ok in zip(seen, agreement[best], strict=True) if ok]

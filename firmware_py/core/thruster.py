@@ -1,0 +1,105 @@
+"""Thruster curves: the paper's fifth-order polynomials force(command) and power(force), supply voltage, and the lag.
+
+The controller's side: it turns wanted forces into commands (limiter) and commands into the forces that it believes in (estimator).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from firmware_py.core.body import ThrusterSet
+
+BISECTIONS = 40
+"""Halvings of the command interval: 2^-40, far below the bus's 1/2048."""
+
+
+@njit("float64(float64[::1],float64)", cache=True)
+def polynomial(c, x):  # type: ignore[no-untyped-def]
+    """c[0] x + c[1] x^2 + ... without a constant term, so that no command is no force."""
+    value = 0.0
+    for i in range(c.shape[0] - 1, -1, -1):
+        value = (value + c[i]) * x
+    return value
+
+
+@njit("float64(float64[::1],float64)", cache=True)
+def inverse(c, value):  # type: ignore[no-untyped-def]
+    """The x in 0..1 with polynomial(c, x) = value; 0 below and 1 above the range. c must rise over 0..1."""
+    if value <= 0.0:
+        return 0.0
+    if value >= polynomial(c, 1.0):
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if polynomial(c, middle) < value:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+@njit(
+    "void(float64[::1],float64[::1],float64[:,::1],float64[:,::1],float64[::1],float64[::1],float64[::1])",
+    cache=True,
+)
+def commands(force, scale, forward, reverse, deadband, limit_share, out):  # type: ignore[no-untyped-def]
+    """(n,) command of each thruster for its wanted force.
+
+    Args:
+        force: (n,) N. scale: (n,) force at this voltage over force at the curve's voltage.
+        forward, reverse: (n, 5) polynomials. deadband: (n,) N. limit_share: (n,) largest command. out: (n,) is written.
+    """
+    for i in range(force.shape[0]):
+        f = force[i] / scale[i]
+        if abs(f) < 0.5 * deadband[i]:
+            out[i] = 0.0
+        elif f > 0.0:
+            out[i] = min(inverse(forward[i], f), limit_share[i])
+        else:
+            out[i] = -min(inverse(reverse[i], -f), limit_share[i])
+
+
+def is_monotone(coefficients: np.ndarray) -> bool:
+    """Whether a force polynomial rises over commands 0..1, so that it has an inverse."""
+    x = np.linspace(0.0, 1.0, 401)
+    return bool(np.all(np.diff([polynomial(np.ascontiguousarray(coefficients), v) for v in x]) > 0.0))
+
+
+@njit("float64(float64[::1],float64[:,::1],float64[:,::1])", cache=True)
+def total_power(force, power_forward, power_reverse):  # type: ignore[no-untyped-def]
+    """Electrical power of all thrusters, W."""
+    total = 0.0
+    for i in range(force.shape[0]):
+        total += polynomial(power_forward[i] if force[i] > 0.0 else power_reverse[i], abs(force[i]))
+    return total
+
+
+class ThrusterLag:
+    """The forces that the thrusters are believed to give now: commanded forces through a first-order lag.
+
+    The command of tick k leaves in tick k and acts from SYNC k+1 on, so one command waits in `_pending`.
+    """
+
+    def __init__(self, thrusters: ThrusterSet, dt_s: float) -> None:
+        n = thrusters.lag_s.size
+        self._decay = np.array([math.exp(-dt_s / lag) if lag > 0 else 0.0 for lag in thrusters.lag_s])
+        self._lag_over_dt = thrusters.lag_s / dt_s
+        self.force_n = np.zeros(n)
+        self._acting = np.zeros(n)
+        self._pending = np.zeros(n)
+
+    def step(self) -> np.ndarray:
+        """(n,) mean force of each thruster over the tick that ends now, N; moves the lag on by one tick."""
+        end = self._acting + (self.force_n - self._acting) * self._decay
+        mean = self._acting + (self.force_n - end) * self._lag_over_dt
+        self.force_n = end
+        self._acting = self._pending
+        return mean
+
+    def command(self, force_n: np.ndarray) -> None:
+        """The forces asked for in this tick."""
+        self._pending = force_n

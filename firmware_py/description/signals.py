@@ -1,0 +1,252 @@
+"""What is logged: the signals of a channel with unit and size, their protobuf message, and how a log is read.
+
+A channel is an MCAP topic with one protobuf message per tick. Firmware and bench each declare their own with it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.exceptions import McapError
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
+
+PACKAGE = "modcube"
+
+Columns = dict[str, np.ndarray]
+"""One array per signal of a channel, (k,) or (k, n) over its k messages, and `log_time`, (k,) int64 ns."""
+
+_FIELD = descriptor_pb2.FieldDescriptorProto
+_FIXED64, _LENGTH, _VARINT = 1, 2, 0  # protobuf wire types
+_KINDS: Mapping[str, tuple[int, int, str]] = {
+    "double": (_FIELD.TYPE_DOUBLE, _FIXED64, "<f8"),
+    "int": (_FIELD.TYPE_SFIXED64, _FIXED64, "<i8"),
+    "bool": (_FIELD.TYPE_BOOL, _VARINT, "u1"),
+}
+
+
+class Signal(NamedTuple):
+    """One signal: `size` 0 is a scalar, else an array of that length (packed repeated doubles)."""
+
+    name: str
+    size: int = 0
+    unit: str = ""
+    kind: str = "double"
+
+
+class Layout:
+    """The message of one channel. Every field is always written, at full width, so each message has the same length.
+
+    That makes a message one row of a structured array: written by filling a row whose protobuf tags stand already,
+    read by viewing the joined bytes of all messages at once.
+    """
+
+    def __init__(self, name: str, signals: Sequence[Signal]) -> None:
+        """`name` is the message's name within `PACKAGE`. Raises ValueError when an array is not of doubles."""
+        if any(signal.size and signal.kind != "double" for signal in signals):
+            raise ValueError(f"{name}: only doubles come in arrays")
+        self.name = name
+        self.signals = tuple(signals)
+
+    @cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """The row: before each value `name` its tag bytes, `name#`."""
+        fields: list[tuple[Any, ...]] = []
+        for number, signal in enumerate(self.signals, 1):
+            fields.append((f"{signal.name}#", "u1", (len(_prefix(number, signal)),)))
+            shape = (signal.size,) if signal.size else ()
+            fields.append((signal.name, _KINDS[signal.kind][2], shape))
+        return np.dtype(fields)
+
+    def row(self) -> Row:
+        """A fresh row to fill."""
+        return Row(self)
+
+    @cached_property
+    def schema(self) -> bytes:
+        """The serialised FileDescriptorSet of the message; units stand as trailing comments."""
+        file = descriptor_pb2.FileDescriptorProto(name=f"{PACKAGE}/{self.name}.proto", package=PACKAGE, syntax="proto3")
+        message = file.message_type.add(name=self.name)
+        for number, signal in enumerate(self.signals, 1):
+            label = _FIELD.LABEL_REPEATED if signal.size else _FIELD.LABEL_OPTIONAL
+            message.field.add(name=signal.name, number=number, label=label, type=_KINDS[signal.kind][0])
+            if signal.unit:
+                place = file.source_code_info.location.add(path=[4, 0, 2, number - 1], span=[number, 0, 1])
+                place.trailing_comments = f" {signal.unit}\n"
+        return bytes(descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString(deterministic=True))
+
+    @property
+    def schema_name(self) -> str:
+        """Full name of the message."""
+        return f"{PACKAGE}.{self.name}"
+
+
+class Row:
+    """One message that is filled again and again: `set` values by name, then take its `bytes`."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._array = np.zeros((), layout.dtype)
+        for number, signal in enumerate(layout.signals, 1):
+            self._array[f"{signal.name}#"] = np.frombuffer(_prefix(number, signal), "u1")
+        self.views: tuple[np.ndarray, ...] = tuple(self._array[signal.name] for signal in layout.signals)
+        """Views into the row, in the order of the layout's signals; assign with `view[...] = value`."""
+
+    def encode(self, values: Iterable[Any]) -> bytes:
+        """The message of `values`, one per signal, in the layout's order."""
+        for view, value in zip(self.views, values, strict=True):
+            view[...] = value
+        return self._array.tobytes()
+
+
+class TextLayout:
+    """A message of one text with numbers before it; for what comes seldom (events, requests)."""
+
+    def __init__(self, name: str, numbers: Sequence[str], text: str) -> None:
+        self.name = name
+        file = descriptor_pb2.FileDescriptorProto(name=f"{PACKAGE}/{name}.proto", package=PACKAGE, syntax="proto3")
+        self._file = file
+        message = file.message_type.add(name=name)
+        for i, each in enumerate((*numbers, text), 1):
+            kind = _FIELD.TYPE_STRING if each == text else _FIELD.TYPE_SFIXED64
+            message.field.add(name=each, number=i, label=_FIELD.LABEL_OPTIONAL, type=kind)
+        pool = descriptor_pool.DescriptorPool()
+        pool.Add(self._file)
+        self._names = (*numbers, text)
+        self._class = message_factory.GetMessageClass(pool.FindMessageTypeByName(self.schema_name))
+
+    @property
+    def schema_name(self) -> str:
+        """Full name of the message."""
+        return f"{PACKAGE}.{self.name}"
+
+    @property
+    def schema(self) -> bytes:
+        """The serialised FileDescriptorSet."""
+        return bytes(descriptor_pb2.FileDescriptorSet(file=[self._file]).SerializeToString(deterministic=True))
+
+    def encode(self, *values: int | str) -> bytes:
+        """The message of the numbers and the text."""
+        message = self._class(**dict(zip(self._names, values, strict=True)))
+        return bytes(message.SerializeToString(deterministic=True))
+
+
+def read_signals(path: Path) -> dict[str, Columns]:
+    """All channels of an MCAP log of protobuf messages, up to its end or to where it is torn.
+
+    Messages of one channel may differ in the length of their arrays (a body that merged): short rows end in NaN.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    times: dict[int, list[int]] = {}
+    payloads: dict[int, list[bytes]] = {}
+    for record in _records(path.read_bytes()):
+        if isinstance(record, Message):
+            times.setdefault(record.channel_id, []).append(record.log_time)
+            payloads.setdefault(record.channel_id, []).append(record.data)
+        elif isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+    result: dict[str, Columns] = {}
+    for number, messages in payloads.items():
+        columns = _columns(schemas[channels[number].schema_id], messages)
+        result[channels[number].topic] = {"log_time": np.array(times[number], np.int64), **columns}
+    return result
+
+
+def _records(data: bytes) -> Iterator[Any]:
+    try:
+        yield from StreamReader(BytesIO(data), validate_crcs=True).records
+    except (McapError, EOFError, ValueError, struct.error):
+        return  # torn: what came before it stands
+
+
+def _columns(schema: Schema, messages: list[bytes]) -> Columns:
+    files = descriptor_pb2.FileDescriptorSet.FromString(schema.data)
+    fields = files.file[0].message_type[0].field
+    if any(field.type == _FIELD.TYPE_STRING for field in fields):
+        return _text_columns(schema, files, messages)
+    kinds = {number: name for name, (number, _, _) in _KINDS.items()}
+    by_length: dict[int, list[int]] = {}
+    for i, message in enumerate(messages):
+        by_length.setdefault(len(message), []).append(i)
+    parts: list[_Part] = []
+    for indices in by_length.values():
+        counts = _counts(messages[indices[0]])
+        signals = [Signal(f.name, counts.get(f.number, 0), kind=kinds[f.type]) for f in fields]
+        rows = np.frombuffer(b"".join(messages[i] for i in indices), Layout(schema.name, signals).dtype)
+        parts.append((indices, rows, signals))
+    return {field.name: _column(i, field.name, parts, len(messages)) for i, field in enumerate(fields)}
+
+
+_Part = tuple[list[int], np.ndarray, list[Signal]]
+"""Messages of one length: their places in the channel, their rows, their signals."""
+
+
+def _column(position: int, name: str, parts: list[_Part], total: int) -> np.ndarray:
+    if len(parts) == 1:
+        return np.ascontiguousarray(parts[0][1][name])
+    width = max(signals[position].size for _, _, signals in parts)
+    first = parts[0][1][name]
+    column = np.full((total, width), np.nan) if width else np.zeros(total, first.dtype)
+    for indices, rows, signals in parts:
+        if width:
+            column[indices, : signals[position].size] = rows[name]
+        else:
+            column[indices] = rows[name]
+    return column
+
+
+def _text_columns(schema: Schema, files: descriptor_pb2.FileDescriptorSet, messages: list[bytes]) -> Columns:
+    classes = message_factory.GetMessages(list(files.file))
+    parsed = [classes[schema.name].FromString(message) for message in messages]
+    return {f.name: np.array([getattr(m, f.name) for m in parsed]) for f in files.file[0].message_type[0].field}
+
+
+def _varint(value: int) -> bytes:
+    out = b""
+    while value > 0x7F:
+        out += bytes([value & 0x7F | 0x80])
+        value >>= 7
+    return out + bytes([value])
+
+
+def _prefix(number: int, signal: Signal) -> bytes:
+    """Tag of a field, and its length where it is an array (Protocol Buffers, "Encoding")."""
+    if signal.size:
+        return _varint(number << 3 | _LENGTH) + _varint(8 * signal.size)
+    return _varint(number << 3 | _KINDS[signal.kind][1])
+
+
+def _counts(message: bytes) -> dict[int, int]:
+    """Field number -> length of its array of doubles, by walking one message."""
+    counts, at = {}, 0
+    while at < len(message):
+        tag, at = _read_varint(message, at)
+        if tag & 7 == _LENGTH:
+            size, at = _read_varint(message, at)
+            counts[tag >> 3] = size // 8
+            at += size
+        else:
+            at += 8 if tag & 7 == _FIXED64 else 1
+    return counts
+
+
+def _read_varint(data: bytes, at: int) -> tuple[int, int]:
+    value, shift = 0, 0
+    while True:
+        byte = data[at]
+        value |= (byte & 0x7F) << shift
+        at, shift = at + 1, shift + 7
+        if byte < 0x80:
+            return value, at

@@ -1,0 +1,192 @@
+"""Drag table of an assembly: outlines on the nodes of a cube-map, coefficients, rotational damping.
+
+The outlines depend on geometry alone and are kept on disk (prepare.drag_cache) under a key that is the same however the
+shape is turned or moved; coefficients, density and centre of mass are applied afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware_py.core.body import DragTable
+from firmware_py.core.drag_lookup import node_directions
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.prepare import shape_key
+from firmware_py.prepare.drag_cache import DragCache
+from firmware_py.prepare.lattice import MATRICES
+from firmware_py.prepare.projected_area import Solid, areas_and_centroids
+from firmware_py.prepare.shape_key import Part
+
+NODES_PER_RIM = 13
+"""6 x 13 x 13 = 1014 nodes; odd, so that the kinks of a cube's outline at zero components fall on nodes."""
+
+WATER_DENSITY = 998.2
+"""kg/m^3, fresh water at 20 degC (IAPWS)."""
+
+_SUBDIVISIONS = 3
+"""Each triangle of a hull becomes 4^3 for the damping integral: within 0.5 % for a cube."""
+
+Outlines = Callable[[Sequence[Solid], np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Solids and (n, 3) directions to (n,) areas and (n, 3) centroids, as projected_area.areas_and_centroids."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where one module sits: its vehicle, lattice cell (3,) and rotation index."""
+
+    vehicle: Vehicle
+    cell: tuple[int, int, int]
+    rotation: int
+
+
+def build(
+    placements: Sequence[Placement],
+    centre: np.ndarray,
+    pitch_m: float,
+    cache: DragCache | None = None,
+    mode: str = "exact",
+    method: Outlines = areas_and_centroids,
+    nodes_per_rim: int = NODES_PER_RIM,
+    density: float = WATER_DENSITY,
+) -> DragTable:
+    """The drag table of docked modules.
+
+    Args:
+        placements: the modules.
+        centre: (3,) centre of mass in the lattice frame, m, about which moments are taken.
+        pitch_m: lattice pitch.
+        cache: kept outlines; None builds every time.
+        mode: name of `method` in the key.
+        method: how outlines are found.
+        nodes_per_rim: grid of each side of the cube-map.
+        density: kg/m^3.
+
+    Returns:
+        Arrays for core.drag_lookup; body axes are those of the lattice.
+    """
+    directions = node_directions(nodes_per_rim)
+    nodes = np.zeros((6, nodes_per_rim, nodes_per_rim, 4))
+    rotational, linear = np.zeros(3), np.zeros(6)
+    by_area = [p for p in placements if not p.vehicle.drag.quadratic.size]
+    if by_area:
+        outline = _outlines(by_area, pitch_m, cache, mode, method, nodes_per_rim)
+        nodes[..., 0] = 0.5 * density * coefficient(by_area, directions) * outline[..., 0]
+        nodes[..., 1:] = outline[..., 1:] - centre
+        rotational += rotational_damping(placements, centre, pitch_m, density)
+    for placement in placements:
+        turn = MATRICES[placement.rotation]
+        linear += (np.abs(turn) @ placement.vehicle.drag.linear.reshape(2, 3).T).T.ravel()
+        if placement.vehicle.drag.quadratic.size:
+            _add_published(placement, turn, directions, pitch_m * np.array(placement.cell) - centre, nodes)
+            rotational += np.abs(turn) @ placement.vehicle.drag.quadratic[3:]
+    nodes[..., 1:] -= np.sum(nodes[..., 1:] * directions, axis=-1, keepdims=True) * directions
+    return DragTable(nodes, rotational, linear)
+
+
+def coefficient(placements: Sequence[Placement], directions: np.ndarray) -> np.ndarray:
+    """(...,) drag coefficient for flow along (..., 3) unit directions, the modules' own weighted by their surface.
+
+    A quartic cubic harmonic through the values on face and edge: 1 on a face, 1/2 on an edge, 1/3 at a corner is
+    s = sum d_i^4, the same for all 24 rotations, so a module's rotation does not enter.
+    """
+    s = np.sum(directions**4, axis=-1)
+    total, weights = np.zeros(s.shape), 0.0
+    for placement in placements:
+        size = placement.vehicle.hull.size_m
+        weight = float(size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
+        corner = placement.vehicle.cd_corner
+        total += weight * (corner + (placement.vehicle.drag.cd_face - corner) * (3.0 * s - 1.0) / 2.0)
+        weights += weight
+    return np.asarray(total / weights)
+
+
+def _add_published(
+    placement: Placement, turn: np.ndarray, directions: np.ndarray, position: np.ndarray, nodes: np.ndarray
+) -> None:
+    """Add a vehicle's published quadratic damping, as the part along the flow: F . d = -sum q_i |d_i|^3."""
+    c = np.abs(directions @ turn) ** 3 @ placement.vehicle.drag.quadratic[:3]
+    total = nodes[..., 0] + c
+    share = np.divide(c, total, out=np.zeros_like(c), where=total > 0.0)[..., None]
+    nodes[..., 1:] += share * (position - nodes[..., 1:])
+    nodes[..., 0] = total
+
+
+def rotational_damping(
+    placements: Sequence[Placement], centre: np.ndarray, pitch_m: float, density: float = WATER_DENSITY
+) -> np.ndarray:
+    """(3,) quadratic damping about the body axes through `centre`, N m s^2.
+
+    The hull's surface under the law of the drag table, dF = -1/2 rho Cd max(n . v, 0) v dS with v = w x r: for unit w
+    along axis k the moment is 1/2 rho Cd times the integral of max(n . (e_k x r), 0) times the squared distance from the
+    axis. Triangles that lie on a docked face are left out.
+    """
+    total = np.zeros(3)
+    occupied = {p.cell for p in placements}
+    for placement in placements:
+        if placement.vehicle.drag.quadratic.size:
+            continue
+        for solid in shape_key.solids([_part(placement)], pitch_m):
+            points, normals = _surface(solid, _open_triangles(solid, placement.cell, occupied, pitch_m))
+            r = points - centre
+            speed = np.maximum(np.einsum("ti,kti->kt", normals, np.cross(np.eye(3)[:, None], r[None])), 0.0)
+            off_axis = np.sum(r * r, axis=1) - r.T**2
+            total += 0.5 * density * placement.vehicle.drag.rotational_cd * np.sum(speed * off_axis, axis=1)
+    return total
+
+
+def _open_triangles(
+    solid: Solid, cell: tuple[int, int, int], occupied: set[tuple[int, int, int]], pitch_m: float
+) -> np.ndarray:
+    keep = np.ones(len(solid.triangles), dtype=bool)
+    corners = solid.vertices[solid.triangles] / pitch_m - np.array(cell)
+    for axis in range(3):
+        for sign in (1, -1):
+            neighbour = tuple(c + sign * (k == axis) for k, c in enumerate(cell))
+            if neighbour in occupied:
+                keep &= ~np.all(sign * corners[:, :, axis] > 0.5 - 1e-6, axis=1)
+    return keep
+
+
+def _surface(solid: Solid, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (k, 3) and normals times area (k, 3) of the subdivided triangles."""
+    corners = solid.vertices[solid.triangles[keep]]
+    for _ in range(_SUBDIVISIONS):
+        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        corners = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    normals = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return corners.mean(axis=1), normals
+
+
+def _part(placement: Placement) -> Part:
+    return shape_key.part(placement.vehicle, placement.cell, placement.rotation)
+
+
+def _outlines(
+    placements: Sequence[Placement], pitch_m: float, cache: DragCache | None, mode: str, method: Outlines, n: int
+) -> np.ndarray:
+    """(6, n, n, 4) area and centroid in the lattice frame, out of the canonical shape's."""
+    shape = shape_key.canonical([_part(p) for p in placements], pitch_m)
+    key = f"{mode} {n} {shape.key}"
+    values = cache.load(key, (6, n, n, 4)) if cache else None
+    if values is None:
+        values = _measure(shape_key.solids(shape.parts, pitch_m), node_directions(n), method)
+        if cache:
+            cache.store(key, values)
+    turned = values[shape_key.turned_nodes(shape.rotation, n)]
+    back = MATRICES[shape.rotation]
+    return np.concatenate([turned[..., :1], turned[..., 1:] @ back.T + pitch_m * shape.origin], axis=-1)
+
+
+def _measure(solids: Sequence[Solid], directions: np.ndarray, method: Outlines) -> np.ndarray:
+    """(..., 4) area and centroid on each node. Opposite nodes see one outline and rims are shared: each is found once."""
+    flat = directions.reshape(-1, 3)
+    leading = flat[np.arange(len(flat)), np.argmax(np.round(np.abs(flat), 9) > 0.0, axis=1)]
+    half = np.round(flat * np.sign(leading)[:, None], 9)
+    _, where, inverse = np.unique(half, axis=0, return_index=True, return_inverse=True)
+    areas, centroids = method(solids, flat[where])
+    values = np.concatenate([areas[:, None], centroids], axis=1)
+    return np.asarray(values[inverse.ravel()].reshape(*directions.shape[:-1], 4))

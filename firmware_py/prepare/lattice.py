@@ -1,0 +1,62 @@
+"""The 24 rotations of a cube as a group: how a module may sit in the lattice, and how an assembly may be turned.
+
+Rotation k of a fleet file is row k of `MATRICES`: module frame to body (lattice) frame. Row 0 is the identity.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from firmware_py.core import rotations
+from firmware_py.description.schema import frozen_array
+from firmware_py.description.vehicle import FACE_NORMALS
+
+
+def _proper_signed_permutations() -> np.ndarray:
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            if np.linalg.det(matrix) > 0.0:
+                found.append(matrix)
+    return np.array(found)
+
+
+def _rounded_quaternion(matrix: np.ndarray) -> np.ndarray:
+    """Components of these are 0, 1/2, sqrt(1/2) or 1: their squares, times four, are whole."""
+    q = rotations.from_matrix(np.array(matrix))
+    return np.asarray(np.sign(q) * np.sqrt(np.round(4.0 * q * q) / 4.0))
+
+
+MATRICES = frozen_array(_proper_signed_permutations())
+"""(24, 3, 3) signed permutation matrices with determinant 1; whole numbers."""
+
+QUATERNIONS = frozen_array([_rounded_quaternion(m) for m in MATRICES])
+"""(24, 4) the same as quaternions, scalar first."""
+
+PRODUCT = np.array([[int(np.argmax((a @ b == MATRICES).all(axis=(1, 2)))) for b in MATRICES] for a in MATRICES])
+"""(24, 24) index of MATRICES[i] @ MATRICES[j]."""
+PRODUCT.flags.writeable = False
+
+INVERSE = np.argmax(PRODUCT == 0, axis=1)
+"""(24,) index of the inverse."""
+INVERSE.flags.writeable = False
+
+
+def face_direction(rotation: int, face: int) -> tuple[int, int, int]:
+    """Lattice direction into which face `face` (0..5, description.vehicle.FACE_NAMES) of a turned module looks."""
+    x, y, z = (round(float(c)) for c in MATRICES[rotation] @ FACE_NORMALS[face])
+    return x, y, z
+
+
+def face_towards(rotation: int, direction: tuple[int, int, int]) -> int:
+    """Face of a turned module that looks into a lattice direction (one of the six unit vectors)."""
+    return int(np.argmax(FACE_NORMALS @ (MATRICES[rotation].T @ np.array(direction, dtype=float))))
+
+
+def nearest(matrix: np.ndarray) -> int:
+    """Index of the rotation of the cube nearest to a (3, 3) rotation matrix."""
+    return int(np.argmax(np.einsum("kij,ij->k", MATRICES, matrix)))

@@ -1,0 +1,120 @@
+"""A name for the geometry of an assembly that does not change when the assembly is turned or moved.
+
+Drag tables are kept under it: the shape is brought into its canonical pose (the first of 24 in order), built there, and
+read back through the rotation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware_py.core.drag_lookup import node_directions
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.prepare.lattice import INVERSE, MATRICES, PRODUCT
+from firmware_py.prepare.projected_area import Solid, box
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One module's hull in the lattice.
+
+    Attributes:
+        cell: lattice cell.
+        rotation: which of the 24 rotations.
+        hull: the hull in the module frame.
+        name: the same for equal hulls.
+        size: (3,) edges of a box, whose half-turns look alike; None for any other hull.
+    """
+
+    cell: tuple[int, int, int]
+    rotation: int
+    hull: Solid
+    name: str
+    size: np.ndarray | None
+
+    def token(self, turn: int) -> tuple[int, int, int, str]:
+        """Cell and looks after turning the whole shape by rotation `turn`."""
+        x, y, z = (round(float(c)) for c in MATRICES[turn] @ np.array(self.cell))
+        rotation = int(PRODUCT[turn, self.rotation])
+        if self.size is None:
+            return x, y, z, f"{self.name}@{rotation}"
+        return x, y, z, f"box{_text(np.abs(MATRICES[rotation]) @ self.size)}"
+
+
+@dataclass(frozen=True, eq=False)
+class CanonicalShape:
+    """A shape in its canonical pose.
+
+    Attributes:
+        key: text that names the geometry.
+        parts: the modules in the canonical pose.
+        rotation: index of the rotation from the canonical frame to the lattice frame.
+        origin: (3,) of the canonical frame in the lattice frame, in cells.
+    """
+
+    key: str
+    parts: tuple[Part, ...]
+    rotation: int
+    origin: np.ndarray
+
+
+def _text(values: np.ndarray) -> str:
+    return "x".join(f"{v:.9g}" for v in np.asarray(values).ravel())
+
+
+def part(vehicle: Vehicle, cell: tuple[int, int, int], rotation: int) -> Part:
+    """The part that a module of `vehicle` is."""
+    size = vehicle.hull.size_m
+    hull = box(size)
+    return Part(cell, rotation, hull, _digest(hull), size)
+
+
+def _digest(hull: Solid) -> str:
+    data = np.round(hull.vertices, 9).tobytes() + hull.triangles.astype(np.int64).tobytes()
+    return "mesh" + hashlib.sha256(data).hexdigest()[:24]
+
+
+def solids(parts: Sequence[Part], pitch_m: float) -> list[Solid]:
+    """The hulls of the parts, placed in the frame of their cells."""
+    return [p.hull.placed(MATRICES[p.rotation], pitch_m * np.array(p.cell)) for p in parts]
+
+
+def canonical(parts: Sequence[Part], pitch_m: float) -> CanonicalShape:
+    """The pose, out of 24, whose sorted list of cells and looks comes first; its lowest corner is at the origin."""
+    best: tuple[list[tuple[int, int, int, str]], int, tuple[int, int, int]] | None = None
+    for turn in range(24):
+        tokens = [p.token(turn) for p in parts]
+        low = (min(t[0] for t in tokens), min(t[1] for t in tokens), min(t[2] for t in tokens))
+        listed = sorted((x - low[0], y - low[1], z - low[2], looks) for x, y, z, looks in tokens)
+        if best is None or listed < best[0]:
+            best = (listed, turn, low)
+    assert best is not None
+    listed, turn, low = best
+    moved = []
+    for p in parts:
+        x, y, z, _ = p.token(turn)
+        cell = (x - low[0], y - low[1], z - low[2])
+        moved.append(Part(cell, int(PRODUCT[turn, p.rotation]), p.hull, p.name, p.size))
+    moved.sort(key=lambda p: p.token(0))
+    back = int(INVERSE[turn])
+    origin = MATRICES[back] @ np.array(low, dtype=float)
+    return CanonicalShape(f"pitch{pitch_m:.9g} {listed}", tuple(moved), back, origin)
+
+
+def turned_nodes(rotation: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices (side, i, j), each (6, n, n), of a cube-map in frame c for the nodes of one in frame b.
+
+    `rotation` turns vectors of c into b, and so nodes of one into nodes of the other.
+    """
+    directions = node_directions(n) @ MATRICES[rotation]
+    signed = np.stack([s * directions[..., a] for a in range(3) for s in (1.0, -1.0)], axis=-1)
+    side = np.argmax(signed.round(9), axis=-1)
+    axis = side // 2
+    major = np.abs(np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0])
+    across = [np.take_along_axis(directions, ((axis + k) % 3)[..., None], axis=-1)[..., 0] for k in (1, 2)]
+    i, j = (np.rint((c / major + 1.0) * (n - 1) / 2).astype(int) for c in across)
+    return side, i, j

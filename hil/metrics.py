@@ -1,0 +1,97 @@
+"""Figures of a flight from its logs alone: truth against reference, estimate against truth. Every tick counts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from firmware_py.core.rotations import rotate
+from hil.signals import Flight
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+PAPER_SPIRAL_RMSE_MM = 20.92
+"""Position RMSE of the paper's robot on its spiral in a real tank (RS-ModCubes)."""
+
+
+def rotation_vectors(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(k, 3) rotation vectors, in frame b, that turn attitudes b into a: log(b^-1 a), angle at most pi, rad.
+
+    Args:
+        a, b: (k, 4) unit quaternions, scalar first.
+    """
+    w = np.sum(a * b, axis=1)
+    v = b[:, :1] * a[:, 1:] - a[:, :1] * b[:, 1:] - np.cross(b[:, 1:], a[:, 1:])
+    sign = np.where(w < 0, -1.0, 1.0)
+    sine = np.linalg.norm(v, axis=1)
+    angle = 2.0 * np.arctan2(sine, np.abs(w))
+    factor = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+    return (sign * factor)[:, None] * v
+
+
+def body_positions(flight: Flight, com_m: np.ndarray) -> np.ndarray:
+    """(k, 3) true positions of the point that the firmware controls: the module's nominal centre of mass, world, m."""
+    p_wm, q_wm = flight.truth["p_wm"], flight.truth["q_wm"]
+    if not np.any(com_m):
+        return p_wm
+    return p_wm + np.array([rotate(q, com_m) for q in np.ascontiguousarray(q_wm)])
+
+
+def flight_metrics(
+    flight: Flight,
+    *,
+    com_m: np.ndarray | None = None,
+    wall_s: float = 0.0,
+    deadline_misses: int = 0,
+) -> dict[str, float]:
+    """All metrics of result.json of a flight of one module.
+
+    Args:
+        flight: the ticks of the trajectory, from its start to its end (`Flight.between`).
+        com_m: (3,) nominal centre of mass in the module frame, m; the hull's centre when left out.
+        wall_s: time that the machine took for the same ticks, s; 0 where it is not known gives a real-time factor of 0.
+        deadline_misses: ticks that began late; 0 in lockstep.
+    """
+    firmware, truth = flight.firmware, flight.truth
+    position = body_positions(flight, np.zeros(3) if com_m is None else com_m)
+    error = np.linalg.norm(position - firmware["setpoint_p_wb"], axis=1)
+    angle = np.linalg.norm(rotation_vectors(truth["q_wm"], firmware["setpoint_q_wb"]), axis=1)
+    estimate_error = firmware["p_wb"] - position
+    estimate_angle = rotation_vectors(truth["q_wm"], firmware["q_wb"])
+    time_s = flight.time_s
+    period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    duration_s = float(time_s[-1]) + period_s
+    metrics = {
+        "position_rmse_m": _rms(error),
+        "position_max_m": float(error.max()),
+        "attitude_rmse_rad": _rms(angle),
+        "attitude_max_rad": float(angle.max()),
+        "estimate_position_rmse_m": _rms(np.linalg.norm(estimate_error, axis=1)),
+        "estimate_attitude_rmse_rad": _rms(np.linalg.norm(estimate_angle, axis=1)),
+        "nis_mean": nis_mean(firmware["nis"], firmware["nis_dof"]),
+    }
+    inside = np.abs(np.hstack([estimate_error, estimate_angle])) <= 3.0 * np.hstack(
+        [firmware["sigma_p"], firmware["sigma_q"]]
+    )
+    metrics |= {f"sigma3_share_{axis}": float(share) for axis, share in zip(AXES, inside.mean(axis=0), strict=True)}
+    return metrics | {
+        "sigma3_share": float(inside.mean(axis=0).min()),
+        "thrust_rms_n": _rms(firmware["commanded_n"]),
+        "tags_rejected": float(firmware["rejected"][-1] - firmware["rejected"][0]),
+        "duration_s": duration_s,
+        "real_time_factor": duration_s / wall_s if wall_s > 0.0 else 0.0,
+        "ticks": float(len(time_s)),
+        "unmatched_ticks": float(flight.unmatched),
+        "deadline_misses": float(deadline_misses),
+    }
+
+
+def nis_mean(nis: np.ndarray, dof: np.ndarray) -> float:
+    """Normalised innovation squared of the accepted tag updates over its expectation (1 for a consistent filter).
+
+    (k,) per tick, summed over the updates of the tick; ticks without one are NaN or have dof 0. NaN without any.
+    """
+    used = (dof > 0) & np.isfinite(nis)
+    return float(nis[used].sum() / dof[used].sum()) if used.any() else float("nan")
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
