@@ -1,6 +1,6 @@
 """The plant's own log, truth.mcap, and a flight read back: firmware's and plant's signals joined by tick.
 
-The plant writes with another library than the firmware (mcap here, foxglove there), so neither hides the other's faults.
+The plant writes with another library than the firmware (mcap here, foxglove there): neither hides the other's faults.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def module_signals(thrusters: int) -> tuple[Signal, ...]:
 
 
 class TruthRecorder:
-    """Writes /plant/moduleN, one message per tick and module. A context manager. Raises OSError when the disk is full."""
+    """Writes /plant/moduleN, a message per tick and module. A context manager. Raises OSError when the disk is full."""
 
     def __init__(self, folder: Path, thrusters: tuple[int, ...]) -> None:
         """`thrusters` has the number of thrusters of each module of the fleet, in its order."""
@@ -47,7 +47,8 @@ class TruthRecorder:
         for module, count in enumerate(thrusters):
             layout = Layout("Module", module_signals(count))
             schema = self._writer.register_schema(layout.schema_name, "protobuf", layout.schema)
-            self._modules.append((self._writer.register_channel(f"/plant/module{module}", "protobuf", schema), layout.row()))
+            channel = self._writer.register_channel(f"/plant/module{module}", "protobuf", schema)
+            self._modules.append((channel, layout.row()))
 
     def record(
         self,

@@ -93,6 +93,25 @@ class Parameters:
         return dataclasses.replace(self, **{group_name: dataclasses.replace(group, **{name: value})})
 
 
+PAPER = Parameters(
+    control=Control(
+        law="paper",
+        position_bandwidth=5.0**0.5,
+        position_damping=2.0 / (2.0 * 5.0**0.5),
+        attitude_bandwidth=2.0**0.5,
+        attitude_damping=1.0 / (2.0 * 2.0**0.5),
+        disturbance_feedforward=0.0,
+        lead_s=0.0,
+    ),
+    estimation=Estimation(kind="paper"),
+    allocation=Allocation(mode="pseudo_inverse"),
+)
+"""The paper's controller with the authors' gains, as accelerations: position 5 and 2, attitude 2 and 1 ."""
+
+CONTROLLERS = {"modcube": Parameters(), "paper": PAPER}
+"""Whole sets of parameters by name."""
+
+
 def registry() -> Iterator[tuple[str, Limits]]:
     """Every tunable as `group.field` with its limits, in a fixed order."""
     for group in dataclasses.fields(Parameters):

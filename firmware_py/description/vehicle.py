@@ -5,6 +5,7 @@ Positions and directions are in the module frame: FRD, origin at the hull's cent
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from importlib import resources
@@ -26,7 +27,7 @@ class Hull:
     """The outside."""
 
     size_m: np.ndarray = quantity(unit="m", low=0.01, high=10.0, shape=(3,), help="edges of the box along x, y, z")
-    mesh: str = quantity("", help="file of a closed mesh beside the vehicle file, in place of the box")
+    mesh: str = quantity("", help="closed mesh (module frame, m) beside the vehicle file, in place of the box")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,6 +46,17 @@ class Inertial:
     righting_arm_m: float = quantity(
         0.0, unit="m", low=-0.5, high=0.5, help="centre of buoyancy above the centre of mass, times dry weight a moment"
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Payload:
+    """A tool or cargo carried by the module: a solid box, trimmed so that it neither sinks nor rights."""
+
+    name: str = quantity(help="for people")
+    dry_kg: float = quantity(unit="kg", low=0.0, high=1000.0, help="mass in air, trim included")
+    entrained_kg: float = quantity(0.0, unit="kg", low=0.0, high=1000.0, help="water that moves with it")
+    size_m: np.ndarray = quantity(unit="m", low=0.001, high=10.0, shape=(3,), help="edges of its box along x, y, z")
+    position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="centre of its box and of its mass")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,6 +139,7 @@ class Vehicle:
     thruster: tuple[Thruster, ...] = quantity()
     tag: tuple[Tag, ...] = quantity(())
     supply: Supply = quantity(Supply())
+    payload: tuple[Payload, ...] = quantity(())
     assumption: str = quantity("", help="what is assumed and not measured; shown wherever the vehicle is shown")
     faces: str = quantity("PDPDPD", help="one letter a face, A to F: P probe, D drogue, - none")
     force_max_n: float = quantity(unit="N", low=0.1, high=1e4, help="forward limit of each thruster")
@@ -180,6 +193,9 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
         raise DescriptionError(f"vehicle {name!r} is unknown; there are {', '.join(vehicle_names())}, or give a .toml file")
     table, source = read_toml(path)
     vehicle: Vehicle = build(Vehicle, table, source)
+    if vehicle.hull.mesh:
+        hull = dataclasses.replace(vehicle.hull, mesh=str(path.parent / vehicle.hull.mesh))
+        vehicle = dataclasses.replace(vehicle, hull=hull)
     return vehicle
 
 

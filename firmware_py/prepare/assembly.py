@@ -6,6 +6,7 @@ Runs before a body is needed (start, or when docking is requested); the tick onl
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,11 +14,11 @@ from firmware_py.core import rotations
 from firmware_py.core.body import Body, ThrusterSet
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import FACE_NAMES, Vehicle
+from firmware_py.description.vehicle import Vehicle
 from firmware_py.prepare import drag_table
 from firmware_py.prepare.drag_cache import DragCache
-from firmware_py.prepare.drag_table import Placement
-from firmware_py.prepare.lattice import MATRICES, QUATERNIONS, face_towards
+from firmware_py.prepare.joints import Placement, check_joints
+from firmware_py.prepare.lattice import MATRICES, QUATERNIONS
 
 GRAVITY = 9.80665
 """m/s^2, standard."""
@@ -57,10 +58,10 @@ def assemble(
     count = len(vehicles)
     modules = tuple(range(count)) if modules is None else tuple(int(m) for m in modules)
     if not 1 <= count <= MOST_MODULES or not len(cells) == len(rotation) == len(modules) == count:
-        raise DescriptionError(f"a body has 1 to {MOST_MODULES} modules, each with cell, rotation and vehicle; got {count}")
+        raise DescriptionError(f"a body has 1 to {MOST_MODULES} modules with cell, rotation and vehicle, not {count}")
     turned = zip(vehicles, cells, rotation, strict=True)
     placements = [Placement(v, (int(c[0]), int(c[1]), int(c[2])), int(r)) for v, c, r in turned]
-    check_joints(placements, modules)
+    check_joints(placements, modules, pitch_m)
     return _body(placements, modules, pitch_m, cache, name or _name(placements))
 
 
@@ -83,55 +84,6 @@ def assemble_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle], cache: DragCac
     return bodies
 
 
-def check_joints(placements: Sequence[Placement], modules: Sequence[int]) -> None:
-    """Refuse placements that cannot be docked; see `assemble`."""
-    at: dict[tuple[int, int, int], int] = {}
-    for i, placement in enumerate(placements):
-        if placement.cell in at:
-            other = modules[at[placement.cell]]
-            raise DescriptionError(f"modules {other} and {modules[i]} overlap in cell {placement.cell}")
-        if not 0 <= placement.rotation < 24:
-            raise DescriptionError(f"module {modules[i]}: rotation {placement.rotation} is none of 0 to 23")
-        at[placement.cell] = i
-    joints: dict[int, list[int]] = {i: [] for i in range(len(placements))}
-    for i, placement in enumerate(placements):
-        for axis in range(3):
-            j = at.get(_neighbour(placement.cell, axis))
-            if j is not None and _joined(placements, modules, i, j, axis):
-                joints[i].append(j)
-                joints[j].append(i)
-    reached, open_ends = {0}, [0]
-    while open_ends:
-        for j in joints[open_ends.pop()]:
-            if j not in reached:
-                reached.add(j)
-                open_ends.append(j)
-    if lost := [str(modules[i]) for i in range(len(placements)) if i not in reached]:
-        raise DescriptionError(f"no docked face joins module {', '.join(lost)} to module {modules[0]}")
-
-
-def _neighbour(cell: tuple[int, int, int], axis: int) -> tuple[int, int, int]:
-    x, y, z = (c + (k == axis) for k, c in enumerate(cell))
-    return x, y, z
-
-
-def _joined(placements: Sequence[Placement], modules: Sequence[int], i: int, j: int, axis: int) -> bool:
-    """Whether the faces between neighbours i and j (i below j along `axis`) dock. A probe needs a drogue before it."""
-    unit = [0, 0, 0]
-    unit[axis] = 1
-    upper = face_towards(placements[i].rotation, (unit[0], unit[1], unit[2]))
-    lower = face_towards(placements[j].rotation, (-unit[0], -unit[1], -unit[2]))
-    kinds = placements[i].vehicle.faces[upper] + placements[j].vehicle.faces[lower]
-    if kinds in ("PP", "P-", "-P"):
-        what = "probe" if kinds == "PP" else "a face without drogue"
-        first, second = ((i, upper), (j, lower)) if kinds[0] == "P" else ((j, lower), (i, upper))
-        raise DescriptionError(
-            f"module {modules[first[0]]}'s probe on face {FACE_NAMES[first[1]]} meets {what} on face "
-            f"{FACE_NAMES[second[1]]} of module {modules[second[0]]}"
-        )
-    return set(kinds) == {"P", "D"}
-
-
 def _name(placements: Sequence[Placement]) -> str:
     counts: dict[str, int] = {}
     for placement in placements:
@@ -144,13 +96,12 @@ def _body(
 ) -> Body:
     turns = np.array([MATRICES[p.rotation] for p in placements])
     origins = pitch_m * np.array([p.cell for p in placements], dtype=float)
-    inertials = [p.vehicle.inertial for p in placements]
-    masses = np.array([i.dry_kg + i.entrained_kg for i in inertials])
-    centres = origins + np.einsum("mij,mj->mi", turns, np.array([i.com_m for i in inertials]))
-    com = masses @ centres / masses.sum()
+    lumps = [lump for p, origin in zip(placements, origins, strict=True) for lump in _lumps(p, origin)]
+    rigid_mass = sum(lump.mass for lump in lumps)
+    com = np.sum([lump.mass * lump.centre for lump in lumps], axis=0) / rigid_mass
     r_bm = origins - com
     q_bm = np.array([QUATERNIONS[p.rotation] for p in placements])
-    mass = mass_matrix(placements, r_bm)
+    mass = _mass_matrix(lumps, placements, com, r_bm)
     tags = [(k, tag) for k, p in enumerate(placements) for tag in p.vehicle.tag]
     return Body(
         name=name,
@@ -161,8 +112,8 @@ def _body(
         r_bi=r_bm.copy(),
         mass=mass,
         mass_inv=np.ascontiguousarray(np.linalg.inv(mass)),
-        rigid_mass_kg=float(masses.sum()),
-        dry_kg=float(sum(i.dry_kg for i in inertials)),
+        rigid_mass_kg=float(rigid_mass),
+        dry_kg=float(sum(_dry_kg(p.vehicle) for p in placements)),
         righting=sum((_righting(p) for p in placements), np.zeros(3)),
         thrusters=thruster_set([p.vehicle for p in placements], turns, r_bm),
         drag=drag_table.build(placements, com, pitch_m, cache),
@@ -183,32 +134,62 @@ def _power(vehicle: Vehicle) -> float:
 
 
 def _righting(placement: Placement) -> np.ndarray:
-    """(3,) dry weight times the arm from centre of mass up (-z of the module) to that of buoyancy, lattice axes, N m."""
+    """(3,) dry weight times the arm from centre of mass up (-z of the module) to that of buoyancy, N m."""
     inertial = placement.vehicle.inertial
     moment = GRAVITY * inertial.dry_kg * inertial.righting_arm_m
     return np.asarray(MATRICES[placement.rotation] @ np.array([0.0, 0.0, -moment]))
 
 
-def mass_matrix(placements: Sequence[Placement], r_bm: np.ndarray) -> np.ndarray:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lump:
+    """A rigid part with the water inside: mass, centre (3,) in the lattice frame, inertia (3, 3) about the centre."""
+
+    mass: float
+    centre: np.ndarray
+    inertia: np.ndarray
+
+
+def _lumps(placement: Placement, origin: np.ndarray) -> list[_Lump]:
+    inertial, turn = placement.vehicle.inertial, MATRICES[placement.rotation]
+    module = inertial.dry_kg + inertial.entrained_kg
+    lumps = [_Lump(module, origin + turn @ inertial.com_m, turn @ inertial.inertia @ turn.T)]
+    for payload in placement.vehicle.payload:
+        mass, squares = payload.dry_kg + payload.entrained_kg, payload.size_m**2
+        inertia = mass / 12.0 * np.diag(squares.sum() - squares)
+        lumps.append(_Lump(mass, origin + turn @ payload.position_m, turn @ inertia @ turn.T))
+    return lumps
+
+
+def _dry_kg(vehicle: Vehicle) -> float:
+    return vehicle.inertial.dry_kg + sum(p.dry_kg for p in vehicle.payload)
+
+
+def _mass_matrix(
+    lumps: Sequence[_Lump], placements: Sequence[Placement], com: np.ndarray, r_bm: np.ndarray
+) -> np.ndarray:
     """(6, 6) rigid, entrained and added mass about the body's centre of mass, body axes.
 
-    Each module contributes H^T M_i H, where H = [I, -S(r); 0, I] takes the body's velocity to a point r of the module
-    (Fossen's system transformation): its centre of mass for the rigid part, its hull's centre for added mass.
+    Each part contributes H^T M_i H, where H = [I, -S(r); 0, I] takes the body's velocity to a point r of the module
+    (Fossen's system transformation): the centre of mass of a rigid lump, the hull's centre for added mass.
     """
-    total = np.zeros((6, 6))
+    parts = []
+    for lump in lumps:
+        parts.append((_blocks(lump.mass * np.eye(3), lump.inertia), lump.centre - com))
     for placement, origin in zip(placements, r_bm, strict=True):
-        inertial, turn = placement.vehicle.inertial, MATRICES[placement.rotation]
-        rigid = np.zeros((6, 6))
-        rigid[:3, :3] = (inertial.dry_kg + inertial.entrained_kg) * np.eye(3)
-        rigid[3:, 3:] = turn @ inertial.inertia @ turn.T
-        added = np.zeros((6, 6))
-        added[:3, :3] = turn @ np.diag(inertial.added[:3]) @ turn.T
-        added[3:, 3:] = turn @ np.diag(inertial.added[3:]) @ turn.T
-        for part, r in ((rigid, origin + turn @ inertial.com_m), (added, origin)):
-            h = np.eye(6)
-            h[:3, 3:] = -rotations.skew(r)
-            total += h.T @ part @ h
+        turn, added = MATRICES[placement.rotation], placement.vehicle.inertial.added
+        parts.append((_blocks(turn @ np.diag(added[:3]) @ turn.T, turn @ np.diag(added[3:]) @ turn.T), origin))
+    total = np.zeros((6, 6))
+    for part, r in parts:
+        h = _blocks(np.eye(3), np.eye(3))
+        h[:3, 3:] = -rotations.skew(r)
+        total += h.T @ part @ h
     return 0.5 * (total + total.T)
+
+
+def _blocks(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3], matrix[3:, 3:] = upper, lower
+    return matrix
 
 
 def thruster_set(vehicles: Sequence[Vehicle], turns: np.ndarray, r_bm: np.ndarray) -> ThrusterSet:

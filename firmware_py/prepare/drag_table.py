@@ -7,15 +7,14 @@ shape is turned or moved; coefficients, density and centre of mass are applied a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from firmware_py.core.body import DragTable
 from firmware_py.core.drag_lookup import node_directions
-from firmware_py.description.vehicle import Vehicle
 from firmware_py.prepare import shape_key
 from firmware_py.prepare.drag_cache import DragCache
+from firmware_py.prepare.joints import Placement
 from firmware_py.prepare.lattice import MATRICES
 from firmware_py.prepare.projected_area import Solid, areas_and_centroids
 from firmware_py.prepare.shape_key import Part
@@ -31,15 +30,6 @@ _SUBDIVISIONS = 3
 
 Outlines = Callable[[Sequence[Solid], np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Solids and (n, 3) directions to (n,) areas and (n, 3) centroids, as projected_area.areas_and_centroids."""
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """Where one module sits: its vehicle, lattice cell (3,) and rotation index."""
-
-    vehicle: Vehicle
-    cell: tuple[int, int, int]
-    rotation: int
 
 
 def build(
@@ -120,8 +110,8 @@ def rotational_damping(
     """(3,) quadratic damping about the body axes through `centre`, N m s^2.
 
     The hull's surface under the law of the drag table, dF = -1/2 rho Cd max(n . v, 0) v dS with v = w x r: for unit w
-    along axis k the moment is 1/2 rho Cd times the integral of max(n . (e_k x r), 0) times the squared distance from the
-    axis. Triangles that lie on a docked face are left out.
+    along axis k the moment is 1/2 rho Cd times the integral of max(n . (e_k x r), 0) times the squared distance from
+    the axis. Triangles that lie on a docked face are left out.
     """
     total = np.zeros(3)
     occupied = {p.cell for p in placements}
@@ -182,7 +172,7 @@ def _outlines(
 
 
 def _measure(solids: Sequence[Solid], directions: np.ndarray, method: Outlines) -> np.ndarray:
-    """(..., 4) area and centroid on each node. Opposite nodes see one outline and rims are shared: each is found once."""
+    """(..., 4) area and centroid on each node. Opposite nodes see one outline, rims are shared: each is found once."""
     flat = directions.reshape(-1, 3)
     leading = flat[np.arange(len(flat)), np.argmax(np.round(np.abs(flat), 9) > 0.0, axis=1)]
     half = np.round(flat * np.sign(leading)[:, None], 9)

@@ -54,15 +54,32 @@ def at_rest(p_wb: Sequence[float] | np.ndarray, q_wb: Sequence[float] | np.ndarr
     return Setpoint(np.array(p_wb, dtype=np.float64), q, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
 
 
-@njit("float64[::1](float64[:,::1], float64[::1], float64, float64, float64)", cache=True)
-def _harmonic(terms, head, duration, end_phase, t):  # type: ignore[no-untyped-def]
+@njit("UniTuple(float64, 3)(float64, float64)", cache=True)
+def progress(tau, ramp):  # type: ignore[no-untyped-def]
+    """Share of the way, its first and second derivative, at the share `tau` of the time (0 to 1), rest to rest.
+
+    Speed rises over the share `ramp` of the time (at most a half) as the fifth-degree smooth step, stays, and falls
+    likewise: velocity, acceleration and jerk vanish at both ends and jerk is continuous in between.
+    """
+    if tau <= 0.0:
+        return 0.0, 0.0, 0.0
+    if tau >= 1.0:
+        return 1.0, 0.0, 0.0
+    top = 1.0 / (1.0 - ramp)
+    x = min(tau, 1.0 - tau) / ramp
+    if x >= 1.0:
+        return top * (tau - 0.5 * ramp), top, 0.0
+    s = top * ramp * x**4 * (2.5 - 3.0 * x + x * x)
+    ds = top * x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    dds = top / ramp * 30.0 * (x * (1.0 - x)) ** 2
+    return (s, ds, dds) if tau < 0.5 else (1.0 - s, ds, -dds)
+
+
+@njit("float64[::1](float64[:,::1], float64[::1], float64, float64, float64, float64)", cache=True)
+def _harmonic(terms, head, duration, end_phase, ramp, t):  # type: ignore[no-untyped-def]
     """(19,) p, q, v, w, a, alpha in one array. `terms`, `head`: see Harmonic."""
-    tau = min(max(t / duration, 0.0), 1.0)
-    # Rest to rest: the septic with zero velocity, acceleration and jerk at both ends.
-    s = tau**4 * (35.0 + tau * (-84.0 + tau * (70.0 - 20.0 * tau)))
-    ds = 140.0 * (tau * (1.0 - tau)) ** 3 / duration
-    dds = 420.0 * (tau * (1.0 - tau)) ** 2 * (1.0 - 2.0 * tau) / duration**2
-    phase, rate, change = end_phase * s, end_phase * ds, end_phase * dds
+    s, ds, dds = progress(t / duration, ramp)
+    phase, rate, change = end_phase * s, end_phase * ds / duration, end_phase * dds / duration**2
     out = np.zeros(19)
     for k in range(3):
         p, dp, ddp = head[k] + head[3 + k] * phase, head[3 + k], 0.0
@@ -102,47 +119,64 @@ class Harmonic:
             quaternion (4) after them: q_wb = first * q_z(yaw phase) * q_x(roll phase) * last.
         duration_s: from rest to rest.
         end_phase: rad.
+        ramp_share: share of the duration in which speed rises, and again in which it falls; see `progress`.
     """
 
     terms: np.ndarray
     head: np.ndarray
     duration_s: float
     end_phase: float
+    ramp_share: float
 
     def sample(self, t_s: float) -> Setpoint:
         """Wanted motion at `t_s`, world NED and wanted body frame; the ends are held."""
-        x = _harmonic(self.terms, self.head, self.duration_s, self.end_phase, t_s)
+        x = _harmonic(self.terms, self.head, self.duration_s, self.end_phase, self.ramp_share, t_s)
         return Setpoint(x[0:3], x[3:7], x[7:10], x[10:13], x[13:16], x[16:19])
 
 
-_LEVEL = (1.0, 0.0, 0.0, 0.0)
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+"""Attitude of the world's axes."""
+
+LONGEST_RAMP = 0.5
+"""Speed rises for half the time and falls for the other half."""
+
+Vector = Sequence[float] | np.ndarray
 
 
 def _make(
     terms: Sequence[Sequence[float]],
-    offset: Sequence[float] | np.ndarray,
-    slope: Sequence[float] | np.ndarray,
+    offset: Vector,
     duration_s: float,
     end_phase: float,
-    first: Sequence[float] | np.ndarray = _LEVEL,
+    ramp_share: float,
+    slope: Vector = (0.0, 0.0, 0.0),
+    first: Vector = LEVEL,
     turning: tuple[float, float] = (0.0, 0.0),
-    last: Sequence[float] | np.ndarray = _LEVEL,
+    last: Vector = LEVEL,
 ) -> Harmonic:
     if not duration_s > 0.0:
         raise ValueError(f"a trajectory needs a duration above zero, not {duration_s} s")
+    if not 0.0 < ramp_share <= LONGEST_RAMP:
+        raise ValueError(f"the ramp share is above 0 and at most {LONGEST_RAMP}, not {ramp_share}")
     before, after = (rotations.normalise(np.array(q, dtype=np.float64)) for q in (first, last))
     head = np.concatenate([np.asarray(offset, float), np.asarray(slope, float), before, turning, after])
-    return Harmonic(np.array(terms, dtype=np.float64).reshape(-1, 4), head, float(duration_s), float(end_phase))
+    table = np.array(terms, dtype=np.float64).reshape(-1, 4)
+    return Harmonic(table, head, float(duration_s), float(end_phase), float(ramp_share))
+
+
+def _sine(axis: int, amplitude: float, frequency: float, angle: float) -> list[float]:
+    return [axis, amplitude, frequency, angle - 0.5 * math.pi]
 
 
 def spiral(
-    centre: Sequence[float] | np.ndarray,
+    centre: Vector,
     radius_m: float,
     climb_m: float,
     turns: float,
     duration_s: float,
     start_angle_rad: float = 0.0,
-    attitude: Sequence[float] | np.ndarray = _LEVEL,
+    attitude: Vector = LEVEL,
+    ramp_share: float = LONGEST_RAMP,
 ) -> Harmonic:
     """The paper's cylindrical spiral, clockwise seen from above, holding its attitude.
 
@@ -154,7 +188,109 @@ def spiral(
         duration_s: rest to rest.
         start_angle_rad: where on the circle it starts, from north towards east.
         attitude: (4,) q_wb held all the way.
+        ramp_share: see `progress`.
     """
     end = 2.0 * math.pi * turns
-    terms = [[0, radius_m, 1.0, start_angle_rad], [1, radius_m, 1.0, start_angle_rad - 0.5 * math.pi]]
-    return _make(terms, centre, [0.0, 0.0, -climb_m / end], duration_s, end, first=attitude)
+    terms = [[0, radius_m, 1.0, start_angle_rad], _sine(1, radius_m, 1.0, start_angle_rad)]
+    slope = [0.0, 0.0, -climb_m / end]
+    return _make(terms, centre, duration_s, end, ramp_share, slope=slope, first=attitude)
+
+
+def circle(
+    centre: Vector,
+    radius_m: float,
+    turns: float,
+    duration_s: float,
+    start_angle_rad: float = 0.0,
+    attitude: Vector = LEVEL,
+    face_along: bool = False,
+    ramp_share: float = LONGEST_RAMP,
+) -> Harmonic:
+    """A level circle, clockwise seen from above; arguments as `spiral`.
+
+    `face_along` turns with the path: the attitude is then that in the frame whose x axis points along the path.
+    """
+    terms = [[0, radius_m, 1.0, start_angle_rad], _sine(1, radius_m, 1.0, start_angle_rad)]
+    end = 2.0 * math.pi * turns
+    if not face_along:
+        return _make(terms, centre, duration_s, end, ramp_share, first=attitude)
+    ahead = rotations.from_euler(0.0, 0.0, start_angle_rad + 0.5 * math.pi)
+    return _make(terms, centre, duration_s, end, ramp_share, first=ahead, turning=(1.0, 0.0), last=attitude)
+
+
+def moebius(
+    centre: Vector,
+    duration_s: float = 60.0,
+    radius_m: float = 1.0,
+    half_width_m: float = 0.3,
+    laps: float = 2.0,
+    start_angle_rad: float = 0.0,
+    attitude: Vector = LEVEL,
+    ramp_share: float = LONGEST_RAMP,
+) -> Harmonic:
+    """Along the rim of a Moebius strip; the body turns with the strip and rolls by 180 deg a lap.
+
+    Point at angle u: r = (R + h cos(u/2)) e_r + h sin(u/2) e_z; body axes (at attitude LEVEL) x = e_u along the centre
+    circle, y = -(cos(u/2) e_r + sin(u/2) e_z) across the strip towards the centre circle, z its normal, down at u = 0.
+
+    Args:
+        centre: (3,) world NED, m.
+        duration_s: rest to rest.
+        radius_m: of the centre circle, R.
+        half_width_m: of the strip, h; 0 follows the centre circle.
+        laps: two close it.
+        start_angle_rad: turns the whole strip about the vertical.
+        attitude: (4,) body in the strip's frame.
+        ramp_share: see `progress`.
+    """
+    a, h = start_angle_rad, half_width_m
+    terms = [[0, radius_m, 1.0, a], _sine(1, radius_m, 1.0, a)]
+    terms += [[0, 0.5 * h, 1.5, a], [0, 0.5 * h, 0.5, a], _sine(1, 0.5 * h, 1.5, a), _sine(1, 0.5 * h, 0.5, a)]
+    terms += [_sine(2, h, 0.5, 0.0)]
+    first = rotations.from_euler(0.0, 0.0, a + 0.5 * math.pi)
+    end = 2.0 * math.pi * laps
+    return _make(terms, centre, duration_s, end, ramp_share, first=first, turning=(1.0, -0.5), last=attitude)
+
+
+def lissajous(
+    centre: Vector,
+    amplitude_m: Vector,
+    frequency: Vector,
+    duration_s: float,
+    angle_rad: Vector = (0.0, 0.0, 0.0),
+    turns: float = 1.0,
+    attitude: Vector = LEVEL,
+    turning: tuple[float, float] = (0.0, 0.0),
+    ramp_share: float = LONGEST_RAMP,
+) -> Harmonic:
+    """p_k = centre_k + amplitude_k sin(frequency_k u + angle_k), u from 0 to 2 pi turns: closed where they are whole.
+
+    Args:
+        centre, amplitude_m, frequency, angle_rad: (3,) per world axis.
+        duration_s: rest to rest.
+        turns: of the phase u.
+        attitude: (4,) q_wb at the start.
+        turning: yaw and then roll, rad per rad of u, about world-down and the body's x axis.
+        ramp_share: see `progress`.
+    """
+    terms = [_sine(k, float(amplitude_m[k]), float(frequency[k]), float(angle_rad[k])) for k in range(3)]
+    end = 2.0 * math.pi * turns
+    return _make(terms, centre, duration_s, end, ramp_share, turning=turning, last=attitude)
+
+
+def line(start: Setpoint, end: Setpoint, duration_s: float, ramp_share: float = LONGEST_RAMP) -> Harmonic:
+    """Straight from pose to pose, turning about one axis on the way; the set-points' motion does not matter."""
+    turn = rotations.difference(end.q_wb, start.q_wb)
+    angle = float(np.linalg.norm(turn))
+    align = _x_axis_to(turn / angle) if angle > 0.0 else np.array(LEVEL)
+    first = rotations.multiply(start.q_wb, align)
+    last = rotations.conjugate(align)
+    slope = end.p_wb - start.p_wb
+    return _make([], start.p_wb, duration_s, 1.0, ramp_share, slope=slope, first=first, turning=(0.0, angle), last=last)
+
+
+def _x_axis_to(axis: np.ndarray) -> np.ndarray:
+    """Unit quaternion that turns the x axis into a unit vector, by the half-way vector; any half-turn for its opposite."""
+    if axis[0] < -1.0 + 1e-12:
+        return np.array([0.0, 0.0, 0.0, 1.0])
+    return np.asarray(rotations.normalise(np.array([1.0 + axis[0], 0.0, -axis[2], axis[1]])))

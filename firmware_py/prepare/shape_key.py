@@ -14,8 +14,9 @@ import numpy as np
 
 from firmware_py.core.drag_lookup import node_directions
 from firmware_py.description.vehicle import Vehicle
+from firmware_py.prepare.hulls import hull_of
 from firmware_py.prepare.lattice import INVERSE, MATRICES, PRODUCT
-from firmware_py.prepare.projected_area import Solid, box
+from firmware_py.prepare.projected_area import Solid
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,14 +26,14 @@ class Part:
     Attributes:
         cell: lattice cell.
         rotation: which of the 24 rotations.
-        hull: the hull in the module frame.
+        hull: closed solids in the module frame.
         name: the same for equal hulls.
-        size: (3,) edges of a box, whose half-turns look alike; None for any other hull.
+        size: (3,) edges where the hull is one box, whose half-turns look alike; None for any other.
     """
 
     cell: tuple[int, int, int]
     rotation: int
-    hull: Solid
+    hull: tuple[Solid, ...]
     name: str
     size: np.ndarray | None
 
@@ -68,19 +69,21 @@ def _text(values: np.ndarray) -> str:
 
 def part(vehicle: Vehicle, cell: tuple[int, int, int], rotation: int) -> Part:
     """The part that a module of `vehicle` is."""
-    size = vehicle.hull.size_m
-    hull = box(size)
+    hull = hull_of(vehicle)
+    size = None if vehicle.hull.mesh or vehicle.payload else vehicle.hull.size_m
     return Part(cell, rotation, hull, _digest(hull), size)
 
 
-def _digest(hull: Solid) -> str:
-    data = np.round(hull.vertices, 9).tobytes() + hull.triangles.astype(np.int64).tobytes()
-    return "mesh" + hashlib.sha256(data).hexdigest()[:24]
+def _digest(hull: Sequence[Solid]) -> str:
+    digest = hashlib.sha256()
+    for solid in hull:
+        digest.update(np.round(solid.vertices, 9).tobytes() + solid.triangles.astype(np.int64).tobytes())
+    return "solids" + digest.hexdigest()[:24]
 
 
 def solids(parts: Sequence[Part], pitch_m: float) -> list[Solid]:
     """The hulls of the parts, placed in the frame of their cells."""
-    return [p.hull.placed(MATRICES[p.rotation], pitch_m * np.array(p.cell)) for p in parts]
+    return [s.placed(MATRICES[p.rotation], pitch_m * np.array(p.cell)) for p in parts for s in p.hull]
 
 
 def canonical(parts: Sequence[Part], pitch_m: float) -> CanonicalShape:

@@ -91,6 +91,16 @@ def _body_values(tick: int, time_ns: int, record: BodyRecord) -> tuple[Any, ...]
     )
 
 
+_ID_TEXTS = tuple(f"{frame_id:03X}#" for frame_id in range(2048))
+
+
+def candump_lines(time_ns: int, bus: int, direction: str, frames: Iterable[tuple[int, bytes]]) -> str:
+    """One line per frame (11-bit id, data), as `candump -L -x` writes them; direction R or T."""
+    seconds, rest = divmod(time_ns, 1_000_000_000)
+    start, end = f"({seconds:010d}.{rest // 1000:06d}) can{bus} ", f" {direction}\n"
+    return "".join([start + _ID_TEXTS[frame_id] + data.hex().upper() + end for frame_id, data in frames])
+
+
 def request_text(request: Request) -> str:
     """JSON of a request, for the log."""
     plain = {"action": request.action.name, "body": request.body, "argument": _plain(request.argument)}
@@ -122,15 +132,18 @@ class GuardedFile:
 
     def write(self, data: bytes | bytearray) -> int:
         """Append; always says that all was taken."""
-        if self._file is not None and self.error is None:
-            view = memoryview(data)
+        if self.error is None:
             try:
-                while view:
-                    view = view[self._file.write(view) :]
+                self._append(data)
             except OSError as error:
                 self.error = error
         self._position += len(data)
         return len(data)
+
+    def _append(self, data: bytes | bytearray) -> None:
+        view = memoryview(data)
+        while view and self._file is not None:
+            view = view[self._file.write(view) :]
 
     def seek(self, offset: int, whence: int = 0) -> int:
         """The position; the log is written forward only."""
@@ -159,7 +172,7 @@ class Recorder:
     def __init__(self, folder: Path, configuration: Mapping[str, Any] | None = None) -> None:
         self._can = GuardedFile(folder / CAN_LOG)
         self._mcap = GuardedFile(folder / SIGNAL_LOG)
-        self._lines: deque[str] = deque()
+        self._frames: deque[tuple[int, int, str, tuple[tuple[int, bytes], ...]]] = deque()
         self._received = 0
         self._reported = False
         self._closed = False
@@ -186,18 +199,13 @@ class Recorder:
 
     def sent(self, time_ns: int, bus: int, frames: Iterable[tuple[int, bytes]]) -> None:
         """Frames (id, data) that the tick at `time_ns` put on bus number `bus`."""
-        self._write_frames(time_ns, bus, frames, " T\n")
+        self._frames.append((time_ns, bus, "T", tuple(frames)))
 
     def received(self, time_ns: int, bus: int, frames: Iterable[tuple[int, bytes]]) -> None:
         """Frames (id, data) that the tick at `time_ns` took from bus number `bus`."""
-        self._received += self._write_frames(time_ns, bus, frames, " R\n")
-
-    def _write_frames(self, time_ns: int, bus: int, frames: Iterable[tuple[int, bytes]], end: str) -> int:
-        seconds, rest = divmod(time_ns, 1_000_000_000)
-        start = f"({seconds:010d}.{rest // 1000:06d}) can{bus} "
-        lines = [f"{start}{frame_id:03X}#{data.hex().upper()}{end}" for frame_id, data in frames]
-        self._lines.append("".join(lines))
-        return len(lines)
+        taken = tuple(frames)
+        self._received += len(taken)
+        self._frames.append((time_ns, bus, "R", taken))
 
     def record(self, inputs: Inputs, outputs: Outputs) -> None:
         """One tick: what it took and everything that it thought."""
@@ -222,8 +230,10 @@ class Recorder:
 
     def flush(self) -> list[Event]:
         """Hand everything so far to the operating system; a warning, once, where that fails."""
-        while self._lines:
-            self._can.write(self._lines.popleft().encode())
+        lines = []
+        while self._frames:
+            lines.append(candump_lines(*self._frames.popleft()))
+        self._can.write("".join(lines).encode())
         self._writer.flush()
         failed = next((file for file in (self._can, self._mcap) if file.error is not None), None)
         if failed is None or self._reported:

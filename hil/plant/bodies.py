@@ -17,9 +17,12 @@ import numpy as np
 from numba import njit, types
 
 from hil.plant import drag
-from hil.plant.water import F1, F2, F3, WATER, push_of_walls
+from hil.plant.vectors import (
+    F2, F3, F8, I1, V3, cross, dot, matrix, matrix_of, minus, plus, times, triple, turn, turn_back,
+)  # fmt: skip
+from hil.plant.water import WATER, is_clear, push_of_walls
 
-I1 = types.int64[::1]
+I8 = types.int64
 
 
 class Bodies(NamedTuple):
@@ -37,6 +40,8 @@ class Bodies(NamedTuple):
     """(b, 8) weight W and buoyancy B of the dry parts, N; W r_W and B r_B, N m."""
     hull: np.ndarray
     """(b, 4) mass of the water that the hulls displace, entrained water included, kg; mass times centre, kg m."""
+    wrench: np.ndarray
+    """(b, 6) working memory: force and moment about O, body frame."""
 
 
 class Modules(NamedTuple):
@@ -48,6 +53,8 @@ class Modules(NamedTuple):
     """(m, 3) hull centre in the body frame."""
     turn: np.ndarray
     """(m, 3, 3) module frame to body frame."""
+    quaternion: np.ndarray
+    """(m, 4) the same."""
     size: np.ndarray
     """(m, 3) edges of the hull."""
     drag: np.ndarray
@@ -58,206 +65,155 @@ class Modules(NamedTuple):
     """(m, 6) quadratic damping that a vehicle file publishes in place of areas."""
 
 
-class Scratch(NamedTuple):
-    """Working memory of the derivative."""
-
-    turn: np.ndarray
-    """(b, 3, 3) body to world."""
-    wrench: np.ndarray
-    """(b, 6) about O, body frame."""
-    work: np.ndarray
-    """(16, 3)."""
+BODIES = types.NamedTuple((F2, F3, F3, F3, F2, F2, F2), Bodies)
+MODULES = types.NamedTuple((I1, F2, F3, F2, F2, F2, F2, F2), Modules)
 
 
-BODIES = types.NamedTuple((F2, F3, F3, F3, F2, F2), Bodies)
-MODULES = types.NamedTuple((I1, F2, F3, F2, F2, F2, F2), Modules)
-SCRATCH = types.NamedTuple((F3, F2, F2), Scratch)
-
-
-def make_scratch(bodies: int) -> Scratch:
-    """Working memory for so many bodies."""
-    return Scratch(np.zeros((bodies, 3, 3)), np.zeros((bodies, 6)), np.zeros((16, 3)))
-
-
-@njit(types.void(F1, F2), cache=True)
-def matrix_of(x, r):
-    """Writes the (3, 3) rotation matrix of the state's quaternion into r."""
-    w, i, j, k = x[3], x[4], x[5], x[6]
-    r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)
-    r[1, 0], r[1, 1], r[1, 2] = 2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)
-    r[2, 0], r[2, 1], r[2, 2] = 2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)
-
-
-@njit(types.void(F2, F1, F1), cache=True)
-def turn(r, a, out):
-    """out = r a."""
-    out[0] = r[0, 0] * a[0] + r[0, 1] * a[1] + r[0, 2] * a[2]
-    out[1] = r[1, 0] * a[0] + r[1, 1] * a[1] + r[1, 2] * a[2]
-    out[2] = r[2, 0] * a[0] + r[2, 1] * a[1] + r[2, 2] * a[2]
-
-
-@njit(types.void(F2, F1, F1), cache=True)
-def turn_back(r, a, out):
-    """out = r^T a."""
-    out[0] = r[0, 0] * a[0] + r[1, 0] * a[1] + r[2, 0] * a[2]
-    out[1] = r[0, 1] * a[0] + r[1, 1] * a[1] + r[2, 1] * a[2]
-    out[2] = r[0, 2] * a[0] + r[1, 2] * a[1] + r[2, 2] * a[2]
-
-
-@njit(types.void(F1, F1, F1, types.float64), cache=True)
-def add_cross(out, a, b, sign):
-    """out += sign a x b."""
-    out[0] += sign * (a[1] * b[2] - a[2] * b[1])
-    out[1] += sign * (a[2] * b[0] - a[0] * b[2])
-    out[2] += sign * (a[0] * b[1] - a[1] * b[0])
-
-
-@njit(types.void(F1, F1, F1), cache=True)
-def add_force(wrench, at, f):
-    """Adds the force f at the point `at` to a wrench (6,); all in one frame."""
+@njit(types.void(F2, I8, V3, V3), cache=True)
+def add_force(wrench, b, at, f):
+    """Adds the force f at the point `at` to row b of wrenches; body frame."""
+    n = cross(at, f)
     for i in range(3):
-        wrench[i] += f[i]
-    add_cross(wrench[3:], at, f, 1.0)
+        wrench[b, i] += f[i]
+        wrench[b, 3 + i] += n[i]
 
 
-@njit(types.void(F2, F1, F1, F1), cache=True)
-def momentum(mass, v, w, out):
-    """out (6,) = mass (6, 6) times [v; w]."""
-    for i in range(6):
-        total = 0.0
-        for j in range(3):
-            total += mass[i, j] * v[j] + mass[i, 3 + j] * w[j]
-        out[i] = total
+@njit(V3(F3, I8, I8, V3, V3), cache=True)
+def half_momentum(mass, b, first, v, w):
+    """Rows `first` to first + 2 of mass matrix number b times [v; w]: linear momentum from 0, angular from 3."""
+    p = (0.0, 0.0, 0.0)
+    for j in range(3):
+        p = plus(p, times(v[j], (mass[b, first, j], mass[b, first + 1, j], mass[b, first + 2, j])))
+        p = plus(p, times(w[j], (mass[b, first, 3 + j], mass[b, first + 1, 3 + j], mass[b, first + 2, 3 + j])))
+    return p
 
 
-@njit(types.void(BODIES, MODULES, WATER, F1, F1, F2, F2, F2, SCRATCH), cache=True)
-def derivative(bodies, modules, water, flow, flow_rate, thrust, x, out, scratch):
+@njit(types.void(BODIES, I8, F2, V3), cache=True)
+def _add_weight(bodies, b, x, flow_rate):
+    """Weight, buoyancy, and the pressure gradient of water that accelerates (Froude-Krylov)."""
+    r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
+    down, rate = r[2], turn_back(r, flow_rate)
+    weight, hull = bodies.weight, bodies.hull
+    f = plus(times(weight[b, 0] - weight[b, 1], down), times(hull[b, 0], rate))
+    lever = minus(triple(weight, b, 2), triple(weight, b, 5))
+    n = plus(cross(lever, down), cross(triple(hull, b, 1), rate))
+    for i in range(3):
+        bodies.wrench[b, i] += f[i]
+        bodies.wrench[b, 3 + i] += n[i]
+
+
+@njit(types.void(BODIES, MODULES, I8, WATER, F2, V3), cache=True)
+def _add_drag(bodies, modules, m, water, x, flow):
+    """Drag of one module at its hull centre, by its velocity relative to the water."""
+    b = modules.body[m]
+    r, at, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), triple(modules.position, m, 0), matrix(modules.turn, m)
+    rate = triple(x, b, 10)
+    v = turn_back(inside, plus(minus(triple(x, b, 7), turn_back(r, flow)), cross(rate, at)))
+    w = turn_back(inside, rate)
+    sx, sy, sz = triple(modules.size, m, 0)
+    c, linear, quadratic, half_rho = modules.drag, modules.linear, modules.quadratic, 0.5 * water.density
+    factor = half_rho * drag.translation(sx, sy, sz, c[m, 0], c[m, 1], v[0], v[1], v[2])
+    f = (
+        -(factor + linear[m, 0] + quadratic[m, 0] * abs(v[0])) * v[0],
+        -(factor + linear[m, 1] + quadratic[m, 1] * abs(v[1])) * v[1],
+        -(factor + linear[m, 2] + quadratic[m, 2] * abs(v[2])) * v[2],
+    )
+    n = (
+        -half_rho * c[m, 2] * drag.rotation(sy, sz, sx, v[1], v[2], w[0]) - (linear[m, 3] + quadratic[m, 3] * abs(w[0])) * w[0],
+        -half_rho * c[m, 3] * drag.rotation(sz, sx, sy, v[2], v[0], w[1]) - (linear[m, 4] + quadratic[m, 4] * abs(w[1])) * w[1],
+        -half_rho * c[m, 4] * drag.rotation(sx, sy, sz, v[0], v[1], w[2]) - (linear[m, 5] + quadratic[m, 5] * abs(w[2])) * w[2],
+    )
+    add_force(bodies.wrench, b, at, turn(inside, f))
+    n = turn(inside, n)
+    for i in range(3):
+        bodies.wrench[b, 3 + i] += n[i]
+
+
+@njit(types.void(BODIES, MODULES, I8, WATER, F2), cache=True)
+def _add_walls(bodies, modules, m, water, x):
+    """Walls, bottom and surface on the eight corners of one module."""
+    b = modules.body[m]
+    r, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), matrix(modules.turn, m)
+    position, size, origin = triple(modules.position, m, 0), triple(modules.size, m, 0), triple(x, b, 0)
+    centre, reach = plus(origin, turn(r, position)), 0.5 * math.sqrt(dot(size, size))
+    if is_clear(water, centre, reach):
+        return
+    lift = 0.25 * water.density * water.gravity * size[0] * size[1]
+    for k in range(8):
+        corner = (size[0] * (0.5 if k & 1 else -0.5), size[1] * (0.5 if k & 2 else -0.5), size[2] * (0.5 if k & 4 else -0.5))
+        at = plus(position, turn(inside, corner))
+        p = plus(origin, turn(r, at))
+        v = turn(r, plus(triple(x, b, 7), cross(triple(x, b, 10), at)))
+        f = push_of_walls(water, p, v)
+        if p[2] < 0.0:  # out of the water: its quarter of the water plane carries less
+            f = (f[0], f[1], f[2] + max(0.0, -lift * p[2] - water.damping * v[2]))
+        add_force(bodies.wrench, b, at, turn_back(r, f))
+
+
+@njit(types.void(BODIES, I8, F2, F2, V3, V3), cache=True)
+def _accelerate(bodies, b, x, out, flow, flow_rate):
+    """Kirchhoff's equations solved for the accelerations, and the kinematics."""
+    q = (x[b, 3], x[b, 4], x[b, 5], x[b, 6])
+    r, v, w = matrix_of(q[0], q[1], q[2], q[3]), triple(x, b, 7), triple(x, b, 10)
+    u, none = turn_back(r, flow), (0.0, 0.0, 0.0)
+    slip = minus(v, u)
+    carried = minus(cross(w, u), turn_back(r, flow_rate))  # dv_r/dt = dv/dt + carried
+    p, spin = half_momentum(bodies.rigid, b, 0, v, w), half_momentum(bodies.rigid, b, 3, v, w)
+    h, swirl = half_momentum(bodies.added, b, 0, slip, w), half_momentum(bodies.added, b, 3, slip, w)
+    f, n = triple(bodies.wrench, b, 0), triple(bodies.wrench, b, 3)
+    f = minus(minus(f, half_momentum(bodies.added, b, 0, carried, none)), cross(w, plus(p, h)))
+    n = minus(minus(n, half_momentum(bodies.added, b, 3, carried, none)), cross(w, plus(spin, swirl)))
+    n = minus(minus(n, cross(v, p)), cross(slip, h))
+    a, alpha = half_momentum(bodies.inverse, b, 0, f, n), half_momentum(bodies.inverse, b, 3, f, n)
+    rate = turn(r, v)
+    for i in range(3):
+        out[b, i], out[b, 7 + i], out[b, 10 + i] = rate[i], a[i], alpha[i]
+    out[b, 3] = -0.5 * (q[1] * w[0] + q[2] * w[1] + q[3] * w[2])
+    out[b, 4] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1])
+    out[b, 5] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2])
+    out[b, 6] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0])
+
+
+@njit(types.void(BODIES, MODULES, WATER, V3, V3, F2, F2, F2), cache=True)
+def derivative(bodies, modules, water, flow, flow_rate, thrust, x, out):
     """Rate of change of the states.
 
     Args:
-        flow, flow_rate: (3,) velocity and acceleration of the water, world.
+        flow, flow_rate: velocity and acceleration of the water, world.
         thrust: (b, 6) wrench of all thrusters (and whatever else acts) about O, body frame.
         x: (b, 13) states; out: (b, 13) written.
     """
     for b in range(x.shape[0]):
-        matrix_of(x[b], scratch.turn[b])
-        scratch.wrench[b, :] = thrust[b]
-        _add_weight(bodies, b, flow_rate, scratch)
+        for i in range(6):
+            bodies.wrench[b, i] = thrust[b, i]
+        _add_weight(bodies, b, x, flow_rate)
     for m in range(modules.body.shape[0]):
-        _add_drag(modules, m, water, flow, x, scratch)
-        _add_walls(modules, m, water, x, scratch)
+        _add_drag(bodies, modules, m, water, x, flow)
+        _add_walls(bodies, modules, m, water, x)
     for b in range(x.shape[0]):
-        _accelerate(bodies, b, flow, flow_rate, x[b], out[b], scratch)
+        _accelerate(bodies, b, x, out, flow, flow_rate)
 
 
-@njit(types.void(BODIES, types.int64, F1, SCRATCH), cache=True)
-def _add_weight(bodies, b, flow_rate, scratch):
-    """Weight, buoyancy, and the pressure gradient of water that accelerates (Froude-Krylov)."""
-    r, wrench, down, rate = scratch.turn[b], scratch.wrench[b], scratch.work[0], scratch.work[1]
-    for i in range(3):
-        down[i] = r[2, i]
-    turn_back(r, flow_rate, rate)
-    weight, hull = bodies.weight[b], bodies.hull[b]
-    for i in range(3):
-        wrench[i] += (weight[0] - weight[1]) * down[i] + hull[0] * rate[i]
-    add_cross(wrench[3:], weight[2:5], down, 1.0)
-    add_cross(wrench[3:], weight[5:8], down, -1.0)
-    add_cross(wrench[3:], hull[1:4], rate, 1.0)
+@njit(types.void(BODIES, MODULES, F2, F8, F2), cache=True)
+def observe(bodies, modules, rates, gravity, out):
+    """Writes what each module is and feels: out (m, 16) hull centre (world), quaternion, velocity (world), rate and specific force.
 
-
-@njit(types.void(MODULES, types.int64, WATER, F1, F2, SCRATCH), cache=True)
-def _add_drag(modules, m, water, flow, x, scratch):
-    """Drag of one module at its hull centre, by its velocity relative to the water."""
-    b = modules.body[m]
-    work, state = scratch.work, x[b]
-    v, w, f, n, spare = work[2], work[3], work[4], work[5], work[6]
-    turn_back(scratch.turn[b], flow, spare)
-    for i in range(3):
-        spare[i] = state[7 + i] - spare[i]
-    add_cross(spare, state[10:13], modules.position[m], 1.0)
-    turn_back(modules.turn[m], spare, v)
-    turn_back(modules.turn[m], state[10:13], w)
-    half_rho, c, (sx, sy, sz) = 0.5 * water.density, modules.drag[m], (modules.size[m, 0], modules.size[m, 1], modules.size[m, 2])
-    factor = half_rho * drag.translation(sx, sy, sz, c[0], c[1], v[0], v[1], v[2])
-    n[0] = -half_rho * c[2] * drag.rotation(sy, sz, sx, v[1], v[2], w[0])
-    n[1] = -half_rho * c[3] * drag.rotation(sz, sx, sy, v[2], v[0], w[1])
-    n[2] = -half_rho * c[4] * drag.rotation(sx, sy, sz, v[0], v[1], w[2])
-    for i in range(3):
-        f[i] = -(factor + modules.linear[m, i] + modules.quadratic[m, i] * abs(v[i])) * v[i]
-        n[i] -= (modules.linear[m, 3 + i] + modules.quadratic[m, 3 + i] * abs(w[i])) * w[i]
-    turn(modules.turn[m], f, v)
-    turn(modules.turn[m], n, w)
-    add_force(scratch.wrench[b], modules.position[m], v)
-    for i in range(3):
-        scratch.wrench[b, 3 + i] += w[i]
-
-
-@njit(types.void(MODULES, types.int64, WATER, F2, SCRATCH), cache=True)
-def _add_walls(modules, m, water, x, scratch):
-    """Walls, bottom and surface on the eight corners of one module."""
-    b = modules.body[m]
-    r, state, work = scratch.turn[b], x[b], scratch.work
-    centre, corner, at, p, v, f = work[2], work[3], work[4], work[5], work[6], work[7]
-    size = modules.size[m]
-    turn(r, modules.position[m], centre)
-    reach = 0.5 * math.sqrt(size[0] ** 2 + size[1] ** 2 + size[2] ** 2)
-    far = 0.0 if water.is_box else math.hypot(state[0] + centre[0], state[1] + centre[1])
-    for i in range(3):
-        centre[i] += state[i]
-        if i < 2 and water.is_box:
-            far = max(far, abs(centre[i]) - water.extent[i] + water.extent[0])
-    if far + reach < water.extent[0] and reach < centre[2] < water.extent[2] - reach:
-        return
-    lift = 0.25 * water.density * water.gravity * size[0] * size[1]
-    for k in range(8):
-        corner[0] = size[0] * (0.5 if k & 1 else -0.5)
-        corner[1] = size[1] * (0.5 if k & 2 else -0.5)
-        corner[2] = size[2] * (0.5 if k & 4 else -0.5)
-        turn(modules.turn[m], corner, at)
+    Args:
+        rates: (b, 13) derivative of the states now.
+    """
+    x = bodies.state
+    for m in range(modules.body.shape[0]):
+        b = modules.body[m]
+        r, at, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), triple(modules.position, m, 0), matrix(modules.turn, m)
+        v, w = triple(x, b, 7), triple(x, b, 10)
+        p = plus(triple(x, b, 0), turn(r, at))
+        a = plus(plus(triple(rates, b, 7), cross(w, v)), plus(cross(triple(rates, b, 10), at), cross(w, cross(w, at))))
+        felt = turn_back(inside, minus(a, times(gravity, r[2])))
+        velocity, rate = turn(r, plus(v, cross(w, at))), turn_back(inside, w)
         for i in range(3):
-            at[i] += modules.position[m, i]
-            corner[i] = state[7 + i]
-        add_cross(corner, state[10:13], at, 1.0)
-        turn(r, corner, v)
-        turn(r, at, p)
-        for i in range(3):
-            p[i] += state[i]
-        push_of_walls(water, p, v, f)
-        if p[2] < 0.0:  # out of the water: its share of the water plane is no longer carried
-            f[2] += max(0.0, -lift * p[2] - water.damping * v[2])
-        turn_back(r, f, corner)
-        add_force(scratch.wrench[b], at, corner)
-
-
-@njit(types.void(BODIES, types.int64, F1, F1, F1, F1, SCRATCH), cache=True)
-def _accelerate(bodies, b, flow, flow_rate, x, out, scratch):
-    """Kirchhoff's equations solved for the accelerations, and the kinematics."""
-    r, wrench, work = scratch.turn[b], scratch.wrench[b], scratch.work
-    v, w = x[7:10], x[10:13]
-    u, slip, carried = work[2], work[3], work[4]
-    turn_back(r, flow, u)
-    turn_back(r, flow_rate, carried)
-    for i in range(3):
-        slip[i] = v[i] - u[i]
-        carried[i] = -carried[i]
-    add_cross(carried, w, u, 1.0)  # dv_r/dt = dv/dt + carried
-    rigid, added, pull = work[5:7].reshape(6), work[7:9].reshape(6), work[9:11].reshape(6)
-    momentum(bodies.rigid[b], v, w, rigid)
-    momentum(bodies.added[b], slip, w, added)
-    none = work[11]
-    none[:] = 0.0
-    momentum(bodies.added[b], carried, none, pull)
-    for i in range(6):
-        wrench[i] -= pull[i]
-    add_cross(wrench[:3], w, rigid[:3], -1.0)
-    add_cross(wrench[:3], w, added[:3], -1.0)
-    add_cross(wrench[3:], w, rigid[3:], -1.0)
-    add_cross(wrench[3:], w, added[3:], -1.0)
-    add_cross(wrench[3:], v, rigid[:3], -1.0)
-    add_cross(wrench[3:], slip, added[:3], -1.0)
-    momentum(bodies.inverse[b], wrench[:3], wrench[3:], out[7:13])
-    turn(r, v, out[:3])
-    out[3] = -0.5 * (x[4] * w[0] + x[5] * w[1] + x[6] * w[2])
-    out[4] = 0.5 * (x[3] * w[0] + x[5] * w[2] - x[6] * w[1])
-    out[5] = 0.5 * (x[3] * w[1] + x[6] * w[0] - x[4] * w[2])
-    out[6] = 0.5 * (x[3] * w[2] + x[4] * w[1] - x[5] * w[0])
+            out[m, i], out[m, 7 + i], out[m, 10 + i], out[m, 13 + i] = p[i], velocity[i], rate[i], felt[i]
+        q, c = modules.quaternion, x
+        out[m, 3] = c[b, 3] * q[m, 0] - c[b, 4] * q[m, 1] - c[b, 5] * q[m, 2] - c[b, 6] * q[m, 3]
+        out[m, 4] = c[b, 3] * q[m, 1] + c[b, 4] * q[m, 0] + c[b, 5] * q[m, 3] - c[b, 6] * q[m, 2]
+        out[m, 5] = c[b, 3] * q[m, 2] - c[b, 4] * q[m, 3] + c[b, 5] * q[m, 0] + c[b, 6] * q[m, 1]
+        out[m, 6] = c[b, 3] * q[m, 3] + c[b, 4] * q[m, 2] - c[b, 5] * q[m, 1] + c[b, 6] * q[m, 0]

@@ -19,10 +19,11 @@ def translation(a, b, c, cd_face, cd_edge, vx, vy, vz):
 
     Cd = cd_edge + (cd_face - cd_edge)(2 s - 1), s = dx^4 + dy^4 + dz^4: s is 1 face-on and 1/2 edge-on.
     """
-    squared = vx * vx + vy * vy + vz * vz
+    x2, y2, z2 = vx * vx, vy * vy, vz * vz
+    squared = x2 + y2 + z2
     if squared < 1e-18:
         return 0.0
-    s = (vx**4 + vy**4 + vz**4) / (squared * squared)
+    s = (x2 * x2 + y2 * y2 + z2 * z2) / (squared * squared)
     cd = cd_edge + (cd_face - cd_edge) * (2.0 * s - 1.0)
     return cd * (b * c * abs(vx) + a * c * abs(vy) + a * b * abs(vz))
 

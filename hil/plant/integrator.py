@@ -4,73 +4,73 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit, types
 
-from hil.plant.bodies import BODIES, MODULES, SCRATCH, add_force, derivative, turn
+from hil.plant.bodies import BODIES, MODULES, derivative
 from hil.plant.thrusters import THRUSTERS, forces_after, load_supplies, settle
-from hil.plant.water import F1, F2, F3, WATER, flow_at
+from hil.plant.vectors import F2, F3, F8
+from hil.plant.water import WATER, flow_at
 
-F8 = types.float64
+I8 = types.int64
 
 
-@njit(types.void(MODULES, THRUSTERS, F1, F1, F2, F2), cache=True)
-def wrenches(modules, thrusters, force, jets, work, out):
-    """Writes the wrench (b, 6) of all thrusters about O, body frame; `jets` (m, 6) flattened is added to each body."""
-    out[:] = 0.0
-    f, at = work[12], work[13]
-    for t in range(force.shape[0]):
-        m = thrusters.module[t]
-        turn(modules.turn[m], thrusters.position[t], at)
-        turn(modules.turn[m], thrusters.direction[t], f)
-        for i in range(3):
-            at[i] += modules.position[m, i]
-            f[i] *= force[t]
-        add_force(out[modules.body[m]], at, f)
-    for m in range(modules.body.shape[0]):
+@njit(types.void(THRUSTERS, F2, F2), cache=True)
+def wrenches(thrusters, external, out):
+    """Writes the wrench (b, 6) about O, body frame, of all thrusters and of `external` (b, 6)."""
+    for b in range(out.shape[0]):
         for i in range(6):
-            out[modules.body[m], i] += jets[6 * m + i]
+            out[b, i] = external[b, i]
+    for t in range(thrusters.force.shape[0]):
+        for i in range(6):
+            out[thrusters.body[t], i] += thrusters.column[t, i] * thrusters.force[t]
 
 
-@njit(types.void(BODIES, MODULES, THRUSTERS, WATER, F1, types.int64, F8, SCRATCH, F3), cache=True)
-def advance(bodies, modules, thrusters, water, jets, steps, h, scratch, stage):
+@njit(types.void(F2, F8, F2, F2), cache=True)
+def along(x, h, rate, out):
+    """out = x + h rate."""
+    for b in range(x.shape[0]):
+        for i in range(13):
+            out[b, i] = x[b, i] + h * rate[b, i]
+
+
+@njit(types.void(F2, F8, F3), cache=True)
+def close_step(x, h, stage):
+    """Sums the four stages into x and makes the quaternions of unit length."""
+    for b in range(x.shape[0]):
+        for i in range(13):
+            x[b, i] += h / 6.0 * (stage[0, b, i] + 2.0 * (stage[1, b, i] + stage[2, b, i]) + stage[3, b, i])
+        norm = math.sqrt(x[b, 3] ** 2 + x[b, 4] ** 2 + x[b, 5] ** 2 + x[b, 6] ** 2)
+        for i in range(3, 7):
+            x[b, i] /= norm
+
+
+@njit(types.void(BODIES, MODULES, THRUSTERS, WATER, F2, I8, F8, F3, F2), cache=True)
+def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust):
     """Moves everything on by `steps` sub-steps of h seconds.
 
     Args:
-        jets: (6 m,) wrench of foreign jets on each module's body, held over the call.
-        stage: (6, b, 13) working memory; stage[5, :, :6] holds the wrenches.
+        external: (b, 6) wrench of jets and magnets about O, body frame, held over the call.
+        stage: (6, b, 13) working memory; stage[5] is left with the rates at the end.
+        thrust: (b, 6) working memory.
     """
-    x = bodies.state
-    flow, flow_rate = scratch.work[14], scratch.work[15]
-    force = thrusters.force
-    thrust = np.empty((x.shape[0], 6))
+    x, trial = bodies.state, stage[4]
     for s in range(steps):
         load_supplies(thrusters)
         for k in range(4):
             share = 0.0 if k == 0 else (1.0 if k == 3 else 0.5)
             if k != 2:
-                forces_after(thrusters, share * h, force)
-                wrenches(modules, thrusters, force, jets, scratch.work, thrust)
-                flow_at(water, (s + share) * h, flow, flow_rate)
-            if k == 0:
-                derivative(bodies, modules, water, flow, flow_rate, thrust, x, stage[0], scratch)
-            else:
-                for b in range(x.shape[0]):
-                    for i in range(13):
-                        stage[4, b, i] = x[b, i] + share * h * stage[k - 1, b, i]
-                derivative(bodies, modules, water, flow, flow_rate, thrust, stage[4], stage[k], scratch)
-        for b in range(x.shape[0]):
-            for i in range(13):
-                x[b, i] += h / 6.0 * (stage[0, b, i] + 2.0 * (stage[1, b, i] + stage[2, b, i]) + stage[3, b, i])
-            norm = math.sqrt(x[b, 3] ** 2 + x[b, 4] ** 2 + x[b, 5] ** 2 + x[b, 6] ** 2)
-            for i in range(3, 7):
-                x[b, i] /= norm
+                forces_after(thrusters, share * h)
+                wrenches(thrusters, external, thrust)
+            flow, flow_rate = flow_at(water, (s + share) * h)
+            if k > 0:
+                along(x, share * h, stage[k - 1], trial)
+            derivative(bodies, modules, water, flow, flow_rate, thrust, trial if k > 0 else x, stage[k])
+        close_step(x, h, stage)
         settle(thrusters, h)
-    flow_at(water, steps * h, flow, flow_rate)
+    flow, flow_rate = flow_at(water, steps * h)
     for i in range(3):
         water.flow[1, i] = flow[i] - water.flow[0, i]
     load_supplies(thrusters)
-    forces_after(thrusters, 0.0, force)
-    wrenches(modules, thrusters, force, jets, scratch.work, thrust)
-    # What the accelerometers feel now.
-    derivative(bodies, modules, water, flow, flow_rate, thrust, x, stage[5], scratch)
+    forces_after(thrusters, 0.0)
+    wrenches(thrusters, external, thrust)
+    derivative(bodies, modules, water, flow, flow_rate, thrust, x, stage[5])

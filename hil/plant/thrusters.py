@@ -12,10 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, types
 
-from hil.plant.water import F1, F2, F3
+from hil.plant.vectors import F1, F2, F3, F8, I1
 
-F8 = types.float64
-I1 = types.int64[::1]
 
 
 class Thrusters(NamedTuple):
@@ -23,10 +21,10 @@ class Thrusters(NamedTuple):
 
     module: np.ndarray
     """(t,) index of the module."""
-    position: np.ndarray
-    """(t, 3) module frame."""
-    direction: np.ndarray
-    """(t, 3) unit vector of positive force, module frame."""
+    body: np.ndarray
+    """(t,) index of the body."""
+    column: np.ndarray
+    """(t, 6) wrench of unit force about O of that body, body frame."""
     force_curve: np.ndarray
     """(t, 2, 5) forward and reverse polynomial of |command|, N."""
     power_curve: np.ndarray
@@ -43,7 +41,7 @@ class Thrusters(NamedTuple):
     """(m, 2) voltage and current of each module now."""
 
 
-THRUSTERS = types.NamedTuple((I1, F2, F2, F3, F3, F2, F2, F1, F2, F2), Thrusters)
+THRUSTERS = types.NamedTuple((I1, I1, F2, F3, F3, F2, F2, F1, F2, F2), Thrusters)
 
 
 @njit(F8(F1, F8), cache=True)
@@ -95,15 +93,15 @@ def load_supplies(thrusters):
         power[m, 0], power[m, 1] = v, idle_a + conductance * v * v
 
 
-@njit(types.void(THRUSTERS, F8, F1), cache=True)
-def forces_after(thrusters, elapsed_s, out):
-    """Writes the force (t,) of every thruster `elapsed_s` from now, N, at the voltages found by `load_supplies`."""
-    for t in range(out.shape[0]):
+@njit(types.void(THRUSTERS, F8), cache=True)
+def forces_after(thrusters, elapsed_s):
+    """Sets the force of every thruster to that `elapsed_s` from now, at the voltages found by `load_supplies`."""
+    for t in range(thrusters.force.shape[0]):
         lag, target, now = thrusters.constants[t, 2], thrusters.level[t, 0], thrusters.level[t, 1]
         left = math.exp(-elapsed_s / lag) if lag > 0.0 else 0.0
         m = thrusters.module[t]
         scale = thrusters.power[m, 0] / thrusters.supply[m, 0]
-        out[t] = thrusters.constants[t, 0] * scale * scale * (target + (now - target) * left)
+        thrusters.force[t] = thrusters.constants[t, 0] * scale * scale * (target + (now - target) * left)
 
 
 @njit(types.void(THRUSTERS, F8), cache=True)

@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit, types
 
 from hil.plant.spec import Tank, WorldSpec
+from hil.plant.vectors import F1, F2, F8, V3, dot, minus, plus, times, triple
 
-F1, F2, F3 = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 FRICTION = 0.3
 """Largest friction at a wall, share of the normal force (synthetic)."""
 
@@ -34,7 +34,7 @@ class Water(NamedTuple):
     """(3,) half length, half width, depth; or radius, radius, depth, m."""
 
 
-WATER = types.NamedTuple((F2, *(types.float64,) * 5, types.boolean, F1), Water)
+WATER = types.NamedTuple((F2, *(F8,) * 5, types.boolean, F1), Water)
 
 
 def make_water(spec: WorldSpec, tank: Tank) -> Water:
@@ -72,48 +72,47 @@ class Gusts:
         return self._sigma * self._unit
 
 
-@njit(types.void(WATER, types.float64, F1, F1), cache=True)
-def flow_at(water, since_s, velocity, acceleration):
-    """Writes velocity and acceleration (3,) of the water, world frame, `since_s` after `water.flow` was set."""
-    decay = math.exp(-since_s / water.smoothing_s)
-    for i in range(3):
-        mean, now, target = water.flow[0, i], water.flow[1, i], water.flow[2, i]
-        gust = target + (now - target) * decay
-        velocity[i] = mean + gust
-        acceleration[i] = (target - gust) / water.smoothing_s
+@njit(types.Tuple((V3, V3))(WATER, F8), cache=True)
+def flow_at(water, since_s):
+    """Velocity and acceleration of the water, world frame, `since_s` after `water.flow` was set."""
+    keep, rate = math.exp(-since_s / water.smoothing_s), 1.0 / water.smoothing_s
+    target = triple(water.flow, 2, 0)
+    gap = times(keep, minus(triple(water.flow, 1, 0), target))
+    return plus(triple(water.flow, 0, 0), plus(target, gap)), times(-rate, gap)
 
 
-@njit(types.void(WATER, F1, F1, F1), cache=True)
-def push_of_walls(water, p, v, f):
-    """Writes the force (3,) of walls, bottom and surface on one corner at p with velocity v, world frame.
-
-    Above the surface the hull loses buoyancy: the caller adds that by `surface_stiffness`, since it depends on the hull.
-    """
-    f[0] = f[1] = f[2] = 0.0
+@njit(types.boolean(WATER, V3, F8), cache=True)
+def is_clear(water, centre, reach):
+    """Whether a ball of radius `reach` touches neither wall, bottom nor surface."""
+    extent = water.extent
+    if centre[2] < reach or centre[2] > extent[2] - reach:
+        return False
     if water.is_box:
-        for i in range(2):
-            side = 1.0 if p[i] > 0.0 else -1.0
-            _push(water, side * p[i] - water.extent[i], i, side, -1, 0.0, v, f)
-    else:
-        r = math.hypot(p[0], p[1])
-        if r > water.extent[0]:
-            _push(water, r - water.extent[0], 0, p[0] / r, 1, p[1] / r, v, f)
-    _push(water, p[2] - water.extent[2], 2, 1.0, -1, 0.0, v, f)
+        return abs(centre[0]) + reach < extent[0] and abs(centre[1]) + reach < extent[1]
+    return math.hypot(centre[0], centre[1]) + reach < extent[0]
 
 
-@njit(types.void(WATER, types.float64, types.int64, types.float64, types.int64, types.float64, F1, F1), cache=True)
-def _push(water, deep, i, ni, j, nj, v, f):
-    """Adds the force of one wall, `deep` metres into it, to f; its outward normal has ni on axis i and nj on axis j."""
+@njit(V3(WATER, F8, V3, V3), cache=True)
+def _push(water, deep, outward, v):
+    """Force of one wall on a point that is `deep` metres into it."""
     if deep <= 0.0:
-        return
-    n0 = ni if i == 0 else 0.0
-    n1 = ni if i == 1 else (nj if j == 1 else 0.0)
-    n2 = ni if i == 2 else 0.0
-    into = v[0] * n0 + v[1] * n1 + v[2] * n2
+        return (0.0, 0.0, 0.0)
+    into = dot(v, outward)
     normal = max(0.0, water.stiffness * deep + water.damping * into)
-    t0, t1, t2 = v[0] - into * n0, v[1] - into * n1, v[2] - into * n2
-    speed = math.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    along = minus(v, times(into, outward))
+    speed = math.sqrt(dot(along, along))
     rub = min(water.damping, FRICTION * normal / speed) if speed > 1e-9 else 0.0
-    f[0] -= normal * n0 + rub * t0
-    f[1] -= normal * n1 + rub * t1
-    f[2] -= normal * n2 + rub * t2
+    return plus(times(-normal, outward), times(-rub, along))
+
+
+@njit(V3(WATER, V3, V3), cache=True)
+def push_of_walls(water, p, v):
+    """Force of walls and bottom on one corner at p with velocity v, world frame."""
+    extent = water.extent
+    f = _push(water, p[2] - extent[2], (0.0, 0.0, 1.0), v)
+    if water.is_box:
+        x, y = (1.0 if p[0] > 0.0 else -1.0), (1.0 if p[1] > 0.0 else -1.0)
+        f = plus(f, _push(water, x * p[0] - extent[0], (x, 0.0, 0.0), v))
+        return plus(f, _push(water, y * p[1] - extent[1], (0.0, y, 0.0), v))
+    r = math.hypot(p[0], p[1])
+    return plus(f, _push(water, r - extent[0], (p[0] / r, p[1] / r, 0.0), v)) if r > extent[0] else f

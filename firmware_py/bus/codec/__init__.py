@@ -1,0 +1,24 @@
+"""The wire: can_dbc/modcube.dbc compiled once into fast encoders and decoders. Pure; no socket, no clock.
+
+The firmware and the simulated nodes use it at both ends of every frame. cantools reads the DBC; it codes nothing here.
+"""
+
+from firmware_py.bus.codec.crc import crc8
+from firmware_py.bus.codec.database import Codec
+from firmware_py.bus.codec.message import NO_COUNTER, CodecError, Field, Frame, MessageCodec
+from firmware_py.bus.codec.quaternion import pack_quaternion, unpack_quaternion
+from firmware_py.bus.codec.receiver import Received, Receiver
+
+__all__ = [
+    "NO_COUNTER",
+    "Codec",
+    "CodecError",
+    "Field",
+    "Frame",
+    "MessageCodec",
+    "Received",
+    "Receiver",
+    "crc8",
+    "pack_quaternion",
+    "unpack_quaternion",
+]

@@ -1,0 +1,38 @@
+"""All messages of can_dbc/modcube.dbc, read once at start."""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import Any
+
+import cantools.database
+
+from firmware_py.bus.codec.message import CodecError, MessageCodec
+
+
+class Codec:
+    """All messages of the DBC."""
+
+    def __init__(self, database: Any) -> None:
+        self.messages: tuple[MessageCodec, ...] = tuple(MessageCodec(message) for message in database.messages)
+        self._by_name = {message.name: message for message in self.messages}
+        self._by_function = {message.function: message for message in self.messages}
+        if len(self._by_function) != len(self.messages):
+            raise CodecError("two messages of the DBC have the same function")
+
+    @classmethod
+    def load(cls) -> Codec:
+        """The codec of the DBC that the package carries (20 ms; make one and pass it on)."""
+        text = (resources.files("can_dbc") / "modcube.dbc").read_text(encoding="utf-8")
+        return cls(cantools.database.load_string(text, "dbc", frame_id_mask=0x7E0))
+
+    def message(self, name: str) -> MessageCodec:
+        """The message called `name`. Raises KeyError, with the names that there are."""
+        try:
+            return self._by_name[name]
+        except KeyError:
+            raise KeyError(f"no message {name!r}; there are {', '.join(self._by_name)}") from None
+
+    def by_id(self, can_id: int) -> MessageCodec | None:
+        """The message of an 11-bit id, whatever its number; None where the DBC has none. 0x000..0x01F is ESTOP."""
+        return self._by_function.get(can_id >> 5) if 0 <= can_id <= 0x7FF else None

@@ -1,0 +1,109 @@
+"""Whether placed modules can be docked so: cells, faces, probes and drogues, payloads. A refusal names the modules."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import FACE_NAMES, Vehicle
+from firmware_py.prepare.lattice import MATRICES, face_towards
+
+Cell = tuple[int, int, int]
+
+PAYLOAD_CLEARANCE_M = 1e-3
+"""A payload may reach this far into a neighbour's cell: manufacturing tolerance."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where one module sits: its vehicle, lattice cell and rotation index."""
+
+    vehicle: Vehicle
+    cell: Cell
+    rotation: int
+
+
+def check_joints(placements: Sequence[Placement], modules: Sequence[int], pitch_m: float) -> None:
+    """Refuse placements that cannot be docked.
+
+    Args:
+        placements: the modules.
+        modules: their fleet indices, by which they are named.
+        pitch_m: lattice pitch.
+
+    Raises:
+        DescriptionError: two modules in one cell, a payload in another's cell, a probe that meets no drogue, or a
+            module that no joint leads to.
+    """
+    at: dict[Cell, int] = {}
+    for i, placement in enumerate(placements):
+        if placement.cell in at:
+            other = modules[at[placement.cell]]
+            raise DescriptionError(f"modules {other} and {modules[i]} overlap in cell {placement.cell}")
+        if not 0 <= placement.rotation < 24:
+            raise DescriptionError(f"module {modules[i]}: rotation {placement.rotation} is none of 0 to 23")
+        at[placement.cell] = i
+    _check_payloads(placements, modules, at, pitch_m)
+    joints: dict[int, list[int]] = {i: [] for i in range(len(placements))}
+    for i, placement in enumerate(placements):
+        for axis in range(3):
+            j = at.get(_neighbour(placement.cell, axis))
+            if j is not None and _joined(placements, modules, i, j, axis):
+                joints[i].append(j)
+                joints[j].append(i)
+    reached = _reached(joints)
+    if lost := [str(modules[i]) for i in range(len(placements)) if i not in reached]:
+        raise DescriptionError(f"no docked face joins module {', '.join(lost)} to module {modules[0]}")
+
+
+def _neighbour(cell: Cell, axis: int) -> Cell:
+    x, y, z = (c + (k == axis) for k, c in enumerate(cell))
+    return x, y, z
+
+
+def _joined(placements: Sequence[Placement], modules: Sequence[int], i: int, j: int, axis: int) -> bool:
+    """Whether the faces between neighbours i and j (i below j along `axis`) dock. A probe needs a drogue before it."""
+    unit = [0, 0, 0]
+    unit[axis] = 1
+    upper = face_towards(placements[i].rotation, (unit[0], unit[1], unit[2]))
+    lower = face_towards(placements[j].rotation, (-unit[0], -unit[1], -unit[2]))
+    kinds = placements[i].vehicle.faces[upper] + placements[j].vehicle.faces[lower]
+    if kinds in ("PP", "P-", "-P"):
+        what = "probe" if kinds == "PP" else "a face without drogue"
+        first, second = ((i, upper), (j, lower)) if kinds[0] == "P" else ((j, lower), (i, upper))
+        raise DescriptionError(
+            f"module {modules[first[0]]}'s probe on face {FACE_NAMES[first[1]]} meets {what} on face "
+            f"{FACE_NAMES[second[1]]} of module {modules[second[0]]}"
+        )
+    return set(kinds) == {"P", "D"}
+
+
+def _reached(joints: Mapping[int, Sequence[int]]) -> set[int]:
+    reached, open_ends = {0}, [0]
+    while open_ends:
+        for j in joints[open_ends.pop()]:
+            if j not in reached:
+                reached.add(j)
+                open_ends.append(j)
+    return reached
+
+
+def _check_payloads(
+    placements: Sequence[Placement], modules: Sequence[int], at: Mapping[Cell, int], pitch_m: float
+) -> None:
+    for i, placement in enumerate(placements):
+        turn = MATRICES[placement.rotation]
+        for payload in placement.vehicle.payload:
+            centre = np.array(placement.cell) + turn @ payload.position_m / pitch_m
+            half = np.maximum(np.abs(turn) @ payload.size_m / 2.0 - PAYLOAD_CLEARANCE_M, 0.0) / pitch_m
+            low, high = (centre - half + 0.5, centre + half + 0.5)
+            spans = [range(math.floor(a), math.ceil(b)) for a, b in zip(low, high, strict=True)]
+            for cell in ((x, y, z) for x in spans[0] for y in spans[1] for z in spans[2]):
+                if at.get(cell, i) != i:
+                    other = modules[at[cell]]
+                    what = f"payload {payload.name!r} of module {modules[i]}"
+                    raise DescriptionError(f"{what} is in the way of module {other}")

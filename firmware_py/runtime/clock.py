@@ -1,0 +1,39 @@
+"""Clocks: the only place of the firmware that reads one. Everything else is given time as integer nanoseconds."""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Something that knows the time."""
+
+    def now_ns(self) -> int:
+        """Nanoseconds since an arbitrary moment; never goes back."""
+        ...
+
+
+class ManualClock:
+    """Time that stands until it is set: lockstep, where the bench owns time."""
+
+    def __init__(self, start_ns: int = 0) -> None:
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        """The time that was set last."""
+        return self._now_ns
+
+    def set(self, now_ns: int) -> None:
+        """Move to `now_ns`. Raises ValueError for a step back."""
+        if now_ns < self._now_ns:
+            raise ValueError(f"time cannot go back from {self._now_ns} to {now_ns} ns")
+        self._now_ns = now_ns
+
+
+class MonotonicClock:
+    """The machine's CLOCK_MONOTONIC: the same for all processes of one machine."""
+
+    def now_ns(self) -> int:
+        """Nanoseconds since the machine's start."""
+        return time.clock_gettime_ns(time.CLOCK_MONOTONIC)

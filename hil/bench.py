@@ -1,0 +1,123 @@
+"""The bench: firmware and plant on one bus in lockstep, one process and one thread. It owns time, flies a scenario and judges it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from firmware_py.app.firmware import BusFrame, Firmware, compose
+from firmware_py.app.lockstep import Lockstep, Observer, drain
+from firmware_py.bus.codec import Codec
+from firmware_py.bus.port import Port, open_port
+from firmware_py.core.types import Inputs, Outputs, Request
+from firmware_py.description.fleet import Fleet, Module
+from firmware_py.description.parameters import Parameters
+from firmware_py.runtime.recorder import Recorder
+from hil.nodes import Nodes, make_nodes
+from hil.scenario import Scenario, make_world
+from hil.script import Script
+from hil.signals import TruthRecorder
+
+FLUSH_EVERY_S = 0.5
+"""How often logs are handed to the operating system."""
+DEFAULT_BUS = "virtual:modcube"
+
+
+@dataclass(slots=True)
+class Bench:
+    """One scenario on one bus, ready to fly."""
+
+    scenario: Scenario
+    seed: int
+    fleet: Fleet
+    firmware: Firmware
+    nodes: Nodes
+    script: Script
+    firmware_port: Port
+    plant_port: Port
+
+    def fly(
+        self, observers: Sequence[Observer] = (), progress: Callable[[float], None] | None = None, truth: TruthRecorder | None = None
+    ) -> float:
+        """Flies to the end of the script; returns the wall time it took, s."""
+        lockstep = Lockstep(self.firmware, [self.firmware_port], observers)
+        period_ns = self.fleet.period_ns
+        sent, began = 0, time.perf_counter()
+        outputs: Outputs | None = None
+        for tick in range(1, self.script.ticks + 1):
+            time_ns = tick * period_ns
+            sent += lockstep.start_tick(tick, time_ns)
+            answers = self.nodes.step([frame for _, frame in drain([self.plant_port], sent)])
+            for frame in answers:
+                self.plant_port.send(frame)
+            if truth is not None:
+                self._record_truth(truth, tick)
+            outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), len(answers))
+            if progress is not None and tick % self.fleet.rate_hz == 0:
+                progress(time_ns * 1e-9)
+        return time.perf_counter() - began
+
+    def _record_truth(self, recorder: TruthRecorder, tick: int) -> None:
+        world = self.nodes.world
+        for module in range(len(self.fleet.module)):
+            t = world.truth(module)
+            recorder.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w)
+
+
+def fleet_of(scenario: Scenario, bus: str, rate_hz: int) -> Fleet:
+    """The fleet that a scenario's modules make up, all on one bus."""
+    modules = tuple(Module(number=m.number, vehicle=m.vehicle) for m in scenario.module)
+    return Fleet(module=modules, buses=(bus,), rate_hz=rate_hz)
+
+
+def open_bench(
+    stack: ExitStack, scenario: Scenario, seed: int, parameters: Parameters, bus: str = DEFAULT_BUS, rate_hz: int = 100
+) -> Bench:
+    """A bench whose two ports are closed with `stack`. Raises DescriptionError and PortError."""
+    fleet = fleet_of(scenario, bus, rate_hz)
+    firmware = compose(fleet, parameters)
+    world = make_world(scenario, seed, fleet.period_ns)
+    numbers = {module.number: index for index, module in enumerate(fleet.module)}
+    nodes = make_nodes(world, Codec.load(), numbers, scenario)
+    ports = [stack.enter_context(open_port(bus)) for _ in range(2)]
+    return Bench(scenario, seed, fleet, firmware, nodes, Script(scenario, fleet), ports[0], ports[1])
+
+
+def recording(recorder: Recorder, rate_hz: int) -> Observer:
+    """An observer that writes every tick to `recorder`."""
+    flush_every = max(1, round(FLUSH_EVERY_S * rate_hz))
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        # SYNC went out before the answers came; the log keeps that order
+        recorder.sent(outputs.time_ns, 0, [frame for _, frame in sent[:1]])
+        recorder.received(outputs.time_ns, 0, [frame for _, frame in received])
+        recorder.sent(outputs.time_ns, 0, [frame for _, frame in sent[1:]])
+        recorder.record(inputs, outputs)
+        if outputs.tick % flush_every == 0:
+            outputs.events += recorder.flush()
+
+    return observe
+
+
+def fly_scenario(
+    scenario: Scenario,
+    seed: int,
+    parameters: Parameters,
+    out: Path,
+    bus: str = DEFAULT_BUS,
+    rate_hz: int = 100,
+    progress: Callable[[float], None] | None = None,
+) -> float:
+    """Flies `scenario` and leaves the logs in `out`; returns the wall time of the flight, s."""
+    with ExitStack() as stack:
+        bench = open_bench(stack, scenario, seed, parameters, bus, rate_hz)
+        recorder = Recorder(out, {"scenario": scenario.name, "seed": seed, "rate_hz": rate_hz})
+        stack.callback(recorder.close)
+        thrusters = tuple(len(v.thruster) for v in bench.nodes.world.vehicles)
+        truth = stack.enter_context(TruthRecorder(out, thrusters))
+        return bench.fly([recording(recorder, rate_hz)], progress, truth)
+
+

@@ -1,0 +1,271 @@
+"""The simulated CAN nodes: the MCU of each module and the tag camera, between the frames of a bus and the world.
+
+Per tick: the world advances one period, then the frames that came are taken in order; SYNC makes an MCU apply its last accepted
+command, sample and answer, MCU_STATUS last. Nothing here knows the controller.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from firmware_py.bus.codec import Codec, Frame, Received, Receiver, pack_quaternion
+from hil.plant.camera import Camera, Sighting
+from hil.plant.draw import stream
+from hil.plant.sensors import Noise, Sensors
+from hil.plant.spec import SensorSpec
+from hil.plant.world import World
+
+TIMEOUT_NS = 100_000_000
+"""A half of THRUSTER_CMD that is older commands zero."""
+RELEASE_NS = 200_000_000
+"""An e-stop may be released when none came for so long."""
+VERSION = 1
+CABIN_PA = 101325.0
+CABIN_C = 30.0
+
+DISARMED, ARMED, TIMED_OUT, STOPPED = 1, 2, 3, 4
+"""MCU_STATUS states."""
+ERROR_BITS = {"crc": 1, "counter": 2, "length": 4}
+ERROR_TIMEOUT = 8
+
+SLOW = (
+    "DEPTH", "DOCK_CURRENT_ABC", "DOCK_CURRENT_DEF", "ESC_FEEDBACK_1", "ESC_FEEDBACK_2", "ESC_FEEDBACK_3", "ESC_FEEDBACK_4",
+    "POWER", "ENVIRONMENT",
+)  # fmt: skip
+"""Messages that are not sent in every tick."""
+
+
+class Mcu:
+    """The microcontroller of one module."""
+
+    def __init__(self, codec: Codec, number: int, module: int, world: World, spec: SensorSpec) -> None:
+        self.number, self.module = number, module
+        self.stopped = False
+        self.timed_out = False
+        self.relays = [0] * 6
+        self.errors = 0
+        self._world, self._spec = world, spec
+        self._sensors = Sensors(spec, world.spec, world.seed, module)
+        self._thrusters = len(world.vehicles[module].thruster)
+        self._command = np.zeros(8)
+        self._armed = [False, False]
+        self._accepted_ns: list[int | None] = [None, None]
+        self._applied = np.zeros(8)
+        self._last_estop_ns = 0
+        self._power = Noise(stream(world.seed, "power", module), 2)
+        self._rpm = Noise(stream(world.seed, "rpm", module), 8)
+        self._dock = Noise(stream(world.seed, "dock", module), 6)
+        self._fast = [codec.message(name) for name in ("GYRO", "ACCEL", "MCU_STATUS")]
+        self._slow = _schedule(codec, number, world.period_ns)
+        self._counters = dict.fromkeys(SLOW, 0)
+
+    def heard(self, received: Received, time_ns: int) -> None:
+        """A checked frame for this module."""
+        name, values = received.message.name, received.values
+        if name in ("THRUSTER_CMD_A", "THRUSTER_CMD_B"):
+            half = 0 if name == "THRUSTER_CMD_A" else 1
+            self._command[4 * half : 4 * half + 4] = values[:4]
+            self._armed[half] = values[4] == 1
+            self._accepted_ns[half] = time_ns
+            if values[4] == 0 and time_ns - self._last_estop_ns >= RELEASE_NS:
+                self.stopped = False
+        elif name == "DOCK_CMD":
+            self.relays = [int(v) for v in values[:6]]
+
+    def estop(self, time_ns: int) -> None:
+        """An ESTOP frame came: thrust ends at once, without waiting for SYNC."""
+        self.stopped = True
+        self._last_estop_ns = time_ns
+        self._apply(np.zeros(8))
+
+    def watch(self, time_ns: int) -> None:
+        """The MCU's own clock: each half of the command that has grown old ends, SYNC or not."""
+        for half, accepted in enumerate(self._accepted_ns):
+            if accepted is None or time_ns - accepted > TIMEOUT_NS:
+                self._armed[half] = False
+                if self._applied[4 * half : 4 * half + 4].any():
+                    self._applied[4 * half : 4 * half + 4] = 0.0
+                    self._apply(self._applied)
+
+    def sync(self, tick: int, time_ns: int) -> list[Frame]:
+        """Applies the last accepted command, samples, answers."""
+        live = [a is not None and time_ns - a <= TIMEOUT_NS for a in self._accepted_ns]
+        self.timed_out = not all(live)
+        # A fresh half that says disarmed disarms both; a half that is old is zero by itself.
+        disarmed = any(fresh and not armed for fresh, armed in zip(live, self._armed, strict=True))
+        wanted = np.repeat([fresh and not disarmed and not self.stopped for fresh in live], 4)
+        self._apply(np.where(wanted, self._command, 0.0))
+        truth = self._world.truth(self.module)
+        gyro, accel, status = self._fast
+        frames = [
+            gyro.encode(self.number, [*self._sensors.gyro(truth).tolist(), 0], tick),
+            accel.encode(self.number, [*self._sensors.accel(truth).tolist(), 0], tick),
+        ]
+        for message, every, phase in self._slow:
+            if tick % every == phase:
+                counter = self._counters[message.name]
+                self._counters[message.name] = (counter + 1) & 15
+                frames.append(message.encode(self.number, self._reading(message.name, truth), counter))
+        errors = self.errors | (ERROR_TIMEOUT if self.timed_out else 0)
+        self.errors = 0
+        frames.append(status.encode(self.number, [tick & 0xFFFF, VERSION, errors, self._state(disarmed)], tick))
+        return frames
+
+    def _apply(self, command: np.ndarray) -> None:
+        self._applied = command.copy()
+        self._world.set_command(self.module, command[: self._thrusters], True)
+
+    def _state(self, disarmed: bool) -> int:
+        if self.stopped:
+            return STOPPED
+        if self.timed_out:
+            return TIMED_OUT
+        return DISARMED if disarmed else ARMED
+
+    def _reading(self, name: str, truth: Any) -> list[float]:
+        """Values of one slow message, in the order of its fields."""
+        if name == "DEPTH":
+            return [self._sensors.pressure_pa(truth), self._world.spec.temperature_c, 0]
+        if name.startswith("DOCK_CURRENT"):
+            first = 0 if name.endswith("ABC") else 3
+            noise = self._spec.dock_sigma_ma * self._dock.take()
+            return [*noise[first : first + 3].tolist(), *self.relays[first : first + 3]]
+        if name.startswith("ESC_FEEDBACK"):
+            return self._esc(2 * (int(name[-1]) - 1))
+        if name == "POWER":
+            noise = self._power.take() * (self._spec.voltage_sigma_v, self._spec.current_sigma_a)
+            return [truth.voltage_v + float(noise[0]), truth.current_a + float(noise[1]), 0]
+        return [CABIN_C, CABIN_PA, 0]
+
+    def _esc(self, first: int) -> list[float]:
+        noise = self._spec.rpm_sigma * self._rpm.take()
+        values: list[float] = []
+        readings = self._world.esc(self.module)
+        for i in (first, first + 1):
+            if i < self._thrusters:
+                rpm, current = readings[i]
+                values += [float(rpm + (noise[i] if rpm else 0.0)), float(current), 0]
+            else:
+                values += [0.0, 0.0, 3]
+        return values
+
+
+class TagCamera:
+    """The camera's node: sends what the camera saw, when its delay is over."""
+
+    def __init__(self, codec: Codec, camera: Camera, numbers: Mapping[int, int], spec: SensorSpec, world: World) -> None:
+        self._position, self._attitude = codec.message("TAG_POSITION"), codec.message("TAG_ATTITUDE")
+        self._camera, self._world = camera, world
+        self._number_of = {module: number for number, module in numbers.items()}
+        self._delay_ns = round(1e6 * spec.tag_delay_ms)
+        self._waiting: deque[tuple[Sighting, int, int]] = deque()
+        self._sync: tuple[int, int] | None = None
+        self._counters = dict.fromkeys(self._number_of, 0)
+        self.watch()
+
+    def watch(self) -> None:
+        """Takes the pictures that have become due; each is stamped by the last SYNC heard before it."""
+        for sighting in self._camera.watch(self._world):
+            if self._sync is None or sighting.module not in self._number_of:
+                continue
+            tick, sync_ns = self._sync
+            offset_ns = sighting.capture_ns - sync_ns
+            if 0 <= offset_ns <= 25_500_000:  # what 8 bits of 0.1 ms can say
+                self._waiting.append((sighting, tick, offset_ns))
+
+    def sync(self, tick: int, time_ns: int) -> list[Frame]:
+        """Notes the time of SYNC and sends what is due."""
+        self._sync = (tick, time_ns)
+        frames = []
+        while self._waiting and self._waiting[0][0].capture_ns + self._delay_ns <= time_ns:
+            sighting, capture_tick, offset_ns = self._waiting.popleft()
+            counter = self._counters[sighting.module]
+            self._counters[sighting.module] = (counter + 1) & 15
+            number = self._number_of[sighting.module]
+            frames.append(self._position.encode(number, sighting.p_wt.tolist(), counter))
+            values = [*pack_quaternion(sighting.q_wt), sighting.tag_id, sighting.quality, capture_tick & 0xFF, 1e-6 * offset_ns]
+            frames.append(self._attitude.encode(number, values, counter))
+        return frames
+
+
+class Nodes:
+    """All nodes of one bus."""
+
+    def __init__(
+        self, world: World, codec: Codec, numbers: Mapping[int, int], sensors: SensorSpec, cameras: Sequence[Camera] = ()
+    ) -> None:
+        """Args: numbers: number on this bus -> index of the module in the world."""
+        self.world = world
+        self.receiver = Receiver(codec)
+        self.mcus = {number: Mcu(codec, number, module, world, sensors) for number, module in numbers.items()}
+        self.cameras = [TagCamera(codec, camera, numbers, sensors, world) for camera in cameras]
+        self.estops: list[int] = []
+
+    def step(self, frames: Iterable[Frame]) -> list[Frame]:
+        """One tick of a world that has this one bus: advance a period, take the frames, return the answers."""
+        self.world.advance(self.world.period_ns)
+        self.watch()
+        answers: list[Frame] = []
+        for frame in frames:
+            answers += self.take(frame, self.world.time_ns)
+        return answers
+
+    def watch(self) -> None:
+        """What happens without any frame: time-outs and pictures. To be called after every advance of the world."""
+        for camera in self.cameras:
+            camera.watch()
+        for mcu in self.mcus.values():
+            mcu.watch(self.world.time_ns)
+
+    def take(self, frame: Frame, time_ns: int) -> list[Frame]:
+        """One frame from the bus at `time_ns` on the plant's clock; returns the answers. Bad frames are counted and dropped."""
+        before = dict(self.receiver.dropped)
+        received = self.receiver.accept(frame)
+        if received is None:
+            self._blame(frame, before)
+            return []
+        name = received.message.name
+        if name == "ESTOP":
+            for mcu in self.mcus.values():
+                mcu.estop(time_ns)
+            return []
+        if name == "SYNC":
+            tick = int(received.values[0])
+            answers = [f for camera in self.cameras for f in camera.sync(tick, time_ns)]
+            for mcu in self.mcus.values():
+                answers += mcu.sync(tick, time_ns)
+            return answers
+        if received.number in self.mcus:
+            self.mcus[received.number].heard(received, time_ns)
+        return []
+
+    def _blame(self, frame: Frame, before: dict[str, int]) -> None:
+        """The MCU that a dropped frame was meant for reports the kind of error."""
+        mcu = self.mcus.get(frame.id & 0x1F)
+        if mcu is None:
+            return
+        for kind, bit in ERROR_BITS.items():
+            if self.receiver.dropped[kind] != before[kind]:
+                mcu.errors |= bit
+
+
+def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[Any, int, int]]:
+    """(message, every so many ticks, in which of them): staggered by message and module."""
+    slow = []
+    for index, name in enumerate(SLOW):
+        message = codec.message(name)
+        every = max(1, round(message.cycle_ms * 1_000_000 / period_ns))
+        slow.append((message, every, (index + 3 * number) % every))
+    return slow
+
+
+def make_nodes(world: World, codec: Codec, numbers: Mapping[int, int], scenario: Any) -> Nodes:
+    """The nodes of a scenario on one bus; `numbers` maps numbers on the bus to modules."""
+    cameras = [
+        Camera(pose, scenario.sensors, world.vehicles, scenario.tags, world.seed, index) for index, pose in enumerate(scenario.camera)
+    ]
+    return Nodes(world, codec, numbers, scenario.sensors, cameras)

@@ -1,0 +1,104 @@
+"""What differs from the vehicle file in one run: drawn per seed, each source of error from a stream of its own.
+
+The magnitude scales numbers that are always drawn, so switching one error off changes no other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware_py.description.vehicle import Vehicle
+from hil.plant.spec import WorldSpec
+
+SOURCES = (
+    "gusts", "buoyancy", "righting", "trim", "mass", "inertia", "drag", "gain", "deadband", "gyro", "accel", "depth", "tag_phase",
+    "tag_noise", "tag_loss", "tag_flip", "power", "rpm", "dock", "contact", "faults",
+)  # fmt: skip
+"""Names of the streams. New ones go to the end: the order is part of what a seed means."""
+
+
+def stream(seed: int, source: str, module: int = 0) -> np.random.Generator:
+    """The generator of one source of error of one module: what SeedSequence(seed).spawn would give at its place."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(SOURCES.index(source), module))
+    return np.random.Generator(np.random.PCG64(sequence))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModuleDraw:
+    """One module as it really is.
+
+    Attributes:
+        dry_kg, entrained_kg: masses.
+        weight_at, buoyancy_at: (3,) where weight and buoyancy of the dry parts act, module frame.
+        buoyancy_n: buoyancy of the dry parts.
+        com: (3,) centre of mass, water included, module frame.
+        inertia: (3, 3) of robot and entrained water about `com`.
+        added: (6,) added mass about the hull centre.
+        drag: (5,) coefficients face-on, edge-on, of rotation about x, y, z.
+        gain, deadband_n: (t,) of each thruster.
+    """
+
+    dry_kg: float
+    entrained_kg: float
+    weight_at: np.ndarray
+    buoyancy_at: np.ndarray
+    buoyancy_n: float
+    com: np.ndarray
+    inertia: np.ndarray
+    added: np.ndarray
+    drag: np.ndarray
+    gain: np.ndarray
+    deadband_n: np.ndarray
+
+
+def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> ModuleDraw:
+    """Module number `module` of the run `seed`."""
+    count, inertial = len(vehicle.thruster), vehicle.inertial
+
+    def spread(source: str, share: float, size: int) -> np.ndarray:
+        return 1.0 + share * stream(seed, source, module).uniform(-1.0, 1.0, size)
+
+    mass = spread("mass", spec.mass_spread, 4)
+    turn = spread("inertia", spec.inertia_spread, 6)
+    dry, entrained = inertial.dry_kg * mass[0], inertial.entrained_kg * mass[0]
+    sign = -1.0 if stream(seed, "buoyancy", module).uniform() < 0.5 else 1.0
+    arm = inertial.righting_arm_m + spec.righting_spread_m * stream(seed, "righting", module).uniform(-1.0, 1.0)
+    shift = np.append(spec.trim_m * stream(seed, "trim", module).uniform(-1.0, 1.0, 2), 0.0)
+    drag = vehicle.drag
+    root = np.sqrt(turn[:3])
+    deadband = spec.deadband_low_n + (spec.deadband_high_n - spec.deadband_low_n) * stream(seed, "deadband", module).uniform(0, 1, count)
+    return ModuleDraw(
+        dry_kg=dry,
+        entrained_kg=entrained,
+        weight_at=inertial.com_m + shift,
+        buoyancy_at=inertial.com_m - np.array([0.0, 0.0, arm]),
+        buoyancy_n=dry * spec.gravity + sign * spec.buoyancy_error_n,
+        com=inertial.com_m + shift * dry / (dry + entrained),
+        inertia=inertial.inertia * np.outer(root, root),
+        added=inertial.added * np.concatenate([mass[1:], turn[3:]]),
+        drag=np.array([drag.cd_face, drag.cd_edge, *(drag.rotational_cd,) * 3]) * spread("drag", spec.drag_spread, 5),
+        gain=spread("gain", spec.gain_spread, count),
+        deadband_n=deadband,
+    )
+
+
+def skew(a: np.ndarray) -> np.ndarray:
+    """(3, 3) S with S b = a x b."""
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+
+
+def rigid_matrix(mass: float, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """(6, 6) mass matrix about a point O of a body with centre of mass `com` from O and `inertia` about that centre."""
+    s = skew(com)
+    return np.block([[mass * np.eye(3), -mass * s], [mass * s, inertia - mass * s @ s]])
+
+
+def carried(matrix: np.ndarray, position: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """A (6, 6) mass matrix about a module's origin, seen about O of its body: H^T M H.
+
+    H takes [v; w] of O in the body frame to [v; w] of the module in its own: v_m = T^T (v + w x r), w_m = T^T w.
+    """
+    h = np.block([[turn.T, -turn.T @ skew(position)], [np.zeros((3, 3)), turn.T]])
+    return h.T @ matrix @ h

@@ -1,0 +1,71 @@
+"""Gyro, accelerometer and depth sensor of one module: truth plus bias that wanders plus noise. Sampled at SYNC."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hil.plant.draw import stream
+from hil.plant.spec import SensorSpec, WorldSpec
+from hil.plant.world import Truth
+
+BLOCK = 1024
+"""Random numbers drawn at a time: one call for each sample would cost more than the rest of the sensor."""
+
+
+class Noise:
+    """Standard normal numbers in groups of `width`, from blocks drawn ahead."""
+
+    def __init__(self, rng: np.random.Generator, width: int) -> None:
+        self._rng, self._width, self._next = rng, width, BLOCK
+        self._block = np.zeros((0, width))
+
+    def take(self) -> np.ndarray:
+        """(width,) fresh numbers."""
+        if self._next >= BLOCK:
+            self._block, self._next = self._rng.standard_normal((BLOCK, self._width)), 0
+        self._next += 1
+        return self._block[self._next - 1]
+
+
+class Channel:
+    """Error of one sensor: a bias drawn once, its random walk, and white noise."""
+
+    def __init__(self, rng: np.random.Generator, width: int, sigma: float, bias: float, walk: float) -> None:
+        self._noise = Noise(rng, 2 * width)
+        self._width, self._sigma, self._walk = width, sigma, walk
+        self.bias: np.ndarray = bias * rng.standard_normal(width)
+        self._then_ns = 0
+
+    def sample(self, time_ns: int) -> np.ndarray:
+        """(width,) the error now; the walk goes on by the time since the last sample."""
+        draw = self._noise.take()
+        elapsed_s = 1e-9 * (time_ns - self._then_ns)
+        self._then_ns = time_ns
+        self.bias = self.bias + self._walk * math.sqrt(elapsed_s) * draw[: self._width]
+        return self.bias + self._sigma * draw[self._width :]
+
+
+class Sensors:
+    """What one module's MCU reads of its own motion."""
+
+    def __init__(self, spec: SensorSpec, world: WorldSpec, seed: int, module: int) -> None:
+        s = spec
+        self._world = world
+        self._gyro = Channel(stream(seed, "gyro", module), 3, s.gyro_sigma, s.gyro_bias, s.gyro_walk)
+        self._accel = Channel(stream(seed, "accel", module), 3, s.accel_sigma, s.accel_bias, s.accel_walk)
+        self._depth = Channel(stream(seed, "depth", module), 1, s.depth_sigma_m, s.depth_bias_m, s.depth_walk)
+
+    def gyro(self, truth: Truth) -> np.ndarray:
+        """(3,) angular rate, module frame, rad/s."""
+        return truth.w_b + self._gyro.sample(truth.time_ns)
+
+    def accel(self, truth: Truth) -> np.ndarray:
+        """(3,) specific force at the hull centre, module frame, m/s^2: (0, 0, -g) at rest and level."""
+        return truth.specific_force + self._accel.sample(truth.time_ns)
+
+    def pressure_pa(self, truth: Truth) -> float:
+        """Absolute pressure at the hull centre, Pa."""
+        depth = truth.p_wm[2] + float(self._depth.sample(truth.time_ns)[0])
+        return self._world.atmosphere_pa + self._world.density * self._world.gravity * depth

@@ -1,0 +1,261 @@
+"""The world of one run: all modules, the water, and the truth about them. Everything else of the plant asks this.
+
+Time moves only by `advance`. Modules that are docked share a body; one module each to begin with.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core import rotations
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import Vehicle
+from hil.plant import thrusters as thrusters_module
+from hil.plant.bodies import Bodies, Modules, observe
+from hil.plant.draw import ModuleDraw, carried, draw_module, rigid_matrix, stream
+from hil.plant.integrator import advance
+from hil.plant.spec import Tank, WorldSpec
+from hil.plant.thrusters import Thrusters
+from hil.plant.water import Gusts, make_water
+
+STEP_NS = 2_500_000
+"""Sub-step of the integration."""
+
+
+class Start(NamedTuple):
+    """Where a module is put into the water, at rest."""
+
+    p_wm: np.ndarray
+    q_wm: np.ndarray
+
+
+class Truth(NamedTuple):
+    """One module as it is now."""
+
+    time_ns: int
+    p_wm: np.ndarray
+    """(3,) hull centre, world."""
+    q_wm: np.ndarray
+    """(4,) module to world."""
+    v_w: np.ndarray
+    """(3,) velocity of the hull centre, world."""
+    w_b: np.ndarray
+    """(3,) angular rate, module frame."""
+    specific_force: np.ndarray
+    """(3,) at the hull centre, module frame, m/s^2: what an ideal accelerometer reads."""
+    force_n: np.ndarray
+    """(t,) force of each thruster."""
+    current_w: np.ndarray
+    """(3,) velocity of the water."""
+    voltage_v: float
+    current_a: float
+
+
+class BodyTruth(NamedTuple):
+    """One body as it is now."""
+
+    time_ns: int
+    modules: tuple[int, ...]
+    p_wb: np.ndarray
+    """(3,) centre of mass by the vehicle files: the point that the controller steers."""
+    q_wb: np.ndarray
+    """(4,) body to world; the body frame is that of its first module."""
+    v_w: np.ndarray
+    """(3,) velocity of that point, world."""
+    w_b: np.ndarray
+    com_w: np.ndarray
+    """(3,) where the centre of mass, water included, really is."""
+
+
+class World:
+    """Modules in a tank."""
+
+    def __init__(
+        self,
+        spec: WorldSpec,
+        tank: Tank,
+        vehicles: Sequence[Vehicle],
+        starts: Sequence[Start],
+        seed: int,
+        period_ns: int,
+        step_ns: int = STEP_NS,
+    ) -> None:
+        """A world at time 0.
+
+        Args:
+            vehicles, starts: one per module.
+            seed: of every draw; the same seed gives the same world.
+            period_ns: what `advance` will be called with. Raises DescriptionError when step_ns does not divide it.
+        """
+        if period_ns % step_ns:
+            raise DescriptionError(f"plant: the sub-step of {step_ns} ns does not divide the tick of {period_ns} ns")
+        self.time_ns = 0
+        self.vehicles = tuple(vehicles)
+        self.spec = spec
+        self.seed = seed
+        self.period_ns = period_ns
+        self._step_ns = step_ns
+        self._draws = [draw_module(v, spec, seed, m) for m, v in enumerate(vehicles)]
+        self._first = np.concatenate([[0], np.cumsum([len(v.thruster) for v in vehicles])])
+        self.bodies: list[tuple[int, ...]] = [(m,) for m in range(len(vehicles))]
+        self._water = make_water(spec, tank)
+        self._gusts = Gusts(spec, stream(seed, "gusts"), 1e-9 * period_ns)
+        self._water.flow[0], self._water.flow[1] = self._gusts.mean, self._gusts.start
+        self._thrusters = _make_thrusters(vehicles, self._draws, spec)
+        self._modules = _make_modules(vehicles, self._draws)
+        self._body_arrays = _make_bodies(vehicles, self._draws, spec)
+        for m, start in enumerate(starts):
+            self._body_arrays.state[m, :3] = start.p_wm
+            self._body_arrays.state[m, 3:7] = rotations.normalise(np.array(start.q_wm, dtype=np.float64))
+        self._seen = np.zeros((len(vehicles), 16))
+        self._work(len(vehicles))
+        self._step(0)
+
+    def _work(self, bodies: int) -> None:
+        self._stage = np.zeros((6, bodies, 13))
+        self._external = np.zeros((bodies, 6))
+        self._thrust = np.zeros((bodies, 6))
+
+    def set_command(self, module: int, u: np.ndarray, armed: bool) -> None:
+        """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call; disarmed is zero."""
+        for i in range(self._first[module], self._first[module + 1]):
+            value = float(u[i - self._first[module]]) if armed else 0.0
+            thrusters_module.command(self._thrusters, i, value)
+
+    def advance(self, duration_ns: int) -> None:
+        """Moves the world on. The duration must be a multiple of the sub-step, else DescriptionError."""
+        if duration_ns % self._step_ns:
+            raise DescriptionError(f"plant: the sub-step of {self._step_ns} ns does not divide {duration_ns} ns")
+        self._water.flow[2] = self._gusts.step()
+        self._step(duration_ns // self._step_ns)
+        self.time_ns += duration_ns
+
+    def _step(self, steps: int) -> None:
+        h = 1e-9 * self._step_ns
+        bodies, modules = self._body_arrays, self._modules
+        advance(bodies, modules, self._thrusters, self._water, self._external, steps, h, self._stage, self._thrust)
+        observe(bodies, modules, self._stage[5], self.spec.gravity, self._seen)
+
+    def truth(self, module: int) -> Truth:
+        """The truth about one module; its arrays are copies."""
+        seen = self._seen[module].copy()
+        power = self._thrusters.power[module]
+        first, last = self._first[module], self._first[module + 1]
+        return Truth(
+            self.time_ns, seen[:3], seen[3:7], seen[7:10], seen[10:13], seen[13:16], self._thrusters.force[first:last].copy(),
+            self._water.flow[0] + self._water.flow[1], float(power[0]), float(power[1]),
+        )  # fmt: skip
+
+    def body_truth(self, body: int) -> BodyTruth:
+        """The truth about one body, by its index in `bodies`."""
+        modules = self.bodies[body]
+        x = self._body_arrays.state[body]
+        r_wb = rotations.to_matrix(x[3:7])
+        masses = [self.vehicles[m].inertial.dry_kg + self.vehicles[m].inertial.entrained_kg for m in modules]
+        centres = [self._modules.position[m] + self._modules.turn[m] @ self.vehicles[m].inertial.com_m for m in modules]
+        nominal = np.average(centres, axis=0, weights=masses)
+        rigid = self._body_arrays.rigid[body]
+        com = np.array([rigid[5, 1], rigid[3, 2], rigid[4, 0]]) / rigid[0, 0]
+        v_w = r_wb @ (x[7:10] + np.cross(x[10:13], nominal))
+        p = x[:3]
+        return BodyTruth(self.time_ns, modules, p + r_wb @ nominal, x[3:7].copy(), v_w, x[10:13].copy(), p + r_wb @ com)
+
+    def esc(self, module: int) -> np.ndarray:
+        """(t, 2) speed (1/min) and current (A) of each thruster of a module."""
+        first, last = self._first[module], self._first[module + 1]
+        out = np.empty((last - first, 2))
+        for i in range(first, last):
+            thrusters_module.feedback(self._thrusters, i, out[i - first])
+        return out
+
+    def momentum(self) -> np.ndarray:
+        """(b, 6) linear momentum and angular momentum about the world's origin of each body and the water it carries, world."""
+        out = np.empty((len(self.bodies), 6))
+        for b, x in enumerate(self._body_arrays.state[: len(self.bodies)]):
+            r_wb = rotations.to_matrix(x[3:7])
+            flow = np.concatenate([r_wb.T @ (self._water.flow[0] + self._water.flow[1]), np.zeros(3)])
+            total = self._body_arrays.rigid[b] @ x[7:] + self._body_arrays.added[b] @ (x[7:] - flow)
+            p = r_wb @ total[:3]
+            out[b] = np.concatenate([p, r_wb @ total[3:] + np.cross(x[:3], p)])
+        return out
+
+
+def _make_thrusters(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec) -> Thrusters:
+    module = np.array([m for m, v in enumerate(vehicles) for _ in v.thruster], dtype=np.int64)
+    curves = [vehicles[m].curve for m in module]
+    constants = np.column_stack([
+        np.concatenate([d.gain for d in draws]),
+        np.concatenate([d.deadband_n for d in draws]),
+        np.full(len(module), spec.thruster_lag_s),
+        np.array([c.rpm_at_full for c in curves]),
+    ])  # fmt: skip
+    supply = np.array([
+        [v.curve.voltage_v, v.supply.voltage_v, spec.supply_resistance_ohm,
+         v.supply.current_a if spec.supply_limit else math.inf, v.supply.idle_w]
+        for v in vehicles
+    ])  # fmt: skip
+    return Thrusters(
+        module,
+        module.copy(),
+        np.concatenate([np.hstack([v.directions, np.cross(v.positions, v.directions)]) for v in vehicles]),
+        np.array([[c.forward, c.reverse] for c in curves]),
+        np.array([[c.power_forward, c.power_reverse] for c in curves]),
+        constants,
+        np.zeros((len(module), 2)),
+        np.zeros(len(module)),
+        supply,
+        np.zeros((len(vehicles), 2)),
+    )
+
+
+def _make_modules(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw]) -> Modules:
+    n = len(vehicles)
+    published = [v.drag.quadratic if len(v.drag.quadratic) == 6 else np.zeros(6) for v in vehicles]
+    coefficients = [d.drag * (0.0 if len(v.drag.quadratic) else 1.0) for v, d in zip(vehicles, draws, strict=True)]
+    return Modules(
+        np.arange(n, dtype=np.int64),
+        np.zeros((n, 3)),
+        np.tile(np.eye(3), (n, 1, 1)),
+        np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        np.array([v.hull.size_m for v in vehicles]),
+        np.array(coefficients),
+        np.array([v.drag.linear for v in vehicles]),
+        np.array(published),
+    )
+
+
+def _make_bodies(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec) -> Bodies:
+    n = len(vehicles)
+    bodies = Bodies(
+        np.zeros((n, 13)), np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, 8)), np.zeros((n, 4)),
+        np.zeros((n, 6)),
+    )
+    for m in range(n):
+        _fill_body(bodies, m, [(draws[m], vehicles[m], np.zeros(3), np.eye(3))], spec)
+    return bodies
+
+
+def _fill_body(
+    bodies: Bodies, b: int, parts: Sequence[tuple[ModuleDraw, Vehicle, np.ndarray, np.ndarray]], spec: WorldSpec
+) -> None:
+    """Sums the modules of body b: (draw, vehicle, position of the hull centre, module to body rotation) of each."""
+    for array in bodies[1:6]:
+        array[b] = 0.0
+    for draw, vehicle, r, turn in parts:
+        rigid = rigid_matrix(draw.dry_kg + draw.entrained_kg, draw.com, draw.inertia)
+        bodies.rigid[b] += carried(rigid, r, turn)
+        bodies.added[b] += carried(np.diag(draw.added), r, turn)
+        weight = draw.dry_kg * spec.gravity
+        bodies.weight[b, 0] += weight
+        bodies.weight[b, 1] += draw.buoyancy_n
+        bodies.weight[b, 2:5] += weight * (r + turn @ draw.weight_at)
+        bodies.weight[b, 5:8] += draw.buoyancy_n * (r + turn @ draw.buoyancy_at)
+        # Neutral but for the buoyancy error: the hull and what floods it displace what robot and entrained water weigh.
+        displaced = draw.entrained_kg + draw.buoyancy_n / spec.gravity
+        bodies.hull[b, 0] += displaced
+        bodies.hull[b, 1:4] += displaced * r
+    bodies.inverse[b] = np.linalg.inv(bodies.rigid[b] + bodies.added[b])

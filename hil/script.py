@@ -1,0 +1,59 @@
+"""What the person at the bench does: arm, wait at the start, begin the task. It speaks to the firmware by requests alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from firmware_py.core.setpoint import Trajectory, rest_at
+from firmware_py.core.transitions import ARMED
+from firmware_py.core.types import Action, Outputs, Request
+from firmware_py.description.fleet import Fleet
+from firmware_py.prepare import paths
+from hil.scenario import Scenario, Task
+
+ARM_FROM_S = 1.0
+"""First attempt to arm: the pose needs a few tags."""
+ARM_EVERY_S = 0.5
+"""Then again so often until it is granted."""
+
+
+class Script:
+    """The requests of one run."""
+
+    def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self._task = scenario.task
+        start = scenario.module[0].start
+        self.start_pose = rest_at(np.array(start.p_wm, dtype=float), np.array(start.q_wm, dtype=float))
+        self.trajectory = TASKS[scenario.task.kind](scenario.task, self.start_pose.q_wb)
+        self.begin_ns = round(scenario.task.settle_s * 1e9)
+        self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
+        self.ticks = self.end_ns // fleet.period_ns
+        self._armed = False
+
+    def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
+        """What is asked for in the tick at `time_ns`, given the outputs of the tick before."""
+        if time_ns == self.begin_ns:
+            return [Request(Action.TRACK, 0, self.trajectory)]
+        if self._armed or last is None or time_ns < ARM_FROM_S * 1e9:
+            return []
+        if last.records[0].state in ARMED:
+            self._armed = True
+            return [Request(Action.HOLD, 0, self.trajectory.sample(0.0))]
+        every = round(ARM_EVERY_S * self._fleet.rate_hz)
+        return [Request(Action.ARM)] if (time_ns // self._fleet.period_ns) % every == 0 else []
+
+
+def _hover(task: Task, q_wb: np.ndarray) -> Trajectory:
+    return paths.hold(paths.at_rest(task.centre_m, q_wb), task.duration_s)
+
+
+def _spiral(task: Task, q_wb: np.ndarray) -> Trajectory:
+    return paths.spiral(task.centre_m, task.radius_m, task.climb_m, task.turns, task.duration_s, attitude=q_wb)
+
+
+TASKS: dict[str, Callable[[Task, np.ndarray], Trajectory]] = {"hover": _hover, "spiral": _spiral}
+"""Trajectory of each kind of task."""
+

@@ -1,0 +1,85 @@
+"""A made-up flight, written through the real recorders: the paper's spiral with known errors. For tests and looks."""
+
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.core.rotations import exp, multiply
+from firmware_py.core.types import BodyRecord, Estimate, Event, Inputs, Outputs, Setpoint, Thrust
+from firmware_py.runtime.recorder import Recorder
+from hil.signals import TruthRecorder
+
+PERIOD_NS = 10_000_000
+START_NS = 4_000_000_000
+"""The spiral starts after 4 s of hovering."""
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def progress(t_s: float, duration_s: float) -> float:
+    """0 to 1, rest to rest: the quintic."""
+    s = min(max(t_s / duration_s, 0.0), 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+
+
+def spiral(t_s: float, duration_s: float) -> np.ndarray:
+    """Position of a climb of 0.40 m on a radius of 0.30 m in two turns."""
+    s = progress(t_s, duration_s)
+    return np.array([0.3 * np.cos(4 * np.pi * s), 0.3 * np.sin(4 * np.pi * s), 0.6 - 0.4 * s])
+
+
+def smooth(rng: np.random.Generator, ticks: int, sigma: np.ndarray) -> np.ndarray:
+    """(ticks, n) noise with a second of memory and standard deviation `sigma`."""
+    keep = np.exp(-0.01)
+    values = rng.normal(size=(ticks, len(sigma))) * sigma * np.sqrt(1 - keep**2)
+    values[0] = rng.normal(size=len(sigma)) * sigma
+    for i in range(1, ticks):
+        values[i] += keep * values[i - 1]
+    return values
+
+
+def write_flight(
+    folder: Path,
+    *,
+    duration_s: float = 40.0,
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    tilt_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    noise: float = 1.0,
+    seed: int = 0,
+) -> None:
+    """Write the three logs of a flight whose truth is off the reference by `offset_m`, `tilt_rad` and noise."""
+    ticks = 1 + round((START_NS / 1e9 + duration_s) * 1e9 / PERIOD_NS)
+    rng = np.random.default_rng(seed)
+    error = noise * smooth(rng, ticks, np.full(3, 0.0015))
+    tilt = noise * smooth(rng, ticks, np.full(3, 0.004))
+    doubt = noise * smooth(rng, ticks, np.full(3, 0.0008))
+    turn = noise * smooth(rng, ticks, np.full(3, 0.002))
+    thrust = 0.8 + noise * smooth(rng, ticks, np.full(8, 0.5))
+    recorder = Recorder(folder)
+    with TruthRecorder(folder, (8,)) as truth:
+        for tick in range(ticks):
+            time_ns = tick * PERIOD_NS
+            at = (time_ns - START_NS) / 1e9
+            wanted = spiral(at, duration_s)
+            speed = (spiral(at + 0.005, duration_s) - spiral(at - 0.005, duration_s)) / 0.01
+            p_wm = wanted + np.array(offset_m) + error[tick]
+            q_wm = exp(np.array(tilt_rad) + tilt[tick])
+            truth.record(
+                tick, time_ns, 0, p_wm, q_wm, speed, np.zeros(3), thrust[tick], np.array([0.04, 0.03, 0.0])
+            )
+            zero = np.zeros(3)
+            tagged = tick % 2 == 0
+            estimate = Estimate(
+                p_wm + doubt[tick], multiply(q_wm, exp(turn[tick])), np.r_[speed, zero],
+                np.array([0.10, 0.06, 0.4 * (1 - np.exp(-time_ns / 2e9))]), np.array([0.01, -0.02, 0.0]),
+                np.full(3, 0.0008), np.full(3, 0.002), 40_000_000,
+                float(rng.chisquare(6)) if tagged else float("nan"), 6 if tagged else 0, tick // 400, True,
+            )  # fmt: skip
+            wrench = np.r_[0.4 * np.sin(at), 0.4 * np.cos(at), -0.4, zero]
+            result = Thrust(thrust[tick], wrench, (1.0, 1.0))
+            setpoint = Setpoint(wanted, LEVEL, speed, zero, zero, zero)
+            record = BodyRecord(0, 4 if at >= 0 else 3, estimate, setpoint, wrench, result, thrust[tick])
+            events = [Event(6, "tracking the spiral")] if time_ns == START_NS else []
+            recorder.record(Inputs(tick, time_ns, []), Outputs(tick, time_ns, [], False, events, [record]))
+            if tick % 50 == 49:
+                recorder.flush()
+    recorder.close()

@@ -1,0 +1,121 @@
+"""The figures of a flight: known errors give known metrics, and nothing is left out."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hil.checks import Limit, check_metrics, judge, write_result
+from hil.metrics import body_positions, flight_metrics, nis_mean, rotation_vectors
+from hil.signals import Flight, read_flight
+from tests.unit.flights import START_NS, write_flight
+
+LIMITS = (Limit("position_rmse_m", high=0.005), Limit("nis_mean", 0.7, 1.4, "filter consistency"))
+
+
+def spiral_of(folder: Path, duration_s: float = 5.0, **errors: object) -> Flight:
+    write_flight(folder, duration_s=duration_s, **errors)  # type: ignore[arg-type]
+    return read_flight(folder).between(START_NS, START_NS + round(duration_s * 1e9))
+
+
+def test_robot_beside_its_path_shows_that_distance(tmp_path: Path) -> None:
+    metrics = flight_metrics(spiral_of(tmp_path, offset_m=(0.003, 0.0, -0.004), noise=0.0))
+    assert metrics["position_rmse_m"] == pytest.approx(0.005, abs=1e-12)
+    assert metrics["position_max_m"] == pytest.approx(0.005, abs=1e-12)
+    assert metrics["attitude_rmse_rad"] == pytest.approx(0.0, abs=1e-12)
+    assert metrics["estimate_position_rmse_m"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_tilted_robot_shows_its_angle(tmp_path: Path) -> None:
+    metrics = flight_metrics(spiral_of(tmp_path, tilt_rad=(0.03, 0.0, -0.04), noise=0.0))
+    assert metrics["attitude_rmse_rad"] == pytest.approx(0.05, abs=1e-9)
+    assert metrics["attitude_max_rad"] == pytest.approx(0.05, abs=1e-9)
+
+
+def test_every_tick_of_the_trajectory_counts(tmp_path: Path) -> None:
+    metrics = flight_metrics(spiral_of(tmp_path), wall_s=0.1)
+    assert metrics["ticks"] == 501
+    assert metrics["unmatched_ticks"] == 0
+    assert metrics["duration_s"] == pytest.approx(5.01)
+    assert metrics["real_time_factor"] == pytest.approx(50.1)
+    assert metrics["deadline_misses"] == 0
+
+
+def test_honest_filter_is_consistent_in_all_six_axes(tmp_path: Path) -> None:
+    metrics = flight_metrics(spiral_of(tmp_path, duration_s=20.0))
+    assert 0.85 < metrics["nis_mean"] < 1.15
+    assert all(metrics[f"sigma3_share_{axis}"] > 0.97 for axis in ("x", "y", "z", "roll", "pitch", "yaw"))
+    assert metrics["sigma3_share"] == min(v for k, v in metrics.items() if k.startswith("sigma3_share_"))
+
+
+def test_one_bad_tick_is_seen_in_the_worst_error(tmp_path: Path) -> None:
+    flight = spiral_of(tmp_path, noise=0.0)
+    flight.truth["p_wm"][100, 2] += 0.5
+    metrics = flight_metrics(flight)
+    assert metrics["position_max_m"] == pytest.approx(0.5)
+    assert metrics["position_rmse_m"] == pytest.approx(0.5 / math.sqrt(501))
+    assert metrics["sigma3_share_z"] == pytest.approx(500 / 501)
+
+
+def test_filter_without_tags_has_no_consistency_and_fails_its_check() -> None:
+    value = nis_mean(np.array([np.nan, np.nan]), np.array([0, 0]))
+    assert math.isnan(value)
+    assert not check_metrics({"nis_mean": value}, LIMITS[1:])[0].passed
+
+
+def test_consistency_weighs_every_update_alike() -> None:
+    assert nis_mean(np.array([6.0, np.nan, 18.0]), np.array([6, 0, 12])) == pytest.approx(24 / 18)
+
+
+def test_attitude_error_agrees_with_scipy() -> None:
+    rng = np.random.default_rng(5)
+    a, b = (Rotation.from_quat(rng.normal(size=(200, 4))) for _ in range(2))
+    scalar_first = [np.roll(r.as_quat(), 1, axis=1) for r in (a, b)]
+    np.testing.assert_allclose(rotation_vectors(*scalar_first), (b.inv() * a).as_rotvec(), atol=1e-12)
+
+
+def test_attitude_error_is_the_short_way_round() -> None:
+    q = np.array([[1.0, 0.0, 0.0, 0.0]])
+    assert np.linalg.norm(rotation_vectors(-q, q)) == 0.0
+    tiny = np.array([[1.0, 5e-14, 0.0, 0.0]])
+    np.testing.assert_allclose(rotation_vectors(tiny, q), [[1e-13, 0.0, 0.0]], rtol=1e-6)
+
+
+def test_off_centre_mass_moves_with_the_module(tmp_path: Path) -> None:
+    flight = spiral_of(tmp_path, tilt_rad=(0.0, 0.0, math.pi / 2), noise=0.0)
+    moved = body_positions(flight, np.array([0.1, 0.0, 0.0])) - flight.truth["p_wm"]
+    np.testing.assert_allclose(moved, np.tile([0.0, 0.1, 0.0], (501, 1)), atol=1e-12)
+
+
+def test_run_passes_only_when_every_check_does() -> None:
+    good = {"position_rmse_m": 0.005, "nis_mean": 1.0}
+    assert judge("spiral", 3, good, LIMITS).passed
+    assert not judge("spiral", 3, good | {"nis_mean": 1.41}, LIMITS).passed
+    assert not judge("spiral", 3, {"nis_mean": 1.0}, LIMITS).passed
+    assert not judge("spiral", 3, good, ()).passed
+
+
+def test_result_file_has_the_agreed_shape(tmp_path: Path) -> None:
+    metrics = {"position_rmse_m": 0.0026, "nis_mean": math.nan, "ticks": 4001.0}
+    path = write_result(judge("spiral", 3, metrics, LIMITS), tmp_path)
+    assert json.loads(path.read_text()) == {
+        "scenario": "spiral",
+        "seed": 3,
+        "passed": False,
+        "metrics": {"position_rmse_m": 0.0026, "nis_mean": None, "ticks": 4001},
+        "checks": [
+            {"name": "position_rmse_m", "value": 0.0026, "limit": "<= 0.005", "passed": True},
+            {"name": "filter consistency", "value": None, "limit": "0.7 to 1.4", "passed": False},
+        ],
+    }
+
+
+def test_missing_truth_is_said_and_not_passed_over(tmp_path: Path) -> None:
+    write_flight(tmp_path, duration_s=1.0)
+    with pytest.raises(ValueError, match="no truth of module 3"):
+        read_flight(tmp_path, module=3)
+    with pytest.raises(OSError):
+        read_flight(tmp_path / "elsewhere")

@@ -1,0 +1,101 @@
+"""Ticks start at absolute deadlines, whatever the ticks before them did."""
+
+import pytest
+
+from firmware_py.runtime.clock import ManualClock, MonotonicClock
+from firmware_py.runtime.rate_keeper import Histogram, RateKeeper, absolute_sleeper
+
+PERIOD_NS = 10_000_000
+
+
+class LateSleeper:
+    """Wakes up some time after the deadline, as a busy machine does."""
+
+    def __init__(self, clock: ManualClock, late_ns: int) -> None:
+        self.clock = clock
+        self.late_ns = late_ns
+
+    def __call__(self, deadline_ns: int) -> None:
+        self.clock.set(deadline_ns + self.late_ns)
+
+
+def keeper(late_ns: int = 0, start_ns: int = 0) -> tuple[RateKeeper, ManualClock]:
+    clock = ManualClock(start_ns)
+    return RateKeeper(PERIOD_NS, clock, LateSleeper(clock, late_ns)), clock
+
+
+def test_ticks_do_not_drift_when_every_wake_up_is_late() -> None:
+    rate, clock = keeper(late_ns=300_000)
+    rate.start(0)
+    deadlines = []
+    for _ in range(1000):
+        deadlines.append(rate.wait())
+        clock.set(clock.now_ns() + 2_000_000)
+        rate.finish()
+    assert deadlines == [k * PERIOD_NS for k in range(1000)]
+    assert rate.lateness.worst_ns == 300_000
+    assert rate.overruns == rate.skipped == 0
+
+
+def test_long_tick_is_an_overrun_and_the_next_begins_at_once() -> None:
+    rate, clock = keeper()
+    rate.start(0)
+    rate.wait()
+    clock.set(14_000_000)
+    rate.finish()
+    assert rate.wait() == PERIOD_NS
+    assert (rate.overruns, rate.skipped, rate.lateness.worst_ns) == (1, 0, 4_000_000)
+
+
+def test_stall_skips_deadlines_and_keeps_the_phase() -> None:
+    rate, clock = keeper()
+    rate.start(5)
+    rate.wait()
+    clock.set(5 + 57_000_000)
+    rate.finish()
+    assert rate.wait() == 5 + 5 * PERIOD_NS
+    assert rate.skipped == 4
+    assert rate.wait() == 5 + 6 * PERIOD_NS
+
+
+def test_first_tick_is_now_when_no_start_was_set() -> None:
+    rate, _ = keeper(start_ns=123)
+    assert rate.wait() == 123
+
+
+def test_quantiles_of_lateness_are_at_most_a_bin_too_large() -> None:
+    histogram = Histogram()
+    for duration_ns in range(1000, 101_000, 100):
+        histogram.add(duration_ns)
+    assert 50_950 <= histogram.quantile_ns(0.5) <= 1.26 * 50_950
+    assert histogram.quantile_ns(1.0) == 100_900
+    assert histogram.total == 1000
+    assert Histogram().quantile_ns(0.5) == 0
+
+
+def test_durations_beyond_every_bin_are_kept() -> None:
+    histogram = Histogram()
+    histogram.add(5_000_000_000)
+    histogram.add(-3)
+    assert histogram.counts[0] == histogram.counts[-1] == 1
+    assert histogram.quantile_ns(1.0) == 5_000_000_000
+
+
+def test_machine_sleeps_to_the_deadline_and_returns_at_once_after_it() -> None:
+    clock = MonotonicClock()
+    sleep_until = absolute_sleeper(clock)
+    deadline_ns = clock.now_ns() + 1_000_000
+    sleep_until(deadline_ns)
+    assert clock.now_ns() >= deadline_ns
+    sleep_until(0)
+
+
+def test_clock_of_the_bench_refuses_to_go_back() -> None:
+    clock = ManualClock(10)
+    with pytest.raises(ValueError, match="cannot go back"):
+        clock.set(9)
+
+
+def test_period_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="above zero"):
+        RateKeeper(0, ManualClock(), lambda _: None)
