@@ -6,18 +6,32 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 RESULT_FILE = "result.json"
 
 
+UNBOUNDED = 1e9
+"""A bound of this size or more is none."""
+
+
+class Bounds(Protocol):
+    """A metric must be within low..high, both included."""
+
+    @property
+    def metric(self) -> str: ...
+    @property
+    def low(self) -> float: ...
+    @property
+    def high(self) -> float: ...
+
+
 class Limit(NamedTuple):
-    """A metric must be within low..high, both included. `name` is what people read; the metric's when empty."""
+    """The bounds of one metric."""
 
     metric: str
     low: float = -math.inf
     high: float = math.inf
-    name: str = ""
 
 
 class Check(NamedTuple):
@@ -25,9 +39,14 @@ class Check(NamedTuple):
 
     name: str
     value: float
-    limit: str
-    """In words: `<= 0.005`, `>= 25`, `0.7 to 1.4`."""
+    low: float
+    high: float
     passed: bool
+
+    @property
+    def limit(self) -> str:
+        """The bounds in words, in the metric's own unit: `<= 0.005`, `>= 25`, `0.7 to 1.4`."""
+        return limit_text(self.low, self.high)
 
 
 class Result(NamedTuple):
@@ -40,26 +59,24 @@ class Result(NamedTuple):
     checks: tuple[Check, ...]
 
 
-def limit_text(limit: Limit) -> str:
-    """The range in words."""
-    if math.isinf(limit.low):
-        return f"<= {limit.high:g}"
-    if math.isinf(limit.high):
-        return f">= {limit.low:g}"
-    return f"{limit.low:g} to {limit.high:g}"
+def limit_text(low: float, high: float) -> str:
+    """A range in words."""
+    if low <= -UNBOUNDED:
+        return f"<= {high:.4g}"
+    return f">= {low:.4g}" if high >= UNBOUNDED else f"{low:.4g} to {high:.4g}"
 
 
-def check_metrics(metrics: Mapping[str, float], limits: Iterable[Limit]) -> tuple[Check, ...]:
+def check_metrics(metrics: Mapping[str, float], limits: Iterable[Bounds]) -> tuple[Check, ...]:
     """One check per limit, in order."""
     checks = []
     for limit in limits:
         value = metrics.get(limit.metric, math.nan)
         passed = limit.low <= value <= limit.high  # False for NaN
-        checks.append(Check(limit.name or limit.metric, value, limit_text(limit), passed))
+        checks.append(Check(limit.metric, value, limit.low, limit.high, passed))
     return tuple(checks)
 
 
-def judge(scenario: str, seed: int, metrics: Mapping[str, float], limits: Iterable[Limit]) -> Result:
+def judge(scenario: str, seed: int, metrics: Mapping[str, float], limits: Iterable[Bounds]) -> Result:
     """The result of a run: passed when every check passed and there is at least one."""
     checks = check_metrics(metrics, limits)
     return Result(scenario, seed, bool(checks) and all(c.passed for c in checks), dict(metrics), checks)
@@ -69,7 +86,10 @@ def write_result(result: Result, folder: Path) -> Path:
     """Write result.json into `folder`; NaN and infinity, which JSON lacks, become null. Returns its path."""
     plain = result._asdict() | {
         "metrics": {name: _number(value) for name, value in result.metrics.items()},
-        "checks": [check._asdict() | {"value": _number(check.value)} for check in result.checks],
+        "checks": [
+            {"name": check.name, "value": _number(check.value), "limit": check.limit, "passed": check.passed}
+            for check in result.checks
+        ],
     }
     path = folder / RESULT_FILE
     path.write_text(json.dumps(plain, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -2,14 +2,70 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
 import numpy as np
 
 from firmware_py.core.rotations import rotate
+from hil.checks import UNBOUNDED, limit_text
 from hil.signals import Flight
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 PAPER_SPIRAL_RMSE_MM = 20.92
 """Position RMSE of the paper's robot on its spiral in a real tank (RS-ModCubes)."""
+
+
+class Shown(NamedTuple):
+    """How people read a metric: a name, and a unit for which the value is multiplied by `scale`."""
+
+    label: str
+    unit: str = ""
+    scale: float = 1.0
+    digits: int = 2
+
+
+SHOWN = {
+    "position_rmse_m": Shown("Position RMSE, truth against reference", "mm", 1e3),
+    "position_max_m": Shown("Position error, worst tick", "mm", 1e3),
+    "attitude_rmse_rad": Shown("Attitude RMSE, truth against reference", "deg", math.degrees(1.0)),
+    "attitude_max_rad": Shown("Attitude error, worst tick", "deg", math.degrees(1.0)),
+    "estimate_position_rmse_m": Shown("Position RMSE, estimate against truth", "mm", 1e3),
+    "estimate_attitude_rmse_rad": Shown("Attitude RMSE, estimate against truth", "deg", math.degrees(1.0)),
+    "nis_mean": Shown("Tag NIS over its expectation (1: consistent)"),
+    "sigma3_share": Shown("Truth inside 3 sigma, worst of six axes", "%", 100.0, 1),
+    **{f"sigma3_share_{axis}": Shown(f"Truth inside 3 sigma, {axis}", "%", 100.0, 1) for axis in AXES},
+    "thrust_rms_n": Shown("Commanded force of a thruster, RMS", "N"),
+    "tags_rejected": Shown("Tag observations refused by the gate", digits=0),
+    "duration_s": Shown("Duration of the judged part", "s"),
+    "real_time_factor": Shown("Faster than real time by", "times", digits=1),
+    "ticks": Shown("Ticks judged", digits=0),
+    "unmatched_ticks": Shown("Ticks without truth", digits=0),
+    "deadline_misses": Shown("Deadlines missed", digits=0),
+}
+"""Metrics in the order in which tables show them."""
+
+
+def metric_order(names: Iterable[str]) -> list[str]:
+    """Every name once: those that `SHOWN` knows in its order, then the others as they come."""
+    given = dict.fromkeys(names)
+    return [name for name in SHOWN if name in given] + [name for name in given if name not in SHOWN]
+
+
+def shown_value(metric: str, value: float) -> str:
+    """The value as people read it: `2.72 mm`. A metric that is not in `SHOWN` keeps its own unit."""
+    how = SHOWN.get(metric, Shown(metric, digits=4))
+    if not math.isfinite(value):
+        return "none"
+    return f"{value * how.scale:.{how.digits}f} {how.unit}".rstrip()
+
+
+def shown_limit(metric: str, low: float, high: float) -> str:
+    """The bounds of a check as people read them: `<= 5 mm`."""
+    how = SHOWN.get(metric, Shown(metric))
+    low, high = (bound * how.scale if abs(bound) < UNBOUNDED else bound for bound in (low, high))
+    return f"{limit_text(low, high)} {how.unit}".rstrip()
 
 
 def rotation_vectors(a: np.ndarray, b: np.ndarray) -> np.ndarray:

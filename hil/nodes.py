@@ -203,7 +203,7 @@ class Nodes:
         self.receiver = Receiver(codec)
         self.mcus = {number: Mcu(codec, number, module, world, sensors) for number, module in numbers.items()}
         self.cameras = [TagCamera(codec, camera, numbers, sensors, world) for camera in cameras]
-        self.estops: list[int] = []
+        self._dropped = dict(self.receiver.dropped)
 
     def step(self, frames: Iterable[Frame]) -> list[Frame]:
         """One tick of a world that has this one bus: advance a period, take the frames, return the answers."""
@@ -223,10 +223,9 @@ class Nodes:
 
     def take(self, frame: Frame, time_ns: int) -> list[Frame]:
         """One frame from the bus at `time_ns` on the plant's clock; returns the answers. Bad frames are counted and dropped."""
-        before = dict(self.receiver.dropped)
         received = self.receiver.accept(frame)
         if received is None:
-            self._blame(frame, before)
+            self._blame(frame)
             return []
         name = received.message.name
         if name == "ESTOP":
@@ -243,14 +242,14 @@ class Nodes:
             self.mcus[received.number].heard(received, time_ns)
         return []
 
-    def _blame(self, frame: Frame, before: dict[str, int]) -> None:
+    def _blame(self, frame: Frame) -> None:
         """The MCU that a dropped frame was meant for reports the kind of error."""
+        dropped, self._dropped = self._dropped, dict(self.receiver.dropped)
         mcu = self.mcus.get(frame.id & 0x1F)
-        if mcu is None:
-            return
-        for kind, bit in ERROR_BITS.items():
-            if self.receiver.dropped[kind] != before[kind]:
-                mcu.errors |= bit
+        if mcu is not None:
+            for kind, bit in ERROR_BITS.items():
+                if self._dropped[kind] != dropped[kind]:
+                    mcu.errors |= bit
 
 
 def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[Any, int, int]]:

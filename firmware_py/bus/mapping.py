@@ -235,7 +235,7 @@ class OutputEncoder:
         self._heartbeat = codec.message("HEARTBEAT")
         self._thrusters = (codec.message("THRUSTER_CMD_A"), codec.message("THRUSTER_CMD_B"))
         self._dock_counters = [0] * len(fleet.module)
-        self._estop_ns: int | None = None
+        self._estop_due_ns: int | None = None
 
     def sync(self, tick: int) -> list[tuple[int, Frame]]:
         """SYNC of `tick` (modulo 2^32), one per bus."""
@@ -261,10 +261,13 @@ class OutputEncoder:
         return frames
 
     def _estop_is_due(self, outputs: Outputs) -> bool:
+        """At once when it is raised, then at 20 Hz on average whatever the tick rate."""
         if not outputs.estop:
-            self._estop_ns = None
+            self._estop_due_ns = None
             return False
-        if self._estop_ns is not None and outputs.time_ns - self._estop_ns < ESTOP_PERIOD_NS:
+        due_ns = outputs.time_ns if self._estop_due_ns is None else self._estop_due_ns
+        if outputs.time_ns < due_ns:
+            self._estop_due_ns = due_ns
             return False
-        self._estop_ns = outputs.time_ns
+        self._estop_due_ns = due_ns + ESTOP_PERIOD_NS
         return True

@@ -1,6 +1,6 @@
 """Stage 6 of a tick: from a wrench to the force of each thruster (paper, Eq. 6), within limits.
 
-Where the pseudo-inverse stays within limits it is the answer. Otherwise a box-constrained least-squares problem (daqp) keeps the directions of
+Where the pseudo-inverse (plus the preload) stays within limits it is the answer. Otherwise a box-constrained least-squares problem (daqp) keeps the directions of
 force and moment and gives way in the force first.
 """
 
@@ -12,6 +12,7 @@ import daqp
 import numpy as np
 
 from firmware_py.core.body import Body
+from firmware_py.core.preload import preload
 from firmware_py.core.types import Thrust
 from firmware_py.description.parameters import Allocation
 
@@ -36,7 +37,8 @@ class Allocator:
         self._matrix = np.ascontiguousarray(body.thrusters.matrix)
         self._pinv = np.ascontiguousarray(body.thrusters.pinv)
         self._h = np.diag(np.r_[np.full(n, 2.0), 2 * SHARE_WEIGHT, 2 * SHARE_WEIGHT * MOMENT_PRIORITY])
-        self._f = np.r_[np.zeros(n), -2 * SHARE_WEIGHT, -2 * SHARE_WEIGHT * MOMENT_PRIORITY]
+        self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
+        self._preload = preload(body.thrusters, np.ones(n, dtype=bool), self._smallest_n)
         self._sense = np.array([0] * (n + 2) + [EQUALITY] * 6, dtype=c_int)
 
     def set_alive(self, alive: np.ndarray) -> None:
@@ -45,10 +47,11 @@ class Allocator:
         self._matrix = np.ascontiguousarray(t.matrix * alive)
         self._pinv = np.ascontiguousarray(np.linalg.pinv(self._matrix))
         self._f_min, self._f_max = t.f_min * alive, t.f_max * alive
+        self._preload = preload(t, alive, self._smallest_n)
 
     def step(self, wrench: np.ndarray) -> Thrust:
         """The thruster forces for a wanted (6,) wrench, body frame."""
-        force = self._pinv @ wrench
+        force = self._preload + self._pinv @ wrench
         if bool(np.all(force <= self._f_max) and np.all(force >= self._f_min)):
             return Thrust(force, self._matrix @ force, (1.0, 1.0))
         if self._clip_only:
@@ -57,7 +60,7 @@ class Allocator:
         return self._saturated(wrench)
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
-        """min |f|^2 + w_f (1 - a)^2 + w_m (1 - b)^2, J f = [a F; b M], f within limits, 0 <= a, b <= 1."""
+        """min |f - f_preload|^2 + w_f (1 - a)^2 + w_m (1 - b)^2, J f = [a F; b M], f within limits, 0 <= a, b <= 1."""
         n = self._f_max.size
         rows = np.zeros((6, n + 2))
         rows[:, :n] = self._matrix
@@ -65,7 +68,8 @@ class Allocator:
         rows[3:, n + 1] = -wrench[3:]
         upper = np.r_[self._f_max, 1.0, 1.0, np.zeros(6)]
         lower = np.r_[self._f_min, 0.0, 0.0, np.zeros(6)]
-        x, _, flag, _ = daqp.solve(self._h, self._f, rows, upper, lower, self._sense)
+        linear = np.r_[-2 * self._preload, -2 * SHARE_WEIGHT, -2 * SHARE_WEIGHT * MOMENT_PRIORITY]
+        x, _, flag, _ = daqp.solve(self._h, linear, rows, upper, lower, self._sense)
         if flag not in SOLVED:
             share = self._common_share(wrench)
             force = self._pinv @ wrench * share

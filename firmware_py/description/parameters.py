@@ -15,9 +15,9 @@ class Control:
     """PD gains as bandwidth and damping, multiplied by the body's mass matrix, so one set serves every shape."""
 
     law: str = quantity("model", choices=("model", "paper"), help="model: desired velocity in drag and Coriolis; paper: measured")
-    position_bandwidth: float = quantity(1.6, unit="rad/s", low=0.1, high=10, help="of the position loop", mavlink="POS_BW")
+    position_bandwidth: float = quantity(2.5, unit="rad/s", low=0.1, high=10, help="of the position loop", mavlink="POS_BW")
     position_damping: float = quantity(1.0, low=0.1, high=5, help="damping ratio of the position loop", mavlink="POS_DAMP")
-    attitude_bandwidth: float = quantity(2.2, unit="rad/s", low=0.1, high=20, help="of the attitude loop", mavlink="ATT_BW")
+    attitude_bandwidth: float = quantity(3.0, unit="rad/s", low=0.1, high=20, help="of the attitude loop", mavlink="ATT_BW")
     attitude_damping: float = quantity(1.0, low=0.1, high=5, help="damping ratio of the attitude loop", mavlink="ATT_DAMP")
     drag_feedforward: float = quantity(1.0, low=-2, high=2, help="share of the modelled drag fed forward", mavlink="FF_DRAG")
     disturbance_feedforward: float = quantity(
@@ -41,7 +41,7 @@ class Estimation:
     accel_bias_walk: float = quantity(1e-4, unit="m/s^2/sqrt(s)", low=0, high=1, help="accelerometer bias random walk", mavlink="ACC_WALK")
     depth_sigma_m: float = quantity(0.003, unit="m", low=1e-5, high=1, help="depth noise", mavlink="DEPTH_SD")
     depth_bias_walk: float = quantity(2e-4, unit="m/sqrt(s)", low=0, high=1, help="depth bias random walk", mavlink="DEPTH_WALK")
-    force_walk: float = quantity(0.004, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass", mavlink="DIST_F_WALK")
+    force_walk: float = quantity(0.012, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass", mavlink="DIST_F_WALK")
     moment_walk: float = quantity(0.15, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia", mavlink="DIST_M_WALK")
     accel_process: float = quantity(0.012, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC")
     alpha_process: float = quantity(0.05, unit="rad/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled angular acceleration", mavlink="PROC_ALPHA")
@@ -52,6 +52,9 @@ class Allocation:
     """From wrench to thrusters."""
 
     mode: str = quantity("least_squares", choices=("least_squares", "pseudo_inverse"), help="pseudo_inverse clips, as the paper's")
+    preload_n: float = quantity(
+        0.6, unit="N", low=0, high=5, help="thrusters pushed against each other to stay clear of the deadband", mavlink="PRELOAD"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -290,7 +290,7 @@ def line(start: Setpoint, end: Setpoint, duration_s: float, ramp_share: float = 
 
 
 def _x_axis_to(axis: np.ndarray) -> np.ndarray:
-    """Unit quaternion that turns the x axis into a unit vector, by the half-way vector; any half-turn for its opposite."""
+    """Unit quaternion that turns the x axis into a unit vector, by the half-way vector."""
     if axis[0] < -1.0 + 1e-12:
         return np.array([0.0, 0.0, 0.0, 1.0])
     return np.asarray(rotations.normalise(np.array([1.0 + axis[0], 0.0, -axis[2], axis[1]])))

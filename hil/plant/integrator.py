@@ -55,22 +55,22 @@ def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust
     """
     x, trial = bodies.state, stage[4]
     for s in range(steps):
-        load_supplies(thrusters)
+        load_supplies(thrusters, 1)  # half-way, so that the error is of second order
         for k in range(4):
             share = 0.0 if k == 0 else (1.0 if k == 3 else 0.5)
             if k != 2:
-                forces_after(thrusters, share * h)
+                forces_after(thrusters, 0 if k == 0 else (2 if k == 3 else 1))
                 wrenches(thrusters, external, thrust)
             flow, flow_rate = flow_at(water, (s + share) * h)
             if k > 0:
                 along(x, share * h, stage[k - 1], trial)
             derivative(bodies, modules, water, flow, flow_rate, thrust, trial if k > 0 else x, stage[k])
         close_step(x, h, stage)
-        settle(thrusters, h)
+        settle(thrusters)
     flow, flow_rate = flow_at(water, steps * h)
     for i in range(3):
         water.flow[1, i] = flow[i] - water.flow[0, i]
-    load_supplies(thrusters)
-    forces_after(thrusters, 0.0)
+    load_supplies(thrusters, 0)
+    forces_after(thrusters, 0)
     wrenches(thrusters, external, thrust)
     derivative(bodies, modules, water, flow, flow_rate, thrust, x, stage[5])

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, types
 
-from hil.plant.vectors import F1, F2, F3, F8, I1
+from hil.plant.bodies import BODIES, MODULES, add_force
+from hil.plant.vectors import F1, F2, F3, F8, I1, dot, matrix_of, minus, plus, times, triple, turn, turn_back
 
 
 
@@ -25,12 +26,16 @@ class Thrusters(NamedTuple):
     """(t,) index of the body."""
     column: np.ndarray
     """(t, 6) wrench of unit force about O of that body, body frame."""
+    position: np.ndarray
+    """(t, 3) in the body frame."""
     force_curve: np.ndarray
     """(t, 2, 5) forward and reverse polynomial of |command|, N."""
     power_curve: np.ndarray
     """(t, 2, 5) polynomial of |force|, W."""
     constants: np.ndarray
-    """(t, 4) gain, deadband N, lag s, speed at full command 1/min."""
+    """(t, 3) gain, deadband N, speed at full command 1/min."""
+    decay: np.ndarray
+    """(t, 3) what the lag leaves of a difference after no, half and a whole sub-step."""
     level: np.ndarray
     """(t, 2) where the force tends and where it is, N, at the curve's voltage."""
     force: np.ndarray
@@ -41,23 +46,27 @@ class Thrusters(NamedTuple):
     """(m, 2) voltage and current of each module now."""
 
 
-THRUSTERS = types.NamedTuple((I1, I1, F2, F3, F3, F2, F2, F1, F2, F2), Thrusters)
+THRUSTERS = types.NamedTuple((I1, I1, F2, F2, F3, F3, F2, F2, F2, F1, F2, F2), Thrusters)
 
 
-@njit(F8(F1, F8), cache=True)
-def polynomial(c, x):
-    """sum c[i] x^(i+1)."""
-    return x * (c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * c[4]))))
+@njit(F8(F3, types.int64, types.int64, F8), cache=True)
+def polynomial(curves, t, side, x):
+    """sum c[i] x^(i+1) of one curve (side 0 forward, 1 reverse) of thruster t."""
+    total = 0.0
+    for i in range(curves.shape[2] - 1, -1, -1):
+        total = x * (curves[t, side, i] + total)
+    return total
 
 
-@njit(types.void(THRUSTERS, types.int64, F8), cache=True)
-def command(thrusters, t, u):
-    """Gives thruster t the command u, -1 to 1; a force within the deadband is none."""
-    side = 0 if u > 0.0 else 1
-    force = polynomial(thrusters.force_curve[t, side], min(1.0, abs(u)))
-    if force < thrusters.constants[t, 1]:
-        force = 0.0
-    thrusters.level[t, 0] = force if u > 0.0 else -force
+@njit(types.void(THRUSTERS, types.int64, F1), cache=True)
+def command(thrusters, first, u):
+    """Gives thrusters `first` and on the commands u, -1 to 1; a force within the deadband is none."""
+    for i in range(u.shape[0]):
+        t, side = first + i, 0 if u[i] > 0.0 else 1
+        force = polynomial(thrusters.force_curve, t, side, min(1.0, abs(u[i])))
+        if force < thrusters.constants[t, 1]:
+            force = 0.0
+        thrusters.level[t, 0] = force if u[i] > 0.0 else -force
 
 
 @njit(F8(F8, F8, F8, F8, F8), cache=True)
@@ -76,15 +85,16 @@ def voltage_of(open_v, resistance, limit_a, idle_a, conductance):
     return v
 
 
-@njit(types.void(THRUSTERS), cache=True)
-def load_supplies(thrusters):
-    """Finds voltage and current of every module from what its propellers do."""
+@njit(types.void(THRUSTERS, types.int64), cache=True)
+def load_supplies(thrusters, halves):
+    """Finds voltage and current of every module from what its propellers do so many half sub-steps from now."""
     supply, power = thrusters.supply, thrusters.power
     for m in range(supply.shape[0]):
         power[m, 1] = 0.0
     for t in range(thrusters.module.shape[0]):
-        f = thrusters.level[t, 1]
-        power[thrusters.module[t], 1] += polynomial(thrusters.power_curve[t, 0 if f > 0.0 else 1], abs(f))
+        target = thrusters.level[t, 0]
+        f = target + (thrusters.level[t, 1] - target) * thrusters.decay[t, halves]
+        power[thrusters.module[t], 1] += polynomial(thrusters.power_curve, t, 0 if f > 0.0 else 1, abs(f))
     for m in range(supply.shape[0]):
         v0 = supply[m, 0]
         idle_a = supply[m, 4] / supply[m, 1]
@@ -93,37 +103,74 @@ def load_supplies(thrusters):
         power[m, 0], power[m, 1] = v, idle_a + conductance * v * v
 
 
-@njit(types.void(THRUSTERS, F8), cache=True)
-def forces_after(thrusters, elapsed_s):
-    """Sets the force of every thruster to that `elapsed_s` from now, at the voltages found by `load_supplies`."""
+@njit(types.void(THRUSTERS, types.int64), cache=True)
+def forces_after(thrusters, halves):
+    """Sets the force of every thruster to that so many half sub-steps from now, at the voltages found by `load_supplies`."""
     for t in range(thrusters.force.shape[0]):
-        lag, target, now = thrusters.constants[t, 2], thrusters.level[t, 0], thrusters.level[t, 1]
-        left = math.exp(-elapsed_s / lag) if lag > 0.0 else 0.0
+        target, now = thrusters.level[t, 0], thrusters.level[t, 1]
         m = thrusters.module[t]
         scale = thrusters.power[m, 0] / thrusters.supply[m, 0]
-        thrusters.force[t] = thrusters.constants[t, 0] * scale * scale * (target + (now - target) * left)
+        thrusters.force[t] = thrusters.constants[t, 0] * scale * scale * (target + (now - target) * thrusters.decay[t, halves])
 
 
-@njit(types.void(THRUSTERS, F8), cache=True)
-def settle(thrusters, elapsed_s):
-    """Moves the lagged forces on by `elapsed_s`."""
-    for t in range(thrusters.module.shape[0]):
-        lag = thrusters.constants[t, 2]
-        left = math.exp(-elapsed_s / lag) if lag > 0.0 else 0.0
-        thrusters.level[t, 1] = thrusters.level[t, 0] + (thrusters.level[t, 1] - thrusters.level[t, 0]) * left
+@njit(types.void(THRUSTERS), cache=True)
+def settle(thrusters):
+    """Moves the lagged forces on by a sub-step."""
+    level = thrusters.level
+    for t in range(level.shape[0]):
+        level[t, 1] = level[t, 0] + (level[t, 1] - level[t, 0]) * thrusters.decay[t, 2]
 
 
-@njit(types.void(THRUSTERS, types.int64, F1), cache=True)
-def feedback(thrusters, t, out):
-    """Writes rpm (1/min) and current (A) of thruster t into out (2,).
+@njit(types.void(THRUSTERS, types.int64, F2), cache=True)
+def feedback(thrusters, first, out):
+    """Writes rpm (1/min) and current (A) of thrusters `first` and on into out (n, 2).
 
     Thrust goes with the square of the speed; the gain error is the propeller's, so the speed does not show it.
     """
-    f = thrusters.level[t, 1]
-    side = 0 if f > 0.0 else 1
-    m = thrusters.module[t]
-    scale = thrusters.power[m, 0] / thrusters.supply[m, 0]
-    full = polynomial(thrusters.force_curve[t, side], 1.0)
-    rpm = thrusters.constants[t, 3] * scale * math.sqrt(abs(f) / full)
-    out[0] = rpm if f > 0.0 else -rpm
-    out[1] = polynomial(thrusters.power_curve[t, side], abs(f)) / thrusters.supply[m, 0] * scale * scale
+    for i in range(out.shape[0]):
+        t = first + i
+        f, m = thrusters.level[t, 1], thrusters.module[t]
+        side = 0 if f > 0.0 else 1
+        scale = thrusters.power[m, 0] / thrusters.supply[m, 0]
+        full = polynomial(thrusters.force_curve, t, side, 1.0)
+        rpm = thrusters.constants[t, 2] * scale * math.sqrt(abs(f) / full)
+        out[i, 0] = rpm if f > 0.0 else -rpm
+        out[i, 1] = polynomial(thrusters.power_curve, t, side, abs(f)) / thrusters.supply[m, 0] * scale * scale
+
+
+@njit(types.void(THRUSTERS, BODIES, MODULES, F8, F8, F8, F2), cache=True)
+def add_jets(thrusters, bodies, modules, strength, length, radius, out):
+    """Adds the push of every jet on the first other module in its way to the wrenches out (b, 6).
+
+    A jet leaves against the force, widens by a tenth of its way (Pope, Turbulent Flows, 2000, sect. 5.1: spreading rate of a round
+    jet 0.094), and `strength` of its thrust is felt at its start, half of that after `length`. Other modules feel it at the
+    point of its axis nearest to their centre.
+    """
+    x = bodies.state
+    for t in range(thrusters.force.shape[0]):
+        force, own = thrusters.force[t], thrusters.module[t]
+        if abs(force) < 1e-6:
+            continue
+        b = thrusters.body[t]
+        r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
+        jet = turn(r, times(-1.0 if force > 0.0 else 1.0, triple(thrusters.column, t, 0)))
+        start = plus(triple(x, b, 0), turn(r, triple(thrusters.position, t, 0)))
+        hit, way, share = -1, 1e9, 0.0
+        for m in range(modules.body.shape[0]):
+            c = modules.body[m]
+            other = matrix_of(x[c, 3], x[c, 4], x[c, 5], x[c, 6])
+            gap = minus(plus(triple(x, c, 0), turn(other, triple(modules.position, m, 0))), start)
+            ahead = dot(gap, jet)
+            if m == own or ahead <= 0.0 or ahead >= way:
+                continue
+            half = (modules.size[m, 0] + modules.size[m, 1] + modules.size[m, 2]) / 6.0
+            beside = math.sqrt(max(0.0, dot(gap, gap) - ahead * ahead))
+            miss = max(0.0, beside - half) / (radius + 0.1 * ahead)
+            if miss < 2.0:
+                hit, way = m, ahead
+                share = strength * math.exp(-miss * miss) / (1.0 + max(0.0, ahead - half) / length)
+        if hit >= 0:
+            c = modules.body[hit]
+            other = matrix_of(x[c, 3], x[c, 4], x[c, 5], x[c, 6])
+            at = turn_back(other, minus(plus(start, times(way, jet)), triple(x, c, 0)))
+            add_force(out, c, at, turn_back(other, times(share * abs(force), jet)))

@@ -100,12 +100,12 @@ class World:
         self.period_ns = period_ns
         self._step_ns = step_ns
         self._draws = [draw_module(v, spec, seed, m) for m, v in enumerate(vehicles)]
-        self._first = np.concatenate([[0], np.cumsum([len(v.thruster) for v in vehicles])])
+        self._first = [0, *np.cumsum([len(v.thruster) for v in vehicles]).tolist()]
         self.bodies: list[tuple[int, ...]] = [(m,) for m in range(len(vehicles))]
         self._water = make_water(spec, tank)
         self._gusts = Gusts(spec, stream(seed, "gusts"), 1e-9 * period_ns)
         self._water.flow[0], self._water.flow[1] = self._gusts.mean, self._gusts.start
-        self._thrusters = _make_thrusters(vehicles, self._draws, spec)
+        self._thrusters = _make_thrusters(vehicles, self._draws, spec, step_ns)
         self._modules = _make_modules(vehicles, self._draws)
         self._body_arrays = _make_bodies(vehicles, self._draws, spec)
         for m, start in enumerate(starts):
@@ -122,9 +122,7 @@ class World:
 
     def set_command(self, module: int, u: np.ndarray, armed: bool) -> None:
         """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call; disarmed is zero."""
-        for i in range(self._first[module], self._first[module + 1]):
-            value = float(u[i - self._first[module]]) if armed else 0.0
-            thrusters_module.command(self._thrusters, i, value)
+        thrusters_module.command(self._thrusters, self._first[module], np.array(u, dtype=np.float64) * float(armed))
 
     def advance(self, duration_ns: int) -> None:
         """Moves the world on. The duration must be a multiple of the sub-step, else DescriptionError."""
@@ -136,6 +134,10 @@ class World:
 
     def _step(self, steps: int) -> None:
         h = 1e-9 * self._step_ns
+        self._external[:] = 0.0
+        if len(self.vehicles) > 1 and self.spec.jet_strength > 0.0:
+            jet = (self.spec.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
+            thrusters_module.add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._external)
         bodies, modules = self._body_arrays, self._modules
         advance(bodies, modules, self._thrusters, self._water, self._external, steps, h, self._stage, self._thrust)
         observe(bodies, modules, self._stage[5], self.spec.gravity, self._seen)
@@ -168,9 +170,23 @@ class World:
         """(t, 2) speed (1/min) and current (A) of each thruster of a module."""
         first, last = self._first[module], self._first[module + 1]
         out = np.empty((last - first, 2))
-        for i in range(first, last):
-            thrusters_module.feedback(self._thrusters, i, out[i - first])
+        thrusters_module.feedback(self._thrusters, first, out)
         return out
+
+    def draw(self, module: int) -> ModuleDraw:
+        """What this seed made of a module."""
+        return self._draws[module]
+
+    def kinetic_energy(self) -> np.ndarray:
+        """(b,) kinetic energy of each body and of still water that it moves, J."""
+        arrays = self._body_arrays
+        return np.array([0.5 * x[7:] @ (arrays.rigid[b] + arrays.added[b]) @ x[7:] for b, x in enumerate(arrays.state)])
+
+    def set_motion(self, body: int, v_w: np.ndarray, w_b: np.ndarray) -> None:
+        """Gives a body a velocity (3,) of O, world, and an angular rate (3,), body frame."""
+        x = self._body_arrays.state[body]
+        x[7:10], x[10:13] = rotations.rotate_back(x[3:7].copy(), np.array(v_w, dtype=np.float64)), w_b
+        self._step(0)
 
     def momentum(self) -> np.ndarray:
         """(b, 6) linear momentum and angular momentum about the world's origin of each body and the water it carries, world."""
@@ -184,13 +200,12 @@ class World:
         return out
 
 
-def _make_thrusters(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec) -> Thrusters:
+def _make_thrusters(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec, step_ns: int) -> Thrusters:
     module = np.array([m for m, v in enumerate(vehicles) for _ in v.thruster], dtype=np.int64)
     curves = [vehicles[m].curve for m in module]
     constants = np.column_stack([
         np.concatenate([d.gain for d in draws]),
         np.concatenate([d.deadband_n for d in draws]),
-        np.full(len(module), spec.thruster_lag_s),
         np.array([c.rpm_at_full for c in curves]),
     ])  # fmt: skip
     supply = np.array([
@@ -198,13 +213,17 @@ def _make_thrusters(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], sp
          v.supply.current_a if spec.supply_limit else math.inf, v.supply.idle_w]
         for v in vehicles
     ])  # fmt: skip
+    lag = spec.thruster_lag_s
+    decay = np.exp(-0.5e-9 * step_ns / lag * np.arange(3)) if lag > 0.0 else np.zeros(3)
     return Thrusters(
         module,
         module.copy(),
         np.concatenate([np.hstack([v.directions, np.cross(v.positions, v.directions)]) for v in vehicles]),
+        np.concatenate([v.positions for v in vehicles]),
         np.array([[c.forward, c.reverse] for c in curves]),
         np.array([[c.power_forward, c.power_reverse] for c in curves]),
         constants,
+        np.tile(decay, (len(module), 1)),
         np.zeros((len(module), 2)),
         np.zeros(len(module)),
         supply,

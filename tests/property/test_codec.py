@@ -2,6 +2,7 @@
 
 import math
 from importlib import resources
+from pathlib import Path
 
 import cantools.database
 import numpy as np
@@ -23,8 +24,9 @@ from firmware_py.bus.codec import (
 CODEC = Codec.load()
 MESSAGES = {message.name: message for message in CODEC.messages}
 PROTECTED = [name for name, message in MESSAGES.items() if message.protected]
-settings.register_profile("modcube", derandomize=True, deadline=None, max_examples=60)
-settings.load_profile("modcube")
+EXAMPLES = settings(derandomize=True, deadline=None, max_examples=60)
+FEW_EXAMPLES = settings(EXAMPLES, max_examples=10)
+MANY_EXAMPLES = settings(EXAMPLES, max_examples=500)
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +64,7 @@ def protection(frame, message):
 
 
 @pytest.mark.parametrize("name", MESSAGES)
+@EXAMPLES
 @given(data=st.data())
 def test_cantools_reads_what_we_send(name, oracle, data):
     message = MESSAGES[name]
@@ -75,6 +78,7 @@ def test_cantools_reads_what_we_send(name, oracle, data):
 
 
 @pytest.mark.parametrize("name", MESSAGES)
+@EXAMPLES
 @given(data=st.data())
 def test_we_read_what_cantools_sends(name, oracle, data):
     message = MESSAGES[name]
@@ -93,6 +97,7 @@ def test_we_read_what_cantools_sends(name, oracle, data):
 
 
 @pytest.mark.parametrize("name", MESSAGES)
+@EXAMPLES
 @given(data=st.data())
 def test_physical_values_become_the_same_bytes_as_with_cantools(name, oracle, data):
     message = MESSAGES[name]
@@ -103,6 +108,7 @@ def test_physical_values_become_the_same_bytes_as_with_cantools(name, oracle, da
 
 
 @pytest.mark.parametrize("name", MESSAGES)
+@EXAMPLES
 @given(data=st.data())
 def test_wire_changes_a_value_by_half_a_step_at_most(name, data):
     message = MESSAGES[name]
@@ -159,16 +165,32 @@ def test_crc_is_sae_j1850():
     assert frame.data[-1] == Crc8SaeJ1850.calc(frame.id.to_bytes(2, "little") + frame.data[:-1])
 
 
+@EXAMPLES
 @given(can_id=st.integers(0, 0x7FF), payload=st.binary(max_size=7))
 def test_crc_agrees_with_another_implementation(can_id, payload):
     assert crc8(can_id, payload) == Crc8SaeJ1850.calc(can_id.to_bytes(2, "little") + payload)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "counter", "values"),
+    [
+        ("THRUSTER_CMD_A", 3, 5, (0.5, -0.25, 0.0, 1.0, 1)),
+        ("DOCK_CMD", 2, 0, (1, 2, 0, 0, 0, 0)),
+        ("TAG_ATTITUDE", 1, 9, (*pack_quaternion((0.5, -0.5, 0.5, 0.5)), 4, 7, 0x2A, 3.3)),
+    ],
+)
+def test_example_frames_of_the_readme_are_ours(name, number, counter, values):
+    frame = MESSAGES[name].encode(number, values, counter)
+    readme = (Path(__file__).parents[2] / "can_dbc" / "README.md").read_text(encoding="utf-8")
+    (row,) = [line for line in readme.splitlines() if line.startswith(f"| {name} ")]
+    assert row.split("|")[-3:-1] == [f" {frame.id:03X} ", f" {frame.data.hex(' ').upper()} "]
 
 
 # ------------------------------------------------------------------ receiver
 
 
 @pytest.mark.parametrize("name", PROTECTED)
-@settings(max_examples=10)
+@FEW_EXAMPLES
 @given(data=st.data())
 def test_one_flipped_bit_always_drops_a_protected_frame(name, data):
     message = MESSAGES[name]
@@ -183,7 +205,7 @@ def test_one_flipped_bit_always_drops_a_protected_frame(name, data):
 
 
 @pytest.mark.parametrize("name", PROTECTED)
-@settings(max_examples=10)
+@FEW_EXAMPLES
 @given(data=st.data())
 def test_one_flipped_bit_of_an_id_drops_the_frame_or_stops_the_robot(name, data):
     message = MESSAGES[name]
@@ -193,6 +215,7 @@ def test_one_flipped_bit_of_an_id_drops_the_frame_or_stops_the_robot(name, data)
         assert received is None or received.message.name == "ESTOP"
 
 
+@EXAMPLES
 @given(frames=st.lists(st.builds(Frame, st.integers(-5, 0x1000), st.binary(max_size=12)), max_size=40))
 def test_receiver_never_raises_and_counts_every_frame(frames):
     receiver = Receiver(CODEC)
@@ -200,6 +223,7 @@ def test_receiver_never_raises_and_counts_every_frame(frames):
     assert accepted + sum(receiver.dropped.values()) == len(frames)
 
 
+@EXAMPLES
 @given(payload=st.binary(max_size=8), number=st.integers(0, 31))
 def test_any_id_of_estop_stops_whatever_its_length(payload, number):
     received = Receiver(CODEC).accept(Frame(number, payload))
@@ -259,7 +283,7 @@ def unit_quaternions():
 
 
 @given(q=unit_quaternions())
-@settings(max_examples=500)
+@MANY_EXAMPLES
 def test_tag_attitude_survives_the_wire_to_ten_milliradians(q):
     """Half a step of sqrt(2)/510 in three components, where all four are equal: 0.0096 rad (rms 0.0031)."""
     back = unpack_quaternion(*pack_quaternion(q))
@@ -277,6 +301,7 @@ def test_attitude_about_one_axis_is_exact(index, sign):
     assert unpack_quaternion(index, 255, 255, 255) == pytest.approx(np.abs(q))
 
 
+@EXAMPLES
 @given(st.tuples(st.integers(0, 3), *[st.integers(0, 511)] * 3))
 def test_any_raw_attitude_unpacks_to_a_unit_quaternion(raw):
     assert np.linalg.norm(unpack_quaternion(*raw)) == pytest.approx(1.0, abs=1e-12)

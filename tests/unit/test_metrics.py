@@ -13,7 +13,7 @@ from hil.metrics import body_positions, flight_metrics, nis_mean, rotation_vecto
 from hil.signals import Flight, read_flight
 from tests.unit.flights import START_NS, write_flight
 
-LIMITS = (Limit("position_rmse_m", high=0.005), Limit("nis_mean", 0.7, 1.4, "filter consistency"))
+LIMITS = (Limit("position_rmse_m", high=0.005), Limit("nis_mean", 0.7, 1.4))
 
 
 def spiral_of(folder: Path, duration_s: float = 5.0, **errors: object) -> Flight:
@@ -108,7 +108,7 @@ def test_result_file_has_the_agreed_shape(tmp_path: Path) -> None:
         "metrics": {"position_rmse_m": 0.0026, "nis_mean": None, "ticks": 4001},
         "checks": [
             {"name": "position_rmse_m", "value": 0.0026, "limit": "<= 0.005", "passed": True},
-            {"name": "filter consistency", "value": None, "limit": "0.7 to 1.4", "passed": False},
+            {"name": "nis_mean", "value": None, "limit": "0.7 to 1.4", "passed": False},
         ],
     }
 

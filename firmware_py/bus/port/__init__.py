@@ -60,6 +60,7 @@ class Port:
         self._link = link
         self._bus: can.BusABC | None = link.open()
         self._closed = False
+        self._is_lost = False
         self._skip_reopen = 0
         self._now_ns = now_ns
         self._arrival = arrival
@@ -136,6 +137,9 @@ class Port:
     def _read_for_ever(self) -> None:
         pause = threading.Event()
         while not self._closed:
+            if self._is_lost:  # send found out; only the reader closes what the reader reads
+                self._is_lost = False
+                self._let_go()
             frames = self._drain(READ_TIMEOUT_S)
             room = WAITING_FRAMES - len(self._waiting)
             self.faults["overrun"] += max(0, len(frames) - room)
@@ -176,6 +180,9 @@ class Port:
         if message.is_extended_id or message.is_remote_frame or message.is_fd:
             self.faults["foreign"] += 1
             return None
+        if message.dlc != len(message.data):  # a torn line of an slcan adapter
+            self.faults["receive"] += 1
+            return None
         return Frame(message.arbitration_id, bytes(message.data))
 
     def _look_after(self, bus: Any) -> None:
@@ -189,7 +196,10 @@ class Port:
         number = error_number(error)
         if number in _GONE:
             self.faults["gone"] += 1
-            self._let_go()
+            if self._thread is None or self._thread is threading.current_thread():
+                self._let_go()
+            else:
+                self._is_lost = True
         elif number in _DOWN:
             self.faults["down"] += 1
         elif number in _FULL or isinstance(error, can.CanTimeoutError) or "buffer full" in str(error):
@@ -201,7 +211,7 @@ class Port:
         bus, self._bus = self._bus, None
         if bus is not None:
             try:
-                bus.shutdown()
+                self._link.close(bus)
             except Exception:  # slcan writes a last command to a device that may be gone
                 self.faults["gone"] += 1
 

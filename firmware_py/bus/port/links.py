@@ -49,6 +49,10 @@ class Link(ABC):
         """Whether the open interface is still the one of that name."""
         return True
 
+    def close(self, bus: Any) -> None:
+        """Closes a bus of `open`, also one whose interface is gone."""
+        bus.shutdown()
+
     def send(self, bus: Any, frame: Frame) -> None:
         """Hands one frame to `bus`; raises what python-can raises."""
         message = can.Message(arbitration_id=frame[0], is_extended_id=False, data=frame[1])
@@ -171,6 +175,9 @@ class SocketcanLink(Link):
             there = f"there are {', '.join(names)}" if names else "this machine has none with can in its name"
             raise PortError(f"socketcan:{self.address}: there is no such interface; {there}") from None
         try:
+            # python-can leaks the socket of an interface that it cannot bind, so this one goes first.
+            with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
+                probe.bind((self.address,))
             bus = can.Bus(interface="socketcan", channel=self.address)
         except (OSError, can.CanError) as error:
             hint = "not a CAN interface" if error_number(error) == errno.ENODEV else _reason(error)
@@ -203,6 +210,22 @@ class SlcanLink(Link):
         except (OSError, ValueError, can.CanError) as error:
             hint = "it takes a serial device, slcan:/dev/ttyACM0"
             raise PortError(f"slcan:{self.address}: {_reason(error)}; {hint}") from None
+
+    def close(self, bus: Any) -> None:
+        """python-can leaves the device open when it is gone and its last command fails."""
+        try:
+            bus.shutdown()
+        finally:
+            bus.serialPortOrig.close()
+
+    def read(self, bus: Any, timeout_s: float) -> Frame | can.Message | None:
+        """python-can keeps a line that is not text and would stumble over it for ever."""
+        try:
+            return super().read(bus, timeout_s)
+        except can.CanOperationError as error:
+            if isinstance(error.__cause__, UnicodeDecodeError):
+                bus.flush()
+            raise
 
     def is_present(self) -> bool:
         return os.path.exists(self.address)

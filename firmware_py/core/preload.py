@@ -1,0 +1,60 @@
+"""Preload: thrusters of one module pushed against each other, without any wrench, so that small forces stay clear of the deadband.
+
+Worked out when a body is made or a thruster is lost; the allocator adds it to every answer.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from firmware_py.core.body import ThrusterSet
+
+RANK_TOLERANCE = 1e-6
+"""Singular values below this share of the largest count as zero."""
+DIRECTIONS = 720
+"""Directions tried in the null space; half a degree apart where it is a plane."""
+UNEVEN = 5.0
+"""The largest preload force of a module is at most this many times the smallest wanted one."""
+
+
+def preload(thrusters: ThrusterSet, alive: np.ndarray, smallest_n: float) -> np.ndarray:
+    """(n,) forces without wrench, N: every thruster that can be is at least `smallest_n` from zero, and no more than needed.
+
+    Args:
+        alive: (n,) bool, thrusters that may be used.
+        smallest_n: wanted distance from zero; 0 gives no preload.
+    """
+    forces = np.zeros(thrusters.f_max.size)
+    if smallest_n > 0.0:
+        for module in np.unique(thrusters.module):
+            index = np.flatnonzero((thrusters.module == module) & alive)
+            forces[index] = _of_module(thrusters.matrix[:, index], smallest_n)
+    return forces
+
+
+def _of_module(matrix: np.ndarray, smallest_n: float) -> np.ndarray:
+    """(k,) forces of the k thrusters whose wrenches are the columns of `matrix` (6, k)."""
+    if matrix.shape[1] == 0:
+        return np.zeros(0)
+    _, values, rows = np.linalg.svd(matrix)
+    rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
+    null = rows[rank:].T
+    if null.shape[1] == 0:
+        return np.zeros(matrix.shape[1])
+    reachable = np.linalg.norm(null, axis=1) > RANK_TOLERANCE
+    candidates = null @ _directions(null.shape[1])
+    sizes = np.abs(candidates[reachable])
+    best = int(np.argmax(sizes.min(axis=0) / sizes.max(axis=0)))
+    scale = min(smallest_n / max(sizes[:, best].min(), 1e-12), UNEVEN * smallest_n / sizes[:, best].max())
+    return np.asarray(candidates[:, best] * scale)
+
+
+def _directions(dimension: int) -> np.ndarray:
+    """(dimension, DIRECTIONS) unit vectors: all of a plane's half-turn, a fixed draw in more dimensions."""
+    if dimension == 1:
+        return np.ones((1, 1))
+    if dimension == 2:
+        angle = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+        return np.stack([np.cos(angle), np.sin(angle)])
+    draw = np.random.default_rng(0).normal(size=(dimension, DIRECTIONS))
+    return np.asarray(draw / np.linalg.norm(draw, axis=0))

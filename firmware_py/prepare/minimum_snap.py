@@ -1,0 +1,231 @@
+"""Minimum snap through waypoints in position and attitude: closed form, OSQP under limits, time stretched to fit.
+
+Paper, "Trajectory Planning for RS-ModCubes" (Mellinger and Kumar 2011), with continuity to the fourth derivative.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from firmware_py.core import rotations
+from firmware_py.core.body import Body
+from firmware_py.prepare.piecewise import CHANNELS, Piecewise
+from firmware_py.prepare.snap_limits import InfeasibleError, Limits, planes, solve_limited, worst
+from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
+from firmware_py.prepare.snap_thrust import usage, wrenches
+
+__all__ = ["InfeasibleError", "Limits", "Waypoint", "plan"]
+
+ATTITUDE_LEVER_M = 0.5
+"""One radian counts as this many metres where time is divided among the pieces."""
+
+FIRST_SPEED = 0.1
+"""m/s from which free durations start; what comes out does not depend on it."""
+
+_CHECK_POINTS = 16
+"""Points of each piece at which attitude rates and thrusters are checked."""
+
+_LONGEST_STRETCH = 1024.0
+_STRETCH_TOLERANCE = 2e-3
+_SHORTEST_QUATERNION = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoint:
+    """A pose to pass through.
+
+    Attributes:
+        p_wb: (3,) m, world.
+        q_wb: (4,) attitude; None keeps that of the waypoint before.
+        velocity_w: (3,) m/s to pass it with; None leaves it free.
+        stop: come to rest there.
+    """
+
+    p_wb: np.ndarray
+    q_wb: np.ndarray | None = None
+    velocity_w: np.ndarray | None = None
+    stop: bool = False
+
+
+def plan(
+    waypoints: Sequence[Waypoint],
+    durations_s: Sequence[float] | float | None = None,
+    limits: Limits | None = None,
+    body: Body | None = None,
+    stretch: bool = True,
+) -> Piecewise:
+    """The trajectory of least snap through the waypoints, rest to rest.
+
+    Args:
+        waypoints: two or more.
+        durations_s: of each piece; or their sum, divided for least snap; or None: as short as limits and body allow.
+        limits: what the path may do.
+        body: whose thrusters must be able to fly it, in still water.
+        stretch: lengthen the durations until everything fits; False takes them as they are.
+
+    Raises:
+        InfeasibleError: which limit cannot be kept, and where.
+        ValueError: too few waypoints, durations that do not match, or free durations without anything that bounds them.
+    """
+    limits = limits or Limits()
+    request = _Request.of(waypoints, limits, body)
+    base = request.durations(durations_s)
+    if durations_s is not None and not stretch:
+        return request.attempt(base)
+    request.check_standing()
+    if durations_s is None and body is None and not request.bounds_speed():
+        raise ValueError("free durations need a limit on velocity or acceleration, or a body")
+    return _fit(request, base, free=durations_s is None)
+
+
+def _fit(request: _Request, base: np.ndarray, free: bool) -> Piecewise:
+    """The shortest uniform stretch of `base` that fits; below 1 only where durations are free."""
+    high, best = 1.0, request.try_stretch(base, 1.0)
+    low = 1.0
+    while best is None:
+        low, high = high, 2.0 * high
+        if high > _LONGEST_STRETCH:
+            request.attempt(base * low)
+        best = request.try_stretch(base, high)
+    if high == 1.0 and not free:
+        return best
+    while low == high:
+        shorter = request.try_stretch(base, 0.5 * low)
+        if shorter is None:
+            low *= 0.5
+        else:
+            best, low, high = shorter, 0.5 * low, 0.5 * high
+    while high > (1.0 + _STRETCH_TOLERANCE) * low:
+        middle = math.sqrt(low * high)
+        tried = request.try_stretch(base, middle)
+        if tried is None:
+            low = middle
+        else:
+            best, high = tried, middle
+    return replace(best, stretch=1.0) if free else best
+
+
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """Waypoints in the form that the solver takes."""
+
+    position: Knots
+    attitude: Knots
+    limits: Limits
+    body: Body | None
+
+    @staticmethod
+    def of(waypoints: Sequence[Waypoint], limits: Limits, body: Body | None) -> _Request:
+        if len(waypoints) < 2:
+            raise ValueError(f"a trajectory needs two waypoints, not {len(waypoints)}")
+        value = np.array([w.p_wb for w in waypoints], dtype=float)
+        position = Knots.at_rest(value)
+        attitude = Knots.at_rest(_continuous(waypoints))
+        for k, waypoint in enumerate(waypoints):
+            if waypoint.stop:
+                position.fixed[k], attitude.fixed[k] = True, True
+            elif waypoint.velocity_w is not None:
+                position.fixed[k, 0] = True
+                position.derivative[k, 0] = waypoint.velocity_w
+        return _Request(position, attitude, limits, body)
+
+    def bounds_speed(self) -> bool:
+        """Whether some limit keeps the duration from vanishing."""
+        chosen = (self.limits.velocity, self.limits.acceleration, self.limits.angular_rate)
+        return any(x is not None for x in (*chosen, self.limits.angular_acceleration))
+
+    def durations(self, asked: Sequence[float] | float | None) -> np.ndarray:
+        """(n - 1,) s to start from."""
+        count = len(self.position.value) - 1
+        if isinstance(asked, Sequence | np.ndarray):
+            given = np.array(asked, dtype=float)
+            if given.shape != (count,) or not np.all(given > 0.0):
+                raise ValueError(f"{count + 1} waypoints need {count} durations above zero, not {given.tolist()}")
+            return given
+        value = np.hstack([self.position.value, 2.0 * ATTITUDE_LEVER_M * self.attitude.value])
+        distance = float(np.linalg.norm(np.diff(value, axis=0), axis=1).sum())
+        total = max(distance / FIRST_SPEED, 1.0) if asked is None else float(asked)
+        if not total > 0.0:
+            raise ValueError(f"a duration is above zero, not {total}")
+        knots = Knots.at_rest(value)
+        knots.fixed[:] |= self.position.fixed
+        knots.derivative[:, :, :3] = self.position.derivative
+        return divide_time(knots, total, np.ones(CHANNELS))
+
+    def try_stretch(self, base: np.ndarray, factor: float) -> Piecewise | None:
+        """The trajectory at `factor` times the durations, or None where it breaks something."""
+        try:
+            return replace(self.attempt(base * factor), stretch=factor)
+        except InfeasibleError:
+            return None
+
+    def attempt(self, durations: np.ndarray) -> Piecewise:
+        """The trajectory in exactly these durations. Raises InfeasibleError."""
+        system = System.of(durations)
+        unknown = solve(system, self.position)
+        bounds = planes(self.position.value, self.limits)
+        method = "closed form"
+        if worst(bounds, system.coefficients(self.position.value, unknown), durations)[0] > 1.0:
+            unknown, method = solve_limited(system, self.position, bounds, unknown), "osqp"
+        turning = system.coefficients(self.attitude.value, solve(system, self.attitude))
+        both = np.concatenate([system.coefficients(self.position.value, unknown), turning], axis=2)
+        breaks = np.concatenate([[0.0], np.cumsum(durations)])
+        cost = system.cost(self.position.value, unknown)
+        found = Piecewise(np.ascontiguousarray(both), breaks, method, 1.0, cost)
+        self._check_turning(found)
+        if self.body is not None:
+            self._check_thrusters(found, self.body)
+        return found
+
+    def _check_turning(self, found: Piecewise) -> None:
+        grid = found.grid(_CHECK_POINTS)
+        if (shortest := float(grid[..., 19].min())) < _SHORTEST_QUATERNION:
+            where = _place(found, int(np.argmin(grid[..., 19])))
+            raise InfeasibleError(f"attitude turns too far {where} (length {shortest:.2f}); add a waypoint there")
+        rate, change = self.limits.angular_rate, self.limits.angular_acceleration
+        for bound, columns, unit in ((rate, slice(10, 13), "rad/s"), (change, slice(16, 19), "rad/s^2")):
+            size = np.linalg.norm(grid[..., columns], axis=-1)
+            if bound is not None and size.max() > bound:
+                where = _place(found, int(np.argmax(size)))
+                raise InfeasibleError(f"turning takes {size.max():.3g} {unit} of at most {bound:g} {where}")
+
+    def _check_thrusters(self, found: Piecewise, body: Body) -> None:
+        motion = found.grid(_CHECK_POINTS)[..., :19]
+        share, k = usage(body, wrenches(body, motion.reshape(-1, 19)))
+        if share > self.limits.thruster_share:
+            raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, _place(found, k)))
+
+    def check_standing(self) -> None:
+        """Refuse attitudes that the body cannot even hold. Raises InfeasibleError."""
+        if self.body is None:
+            return
+        still = np.zeros((len(self.attitude.value), 19))
+        still[:, 3:7] = self.attitude.value
+        share, k = usage(self.body, wrenches(self.body, still))
+        if share > self.limits.thruster_share:
+            raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, f"to stand still at waypoint {k}"))
+
+
+def _thrust_message(share: float, limit: float, where: str) -> str:
+    used, allowed = f"{100.0 * share:.0f} %", f"{100.0 * limit:.0f} %"
+    return f"the thrusters would be used to {used} of their range, of at most {allowed}, {where}"
+
+
+def _place(found: Piecewise, flat: int) -> str:
+    """In words, the place of a flat index into `found.grid(_CHECK_POINTS)`."""
+    piece, i = divmod(flat, _CHECK_POINTS + 1)
+    time = found.breaks[piece] + i / _CHECK_POINTS * (found.breaks[piece + 1] - found.breaks[piece])
+    return f"between waypoints {piece} and {piece + 1}, at {time:.2f} s"
+
+
+def _continuous(waypoints: Sequence[Waypoint]) -> np.ndarray:
+    """(n, 4) unit quaternions, each with the sign nearer to the one before."""
+    found = [np.array([1.0, 0.0, 0.0, 0.0])]
+    for waypoint in waypoints:
+        q = found[-1] if waypoint.q_wb is None else rotations.normalise(np.array(waypoint.q_wb, dtype=float))
+        found.append(q if q @ found[-1] >= 0.0 else -q)
+    return np.array(found[1:])

@@ -1,0 +1,121 @@
+"""A trajectory of polynomial pieces in position and attitude, as minimum snap makes them; sampled in the tick.
+
+Attitude runs in the space of all quaternions and is normalised: smooth, free of singular attitudes, met at the
+waypoints, and the same however world or body axes are chosen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from firmware_py.core.types import Setpoint
+
+CHANNELS = 7
+"""x, y, z, then the four of the quaternion before it is normalised."""
+
+
+@njit("void(float64[:,::1], float64, float64, float64[:,::1])", cache=True)
+def _derivatives(c, u, rate, out):  # type: ignore[no-untyped-def]
+    """Value and two time derivatives, (3, 7), of coefficients (10, 7) at u; `rate` is du/dt."""
+    out[:] = 0.0
+    for k in range(c.shape[0] - 1, -1, -1):
+        for j in range(7):
+            out[2, j] = out[2, j] * u + 2.0 * out[1, j]
+            out[1, j] = out[1, j] * u + out[0, j]
+            out[0, j] = out[0, j] * u + c[k, j]
+    out[1] *= rate
+    out[2] *= rate * rate
+
+
+@njit("void(float64[:,::1], float64[::1])", cache=True)
+def _motion(d, out):  # type: ignore[no-untyped-def]
+    """(19,) p, q, v, w, a, alpha of derivatives (3, 7).
+
+    With x = |x| q: w = 2 Im(q* x')/|x| and alpha = 2 Im(q* x'')/|x| - 2 w (q . x')/|x|: the part of x' along q turns
+    nothing.
+    """
+    n = math.sqrt(d[0, 3] ** 2 + d[0, 4] ** 2 + d[0, 5] ** 2 + d[0, 6] ** 2)
+    q0, q1, q2, q3 = d[0, 3] / n, d[0, 4] / n, d[0, 5] / n, d[0, 6] / n
+    out[0:3] = d[0, 0:3]
+    out[3], out[4], out[5], out[6] = q0, q1, q2, q3
+    out[7:10] = d[1, 0:3]
+    out[13:16] = d[2, 0:3]
+    growth = 2.0 * (q0 * d[1, 3] + q1 * d[1, 4] + q2 * d[1, 5] + q3 * d[1, 6]) / n
+    for order in range(1, 3):
+        a, b, c, e = d[order, 3], d[order, 4], d[order, 5], d[order, 6]
+        at = 10 if order == 1 else 16
+        out[at] = 2.0 * (q0 * b - q1 * a - q2 * e + q3 * c) / n
+        out[at + 1] = 2.0 * (q0 * c - q2 * a - q3 * b + q1 * e) / n
+        out[at + 2] = 2.0 * (q0 * e - q3 * a - q1 * c + q2 * b) / n
+    out[16:19] -= growth * out[10:13]
+
+
+@njit("float64[::1](float64[:,:,::1], float64[::1], float64)", cache=True)
+def _sample(coefficients, breaks, t):  # type: ignore[no-untyped-def]
+    last = coefficients.shape[0] - 1
+    low, high = 0, last
+    while low < high:
+        middle = (low + high + 1) // 2
+        if breaks[middle] <= t:
+            low = middle
+        else:
+            high = middle - 1
+    rate = 1.0 / (breaks[low + 1] - breaks[low])
+    u = (t - breaks[low]) * rate
+    d = np.empty((3, 7))
+    _derivatives(coefficients[low], min(max(u, 0.0), 1.0), rate, d)
+    out = np.empty(19)
+    _motion(d, out)
+    if u < 0.0 or u > 1.0:
+        out[7:19] = 0.0
+    return out
+
+
+@njit("float64[:,:,::1](float64[:,:,::1], float64[::1], int64)", cache=True)
+def _grid(coefficients, breaks, per_piece):  # type: ignore[no-untyped-def]
+    out = np.empty((coefficients.shape[0], per_piece + 1, 20))
+    d = np.empty((3, 7))
+    for k in range(coefficients.shape[0]):
+        rate = 1.0 / (breaks[k + 1] - breaks[k])
+        for i in range(per_piece + 1):
+            _derivatives(coefficients[k], i / per_piece, rate, d)
+            _motion(d, out[k, i, :19])
+            out[k, i, 19] = math.sqrt(d[0, 3] ** 2 + d[0, 4] ** 2 + d[0, 5] ** 2 + d[0, 6] ** 2)
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piecewise:
+    """Polynomial pieces in time; a `Trajectory`.
+
+    Attributes:
+        coefficients: (k, 10, 7) of 1, u, ..., u^9 in the share u of each piece's duration.
+        breaks: (k + 1,) s, rising from 0.
+        method: how it was found: "closed form" or "osqp".
+        stretch: factor by which the asked durations were lengthened.
+        snap_cost: integral of the squared snap of the position, m^2/s^7.
+    """
+
+    coefficients: np.ndarray
+    breaks: np.ndarray
+    method: str = "closed form"
+    stretch: float = 1.0
+    snap_cost: float = math.nan
+
+    @property
+    def duration_s(self) -> float:
+        """Time from start to end."""
+        return float(self.breaks[-1])
+
+    def sample(self, t_s: float) -> Setpoint:
+        """Wanted motion at `t_s`, world NED and wanted body frame; the ends are held at rest."""
+        x = _sample(self.coefficients, self.breaks, t_s)
+        return Setpoint(x[0:3], x[3:7], x[7:10], x[10:13], x[13:16], x[16:19])
+
+    def grid(self, per_piece: int) -> np.ndarray:
+        """(k, per_piece + 1, 20) p, q, v, w, a, alpha and the length of the quaternion before normalising."""
+        return np.asarray(_grid(self.coefficients, self.breaks, per_piece))

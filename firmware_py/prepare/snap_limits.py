@@ -1,0 +1,250 @@
+"""Minimum snap under limits: velocity, acceleration and corridor as linear rows, solved with OSQP.
+
+Rows stand at a few points of each piece; where the result breaks a limit in between, rows are added there and it is
+solved again, so that the limits hold everywhere and not at samples alone.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import osqp
+import scipy.sparse as sparse
+
+from firmware_py.prepare.snap_spline import ORDERS, TO_COEFFICIENTS, Knots, System, derivative_rows
+
+_FIRST_POINTS = 8
+"""Points of each piece that carry rows from the start."""
+
+_CHECK_POINTS = 48
+"""Points of each piece at which the limits are checked."""
+
+_MARGIN = 2e-3
+"""Share by which rows are tighter than the limit: covers the solver's tolerance and the gaps of the check."""
+
+_ROUNDS = 12
+_SOLVER = {
+    "eps_abs": 1e-5,
+    "eps_rel": 1e-5,
+    "max_iter": 20000,
+    "polishing": True,
+    "verbose": False,
+    "adaptive_rho_interval": 50,  # counted, not timed: the same result every time
+}
+_CORRIDOR_SIDES = 8
+"""A corridor is a prism of this many sides, inside the cylinder."""
+
+
+class InfeasibleError(ValueError):
+    """No trajectory meets the request; the message says which limit, and where."""
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What the trajectory may do; None leaves it free.
+
+    Attributes:
+        velocity: (3,) m/s, along each world axis.
+        acceleration: (3,) m/s^2, along each world axis.
+        corridor_m: largest distance from the straight line between neighbouring waypoints.
+        angular_rate: rad/s.
+        angular_acceleration: rad/s^2.
+        thruster_share: share of each thruster's force that the path may ask for; the rest is for control.
+    """
+
+    velocity: np.ndarray | None = None
+    acceleration: np.ndarray | None = None
+    corridor_m: float | None = None
+    angular_rate: float | None = None
+    angular_acceleration: float | None = None
+    thruster_share: float = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """One scalar limit on one piece: |normal . derivative - centre| <= bound.
+
+    Attributes:
+        piece, order: index of the piece; 0 position, 1 velocity, 2 acceleration.
+        normal: (3,) unit vector.
+        centre, bound: m, m/s or m/s^2.
+        name: for messages.
+    """
+
+    piece: int
+    order: int
+    normal: np.ndarray
+    centre: float
+    bound: float
+    name: str
+
+
+def planes(value: np.ndarray, limits: Limits) -> list[Plane]:
+    """Every scalar limit on every piece between waypoints `value` (n, 3)."""
+    found = []
+    for piece, (a, b) in enumerate(itertools.pairwise(value)):
+        for order, bounds, word in ((1, limits.velocity, "velocity"), (2, limits.acceleration, "acceleration")):
+            for axis in range(3 if bounds is not None else 0):
+                assert bounds is not None
+                unit = "m/s" if order == 1 else "m/s^2"
+                name = f"{word} along {'xyz'[axis]} within {bounds[axis]:g} {unit}"
+                found.append(Plane(piece, order, np.eye(3)[axis], 0.0, float(bounds[axis]), name))
+        if limits.corridor_m is not None:
+            found += _corridor(piece, a, b, limits.corridor_m)
+    return found
+
+
+def _corridor(piece: int, a: np.ndarray, b: np.ndarray, radius: float) -> list[Plane]:
+    length = float(np.linalg.norm(b - a))
+    along = (b - a) / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
+    across = np.cross(along, np.eye(3)[int(np.argmin(np.abs(along)))])
+    across /= np.linalg.norm(across)
+    name = f"corridor of {radius:g} m"
+    found = [Plane(piece, 0, along, float(along @ (a + b)) / 2.0, 0.5 * length + radius, name)]
+    for k in range(_CORRIDOR_SIDES // 2):
+        angle = 2.0 * math.pi * k / _CORRIDOR_SIDES
+        normal = math.cos(angle) * across + math.sin(angle) * np.cross(along, across)
+        found.append(Plane(piece, 0, normal, float(normal @ a), radius * math.cos(math.pi / _CORRIDOR_SIDES), name))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Planes as arrays: piece, order (m,), normal (m, 3), centre, bound (m,)."""
+
+    piece: np.ndarray
+    order: np.ndarray
+    normal: np.ndarray
+    centre: np.ndarray
+    bound: np.ndarray
+
+    @staticmethod
+    def of(limits: list[Plane]) -> _Table:
+        return _Table(
+            np.array([p.piece for p in limits], dtype=int),
+            np.array([p.order for p in limits], dtype=int),
+            np.array([p.normal for p in limits]).reshape(-1, 3),
+            np.array([p.centre for p in limits]),
+            np.array([p.bound for p in limits]),
+        )
+
+    def excess(self, coefficients: np.ndarray, durations: np.ndarray) -> np.ndarray:
+        """(m, points) |normal . derivative - centre| over bound along each piece, at the check points."""
+        u = np.linspace(0.0, 1.0, _CHECK_POINTS + 1)
+        rows = np.stack([derivative_rows(u, order) for order in range(3)])
+        values = np.einsum("muj,mjc,mc->mu", rows[self.order], coefficients[self.piece], self.normal)
+        values /= durations[self.piece][:, None] ** self.order[:, None]
+        return np.asarray(np.abs(values - self.centre[:, None]) / self.bound[:, None])
+
+
+def worst(limits: list[Plane], coefficients: np.ndarray, durations: np.ndarray) -> tuple[float, str]:
+    """How far the worst limit is used (1 is the limit), and a sentence about it; (0, "") without limits."""
+    if not limits:
+        return 0.0, ""
+    excess = _Table.of(limits).excess(coefficients, durations)
+    k, i = (int(x) for x in np.unravel_index(int(np.argmax(excess)), excess.shape))
+    return float(excess[k, i]), _sentence(limits[k], i / _CHECK_POINTS, durations)
+
+
+def _sentence(plane: Plane, u: float, durations: np.ndarray) -> str:
+    time = float(durations[: plane.piece].sum() + u * durations[plane.piece])
+    return f"{plane.name} between waypoints {plane.piece} and {plane.piece + 1}, at {time:.2f} s"
+
+
+def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.ndarray) -> np.ndarray:
+    """(n, 4, 3) scaled derivatives of least snap that keep the limits.
+
+    Args:
+        system: durations.
+        knots: waypoints (n, 3) and what is given there.
+        limits: of `planes`.
+        start: (n, 4, 3) solution without limits.
+
+    Raises:
+        InfeasibleError: names the limit and the place that conflict.
+    """
+    table = _Table.of(limits)
+    problem = _Problem(system, knots, start)
+    index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
+    where = np.tile(np.arange(_FIRST_POINTS) * (_CHECK_POINTS // _FIRST_POINTS), len(limits))
+    for _ in range(_ROUNDS):
+        unknown, conflict = problem.solve(table, index, where / _CHECK_POINTS)
+        if conflict >= 0:
+            what = _sentence(limits[index[conflict]], where[conflict] / _CHECK_POINTS, system.durations)
+            raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s keeps the {what}")
+        excess = table.excess(system.coefficients(knots.value, unknown), system.durations)
+        broken = np.flatnonzero(excess.max(axis=1) > 1.0)
+        if not len(broken):
+            return unknown
+        index = np.concatenate([index, broken])
+        where = np.concatenate([where, excess[broken].argmax(axis=1)])
+    k, i = (int(x) for x in np.unravel_index(int(np.argmax(excess)), excess.shape))
+    what = _sentence(limits[k], i / _CHECK_POINTS, system.durations)
+    raise InfeasibleError(f"no trajectory was found in {_ROUNDS} rounds that keeps the {what}")
+
+
+class _Problem:
+    """The quadratic program in the free scaled derivatives of all three axes, each scaled to unit curvature."""
+
+    def __init__(self, system: System, knots: Knots, start: np.ndarray) -> None:
+        self._system, self._knots, self._count = system, knots, 3 * knots.fixed.size
+        bands = system.banded()
+        size = bands.shape[1]
+        lower = sparse.diags([bands[k, : size - k] for k in range(len(bands))], [-k for k in range(len(bands))])
+        form = sparse.kron(sparse.eye(3), lower + sparse.tril(lower, -1).T, format="csc")
+        self._free = np.flatnonzero(~np.tile(knots.fixed.ravel(), 3))
+        self._given = np.where(knots.fixed[..., None], start, 0.0)
+        reduced = form[self._free][:, self._free]
+        self._scale = 1.0 / np.sqrt(reduced.diagonal())
+        scaling = sparse.diags(self._scale)
+        self._form = sparse.triu(scaling @ reduced @ scaling, format="csc")
+        self._linear = self._scale * self._flat(system.gradient(knots.value, self._given))[self._free]
+        self._warm = self._flat(start)[self._free] / self._scale
+
+    @staticmethod
+    def _flat(unknown: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(unknown.transpose(2, 0, 1)).ravel()
+
+    def solve(self, table: _Table, index: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, int]:
+        """(n, 4, 3) solution with rows for planes `index` (r,) at `u` (r,), and -1 or the row most in conflict."""
+        matrix, constant = self._rows(table, index, u)
+        bound = table.bound[index]
+        low = -(1.0 - _MARGIN) - (constant - table.centre[index]) / bound
+        high = (1.0 - _MARGIN) - (constant - table.centre[index]) / bound
+        scaled = (sparse.diags(1.0 / bound) @ matrix[:, self._free] @ sparse.diags(self._scale)).tocsc()
+        solver = osqp.OSQP()
+        solver.setup(self._form, self._linear, scaled, low, high, **_SOLVER)
+        solver.warm_start(x=self._warm)
+        result = solver.solve(raise_error=False)
+        if result.info.status_val not in (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE):
+            certificate = result.prim_inf_cert
+            known = certificate is not None and len(certificate) == len(index) and np.all(np.isfinite(certificate))
+            return self._given, int(np.argmax(np.abs(certificate))) if known else 0
+        self._warm = result.x
+        flat = self._flat(self._given)
+        flat[self._free] = self._scale * result.x
+        n = len(self._knots.value)
+        return np.ascontiguousarray(flat.reshape(3, n, ORDERS - 1).transpose(1, 2, 0)), -1
+
+    def _rows(self, table: _Table, index: np.ndarray, u: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:
+        """Rows over all unknowns, and what the given positions and derivatives add."""
+        piece, order, normal = table.piece[index], table.order[index], table.normal[index]
+        durations, tau = self._system.durations[piece], self._system.tau
+        rows = np.zeros((len(index), 2 * ORDERS))
+        for k in range(3):
+            rows[order == k] = derivative_rows(u[order == k], k) @ TO_COEFFICIENTS
+        rows *= (durations[:, None] / tau) ** np.tile(np.arange(ORDERS), 2) / durations[:, None] ** order[:, None]
+        data = self._system.hermite(self._knots.value, self._given)[piece]
+        constant = np.einsum("rj,rjc,rc->r", rows, data, normal)
+        size, width = self._count // 3, ORDERS - 1
+        kept = [j for j in range(2 * ORDERS) if j not in (0, ORDERS)]
+        column = width * piece[:, None] + np.arange(2 * width)
+        columns = np.concatenate([axis * size + column for axis in range(3)], axis=1)
+        values = np.concatenate([rows[:, kept] * normal[:, axis : axis + 1] for axis in range(3)], axis=1)
+        row = np.repeat(np.arange(len(index)), columns.shape[1])
+        matrix = sparse.csc_matrix((values.ravel(), (row, columns.ravel())), shape=(len(index), self._count))
+        matrix.eliminate_zeros()
+        return matrix, constant

@@ -1,0 +1,167 @@
+"""Waypoint files: CSV for spreadsheets, TOML for people. Both give what minimum_snap.plan takes.
+
+CSV: a header out of x_m, y_m, z_m, qw, qx, qy, qz, vx_m_s, vy_m_s, vz_m_s, stop, duration_s (of the piece that leads there).
+TOML: [[waypoint]] tables, and optionally duration_s, [limits].
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from firmware_py.prepare.minimum_snap import Limits, Waypoint, plan
+from firmware_py.prepare.piecewise import Piecewise
+
+_POSITION = ("x_m", "y_m", "z_m")
+_ATTITUDE = ("qw", "qx", "qy", "qz")
+_VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
+_COLUMNS = (*_POSITION, *_ATTITUDE, *_VELOCITY, "stop", "duration_s")
+_UNIT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WaypointTable:
+    """One [[waypoint]]."""
+
+    position_m: np.ndarray = quantity(unit="m", low=-1e4, high=1e4, shape=(3,), help="world NED")
+    quaternion: np.ndarray = quantity([], low=-1, high=1, shape=(-1,), help="body to world, scalar first; or none")
+    velocity_m_s: np.ndarray = quantity([], unit="m/s", low=-10, high=10, shape=(-1,), help="to pass with; or none")
+    stop: bool = quantity(False, help="come to rest there")
+    duration_s: float = quantity(0.0, unit="s", low=0.0, high=1e5, help="of the piece that leads there; 0: free")
+
+    def __post_init__(self) -> None:
+        for name, values, length in (("quaternion", self.quaternion, 4), ("velocity_m_s", self.velocity_m_s, 3)):
+            if len(values) not in (0, length):
+                raise DescriptionError(f"{name} needs {length} numbers, not {len(values)}")
+        if len(self.quaternion) and abs(float(np.linalg.norm(self.quaternion)) - 1.0) > _UNIT_TOLERANCE:
+            raise DescriptionError(f"quaternion {self.quaternion.tolist()} has not length 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LimitsTable:
+    """[limits]; 0 or an empty list leaves a quantity free."""
+
+    velocity_m_s: np.ndarray = quantity([], unit="m/s", low=1e-3, high=10, shape=(-1,), help="along x, y, z")
+    acceleration_m_s2: np.ndarray = quantity([], unit="m/s^2", low=1e-3, high=10, shape=(-1,), help="along x, y, z")
+    corridor_m: float = quantity(0.0, unit="m", low=0.0, high=100, help="distance from the straight line")
+    angular_rate_rad_s: float = quantity(0.0, unit="rad/s", low=0.0, high=20, help="of the attitude")
+    angular_acceleration_rad_s2: float = quantity(0.0, unit="rad/s^2", low=0.0, high=100, help="of the attitude")
+    thruster_share: float = quantity(0.8, low=0.05, high=1.0, help="of each thruster's force that the path may ask for")
+
+    def __post_init__(self) -> None:
+        for name, values in (("velocity_m_s", self.velocity_m_s), ("acceleration_m_s2", self.acceleration_m_s2)):
+            if len(values) not in (0, 3):
+                raise DescriptionError(f"{name} needs 3 numbers, not {len(values)}")
+
+    def limits(self) -> Limits:
+        """As minimum_snap takes them."""
+        return Limits(
+            self.velocity_m_s if len(self.velocity_m_s) else None,
+            self.acceleration_m_s2 if len(self.acceleration_m_s2) else None,
+            self.corridor_m or None,
+            self.angular_rate_rad_s or None,
+            self.angular_acceleration_rad_s2 or None,
+            self.thruster_share,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Mission:
+    """A waypoint file."""
+
+    waypoint: tuple[WaypointTable, ...] = quantity()
+    duration_s: float = quantity(0.0, unit="s", low=0.0, high=1e6, help="of the whole; 0: free")
+    limits: LimitsTable = quantity(LimitsTable())
+
+    def __post_init__(self) -> None:
+        if len(self.waypoint) < 2:
+            raise DescriptionError(f"a trajectory needs two waypoints, not {len(self.waypoint)}")
+        given = [w.duration_s > 0.0 for w in self.waypoint[1:]]
+        if any(given) and not all(given):
+            raise DescriptionError(f"waypoint {given.index(False) + 1} lacks duration_s; give it for every piece or for none")
+        if all(given) and self.duration_s > 0.0:
+            raise DescriptionError("duration_s is given for the whole and for every piece; leave one out")
+
+    def plan(self, body: Body | None = None, stretch: bool = True) -> Piecewise:
+        """The trajectory. Raises as minimum_snap.plan does."""
+        points = []
+        for w in self.waypoint:
+            attitude = w.quaternion if len(w.quaternion) else None
+            velocity = w.velocity_m_s if len(w.velocity_m_s) else None
+            points.append(Waypoint(w.position_m, attitude, velocity, w.stop))
+        each = [w.duration_s for w in self.waypoint[1:]]
+        durations: list[float] | float | None = each if all(each) else self.duration_s or None
+        return plan(points, durations, self.limits.limits(), body, stretch)
+
+
+def load_mission(path: Path) -> Mission:
+    """The waypoint file in `path`, .csv or .toml.
+
+    Raises:
+        DescriptionError: one line with file, line and what would be right.
+    """
+    if path.suffix.lower() == ".csv":
+        return _load_csv(path)
+    if path.suffix.lower() != ".toml":
+        raise DescriptionError(f"{path}: a waypoint file ends in .csv or .toml")
+    table, source = read_toml(path)
+    mission: Mission = build(Mission, table, source)
+    return mission
+
+
+def _load_csv(path: Path) -> Mission:
+    try:
+        reader = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig")), skipinitialspace=True)
+    except (OSError, UnicodeDecodeError) as error:
+        raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    header = [name.strip() for name in reader.fieldnames or []]
+    reader.fieldnames = header
+    unknown = [name for name in header if name not in _COLUMNS]
+    missing = [name for name in _POSITION if name not in header]
+    if unknown or missing:
+        what = f"column {unknown[0]!r} is unknown" if unknown else f"column {missing[0]!r} is missing"
+        raise DescriptionError(f"{path}:1: {what}; columns are {', '.join(_COLUMNS)}")
+    try:
+        rows = tuple(_waypoint(row, f"{path}:{reader.line_num}") for row in reader)
+        return Mission(waypoint=rows)
+    except DescriptionError as error:
+        raise DescriptionError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from None
+
+
+def _waypoint(row: dict[str, str], place: str) -> WaypointTable:
+    def group(names: tuple[str, ...]) -> np.ndarray:
+        present = [n for n in names if (row.get(n) or "").strip()]
+        if present and len(present) != len(names):
+            raise DescriptionError(f"{place}: give all of {', '.join(names)} or none")
+        return np.array([_number(row[n], n, place) for n in present])
+
+    position = group(_POSITION)
+    if not len(position):
+        raise DescriptionError(f"{place}: x_m, y_m, z_m are empty")
+    try:
+        return WaypointTable(
+            position_m=position,
+            quaternion=group(_ATTITUDE),
+            velocity_m_s=group(_VELOCITY),
+            stop=bool(_number(row.get("stop") or "0", "stop", place)),
+            duration_s=_number(row.get("duration_s") or "0", "duration_s", place),
+        )
+    except DescriptionError as error:
+        raise DescriptionError(str(error) if str(error).startswith(place) else f"{place}: {error}") from None
+
+
+def _number(text: str, name: str, place: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise DescriptionError(f"{place}: {name}: {text.strip()!r} is not a number") from None
+    if not math.isfinite(value):
+        raise DescriptionError(f"{place}: {name}: {text.strip()!r} is not finite")
+    return value

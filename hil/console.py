@@ -1,0 +1,75 @@
+"""What a bench run shows in the terminal: progress while it flies, and the table of its result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol
+
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from hil.checks import Result
+from hil.metrics import SHOWN, metric_order, shown_limit, shown_value
+
+
+class Advance(Protocol):
+    """Tells how far a run is."""
+
+    def __call__(self, done_s: float) -> None:
+        """`done_s` of simulated time have been flown."""
+        ...
+
+
+@contextmanager
+def flight_progress(title: str, duration_s: float, console: Console | None = None) -> Iterator[Advance]:
+    """A progress bar over simulated time. It leaves one line; where the output is no terminal, it shows nothing."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:5.1f} of {task.total:.1f} s flown"),
+        TimeElapsedColumn(),
+    )
+    console = console or Console()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(title, total=duration_s)
+
+        def advance(done_s: float) -> None:
+            progress.update(task, completed=done_s)
+
+        yield advance
+
+
+def result_table(result: Result) -> Table:
+    """Metrics of a run, and beside those that are checked their limit and verdict."""
+    checks = {check.name: check for check in result.checks}
+    title = Text(f"{result.scenario}, seed {result.seed}", style="bold")
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table.add_column("metric")
+    table.add_column("value", justify="right")
+    table.add_column("limit", justify="right")
+    table.add_column("", justify="left")
+    for name in metric_order([*result.metrics, *checks]):
+        check = checks.get(name)
+        value = result.metrics.get(name, float("nan"))
+        limit, verdict = "", Text()
+        if check is not None:
+            limit = shown_limit(name, check.low, check.high)
+            verdict = Text("passed", style="green") if check.passed else Text("FAILED", style="bold red")
+        table.add_row(SHOWN[name].label if name in SHOWN else name, shown_value(name, value), limit, verdict)
+    return table
+
+
+def print_result(result: Result, report: Path | None = None, console: Console | None = None) -> None:
+    """The table, the verdict in one line, and where the report is."""
+    console = console or Console()
+    console.print(result_table(result))
+    failed = [SHOWN[c.name].label if c.name in SHOWN else c.name for c in result.checks if not c.passed]
+    verdict = f"FAILED: {'; '.join(failed)}" if failed else "passed" if result.passed else "FAILED: nothing was checked"
+    console.print(verdict, style="green" if result.passed else "bold red", highlight=False)
+    if report is not None:
+        console.print(f"report: {report}", highlight=False, soft_wrap=True)

@@ -1,0 +1,292 @@
+"""Plots of a flight as PNG: truth, estimate, reference and command together. matplotlib is imported when needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hil.metrics import rotation_vectors
+from hil.signals import Flight
+
+TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
+"""One colour per kind of signal in every plot (Okabe and Ito's palette, safe for colour-blind readers)."""
+AXIS_COLOURS = ("#cc3311", "#009988", "#0077bb")
+STYLE: dict[str, Any] = {
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "grid.color": "#d8dee4",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+    "figure.dpi": 110,
+    "savefig.facecolor": "white",
+}
+
+
+class Window(NamedTuple):
+    """The part of a flight that is judged, s since its first tick."""
+
+    start_s: float
+    end_s: float
+
+
+def write_plots(
+    flight: Flight,
+    folder: Path,
+    window: Window,
+    tank_m: np.ndarray,
+    force_limits_n: np.ndarray,
+    paper_rmse_mm: float | None = None,
+) -> list[Path]:
+    """Write all plots of a flight into `folder`.
+
+    Args:
+        window: the judged part; the rest is shaded.
+        tank_m: (2, 3) lowest and highest corner of the tank, world, m.
+        force_limits_n: (2,) reverse and forward limit of each thruster, N.
+        paper_rmse_mm: what the paper measured in the same task, to stand beside ours.
+
+    Returns:
+        their paths, the overview first.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    figures = {
+        "overview": lambda: overview(flight, window, tank_m, paper_rmse_mm),
+        "position": lambda: position(flight, window),
+        "attitude": lambda: attitude(flight, window),
+        "estimate": lambda: estimate(flight, window),
+        "thrusters": lambda: thrusters(flight, window, force_limits_n),
+        "disturbance": lambda: disturbance(flight, window),
+    }
+    paths = []
+    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+        from matplotlib import pyplot
+
+        for name, draw in figures.items():
+            figure = draw()
+            paths.append(folder / f"{name}.png")
+            figure.savefig(paths[-1], metadata={"Software": None})
+            pyplot.close(figure)
+    return paths
+
+
+def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: float | None) -> Any:
+    """3D path beside the size of position and attitude error."""
+    figure = _figure(11.0, 5.2)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0))
+    _path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m)
+    inside = _inside(flight, window)
+    time_s = flight.time_s
+    error_mm = 1e3 * np.linalg.norm(flight.truth["p_wm"] - flight.firmware["setpoint_p_wb"], axis=1)
+    angle_deg = np.degrees(
+        np.linalg.norm(rotation_vectors(flight.truth["q_wm"], flight.firmware["setpoint_q_wb"]), axis=1)
+    )
+    for row, (values, unit, what) in enumerate(((error_mm, "mm", "Position"), (angle_deg, "deg", "Attitude"))):
+        axes = figure.add_subplot(grid[row, 1])
+        rms = float(np.sqrt(np.mean(values[inside] ** 2)))
+        axes.plot(time_s, values, color=TRUTH, linewidth=1.0)
+        axes.axhline(rms, color=REFERENCE, linestyle="--", linewidth=1.2, label=f"RMSE {rms:.2f} {unit}")
+        if row == 0 and paper_rmse_mm is not None:
+            paper = f"paper's robot, real tank: RMSE {paper_rmse_mm:g} mm"
+            axes.axhline(paper_rmse_mm, color=AXIS_COLOURS[0], linestyle=":", linewidth=1.4, label=paper)
+        axes.set(title=f"{what} error, truth against reference", ylabel=unit)
+        axes.set_ylim(0.0, 1.3 * max(float(values[inside].max()), *(line.get_ydata()[0] for line in axes.lines[1:])))
+        _finish_time_axis(axes, flight, window, last=row == 1)
+        axes.legend(loc="upper right", ncols=2, fontsize=9)
+    return figure
+
+
+def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray) -> None:
+    low, high = tank_m
+    for fixed in range(3):
+        a, b = (i for i in range(3) if i != fixed)
+        for corner_a in (low[a], high[a]):
+            for corner_b in (low[b], high[b]):
+                line = np.empty((2, 3))
+                line[:, fixed], line[:, a], line[:, b] = (low[fixed], high[fixed]), corner_a, corner_b
+                axes.plot(*line.T, color="#9fb4c7", linewidth=0.9)
+    axes.plot(*flight.firmware["setpoint_p_wb"].T, color=REFERENCE, linestyle="--", linewidth=1.1, label="reference")
+    axes.plot(*flight.truth["p_wm"].T, color=TRUTH, linewidth=1.6, label="truth")
+    axes.scatter(*flight.truth["p_wm"][0], color=TRUTH, s=28, label="start")
+    for which, text in (("x", "north x (m)"), ("y", "east y (m)"), ("z", "down z (m)")):
+        getattr(axes, f"set_{which}label")(text, labelpad=7)
+    axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), zlim=(high[2], low[2]))
+    # y runs backwards as z does: with one of them alone the picture would be a mirror image.
+    axes.set_box_aspect(high - low, zoom=0.93)
+    axes.locator_params(nbins=5)
+    axes.view_init(elev=22, azim=-58)
+    axes.set_title("Path in the tank")
+    axes.legend(loc="upper left", fontsize=9)
+
+
+def position(flight: Flight, window: Window) -> Any:
+    """Position per axis, and beside it what it is off by."""
+    figure = _figure(11.0, 6.6)
+    cells = figure.subplots(3, 2, sharex=True)
+    truth, wanted, believed = flight.truth["p_wm"], flight.firmware["setpoint_p_wb"], flight.firmware["p_wb"]
+    for axis, name in enumerate(("x (north)", "y (east)", "z (down)")):
+        left, right = cells[axis]
+        left.plot(flight.time_s, believed[:, axis], color=ESTIMATE, linewidth=3.0, alpha=0.55, label="estimate")
+        left.plot(flight.time_s, truth[:, axis], color=TRUTH, label="truth")
+        left.plot(flight.time_s, wanted[:, axis], color=REFERENCE, linestyle="--", label="reference")
+        left.set(ylabel=f"{name}, m")
+        doubt_mm, error_mm = 1e3 * (believed - truth)[:, axis], 1e3 * (truth - wanted)[:, axis]
+        right.plot(flight.time_s, doubt_mm, color=ESTIMATE, linewidth=0.9, label="estimate - truth")
+        right.plot(flight.time_s, error_mm, color=TRUTH, label="truth - reference")
+        right.axhline(0.0, color=REFERENCE, linewidth=0.8)
+        right.set(ylabel="mm")
+        _limit_to_window(right, flight, window, np.stack([doubt_mm, error_mm]))
+        for cell in (left, right):
+            _finish_time_axis(cell, flight, window, last=axis == 2)
+    cells[0, 0].set_title("Position")
+    cells[0, 1].set_title("Errors")
+    _legends_below(figure, cells[0])
+    return figure
+
+
+def attitude(flight: Flight, window: Window) -> Any:
+    """Attitude error about the body's axes, truth and estimate."""
+    figure = _figure(11.0, 5.6)
+    cells = figure.subplots(3, 1, sharex=True)
+    wanted = flight.firmware["setpoint_q_wb"]
+    truth = np.degrees(rotation_vectors(flight.truth["q_wm"], wanted))
+    believed = np.degrees(rotation_vectors(flight.firmware["q_wb"], wanted))
+    for axis, name in enumerate(("roll x", "pitch y", "yaw z")):
+        cells[axis].plot(flight.time_s, believed[:, axis], color=ESTIMATE, linewidth=0.9, label="estimate - reference")
+        cells[axis].plot(flight.time_s, truth[:, axis], color=TRUTH, label="truth - reference")
+        cells[axis].axhline(0.0, color=REFERENCE, linewidth=0.8)
+        cells[axis].set(ylabel=f"{name}, deg")
+        _limit_to_window(cells[axis], flight, window, np.stack([truth, believed])[:, :, axis])
+        _finish_time_axis(cells[axis], flight, window, last=axis == 2)
+    cells[0].set_title("Attitude error: rotation vector about the body axes")
+    _legends_below(figure, cells[:1])
+    return figure
+
+
+def estimate(flight: Flight, window: Window) -> Any:
+    """Estimation errors inside three standard deviations, and the normalised innovation."""
+    figure = _figure(11.0, 7.6)
+    cells = figure.subplots(4, 2, sharex=True, gridspec_kw={"height_ratios": (1, 1, 1, 0.9)})
+    off_mm = 1e3 * (flight.firmware["p_wb"] - flight.truth["p_wm"])
+    off_deg = np.degrees(rotation_vectors(flight.truth["q_wm"], flight.firmware["q_wb"]))
+    bands = 3e3 * flight.firmware["sigma_p"], 3.0 * np.degrees(flight.firmware["sigma_q"])
+    names = (("x, mm", "y, mm", "z, mm"), ("roll, deg", "pitch, deg", "yaw, deg"))
+    for column, (error, band) in enumerate(zip((off_mm, off_deg), bands, strict=True)):
+        for axis in range(3):
+            cell, limit = cells[axis, column], band[:, axis]
+            cell.fill_between(flight.time_s, -limit, limit, color=ESTIMATE, alpha=0.22, linewidth=0, label="3 sigma")
+            cell.plot(flight.time_s, error[:, axis], color=TRUTH, linewidth=0.9, label="error of the estimate")
+            cell.set(ylabel=names[column][axis])
+            _limit_to_window(cell, flight, window, np.stack([error[:, axis], limit, -limit]))
+            _finish_time_axis(cell, flight, window)
+    cells[0, 0].set_title("Position: estimate against truth")
+    cells[0, 1].set_title("Attitude: estimate against truth")
+    _innovation(cells[3, 0], flight)
+    _tag_age(cells[3, 1], flight)
+    for cell in cells[3]:
+        _finish_time_axis(cell, flight, window, last=True)
+    _legends_below(figure, cells[0, :1])
+    return figure
+
+
+def _innovation(axes: Any, flight: Flight) -> None:
+    used = flight.firmware["nis_dof"] > 0
+    ratio = flight.firmware["nis"][used] / flight.firmware["nis_dof"][used]
+    axes.plot(flight.time_s[used], ratio, ".", color=TRUTH, markersize=2.0, alpha=0.5)
+    axes.axhline(1.0, color=REFERENCE, linestyle="--", linewidth=1.2)
+    axes.set_title(f"Tag innovation squared over its expectation: mean {np.mean(ratio) if len(ratio) else np.nan:.2f}")
+    axes.set(ylabel="NIS / dof")
+    axes.set_ylim(bottom=0.0)
+
+
+def _tag_age(axes: Any, flight: Flight) -> None:
+    age_ms = flight.firmware["tag_age_ns"] / 1e6
+    axes.plot(flight.time_s, np.where(age_ms < 1e4, age_ms, np.nan), color=COMMAND, linewidth=0.8)
+    axes.set_title(f"Age of the last accepted tag; refused: {int(flight.firmware['rejected'][-1])}")
+    axes.set(ylabel="ms")
+    axes.set_ylim(bottom=0.0)
+
+
+def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray) -> Any:
+    """Force of each thruster: commanded after the limiter, and what the plant's thruster gave."""
+    commanded, given = flight.firmware["commanded_n"], flight.truth["force_n"]
+    rows = -(-commanded.shape[1] // 2)
+    figure = _figure(11.0, 1.0 + 1.45 * rows)
+    cells = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
+    widest = 1.15 * max(1.0, float(np.abs(commanded).max()), float(np.abs(given).max()))
+    for i in range(commanded.shape[1]):
+        cell = cells.flat[i]
+        cell.plot(flight.time_s, commanded[:, i], color=COMMAND, linewidth=2.4, alpha=0.6, label="command")
+        if i < given.shape[1]:
+            cell.plot(flight.time_s, given[:, i], color=TRUTH, linewidth=1.0, label="truth")
+        for limit in force_limits_n:
+            cell.axhline(limit, color=AXIS_COLOURS[0], linestyle=":", linewidth=1.0)
+        cell.set(ylabel=f"T{i + 1}, N", ylim=(-widest, widest))
+        _finish_time_axis(cell, flight, window, last=i >= commanded.shape[1] - 2)
+    low, high = force_limits_n
+    cells[0, 0].set_title(f"Thruster forces (limits {low:g} and {high:g} N)")
+    _legends_below(figure, cells[0, :1])
+    return figure
+
+
+def disturbance(flight: Flight, window: Window) -> Any:
+    """The disturbance that the estimator believes in, the wrench that was asked, and the water's velocity."""
+    figure = _figure(11.0, 6.6)
+    cells = figure.subplots(2, 2, sharex=True)
+    wrench = flight.firmware["wrench_wanted"]
+    parts = (
+        (flight.firmware["force_w"], "Estimated disturbance force, world", "N"),
+        (flight.firmware["moment_b"], "Estimated disturbance moment, body", "N m"),
+        (wrench[:, :3], "Commanded force, body", "N"),
+        (flight.truth["water_w"], "Water velocity (truth), world", "m/s"),
+    )
+    for i, (cell, (values, title, unit)) in enumerate(zip(cells.flat, parts, strict=True)):
+        for axis, name in enumerate("xyz"):
+            cell.plot(flight.time_s, values[:, axis], color=AXIS_COLOURS[axis], linewidth=1.1, label=name)
+        cell.set(title=title, ylabel=unit)
+        _finish_time_axis(cell, flight, window, last=i >= 2)
+    _legends_below(figure, cells[0, :1])
+    return figure
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib import pyplot
+
+    return pyplot.figure(figsize=(width, height), layout="constrained")
+
+
+def _inside(flight: Flight, window: Window) -> np.ndarray:
+    return (flight.time_s >= window.start_s) & (flight.time_s <= window.end_s)
+
+
+def _limit_to_window(axes: Any, flight: Flight, window: Window, values: np.ndarray) -> None:
+    """Scale to what is judged: the first seconds, before the first tag, would flatten everything else."""
+    judged = values[:, _inside(flight, window)]
+    low, high = min(0.0, float(judged.min())), max(0.0, float(judged.max()))
+    margin = 0.08 * max(high - low, 1e-9)
+    axes.set_ylim(low - margin, high + margin)
+
+
+def _finish_time_axis(axes: Any, flight: Flight, window: Window, last: bool = False) -> None:
+    end_s = float(flight.time_s[-1])
+    axes.set_xlim(0.0, end_s)
+    for low, high in ((0.0, window.start_s), (window.end_s, end_s)):
+        if high - low > 0.05:
+            axes.axvspan(low, high, color="#eef1f4", zorder=0, linewidth=0)
+    if last:
+        axes.set_xlabel("time (s)")
+
+
+def _legends_below(figure: Any, cells: Any) -> None:
+    """One legend for the whole figure, under it."""
+    handles = {label: handle for cell in cells for handle, label in zip(*cell.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))

@@ -1,0 +1,184 @@
+"""report.html of a run: one file that opens without a network, with the flight as an animation, figures and plots."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.checks import Result
+from hil.metrics import SHOWN, metric_order, rotation_vectors, shown_limit, shown_value
+from hil.plots import Window
+from hil.signals import Flight
+
+REPORT_FILE = "report.html"
+FRAMES_HZ = 25.0
+"""Samples of the animation a second; it interpolates between them."""
+CAPTIONS = {
+    "overview": "The whole flight. Grey: before and after the judged part.",
+    "position": "Position per axis: reference, truth and estimate, and what they are off by.",
+    "attitude": "Attitude error about each body axis.",
+    "estimate": "Does the filter know how wrong it is? Its error inside three of its own standard deviations.",
+    "thrusters": "Each thruster: what the firmware commanded after its limiter, and the force that the plant's gave.",
+    "disturbance": "Unmodelled force and moment by the filter, the force that was asked for, and the water's velocity.",
+}
+TILES = (
+    "attitude_rmse_rad",
+    "position_max_m",
+    "estimate_position_rmse_m",
+    "nis_mean",
+    "duration_s",
+    "real_time_factor",
+)
+"""Metrics that stand beside the headline."""
+NOT_MEASURED = (
+    "Everything here was flown in a simulated tank, by the firmware of the vehicle, over the vehicle's CAN frames. "
+    "Nothing of it was measured on hardware. Figures of the paper's robot were measured in a real tank."
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """What the animation draws besides the flight.
+
+    Attributes:
+        title: heading, such as `Spiral`; description: one sentence under it.
+        tank: `box` or `cylinder`; tank_m: (2, 3) its lowest and highest corner, world, m.
+        hull_m: (3,) edges of the module. thruster_position_m, thruster_direction: (n, 3) in the module frame.
+        force_limits_n: (2,) reverse and forward limit of each thruster.
+        window: the judged part, s since the flight's first tick.
+        paper_rmse_mm: what the paper measured in the same task, or None.
+        notes: what is assumed or synthetic; shown at the foot.
+    """
+
+    title: str
+    description: str = ""
+    tank: str = "box"
+    tank_m: np.ndarray
+    hull_m: np.ndarray
+    thruster_position_m: np.ndarray
+    thruster_direction: np.ndarray
+    force_limits_n: np.ndarray
+    window: Window
+    paper_rmse_mm: float | None = None
+    notes: tuple[str, ...] = ()
+
+
+def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plots: Sequence[Path]) -> Path:
+    """Write report.html into `folder`; returns its path. `plots` are PNG files, inlined in their order."""
+    parts = {
+        "title": html.escape(f"{scene.title}, seed {result.seed}"),
+        "heading": html.escape(scene.title),
+        "description": html.escape(scene.description),
+        "seed": str(result.seed),
+        "verdict": "passed" if result.passed else "failed",
+        "verdict_text": "All checks passed" if result.passed else "A check failed",
+        "headline": _headline(result, scene),
+        "tiles": _tiles(result),
+        "table": _table(result),
+        "plots": "\n".join(_plot(path) for path in plots),
+        "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in (NOT_MEASURED, *scene.notes)),
+        "style": _asset("style.css"),
+        "viewer": _asset("viewer.js"),
+        "data": json.dumps(animation(flight, scene), separators=(",", ":")).replace("<", "\\u003c"),
+    }
+    page = _asset("page.html")
+    for name, text in parts.items():
+        page = page.replace(f"<!--{name}-->", text)
+    path = folder / REPORT_FILE
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
+    """What the viewer needs: the scene, and the flight thinned to `FRAMES_HZ`."""
+    time_s = flight.time_s
+    period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+    keep = slice(None, None, max(1, round(1.0 / (FRAMES_HZ * period_s))))
+    truth, firmware = flight.truth, flight.firmware
+    error_mm = 1e3 * np.linalg.norm(truth["p_wm"] - firmware["setpoint_p_wb"], axis=1)
+    angle = np.degrees(np.linalg.norm(rotation_vectors(truth["q_wm"], firmware["setpoint_q_wb"]), axis=1))
+    return {
+        "tank": {"kind": scene.tank, "low": _short(scene.tank_m[0], 3), "high": _short(scene.tank_m[1], 3)},
+        "hull": _short(scene.hull_m, 4),
+        "thrusters": {
+            "p": _short(scene.thruster_position_m, 4),
+            "d": _short(scene.thruster_direction, 4),
+            "limits": _short(scene.force_limits_n, 2),
+        },
+        "window": list(scene.window),
+        "paper_mm": scene.paper_rmse_mm,
+        "t": _short(time_s[keep], 3),
+        "p": _short(truth["p_wm"][keep], 5),
+        "q": _short(truth["q_wm"][keep], 5),
+        "ref_p": _short(firmware["setpoint_p_wb"][keep], 5),
+        "ref_q": _short(firmware["setpoint_q_wb"][keep], 5),
+        "force": _short(truth["force_n"][keep], 2),
+        "error_mm": _short(error_mm[keep], 3),
+        "angle_deg": _short(angle[keep], 3),
+    }
+
+
+def _short(values: np.ndarray, digits: int) -> Any:
+    return np.round(np.asarray(values, dtype=float), digits).tolist()
+
+
+def _asset(name: str) -> str:
+    return (resources.files(__name__) / name).read_text(encoding="utf-8")
+
+
+def _headline(result: Result, scene: Scene) -> str:
+    """Our RMSE large; beside the paper's, as bars, where the paper flew the same."""
+    ours_mm = 1e3 * result.metrics.get("position_rmse_m", float("nan"))
+    text = f'<p class="big">{ours_mm:.2f}<span>mm</span></p><p class="under">position RMSE, every tick of the task</p>'
+    if scene.paper_rmse_mm is None:
+        return text
+    widest = max(ours_mm, scene.paper_rmse_mm)
+    rows = (("this flight, simulated", ours_mm, "ours"), ("paper, real tank", scene.paper_rmse_mm, "paper"))
+    bars = "".join(
+        f'<div class="bar"><span class="name">{name}</span>'
+        f'<span class="track"><i class="{kind}" style="width:{100 * value / widest:.1f}%"></i></span>'
+        f'<span class="value">{value:.2f} mm</span></div>'
+        for name, value, kind in rows
+    )
+    return f'{text}<div class="bars">{bars}</div>'
+
+
+def _tiles(result: Result) -> str:
+    return "\n".join(
+        f'<div class="tile"><b>{html.escape(shown_value(name, result.metrics[name]))}</b>'
+        f"<span>{html.escape(SHOWN[name].label)}</span></div>"
+        for name in TILES
+        if name in result.metrics
+    )
+
+
+def _table(result: Result) -> str:
+    checks = {check.name: check for check in result.checks}
+    rows = []
+    for name in metric_order([*checks, *result.metrics]):
+        check = checks.get(name)
+        limit, verdict = "", ""
+        if check is not None:
+            limit = shown_limit(name, check.low, check.high)
+            kind = "passed" if check.passed else "failed"
+            verdict = f'<span class="badge {kind}">{kind}</span>'
+        label = SHOWN[name].label if name in SHOWN else name
+        value = shown_value(name, result.metrics.get(name, float("nan")))
+        cells = (f"<td>{html.escape(label)}</td>", f'<td class="n">{html.escape(value)}</td>')
+        rows.append(f'<tr>{"".join(cells)}<td class="n">{html.escape(limit)}</td><td>{verdict}</td></tr>')
+    return "\n".join(rows)
+
+
+def _plot(path: Path) -> str:
+    data = base64.b64encode(path.read_bytes()).decode()
+    caption = html.escape(CAPTIONS.get(path.stem, path.stem))
+    image = f'<img alt="{caption}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

@@ -1,0 +1,173 @@
+"""The tag camera of the plant: when it sees, what it sees, and how wrong."""
+
+import math
+
+import numpy as np
+import pytest
+
+from firmware_py.core import rotations
+from firmware_py.description.vehicle import load_vehicle
+from hil.plant.camera import Camera, Sighting, crosses_box, tag_pose
+from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
+from hil.plant.world import Start, World
+
+PERIOD_NS = 10_000_000
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+VEHICLE = load_vehicle("modcube")
+ABOVE = CameraPose()
+
+
+def world_of(*starts: Start, seed: int = 0) -> World:
+    return World(WorldSpec(**CALM), Tank(), [VEHICLE] * len(starts), list(starts), seed, PERIOD_NS)
+
+
+def at(x: float, y: float, z: float, q: np.ndarray = LEVEL) -> Start:
+    return Start(np.array([x, y, z]), q)
+
+
+def camera(modules: int = 1, tags: tuple[int, ...] = (5,), seed: int = 0, pose: CameraPose = ABOVE, **changes: float) -> Camera:
+    return Camera(pose, SensorSpec(**{**IDEAL, **changes}), [VEHICLE] * modules, tags, seed)
+
+
+def look(world: World, eye: Camera) -> list[Sighting]:
+    return eye.watch(world)
+
+
+def pictures(eye: Camera, seconds: float, start: Start | None = None) -> list[Sighting]:
+    """What it sees of one module that is held still: the world's time goes on, the module does not."""
+    world = world_of(start or at(0.0, 0.0, 0.4))
+    found = []
+    for _ in range(round(seconds * 100)):
+        found += eye.watch(world)
+        world.time_ns += PERIOD_NS
+    return found
+
+
+def test_camera_sees_the_top_tag_where_it_is() -> None:
+    (seen,) = look(world_of(at(0.1, -0.2, 0.4, rotations.from_euler(0.1, -0.2, 2.0))), camera())
+    p, q = tag_pose(np.array([0.1, -0.2, 0.4]), rotations.from_euler(0.1, -0.2, 2.0), VEHICLE.tag[5])
+    assert seen.tag_id == 5 and seen.capture_ns == 0
+    np.testing.assert_allclose(seen.p_wt, p, atol=1e-12)
+    np.testing.assert_allclose(np.abs(seen.q_wt @ q), 1.0)
+
+
+def test_level_module_shows_its_top_tag_face_up() -> None:
+    (seen,) = look(world_of(at(0.0, 0.0, 0.4)), camera())
+    np.testing.assert_allclose(seen.p_wt, [0.0, 0.0, 0.4 - 0.105])
+    np.testing.assert_allclose(rotations.to_matrix(seen.q_wt)[:, 2], [0.0, 0.0, 1.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("tilt_deg", "seen"), [(60.0, True), (64.0, True), (67.0, False), (120.0, False)])
+def test_tag_is_read_up_to_65_degrees_of_incidence(tilt_deg: float, seen: bool) -> None:
+    q = rotations.from_euler(math.radians(tilt_deg), 0.0, 0.0)
+    lever = rotations.rotate(q, np.array([0.0, 0.0, -0.105]))
+    # the tag itself is put right below the camera, so that the tilt is the incidence
+    world = world_of(Start(np.array([0.0, 0.0, 0.4]) - lever, q))
+    assert bool(look(world, camera())) == seen
+
+
+def test_camera_picks_the_tag_that_faces_it_most() -> None:
+    world = world_of(at(0.0, 0.0, 0.4, rotations.from_euler(math.radians(80.0), 0.0, 0.0)))
+    (seen,) = look(world, camera(tags=(0, 1, 2, 3, 4, 5)))
+    assert VEHICLE.tag[seen.tag_id].id == 3, "rolled to the right, the left face looks up"
+
+
+def test_tag_outside_the_field_of_view_is_not_seen() -> None:
+    narrow = CameraPose(half_view_deg=10.0)
+    assert not look(world_of(at(0.4, 0.0, 0.4)), camera(pose=narrow))
+    assert look(world_of(at(0.2, 0.0, 0.4)), camera(pose=narrow))
+
+
+def test_module_above_hides_the_one_below() -> None:
+    apart = world_of(at(-0.3, 0.0, 0.2), at(0.3, 0.0, 0.6))
+    assert [s.module for s in look(apart, camera(2))] == [0, 1]
+    stacked = world_of(at(0.0, 0.0, 0.2), at(0.0, 0.0, 0.6))
+    assert [s.module for s in look(stacked, camera(2))] == [0]
+    docked = world_of(at(0.0, 0.0, 0.3), at(0.0, 0.0, 0.51))
+    assert [s.module for s in look(docked, camera(2))] == [0]
+
+
+def test_segment_and_box() -> None:
+    half, q = np.array([1.0, 2.0, 3.0]), rotations.from_euler(0.0, 0.0, math.pi / 2)
+    a, b = np.array([-5.0, 1.5, 0.0]), np.array([5.0, 1.5, 0.0])
+    assert not crosses_box(a, b, np.zeros(3), q, half), "turned by 90 degrees its y half edge is 1"
+    assert crosses_box(a, b, np.zeros(3), LEVEL, half)
+    assert not crosses_box(a, np.array([-2.0, 1.5, 0.0]), np.zeros(3), LEVEL, half)
+
+
+def test_pictures_come_at_60_hz_with_a_phase_per_seed() -> None:
+    seen = pictures(camera(tag_phase=1.0), 10.0)
+    assert len(seen) == pytest.approx(600, abs=1)
+    assert {b.capture_ns - a.capture_ns for a, b in zip(seen, seen[1:], strict=False)} == {16_666_667}
+    assert seen[0].capture_ns != pictures(camera(tag_phase=1.0, seed=1), 1.0)[0].capture_ns
+
+
+def test_noise_is_larger_along_the_camera_axis() -> None:
+    slanted = CameraPose(position_m=np.array([0.0, -0.8, -0.8]), axis=np.array([0.0, math.sqrt(0.5), math.sqrt(0.5)]))
+    seen = pictures(camera(pose=slanted, tag_sigma_m=0.002, tag_sigma_axis_m=0.004), 60.0)
+    error = np.array([s.p_wt for s in seen]) - [0.0, 0.0, 0.4 - 0.105]
+    across = np.array([0.0, math.sqrt(0.5), -math.sqrt(0.5)])
+    assert (error @ slanted.axis).std() == pytest.approx(0.004, rel=0.06)
+    assert (error @ across).std() == pytest.approx(0.002, rel=0.06)
+    assert error[:, 0].std() == pytest.approx(0.002, rel=0.06)
+
+
+def test_attitude_noise_is_half_a_degree_about_each_axis() -> None:
+    seen = pictures(camera(tag_sigma_deg=0.5), 60.0)
+    errors = np.array([rotations.log(s.q_wt) for s in seen])
+    np.testing.assert_allclose(np.degrees(errors.std(axis=0)), 0.5, rtol=0.06)
+
+
+def test_two_percent_of_the_pictures_are_lost() -> None:
+    assert len(pictures(camera(tag_dropped=0.02), 100.0)) / 6000 == pytest.approx(0.98, abs=0.006)
+
+
+def test_flipped_pose_looks_the_same_from_the_camera() -> None:
+    """The second pose of a planar tag: seen from far away its corners are where they were, and their depths are mirrored."""
+    start = at(0.2, 0.1, 0.4, rotations.from_euler(0.4, -0.3, 0.7))
+    (true,), (flipped,) = look(world_of(start), camera()), look(world_of(start), camera(tag_flipped=1.0))
+    np.testing.assert_allclose(flipped.p_wt, true.p_wt)
+    sight = ABOVE.position_m - true.p_wt
+    sight /= np.linalg.norm(sight)
+    corners = 0.05 * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
+    a, b = corners @ rotations.to_matrix(true.q_wt).T, corners @ rotations.to_matrix(flipped.q_wt).T
+    np.testing.assert_allclose(b @ sight, -(a @ sight), atol=1e-12)
+    np.testing.assert_allclose(b - np.outer(b @ sight, sight), a - np.outer(a @ sight, sight), atol=1e-12)
+    assert abs(true.q_wt @ flipped.q_wt) < 0.99
+
+
+def test_half_a_percent_of_the_poses_are_flipped() -> None:
+    start = at(0.0, 0.0, 0.4, rotations.from_euler(0.5, 0.0, 0.0))
+    seen = pictures(camera(tag_flipped=0.005), 100.0, start)
+    flipped = [s for s in seen if abs(s.q_wt @ seen[0].q_wt) < 0.99]
+    assert len(flipped) / len(seen) == pytest.approx(0.005, abs=0.003)
+
+
+def test_moving_module_is_seen_where_it_was_at_the_picture() -> None:
+    world, eye = world_of(at(-0.3, 0.0, 0.4)), camera(tag_phase=1.0)
+    fine = world_of(at(-0.3, 0.0, 0.4))
+    for each in (world, fine):
+        each.set_motion(0, [0.3, 0.1, 0.0], [0.0, 0.0, 0.8])
+    eye.watch(world)
+    seen = []
+    for _ in range(20):
+        world.advance(PERIOD_NS)
+        seen += eye.watch(world)
+    assert len(seen) >= 11
+    for sighting in seen:
+        while fine.time_ns < sighting.capture_ns - 1_250_000:
+            fine.advance(2_500_000)
+        truth = fine.truth(0)
+        late_s = 1e-9 * (sighting.capture_ns - truth.time_ns)
+        q = rotations.multiply(truth.q_wm, rotations.exp(truth.w_b * late_s))
+        p, _ = tag_pose(truth.p_wm + truth.v_w * late_s, q, VEHICLE.tag[5])
+        np.testing.assert_allclose(sighting.p_wt, p, atol=2e-6)
+        assert np.linalg.norm(rotations.difference(sighting.q_wt, q)) < 1e-5
+
+
+def test_losing_pictures_changes_no_other_draw() -> None:
+    clean = {s.capture_ns: s.p_wt for s in pictures(camera(tag_sigma_m=0.002), 10.0)}
+    lossy = pictures(camera(tag_sigma_m=0.002, tag_dropped=0.3), 10.0)
+    assert 0 < len(lossy) < len(clean)
+    for sighting in lossy:
+        np.testing.assert_array_equal(sighting.p_wt, clean[sighting.capture_ns])

@@ -1,0 +1,245 @@
+"""Process and measurement models against finite differences: every block of the Jacobians, body-frame errors."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from firmware_py.core import observation, propagation
+from firmware_py.core.body import Body
+from firmware_py.core.propagation import ERRORS
+from firmware_py.core.rotations import difference, exp, from_euler, multiply
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+
+BLOCKS = {
+    "position": slice(0, 3),
+    "attitude": slice(3, 6),
+    "velocity": slice(6, 9),
+    "rate": slice(9, 12),
+    "gyro bias": slice(12, 15),
+    "accel bias": slice(15, 18),
+    "force": slice(18, 21),
+    "moment": slice(21, 24),
+    "depth bias": slice(24, 25),
+}
+DT = 1e-4
+TAU = np.array([3.0, -2.0, 5.0, 0.4, -0.3, 0.2])
+LEVER = np.array([0.05, -0.11, -0.2])
+
+
+@pytest.fixture(scope="module", params=[1, 3], ids=["one module", "L of three"])
+def body(request: pytest.FixtureRequest) -> Body:
+    cells = [(0, 0, 0), (1, 0, 0), (1, 1, 0)][: request.param]
+    return assemble(cells, [0, 4, 12][: request.param], [load_vehicle("modcube")] * request.param)
+
+
+def plant(body: Body) -> tuple[np.ndarray, ...]:
+    drag = body.drag
+    return body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear
+
+
+def state(seed: int) -> np.ndarray:
+    """A fast, tilted robot under a disturbance."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=26) * np.repeat([1.0, 1.0, 0.4, 1.0, 0.02, 0.1, 3.0, 0.3, 0.05], [3, 4, 3, 3, 3, 3, 3, 3, 1])
+    x[3:7] /= np.linalg.norm(x[3:7])
+    return x
+
+
+def error_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(25,) e with inject(b, e) = a, by scipy."""
+    turn = Rotation.from_quat(b[[4, 5, 6, 3]]).inv() * Rotation.from_quat(a[[4, 5, 6, 3]])
+    return np.r_[a[:3] - b[:3], turn.as_rotvec(), a[7:] - b[7:]]
+
+
+def differences(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, h: float = 1e-5) -> np.ndarray:
+    """Central differences of `function` over the 25 errors."""
+    moved = [(propagation.inject(x, h * unit), propagation.inject(x, -h * unit)) for unit in np.eye(ERRORS)]
+    return np.array([(function(above) - function(below)) / (2 * h) for above, below in moved]).T
+
+
+# ---------------------------------------------------------------- process
+
+
+def stepped(x: np.ndarray, body: Body, after: np.ndarray, dt: float) -> np.ndarray:
+    """Where `x` is a step later, as the error from `after`."""
+    return error_between(propagation.step(x, TAU, dt, *plant(body)), after)
+
+
+@pytest.fixture(scope="module", params=range(5))
+def jacobians(body: Body, request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray]:
+    """(F - I) / dt as the estimator has it, and by finite differences of the step."""
+    x = state(request.param)
+    step = partial(stepped, body=body, after=propagation.step(x, TAU, DT, *plant(body)), dt=DT)
+    numeric = differences(step, x)
+    return (propagation.transition(x, TAU, DT, *plant(body)) - np.eye(ERRORS)) / DT, (numeric - np.eye(ERRORS)) / DT
+
+
+def wrong_blocks(analytic: np.ndarray, numeric: np.ndarray) -> list[tuple[str, str]]:
+    """Blocks that differ by more than 0.5 % of themselves and 0.02 % of the largest in their row."""
+    wrong = []
+    for row, rows in BLOCKS.items():
+        of_row = 2e-4 * np.abs(numeric[rows]).max() + 1e-6
+        for column, columns in BLOCKS.items():
+            block = numeric[rows, columns]
+            if np.abs(analytic[rows, columns] - block).max() > 5e-3 * np.abs(block).max() + of_row:
+                wrong.append((row, column))
+    return wrong
+
+
+def test_every_block_of_the_transition_is_the_derivative_of_the_step(jacobians: tuple[np.ndarray, np.ndarray]) -> None:
+    assert wrong_blocks(*jacobians) == []
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        ("position", "attitude"), ("position", "velocity"), ("attitude", "attitude"), ("attitude", "rate"),
+        ("velocity", "attitude"), ("velocity", "velocity"), ("velocity", "rate"), ("velocity", "force"),
+        ("rate", "attitude"), ("rate", "rate"), ("rate", "moment"),
+    ],
+)  # fmt: skip
+def test_block_of_the_wrong_sign_would_be_noticed(
+    jacobians: tuple[np.ndarray, np.ndarray], block: tuple[str, str]
+) -> None:
+    spoilt = jacobians[0].copy()
+    spoilt[BLOCKS[block[0]], BLOCKS[block[1]]] *= -1.0
+    assert wrong_blocks(spoilt, jacobians[1]) == [block]
+
+
+def test_force_has_moved_the_robot_by_the_end_of_the_step(body: Body) -> None:
+    """The second-order block: half a dt squared over the mass."""
+    x = np.zeros(26)
+    x[3] = 1.0
+    f = propagation.transition(x, np.zeros(6), 0.01, *plant(body))
+    np.testing.assert_allclose(f[0:3, 18:21], 0.5e-4 * body.mass_inv[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(f[3:6, 21:24], 0.5e-4 * body.mass_inv[3:, 3:], atol=1e-12)
+
+
+def test_transition_is_second_order_in_the_step(body: Body) -> None:
+    """Halving the step quarters the error of one step's Jacobian or better, down to rounding."""
+    x = state(1)
+    errors = []
+    for dt in (0.02, 0.01, 0.005):
+        step = partial(stepped, body=body, after=propagation.step(x, TAU, dt, *plant(body)), dt=dt)
+        numeric = differences(step, x)
+        errors.append(np.abs(propagation.transition(x, TAU, dt, *plant(body)) - numeric).max())
+    assert errors[1] < 0.35 * errors[0]
+    assert errors[2] < 0.35 * errors[1]
+
+
+def test_step_follows_the_equations_of_motion(body: Body) -> None:
+    """Half a second in ticks against an adaptive solver of the same equations."""
+    x = state(2)
+
+    def rates(_: float, y: np.ndarray) -> np.ndarray:
+        q = np.ascontiguousarray(y[3:7] / np.linalg.norm(y[3:7]))
+        turn = Rotation.from_quat(q[[1, 2, 3, 0]])
+        nu = np.ascontiguousarray(y[7:13])
+        external = TAU + np.r_[turn.inv().apply(x[19:22]), x[22:25]]
+        acceleration = propagation.acceleration(nu, q, external, *plant(body))
+        return np.r_[turn.apply(nu[:3]), 0.5 * multiply(q, np.r_[0.0, nu[3:]]), acceleration]
+
+    exact = solve_ivp(rates, (0.0, 0.5), x[:13], method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+    y = x
+    for _ in range(50):
+        y = propagation.step(y, TAU, 0.01, *plant(body))
+    exact_turn = np.ascontiguousarray(exact[3:7] / np.linalg.norm(exact[3:7]))
+    np.testing.assert_allclose(y[:3], exact[:3], atol=2e-4)
+    np.testing.assert_allclose(difference(np.ascontiguousarray(y[3:7]), exact_turn), 0.0, atol=1e-3)
+    np.testing.assert_allclose(y[7:13], exact[7:], atol=3e-3)
+    np.testing.assert_array_equal(y[13:], x[13:], "biases and disturbance stand still")
+
+
+def test_acceleration_is_force_over_mass_at_rest(body: Body) -> None:
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    got = propagation.acceleration(np.zeros(6), level, TAU, *plant(body))
+    np.testing.assert_allclose(body.mass @ got, TAU + np.r_[0, 0, 0, np.cross(body.righting, [0, 0, -1])], atol=1e-12)
+
+
+def test_injected_error_is_a_turn_in_the_body_frame() -> None:
+    x = state(3)
+    e = np.random.default_rng(5).normal(scale=0.1, size=ERRORS)
+    np.testing.assert_allclose(error_between(propagation.inject(x, e), x), e, atol=1e-12)
+
+
+def test_carried_rate_is_the_gyros_less_its_bias(body: Body) -> None:
+    x = state(4)
+    gyros = np.array([[0.1, 0.2, 0.3], [np.nan] * 3, [-0.1, 0.4, 0.2]])
+    carried = propagation.carry(x, np.tile(TAU, (3, 1)), gyros, 0.01, 0.004, *plant(body))
+    np.testing.assert_allclose(carried[10:13], gyros[2] - x[13:16], atol=1e-15)
+    by_hand = propagation.step(x, TAU, 0.004, *plant(body))
+    by_hand[10:13] = gyros[0] - x[13:16]
+    by_hand = propagation.step(by_hand, TAU, 0.01, *plant(body))
+    by_hand = propagation.step(by_hand, TAU, 0.01, *plant(body))
+    np.testing.assert_allclose(carried[:10], by_hand[:10], atol=1e-15)
+
+
+# ---------------------------------------------------------------- measurements
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_tag_jacobian_is_the_derivative_of_the_residual(seed: int) -> None:
+    x = state(seed)
+    p_wt, q_wb = x[:3] + 0.3, multiply(x[3:7].copy(), exp(np.array([0.002, -0.001, 0.003])))
+    _, h, _ = observation.tag(x, p_wt, LEVER, q_wb, np.ones(6))
+    numeric = differences(lambda y: observation.tag(y, p_wt, LEVER, q_wb, np.ones(6))[0], x)
+    np.testing.assert_allclose(h, -numeric, atol=3e-3)
+    np.testing.assert_allclose(h[:3], -numeric[:3], atol=1e-8)
+
+
+def test_tag_residual_is_zero_where_the_tag_is() -> None:
+    x = state(1)
+    p_wt = x[:3] + Rotation.from_quat(x[[4, 5, 6, 3]]).apply(LEVER)
+    residual, _, noise = observation.tag(x, p_wt, LEVER, x[3:7].copy(), np.arange(1.0, 7.0))
+    np.testing.assert_allclose(residual, 0.0, atol=1e-14)
+    np.testing.assert_array_equal(noise, np.diag(np.arange(1.0, 7.0)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_inertial_jacobian_is_the_derivative_of_the_residual(seed: int) -> None:
+    x, sigma = state(seed), np.array([0.1, 0.2, 0.3])
+    gyro, accel = np.array([0.1, 0.2, 0.3]), np.array([0.5, -0.2, -9.7])
+    _, h, noise = observation.inertial(x, gyro, accel, 1.2, sigma)
+    numeric = differences(lambda y: observation.inertial(y, gyro, accel, 1.2, sigma)[0], x)
+    np.testing.assert_allclose(h, -numeric, atol=1e-8)
+    np.testing.assert_allclose(np.diag(noise), np.repeat(sigma, [3, 3, 1]) ** 2)
+
+
+def test_accelerometer_of_a_level_robot_at_rest_points_up() -> None:
+    """It feels what holds it: -g along z, which is down."""
+    x = np.zeros(26)
+    x[3] = 1.0
+    residual, _, _ = observation.inertial(x, np.zeros(3), np.array([0.0, 0.0, -9.80665]), 0.0, np.ones(3))
+    np.testing.assert_allclose(residual, 0.0)
+    x[3:7] = from_euler(0.5, 0.0, 0.0)
+    felt = np.array([0.0, -9.80665 * np.sin(0.5), -9.80665 * np.cos(0.5)])
+    np.testing.assert_allclose(observation.inertial(x, np.zeros(3), felt, 0.0, np.ones(3))[0], 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("gyro", [True, False])
+@pytest.mark.parametrize("accel", [True, False])
+@pytest.mark.parametrize("depth", [True, False])
+def test_sensor_that_did_not_come_has_no_row(gyro: bool, accel: bool, depth: bool) -> None:
+    x, sigma = state(0), np.array([0.1, 0.2, 0.3])
+    full = observation.inertial(x, np.ones(3), 2 * np.ones(3), 3.0, sigma)
+    nothing = np.full(3, np.nan)
+    part = observation.inertial(
+        x, np.ones(3) if gyro else nothing, 2 * np.ones(3) if accel else nothing, 3.0 if depth else np.nan, sigma
+    )
+    rows = np.repeat([gyro, accel, depth], [3, 3, 1])
+    np.testing.assert_array_equal(part[0], full[0][rows])
+    np.testing.assert_array_equal(part[1], full[1][rows])
+    np.testing.assert_array_equal(part[2], full[2][np.ix_(rows, rows)])
+
+
+def test_normalised_square_is_the_innovation_over_its_covariance() -> None:
+    rng = np.random.default_rng(6)
+    h, half = rng.normal(size=(6, ERRORS)), rng.normal(size=(ERRORS, ERRORS))
+    residual, covariance, noise = rng.normal(size=6), half @ half.T, np.diag(rng.uniform(1, 2, 6))
+    expected = residual @ np.linalg.inv(h @ covariance @ h.T + noise) @ residual
+    assert observation.normalised_square(residual, h, noise, covariance) == pytest.approx(expected)

@@ -1,0 +1,131 @@
+"""What a run leaves for people: plots, a report that opens without a network, and the table in the terminal."""
+
+import base64
+import io
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from firmware_py.description.vehicle import load_vehicle
+from hil.checks import Limit, Result, judge
+from hil.console import flight_progress, print_result
+from hil.metrics import SHOWN, flight_metrics, metric_order, shown_limit, shown_value
+from hil.plots import Window, write_plots
+from hil.report import CAPTIONS, Scene, animation, write_report
+from hil.signals import Flight, read_flight
+from tests.unit.flights import START_NS, write_flight
+
+TANK_M = np.array([[-0.65, -0.60, 0.0], [0.65, 0.60, 0.76]])
+WINDOW = Window(4.0, 8.0)
+LIMITS = (Limit("position_rmse_m", high=0.008), Limit("nis_mean", 0.7, 1.4))
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    folder = tmp_path_factory.mktemp("flight")
+    write_flight(folder, duration_s=4.0)
+    return read_flight(folder)
+
+
+@pytest.fixture(scope="module")
+def result(flight: Flight) -> Result:
+    return judge("spiral", 7, flight_metrics(flight.between(START_NS, START_NS + 4_000_000_000)), LIMITS)
+
+
+def scene(title: str = "Spiral") -> Scene:
+    vehicle = load_vehicle("modcube")
+    return Scene(
+        title=title,
+        tank_m=TANK_M,
+        hull_m=vehicle.hull.size_m,
+        thruster_position_m=vehicle.positions,
+        thruster_direction=vehicle.directions,
+        force_limits_n=np.array([vehicle.force_min_n, vehicle.force_max_n]),
+        window=WINDOW,
+        paper_rmse_mm=20.92,
+        notes=("the thruster curve is synthetic",),
+    )
+
+
+def test_every_plot_is_written_and_has_a_caption(flight: Flight, tmp_path: Path) -> None:
+    paths = write_plots(flight, tmp_path, WINDOW, TANK_M, np.array([-8.0, 10.0]), 20.92)
+    assert [path.stem for path in paths] == list(CAPTIONS)
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
+
+
+def test_report_needs_no_network_and_carries_its_plots(flight: Flight, result: Result, tmp_path: Path) -> None:
+    plot = tmp_path / "overview.png"
+    plot.write_bytes(b"\x89PNG of a flight")
+    page = write_report(tmp_path, result, flight, scene(), [plot]).read_text()
+    assert not re.search(r"https?://|<link|@import|url\(|fetch\(|XMLHttpRequest", page)
+    sources = re.findall(r'src="([^"]*)"', page)
+    assert sources == ["data:image/png;base64," + base64.b64encode(plot.read_bytes()).decode()]
+    assert "<!--" not in page.replace("<!DOCTYPE", "")
+
+
+def test_report_shows_our_figure_beside_the_papers(flight: Flight, result: Result, tmp_path: Path) -> None:
+    page = write_report(tmp_path, result, flight, scene(), []).read_text()
+    assert f"{1e3 * result.metrics['position_rmse_m']:.2f} mm" in page
+    assert "paper, real tank" in page
+    assert "20.92 mm" in page
+    assert "Nothing of it was measured on hardware" in page
+    assert "the thruster curve is synthetic" in page
+
+
+def test_report_of_a_failed_flight_says_so(flight: Flight, result: Result, tmp_path: Path) -> None:
+    failed = judge("spiral", 7, result.metrics, [Limit("position_rmse_m", high=1e-6)])
+    page = write_report(tmp_path, failed, flight, scene(), []).read_text()
+    assert "A check failed" in page
+    assert "All checks passed" not in page
+
+
+def test_markup_in_a_title_stays_text(flight: Flight, result: Result, tmp_path: Path) -> None:
+    page = write_report(tmp_path, result, flight, scene("<script>alert(1)</script>"), []).read_text()
+    assert "<script>alert" not in page
+
+
+def test_animation_follows_the_true_robot(flight: Flight) -> None:
+    shown = animation(flight, scene())
+    assert len(shown["t"]) == len(shown["p"]) == len(shown["force"]) == 201
+    np.testing.assert_allclose(shown["p"], flight.truth["p_wm"][::4], atol=6e-6)
+    np.testing.assert_allclose(np.diff(shown["t"]), 0.04, atol=1e-9)
+    json.dumps(shown, allow_nan=False)
+
+
+def test_values_are_shown_in_units_that_people_read() -> None:
+    assert shown_value("position_rmse_m", 0.00272) == "2.72 mm"
+    assert shown_value("attitude_rmse_rad", math.radians(1.5)) == "1.50 deg"
+    assert shown_value("sigma3_share", 0.97) == "97.0 %"
+    assert shown_value("nis_mean", math.nan) == "none"
+    assert shown_value("docking_tries", 3.0) == "3.0000"
+    assert shown_limit("position_rmse_m", -1e9, 0.005) == "<= 5 mm"
+    assert shown_limit("sigma3_share", 0.97, math.inf) == ">= 97 %"
+    assert shown_limit("nis_mean", 0.7, 1.4) == "0.7 to 1.4"
+
+
+def test_every_metric_of_a_flight_has_a_name_for_people(result: Result) -> None:
+    assert set(result.metrics) <= set(SHOWN)
+    names = ["unheard_of", "ticks", "position_rmse_m", "ticks"]
+    assert metric_order(names) == ["position_rmse_m", "ticks", "unheard_of"]
+
+
+def test_terminal_table_names_the_check_that_failed(result: Result) -> None:
+    console = Console(file=io.StringIO(), width=120)
+    limits = [Limit("position_rmse_m", high=1e-6), Limit("attitude_max_rad", high=1.0)]
+    print_result(judge("spiral", 7, result.metrics, limits), Path("out") / "report.html", console)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "FAILED: Position RMSE, truth against reference" in text
+    assert "spiral, seed 7" in text
+    assert "report: out/report.html" in text
+
+
+def test_progress_is_silent_where_nobody_looks() -> None:
+    console = Console(file=io.StringIO(), force_terminal=False)
+    with flight_progress("spiral", 40.0, console) as advance:
+        advance(20.0)
+    assert console.file.getvalue().strip() == ""  # type: ignore[attr-defined]
