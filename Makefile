@@ -60,8 +60,8 @@ quick: lint ## lint and the fast tests, under 60 s: for every commit
 test: setup ## all tests that this machine can run; names what is left out in its last lines
 	@$(PY) tools/run_tests.py $(SYSTEM_PACKAGES)
 
-test-vcan: setup ## the tests on real SocketCAN
-	@$(PY) -m pytest tests/vcan -m vcan
+test-vcan: setup ## the tests on real SocketCAN: here, or in the virtual machine where there is none
+	@$(PY) -m pytest -rs --capture=no -m vcan tests/vcan
 
 hil: setup ## fly the spiral on the bench and name the report
 	@$(BIN)/modcube hil run spiral --out runs/spiral; status=$$?; \

@@ -83,8 +83,8 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
     """3D path beside the size of position and attitude error."""
     figure = _figure(11.0, 5.2)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0))
-    _path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m)
     inside = _inside(flight, window)
+    _path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m, inside)
     time_s = flight.time_s
     error_mm = 1e3 * np.linalg.norm(flight.truth["p_wm"] - flight.firmware["setpoint_p_wb"], axis=1)
     angle_deg = np.degrees(
@@ -105,7 +105,7 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
     return figure
 
 
-def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray) -> None:
+def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray, inside: np.ndarray) -> None:
     low, high = tank_m
     for fixed in range(3):
         a, b = (i for i in range(3) if i != fixed)
@@ -114,7 +114,8 @@ def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray) -> None:
                 line = np.empty((2, 3))
                 line[:, fixed], line[:, a], line[:, b] = (low[fixed], high[fixed]), corner_a, corner_b
                 axes.plot(*line.T, color="#9fb4c7", linewidth=0.9)
-    axes.plot(*flight.firmware["setpoint_p_wb"].T, color=REFERENCE, linestyle="--", linewidth=1.1, label="reference")
+    wanted = flight.firmware["setpoint_p_wb"][inside]
+    axes.plot(*wanted.T, color=REFERENCE, linestyle="--", linewidth=1.1, label="reference")
     axes.plot(*flight.truth["p_wm"].T, color=TRUTH, linewidth=1.6, label="truth")
     axes.scatter(*flight.truth["p_wm"][0], color=TRUTH, s=28, label="start")
     for which, text in (("x", "north x (m)"), ("y", "east y (m)"), ("z", "down z (m)")):

@@ -1,21 +1,20 @@
 """Waypoint files: CSV for spreadsheets, TOML for people. Both give what minimum_snap.plan takes.
 
-CSV: a header out of x_m, y_m, z_m, qw, qx, qy, qz, vx_m_s, vy_m_s, vz_m_s, stop, duration_s (of the piece that leads there).
-TOML: [[waypoint]] tables, and optionally duration_s, [limits].
+CSV: a header out of x_m, y_m, z_m, qw, qx, qy, qz, vx_m_s, vy_m_s, vz_m_s, stop (0 or 1), duration_s (of the piece that
+leads there). TOML: [[waypoint]] tables, and optionally duration_s, [limits].
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, Source, build, quantity, read_toml
 from firmware_py.prepare.minimum_snap import Limits, Waypoint, plan
 from firmware_py.prepare.piecewise import Piecewise
 
@@ -85,7 +84,8 @@ class Mission:
             raise DescriptionError(f"a trajectory needs two waypoints, not {len(self.waypoint)}")
         given = [w.duration_s > 0.0 for w in self.waypoint[1:]]
         if any(given) and not all(given):
-            raise DescriptionError(f"waypoint {given.index(False) + 1} lacks duration_s; give it for every piece or for none")
+            lacking = given.index(False) + 1
+            raise DescriptionError(f"waypoint {lacking} lacks duration_s; give it for every piece or for none")
         if all(given) and self.duration_s > 0.0:
             raise DescriptionError("duration_s is given for the whole and for every piece; leave one out")
 
@@ -128,40 +128,30 @@ def _load_csv(path: Path) -> Mission:
     if unknown or missing:
         what = f"column {unknown[0]!r} is unknown" if unknown else f"column {missing[0]!r} is missing"
         raise DescriptionError(f"{path}:1: {what}; columns are {', '.join(_COLUMNS)}")
+    rows = tuple(_waypoint(row, f"{path}:{reader.line_num}") for row in reader)
     try:
-        rows = tuple(_waypoint(row, f"{path}:{reader.line_num}") for row in reader)
         return Mission(waypoint=rows)
     except DescriptionError as error:
-        raise DescriptionError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from None
+        raise DescriptionError(f"{path}: {error}") from None
 
 
 def _waypoint(row: dict[str, str], place: str) -> WaypointTable:
-    def group(names: tuple[str, ...]) -> np.ndarray:
+    table: dict[str, object] = {}
+    for key, names in (("position_m", _POSITION), ("quaternion", _ATTITUDE), ("velocity_m_s", _VELOCITY)):
         present = [n for n in names if (row.get(n) or "").strip()]
         if present and len(present) != len(names):
             raise DescriptionError(f"{place}: give all of {', '.join(names)} or none")
-        return np.array([_number(row[n], n, place) for n in present])
-
-    position = group(_POSITION)
-    if not len(position):
-        raise DescriptionError(f"{place}: x_m, y_m, z_m are empty")
-    try:
-        return WaypointTable(
-            position_m=position,
-            quaternion=group(_ATTITUDE),
-            velocity_m_s=group(_VELOCITY),
-            stop=bool(_number(row.get("stop") or "0", "stop", place)),
-            duration_s=_number(row.get("duration_s") or "0", "duration_s", place),
-        )
-    except DescriptionError as error:
-        raise DescriptionError(str(error) if str(error).startswith(place) else f"{place}: {error}") from None
+        if present:
+            table[key] = [_number(row[n], n, place) for n in present]
+    if (row.get("duration_s") or "").strip():
+        table["duration_s"] = _number(row["duration_s"], "duration_s", place)
+    table["stop"] = bool(_number(row.get("stop") or "0", "stop", place))
+    waypoint: WaypointTable = build(WaypointTable, table, Source(place, ""))
+    return waypoint
 
 
 def _number(text: str, name: str, place: str) -> float:
     try:
-        value = float(text)
+        return float(text)
     except ValueError:
         raise DescriptionError(f"{place}: {name}: {text.strip()!r} is not a number") from None
-    if not math.isfinite(value):
-        raise DescriptionError(f"{place}: {name}: {text.strip()!r} is not finite")
-    return value

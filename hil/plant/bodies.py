@@ -129,15 +129,21 @@ def _add_drag(bodies, modules, m, water, x, flow):
         bodies.wrench[b, 3 + i] += n[i]
 
 
+@njit(types.boolean(MODULES, I8, WATER, F2), cache=True)
+def _touches(modules, m, water, x):
+    """Whether a module is so near to wall, bottom or surface that its corners must be looked at."""
+    b = modules.body[m]
+    centre = turn(matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), triple(modules.position, m, 0))
+    size = triple(modules.size, m, 0)
+    return not is_clear(water, plus(triple(x, b, 0), centre), 0.5 * math.sqrt(dot(size, size)))
+
+
 @njit(types.void(BODIES, MODULES, I8, WATER, F2), cache=True)
 def _add_walls(bodies, modules, m, water, x):
     """Walls, bottom and surface on the eight corners of one module."""
     b = modules.body[m]
     r, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), matrix(modules.turn, m)
     position, size, origin = triple(modules.position, m, 0), triple(modules.size, m, 0), triple(x, b, 0)
-    centre, reach = plus(origin, turn(r, position)), 0.5 * math.sqrt(dot(size, size))
-    if is_clear(water, centre, reach):
-        return
     lift = 0.25 * water.density * water.gravity * size[0] * size[1]
     for k in range(8):
         corner = (size[0] * (0.5 if k & 1 else -0.5), size[1] * (0.5 if k & 2 else -0.5), size[2] * (0.5 if k & 4 else -0.5))
@@ -189,7 +195,8 @@ def derivative(bodies, modules, water, flow, flow_rate, thrust, x, out):
         _add_weight(bodies, b, x, flow_rate)
     for m in range(modules.body.shape[0]):
         _add_drag(bodies, modules, m, water, x, flow)
-        _add_walls(bodies, modules, m, water, x)
+        if _touches(modules, m, water, x):
+            _add_walls(bodies, modules, m, water, x)
     for b in range(x.shape[0]):
         _accelerate(bodies, b, x, out, flow, flow_rate)
 

@@ -6,7 +6,7 @@ import math
 
 from numba import njit, types
 
-from hil.plant.bodies import BODIES, MODULES, derivative
+from hil.plant.bodies import BODIES, MODULES, derivative, observe
 from hil.plant.thrusters import THRUSTERS, forces_after, load_supplies, settle
 from hil.plant.vectors import F2, F3, F8
 from hil.plant.water import WATER, flow_at
@@ -44,14 +44,15 @@ def close_step(x, h, stage):
             x[b, i] /= norm
 
 
-@njit(types.void(BODIES, MODULES, THRUSTERS, WATER, F2, I8, F8, F3, F2), cache=True)
-def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust):
+@njit(types.void(BODIES, MODULES, THRUSTERS, WATER, F2, I8, F8, F3, F2, F2), cache=True)
+def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust, seen):
     """Moves everything on by `steps` sub-steps of h seconds.
 
     Args:
         external: (b, 6) wrench of jets and magnets about O, body frame, held over the call.
         stage: (6, b, 13) working memory; stage[5] is left with the rates at the end.
         thrust: (b, 6) working memory.
+        seen: (m, 16) written: what every module is and feels at the end (`bodies.observe`).
     """
     x, trial = bodies.state, stage[4]
     for s in range(steps):
@@ -62,9 +63,8 @@ def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust
                 forces_after(thrusters, 0 if k == 0 else (2 if k == 3 else 1))
                 wrenches(thrusters, external, thrust)
             flow, flow_rate = flow_at(water, (s + share) * h)
-            if k > 0:
-                along(x, share * h, stage[k - 1], trial)
-            derivative(bodies, modules, water, flow, flow_rate, thrust, trial if k > 0 else x, stage[k])
+            along(x, share * h, stage[max(0, k - 1)], trial)
+            derivative(bodies, modules, water, flow, flow_rate, thrust, trial, stage[k])
         close_step(x, h, stage)
         settle(thrusters)
     flow, flow_rate = flow_at(water, steps * h)
@@ -74,3 +74,4 @@ def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust
     forces_after(thrusters, 0)
     wrenches(thrusters, external, thrust)
     derivative(bodies, modules, water, flow, flow_rate, thrust, x, stage[5])
+    observe(bodies, modules, stage[5], water.gravity, seen)

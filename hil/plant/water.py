@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit, types
 
 from hil.plant.spec import Tank, WorldSpec
-from hil.plant.vectors import F1, F2, F8, V3, dot, minus, plus, times, triple
+from hil.plant.vectors import F2, F8, V3, dot, minus, plus, times, triple
 
 FRICTION = 0.3
 """Largest friction at a wall, share of the normal force (synthetic)."""
@@ -30,21 +30,22 @@ class Water(NamedTuple):
     stiffness: float
     damping: float
     is_box: bool
-    extent: np.ndarray
-    """(3,) half length, half width, depth; or radius, radius, depth, m."""
+    half_length: float
+    """Of a box; radius of a cylinder, m."""
+    half_width: float
+    depth: float
 
 
-WATER = types.NamedTuple((F2, *(F8,) * 5, types.boolean, F1), Water)
+WATER = types.NamedTuple((F2, *(F8,) * 5, types.boolean, F8, F8, F8), Water)
 
 
 def make_water(spec: WorldSpec, tank: Tank) -> Water:
     """Still water in `tank`."""
     is_box = tank.kind == "box"
-    extent = [0.5 * tank.size_m[0], 0.5 * tank.size_m[1], tank.size_m[2]] if is_box else [tank.radius_m, tank.radius_m, tank.depth_m]
-    return Water(
-        np.zeros((3, 3)), spec.density, spec.gravity, spec.gust_smoothing_s, spec.wall_stiffness, spec.wall_damping, is_box,
-        np.array(extent, dtype=np.float64),
-    )  # fmt: skip
+    length, width, depth = tank.size_m.tolist() if is_box else (2 * tank.radius_m, 2 * tank.radius_m, tank.depth_m)
+    wall = (spec.wall_stiffness, spec.wall_damping)
+    extent = (0.5 * length, 0.5 * width, depth)
+    return Water(np.zeros((3, 3)), spec.density, spec.gravity, spec.gust_smoothing_s, *wall, is_box, *extent)
 
 
 class Gusts:
@@ -84,12 +85,11 @@ def flow_at(water, since_s):
 @njit(types.boolean(WATER, V3, F8), cache=True)
 def is_clear(water, centre, reach):
     """Whether a ball of radius `reach` touches neither wall, bottom nor surface."""
-    extent = water.extent
-    if centre[2] < reach or centre[2] > extent[2] - reach:
+    if centre[2] < reach or centre[2] > water.depth - reach:
         return False
     if water.is_box:
-        return abs(centre[0]) + reach < extent[0] and abs(centre[1]) + reach < extent[1]
-    return math.hypot(centre[0], centre[1]) + reach < extent[0]
+        return abs(centre[0]) + reach < water.half_length and abs(centre[1]) + reach < water.half_width
+    return math.hypot(centre[0], centre[1]) + reach < water.half_length
 
 
 @njit(V3(WATER, F8, V3, V3), cache=True)
@@ -108,11 +108,10 @@ def _push(water, deep, outward, v):
 @njit(V3(WATER, V3, V3), cache=True)
 def push_of_walls(water, p, v):
     """Force of walls and bottom on one corner at p with velocity v, world frame."""
-    extent = water.extent
-    f = _push(water, p[2] - extent[2], (0.0, 0.0, 1.0), v)
+    f = _push(water, p[2] - water.depth, (0.0, 0.0, 1.0), v)
     if water.is_box:
         x, y = (1.0 if p[0] > 0.0 else -1.0), (1.0 if p[1] > 0.0 else -1.0)
-        f = plus(f, _push(water, x * p[0] - extent[0], (x, 0.0, 0.0), v))
-        return plus(f, _push(water, y * p[1] - extent[1], (0.0, y, 0.0), v))
+        f = plus(f, _push(water, x * p[0] - water.half_length, (x, 0.0, 0.0), v))
+        return plus(f, _push(water, y * p[1] - water.half_width, (0.0, y, 0.0), v))
     r = math.hypot(p[0], p[1])
-    return plus(f, _push(water, r - extent[0], (p[0] / r, p[1] / r, 0.0), v)) if r > extent[0] else f
+    return plus(f, _push(water, r - water.half_length, (p[0] / r, p[1] / r, 0.0), v)) if r > water.half_length else f

@@ -15,7 +15,7 @@ from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from hil.plant import thrusters as thrusters_module
-from hil.plant.bodies import Bodies, Modules, observe
+from hil.plant.bodies import Bodies, Modules
 from hil.plant.draw import ModuleDraw, carried, draw_module, rigid_matrix, stream
 from hil.plant.integrator import advance
 from hil.plant.spec import Tank, WorldSpec
@@ -138,9 +138,8 @@ class World:
         if len(self.vehicles) > 1 and self.spec.jet_strength > 0.0:
             jet = (self.spec.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
             thrusters_module.add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._external)
-        bodies, modules = self._body_arrays, self._modules
-        advance(bodies, modules, self._thrusters, self._water, self._external, steps, h, self._stage, self._thrust)
-        observe(bodies, modules, self._stage[5], self.spec.gravity, self._seen)
+        arrays = (self._body_arrays, self._modules, self._thrusters, self._water)
+        advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
 
     def truth(self, module: int) -> Truth:
         """The truth about one module; its arrays are copies."""

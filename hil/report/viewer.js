@@ -55,7 +55,9 @@
     }
     return a;
   };
-  const magnified = (i) => between(data.ref_p[i], data.p[i], state.magnify);
+  const judged = (i) => data.t[i] >= data.window[0] && data.t[i] <= data.window[1];
+  const reference = data.ref_p.filter((_, i) => judged(i));  // before the task there may be no reference yet
+  const magnified = (i) => (judged(i) ? between(data.ref_p[i], data.p[i], state.magnify) : data.p[i]);
   const sample = (t) => {
     const i = indexAt(t), j = Math.min(i + 1, data.t.length - 1);
     const s = j > i ? Math.min(1, (t - data.t[i]) / (data.t[j] - data.t[i])) : 0;
@@ -195,10 +197,10 @@
     trail.push(now.p);
     path([now.p, [now.p[0], now.p[1], high[2]]], "rgba(255,255,255,0.25)", 1, [2, 4]);
     polygon(FACES[4].corners.map((corner) => { const c = add(now.p, turn(now.q, corner)); return [c[0], c[1], high[2]]; }), "rgba(3,12,22,0.35)");
-    path(data.ref_p, "rgba(255,255,255,0.75)", 1.4, [6, 6]);
+    path(reference, "rgba(255,255,255,0.75)", 1.4, [6, 6]);
     path(trail, "rgba(88,183,255,0.25)", 6);
     path(trail, "#58b7ff", 2.2);
-    if (state.magnify > 1) drawGhost(now.refP, now.refQ);
+    if (state.magnify > 1 && judged(now.i)) drawGhost(now.refP, now.refQ);
     drawCube(now.p, now.q);
     drawArrows(now.p, now.q, now.force);
     drawSurface();

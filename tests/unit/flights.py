@@ -63,9 +63,7 @@ def write_flight(
             speed = (spiral(at + 0.005, duration_s) - spiral(at - 0.005, duration_s)) / 0.01
             p_wm = wanted + np.array(offset_m) + error[tick]
             q_wm = exp(np.array(tilt_rad) + tilt[tick])
-            truth.record(
-                tick, time_ns, 0, p_wm, q_wm, speed, np.zeros(3), thrust[tick], np.array([0.04, 0.03, 0.0])
-            )
+            truth.record(tick, time_ns, 0, p_wm, q_wm, speed, np.zeros(3), thrust[tick], np.array([0.04, 0.03, 0.0]))
             zero = np.zeros(3)
             tagged = tick % 2 == 0
             estimate = Estimate(

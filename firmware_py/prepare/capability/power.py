@@ -1,0 +1,83 @@
+"""Power space and thrust variance: what a wrench of declared size costs in every direction, by the pseudo-inverse f = J^+ w.
+
+P(d) = sum [P(f_i) - P(0)] with the thrusters' measured power; what the electronics draw at rest is apart. The paper's own
+figure is proportional to the number of thrusters, so it measures idle power.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware_py.prepare.capability.layout import Layout
+from firmware_py.prepare.capability.wrench import embed, free_components
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PowerSpace:
+    """One layout in one frame.
+
+    Attributes:
+        size: |w| of the declared wrench, N or N m.
+        directions: (k, d) unit vectors, d = 3 less what is passive.
+        forces: (k, n) N.
+        power_w: (k,) W; NaN where the thrusters' power is not known.
+        residual: largest |J f - w| over the directions, N and N m together; zero where the layout spans the frame.
+        over_limit: share of the directions in which some thruster passes its limit.
+        variance: of a thruster's force over all thrusters and the whole sphere, N^2, in closed form.
+    """
+
+    size: float
+    directions: np.ndarray
+    forces: np.ndarray
+    power_w: np.ndarray
+    residual: float
+    over_limit: float
+    variance: float
+
+
+def power_space(layout: Layout, frame: str, directions: np.ndarray, size: float = 1.0) -> PowerSpace:
+    """The power space of a layout.
+
+    Args:
+        frame: of layout.FRAMES.
+        directions: (k, d) unit vectors over the frame's components that are not left out.
+        size: |w|, N or N m.
+    """
+    components = free_components(layout, frame)
+    wrenches = size * embed(directions, components)
+    pinv = np.linalg.pinv(layout.matrix, rcond=1e-9)
+    forces = wrenches @ pinv.T
+    residual = np.linalg.norm(forces @ layout.matrix.T - wrenches, axis=1)
+    over = np.any((forces > layout.f_max + 1e-9) | (forces < layout.f_min - 1e-9), axis=1)
+    # A unit vector in d dimensions has mean zero and second moment 1/d in each component.
+    mean_square = float(np.sum(pinv[:, components] ** 2)) / len(components)
+    return PowerSpace(
+        size=size,
+        directions=directions,
+        forces=forces,
+        power_w=electrical_power(layout, forces),
+        residual=float(residual.max()),
+        over_limit=float(over.mean()),
+        variance=size**2 * mean_square / layout.count,
+    )
+
+
+def electrical_power(layout: Layout, forces: np.ndarray) -> np.ndarray:
+    """(k,) power above idle of (k, n) forces, W; NaN where the layout has no power curve."""
+    if not layout.power_forward.shape[1]:
+        return np.full(len(forces), np.nan)
+    size = np.abs(forces)
+    total = np.zeros(forces.shape)
+    coefficients = np.where(forces[..., None] > 0.0, layout.power_forward, layout.power_reverse)
+    for order in range(coefficients.shape[-1] - 1, -1, -1):
+        total = (total + coefficients[..., order]) * size
+    return np.asarray(total.sum(axis=1))
+
+
+def mean_square_effort(layout: Layout, frame: str) -> float:
+    """Mean over unit directions of sum f^2 under the pseudo-inverse, N^2 per N^2 or per (N m)^2."""
+    components = free_components(layout, frame)
+    pinv = np.linalg.pinv(layout.matrix, rcond=1e-9)
+    return float(np.sum(pinv[:, components] ** 2)) / len(components)

@@ -1,0 +1,98 @@
+"""The commands `modcube hil ...`: run a scenario, run many seeds of it, list what there is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
+from firmware_py.description.schema import DescriptionError
+from hil.bench import DEFAULT_BUS
+from hil.scenario import Scenario, load_scenario, scenario_names
+
+app = typer.Typer(help="The bench: the firmware against a simulated plant on the same CAN bus.", no_args_is_help=True)
+
+FAILED = 1
+"""Exit status when a check failed."""
+
+ScenarioName = Annotated[str, typer.Argument(help="name of a scenario (`modcube hil list`), or a .toml file")]
+Controller = Annotated[str, typer.Option(help="modcube, paper, or a file of parameters")]
+Vehicle = Annotated[str, typer.Option(help="vehicle in place of the scenario's")]
+Sensors = Annotated[str, typer.Option(help="real, or ideal: no noise, no delay")]
+
+
+def parameters_of(controller: str) -> Parameters:
+    """The parameters called `controller`, or those in that file. Raises DescriptionError."""
+    if controller.endswith(".toml"):
+        return load_parameters(Path(controller))
+    if controller not in CONTROLLERS:
+        known = ", ".join(CONTROLLERS)
+        raise DescriptionError(f"controller {controller!r} is unknown; there are {known}, or give a .toml file")
+    return CONTROLLERS[controller]
+
+
+def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
+    """The scenario `name` with what the command line changes of it. Raises DescriptionError."""
+    scenario = load_scenario(name)
+    if sensors not in ("real", "ideal"):
+        raise DescriptionError(f"sensors {sensors!r} is unknown; there are real, ideal")
+    if sensors == "ideal":
+        scenario = scenario.with_ideal_sensors()
+    return scenario.with_vehicle(vehicle) if vehicle else scenario
+
+
+@app.command()
+def run(
+    scenario: ScenarioName,
+    seed: Annotated[int, typer.Option(min=0, help="of the world's every draw")] = 0,
+    bus: Annotated[str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE")] = DEFAULT_BUS,
+    out: Annotated[Path | None, typer.Option(help="folder for logs, plots and report")] = None,
+    controller: Controller = "modcube",
+    vehicle: Vehicle = "",
+    sensors: Sensors = "real",
+    plots: Annotated[bool, typer.Option(help="draw plots and report")] = True,
+) -> None:
+    """Fly one scenario; prints a table and leaves logs, plots, report.html and result.json."""
+    from hil.console import flight_progress, print_result
+    from hil.flight import fly_and_judge, illustrate
+
+    chosen = scenario_of(scenario, vehicle, sensors)
+    parameters = parameters_of(controller)
+    folder = out if out is not None else Path("runs") / chosen.name
+    with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:
+        result = fly_and_judge(chosen, seed, parameters, folder, bus, progress=progress)
+    report = illustrate(chosen, result, folder) if plots else None
+    print_result(result, report)
+    raise typer.Exit(0 if result.passed else FAILED)
+
+
+@app.command()
+def campaign(
+    scenario: ScenarioName,
+    trials: Annotated[int, typer.Option(min=1, help="number of seeds")] = 20,
+    jobs: Annotated[int, typer.Option(min=1, help="processes")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="first seed")] = 0,
+    out: Annotated[Path | None, typer.Option(help="folder for campaign.json")] = None,
+    controller: Controller = "modcube",
+    vehicle: Vehicle = "",
+    sensors: Sensors = "real",
+) -> None:
+    """Fly many seeds of a scenario; prints a table and leaves campaign.json."""
+    from hil.campaign import print_campaign, run_campaign
+
+    chosen = scenario_of(scenario, vehicle, sensors)
+    folder = out if out is not None else Path("runs") / f"{chosen.name}-campaign"
+    summary = run_campaign(chosen, parameters_of(controller), range(seed, seed + trials), jobs, folder)
+    print_campaign(summary)
+    raise typer.Exit(0 if summary["succeeded"] == summary["trials"] else FAILED)
+
+
+@app.command("list")
+def list_scenarios() -> None:
+    """The scenarios that the package carries."""
+    for name in scenario_names():
+        typer.echo(f"{name:20s} {load_scenario(name).help}")
+
+

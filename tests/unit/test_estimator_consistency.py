@@ -1,0 +1,296 @@
+"""The estimator against a plain Kalman filter that gets everything in time order, and against its own claims."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from firmware_py.core import propagation
+from firmware_py.core.body import Body
+from firmware_py.core.estimator import Estimator
+from firmware_py.core.propagation import ERRORS, STATES
+from firmware_py.core.rotations import difference, exp, from_euler, multiply
+from firmware_py.core.types import BodyPose, Estimate, Measured
+from firmware_py.description.parameters import Estimation
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+
+PERIOD = 10_000_000
+DT = 0.01
+LEVER = np.array([0.0, 0.0, -0.105])
+P = Estimation()
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return assemble([(0, 0, 0), (1, 0, 0)], [0, 4], [load_vehicle("modcube")] * 2)
+
+
+def plant(body: Body) -> tuple[np.ndarray, ...]:
+    drag = body.drag
+    return body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear
+
+
+def tag_of(x: np.ndarray, capture_ns: int, noise: np.ndarray | None = None, lever: np.ndarray = LEVER) -> BodyPose:
+    """What a tag says of a robot in state `x`; noise (6,) of position and attitude."""
+    e = np.zeros(6) if noise is None else noise
+    p_wt = x[:3] + Rotation.from_quat(x[[4, 5, 6, 3]]).apply(lever) + e[:3]
+    return BodyPose(capture_ns, p_wt, lever, multiply(x[3:7].copy(), exp(e[3:].copy())), 1)
+
+
+def inertial_of(x: np.ndarray, rng: np.random.Generator | None = None) -> Measured:
+    """What gyro, accelerometer and pressure sensor say of a robot in state `x`."""
+    down = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, 1.0])
+    noise = np.zeros(7) if rng is None else rng.normal(size=7)
+    gyro = x[10:13] + x[13:16] + P.gyro_sigma * noise[:3]
+    accel = x[16:19] - 9.80665 * down + P.accel_sigma * noise[3:6]
+    return Measured(gyro, accel, float(x[2] + x[25] + P.depth_sigma_m * noise[6]), [])
+
+
+def start_state(p_wb: tuple[float, float, float] = (1.0, -0.5, 0.8)) -> np.ndarray:
+    x = np.zeros(STATES)
+    x[:3] = p_wb
+    x[3:7] = from_euler(0.2, -0.4, 1.0)
+    return x
+
+
+def still(body: Body, x: np.ndarray) -> np.ndarray:
+    """The thruster wrench that holds a robot in state `x`."""
+    up = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, -1.0])
+    return np.r_[0.0, 0.0, 0.0, -np.cross(body.righting, up)]
+
+
+@dataclass
+class Flight:
+    """A drawn flight: per tick the truth, the wrench, and what the sensors say; tags by the tick of their arrival."""
+
+    truth: list[np.ndarray] = field(default_factory=list)
+    tau: list[np.ndarray] = field(default_factory=list)
+    measured: list[Measured] = field(default_factory=list)
+
+    def ticks(self) -> Iterator[tuple[int, np.ndarray, Measured]]:
+        for k, (tau, measured) in enumerate(zip(self.tau, self.measured, strict=True)):
+            yield k * PERIOD, tau, measured
+
+
+def process_sigma(body: Body, p: Estimation) -> np.ndarray:
+    """(25,) root spectral density of what the model leaves out, from the parameters' own words."""
+    m, j = np.diag(body.mass)[:3], np.diag(body.mass)[3:]
+    walks = [p.gyro_bias_walk] * 3 + [p.accel_bias_walk] * 3 + list(p.force_walk * m) + list(p.moment_walk * j)
+    return np.array([0.0] * 6 + [p.accel_process] * 3 + [p.alpha_process] * 3 + walks + [p.depth_bias_walk])
+
+
+def fly(
+    body: Body, seconds: float, seed: int, delay_ms: Callable[[int], float], push: float = 1.0, tag_ms: float = 17.0
+) -> Flight:
+    """A robot pushed about by slow sines, drawn from the estimator's own model; tags between and on the ticks."""
+    rng = np.random.default_rng(seed)
+    flight = Flight()
+    x = start_state()
+    x[13:16], x[16:19], x[25] = rng.normal(scale=0.02, size=3), rng.normal(scale=0.1, size=3), 0.03
+    sigma = process_sigma(body, P)
+    tag_sigma = np.repeat([P.tag_sigma_m, P.tag_sigma_axis_m, P.tag_sigma_rad], [2, 1, 3])
+    count = round(seconds / DT)
+    arriving: dict[int, list[BodyPose]] = {}
+    pictures, taken = [round(n * tag_ms * 1e6) for n in range(int(seconds * 1e3 / tag_ms))], 0
+    for k in range(count):
+        t = k * PERIOD
+        tau = still(body, x) + push * np.array([4.0, -3.0, 3.0, 0.3, -0.3, 0.3]) * np.sin(0.7 * t * 1e-9 + np.arange(6))
+        tau *= k > 0
+        before = x
+        if k:
+            surprise = sigma * np.sqrt(DT) * rng.normal(size=ERRORS)
+            x = propagation.inject(propagation.step(x, tau, DT, *plant(body)), surprise)
+        while taken < len(pictures) and pictures[taken] <= t:
+            capture = pictures[taken]
+            part = (capture - t) * 1e-9 + DT
+            seen = x if capture == t else propagation.step(before, tau, part, *plant(body))
+            due = -(-(capture + round(delay_ms(taken) * 1e6)) // PERIOD)
+            arriving.setdefault(due, []).append(tag_of(seen, capture, tag_sigma * rng.normal(size=6)))
+            taken += 1
+        flight.truth.append(x)
+        flight.tau.append(tau)
+        flight.measured.append(inertial_of(x, rng)._replace(tags=arriving.pop(k, [])))
+    return flight
+
+
+class InOrder:
+    """A textbook Kalman filter on the error state: every event in the order in which it happened, nothing ever late.
+
+    Measurement Jacobians by finite differences of its own models; the standard covariance update, (I - K H) P.
+    """
+
+    def __init__(self, body: Body, first: BodyPose, p: Estimation) -> None:
+        self.plant = plant(body)
+        self.x = np.zeros(STATES)
+        self.x[3:7] = first.q_wb
+        self.x[:3] = first.p_wt - self._turn(self.x).apply(first.lever_b)
+        m, j = np.diag(body.mass)[:3], np.diag(body.mass)[3:]
+        sigma = [0.02] * 3 + [0.05] * 3 + [0.2] * 3 + [0.3] * 3 + [0.02] * 3 + [0.1] * 3 + list(0.1 * m) + list(0.3 * j)
+        self.covariance = np.diag(np.r_[sigma, 0.1]) ** 2
+        self.q = np.diag(process_sigma(body, p) ** 2)
+        self.p = p
+        self.time_ns = first.capture_ns
+
+    @staticmethod
+    def _turn(x: np.ndarray) -> Rotation:
+        return Rotation.from_quat(x[[4, 5, 6, 3]])
+
+    def move(self, tau: np.ndarray, to_ns: int) -> None:
+        dt = (to_ns - self.time_ns) * 1e-9
+        if dt > 0.0:
+            f = propagation.transition(self.x, tau, dt, *self.plant)
+            self.x = propagation.step(self.x, tau, dt, *self.plant)
+            self.covariance = f @ self.covariance @ f.T + self.q * dt
+        self.time_ns = to_ns
+
+    def _correct(self, residual: Callable[[np.ndarray], np.ndarray], noise: np.ndarray) -> None:
+        h = 1e-6
+        moved = [(propagation.inject(self.x, h * e), propagation.inject(self.x, -h * e)) for e in np.eye(ERRORS)]
+        jacobian = np.array([(residual(below) - residual(above)) / (2 * h) for above, below in moved]).T
+        s = jacobian @ self.covariance @ jacobian.T + np.diag(noise)
+        gain = np.linalg.solve(s, jacobian @ self.covariance).T
+        self.x = propagation.inject(self.x, gain @ residual(self.x))
+        self.covariance = (np.eye(ERRORS) - gain @ jacobian) @ self.covariance
+
+    def hear(self, measured: Measured) -> None:
+        """The inertial sensors and depth of one tick."""
+
+        def residual(x: np.ndarray) -> np.ndarray:
+            expected = inertial_of(x)
+            return np.r_[
+                measured.gyro - expected.gyro, measured.accel - expected.accel, measured.depth_m - expected.depth_m
+            ]
+
+        p = self.p
+        self._correct(residual, np.repeat([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m], [3, 3, 1]) ** 2)
+
+    def see(self, tag: BodyPose) -> None:
+        """One tag; its attitude error is compared at first order, as an error of the body."""
+
+        def residual(x: np.ndarray) -> np.ndarray:
+            turn = self._turn(x)
+            seen = Rotation.from_quat(tag.q_wb[[1, 2, 3, 0]])
+            return np.r_[tag.p_wt - x[:3] - turn.apply(tag.lever_b), (turn.inv() * seen).as_rotvec()]
+
+        p = self.p
+        self._correct(residual, np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2)
+
+
+def in_order(body: Body, flight: Flight, p: Estimation = P) -> InOrder:
+    """The reference, run over all tags that arrived by the end, stopped at the newest of them."""
+    tags = sorted((tag for measured in flight.measured for tag in measured.tags), key=lambda tag: tag.capture_ns)
+    reference = InOrder(body, tags[0], p)
+    waiting = tags[1:]
+    for time_ns, tau, measured in flight.ticks():
+        if time_ns <= tags[0].capture_ns:
+            continue
+        while waiting and waiting[0].capture_ns < time_ns:
+            reference.move(tau, waiting[0].capture_ns)
+            reference.see(waiting.pop(0))
+        if not waiting:
+            return reference
+        reference.move(tau, time_ns)
+        reference.hear(measured)
+        while waiting and waiting[0].capture_ns == time_ns:
+            reference.see(waiting.pop(0))
+        if not waiting:
+            return reference
+    raise AssertionError("a tag was left over")
+
+
+def run(body: Body, flight: Flight, p: Estimation = P) -> tuple[Estimator, list[Estimate]]:
+    estimator = Estimator(body, p, PERIOD)
+    return estimator, [estimator.step(time_ns, measured, tau) for time_ns, tau, measured in flight.ticks()]
+
+
+# ---------------------------------------------------------------- late tags
+
+
+@pytest.mark.parametrize(
+    "delay_ms",
+    [lambda n: 0.0, lambda n: 65.0, lambda n: 43.0 + 8.0 * (n % 2), lambda n: 300.0],
+    ids=["at once", "65 ms late", "43 and 51 ms late", "300 ms late"],
+)
+def test_late_tags_count_as_if_they_had_come_in_time(body: Body, delay_ms: Callable[[int], float]) -> None:
+    flight = fly(body, 0.9, 1, delay_ms)
+    open_gate = replace(P, tag_gate=50.0)
+    _, estimates = run(body, flight, open_gate)
+    reference = in_order(body, flight)
+    x, last = reference.x, reference.time_ns
+    for time_ns, tau, measured in flight.ticks():
+        if time_ns > last:
+            x = propagation.step(x, tau, (time_ns - max(last, time_ns - PERIOD)) * 1e-9, *plant(body))
+            x[10:13] = measured.gyro - x[13:16]
+    e = estimates[-1]
+    np.testing.assert_allclose(e.p_wb, x[:3], atol=2e-6)
+    np.testing.assert_allclose(difference(e.q_wb, x[3:7].copy()), 0.0, atol=2e-6)
+    np.testing.assert_allclose(e.nu, x[7:13], atol=2e-5)
+    np.testing.assert_allclose(e.force_w, x[19:22], atol=1e-4)
+    np.testing.assert_allclose(e.moment_b, x[22:25], atol=1e-4)
+
+
+def test_same_inputs_give_the_same_bytes(body: Body) -> None:
+    flight = fly(body, 0.6, 7, lambda n: 50.0)
+    first, second = (run(body, flight)[1] for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        assert all(np.asarray(u).tobytes() == np.asarray(v).tobytes() for u, v in zip(a, b, strict=True))
+
+
+# ---------------------------------------------------------------- what it claims about itself
+
+
+@pytest.fixture(scope="module")
+def drawn(body: Body) -> list[tuple[Flight, list[Estimate]]]:
+    flights = [fly(body, 3.0, seed, lambda n: 45.0) for seed in range(8)]
+    return [(flight, run(body, flight)[1]) for flight in flights]
+
+
+SETTLED = 100
+"""Ticks."""
+
+
+def test_innovations_are_as_large_as_the_filter_expects(drawn: list[tuple[Flight, list[Estimate]]]) -> None:
+    """Mean NIS over degrees of freedom is 1 for a filter whose model is the world's: within four sigma of that here."""
+    settled = [e for _, estimates in drawn for e in estimates[SETTLED:] if e.nis_dof]
+    dof = sum(e.nis_dof for e in settled)
+    mean = sum(e.nis for e in settled) / dof
+    assert dof > 5000
+    assert abs(mean - 1.0) < 4.0 * np.sqrt(2.0 / dof)
+
+
+def test_errors_are_as_large_as_the_sigmas_say(drawn: list[tuple[Flight, list[Estimate]]]) -> None:
+    position, attitude = [], []
+    for flight, estimates in drawn:
+        for x, e in zip(flight.truth[SETTLED:], estimates[SETTLED:], strict=True):
+            position.append((e.p_wb - x[:3]) / e.sigma_p)
+            attitude.append(difference(x[3:7].copy(), e.q_wb) / e.sigma_q)
+    for normalised in (position, attitude):
+        per_axis = np.mean(np.square(normalised), axis=0)
+        assert np.all(per_axis > 0.4) and np.all(per_axis < 2.0), "eight flights are few independent draws an axis"
+        assert np.mean(per_axis) == pytest.approx(1.0, abs=0.35)
+
+
+def test_estimate_is_better_than_the_tags(drawn: list[tuple[Flight, list[Estimate]]]) -> None:
+    errors = [e.p_wb - x[:3] for f, es in drawn for x, e in zip(f.truth[SETTLED:], es[SETTLED:], strict=True)]
+    assert np.sqrt(np.mean(np.square(errors))) < 0.6 * P.tag_sigma_m
+
+
+def test_wrong_lever_arm_of_the_tag_would_be_noticed(body: Body, drawn: list[tuple[Flight, list[Estimate]]]) -> None:
+    """A tag believed 3 cm from where it is does not pass the bound on the error."""
+    flight = drawn[0][0]
+    off = np.array([0.0, 0.03, 0.0])
+    wrong = [m._replace(tags=[tag._replace(lever_b=tag.lever_b + off) for tag in m.tags]) for m in flight.measured]
+    _, estimates = run(body, replace(flight, measured=wrong))
+    pairs = list(zip(flight.truth, estimates, strict=True))[SETTLED:]
+    assert np.mean([np.square((e.p_wb - x[:3]) / e.sigma_p) for x, e in pairs]) > 5.0
+
+
+def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
+    """At 0.7 m/s a filter that believes water to push along refuses good tags; the right one refuses none."""
+    flight = fly(body, 3.0, 1, lambda n: 45.0, push=6.0)
+    pushed = replace(body, drag=replace(body.drag, nodes=-body.drag.nodes))
+    assert run(body, flight)[1][-1].rejected == 0
+    assert run(pushed, flight)[1][-1].rejected > 10

@@ -1,0 +1,50 @@
+"""The guest from outside: the packages it misses, and one call that boots it, runs a command and says how it ended."""
+
+import os
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+RUN = ROOT / "hil" / "guest" / "run"
+
+
+def missing_packages() -> list[str]:
+    """The Debian packages that the guest needs and this machine has not."""
+    prepare = [RUN.with_name("prepare"), "--missing"]
+    return subprocess.run(prepare, capture_output=True, text=True).stdout.split()
+
+
+class Guest:
+    """Runs commands in a freshly booted guest; nothing stays between two calls but what lands in `out`."""
+
+    def run(
+        self,
+        command: Sequence[str | Path],
+        *,
+        counted: bool = False,
+        processors: int = 1,
+        warm_up: str = "",
+        out: Path | None = None,
+        timeout_s: int = 600,
+        capture: bool = True,
+    ) -> subprocess.CompletedProcess[str]:
+        """Boots, runs `command` in the repository's root, powers off.
+
+        Args:
+            counted: the guest's clock counts instructions, so that lateness does not depend on this machine's load.
+            processors: of the guest; 1 when counted.
+            warm_up: shell command run outside first, to fill the cache of compiled code that the guest reads.
+            out: receives the files that the command leaves in $VG_OUT.
+            timeout_s: after which the guest is ended.
+            capture: returns stdout and stderr; otherwise they go where this process's go.
+
+        Returns:
+            returncode: the command's; 124 time-out, 125 the guest did not finish, 126 it could not be prepared.
+        """
+        switches = {"VG_SMP": str(processors), "VG_TIMEOUT": str(timeout_s), "VG_WARM": warm_up}
+        switches |= {"VG_COUNTED": "1"} if counted else {}
+        switches |= {"VG_OUT": str(out)} if out else {}
+        return subprocess.run(
+            [RUN, *command], cwd=ROOT, env=os.environ | switches, capture_output=capture, text=True, check=False
+        )
