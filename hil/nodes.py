@@ -157,7 +157,9 @@ class Mcu:
 class TagCamera:
     """The camera's node: sends what the camera saw, when its delay is over."""
 
-    def __init__(self, codec: Codec, camera: Camera, numbers: Mapping[int, int], spec: SensorSpec, world: World) -> None:
+    def __init__(
+        self, codec: Codec, camera: Camera, numbers: Mapping[int, int], spec: SensorSpec, world: World
+    ) -> None:
         self._position, self._attitude = codec.message("TAG_POSITION"), codec.message("TAG_ATTITUDE")
         self._camera, self._world = camera, world
         self._number_of = {module: number for number, module in numbers.items()}
@@ -187,7 +189,13 @@ class TagCamera:
             self._counters[sighting.module] = (counter + 1) & 15
             number = self._number_of[sighting.module]
             frames.append(self._position.encode(number, sighting.p_wt.tolist(), counter))
-            values = [*pack_quaternion(sighting.q_wt), sighting.tag_id, sighting.quality, capture_tick & 0xFF, 1e-6 * offset_ns]
+            values = [
+                *pack_quaternion(sighting.q_wt),
+                sighting.tag_id,
+                sighting.quality,
+                capture_tick & 0xFF,
+                1e-6 * offset_ns,
+            ]
             frames.append(self._attitude.encode(number, values, counter))
         return frames
 
@@ -196,7 +204,12 @@ class Nodes:
     """All nodes of one bus."""
 
     def __init__(
-        self, world: World, codec: Codec, numbers: Mapping[int, int], sensors: SensorSpec, cameras: Sequence[Camera] = ()
+        self,
+        world: World,
+        codec: Codec,
+        numbers: Mapping[int, int],
+        sensors: SensorSpec,
+        cameras: Sequence[Camera] = (),
     ) -> None:
         """Args: numbers: number on this bus -> index of the module in the world."""
         self.world = world
@@ -265,6 +278,7 @@ def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[Any, int,
 def make_nodes(world: World, codec: Codec, numbers: Mapping[int, int], scenario: Any) -> Nodes:
     """The nodes of a scenario on one bus; `numbers` maps numbers on the bus to modules."""
     cameras = [
-        Camera(pose, scenario.sensors, world.vehicles, scenario.tags, world.seed, index) for index, pose in enumerate(scenario.camera)
+        Camera(pose, scenario.sensors, world.vehicles, scenario.tags, world.seed, index)
+        for index, pose in enumerate(scenario.camera)
     ]
     return Nodes(world, codec, numbers, scenario.sensors, cameras)

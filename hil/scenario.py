@@ -41,7 +41,9 @@ class Task:
     radius_m: float = quantity(0.30, unit="m", low=0.01, high=100, help="spiral: radius")
     climb_m: float = quantity(0.40, unit="m", low=-100, high=100, help="spiral: height gained")
     turns: float = quantity(2.0, low=0.01, high=1000, help="spiral: turns, seen from above clockwise")
-    centre_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,), help="hover: place; spiral: bottom of its axis")
+    centre_m: np.ndarray = quantity(
+        [0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,), help="hover: place; spiral: bottom of its axis"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +112,9 @@ def load_scenario(name: str) -> Scenario:
     elif name in scenario_names():
         path = Path(str(resources.files("hil") / "scenarios" / f"{name}.toml"))
     else:
-        raise DescriptionError(f"scenario {name!r} is unknown; there are {', '.join(scenario_names())}, or give a .toml file")
+        raise DescriptionError(
+            f"scenario {name!r} is unknown; there are {', '.join(scenario_names())}, or give a .toml file"
+        )
     table, source = read_toml(path)
     scenario: Scenario = build(Scenario, table, source)
     return scenario

@@ -101,7 +101,8 @@ class InputCollector:
         self._expire_halves()
         estop, self._estop = self._estop, False
         dropped = sum(sum(receiver.dropped.values()) for receiver in self._receivers)
-        return Inputs(tick, time_ns, modules, list(requests), estop, dropped)
+        foreign = self.faults["foreign_sync"] > 0
+        return Inputs(tick, time_ns, modules, list(requests), estop, dropped, foreign)
 
     def _make_handlers(self) -> dict[str, Callable[[int, ModuleInputs, Received], None]]:
         handlers: dict[str, Callable[[int, ModuleInputs, Received], None]] = {

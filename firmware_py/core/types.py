@@ -66,15 +66,80 @@ class ModuleInputs:
     """Any frame of the module came."""
 
 
+class Mode(IntEnum):
+    """How an armed body is steered; ArduSub's names and numbers where the meaning is the same."""
+
+    STABILIZE = 0
+    """Sticks give force and turning rate; attitude is held."""
+    ALT_HOLD = 2
+    """As STABILIZE, and depth is held."""
+    AUTO = 3
+    """Follows a trajectory or mission."""
+    GUIDED = 4
+    """Follows set-points that stream in."""
+    SURFACE = 9
+    """Rises and stays up."""
+    POSHOLD = 16
+    """Holds the place; sticks move it."""
+    MANUAL = 19
+    """Sticks are forces and moments."""
+    MOTOR_DETECT = 20
+    """Turns one thruster after the other."""
+    DOCK = 30
+    """The docking sequence steers; modcube's own number."""
+
+
 class Action(IntEnum):
-    """What a person or program may ask of a body."""
+    """What a person or program may ask of a body; `argument` of the Request in brackets."""
 
     ARM = 1
+    """[bool: forced]"""
     DISARM = 2
+    """[bool: forced]"""
     HOLD = 3
+    """POSHOLD [Setpoint, or None: here]"""
     TRACK = 4
+    """AUTO [Trajectory]"""
     ESTOP = 5
     CLEAR_ESTOP = 6
+    SET_MODE = 7
+    """[Mode]"""
+    STICKS = 8
+    """[Sticks]"""
+    SET_POINT = 9
+    """GUIDED's newest set-point [Setpoint]"""
+    SET_PARAMETER = 10
+    """[(name as in the registry, value)]"""
+    DOCK = 11
+    """[DockRequest]"""
+    UNDOCK = 12
+    """[DockRequest]"""
+    MOTOR_TEST = 13
+    """[(thruster, share of full command, seconds)]"""
+    GROUND_ALIVE = 14
+    """The ground station was heard [None]"""
+
+
+class Sticks(NamedTuple):
+    """Pilot input, each -1 to 1, body FRD: forward, right, down; roll, pitch, yaw."""
+
+    force: tuple[float, float, float]
+    moment: tuple[float, float, float]
+
+
+class DockRequest(NamedTuple):
+    """Which faces are to meet, or to part."""
+
+    module: int
+    """Fleet index of the active module."""
+    face: int
+    """Its face, 0 to 5 as description.vehicle.FACE_NAMES."""
+    target_module: int
+    target_face: int
+    quarter_turns: int = 0
+    """Rotation of the active face about its normal against the target's, 0 to 3."""
+    both_approach: bool = False
+    """Both bodies move, as in the paper."""
 
 
 class Request(NamedTuple):
@@ -82,8 +147,8 @@ class Request(NamedTuple):
 
     action: Action
     body: int = 0
+    """Number of the body: the fleet index of its leader."""
     argument: Any = None
-    """TRACK: a Trajectory; HOLD: None holds here, else a Setpoint."""
 
 
 @dataclass(slots=True)
@@ -98,6 +163,8 @@ class Inputs:
     """An ESTOP frame came since the previous tick."""
     dropped_frames: int = 0
     """Frames dropped by the codec so far, all kinds."""
+    foreign_sync: bool = False
+    """Somebody else sends SYNC on one of our buses."""
 
 
 # ---------------------------------------------------------------- between the stages

@@ -14,11 +14,26 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from hil.plant import drag
 from hil.plant.vectors import (
-    F2, F3, F8, I1, V3, cross, dot, matrix, matrix_of, minus, plus, times, triple, turn, turn_back,
+    F2,
+    F3,
+    F8,
+    I1,
+    V3,
+    compiled,
+    cross,
+    dot,
+    matrix,
+    matrix_of,
+    minus,
+    plus,
+    times,
+    triple,
+    turn,
+    turn_back,
 )  # fmt: skip
 from hil.plant.water import WATER, is_clear, push_of_walls
 
@@ -69,7 +84,7 @@ BODIES = types.NamedTuple((F2, F3, F3, F3, F2, F2, F2), Bodies)
 MODULES = types.NamedTuple((I1, F2, F3, F2, F2, F2, F2, F2), Modules)
 
 
-@njit(types.void(F2, I8, V3, V3), cache=True)
+@compiled(types.void(F2, I8, V3, V3))
 def add_force(wrench, b, at, f):
     """Adds the force f at the point `at` to row b of wrenches; body frame."""
     n = cross(at, f)
@@ -78,7 +93,7 @@ def add_force(wrench, b, at, f):
         wrench[b, 3 + i] += n[i]
 
 
-@njit(V3(F3, I8, I8, V3, V3), cache=True)
+@compiled(V3(F3, I8, I8, V3, V3))
 def half_momentum(mass, b, first, v, w):
     """Rows `first` to first + 2 of mass matrix number b times [v; w]: linear momentum from 0, angular from 3."""
     p = (0.0, 0.0, 0.0)
@@ -88,7 +103,7 @@ def half_momentum(mass, b, first, v, w):
     return p
 
 
-@njit(types.void(BODIES, I8, F2, V3), cache=True)
+@compiled(types.void(BODIES, I8, F2, V3))
 def _add_weight(bodies, b, x, flow_rate):
     """Weight, buoyancy, and the pressure gradient of water that accelerates (Froude-Krylov)."""
     r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
@@ -102,11 +117,15 @@ def _add_weight(bodies, b, x, flow_rate):
         bodies.wrench[b, 3 + i] += n[i]
 
 
-@njit(types.void(BODIES, MODULES, I8, WATER, F2, V3), cache=True)
+@compiled(types.void(BODIES, MODULES, I8, WATER, F2, V3))
 def _add_drag(bodies, modules, m, water, x, flow):
     """Drag of one module at its hull centre, by its velocity relative to the water."""
     b = modules.body[m]
-    r, at, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), triple(modules.position, m, 0), matrix(modules.turn, m)
+    r, at, inside = (
+        matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]),
+        triple(modules.position, m, 0),
+        matrix(modules.turn, m),
+    )
     rate = triple(x, b, 10)
     v = turn_back(inside, plus(minus(triple(x, b, 7), turn_back(r, flow)), cross(rate, at)))
     w = turn_back(inside, rate)
@@ -119,9 +138,12 @@ def _add_drag(bodies, modules, m, water, x, flow):
         -(factor + linear[m, 2] + quadratic[m, 2] * abs(v[2])) * v[2],
     )
     n = (
-        -half_rho * c[m, 2] * drag.rotation(sy, sz, sx, v[1], v[2], w[0]) - (linear[m, 3] + quadratic[m, 3] * abs(w[0])) * w[0],
-        -half_rho * c[m, 3] * drag.rotation(sz, sx, sy, v[2], v[0], w[1]) - (linear[m, 4] + quadratic[m, 4] * abs(w[1])) * w[1],
-        -half_rho * c[m, 4] * drag.rotation(sx, sy, sz, v[0], v[1], w[2]) - (linear[m, 5] + quadratic[m, 5] * abs(w[2])) * w[2],
+        -half_rho * c[m, 2] * drag.rotation(sy, sz, sx, v[1], v[2], w[0])
+        - (linear[m, 3] + quadratic[m, 3] * abs(w[0])) * w[0],
+        -half_rho * c[m, 3] * drag.rotation(sz, sx, sy, v[2], v[0], w[1])
+        - (linear[m, 4] + quadratic[m, 4] * abs(w[1])) * w[1],
+        -half_rho * c[m, 4] * drag.rotation(sx, sy, sz, v[0], v[1], w[2])
+        - (linear[m, 5] + quadratic[m, 5] * abs(w[2])) * w[2],
     )
     add_force(bodies.wrench, b, at, turn(inside, f))
     n = turn(inside, n)
@@ -129,7 +151,7 @@ def _add_drag(bodies, modules, m, water, x, flow):
         bodies.wrench[b, 3 + i] += n[i]
 
 
-@njit(types.boolean(MODULES, I8, WATER, F2), cache=True)
+@compiled(types.boolean(MODULES, I8, WATER, F2))
 def _touches(modules, m, water, x):
     """Whether a module is so near to wall, bottom or surface that its corners must be looked at."""
     b = modules.body[m]
@@ -138,7 +160,7 @@ def _touches(modules, m, water, x):
     return not is_clear(water, plus(triple(x, b, 0), centre), 0.5 * math.sqrt(dot(size, size)))
 
 
-@njit(types.void(BODIES, MODULES, I8, WATER, F2), cache=True)
+@compiled(types.void(BODIES, MODULES, I8, WATER, F2))
 def _add_walls(bodies, modules, m, water, x):
     """Walls, bottom and surface on the eight corners of one module."""
     b = modules.body[m]
@@ -146,7 +168,11 @@ def _add_walls(bodies, modules, m, water, x):
     position, size, origin = triple(modules.position, m, 0), triple(modules.size, m, 0), triple(x, b, 0)
     lift = 0.25 * water.density * water.gravity * size[0] * size[1]
     for k in range(8):
-        corner = (size[0] * (0.5 if k & 1 else -0.5), size[1] * (0.5 if k & 2 else -0.5), size[2] * (0.5 if k & 4 else -0.5))
+        corner = (
+            size[0] * (0.5 if k & 1 else -0.5),
+            size[1] * (0.5 if k & 2 else -0.5),
+            size[2] * (0.5 if k & 4 else -0.5),
+        )
         at = plus(position, turn(inside, corner))
         p = plus(origin, turn(r, at))
         v = turn(r, plus(triple(x, b, 7), cross(triple(x, b, 10), at)))
@@ -156,7 +182,7 @@ def _add_walls(bodies, modules, m, water, x):
         add_force(bodies.wrench, b, at, turn_back(r, f))
 
 
-@njit(types.void(BODIES, I8, F2, F2, V3, V3), cache=True)
+@compiled(types.void(BODIES, I8, F2, F2, V3, V3))
 def _accelerate(bodies, b, x, out, flow, flow_rate):
     """Kirchhoff's equations solved for the accelerations, and the kinematics."""
     q = (x[b, 3], x[b, 4], x[b, 5], x[b, 6])
@@ -180,7 +206,7 @@ def _accelerate(bodies, b, x, out, flow, flow_rate):
     out[b, 6] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0])
 
 
-@njit(types.void(BODIES, MODULES, WATER, V3, V3, F2, F2, F2), cache=True)
+@compiled(types.void(BODIES, MODULES, WATER, V3, V3, F2, F2, F2))
 def derivative(bodies, modules, water, flow, flow_rate, thrust, x, out):
     """Rate of change of the states.
 
@@ -201,7 +227,7 @@ def derivative(bodies, modules, water, flow, flow_rate, thrust, x, out):
         _accelerate(bodies, b, x, out, flow, flow_rate)
 
 
-@njit(types.void(BODIES, MODULES, F2, F8, F2), cache=True)
+@compiled(types.void(BODIES, MODULES, F2, F8, F2))
 def observe(bodies, modules, rates, gravity, out):
     """Writes what each module is and feels: out (m, 16) hull centre (world), quaternion, velocity (world), rate and specific force.
 
@@ -211,7 +237,11 @@ def observe(bodies, modules, rates, gravity, out):
     x = bodies.state
     for m in range(modules.body.shape[0]):
         b = modules.body[m]
-        r, at, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), triple(modules.position, m, 0), matrix(modules.turn, m)
+        r, at, inside = (
+            matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]),
+            triple(modules.position, m, 0),
+            matrix(modules.turn, m),
+        )
         v, w = triple(x, b, 7), triple(x, b, 10)
         p = plus(triple(x, b, 0), turn(r, at))
         a = plus(plus(triple(rates, b, 7), cross(w, v)), plus(cross(triple(rates, b, 10), at), cross(w, cross(w, at))))

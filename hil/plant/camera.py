@@ -44,7 +44,13 @@ class Camera:
     """Takes a picture whenever one is due and reports the best tag of every module that it can read."""
 
     def __init__(
-        self, pose: CameraPose, spec: SensorSpec, vehicles: Sequence[Vehicle], tags: Sequence[int], seed: int, index: int = 0
+        self,
+        pose: CameraPose,
+        spec: SensorSpec,
+        vehicles: Sequence[Vehicle],
+        tags: Sequence[int],
+        seed: int,
+        index: int = 0,
     ) -> None:
         self._pose, self._spec = pose, spec
         self._axis = pose.axis / np.linalg.norm(pose.axis)
@@ -135,6 +141,9 @@ def _between(a: Truth, b: Truth, time_ns: int) -> _Seen:
         return _Seen(b.p_wm, b.q_wm)
     s, h = (time_ns - a.time_ns) / span, 1e-9 * span
     p = (
-        (1 + 2 * s) * (1 - s) ** 2 * a.p_wm + s * (1 - s) ** 2 * h * a.v_w + s * s * (3 - 2 * s) * b.p_wm - s * s * (1 - s) * h * b.v_w
+        (1 + 2 * s) * (1 - s) ** 2 * a.p_wm
+        + s * (1 - s) ** 2 * h * a.v_w
+        + s * s * (3 - 2 * s) * b.p_wm
+        - s * s * (1 - s) * h * b.v_w
     )
     return _Seen(p, rotations.multiply(a.q_wm, rotations.exp(s * rotations.difference(b.q_wm, a.q_wm))))

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
-F8 = "float64"
+from hil.plant.vectors import F8, compiled
 
 
-@njit(f"{F8}({F8},{F8},{F8},{F8},{F8},{F8},{F8},{F8})", cache=True)
+@compiled(F8(F8, F8, F8, F8, F8, F8, F8, F8))
 def translation(a, b, c, cd_face, cd_edge, vx, vy, vz):
     """Cd(d) A(d) |v|, m^3/s, of a box with edges a, b, c (m) moving at v (m/s, box frame) through the water.
 
@@ -28,7 +26,7 @@ def translation(a, b, c, cd_face, cd_edge, vx, vy, vz):
     return cd * (b * c * abs(vx) + a * c * abs(vy) + a * b * abs(vz))
 
 
-@njit(f"{F8}({F8},{F8},{F8})", cache=True)
+@compiled(F8(F8, F8, F8))
 def strip(v, w, h):
     """Integral over y from -h to h of |v + w y| (v + w y) y dy, m^5/s^2 per metre: strips of a side in cross-flow.
 
@@ -40,7 +38,7 @@ def strip(v, w, h):
     return math.copysign(inner, w)
 
 
-@njit(f"{F8}({F8},{F8},{F8},{F8},{F8},{F8})", cache=True)
+@compiled(F8(F8, F8, F8, F8, F8, F8))
 def rotation(a, b, c, vx, vy, wz):
     """Integral, m^5/s^2, whose product with 1/2 rho Cd is the moment against wz of a box with edges a, b and c along z."""
     return c * (strip(vy, wz, 0.5 * a) + strip(-vx, wz, 0.5 * b))

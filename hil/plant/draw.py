@@ -68,7 +68,9 @@ def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> Mo
     shift = np.append(spec.trim_m * stream(seed, "trim", module).uniform(-1.0, 1.0, 2), 0.0)
     drag = vehicle.drag
     root = np.sqrt(turn[:3])
-    deadband = spec.deadband_low_n + (spec.deadband_high_n - spec.deadband_low_n) * stream(seed, "deadband", module).uniform(0, 1, count)
+    deadband = spec.deadband_low_n + (spec.deadband_high_n - spec.deadband_low_n) * stream(
+        seed, "deadband", module
+    ).uniform(0, 1, count)
     return ModuleDraw(
         dry_kg=dry,
         entrained_kg=entrained,

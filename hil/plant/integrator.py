@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 
-from numba import njit, types
+from numba import types
 
 from hil.plant.bodies import BODIES, MODULES, derivative, observe
 from hil.plant.thrusters import THRUSTERS, forces_after, load_supplies, settle
-from hil.plant.vectors import F2, F3, F8
+from hil.plant.vectors import F2, F3, F8, compiled
 from hil.plant.water import WATER, flow_at
 
 I8 = types.int64
 
 
-@njit(types.void(THRUSTERS, F2, F2), cache=True)
+@compiled(types.void(THRUSTERS, F2, F2))
 def wrenches(thrusters, external, out):
     """Writes the wrench (b, 6) about O, body frame, of all thrusters and of `external` (b, 6)."""
     for b in range(out.shape[0]):
@@ -25,7 +25,7 @@ def wrenches(thrusters, external, out):
             out[thrusters.body[t], i] += thrusters.column[t, i] * thrusters.force[t]
 
 
-@njit(types.void(F2, F8, F2, F2), cache=True)
+@compiled(types.void(F2, F8, F2, F2))
 def along(x, h, rate, out):
     """out = x + h rate."""
     for b in range(x.shape[0]):
@@ -33,7 +33,7 @@ def along(x, h, rate, out):
             out[b, i] = x[b, i] + h * rate[b, i]
 
 
-@njit(types.void(F2, F8, F3), cache=True)
+@compiled(types.void(F2, F8, F3))
 def close_step(x, h, stage):
     """Sums the four stages into x and makes the quaternions of unit length."""
     for b in range(x.shape[0]):
@@ -44,7 +44,7 @@ def close_step(x, h, stage):
             x[b, i] /= norm
 
 
-@njit(types.void(BODIES, MODULES, THRUSTERS, WATER, F2, I8, F8, F3, F2, F2), cache=True)
+@compiled(types.void(BODIES, MODULES, THRUSTERS, WATER, F2, I8, F8, F3, F2, F2))
 def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust, seen):
     """Moves everything on by `steps` sub-steps of h seconds.
 

@@ -21,29 +21,43 @@ class WorldSpec:
     gravity: float = quantity(9.81, unit="m/s^2", low=9, high=10, help="downwards")
     atmosphere_pa: float = quantity(101325.0, unit="Pa", low=8e4, high=1.2e5, help="pressure at the surface")
     temperature_c: float = quantity(20.0, unit="degC", low=-2, high=40, help="of the water")
-    current_m_s: float = quantity(0.05, unit="m/s", low=0, high=2, help="mean horizontal current, direction per seed (synthetic)")
+    current_m_s: float = quantity(
+        0.05, unit="m/s", low=0, high=2, help="mean horizontal current, direction per seed (synthetic)"
+    )
     gust_m_s: float = quantity(
         0.015, unit="m/s", low=0, high=1, help="gusts per axis, standard deviation: 30 % of the mean (synthetic)"
     )
     gust_time_s: float = quantity(5.0, unit="s", low=0.1, high=1000, help="correlation time of the gusts (synthetic)")
-    gust_smoothing_s: float = quantity(1.0, unit="s", low=0.05, high=100, help="second lag: water has inertia (synthetic)")
+    gust_smoothing_s: float = quantity(
+        1.0, unit="s", low=0.05, high=100, help="second lag: water has inertia (synthetic)"
+    )
     buoyancy_error_n: float = quantity(0.5, unit="N", low=0, high=1000, help="net buoyancy, sign per seed (synthetic)")
     righting_spread_m: float = quantity(
         0.005, unit="m", low=0, high=0.5, help="righting arm drawn this far around the vehicle file's (synthetic)"
     )
-    trim_m: float = quantity(0.003, unit="m", low=0, high=0.5, help="lateral shift of the dry mass, each axis drawn up to this (synthetic)")
+    trim_m: float = quantity(
+        0.003, unit="m", low=0, high=0.5, help="lateral shift of the dry mass, each axis drawn up to this (synthetic)"
+    )
     mass_spread: float = quantity(0.15, low=0, high=0.8, help="share: rigid mass; added mass of each axis (synthetic)")
-    inertia_spread: float = quantity(0.15, low=0, high=0.3, help="share: inertia of each axis, rigid and added (synthetic)")
-    drag_spread: float = quantity(0.20, low=0, high=0.9, help="share: coefficients face-on, edge-on, of rotation (synthetic)")
+    inertia_spread: float = quantity(
+        0.15, low=0, high=0.3, help="share: inertia of each axis, rigid and added (synthetic)"
+    )
+    drag_spread: float = quantity(
+        0.20, low=0, high=0.9, help="share: coefficients face-on, edge-on, of rotation (synthetic)"
+    )
     gain_spread: float = quantity(0.05, low=0, high=0.9, help="share: force of each thruster (synthetic)")
     thruster_lag_s: float = quantity(0.08, unit="s", low=0, high=2, help="first-order lag of the force (synthetic)")
     deadband_low_n: float = quantity(0.10, unit="N", low=0, high=10, help="smallest deadband drawn (synthetic)")
     deadband_high_n: float = quantity(0.25, unit="N", low=0, high=10, help="largest deadband drawn (synthetic)")
     supply_resistance_ohm: float = quantity(0.10, unit="ohm", low=0, high=10, help="makes the voltage sag (synthetic)")
     supply_limit: bool = quantity(True, help="the supply gives no more than its current")
-    jet_strength: float = quantity(0.3, low=0, high=1, help="share of a jet's thrust that pushes a module in its way (synthetic)")
+    jet_strength: float = quantity(
+        0.3, low=0, high=1, help="share of a jet's thrust that pushes a module in its way (synthetic)"
+    )
     jet_length_m: float = quantity(0.5, unit="m", low=0.01, high=100, help="length over which a jet halves (synthetic)")
-    jet_radius_m: float = quantity(0.06, unit="m", low=0.001, high=10, help="of a jet at its thruster; opens by 0.1 (synthetic)")
+    jet_radius_m: float = quantity(
+        0.06, unit="m", low=0.001, high=10, help="of a jet at its thruster; opens by 0.1 (synthetic)"
+    )
     wall_stiffness: float = quantity(2000.0, unit="N/m", low=0, high=1e6, help="of one corner on a wall (synthetic)")
     wall_damping: float = quantity(60.0, unit="N s/m", low=0, high=1e5, help="across and along the wall (synthetic)")
 
@@ -67,11 +81,15 @@ class SensorSpec:
     gyro_sigma: float = quantity(0.002, unit="rad/s", low=0, high=1, help="noise per sample: consumer MEMS (synthetic)")
     gyro_bias: float = quantity(0.005, unit="rad/s", low=0, high=1, help="bias drawn per axis, sigma (synthetic)")
     gyro_walk: float = quantity(2e-5, unit="rad/s/sqrt(s)", low=0, high=1, help="random walk of the bias (synthetic)")
-    accel_sigma: float = quantity(0.03, unit="m/s^2", low=0, high=10, help="noise per sample: consumer MEMS (synthetic)")
+    accel_sigma: float = quantity(
+        0.03, unit="m/s^2", low=0, high=10, help="noise per sample: consumer MEMS (synthetic)"
+    )
     accel_bias: float = quantity(0.05, unit="m/s^2", low=0, high=10, help="bias drawn per axis, sigma (synthetic)")
     accel_walk: float = quantity(1e-4, unit="m/s^2/sqrt(s)", low=0, high=1, help="random walk of the bias (synthetic)")
     depth_sigma_m: float = quantity(0.002, unit="m", low=0, high=1, help="noise (synthetic)")
-    depth_bias_m: float = quantity(0.02, unit="m", low=0, high=10, help="bias drawn, sigma: weather and datum (synthetic)")
+    depth_bias_m: float = quantity(
+        0.02, unit="m", low=0, high=10, help="bias drawn, sigma: weather and datum (synthetic)"
+    )
     depth_walk: float = quantity(2e-4, unit="m/sqrt(s)", low=0, high=1, help="random walk of the bias (synthetic)")
     tag_rate_hz: float = quantity(60.0, unit="Hz", low=0.1, high=400, help="pictures a second, free-running (paper)")
     tag_phase: float = quantity(1.0, low=0, high=1, help="share of a picture's period over which its phase is drawn")
@@ -81,7 +99,9 @@ class SensorSpec:
     tag_sigma_deg: float = quantity(0.5, unit="deg", low=0, high=90, help="attitude noise, each axis (synthetic)")
     tag_dropped: float = quantity(0.02, low=0, high=1, help="share of pictures without a pose (synthetic)")
     tag_flipped: float = quantity(0.005, low=0, high=1, help="share with the planar tag's second pose (synthetic)")
-    tag_incidence_deg: float = quantity(65.0, unit="deg", low=1, high=90, help="a tag seen more obliquely is not read (synthetic)")
+    tag_incidence_deg: float = quantity(
+        65.0, unit="deg", low=1, high=90, help="a tag seen more obliquely is not read (synthetic)"
+    )
     voltage_sigma_v: float = quantity(0.01, unit="V", low=0, high=10, help="noise of the battery voltage (synthetic)")
     current_sigma_a: float = quantity(0.02, unit="A", low=0, high=10, help="noise of the battery current (synthetic)")
     rpm_sigma: float = quantity(5.0, unit="1/min", low=0, high=1000, help="noise of the propeller speeds (synthetic)")
@@ -104,7 +124,9 @@ class Tank:
     """Where the water is. Origin at the centre of the surface, z down."""
 
     kind: str = quantity("box", choices=("box", "cylinder"), help="shape")
-    size_m: np.ndarray = quantity([1.3, 1.2, 0.76], unit="m", low=0.1, high=1000, shape=(3,), help="box: length, width, depth")
+    size_m: np.ndarray = quantity(
+        [1.3, 1.2, 0.76], unit="m", low=0.1, high=1000, shape=(3,), help="box: length, width, depth"
+    )
     radius_m: float = quantity(3.5, unit="m", low=0.1, high=1000, help="cylinder: radius")
     depth_m: float = quantity(3.0, unit="m", low=0.1, high=1000, help="cylinder: depth")
 
@@ -113,7 +135,9 @@ class Tank:
 class CameraPose:
     """A tag camera fixed in the world."""
 
-    position_m: np.ndarray = quantity([0.0, 0.0, -1.2], unit="m", low=-100, high=100, shape=(3,), help="of its lens, world")
+    position_m: np.ndarray = quantity(
+        [0.0, 0.0, -1.2], unit="m", low=-100, high=100, shape=(3,), help="of its lens, world"
+    )
     axis: np.ndarray = quantity([0.0, 0.0, 1.0], low=-1.001, high=1.001, shape=(3,), help="optical axis, world")
     half_view_deg: float = quantity(60.0, unit="deg", low=1, high=89, help="half the cone in which it sees")
 

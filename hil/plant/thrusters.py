@@ -10,11 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from hil.plant.bodies import BODIES, MODULES, add_force
-from hil.plant.vectors import F1, F2, F3, F8, I1, dot, matrix_of, minus, plus, times, triple, turn, turn_back
-
+from hil.plant.vectors import F1, F2, F3, F8, I1, compiled, dot, matrix_of, minus, plus, times, triple, turn, turn_back
 
 
 class Thrusters(NamedTuple):
@@ -49,7 +48,7 @@ class Thrusters(NamedTuple):
 THRUSTERS = types.NamedTuple((I1, I1, F2, F2, F3, F3, F2, F2, F2, F1, F2, F2), Thrusters)
 
 
-@njit(F8(F3, types.int64, types.int64, F8), cache=True)
+@compiled(F8(F3, types.int64, types.int64, F8))
 def polynomial(curves, t, side, x):
     """sum c[i] x^(i+1) of one curve (side 0 forward, 1 reverse) of thruster t."""
     total = 0.0
@@ -58,7 +57,7 @@ def polynomial(curves, t, side, x):
     return total
 
 
-@njit(types.void(THRUSTERS, types.int64, F1), cache=True)
+@compiled(types.void(THRUSTERS, types.int64, F1))
 def command(thrusters, first, u):
     """Gives thrusters `first` and on the commands u, -1 to 1; a force within the deadband is none."""
     for i in range(u.shape[0]):
@@ -69,7 +68,7 @@ def command(thrusters, first, u):
         thrusters.level[t, 0] = force if u[i] > 0.0 else -force
 
 
-@njit(F8(F8, F8, F8, F8, F8), cache=True)
+@compiled(F8(F8, F8, F8, F8, F8))
 def voltage_of(open_v, resistance, limit_a, idle_a, conductance):
     """Voltage at which supply and load agree.
 
@@ -85,7 +84,7 @@ def voltage_of(open_v, resistance, limit_a, idle_a, conductance):
     return v
 
 
-@njit(types.void(THRUSTERS, types.int64), cache=True)
+@compiled(types.void(THRUSTERS, types.int64))
 def load_supplies(thrusters, halves):
     """Finds voltage and current of every module from what its propellers do so many half sub-steps from now."""
     supply, power = thrusters.supply, thrusters.power
@@ -103,17 +102,19 @@ def load_supplies(thrusters, halves):
         power[m, 0], power[m, 1] = v, idle_a + conductance * v * v
 
 
-@njit(types.void(THRUSTERS, types.int64), cache=True)
+@compiled(types.void(THRUSTERS, types.int64))
 def forces_after(thrusters, halves):
     """Sets the force of every thruster to that so many half sub-steps from now, at the voltages found by `load_supplies`."""
     for t in range(thrusters.force.shape[0]):
         target, now = thrusters.level[t, 0], thrusters.level[t, 1]
         m = thrusters.module[t]
         scale = thrusters.power[m, 0] / thrusters.supply[m, 0]
-        thrusters.force[t] = thrusters.constants[t, 0] * scale * scale * (target + (now - target) * thrusters.decay[t, halves])
+        thrusters.force[t] = (
+            thrusters.constants[t, 0] * scale * scale * (target + (now - target) * thrusters.decay[t, halves])
+        )
 
 
-@njit(types.void(THRUSTERS), cache=True)
+@compiled(types.void(THRUSTERS))
 def settle(thrusters):
     """Moves the lagged forces on by a sub-step."""
     level = thrusters.level
@@ -121,7 +122,7 @@ def settle(thrusters):
         level[t, 1] = level[t, 0] + (level[t, 1] - level[t, 0]) * thrusters.decay[t, 2]
 
 
-@njit(types.void(THRUSTERS, types.int64, F2), cache=True)
+@compiled(types.void(THRUSTERS, types.int64, F2))
 def feedback(thrusters, first, out):
     """Writes rpm (1/min) and current (A) of thrusters `first` and on into out (n, 2).
 
@@ -138,7 +139,7 @@ def feedback(thrusters, first, out):
         out[i, 1] = polynomial(thrusters.power_curve, t, side, abs(f)) / thrusters.supply[m, 0] * scale * scale
 
 
-@njit(types.void(THRUSTERS, BODIES, MODULES, F8, F8, F8, F2), cache=True)
+@compiled(types.void(THRUSTERS, BODIES, MODULES, F8, F8, F8, F2))
 def add_jets(thrusters, bodies, modules, strength, length, radius, out):
     """Adds the push of every jet on the first other module in its way to the wrenches out (b, 6).
 

@@ -10,10 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from hil.plant.spec import Tank, WorldSpec
-from hil.plant.vectors import F2, F8, V3, dot, minus, plus, times, triple
+from hil.plant.vectors import F2, F8, V3, compiled, dot, minus, plus, times, triple
 
 FRICTION = 0.3
 """Largest friction at a wall, share of the normal force (synthetic)."""
@@ -73,7 +73,7 @@ class Gusts:
         return self._sigma * self._unit
 
 
-@njit(types.Tuple((V3, V3))(WATER, F8), cache=True)
+@compiled(types.Tuple((V3, V3))(WATER, F8))
 def flow_at(water, since_s):
     """Velocity and acceleration of the water, world frame, `since_s` after `water.flow` was set."""
     keep, rate = math.exp(-since_s / water.smoothing_s), 1.0 / water.smoothing_s
@@ -82,7 +82,7 @@ def flow_at(water, since_s):
     return plus(triple(water.flow, 0, 0), plus(target, gap)), times(-rate, gap)
 
 
-@njit(types.boolean(WATER, V3, F8), cache=True)
+@compiled(types.boolean(WATER, V3, F8))
 def is_clear(water, centre, reach):
     """Whether a ball of radius `reach` touches neither wall, bottom nor surface."""
     if centre[2] < reach or centre[2] > water.depth - reach:
@@ -92,7 +92,7 @@ def is_clear(water, centre, reach):
     return math.hypot(centre[0], centre[1]) + reach < water.half_length
 
 
-@njit(V3(WATER, F8, V3, V3), cache=True)
+@compiled(V3(WATER, F8, V3, V3))
 def _push(water, deep, outward, v):
     """Force of one wall on a point that is `deep` metres into it."""
     if deep <= 0.0:
@@ -105,7 +105,7 @@ def _push(water, deep, outward, v):
     return plus(times(-normal, outward), times(-rub, along))
 
 
-@njit(V3(WATER, V3, V3), cache=True)
+@compiled(V3(WATER, V3, V3))
 def push_of_walls(water, p, v):
     """Force of walls and bottom on one corner at p with velocity v, world frame."""
     f = _push(water, p[2] - water.depth, (0.0, 0.0, 1.0), v)

@@ -199,7 +199,9 @@ class World:
         return out
 
 
-def _make_thrusters(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec, step_ns: int) -> Thrusters:
+def _make_thrusters(
+    vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec, step_ns: int
+) -> Thrusters:
     module = np.array([m for m, v in enumerate(vehicles) for _ in v.thruster], dtype=np.int64)
     curves = [vehicles[m].curve for m in module]
     constants = np.column_stack([
@@ -249,7 +251,12 @@ def _make_modules(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw]) -> M
 def _make_bodies(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec) -> Bodies:
     n = len(vehicles)
     bodies = Bodies(
-        np.zeros((n, 13)), np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, 8)), np.zeros((n, 4)),
+        np.zeros((n, 13)),
+        np.zeros((n, 6, 6)),
+        np.zeros((n, 6, 6)),
+        np.zeros((n, 6, 6)),
+        np.zeros((n, 8)),
+        np.zeros((n, 4)),
         np.zeros((n, 6)),
     )
     for m in range(n):

@@ -158,7 +158,9 @@ def test_heavy_module_comes_to_rest_on_the_bottom() -> None:
 def test_light_module_floats_at_the_surface() -> None:
     spec = WorldSpec(**{**CALM, "buoyancy_error_n": 0.5})
     seed = next(s for s in range(20) if not sinks(spec, s))
-    world = World(spec, Tank(), [vehicle(righting_arm_m=0.005)], [Start(np.array([0.1, 0.1, 0.4]), LEVEL)], seed, PERIOD_NS)
+    world = World(
+        spec, Tank(), [vehicle(righting_arm_m=0.005)], [Start(np.array([0.1, 0.1, 0.4]), LEVEL)], seed, PERIOD_NS
+    )
     run(world, 120.0)
     # it shows so much of its 0.0441 m^2 that half a newton of buoyancy is lost
     shown = 0.5 / (spec.density * spec.gravity * 0.21**2)

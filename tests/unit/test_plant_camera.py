@@ -25,7 +25,9 @@ def at(x: float, y: float, z: float, q: np.ndarray = LEVEL) -> Start:
     return Start(np.array([x, y, z]), q)
 
 
-def camera(modules: int = 1, tags: tuple[int, ...] = (5,), seed: int = 0, pose: CameraPose = ABOVE, **changes: float) -> Camera:
+def camera(
+    modules: int = 1, tags: tuple[int, ...] = (5,), seed: int = 0, pose: CameraPose = ABOVE, **changes: float
+) -> Camera:
     return Camera(pose, SensorSpec(**{**IDEAL, **changes}), [VEHICLE] * modules, tags, seed)
 
 

@@ -17,7 +17,9 @@ OCEAN = Tank(kind="box", size_m=np.array([900.0, 900.0, 900.0]))
 CURVE = load_vehicle("modcube").curve
 
 
-def still(positions: list[list[float]] | None = None, seed: int = 0, body: Vehicle | None = None, **world: object) -> World:
+def still(
+    positions: list[list[float]] | None = None, seed: int = 0, body: Vehicle | None = None, **world: object
+) -> World:
     """Modules at rest in deep calm water."""
     places = positions or [[0.0, 0.0, 400.0]]
     body = body or load_vehicle("modcube")
@@ -152,7 +154,9 @@ def test_jet_pushes_less_from_farther_away() -> None:
 
 def test_same_seed_gives_the_same_world_and_another_does_not() -> None:
     def flight(seed: int) -> np.ndarray:
-        world = World(WorldSpec(), Tank(), [load_vehicle("modcube")], [Start(np.array([0.0, 0.0, 0.4]), LEVEL)], seed, PERIOD_NS)
+        world = World(
+            WorldSpec(), Tank(), [load_vehicle("modcube")], [Start(np.array([0.0, 0.0, 0.4]), LEVEL)], seed, PERIOD_NS
+        )
         world.set_command(0, np.full(8, 0.2), True)
         run(world, 200)
         return np.concatenate(world.truth(0)[1:6])
@@ -165,7 +169,9 @@ def test_switching_one_error_off_leaves_the_draws_of_the_others() -> None:
     body = load_vehicle("modcube")
     start = [Start(np.array([0.0, 0.0, 0.4]), LEVEL)]
     all_on = World(WorldSpec(), Tank(), [body], start, 7, PERIOD_NS)
-    less = World(dataclasses.replace(WorldSpec(), mass_spread=0.0, current_m_s=0.0), Tank(), [body], start, 7, PERIOD_NS)
+    less = World(
+        dataclasses.replace(WorldSpec(), mass_spread=0.0, current_m_s=0.0), Tank(), [body], start, 7, PERIOD_NS
+    )
     for name in ("drag", "gain", "deadband_n", "weight_at", "buoyancy_at"):
         np.testing.assert_array_equal(getattr(all_on.draw(0), name), getattr(less.draw(0), name))
     assert all_on.draw(0).dry_kg != less.draw(0).dry_kg == pytest.approx(2.6)

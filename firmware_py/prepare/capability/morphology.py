@@ -92,7 +92,7 @@ def willmore(coefficients: np.ndarray, l_max: int) -> tuple[float, float, float]
     if r.min() <= 0.0:
         return math.nan, math.nan, float(r.min() / r.max())
     sin, cos = np.sin(polar), np.cos(polar)
-    # First and second fundamental forms of r e_r in the frame (e_r, e_polar, e_azimuth).
+    # First and second fundamental forms of r e_r, in the frame (e_r, e_polar, e_azimuth) that turns with the angles.
     e, f, g = r_p**2 + r**2, r_p * r_a, r_a**2 + (r * sin) ** 2
     area = np.sqrt(e * g - f * f)
     normal = np.stack([r * r * sin, -r * r_p * sin, -r * r_a]) / area
@@ -101,7 +101,6 @@ def willmore(coefficients: np.ndarray, l_max: int) -> tuple[float, float, float]
         np.stack([r_pa, r_a, r_p * sin + r * cos]),
         np.stack([r_aa - r * sin**2, -r * sin * cos, 2.0 * r_a * sin]),
     )
-    # d/da of e_polar is cos e_azimuth and of r_a e_r is r_a sin e_azimuth; written out in `second`.
     ll, mm, nn = (np.sum(normal * part, axis=0) for part in second)
     mean = (e * nn - 2.0 * f * mm + g * ll) / (2.0 * area**2)
     gauss = (ll * nn - mm * mm) / area**2

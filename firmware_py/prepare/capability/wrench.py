@@ -48,6 +48,7 @@ class WrenchSpace:
     Attributes:
         layout: whose.
         dead: so many thrusters give nothing, always those whose loss hurts most.
+        normals: (m, 6) of facets.normals_of.
 
     Raises:
         ValueError: more thrusters than facets can be found for; use `reach_by_programs`.
@@ -56,8 +57,8 @@ class WrenchSpace:
     def __init__(self, layout: Layout, dead: int = 0, normals: np.ndarray | None = None) -> None:
         self.layout = layout
         self.dead = dead
-        self._normals = facets.normals_of(layout) if normals is None else normals
-        self._supports = facets.supports_of(layout, self._normals, dead)
+        self.normals = facets.normals_of(layout) if normals is None else normals
+        self._supports = facets.supports_of(layout, self.normals, dead)
 
     def with_dead(self, dead: int) -> WrenchSpace:
         """The wrenches that are left whichever `dead` thrusters give nothing (exact: see there).
@@ -65,12 +66,12 @@ class WrenchSpace:
         A facet of what n - dead thrusters can do is spanned by some of them, so its normal is one of the full layout's; along
         it the worst loss is that of the `dead` largest contributions.
         """
-        return WrenchSpace(self.layout, dead, self._normals)
+        return WrenchSpace(self.layout, dead, self.normals)
 
     def reach(self, wrenches: np.ndarray) -> np.ndarray:
         """(k,) largest factor of each of (k, 6) wrenches; 0 for what the layout cannot push at all."""
         wrenches = np.atleast_2d(np.asarray(wrenches, dtype=float))
-        factor = facets.reach(self.layout, self._normals, self._supports, wrenches)
+        factor = facets.reach(self.layout, self.normals, self._supports, wrenches)
         return np.where(_in_span(self.layout, wrenches), factor, 0.0)
 
     def section(self, frame: str) -> Section | None:
@@ -81,7 +82,7 @@ class WrenchSpace:
         components = free_components(self.layout, frame)
         if not components or not self.layout.spans(components):
             return None
-        both = np.concatenate([self._normals, -self._normals])[:, components]
+        both = np.concatenate([self.normals, -self.normals])[:, components]
         size = np.linalg.norm(both, axis=1)
         scale = float(size.max())
         keep = size > 1e-9 * scale

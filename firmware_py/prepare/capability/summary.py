@@ -1,0 +1,239 @@
+"""Everything that is said of one layout: both frames, all normalisations, degenerate cases named. What the tools print and draw."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from firmware_py.prepare.capability.ellipsoid import Ellipsoid, largest_inscribed
+from firmware_py.prepare.capability.layout import AXES, FRAMES, Layout
+from firmware_py.prepare.capability.morphology import Harmonics, Shape
+from firmware_py.prepare.capability.power import PowerSpace, power_space
+from firmware_py.prepare.capability.sphere import fibonacci
+from firmware_py.prepare.capability.wrench import Section, WrenchSpace, embed, reach_by_programs
+
+DIRECTIONS = 1000
+"""Directions over the sphere, as in the paper's drag table."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reach:
+    """Reachable wrenches of one frame under one normalisation.
+
+    Attributes:
+        degenerate: the layout cannot push in some direction of the frame, so the volume is zero.
+        section: the polytope, None where degenerate.
+        ellipsoid: the largest inscribed one, None where degenerate.
+        volume: of the ellipsoid, N^d or (N m)^d, d the frame's free components; 0 where degenerate.
+        worst: smallest lambda over all directions, N or N m.
+        radius: (k,) lambda over the directions of `Capability.directions`; zeros where not reachable.
+        shape: energies of that surface, None where degenerate or not a surface in three dimensions.
+    """
+
+    degenerate: bool
+    section: Section | None
+    ellipsoid: Ellipsoid | None
+    volume: float
+    worst: float
+    radius: np.ndarray
+    shape: Shape | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capability:
+    """What one layout can do.
+
+    Attributes:
+        layout: whose.
+        rank: of its matrix.
+        unreachable: degrees of freedom that cannot be pushed alone.
+        directions: (k, 3).
+        reach: by frame and normalisation.
+        declared: the same with the passive degrees of freedom declared; empty where there are none.
+        power, power_shape: by frame.
+        programs_differ: largest relative difference of linear programs from facets over both frames, NaN if not run.
+        axes: (6, 2) most that can be pushed along and against each component alone, N and N m.
+    """
+
+    layout: Layout
+    rank: int
+    unreachable: tuple[str, ...]
+    directions: np.ndarray
+    reach: dict[str, dict[str, Reach]]
+    declared: dict[str, dict[str, Reach]]
+    power: dict[str, PowerSpace]
+    power_shape: dict[str, Shape]
+    programs_differ: float
+    axes: np.ndarray
+    notes: tuple[str, ...] = field(default=())
+
+
+def characterise(
+    layout: Layout,
+    count: int = DIRECTIONS,
+    sizes: dict[str, float] | None = None,
+    programs: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> Capability:
+    """Both frames of one layout.
+
+    Args:
+        count: directions over the sphere, at least 121.
+        sizes: |w| of the power space by frame; 1 N and 1 N m when left out.
+        programs: solve the linear programs too and compare.
+        progress: called with what comes next.
+
+    Raises:
+        ValueError: too many thrusters for facets.
+    """
+    directions = fibonacci(count)
+    harmonics = Harmonics(directions)
+    say = progress or (lambda text: None)
+    space = WrenchSpace(layout)
+    reach: dict[str, dict[str, Reach]] = {}
+    power: dict[str, PowerSpace] = {}
+    differ = 0.0 if programs else math.nan
+    for frame in FRAMES:
+        say(f"{frame}: facets and inscribed ellipsoid")
+        reach[frame] = _all_normalisations(layout, frame, directions, harmonics)
+        power[frame] = power_space(layout, frame, directions, (sizes or {}).get(frame, 1.0))
+        if programs:
+            say(f"{frame}: {count} linear programs")
+            differ = max(differ, _difference(layout, frame, directions, reach[frame]["physical"].radius))
+    declared: dict[str, dict[str, Reach]] = {}
+    if layout.passive:
+        rest = layout.with_passive_declared()
+        declared = {frame: _all_normalisations(rest, frame, directions, harmonics) for frame in FRAMES}
+    return Capability(
+        layout=layout,
+        rank=layout.rank,
+        unreachable=layout.unreachable(),
+        directions=directions,
+        reach=reach,
+        declared=declared,
+        power=power,
+        power_shape={frame: harmonics.shape(_known(power[frame].power_w)) for frame in FRAMES},
+        programs_differ=differ,
+        axes=np.stack([space.reach(np.eye(6)), space.reach(-np.eye(6))], axis=1),
+        notes=_notes(layout),
+    )
+
+
+def _known(power_w: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(power_w), power_w, 0.0)
+
+
+def _all_normalisations(layout: Layout, frame: str, directions: np.ndarray, harmonics: Harmonics) -> dict[str, Reach]:
+    normals = WrenchSpace(layout).normals
+
+    def found(how: str) -> Reach:
+        return _reach(WrenchSpace(layout.normalised(how), 0, normals), frame, directions, harmonics)
+
+    physical, unit = found("physical"), found("unit_thrust")
+    share = float(layout.normalised("equal_total_thrust").f_max[0])
+    return {"physical": physical, "unit_thrust": unit, "equal_total_thrust": _scaled(unit, share)}
+
+
+def _scaled(reach: Reach, share: float) -> Reach:
+    """The reach with all force limits multiplied by `share`."""
+    section, ellipsoid, shape = reach.section, reach.ellipsoid, reach.shape
+    return Reach(
+        degenerate=reach.degenerate,
+        section=section and dataclasses.replace(section, offsets=share * section.offsets),
+        ellipsoid=ellipsoid and Ellipsoid(share * ellipsoid.shape, share * ellipsoid.centre),
+        volume=reach.volume * (share ** len(ellipsoid.centre) if ellipsoid else 0.0),
+        worst=share * reach.worst,
+        radius=share * reach.radius,
+        shape=shape and dataclasses.replace(shape, dirichlet=share**2 * shape.dirichlet),
+    )
+
+
+def _reach(space: WrenchSpace, frame: str, directions: np.ndarray, harmonics: Harmonics) -> Reach:
+    section = space.section(frame)
+    if section is None:
+        radius = space.reach(embed(directions, FRAMES[frame]))
+        return Reach(True, None, None, 0.0, 0.0, radius, None)
+    ellipsoid = largest_inscribed(section.normals, section.offsets)
+    full = len(section.components) == 3
+    radius = section.reach(directions) if full else np.zeros(len(directions))
+    shape = harmonics.shape(radius) if full else None
+    return Reach(False, section, ellipsoid, ellipsoid.volume, section.worst(), radius, shape)
+
+
+def _difference(layout: Layout, frame: str, directions: np.ndarray, exact: np.ndarray) -> float:
+    """Largest |program - facet| over the largest of the two; over the largest radius where a direction is out of reach."""
+    programs = reach_by_programs(layout, embed(directions, FRAMES[frame]))
+    scale = np.where(exact > 0.0, exact, max(float(exact.max()), float(layout.f_max.max())))
+    return float(np.max(np.abs(programs - exact) / scale))
+
+
+def _notes(layout: Layout) -> tuple[str, ...]:
+    notes = []
+    if layout.rank < 6:
+        held = ", ".join(AXES[c] for c in layout.passive) or "none declared"
+        notes.append(f"degenerate: rank {layout.rank}, cannot push {', '.join(layout.unreachable())} alone; passive: {held}")
+    if layout.assumption:
+        notes.append(f"assumed: {layout.assumption}")
+    return tuple(notes)
+
+
+def to_plain(result: Capability) -> dict[str, Any]:
+    """Figures alone, for JSON; units in the names."""
+
+    def number(value: float) -> float | None:
+        return float(value) if math.isfinite(value) else None
+
+    def shape(part: Shape | None) -> dict[str, Any] | None:
+        if part is None:
+            return None
+        return {
+            "dirichlet_energy": number(part.dirichlet),
+            "dirichlet_scale_free": number(part.dirichlet_scale_free),
+            "willmore_energy": number(part.willmore),
+            "willmore_refused": part.refused,
+            "total_curvature": number(part.total_curvature),
+            "fit_misfit_share": number(part.misfit),
+        }
+
+    def reach(part: Reach) -> dict[str, Any]:
+        return {
+            "degenerate": part.degenerate,
+            "max_inscribed_ellipsoid_volume": number(part.volume),
+            "ellipsoid": None
+            if part.ellipsoid is None
+            else {"shape": part.ellipsoid.shape.tolist(), "centre": part.ellipsoid.centre.tolist()},
+            "worst_direction": number(part.worst),
+            "facets": 0 if part.section is None else len(part.section.offsets),
+            "surface": shape(part.shape),
+        }
+
+    def power(frame: str) -> dict[str, Any]:
+        space = result.power[frame]
+        return {
+            "wrench_size": space.size,
+            "mean_power_w": number(float(np.mean(space.power_w))),
+            "largest_residual": number(space.residual),
+            "share_over_limits": space.over_limit,
+            "thrust_variance_n2": space.variance,
+            "surface": shape(result.power_shape[frame]),
+        }
+
+    return {
+        "name": result.layout.name,
+        "thrusters": result.layout.count,
+        "rank": result.rank,
+        "unreachable": list(result.unreachable),
+        "passive": [AXES[c] for c in result.layout.passive],
+        "assumption": result.layout.assumption,
+        "directions": len(result.directions),
+        "axes_positive_negative": result.axes.tolist(),
+        "programs_differ": number(result.programs_differ),
+        "wrench": {f: {how: reach(r) for how, r in by.items()} for f, by in result.reach.items()},
+        "wrench_passive_declared": {f: {how: reach(r) for how, r in by.items()} for f, by in result.declared.items()},
+        "power": {frame: power(frame) for frame in FRAMES},
+    }

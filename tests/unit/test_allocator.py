@@ -1,0 +1,253 @@
+"""Allocation against other solvers: exact within limits, direction and priority kept beyond them, dead thrusters left out."""
+
+import itertools
+from dataclasses import replace
+
+import clarabel
+import numpy as np
+import pytest
+from scipy import sparse
+from scipy.optimize import linprog, lsq_linear
+
+from firmware_py.core.allocator import MOMENT_PRIORITY, SHARE_WEIGHT, Allocator
+from firmware_py.core.body import Body
+from firmware_py.core.preload import preload
+from firmware_py.core.types import Thrust
+from firmware_py.description.parameters import Allocation
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+
+PLAIN = replace(Allocation(), preload_n=0.0)
+SQUARE = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
+LOSES_RANK = {(4, 7), (5, 6), (2, 3)}
+"""Pairs without which yaw, or roll and yaw combined, cannot be made (the paper's errata)."""
+
+
+@pytest.fixture(scope="module", params=[1, 2, 4])
+def body(request: pytest.FixtureRequest) -> Body:
+    return assemble(SQUARE[: request.param], [0] * request.param, [load_vehicle("modcube")] * request.param)
+
+
+@pytest.fixture(scope="module")
+def single() -> Body:
+    return assemble([(0, 0, 0)], [0], [load_vehicle("modcube")])
+
+
+def wrenches(body: Body, count: int, size: float, seed: int = 0) -> np.ndarray:
+    """Random wrenches; size 1 is near the limits of the body."""
+    draw = np.random.default_rng(seed).normal(size=(count, 6))
+    return size * len(body.modules) * draw * np.repeat([12.0, 0.8], 3)
+
+
+def assert_within_limits(body: Body, thrust: Thrust) -> None:
+    assert np.all(thrust.force_n <= body.thrusters.f_max) and np.all(thrust.force_n >= body.thrusters.f_min)
+
+
+# ---------------------------------------------------------------- within limits
+
+
+def test_wrench_within_limits_is_made_exactly(body: Body) -> None:
+    for wrench in wrenches(body, 30, 0.15):
+        thrust = Allocator(body, Allocation()).step(wrench)
+        np.testing.assert_allclose(body.thrusters.matrix @ thrust.force_n, wrench, atol=1e-11)
+        np.testing.assert_allclose(thrust.achieved, wrench, atol=1e-11)
+        assert thrust.scale == (1.0, 1.0)
+        assert_within_limits(body, thrust)
+
+
+def test_wrench_within_limits_takes_the_least_effort(body: Body) -> None:
+    """No other way to make it has a smaller sum of squares (bounded least squares with a hard weight on the wrench)."""
+    t = body.thrusters
+    for wrench in wrenches(body, 10, 0.15, seed=1):
+        thrust = Allocator(body, PLAIN).step(wrench)
+        weight = 1e4
+        rows, target = np.vstack([weight * t.matrix, np.eye(t.f_max.size)]), np.r_[weight * wrench, np.zeros(t.f_max.size)]
+        other = lsq_linear(rows, target, (t.f_min, t.f_max), method="bvls", tol=1e-14)
+        np.testing.assert_allclose(thrust.force_n, other.x, atol=1e-4)
+
+
+def test_no_wrench_is_no_force(body: Body) -> None:
+    assert not Allocator(body, PLAIN).step(np.zeros(6)).force_n.any()
+
+
+# ---------------------------------------------------------------- beyond limits
+
+
+def best_by_clarabel(body: Body, wrench: np.ndarray) -> tuple[np.ndarray, float]:
+    """The allocator's problem in clarabel's form: (n + 2,) forces and shares, and the least cost."""
+    t = body.thrusters
+    n = t.f_max.size
+    weights = np.r_[np.ones(n), SHARE_WEIGHT, SHARE_WEIGHT * MOMENT_PRIORITY]
+    goal = np.r_[np.zeros(n), 1.0, 1.0]
+    equality = np.hstack([t.matrix, -np.r_[wrench[:3], 0, 0, 0][:, None], -np.r_[0, 0, 0, wrench[3:]][:, None]])
+    a = sparse.csc_matrix(np.vstack([equality, np.eye(n + 2), -np.eye(n + 2)]))
+    b = np.r_[np.zeros(6), t.f_max, 1.0, 1.0, -t.f_min, 0.0, 0.0]
+    cones = [clarabel.ZeroConeT(6), clarabel.NonnegativeConeT(2 * n + 4)]
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
+    solver = clarabel.DefaultSolver(sparse.csc_matrix(np.diag(2 * weights)), -2 * weights * goal, a, b, cones, settings)
+    x = np.array(solver.solve().x)
+    return x, float(weights @ (x - goal) ** 2)
+
+
+@pytest.mark.parametrize("size", [0.5, 1.0, 3.0, 10.0])
+def test_saturated_answer_is_the_one_another_solver_finds(body: Body, size: float) -> None:
+    allocator = Allocator(body, PLAIN)
+    saturated = 0
+    for wrench in wrenches(body, 12, size, seed=2):
+        thrust = allocator.step(wrench)
+        if thrust.scale == (1.0, 1.0):
+            continue
+        saturated += 1
+        x, cost = best_by_clarabel(body, wrench)
+        weights = np.array([SHARE_WEIGHT, SHARE_WEIGHT * MOMENT_PRIORITY])
+        ours = float(thrust.force_n @ thrust.force_n + weights @ (1.0 - np.array(thrust.scale)) ** 2)
+        assert ours <= cost + 1e-4 * (1.0 + cost)
+        np.testing.assert_allclose(thrust.force_n, x[:-2], atol=2e-2)
+        np.testing.assert_allclose(thrust.scale, x[-2:], atol=1e-4)
+    assert saturated >= 3
+
+
+@pytest.mark.parametrize("size", [1.0, 3.0, 10.0])
+def test_saturation_keeps_the_directions_of_force_and_moment(body: Body, size: float) -> None:
+    allocator = Allocator(body, Allocation())
+    for wrench in wrenches(body, 40, size, seed=3):
+        thrust = allocator.step(wrench)
+        force, moment = thrust.scale
+        np.testing.assert_allclose(thrust.achieved, np.r_[force * wrench[:3], moment * wrench[3:]], atol=1e-6)
+        assert 0.0 <= force <= 1.0 + 1e-9 and 0.0 <= moment <= 1.0 + 1e-5
+        assert_within_limits(body, thrust)
+
+
+def best_share(body: Body, along: np.ndarray, beside: np.ndarray) -> float:
+    """The largest share of wrench `along` that can be made together with all of `beside`, by linear programming."""
+    t = body.thrusters
+    n = t.f_max.size
+    bounds = [*zip(t.f_min, t.f_max, strict=True), (0.0, 1.0)]
+    result = linprog(np.r_[np.zeros(n), -1.0], A_eq=np.c_[t.matrix, -along], b_eq=beside, bounds=bounds)
+    return float(result.x[-1]) if result.success else 0.0
+
+
+def test_moment_that_can_be_made_is_made_however_large_the_force(body: Body) -> None:
+    """Attitude first: a robot that is asked for 100 N a module and the moment that it can give, keeps the moment."""
+    allocator = Allocator(body, Allocation())
+    modules = len(body.modules)
+    for direction in np.random.default_rng(4).normal(size=(20, 3)):
+        force = 100.0 * modules * direction / np.linalg.norm(direction)
+        moment = 0.5 * modules * np.roll(direction, 1) / np.linalg.norm(direction)
+        assert best_share(body, np.r_[0.0, 0.0, 0.0, moment], np.zeros(6)) == pytest.approx(1.0)
+        thrust = allocator.step(np.r_[force, moment])
+        assert thrust.scale[1] > 0.995
+        assert thrust.scale[0] < 0.5
+
+
+def test_force_that_is_left_beside_the_moment_is_used(body: Body) -> None:
+    allocator = Allocator(body, PLAIN)
+    for wrench in wrenches(body, 25, 1.5, seed=5):
+        best = best_share(body, np.r_[wrench[:3], 0.0, 0.0, 0.0], np.r_[0.0, 0.0, 0.0, wrench[3:]])
+        assert allocator.step(wrench).scale[0] > 0.8 * best - 0.01
+
+
+def test_paper_mode_clips_the_pseudo_inverse(single: Body) -> None:
+    wrench = np.array([40.0, 0.0, 10.0, 0.0, 1.0, 0.0])
+    thrust = Allocator(single, replace(Allocation(), mode="pseudo_inverse")).step(wrench)
+    raw = np.linalg.pinv(single.thrusters.matrix) @ wrench
+    np.testing.assert_allclose(thrust.force_n, np.clip(raw, -8.0, 10.0), atol=1e-12)
+    np.testing.assert_allclose(thrust.achieved, single.thrusters.matrix @ thrust.force_n, atol=1e-12)
+
+
+def test_clipping_bends_the_wrench_and_least_squares_does_not(single: Body) -> None:
+    """Why the paper's mode is not the default."""
+    wrench = np.array([40.0, 5.0, 0.0, 0.0, 0.5, 0.0])
+
+    def bend(parameters: Allocation) -> float:
+        force = Allocator(single, parameters).step(wrench).achieved[:3]
+        return float(np.linalg.norm(np.cross(force, wrench[:3])) / np.linalg.norm(force) / np.linalg.norm(wrench[:3]))
+
+    assert bend(replace(Allocation(), mode="pseudo_inverse")) > 0.02
+    assert bend(Allocation()) < 1e-6
+
+
+# ---------------------------------------------------------------- dead thrusters
+
+
+@pytest.mark.parametrize("dead", range(8))
+def test_dead_thruster_leaves_the_problem_at_once(single: Body, dead: int) -> None:
+    allocator = Allocator(single, Allocation())
+    allocator.step(np.ones(6))
+    allocator.set_alive(np.arange(8) != dead)
+    for wrench in [*wrenches(single, 10, 0.1, seed=6), *wrenches(single, 10, 3.0, seed=7)]:
+        thrust = allocator.step(wrench)
+        assert thrust.force_n[dead] == 0.0
+        np.testing.assert_allclose(thrust.achieved, single.thrusters.matrix @ thrust.force_n, atol=1e-9)
+        expected = np.r_[thrust.scale[0] * wrench[:3], thrust.scale[1] * wrench[3:]]
+        np.testing.assert_allclose(thrust.achieved, expected, atol=1e-6)
+        assert_within_limits(single, thrust)
+
+
+@pytest.mark.parametrize("dead", range(8))
+def test_small_wrench_is_still_exact_without_one_thruster(single: Body, dead: int) -> None:
+    allocator = Allocator(single, Allocation())
+    allocator.set_alive(np.arange(8) != dead)
+    for direction in np.random.default_rng(8).normal(size=(20, 6)):
+        wrench = np.r_[direction[:3] / np.linalg.norm(direction[:3]), 0.1 * direction[3:] / np.linalg.norm(direction[3:])]
+        np.testing.assert_allclose(allocator.step(wrench).achieved, wrench, atol=1e-9)
+
+
+def test_thruster_that_comes_back_is_used_again(single: Body) -> None:
+    allocator, fresh = Allocator(single, Allocation()), Allocator(single, Allocation())
+    allocator.set_alive(np.arange(8) != 3)
+    allocator.set_alive(np.ones(8, dtype=bool))
+    for wrench in wrenches(single, 5, 1.0, seed=9):
+        np.testing.assert_allclose(allocator.step(wrench).force_n, fresh.step(wrench).force_n, atol=1e-9)
+
+
+@pytest.mark.parametrize("pair", list(itertools.combinations(range(8), 2)))
+def test_any_two_dead_thrusters_leave_forces_that_are_finite_and_within_limits(
+    single: Body, pair: tuple[int, int]
+) -> None:
+    allocator = Allocator(single, Allocation())
+    allocator.set_alive(~np.isin(np.arange(8), pair))
+    for wrench in wrenches(single, 5, 0.1, seed=10):
+        thrust = allocator.step(wrench)
+        assert_within_limits(single, thrust)
+        assert not thrust.force_n[list(pair)].any()
+        if pair not in LOSES_RANK and thrust.scale == (1.0, 1.0):
+            np.testing.assert_allclose(thrust.achieved, wrench, atol=1e-9)
+
+
+def test_robot_without_any_thruster_asks_for_nothing(single: Body) -> None:
+    allocator = Allocator(single, Allocation())
+    allocator.set_alive(np.zeros(8, dtype=bool))
+    assert not allocator.step(np.ones(6)).force_n.any()
+
+
+# ---------------------------------------------------------------- preload
+
+
+def test_preload_makes_no_wrench(body: Body) -> None:
+    alive = np.ones(body.thrusters.f_max.size, dtype=bool)
+    np.testing.assert_allclose(body.thrusters.matrix @ preload(body.thrusters, alive, 0.6), 0.0, atol=1e-12)
+
+
+def test_preload_keeps_every_thruster_clear_of_its_deadband(body: Body) -> None:
+    force = Allocator(body, Allocation()).step(np.zeros(6)).force_n
+    assert np.all(np.abs(force) > 0.25), "the largest deadband of the draw"
+    assert np.all(np.abs(force) < 5 * 0.6 + 1e-9)
+
+
+@pytest.mark.parametrize("dead", range(8))
+def test_preload_without_one_thruster_makes_no_wrench_and_spares_it(single: Body, dead: int) -> None:
+    force = preload(single.thrusters, np.arange(8) != dead, 0.6)
+    assert force[dead] == 0.0
+    np.testing.assert_allclose(single.thrusters.matrix @ force, 0.0, atol=1e-12)
+
+
+def test_preload_is_that_of_each_module_alone(body: Body) -> None:
+    """Modules may part at any time: no module may lean on another."""
+    t = body.thrusters
+    force = preload(t, np.ones(t.f_max.size, dtype=bool), 0.6)
+    for module in range(len(body.modules)):
+        mine = t.module == module
+        np.testing.assert_allclose(t.matrix[:, mine] @ force[mine], 0.0, atol=1e-12)
