@@ -123,7 +123,8 @@ class Estimator:
         _, self._covariance = predict(self._zero, self._covariance, transition, self._noise * dt)
 
     def _fuse_inertial(self, index: int) -> None:
-        residual, h, noise = observation.inertial(self._x, *self._history.inertial(index), self._inertial_sigma)
+        moved = propagation.inertial_acceleration(self._x, self._history.tau(index), *self._plant)
+        residual, h, noise = observation.inertial(self._x, *self._history.inertial(index), self._inertial_sigma, moved)
         if residual.size:
             self._correct(residual, noise, h)
 

@@ -20,9 +20,13 @@ MODEL = Tuple((float64[::1], float64[:, ::1], float64[:, ::1]))
 """Residual (m,), Jacobian (m, 25), noise covariance (m, m)."""
 
 
-@njit(MODEL(float64[::1], float64[::1], float64[::1], float64, float64[::1]), cache=True)
-def inertial(x, gyro, accel, depth, sigma):  # type: ignore[no-untyped-def]
-    """Gyro (3,), accelerometer (3,) of a body that hardly accelerates, and depth; sigma (3,) in that order."""
+@njit(MODEL(float64[::1], float64[::1], float64[::1], float64, float64[::1], float64[::1]), cache=True)
+def inertial(x, gyro, accel, depth, sigma, moved):  # type: ignore[no-untyped-def]
+    """Gyro (3,), accelerometer (3,) and depth; sigma (3,) in that order.
+
+    The accelerometer gives the tilt: its model is gravity plus `moved` (3,), the acceleration that thrusters and drag give the body by
+    the process model, body frame, taken as known.
+    """
     residual = np.empty(7)
     h = np.zeros((7, ERRORS))
     variance = np.empty(7)
@@ -37,7 +41,7 @@ def inertial(x, gyro, accel, depth, sigma):  # type: ignore[no-untyped-def]
         down = to_matrix(x[3:7].copy())[2].copy()
         h[rows : rows + 3, 3:6] = -GRAVITY * skew(down)
         for i in range(3):
-            residual[rows + i] = accel[i] - (x[16 + i] - GRAVITY * down[i])
+            residual[rows + i] = accel[i] - (x[16 + i] + moved[i] - GRAVITY * down[i])
             h[rows + i, 15 + i] = 1.0
             variance[rows + i] = sigma[1] ** 2
         rows += 3

@@ -13,7 +13,7 @@ from numba import njit
 
 from firmware_py.core.drag_lookup import drag_wrench
 from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
-from firmware_py.core.rotations import M, V, exp, multiply, normalise, rotate, rotate_back, skew, to_matrix
+from firmware_py.core.rotations import M, V, cross, exp, multiply, normalise, rotate, rotate_back, skew, to_matrix
 
 STATES = 26
 ERRORS = 25
@@ -28,6 +28,18 @@ def acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, l
     total = external - coriolis_wrench(mass, nu) + drag_wrench(nodes, rotational, linear, nu)
     total[3:] += restoring_moment(righting, q)
     return mass_inv @ total
+
+
+@njit(f"{V}({V},{V},{PLANT})", cache=True)
+def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
+    """(3,) acceleration of the centre of mass against the world, body frame, in state x under the thruster wrench tau (6,)."""
+    q = x[3:7].copy()
+    nu = x[7:13].copy()
+    external = tau.copy()
+    external[:3] += rotate_back(q, x[19:22].copy())
+    external[3:] += x[22:25]
+    rate = acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear)
+    return rate[:3] + cross(nu[3:].copy(), nu[:3].copy())
 
 
 @njit(f"{V}({V},{V},float64,{PLANT})", cache=True)
