@@ -53,6 +53,8 @@ def run(
     vehicle: Vehicle = "",
     sensors: Sensors = "real",
     plots: Annotated[bool, typer.Option(help="draw plots and report")] = True,
+    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="ticks a second")] = 100,
+    realtime: Annotated[bool, typer.Option("--realtime", help="two processes, each on its own clock")] = False,
 ) -> None:
     """Fly one scenario; prints a table and leaves logs, plots, report.html and result.json."""
     from hil.console import flight_progress, print_result
@@ -61,8 +63,10 @@ def run(
     chosen = scenario_of(scenario, vehicle, sensors)
     parameters = parameters_of(controller)
     folder = out if out is not None else Path("runs") / chosen.name
+    if realtime and bus.startswith("virtual:"):
+        raise DescriptionError(f"bus {bus!r} does not reach another process; --realtime needs udp:GROUP:PORT or socketcan:IFACE")
     with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:
-        result = fly_and_judge(chosen, seed, parameters, folder, bus, progress=progress)
+        result = fly_and_judge(chosen, seed, parameters, folder, bus, rate_hz, progress, realtime)
     report = illustrate(chosen, result, folder) if plots else None
     print_result(result, report)
     raise typer.Exit(0 if result.passed else FAILED)

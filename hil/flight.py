@@ -14,10 +14,13 @@ from hil.checks import Result, judge, write_result
 from hil.metrics import PAPER_SPIRAL_RMSE_MM, flight_metrics
 from hil.plant.spec import Tank
 from hil.plots import Window, write_plots
+from hil.realtime import fly_in_real_time
 from hil.report import Scene, write_report
 from hil.scenario import Scenario
 from hil.signals import Flight, read_flight
 
+REGULAR_TICKS = 50
+"""Ticks at the start of a log that its period is read from."""
 PAPER_RMSE_MM = {"spiral": PAPER_SPIRAL_RMSE_MM}
 """What the paper measured, by the kind of task."""
 
@@ -30,23 +33,34 @@ def fly_and_judge(
     bus: str = DEFAULT_BUS,
     rate_hz: int = 100,
     progress: Callable[[float], None] | None = None,
+    realtime: bool = False,
 ) -> Result:
     """Flies `scenario`; the logs and result.json are in `out` afterwards. Raises DescriptionError and PortError."""
     out.mkdir(parents=True, exist_ok=True)
-    wall_s = fly_scenario(scenario, seed, parameters, out, bus, rate_hz, progress)
-    result = judge_logs(scenario, seed, out, wall_s)
+    if realtime:
+        flown = fly_in_real_time(scenario, seed, parameters, out, bus, rate_hz, progress)
+        result = judge_logs(scenario, seed, out, flown.wall_s, flown.deadline_misses)
+    else:
+        result = judge_logs(scenario, seed, out, fly_scenario(scenario, seed, parameters, out, bus, rate_hz, progress))
     write_result(result, out)
     return result
 
 
-def judge_logs(scenario: Scenario, seed: int, folder: Path, wall_s: float = 0.0) -> Result:
+def judge_logs(scenario: Scenario, seed: int, folder: Path, wall_s: float = 0.0, deadline_misses: int = 0) -> Result:
     """The result of the flight whose logs are in `folder`; `wall_s` is what the whole run took."""
-    begin_ns = round(scenario.task.settle_s * 1e9)
-    flight = read_flight(folder).between(begin_ns, begin_ns + round(scenario.task.duration_s * 1e9))
+    whole = read_flight(folder)
+    begin_ns = start_of(whole) + round(scenario.task.settle_s * 1e9)
+    flight = whole.between(begin_ns, begin_ns + round(scenario.task.duration_s * 1e9))
     share = scenario.task.duration_s / scenario.duration_s
     vehicle = load_vehicle(scenario.module[0].vehicle)
-    metrics = flight_metrics(flight, com_m=vehicle.inertial.com_m, wall_s=wall_s * share)
+    metrics = flight_metrics(flight, com_m=vehicle.inertial.com_m, wall_s=wall_s * share, deadline_misses=deadline_misses)
     return judge(scenario.name, seed, metrics, scenario.checks)
+
+
+def start_of(flight: Flight) -> int:
+    """Time of the start of a run, one tick before its first, ns."""
+    time_ns = flight.ticks["time_ns"]
+    return int(time_ns[0] - np.min(np.diff(time_ns[:REGULAR_TICKS])))
 
 
 def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
@@ -59,7 +73,7 @@ def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
 
 
 def _scene(scenario: Scenario, vehicle: Vehicle, flight: Flight) -> Scene:
-    first_s = float(flight.firmware["time_ns"][0]) * 1e-9
+    first_s = float(flight.firmware["time_ns"][0] - start_of(flight)) * 1e-9
     begin_s = scenario.task.settle_s - first_s
     return Scene(
         title=scenario.name.capitalize(),

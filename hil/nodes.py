@@ -1,7 +1,7 @@
 """The simulated CAN nodes: the MCU of each module and the tag camera, between the frames of a bus and the world.
 
-Per tick: the world advances one period, then the frames that came are taken in order; SYNC makes an MCU apply its last accepted
-command, sample and answer, MCU_STATUS last. Nothing here knows the controller.
+Per tick: the world advances one period, then the frames that came are taken in order; SYNC makes an MCU apply its last
+accepted command, sample and answer, MCU_STATUS last. Nothing here knows the controller.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
-
-import numpy as np
 
 from firmware_py.bus.codec import Codec, Frame, Received, Receiver, pack_quaternion
 from hil.plant.camera import Camera, Sighting
@@ -33,8 +31,8 @@ ERROR_BITS = {"crc": 1, "counter": 2, "length": 4}
 ERROR_TIMEOUT = 8
 
 SLOW = (
-    "DEPTH", "DOCK_CURRENT_ABC", "DOCK_CURRENT_DEF", "ESC_FEEDBACK_1", "ESC_FEEDBACK_2", "ESC_FEEDBACK_3", "ESC_FEEDBACK_4",
-    "POWER", "ENVIRONMENT",
+    "DEPTH", "DOCK_CURRENT_ABC", "DOCK_CURRENT_DEF", "ESC_FEEDBACK_1", "ESC_FEEDBACK_2", "ESC_FEEDBACK_3",
+    "ESC_FEEDBACK_4", "POWER", "ENVIRONMENT",
 )  # fmt: skip
 """Messages that are not sent in every tick."""
 
@@ -42,7 +40,7 @@ SLOW = (
 class Mcu:
     """The microcontroller of one module."""
 
-    def __init__(self, codec: Codec, number: int, module: int, world: World, spec: SensorSpec) -> None:
+    def __init__(self, codec: Codec, number: int, module: int, world: World, spec: SensorSpec, tick_ns: int) -> None:
         self.number, self.module = number, module
         self.stopped = False
         self.timed_out = False
@@ -51,16 +49,16 @@ class Mcu:
         self._world, self._spec = world, spec
         self._sensors = Sensors(spec, world.spec, world.seed, module)
         self._thrusters = len(world.vehicles[module].thruster)
-        self._command = np.zeros(8)
+        self._command = [0.0] * 8
         self._armed = [False, False]
         self._accepted_ns: list[int | None] = [None, None]
-        self._applied = np.zeros(8)
+        self._applied = [0.0] * 8
         self._last_estop_ns = 0
         self._power = Noise(stream(world.seed, "power", module), 2)
         self._rpm = Noise(stream(world.seed, "rpm", module), 8)
         self._dock = Noise(stream(world.seed, "dock", module), 6)
         self._fast = [codec.message(name) for name in ("GYRO", "ACCEL", "MCU_STATUS")]
-        self._slow = _schedule(codec, number, world.period_ns)
+        self._slow = _schedule(codec, number, tick_ns)
         self._counters = dict.fromkeys(SLOW, 0)
 
     def heard(self, received: Received, time_ns: int) -> None:
@@ -80,16 +78,15 @@ class Mcu:
         """An ESTOP frame came: thrust ends at once, without waiting for SYNC."""
         self.stopped = True
         self._last_estop_ns = time_ns
-        self._apply(np.zeros(8))
+        self._apply([0.0] * 8)
 
     def watch(self, time_ns: int) -> None:
         """The MCU's own clock: each half of the command that has grown old ends, SYNC or not."""
         for half, accepted in enumerate(self._accepted_ns):
             if accepted is None or time_ns - accepted > TIMEOUT_NS:
                 self._armed[half] = False
-                if self._applied[4 * half : 4 * half + 4].any():
-                    self._applied[4 * half : 4 * half + 4] = 0.0
-                    self._apply(self._applied)
+                if any(self._applied[4 * half : 4 * half + 4]):
+                    self._apply([0.0 if i // 4 == half else u for i, u in enumerate(self._applied)])
 
     def sync(self, tick: int, time_ns: int) -> list[Frame]:
         """Applies the last accepted command, samples, answers."""
@@ -97,8 +94,8 @@ class Mcu:
         self.timed_out = not all(live)
         # A fresh half that says disarmed disarms both; a half that is old is zero by itself.
         disarmed = any(fresh and not armed for fresh, armed in zip(live, self._armed, strict=True))
-        wanted = np.repeat([fresh and not disarmed and not self.stopped for fresh in live], 4)
-        self._apply(np.where(wanted, self._command, 0.0))
+        allowed = [fresh and not disarmed and not self.stopped for fresh in live]
+        self._apply([u if allowed[i // 4] else 0.0 for i, u in enumerate(self._command)])
         truth = self._world.truth(self.module)
         gyro, accel, status = self._fast
         frames = [
@@ -115,8 +112,8 @@ class Mcu:
         frames.append(status.encode(self.number, [tick & 0xFFFF, VERSION, errors, self._state(disarmed)], tick))
         return frames
 
-    def _apply(self, command: np.ndarray) -> None:
-        self._applied = command.copy()
+    def _apply(self, command: list[float]) -> None:
+        self._applied = command
         self._world.set_command(self.module, command[: self._thrusters], True)
 
     def _state(self, disarmed: bool) -> int:
@@ -190,7 +187,7 @@ class TagCamera:
             number = self._number_of[sighting.module]
             frames.append(self._position.encode(number, sighting.p_wt.tolist(), counter))
             values = [
-                *pack_quaternion(sighting.q_wt),
+                *pack_quaternion(sighting.q_wt.tolist()),
                 sighting.tag_id,
                 sighting.quality,
                 capture_tick & 0xFF,
@@ -210,11 +207,18 @@ class Nodes:
         numbers: Mapping[int, int],
         sensors: SensorSpec,
         cameras: Sequence[Camera] = (),
+        tick_ns: int = 0,
     ) -> None:
-        """Args: numbers: number on this bus -> index of the module in the world."""
+        """All nodes at rest.
+
+        Args:
+            numbers: number on this bus -> index of the module in the world.
+            tick_ns: period of SYNC; 0: the world's.
+        """
         self.world = world
+        tick_ns = tick_ns or world.period_ns
         self.receiver = Receiver(codec)
-        self.mcus = {number: Mcu(codec, number, module, world, sensors) for number, module in numbers.items()}
+        self.mcus = {number: Mcu(codec, number, module, world, sensors, tick_ns) for number, module in numbers.items()}
         self.cameras = [TagCamera(codec, camera, numbers, sensors, world) for camera in cameras]
         self._dropped = dict(self.receiver.dropped)
 
@@ -235,7 +239,7 @@ class Nodes:
             mcu.watch(self.world.time_ns)
 
     def take(self, frame: Frame, time_ns: int) -> list[Frame]:
-        """One frame from the bus at `time_ns` on the plant's clock; returns the answers. Bad frames are counted and dropped."""
+        """One frame from the bus at `time_ns` on the plant's clock; returns the answers. Bad frames count and drop."""
         received = self.receiver.accept(frame)
         if received is None:
             self._blame(frame)
@@ -275,10 +279,10 @@ def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[Any, int,
     return slow
 
 
-def make_nodes(world: World, codec: Codec, numbers: Mapping[int, int], scenario: Any) -> Nodes:
+def make_nodes(world: World, codec: Codec, numbers: Mapping[int, int], scenario: Any, tick_ns: int = 0) -> Nodes:
     """The nodes of a scenario on one bus; `numbers` maps numbers on the bus to modules."""
     cameras = [
         Camera(pose, scenario.sensors, world.vehicles, scenario.tags, world.seed, index)
         for index, pose in enumerate(scenario.camera)
     ]
-    return Nodes(world, codec, numbers, scenario.sensors, cameras)
+    return Nodes(world, codec, numbers, scenario.sensors, cameras, tick_ns)

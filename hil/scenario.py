@@ -90,7 +90,7 @@ class Scenario:
 
     def with_calm_world(self) -> Scenario:
         """The same in still water, with a robot that is what its vehicle file says."""
-        return dataclasses.replace(self, world=dataclasses.replace(self.world, **CALM))
+        return dataclasses.replace(self, world=dataclasses.replace(self.world, **CALM))  # type: ignore[arg-type]
 
 
 def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:

@@ -32,10 +32,12 @@ class Script:
         self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
         self.ticks = self.end_ns // fleet.period_ns
         self._armed = False
+        self._begun = False
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
-        """What is asked for in the tick at `time_ns`, given the outputs of the tick before."""
-        if time_ns == self.begin_ns:
+        """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
+        if time_ns >= self.begin_ns and not self._begun:
+            self._begun = True
             return [Request(Action.TRACK, 0, self.trajectory)]
         if self._armed or last is None or time_ns < ARM_FROM_S * 1e9:
             return []

@@ -2,97 +2,104 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from firmware_py.app.firmware import BusFrame, Firmware
 from firmware_py.app.lockstep import Observer
-from firmware_py.bus.port import Port
+from firmware_py.bus.port import Port, PortError, open_port
 from firmware_py.core.types import Outputs, Request
-from firmware_py.runtime.clock import Clock
-from firmware_py.runtime.rate_keeper import RateKeeper
+from firmware_py.runtime.clock import MonotonicClock
+from firmware_py.runtime.rate_keeper import RateKeeper, absolute_sleeper
 
 LISTEN_NS = 200_000_000
 """How long a bus is listened to before the first SYNC: a foreign SYNC refuses the start."""
 
 
-class ForeignSyncError(RuntimeError):
-    """Somebody else sends SYNC on this bus."""
-
-
 @dataclass(slots=True)
 class RealTimeLoop:
-    """Runs the firmware against the clock. `requests` hands over what people asked for since the last tick."""
+    """Runs the firmware against the clock.
+
+    Attributes:
+        requests: hands over what people asked for since the last tick, given its outputs and the time of this one.
+        unanswered: ticks that closed at half time because a module had not answered.
+    """
 
     firmware: Firmware
     ports: Sequence[Port]
-    clock: Clock
+    clock: MonotonicClock
     rate_keeper: RateKeeper
-    requests: Callable[[], Sequence[Request]]
+    requests: Callable[[int, Outputs | None], Sequence[Request]]
     observers: Sequence[Observer] = ()
     unanswered: int = 0
-    """Ticks that closed at half time because a module had not answered."""
     _received: list[BusFrame] = field(default_factory=list)
+    _last: Outputs | None = None
 
     def listen(self) -> None:
-        """Listens before the first SYNC. Raises ForeignSyncError."""
-        end = self.clock.now_ns() + LISTEN_NS
-        while self.clock.now_ns() < end:
-            for bus, port in enumerate(self.ports):
-                port.wait(end)
-                for frame in port.receive():
-                    self.firmware.collector.take(bus, frame)
-        if self.firmware.collector.faults["foreign_sync"]:
-            raise ForeignSyncError("another SYNC producer is on the bus: stop it, or use another bus")
+        """Listens before the first SYNC. Raises PortError when somebody else sends SYNC on a bus."""
+        end_ns = self.clock.now_ns() + LISTEN_NS
+        collector = self.firmware.collector
+        self.ports[0].wait(end_ns, lambda: self._take() and collector.faults["foreign_sync"] > 0)
+        self._take()
+        self._received.clear()
+        if collector.faults["foreign_sync"]:
+            raise PortError("another SYNC producer is on the bus: stop it, or use another bus")
 
-    def run(self, stop: Callable[[Outputs], bool], first_tick: int = 0) -> None:
-        """Ticks until `stop` says so of a tick's outputs."""
+    def run(self, stop: Callable[[int, Outputs], bool], first_tick: int = 1) -> None:
+        """Ticks until `stop` says so of a tick's number and outputs."""
         tick = first_tick
         while True:
-            time_ns = self.rate_keeper.wait()
-            outputs = self.tick(tick, time_ns)
-            if stop(outputs):
+            outputs = self.tick(tick, self.rate_keeper.wait())
+            self.rate_keeper.finish()
+            if stop(tick, outputs):
                 return
             tick += 1
 
     def tick(self, tick: int, time_ns: int) -> Outputs:
-        """One tick that starts at the absolute time `time_ns`."""
-        collector = self.firmware.collector
+        """One tick that starts at `time_ns` on the loop's clock."""
         sync = self.firmware.sync(tick, time_ns)
-        for bus, frame in sync:
-            self.ports[bus].send(frame)
-        self._gather(tick, time_ns + self.firmware.fleet.period_ns // 2)
-        self.unanswered += not collector.all_answered(tick)
+        self._send(sync)
+        collector = self.firmware.collector
+        close_ns = time_ns + self.firmware.fleet.period_ns // 2
+        in_time = self.ports[0].wait(close_ns, lambda: self._take() and collector.all_answered(tick))
+        self.unanswered += not in_time
         received, self._received = self._received, []
-        inputs = collector.collect(tick, time_ns, self.requests())
+        inputs = collector.collect(tick, time_ns, list(self.requests(time_ns, self._last)))
         outputs = self.firmware.pipeline.step(inputs)
         frames = self.firmware.encoder.frames(outputs)
-        for bus, frame in frames:
-            self.ports[bus].send(frame)
+        self._send(frames)
         for observer in self.observers:
             observer(received, sync + frames, inputs, outputs)
+        self._last = outputs
         return outputs
 
-    def _gather(self, tick: int, close_ns: int) -> None:
-        """Takes frames until every module has answered this tick, or until `close_ns`."""
-        collector = self.firmware.collector
-        while True:
-            for bus, port in enumerate(self.ports):
-                for frame in port.receive():
-                    collector.take(bus, frame)
-                    self._received.append((bus, frame))
-            if collector.all_answered(tick) or self.clock.now_ns() >= close_ns:
-                return
-            self._wait(close_ns)
+    def _take(self) -> bool:
+        """Hands every frame that is there to the collector."""
+        for bus, port in enumerate(self.ports):
+            for frame in port.receive():
+                self.firmware.collector.take(bus, frame)
+                self._received.append((bus, frame))
+        return True
 
-    def _wait(self, close_ns: int) -> None:
-        """Blocks until something comes, or until `close_ns`; with several buses it looks at each in turn."""
-        if len(self.ports) == 1:
-            self.ports[0].wait(close_ns)
-        else:
-            for port in self.ports:
-                port.wait(min(close_ns, self.clock.now_ns() + SEVERAL_BUSES_NS))
+    def _send(self, frames: Sequence[BusFrame]) -> None:
+        for bus, frame in frames:
+            self.ports[bus].send(frame)
 
 
-SEVERAL_BUSES_NS = 200_000
-"""How long one of several buses is waited for before the next is looked at."""
+def open_loop(
+    stack: ExitStack,
+    firmware: Firmware,
+    requests: Callable[[int, Outputs | None], Sequence[Request]],
+    observers: Sequence[Observer] = (),
+) -> RealTimeLoop:
+    """A loop on the fleet's buses, whose ports are closed with `stack`. Raises PortError."""
+    clock = MonotonicClock.started_now()
+    arrival = threading.Event()
+    ports = [
+        stack.enter_context(open_port(bus, reader=True, now_ns=clock.now_ns, arrival=arrival)) for bus in firmware.fleet.buses
+    ]
+    sleep = absolute_sleeper(clock)
+    keeper = RateKeeper(firmware.fleet.period_ns, clock, lambda deadline_ns: sleep(deadline_ns + clock.origin_ns))
+    return RealTimeLoop(firmware, ports, clock, keeper, requests, observers)

@@ -25,8 +25,8 @@ NODES_PER_RIM = 13
 WATER_DENSITY = 998.2
 """kg/m^3, fresh water at 20 degC (IAPWS)."""
 
-_SUBDIVISIONS = 3
-"""Each triangle of a hull becomes 4^3 for the damping integral: within 0.5 % for a cube."""
+_SUBDIVISIONS = 2
+"""Each triangle of a hull becomes 4^2 for the damping integral: within 0.2 % for a cube."""
 
 Outlines = Callable[[Sequence[Solid], np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Solids and (n, 3) directions to (n,) areas and (n, 3) centroids, as projected_area.areas_and_centroids."""
@@ -141,14 +141,15 @@ def _open_triangles(
 
 
 def _surface(solid: Solid, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (k, 3) and normals times area (k, 3) of the subdivided triangles."""
+    """Points (k, 3) and normals times area (k, 3): the mid-edge rule, of second order, on subdivided triangles."""
     corners = solid.vertices[solid.triangles[keep]]
     for _ in range(_SUBDIVISIONS):
         a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
         ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
         corners = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
-    normals = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return corners.mean(axis=1), normals
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 6.0
+    middles = 0.5 * (corners + np.roll(corners, -1, axis=1))
+    return middles.reshape(-1, 3), np.repeat(normals, 3, axis=0)
 
 
 def _part(placement: Placement) -> Part:

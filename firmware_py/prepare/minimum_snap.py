@@ -191,7 +191,7 @@ class _Request:
             size = np.linalg.norm(grid[..., columns], axis=-1)
             if bound is not None and size.max() > bound:
                 where = _place(found, int(np.argmax(size)))
-                raise InfeasibleError(f"turning takes {size.max():.3g} {unit} of at most {bound:g} {where}")
+                raise InfeasibleError(f"turning takes {size.max():.3g} {unit} of at most {bound:g} {unit} {where}")
 
     def _check_thrusters(self, found: Piecewise, body: Body) -> None:
         motion = found.grid(_CHECK_POINTS)[..., :19]

@@ -34,6 +34,15 @@ class ManualClock:
 class MonotonicClock:
     """The machine's CLOCK_MONOTONIC: the same for all processes of one machine."""
 
+    def __init__(self, origin_ns: int = 0) -> None:
+        """`origin_ns`: the machine's time that this clock calls zero."""
+        self.origin_ns = origin_ns
+
+    @classmethod
+    def started_now(cls) -> MonotonicClock:
+        """A clock that shows zero now."""
+        return cls(time.clock_gettime_ns(time.CLOCK_MONOTONIC))
+
     def now_ns(self) -> int:
-        """Nanoseconds since the machine's start."""
-        return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+        """Nanoseconds since the origin."""
+        return time.clock_gettime_ns(time.CLOCK_MONOTONIC) - self.origin_ns

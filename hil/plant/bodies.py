@@ -1,10 +1,10 @@
 """Motion of rigid bodies in water: Kirchhoff's equations.
 
-A body is one or more modules docked rigidly. Its frame has its origin O at the hull centre of its first module. State of a
-body, (13,): position of O in the world, quaternion body to world, velocity of O and angular rate, both in the body frame.
+A body is one or more modules docked rigidly. Its frame is that of its first module, origin O at that hull's centre. Its
+state, (13,): position of O in the world, quaternion body to world, velocity of O and angular rate in the body frame.
 
-With the momenta of robot and entrained water (p, L) and of the water outside (h, l: added mass times velocity relative to the
-water), all about O in the body frame (Lamb, Hydrodynamics, ch. VI):
+With the momenta of robot and entrained water (p, L) and of the water outside (h, l: added mass times velocity relative
+to the water), all about O in the body frame (Lamb, Hydrodynamics, ch. VI):
     d(p + h)/dt = F - w x (p + h),    d(L + l)/dt = N - w x (L + l) - v x p - v_r x h.
 """
 
@@ -229,10 +229,11 @@ def derivative(bodies, modules, water, flow, flow_rate, thrust, x, out):
 
 @compiled(types.void(BODIES, MODULES, F2, F8, F2))
 def observe(bodies, modules, rates, gravity, out):
-    """Writes what each module is and feels: out (m, 16) hull centre (world), quaternion, velocity (world), rate and specific force.
+    """Writes what each module is and feels.
 
     Args:
         rates: (b, 13) derivative of the states now.
+        out: (m, 16) hull centre (world), quaternion, velocity (world), rate and specific force (module frame).
     """
     x = bodies.state
     for m in range(modules.body.shape[0]):

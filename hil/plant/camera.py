@@ -1,7 +1,7 @@
-"""A camera that watches the tank and finds the pose of tags: free-running, late, noisy, and blind where a hull is in the way.
+"""A camera that finds the pose of tags in the tank: free-running, late, noisy, and blind where a hull is in the way.
 
-A planar tag has two poses that look nearly alike: the true one, and that turned half round about the line of sight and half round
-about the tag's own normal. Face-on both coincide.
+A planar tag has two poses that look nearly alike: the true one, and that turned half round about the line of sight and
+half round about the tag's own normal. Face-on both coincide.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from firmware_py.description.vehicle import Tag, Vehicle
 from hil.plant.draw import stream
 from hil.plant.sensors import Noise
 from hil.plant.spec import CameraPose, SensorSpec
-from hil.plant.world import Truth, World
+from hil.plant.world import World
 
 HALF_TURN_Z = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -64,15 +64,16 @@ class Camera:
         self._noise = [Noise(stream(seed, "tag_noise", k), 6) for k in key]
         self._loss = [stream(seed, "tag_loss", k) for k in key]
         self._flip = [stream(seed, "tag_flip", k) for k in key]
-        self._before: list[Truth] = []
+        self._before, self._before_ns = np.zeros((len(vehicles), 16)), 0
 
     def watch(self, world: World) -> list[Sighting]:
         """Sightings of all pictures due up to the world's time. To be called at the start and after every advance."""
-        now = [world.truth(m) for m in range(len(self._sizes))]
-        before, self._before = self._before or now, now
+        before, before_ns = self._before, self._before_ns
+        self._before, self._before_ns = world.seen(), world.time_ns
         found = []
         while self.next_ns <= world.time_ns:
-            modules = [_between(a, b, self.next_ns) for a, b in zip(before, now, strict=True)]
+            elapsed_s, span_s = 1e-9 * (self.next_ns - before_ns), 1e-9 * (world.time_ns - before_ns)
+            modules = [_between(a, b, elapsed_s, span_s) for a, b in zip(before, self._before, strict=True)]
             for m in range(len(modules)):
                 sighting = self._look(modules, m, self.next_ns)
                 if sighting is not None:
@@ -134,16 +135,15 @@ def crosses_box(a: np.ndarray, b: np.ndarray, p: np.ndarray, q: np.ndarray, half
     return enter < leave
 
 
-def _between(a: Truth, b: Truth, time_ns: int) -> _Seen:
-    """Pose between two truths: cubic in position, constant rate of turn."""
-    span = b.time_ns - a.time_ns
-    if span == 0:
-        return _Seen(b.p_wm, b.q_wm)
-    s, h = (time_ns - a.time_ns) / span, 1e-9 * span
-    p = (
-        (1 + 2 * s) * (1 - s) ** 2 * a.p_wm
-        + s * (1 - s) ** 2 * h * a.v_w
-        + s * s * (3 - 2 * s) * b.p_wm
-        - s * s * (1 - s) * h * b.v_w
-    )
-    return _Seen(p, rotations.multiply(a.q_wm, rotations.exp(s * rotations.difference(b.q_wm, a.q_wm))))
+def _between(a: np.ndarray, b: np.ndarray, elapsed_s: float, span_s: float) -> _Seen:
+    """Pose `elapsed_s` after a, where b is `span_s` after a: cubic in position, constant rate of turn.
+
+    a, b: (16,) rows of `World.seen`.
+    """
+    if span_s <= 0.0:
+        return _Seen(b[:3], b[3:7])
+    s = elapsed_s / span_s
+    r = 1.0 - s
+    p = r * r * ((1 + 2 * s) * a[:3] + s * span_s * a[7:10]) + s * s * ((3 - 2 * s) * b[:3] - r * span_s * b[7:10])
+    turned = rotations.difference(b[3:7], a[3:7])
+    return _Seen(p, rotations.multiply(a[3:7], rotations.exp(s * turned)))

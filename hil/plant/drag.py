@@ -1,7 +1,7 @@
 """Drag of boxes in flow, from their own projected areas. Called at every stage of the integration.
 
-F = -1/2 rho Cd(d) A(d) |v| v. A box of edges a, b, c shows A(d) = bc|dx| + ac|dy| + ab|dz| to flow from d. Cd is the cubic
-polynomial in d that takes the given values face-on and edge-on.
+F = -1/2 rho Cd(d) A(d) |v| v. A box of edges a, b, c shows A(d) = bc|dx| + ac|dy| + ab|dz| to flow from d. Cd is the
+polynomial of fourth degree in d, with the symmetry of a cube, that takes the given values face-on and edge-on.
 """
 
 from __future__ import annotations
@@ -40,5 +40,5 @@ def strip(v, w, h):
 
 @compiled(F8(F8, F8, F8, F8, F8, F8))
 def rotation(a, b, c, vx, vy, wz):
-    """Integral, m^5/s^2, whose product with 1/2 rho Cd is the moment against wz of a box with edges a, b and c along z."""
+    """Integral, m^5/s^2, of a box with edges a, b and c along z: times 1/2 rho Cd the moment against its rate wz."""
     return c * (strip(vy, wz, 0.5 * a) + strip(-vx, wz, 0.5 * b))

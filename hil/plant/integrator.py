@@ -1,4 +1,4 @@
-"""One tick of the world: bodies, thrusters and water move on together, by Runge-Kutta of fourth order at a fixed sub-step."""
+"""One tick of the world: bodies, thrusters and water move on by Runge-Kutta of fourth order at a fixed sub-step."""
 
 from __future__ import annotations
 

@@ -66,11 +66,14 @@ class WorldSpec:
             raise DescriptionError("deadband_low_n is above deadband_high_n")
 
 
-CALM = {
-    "current_m_s": 0.0, "gust_m_s": 0.0, "buoyancy_error_n": 0.0, "righting_spread_m": 0.0, "trim_m": 0.0, "mass_spread": 0.0,
-    "inertia_spread": 0.0, "drag_spread": 0.0, "gain_spread": 0.0, "thruster_lag_s": 0.0, "deadband_low_n": 0.0,
-    "deadband_high_n": 0.0, "supply_resistance_ohm": 0.0, "supply_limit": False, "jet_strength": 0.0,
-}  # fmt: skip
+CALM: dict[str, float] = dict.fromkeys(
+    (
+        "current_m_s", "gust_m_s", "buoyancy_error_n", "righting_spread_m", "trim_m", "mass_spread", "inertia_spread",
+        "drag_spread", "gain_spread", "thruster_lag_s", "deadband_low_n", "deadband_high_n", "supply_resistance_ohm",
+        "supply_limit", "jet_strength",
+    ),
+    0,
+)  # fmt: skip
 """Overrides that switch every error of the world off."""
 
 
@@ -108,14 +111,14 @@ class SensorSpec:
     dock_sigma_ma: float = quantity(4.0, unit="mA", low=0, high=1000, help="noise of the magnet currents (synthetic)")
 
 
-IDEAL = {
-    name: 0.0
-    for name in (
-        "gyro_sigma", "gyro_bias", "gyro_walk", "accel_sigma", "accel_bias", "accel_walk", "depth_sigma_m", "depth_bias_m",
-        "depth_walk", "tag_phase", "tag_delay_ms", "tag_sigma_m", "tag_sigma_axis_m", "tag_sigma_deg", "tag_dropped",
-        "tag_flipped", "voltage_sigma_v", "current_sigma_a", "rpm_sigma", "dock_sigma_ma",
-    )
-}  # fmt: skip
+IDEAL: dict[str, float] = dict.fromkeys(
+    (
+        "gyro_sigma", "gyro_bias", "gyro_walk", "accel_sigma", "accel_bias", "accel_walk", "depth_sigma_m",
+        "depth_bias_m", "depth_walk", "tag_phase", "tag_delay_ms", "tag_sigma_m", "tag_sigma_axis_m", "tag_sigma_deg",
+        "tag_dropped", "tag_flipped", "voltage_sigma_v", "current_sigma_a", "rpm_sigma", "dock_sigma_ma",
+    ),
+    0,
+)  # fmt: skip
 """Overrides for perfect sensors: no noise, no bias, no delay."""
 
 

@@ -1,7 +1,7 @@
 """Thrusters and their supply: command -> force, through deadband, lag, voltage, gain error and the supply's limit.
 
-The static force at the curve's voltage follows a first-order lag; what acts is that times gain and (V/V0)^2, since at a given
-duty the propeller's speed is proportional to the voltage. Jets push the modules in their way.
+The static force at the curve's voltage follows a first-order lag; what acts is that times gain and (V/V0)^2, since at a
+given duty the propeller's speed is proportional to the voltage. (Jets: jets.py.)
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from hil.plant.bodies import BODIES, MODULES, add_force
-from hil.plant.vectors import F1, F2, F3, F8, I1, compiled, dot, matrix_of, minus, plus, times, triple, turn, turn_back
+from hil.plant.vectors import F1, F2, F3, F8, I1, compiled
 
 
 class Thrusters(NamedTuple):
@@ -40,7 +39,7 @@ class Thrusters(NamedTuple):
     force: np.ndarray
     """(t,) force that acts now, N."""
     supply: np.ndarray
-    """(m, 5) curve voltage, open-circuit voltage, resistance, largest current (infinity: none), power of the electronics."""
+    """(m, 5) curve voltage, open-circuit voltage, resistance, largest current or infinity, power of the electronics."""
     power: np.ndarray
     """(m, 2) voltage and current of each module now."""
 
@@ -72,8 +71,8 @@ def command(thrusters, first, u):
 def voltage_of(open_v, resistance, limit_a, idle_a, conductance):
     """Voltage at which supply and load agree.
 
-    At a given duty the power of a thruster goes with V^3, so its current with V^2: I(V) = idle + conductance V^2. The supply
-    gives V = open - R I, and never more than its limit.
+    At a given duty the power of a thruster goes with V^3, so its current with V^2: I(V) = idle + conductance V^2. The
+    supply gives V = open - R I, and never more than its limit.
     """
     v = open_v - resistance * idle_a
     if resistance * conductance > 1e-12:
@@ -104,7 +103,7 @@ def load_supplies(thrusters, halves):
 
 @compiled(types.void(THRUSTERS, types.int64))
 def forces_after(thrusters, halves):
-    """Sets the force of every thruster to that so many half sub-steps from now, at the voltages found by `load_supplies`."""
+    """Sets every thruster's force to that so many half sub-steps from now, at the voltages of `load_supplies`."""
     for t in range(thrusters.force.shape[0]):
         target, now = thrusters.level[t, 0], thrusters.level[t, 1]
         m = thrusters.module[t]
@@ -137,41 +136,3 @@ def feedback(thrusters, first, out):
         rpm = thrusters.constants[t, 2] * scale * math.sqrt(abs(f) / full)
         out[i, 0] = rpm if f > 0.0 else -rpm
         out[i, 1] = polynomial(thrusters.power_curve, t, side, abs(f)) / thrusters.supply[m, 0] * scale * scale
-
-
-@compiled(types.void(THRUSTERS, BODIES, MODULES, F8, F8, F8, F2))
-def add_jets(thrusters, bodies, modules, strength, length, radius, out):
-    """Adds the push of every jet on the first other module in its way to the wrenches out (b, 6).
-
-    A jet leaves against the force, widens by a tenth of its way (Pope, Turbulent Flows, 2000, sect. 5.1: spreading rate of a round
-    jet 0.094), and `strength` of its thrust is felt at its start, half of that after `length`. Other modules feel it at the
-    point of its axis nearest to their centre.
-    """
-    x = bodies.state
-    for t in range(thrusters.force.shape[0]):
-        force, own = thrusters.force[t], thrusters.module[t]
-        if abs(force) < 1e-6:
-            continue
-        b = thrusters.body[t]
-        r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
-        jet = turn(r, times(-1.0 if force > 0.0 else 1.0, triple(thrusters.column, t, 0)))
-        start = plus(triple(x, b, 0), turn(r, triple(thrusters.position, t, 0)))
-        hit, way, share = -1, 1e9, 0.0
-        for m in range(modules.body.shape[0]):
-            c = modules.body[m]
-            other = matrix_of(x[c, 3], x[c, 4], x[c, 5], x[c, 6])
-            gap = minus(plus(triple(x, c, 0), turn(other, triple(modules.position, m, 0))), start)
-            ahead = dot(gap, jet)
-            if m == own or ahead <= 0.0 or ahead >= way:
-                continue
-            half = (modules.size[m, 0] + modules.size[m, 1] + modules.size[m, 2]) / 6.0
-            beside = math.sqrt(max(0.0, dot(gap, gap) - ahead * ahead))
-            miss = max(0.0, beside - half) / (radius + 0.1 * ahead)
-            if miss < 2.0:
-                hit, way = m, ahead
-                share = strength * math.exp(-miss * miss) / (1.0 + max(0.0, ahead - half) / length)
-        if hit >= 0:
-            c = modules.body[hit]
-            other = matrix_of(x[c, 3], x[c, 4], x[c, 5], x[c, 6])
-            at = turn_back(other, minus(plus(start, times(way, jet)), triple(x, c, 0)))
-            add_force(out, c, at, turn_back(other, times(share * abs(force), jet)))

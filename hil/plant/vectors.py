@@ -1,4 +1,4 @@
-"""Vectors as tuples of three floats, for compiled code: they live in registers, where arrays of three would cost more than the sums."""
+"""Vectors as tuples of three floats, for compiled code: they live in registers; arrays cost more than the sums."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ M3 = types.UniTuple(V3, 3)
 
 
 def compiled(signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles a function for one signature. Dividing by zero gives infinity as in numpy: checks for it cost a third of the time."""
+    """Compiles for one signature. Dividing by zero gives infinity as in numpy: to check costs a third of the time."""
     return cast("Callable[[Callable[..., Any]], Any]", njit(signature, cache=True, error_model="numpy"))
 
 

@@ -1,6 +1,6 @@
 """The water and its edges: current with gusts, walls, bottom and surface of the tank.
 
-The current is uniform over the tank: a mean that is drawn per seed and second-order Gauss-Markov gusts, which have a finite
+The current is uniform over the tank: a mean that is drawn per seed and second-order Gauss-Markov gusts, of finite
 acceleration. Walls are soft: springs and dampers at the corners of each hull.
 """
 
@@ -51,8 +51,8 @@ def make_water(spec: WorldSpec, tank: Tank) -> Water:
 class Gusts:
     """Drives the gust: white noise through two lags, T1 (correlation) and T2 (smoothing), with the wanted variance.
 
-    The output of the first lag, of variance s1^2, has the covariance s1^2 T1/(T1+T2) with that of the second and gives it the
-    same figure as variance (Lyapunov's equation of the two lags).
+    The output of the first lag, of variance s1^2, has the covariance s1^2 T1/(T1+T2) with that of the second, whose
+    variance is the same figure (Lyapunov's equation of the two lags).
     """
 
     def __init__(self, spec: WorldSpec, rng: np.random.Generator, period_s: float) -> None:

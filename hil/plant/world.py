@@ -18,6 +18,7 @@ from hil.plant import thrusters as thrusters_module
 from hil.plant.bodies import Bodies, Modules
 from hil.plant.draw import ModuleDraw, carried, draw_module, rigid_matrix, stream
 from hil.plant.integrator import advance
+from hil.plant.jets import add_jets
 from hil.plant.spec import Tank, WorldSpec
 from hil.plant.thrusters import Thrusters
 from hil.plant.water import Gusts, make_water
@@ -120,7 +121,7 @@ class World:
         self._external = np.zeros((bodies, 6))
         self._thrust = np.zeros((bodies, 6))
 
-    def set_command(self, module: int, u: np.ndarray, armed: bool) -> None:
+    def set_command(self, module: int, u: Sequence[float] | np.ndarray, armed: bool) -> None:
         """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call; disarmed is zero."""
         thrusters_module.command(self._thrusters, self._first[module], np.array(u, dtype=np.float64) * float(armed))
 
@@ -137,7 +138,7 @@ class World:
         self._external[:] = 0.0
         if len(self.vehicles) > 1 and self.spec.jet_strength > 0.0:
             jet = (self.spec.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
-            thrusters_module.add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._external)
+            add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._external)
         arrays = (self._body_arrays, self._modules, self._thrusters, self._water)
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
 
@@ -147,9 +148,14 @@ class World:
         power = self._thrusters.power[module]
         first, last = self._first[module], self._first[module + 1]
         return Truth(
-            self.time_ns, seen[:3], seen[3:7], seen[7:10], seen[10:13], seen[13:16], self._thrusters.force[first:last].copy(),
-            self._water.flow[0] + self._water.flow[1], float(power[0]), float(power[1]),
+            self.time_ns, seen[:3], seen[3:7], seen[7:10], seen[10:13], seen[13:16],
+            self._thrusters.force[first:last].copy(), self._water.flow[0] + self._water.flow[1],
+            float(power[0]), float(power[1]),
         )  # fmt: skip
+
+    def seen(self) -> np.ndarray:
+        """(m, 16) of all modules, cheaper than their truths: place, quaternion, velocity, rate, specific force."""
+        return self._seen.copy()
 
     def body_truth(self, body: int) -> BodyTruth:
         """The truth about one body, by its index in `bodies`."""
@@ -188,7 +194,7 @@ class World:
         self._step(0)
 
     def momentum(self) -> np.ndarray:
-        """(b, 6) linear momentum and angular momentum about the world's origin of each body and the water it carries, world."""
+        """(b, 6) linear and angular momentum about the world's origin of each body with the water it moves, world."""
         out = np.empty((len(self.bodies), 6))
         for b, x in enumerate(self._body_arrays.state[: len(self.bodies)]):
             r_wb = rotations.to_matrix(x[3:7])
@@ -260,17 +266,17 @@ def _make_bodies(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec:
         np.zeros((n, 6)),
     )
     for m in range(n):
-        _fill_body(bodies, m, [(draws[m], vehicles[m], np.zeros(3), np.eye(3))], spec)
+        _fill_body(bodies, m, [(draws[m], np.zeros(3), np.eye(3))], spec)
     return bodies
 
 
 def _fill_body(
-    bodies: Bodies, b: int, parts: Sequence[tuple[ModuleDraw, Vehicle, np.ndarray, np.ndarray]], spec: WorldSpec
+    bodies: Bodies, b: int, parts: Sequence[tuple[ModuleDraw, np.ndarray, np.ndarray]], spec: WorldSpec
 ) -> None:
-    """Sums the modules of body b: (draw, vehicle, position of the hull centre, module to body rotation) of each."""
+    """Sums the modules of body b: (draw, position of the hull centre, module to body rotation) of each."""
     for array in bodies[1:6]:
         array[b] = 0.0
-    for draw, vehicle, r, turn in parts:
+    for draw, r, turn in parts:
         rigid = rigid_matrix(draw.dry_kg + draw.entrained_kg, draw.com, draw.inertia)
         bodies.rigid[b] += carried(rigid, r, turn)
         bodies.added[b] += carried(np.diag(draw.added), r, turn)

@@ -131,7 +131,7 @@ def _all(lopsided: Vehicle, count: int) -> list[Vehicle]:
 def _energy_of_parts(
     body_v: np.ndarray, w: np.ndarray, vehicles: list[Vehicle], cells: list[tuple[int, int, int]], turns: list[int]
 ) -> float:
-    """Kinetic energy from the velocities of the parts, without a mass matrix; `body_v` is that of the lattice's origin."""
+    """Kinetic energy from velocities of the parts, without a mass matrix; `body_v` is that of the lattice's origin."""
     energy = 0.0
     for vehicle, cell, index in zip(vehicles, cells, turns, strict=True):
         turn, origin = lattice.MATRICES[index], PITCH * np.array(cell, dtype=float)

@@ -1,6 +1,7 @@
 """The tag camera of the plant: when it sees, what it sees, and how wrong."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -100,7 +101,7 @@ def test_segment_and_box() -> None:
 def test_pictures_come_at_60_hz_with_a_phase_per_seed() -> None:
     seen = pictures(camera(tag_phase=1.0), 10.0)
     assert len(seen) == pytest.approx(600, abs=1)
-    assert {b.capture_ns - a.capture_ns for a, b in zip(seen, seen[1:], strict=False)} == {16_666_667}
+    assert {b.capture_ns - a.capture_ns for a, b in pairwise(seen)} == {16_666_667}
     assert seen[0].capture_ns != pictures(camera(tag_phase=1.0, seed=1), 1.0)[0].capture_ns
 
 
@@ -125,7 +126,7 @@ def test_two_percent_of_the_pictures_are_lost() -> None:
 
 
 def test_flipped_pose_looks_the_same_from_the_camera() -> None:
-    """The second pose of a planar tag: seen from far away its corners are where they were, and their depths are mirrored."""
+    """The second pose of a planar tag: seen from far away its corners stay, and their depths are mirrored."""
     start = at(0.2, 0.1, 0.4, rotations.from_euler(0.4, -0.3, 0.7))
     (true,), (flipped,) = look(world_of(start), camera()), look(world_of(start), camera(tag_flipped=1.0))
     np.testing.assert_allclose(flipped.p_wt, true.p_wt)

@@ -11,8 +11,8 @@ RUN = ROOT / "hil" / "guest" / "run"
 
 def missing_packages() -> list[str]:
     """The Debian packages that the guest needs and this machine has not."""
-    prepare = [RUN.with_name("prepare"), "--missing"]
-    return subprocess.run(prepare, capture_output=True, text=True).stdout.split()
+    prepare = str(RUN.with_name("prepare"))
+    return subprocess.run([prepare, "--missing"], capture_output=True, text=True, check=False).stdout.split()
 
 
 class Guest:
@@ -20,7 +20,7 @@ class Guest:
 
     def run(
         self,
-        command: Sequence[str | Path],
+        command: Sequence[str],
         *,
         counted: bool = False,
         processors: int = 1,
@@ -46,5 +46,5 @@ class Guest:
         switches |= {"VG_COUNTED": "1"} if counted else {}
         switches |= {"VG_OUT": str(out)} if out else {}
         return subprocess.run(
-            [RUN, *command], cwd=ROOT, env=os.environ | switches, capture_output=capture, text=True, check=False
+            [str(RUN), *command], cwd=ROOT, env=os.environ | switches, capture_output=capture, text=True, check=False
         )

@@ -1,14 +1,46 @@
-"""Link control: one vcan interface that goes down, comes up, is deleted, made again, or whose send buffer is full."""
+"""Link control: one vcan interface that goes down, comes up, is deleted, made again, or whose send buffer is full.
 
+What `ip link` does, asked of the kernel directly: a process costs 35 to 75 ms in the guest, an event here 0.1 to 16 ms.
+"""
+
+import os
+import socket
+import struct
 import subprocess
 from pathlib import Path
 
+NETLINK_ROUTE = 0
+RTM_NEWLINK, RTM_DELLINK = 16, 17
+REQUEST_AND_ACK, NEW_ONLY = 0x005, 0x600
+"""NLM_F_REQUEST | NLM_F_ACK and NLM_F_CREATE | NLM_F_EXCL of linux/netlink.h."""
+IFLA_INFO_KIND, IFLA_IFNAME, IFLA_LINKINFO = 1, 3, 18
+"""Attributes of linux/if_link.h."""
+HEADER = struct.Struct("=IHHII")
+"""struct nlmsghdr: length, type, flags, sequence, port."""
+LINK = struct.Struct("=BxHiII")
+"""struct ifinfomsg: family, type, index, flags, which flags change."""
 IFF_UP = 0x1
 """Flag of linux/if.h."""
 HELD_FRAMES = 1
 """Frames that a full buffer holds before it refuses with ENOBUFS."""
 HOLD = "200s"
 """How long it holds them; tc takes at most 274 s."""
+
+
+def _attribute(kind: int, value: bytes) -> bytes:
+    length = 4 + len(value)
+    return struct.pack("=HH", length, kind) + value + bytes(-length % 4)
+
+
+def _change(name: str, kind: int, how: int = 0, flags: int = 0, changed: int = 0, attributes: bytes = b"") -> None:
+    """One request of rtnetlink(7) about the interface, and the kernel's answer to it."""
+    named = _attribute(IFLA_IFNAME, name.encode() + b"\0")
+    body = LINK.pack(socket.AF_UNSPEC, 0, 0, flags, changed) + named + attributes
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, NETLINK_ROUTE) as kernel:
+        kernel.send(HEADER.pack(HEADER.size + len(body), kind, REQUEST_AND_ACK | how, 1, 0) + body)
+        (answer,) = struct.unpack_from("=i", kernel.recv(4096), HEADER.size)
+    if answer:
+        raise OSError(-answer, os.strerror(-answer), name)
 
 
 def _run(*words: str) -> None:
@@ -32,7 +64,7 @@ class Interface:
     """A vcan interface, by name (at most 15 characters). Each method returns when the kernel has done it.
 
     Raises:
-        OSError: the kernel refused, with the words of `ip` or `tc`.
+        OSError: the kernel refused; its errno, or the words of `tc`.
     """
 
     def __init__(self, name: str) -> None:
@@ -47,18 +79,19 @@ class Interface:
 
     def create(self) -> None:
         """A new interface of the name, down."""
-        _run("ip", "link", "add", "dev", self.name, "type", "vcan")
+        vcan = _attribute(IFLA_LINKINFO, _attribute(IFLA_INFO_KIND, b"vcan"))
+        _change(self.name, RTM_NEWLINK, NEW_ONLY, attributes=vcan)
 
     def delete(self) -> None:
         """Away with it; nothing to do when there is none."""
         if self.exists():
-            _run("ip", "link", "delete", "dev", self.name)
+            _change(self.name, RTM_DELLINK)
 
     def up(self) -> None:
-        _run("ip", "link", "set", self.name, "up")
+        _change(self.name, RTM_NEWLINK, flags=IFF_UP, changed=IFF_UP)
 
     def down(self) -> None:
-        _run("ip", "link", "set", self.name, "down")
+        _change(self.name, RTM_NEWLINK, changed=IFF_UP)
 
     def make_again(self) -> None:
         """Deleted, made and up in one go: a new interface of the old name."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.vcan.guest import Guest
 
-FOLDER = Path(__file__).parent
+FOLDER = str(Path(__file__).parent)
 # Plug-ins cost seconds of import in the guest.
 WITHOUT = [f"-pno:{name}" for name in ("cacheprovider", "hypothesispytest", "xdist")]
 PYTEST = [sys.executable, "-m", "pytest", FOLDER, *WITHOUT]
@@ -15,7 +15,7 @@ TIMEOUT_S = 1200
 
 def test_everything_on_real_socketcan_passes_in_the_guest(guest: Guest) -> None:
     # Collecting imports what the tests import: compiled code of both kinds is then in the caches that the guest reads.
-    warm_up = shlex.join(map(str, [*PYTEST, "--collect-only", "-qq"])) + " >/dev/null"
+    warm_up = shlex.join([*PYTEST, "--collect-only", "-qq"]) + " >/dev/null"
     inner = [*PYTEST, "-m", "vcan", "-rs", "--durations=5"]
     result = guest.run(inner, warm_up=warm_up, timeout_s=TIMEOUT_S, capture=False)
     assert result.returncode == 0, "in the guest (its report is above, or under captured output)"

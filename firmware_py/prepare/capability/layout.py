@@ -152,13 +152,21 @@ def of_modules(
     check_joints(placements, range(len(placements)), pitch_m)
     turns = np.array([MATRICES[p.rotation] for p in placements])
     origins = pitch_m * np.array([p.cell for p in placements], dtype=float)
-    masses = np.array([v.inertial.dry_kg + v.inertial.entrained_kg for v in vehicles])
-    centres = origins + np.einsum("mij,mj->mi", turns, np.array([v.inertial.com_m for v in vehicles]))
-    r_bm = origins - masses @ centres / masses.sum()
+    lumps = [(mass, origin + turn @ at) for p, turn, origin in zip(placements, turns, origins, strict=True)
+             for mass, at in _lumps(p.vehicle)]
+    total = sum(mass for mass, _ in lumps)
+    r_bm = origins - np.sum([mass * at for mass, at in lumps], axis=0) / total
     passive = tuple(AXES.index(a) for a in vehicles[0].passive_dof) if len(vehicles) == 1 else ()
     assumption = "; ".join(dict.fromkeys(v.assumption for v in vehicles if v.assumption))
     thrusters = thruster_set(vehicles, turns, r_bm)
     return of_thrusters(name or f"{len(vehicles)} x {vehicles[0].name}", thrusters, passive, assumption)
+
+
+def _lumps(vehicle: Vehicle) -> list[tuple[float, np.ndarray]]:
+    """Masses of a module and what it carries, entrained water included, kg, and where, module frame, m."""
+    own = vehicle.inertial
+    carried = [(load.dry_kg + load.entrained_kg, load.position_m) for load in vehicle.payload]
+    return [(own.dry_kg + own.entrained_kg, own.com_m), *carried]
 
 
 def of_thrusters(name: str, thrusters: ThrusterSet, passive: tuple[int, ...] = (), assumption: str = "") -> Layout:

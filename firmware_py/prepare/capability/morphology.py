@@ -52,11 +52,12 @@ class Harmonics:
             raise ValueError(f"{len(directions)} directions are too few for harmonics of degree {l_max}")
         self.l_max = l_max
         polar, azimuth = angles(directions)
-        values, _, _ = _legendre(polar, l_max)
+        (values,) = _legendre(polar, l_max, 0)
         order = _orders(l_max)
         turning = np.where(order[:, 1] >= 0, np.cos(np.outer(azimuth, order[:, 1])), -np.sin(np.outer(azimuth, order[:, 1])))
         self._matrix = values[:, order[:, 0], np.abs(order[:, 1])] * turning
         self._inverse = np.linalg.pinv(self._matrix)
+        self._surface = Quadrature(l_max)
 
     def fit(self, radius: np.ndarray) -> np.ndarray:
         """((l_max + 1)^2,) coefficients a_lm, by least squares; order of `_orders`."""
@@ -71,7 +72,7 @@ class Harmonics:
         ratio = float(radius.min() / radius.max()) if radius.max() > 0.0 else 0.0
         if ratio < LEAST_RATIO:
             return Shape(energy, scale_free, math.nan, f"r_min / r_max is {ratio:.1e}", math.nan, misfit)
-        value, curvature, fitted_ratio = willmore(a, self.l_max)
+        value, curvature, fitted_ratio = self._surface.willmore(a)
         if fitted_ratio < LEAST_RATIO:
             return Shape(energy, scale_free, math.nan, "the fitted surface passes the origin", math.nan, misfit)
         return Shape(energy, scale_free, value, "", curvature, misfit)
@@ -83,54 +84,60 @@ def dirichlet(coefficients: np.ndarray) -> float:
     return float(np.sum(degree * (degree + 1) * coefficients**2))
 
 
-def willmore(coefficients: np.ndarray, l_max: int) -> tuple[float, float, float]:
-    """E_W, int K dA and r_min / r_max of the surface r(d) d, by Gauss-Legendre (polar) and trapezoidal (azimuth) quadrature."""
-    x, weights = np.polynomial.legendre.leggauss(_POLAR)
-    polar = np.arccos(x)[:, None]
-    azimuth = 2.0 * np.pi * np.arange(_AZIMUTH)[None] / _AZIMUTH
-    r, r_p, r_a, r_pp, r_pa, r_aa = _radius(coefficients, l_max, polar[:, 0], azimuth[0])
-    if r.min() <= 0.0:
-        return math.nan, math.nan, float(r.min() / r.max())
-    sin, cos = np.sin(polar), np.cos(polar)
-    # First and second fundamental forms of r e_r, in the frame (e_r, e_polar, e_azimuth) that turns with the angles.
-    e, f, g = r_p**2 + r**2, r_p * r_a, r_a**2 + (r * sin) ** 2
-    area = np.sqrt(e * g - f * f)
-    normal = np.stack([r * r * sin, -r * r_p * sin, -r * r_a]) / area
-    second = (
-        np.stack([r_pp - r, 2.0 * r_p, np.zeros_like(r)]),
-        np.stack([r_pa, r_a, r_p * sin + r * cos]),
-        np.stack([r_aa - r * sin**2, -r * sin * cos, 2.0 * r_a * sin]),
-    )
-    ll, mm, nn = (np.sum(normal * part, axis=0) for part in second)
-    mean = (e * nn - 2.0 * f * mm + g * ll) / (2.0 * area**2)
-    gauss = (ll * nn - mm * mm) / area**2
-    element = area / sin * weights[:, None] * (2.0 * np.pi / _AZIMUTH)
-    return float(np.sum((mean**2 - gauss) * element)), float(np.sum(gauss * element)), float(r.min() / r.max())
+class Quadrature:
+    """Gauss-Legendre nodes in the polar angle, even ones in azimuth, and the harmonics on them."""
 
+    def __init__(self, l_max: int) -> None:
+        x, weights = np.polynomial.legendre.leggauss(_POLAR)
+        polar = np.arccos(x)
+        azimuth = 2.0 * np.pi * np.arange(_AZIMUTH) / _AZIMUTH
+        self._order = _orders(l_max)
+        self._legendre = _legendre(polar, l_max, 2)
+        turns = np.outer(np.arange(l_max + 1), azimuth)
+        self._cosine, self._sine = np.cos(turns), np.sin(turns)
+        self._sin, self._cos = np.sin(polar)[:, None], np.cos(polar)[:, None]
+        self._weights = weights[:, None] * (2.0 * np.pi / _AZIMUTH)
 
-def _radius(coefficients: np.ndarray, l_max: int, polar: np.ndarray, azimuth: np.ndarray) -> tuple[np.ndarray, ...]:
-    """r and its derivatives p, a, pp, pa, aa (polar, azimuth) on the product grid, each (polar, azimuth)."""
-    legendre = _legendre(polar, l_max)
-    order = _orders(l_max)
-    m = np.arange(l_max + 1)
-    cosine, sine = np.cos(np.outer(m, azimuth)), np.sin(np.outer(m, azimuth))
-    out = []
-    by_cosine, by_sine = [], []
-    for table in legendre:
-        c, s = np.zeros((2, len(polar), l_max + 1))
-        for a, (degree, k) in zip(coefficients, order, strict=True):
-            (c if k >= 0 else s)[:, abs(k)] += a * table[:, degree, abs(k)]
-        by_cosine.append(c)
-        by_sine.append(s)
-    for derivative, turns in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)):
-        c, s = by_cosine[derivative], by_sine[derivative]
-        if turns == 0:
-            out.append(c @ cosine + s @ sine)
-        elif turns == 1:
-            out.append(-(c * m) @ sine + (s * m) @ cosine)
-        else:
-            out.append(-(c * m**2) @ cosine - (s * m**2) @ sine)
-    return tuple(out)
+    def willmore(self, coefficients: np.ndarray) -> tuple[float, float, float]:
+        """E_W, int K dA and r_min / r_max of the surface r(d) d; the energies NaN where it passes the origin."""
+        r, r_p, r_a, r_pp, r_pa, r_aa = self._radius(coefficients)
+        if r.min() <= 0.0:
+            return math.nan, math.nan, float(r.min() / r.max())
+        sin, cos = self._sin, self._cos
+        # First and second fundamental forms of r e_r, in the frame (e_r, e_polar, e_azimuth) that turns with the angles.
+        e, f, g = r_p**2 + r**2, r_p * r_a, r_a**2 + (r * sin) ** 2
+        area = np.sqrt(e * g - f * f)
+        normal = np.stack([r * r * sin, -r * r_p * sin, -r * r_a]) / area
+        second = (
+            np.stack([r_pp - r, 2.0 * r_p, np.zeros_like(r)]),
+            np.stack([r_pa, r_a, r_p * sin + r * cos]),
+            np.stack([r_aa - r * sin**2, -r * sin * cos, 2.0 * r_a * sin]),
+        )
+        ll, mm, nn = (np.sum(normal * part, axis=0) for part in second)
+        mean = (e * nn - 2.0 * f * mm + g * ll) / (2.0 * area**2)
+        gauss = (ll * nn - mm * mm) / area**2
+        element = area / sin * self._weights
+        return float(np.sum((mean**2 - gauss) * element)), float(np.sum(gauss * element)), float(r.min() / r.max())
+
+    def _radius(self, coefficients: np.ndarray) -> tuple[np.ndarray, ...]:
+        """r and its derivatives p, a, pp, pa, aa (polar, azimuth), each (polar nodes, azimuth nodes)."""
+        parts = []
+        for table in self._legendre:
+            c, s = np.zeros((2, *table.shape[::2]))
+            for a, (degree, m) in zip(coefficients, self._order, strict=True):
+                (c if m >= 0 else s)[:, abs(m)] += a * table[:, degree, abs(m)]
+            parts.append((c, s))
+        out = []
+        m = np.arange(self._cosine.shape[0])
+        for derivative, turns in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)):
+            c, s = parts[derivative]
+            if turns == 0:
+                out.append(c @ self._cosine + s @ self._sine)
+            elif turns == 1:
+                out.append((s * m) @ self._cosine - (c * m) @ self._sine)
+            else:
+                out.append(-(c * m**2) @ self._cosine - (s * m**2) @ self._sine)
+        return tuple(out)
 
 
 def _orders(l_max: int) -> np.ndarray:
@@ -138,15 +145,15 @@ def _orders(l_max: int) -> np.ndarray:
     return np.array([(degree, m) for degree in range(l_max + 1) for m in range(-degree, degree + 1)])
 
 
-def _legendre(polar: np.ndarray, l_max: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Three arrays (n, l, m >= 0): orthonormal real harmonics without their turning, and two derivatives by the polar angle."""
+def _legendre(polar: np.ndarray, l_max: int, derivatives: int) -> tuple[np.ndarray, ...]:
+    """Arrays (n, l, m >= 0): orthonormal real harmonics without their turning, and so many derivatives by the polar angle."""
     from scipy.special import sph_harm_y  # a quarter of a second to import
 
-    tables = np.zeros((3, len(polar), l_max + 1, l_max + 1))
+    tables = np.zeros((derivatives + 1, len(polar), l_max + 1, l_max + 1))
     for degree in range(l_max + 1):
         for m in range(degree + 1):
-            value, gradient, hessian = sph_harm_y(degree, m, polar, 0.0, diff_n=2)
-            factor = 1.0 if m == 0 else math.sqrt(2.0)
-            for table, part in zip(tables, (value, gradient[..., 0], hessian[..., 0, 0]), strict=True):
-                table[:, degree, m] = factor * part.real
-    return tables[0], tables[1], tables[2]
+            found = sph_harm_y(degree, m, polar, 0.0, diff_n=derivatives)
+            parts = (found,) if derivatives == 0 else (found[0], found[1][..., 0], found[2][..., 0, 0])
+            for table, part in zip(tables, parts, strict=True):
+                table[:, degree, m] = (1.0 if m == 0 else math.sqrt(2.0)) * part.real
+    return tuple(tables)

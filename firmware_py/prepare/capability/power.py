@@ -6,12 +6,20 @@ figure is proportional to the number of thrusters, so it measures idle power.
 
 from __future__ import annotations
 
+from ctypes import c_int
 from dataclasses import dataclass
 
+import daqp
 import numpy as np
 
 from firmware_py.prepare.capability.layout import Layout
 from firmware_py.prepare.capability.wrench import embed, free_components
+
+_EQUALITY = 5
+"""daqp's mark of an equality row."""
+
+_SOLVED = 1
+"""daqp's exit flag for optimal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +82,21 @@ def electrical_power(layout: Layout, forces: np.ndarray) -> np.ndarray:
     for order in range(coefficients.shape[-1] - 1, -1, -1):
         total = (total + coefficients[..., order]) * size
     return np.asarray(total.sum(axis=1))
+
+
+def least_squares_forces(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
+    """(k, n) forces with the smallest sum of squares within limits for (k, 6) wrenches; J^+ w where that is out of reach."""
+    forces = wrenches @ np.linalg.pinv(layout.matrix, rcond=1e-9).T
+    n = layout.count
+    sense = np.array([0] * n + [_EQUALITY] * 6, dtype=c_int)
+    matrix = np.ascontiguousarray(layout.matrix)
+    over = np.any((forces > layout.f_max) | (forces < layout.f_min), axis=1)
+    for k in np.flatnonzero(over):
+        upper, lower = np.r_[layout.f_max, wrenches[k]], np.r_[layout.f_min, wrenches[k]]
+        x, _, flag, _ = daqp.solve(2.0 * np.eye(n), np.zeros(n), matrix, upper, lower, sense)
+        if flag == _SOLVED:
+            forces[k] = x
+    return np.asarray(forces)
 
 
 def mean_square_effort(layout: Layout, frame: str) -> float:

@@ -16,6 +16,9 @@ from firmware_py.prepare.capability.layout import FRAMES, Layout
 _BATCH = 100
 """Linear programs solved as one block-diagonal program: 0.13 ms each for 8 thrusters, 1.6 ms each when alone."""
 
+_PARALLEL = 1e-9
+"""Share of the largest below which a facet's normal does not enter a frame."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Section:
@@ -74,6 +77,15 @@ class WrenchSpace:
         factor = facets.reach(self.layout, self.normals, self._supports, wrenches)
         return np.where(_in_span(self.layout, wrenches), factor, 0.0)
 
+    def worst(self, frame: str) -> float:
+        """Smallest lambda over all directions of a frame, N or N m: the distance to the nearest facet."""
+        components = free_components(self.layout, frame)
+        if not components or not self.layout.spans(components):
+            return 0.0
+        size = np.linalg.norm(self.normals[:, components], axis=1)
+        keep = size > _PARALLEL * float(size.max())
+        return float((self._supports[keep] / size[keep, None]).min())
+
     def section(self, frame: str) -> Section | None:
         """The polytope in one frame of FRAMES; None where the layout does not span it (then its volume is zero).
 
@@ -84,8 +96,7 @@ class WrenchSpace:
             return None
         both = np.concatenate([self.normals, -self.normals])[:, components]
         size = np.linalg.norm(both, axis=1)
-        scale = float(size.max())
-        keep = size > 1e-9 * scale
+        keep = size > _PARALLEL * float(size.max())
         normals = both[keep] / size[keep, None]
         offsets = self._supports.T.reshape(-1)[keep] / size[keep]
         return Section(components, *_irredundant(normals, offsets))

@@ -1,0 +1,131 @@
+"""MAVLink 2 signing: who is believed. Verifies before it remembers anything, so a forged packet changes nothing.
+
+Source: MAVLink developer guide, "Message Signing". Times are in units of 10 us since 1 January 2015, UTC.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from firmware_py.ground.files import write_atomically
+
+KEY_BYTES = 32
+SIGNATURE_BYTES = 13
+EPOCH_S = 1_420_070_400
+"""1 January 2015 as Unix time."""
+_UNITS_PER_S = 100_000
+_NEW_STREAM_UNITS = 60 * _UNITS_PER_S
+"""A stream that was never heard may be a minute behind."""
+_FLOOR_MARGIN = _UNITS_PER_S
+"""The stored time stamp is that much ahead, as long as the interval at which it is stored."""
+_MOST_STREAMS = 256
+_TIME_MASK = (1 << 48) - 1
+RADIO_STATUS = 109
+"""The one message that is believed unsigned: radios inject it and have no key."""
+
+Stream = tuple[int, int, int]
+"""Link id, system, component."""
+
+
+def units_of(unix_ns: int) -> int:
+    """Signing time of a Unix time."""
+    return max(0, unix_ns - EPOCH_S * 1_000_000_000) // 10_000
+
+
+@dataclass(slots=True)
+class Signing:
+    """Key, time stamp, and the newest time stamp of every stream that was believed."""
+
+    key: bytes | None = None
+    timestamp: int = 0
+    """Of the next frame that goes out; at least that of every believed frame."""
+    floor: int = 0
+    """New streams start above this: nothing from before the last start is believed again."""
+    streams: dict[Stream, int] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    """Frames by what became of them: good, unsigned, bad, replayed, old, full."""
+    changed: bool = False
+    """There is something to store."""
+
+    def advance(self, unix_ns: int) -> None:
+        """Follow the clock; never goes back."""
+        self.timestamp = max(self.timestamp, units_of(unix_ns))
+
+    def adopt(self, key: bytes, timestamp: int) -> None:
+        """Take a new key; all zeros turn signing off."""
+        self.key = key if any(key) else None
+        self.timestamp = max(self.timestamp, timestamp & _TIME_MASK)
+        self.streams.clear()
+        self.changed = True
+
+    def sign(self, frame: bytes, link: int) -> bytes:
+        """The 13 bytes that follow `frame`."""
+        assert self.key is not None
+        self.timestamp += 1
+        tail = bytes([link & 0xFF]) + self.timestamp.to_bytes(6, "little")
+        return tail + _digest(self.key, frame + tail)
+
+    def believes(self, frame: bytes, signature: bytes, message: int, system: int, component: int) -> bool:
+        """Whether a frame with a good checksum may act. `signature` is empty when it is unsigned."""
+        if self.key is None:
+            return True
+        if not signature:
+            self.counts["unsigned"] += 1
+            return message == RADIO_STATUS
+        if not hmac.compare_digest(_digest(self.key, frame + signature[:7]), signature[7:]):
+            self.counts["bad"] += 1
+            return False
+        return self._is_new(int.from_bytes(signature[1:7], "little"), (signature[0], system, component))
+
+    def _is_new(self, stamp: int, stream: Stream) -> bool:
+        newest = self.streams.get(stream)
+        verdict = "good"
+        if newest is not None and stamp <= newest:
+            verdict = "replayed"
+        elif newest is None and (stamp <= self.floor or stamp < self.timestamp - _NEW_STREAM_UNITS):
+            verdict = "old"
+        elif newest is None and len(self.streams) >= _MOST_STREAMS:
+            verdict = "full"
+        self.counts[verdict] += 1
+        if verdict != "good":
+            return False
+        self.streams[stream] = stamp
+        self.timestamp = max(self.timestamp, stamp)
+        self.changed = True
+        return True
+
+    def save(self, path: Path) -> None:
+        """Store key and time stamp in a file that only its owner may read. Raises OSError."""
+        newest = max([self.floor - _FLOOR_MARGIN, *self.streams.values()])
+        table = {"key": self.key.hex() if self.key else "", "timestamp": newest + _FLOOR_MARGIN}
+        write_atomically(path, json.dumps(table).encode(), 0o600)
+        self.changed = False
+
+
+def load_signing(path: Path) -> Signing:
+    """What `path` holds; no file, no key.
+
+    Raises:
+        ValueError: the file is there and wrong, or others may read it; one line. Never falls back to no key.
+    """
+    if not path.exists():
+        return Signing()
+    if path.stat().st_mode & 0o077:
+        raise ValueError(f"{path}: others may read this key; allow it only to its owner: chmod 600 {path}")
+    try:
+        table = json.loads(path.read_text())
+        key, stamp = bytes.fromhex(table["key"]), int(table["timestamp"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a key file: {error}") from None
+    if len(key) not in (0, KEY_BYTES):
+        raise ValueError(f"{path}: the key has {len(key)} bytes; it needs {KEY_BYTES}")
+    return Signing(key=key or None, timestamp=stamp, floor=stamp)
+
+
+def _digest(key: bytes, covered: bytes) -> bytes:
+    return hashlib.sha256(key + covered).digest()[:6]

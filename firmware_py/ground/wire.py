@@ -1,0 +1,141 @@
+"""Bytes to messages and back: MAVLink 1 and 2 frames, checksum, signature. Pure; never raises on what comes in.
+
+Not pymavlink's own parser: it stores a stream's time stamp before it verifies the signature, and its allow-unsigned
+callback also passes badly signed frames. Source: MAVLink developer guide, "Packet Serialization".
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from pymavlink.generator.mavcrc import x25crc
+
+from firmware_py.ground.dialect import Dialect, Message
+from firmware_py.ground.signing import SIGNATURE_BYTES, Signing
+
+_MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
+_MAGIC = re.compile(b"[\xfd\xfe]")
+_SIGNED = 0x01
+_HEADER_1, _HEADER_2 = struct.Struct("<BBBBBB"), struct.Struct("<BBBBBBBHB")
+_CRC = struct.Struct("<H")
+
+
+class Packet(NamedTuple):
+    """A message that is believed, and the bytes that it came in."""
+
+    message: Message
+    raw: bytes
+
+
+class Framer:
+    """Cuts the bytes of one peer into frames."""
+
+    def __init__(self, dialect: Dialect, signing: Signing, counts: Counter[str]) -> None:
+        self._dialect, self._signing = dialect, signing
+        self._buffer = bytearray()
+        self.counts = counts
+        """Frames by what became of them: good, checksum, unknown, flags, refused; bytes that belong to no frame: garbage."""
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """The believed messages that `data` completes."""
+        self._buffer += data
+        packets: list[Packet] = []
+        at = 0
+        while (start := self._next_magic(at)) is not None:
+            self.counts["garbage"] += start - at
+            at = start
+            size = self._frame_size(at)
+            if size is None or len(self._buffer) - at < size:
+                break
+            packet = self._frame(bytes(self._buffer[at : at + size]))
+            if packet is None:
+                at += 1  # what looked like a frame may hold a real one
+                continue
+            at += size
+            if packet.message.name:
+                packets.append(packet)
+        else:
+            self.counts["garbage"] += len(self._buffer) - at
+            at = len(self._buffer)
+        del self._buffer[:at]
+        return packets
+
+    def end(self) -> None:
+        """A datagram is over: a frame never goes on in the next."""
+        self.counts["garbage"] += len(self._buffer)
+        self._buffer.clear()
+
+    def _next_magic(self, at: int) -> int | None:
+        found = _MAGIC.search(self._buffer, at)
+        return None if found is None else found.start()
+
+    def _frame_size(self, at: int) -> int | None:
+        """Bytes of the frame at `at`, or None while its header is incomplete."""
+        if len(self._buffer) - at < 3:
+            return None
+        length = self._buffer[at + 1]
+        if self._buffer[at] == _MAGIC_1:
+            return _HEADER_1.size + length + _CRC.size
+        signature = SIGNATURE_BYTES if self._buffer[at + 2] & _SIGNED else 0
+        return _HEADER_2.size + length + _CRC.size + signature
+
+    def _frame(self, raw: bytes) -> Packet | None:
+        """The message; None when this is no frame; a nameless one when it is a frame that is not believed."""
+        if raw[0] == _MAGIC_1:
+            _, length, _, system, component, number = _HEADER_1.unpack_from(raw)
+            header = _HEADER_1.size
+        else:
+            _, length, flags, _, _, system, component, low, high = _HEADER_2.unpack_from(raw)
+            number, header = low | high << 16, _HEADER_2.size
+            if flags & ~_SIGNED:
+                self.counts["flags"] += 1
+                return None
+        definition = self._dialect.by_number.get(number)
+        if definition is None:
+            self.counts["unknown"] += 1
+            return None
+        end = header + length
+        if checksum(raw[1:end], definition.crc_extra) != _CRC.unpack_from(raw, end)[0]:
+            self.counts["checksum"] += 1
+            return None
+        signature = raw[end + _CRC.size :]
+        if not self._signing.believes(raw[: end + _CRC.size], signature, number, system, component):
+            self.counts["refused"] += 1
+            return _REFUSED
+        self.counts["good"] += 1
+        return Packet(Message(definition.name, definition.decode(raw[header:end]), system, component), raw)
+
+
+_REFUSED = Packet(Message("", {}), b"")
+
+
+def checksum(covered: bytes, crc_extra: int) -> int:
+    """X.25 checksum of a frame without its magic byte, and of the message's own byte."""
+    crc = x25crc(covered)
+    crc.accumulate(bytes([crc_extra]))
+    return int(crc.crc)
+
+
+class Encoder:
+    """Makes the frames of one system and component, MAVLink 2."""
+
+    def __init__(self, dialect: Dialect, signing: Signing, system: int, component: int) -> None:
+        self._dialect, self._signing = dialect, signing
+        self.system, self.component = system, component
+        self._sequence = 0
+
+    def encode(self, name: str, values: Mapping[str, Any], link: int = 0) -> bytes:
+        """One frame. Raises KeyError for a message or field that there is not."""
+        definition = self._dialect.by_name[name]
+        payload = definition.encode(values)
+        flags = 0 if self._signing.key is None else _SIGNED
+        number, sequence = definition.number, self._sequence
+        self._sequence = (sequence + 1) & 0xFF
+        low, high = number & 0xFFFF, number >> 16
+        frame = _HEADER_2.pack(_MAGIC_2, len(payload), flags, 0, sequence, self.system, self.component, low, high) + payload
+        frame += _CRC.pack(checksum(frame[1:], definition.crc_extra))
+        return frame + self._signing.sign(frame, link) if flags else frame

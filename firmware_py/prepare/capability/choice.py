@@ -1,0 +1,137 @@
+"""Which shape for a task: all distinct polycubes ranked by margin, power or thrust variance, with what k dead thrusters leave.
+
+The modules stay parallel to each other (so every probe meets a drogue); each shape is tried in every way it can lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.prepare.assembly import PITCH_M, assemble
+from firmware_py.prepare.capability.layout import FRAMES, Layout, of_modules, of_thrusters
+from firmware_py.prepare.capability.polycubes import Cells, polycubes, poses
+from firmware_py.prepare.capability.power import electrical_power, least_squares_forces
+from firmware_py.prepare.capability.task import Task, wrenches_along
+from firmware_py.prepare.capability.wrench import WrenchSpace, reach_by_programs
+from firmware_py.prepare.drag_cache import DragCache
+
+_STILL = 1e-6
+"""N; a wrench smaller than this (torque over the lever arm) asks for nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitness:
+    """One way of lying of one shape, against the task.
+
+    Attributes:
+        cells: lattice cells.
+        margin: smallest factor by which the task's wrenches can be multiplied; below 1 the shape cannot do it.
+        power_w: mean electrical power above idle, of the allocation with the smallest sum of squares within limits.
+        variance: of a thruster's force over all thrusters and moments, N^2.
+    """
+
+    cells: Cells
+    margin: float
+    power_w: float
+    variance: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """The best way of lying of one shape.
+
+    Attributes:
+        best: see there.
+        poses: how many ways it can lie.
+        guaranteed_margin: margin whichever `dead` thrusters give nothing.
+        guaranteed_n, guaranteed_nm: force and moment in the worst direction, whichever `dead` thrusters give nothing.
+        whole_n, whole_nm: the same with all thrusters alive.
+    """
+
+    best: Fitness
+    poses: int
+    guaranteed_margin: float
+    guaranteed_n: float
+    guaranteed_nm: float
+    whole_n: float
+    whole_nm: float
+
+
+def rank(
+    task: Task,
+    count: int,
+    vehicle: Vehicle,
+    cache: DragCache | None = None,
+    pitch_m: float = PITCH_M,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Choice]:
+    """Every distinct polycube of `count` modules, best first.
+
+    Args:
+        cache: kept drag outlines, for trajectories.
+        progress: called with shapes done and shapes in all.
+
+    Raises:
+        ValueError: a count without a list of shapes. DescriptionError: the vehicle cannot be docked to its like.
+    """
+    shapes = polycubes(count)
+    path = task.trajectory.path() if task.trajectory else None
+    found = []
+    for done, shape in enumerate(shapes):
+        tried: list[tuple[Fitness, Layout, np.ndarray]] = []
+        for cells in poses(shape):
+            if path is None or task.trajectory is None:
+                layout, wrenches = of_modules(cells, [0] * count, [vehicle] * count, pitch_m), task.wrench
+            else:
+                body = assemble(cells, [0] * count, [vehicle] * count, pitch_m=pitch_m, cache=cache)
+                layout, wrenches = of_thrusters(body.name, body.thrusters), wrenches_along(path, body, task.trajectory.samples)
+            tried.append((fitness(cells, layout, wrenches), layout, wrenches))
+        best, layout, wrenches = min(tried, key=lambda entry: (_order(task, entry[0]), entry[0].cells))
+        found.append(_choice(best, len(tried), layout, wrenches, task.dead))
+        if progress:
+            progress(done + 1, len(shapes))
+    return sorted(found, key=lambda choice: (_order(task, choice.best), choice.best.cells))
+
+
+def fitness(cells: Cells, layout: Layout, wrenches: np.ndarray) -> Fitness:
+    """How one layout does against (k, 6) wrenches, N and N m."""
+    asked = wrenches[np.linalg.norm(wrenches / _rows(layout), axis=1) > _STILL]
+    forces = least_squares_forces(layout, wrenches)
+    margin = float(reach_by_programs(layout, asked).min()) if len(asked) else np.inf
+    return Fitness(cells, margin, float(electrical_power(layout, forces).mean()), float(forces.var()))
+
+
+def _rows(layout: Layout) -> np.ndarray:
+    return np.array([1.0, 1.0, 1.0, *[layout.lever_m] * 3])
+
+
+def _order(task: Task, part: Fitness) -> tuple[bool, float, float]:
+    """Sorting key: what can do the task comes first. Rounded, so that rounding errors do not part shapes that are alike."""
+    value = {"margin": -part.margin, "power": part.power_w, "variance": part.variance}[task.rank_by]
+    second = part.power_w if task.rank_by == "margin" else -part.margin
+    return part.margin < 1.0, _rounded(value), _rounded(second)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.9g}")
+
+
+def _choice(best: Fitness, count: int, layout: Layout, wrenches: np.ndarray, dead: int) -> Choice:
+    whole = WrenchSpace(layout)
+    left = whole.with_dead(dead)
+    asked = wrenches[np.linalg.norm(wrenches / _rows(layout), axis=1) > _STILL]
+    margin = float(left.reach(asked).min()) if len(asked) else np.inf
+    worst = {(space, frame): space.worst(frame) for space in (whole, left) for frame in FRAMES}
+    return Choice(
+        best,
+        count,
+        margin,
+        worst[left, "force"],
+        worst[left, "torque"],
+        worst[whole, "force"],
+        worst[whole, "torque"],
+    )

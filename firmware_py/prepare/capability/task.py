@@ -1,0 +1,90 @@
+"""What a shape is wanted for: wrenches to hold, or a trajectory to fly, read from a task file.
+
+A task file is TOML: `wrench = [[Fx, Fy, Fz, Mx, My, Mz], ...]` or a [trajectory] table, and how to rank.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.core import rigid_body, rotations
+from firmware_py.core.body import Body
+from firmware_py.core.drag_lookup import drag_wrench
+from firmware_py.core.types import Setpoint
+from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from firmware_py.prepare import paths
+
+RANKINGS = ("margin", "power", "variance")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrajectoryTable:
+    """[trajectory]: one of the closed-form paths of prepare.paths about the origin, rest to rest."""
+
+    kind: str = quantity(choices=("spiral", "circle", "moebius", "lissajous"), help="form of the path")
+    duration_s: float = quantity(60.0, unit="s", low=0.1, high=1e5, help="rest to rest")
+    radius_m: float = quantity(0.5, unit="m", low=0.0, high=1e3, help="spiral, circle, moebius")
+    climb_m: float = quantity(0.4, unit="m", low=-1e3, high=1e3, help="spiral: rise from start to end")
+    half_width_m: float = quantity(0.3, unit="m", low=0.0, high=1e3, help="moebius")
+    turns: float = quantity(2.0, low=0.01, high=1e3, help="turns, laps or cycles")
+    amplitude_m: np.ndarray = quantity([0.5, 0.5, 0.2], unit="m", low=0, high=1e3, shape=(3,), help="lissajous")
+    frequency: np.ndarray = quantity([1.0, 2.0, 3.0], low=0, high=100, shape=(3,), help="lissajous: per turn, each axis")
+    samples: int = quantity(100, low=2, high=10000, help="moments at which the wrench is looked at")
+
+    def path(self) -> paths.Trajectory:
+        """The trajectory, world NED."""
+        origin = np.zeros(3)
+        if self.kind == "spiral":
+            return paths.spiral(origin, self.radius_m, self.climb_m, self.turns, self.duration_s)
+        if self.kind == "circle":
+            return paths.circle(origin, self.radius_m, self.turns, self.duration_s)
+        if self.kind == "moebius":
+            return paths.moebius(origin, self.duration_s, self.radius_m, self.half_width_m, self.turns)
+        return paths.lissajous(origin, self.amplitude_m, self.frequency, self.duration_s, turns=self.turns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Task:
+    """One task file. The modules' axes are the task's; how the shape lies in them is free."""
+
+    name: str = quantity(help="for people")
+    vehicle: str = quantity("modcube", help="vehicle name or file of every module")
+    rank_by: str = quantity("margin", choices=RANKINGS, help="what decides")
+    dead: int = quantity(1, low=0, high=4, help="thrusters that may be dead for the guaranteed figures")
+    wrench: np.ndarray = quantity([], unit="N, N m", low=-1e5, high=1e5, shape=(-1, 6), help="held wrenches, body FRD")
+    trajectory: TrajectoryTable | None = quantity(None, help="flown in place of held wrenches")
+
+    def __post_init__(self) -> None:
+        if (self.wrench.size > 0) == (self.trajectory is not None):
+            raise DescriptionError("needs either `wrench` rows or a [trajectory] table, not both")
+        if self.wrench.size and not np.all(np.any(self.wrench != 0.0, axis=1)):
+            raise DescriptionError(f"wrench row {int(np.argmin(np.any(self.wrench != 0.0, axis=1)))} is zero")
+
+
+def load_task(path: Path) -> Task:
+    """The task in `path`. Raises DescriptionError, one line."""
+    table, source = read_toml(path)
+    task: Task = build(Task, table, source)
+    return task
+
+
+def wrenches_along(path: paths.Trajectory, body: Body, samples: int) -> np.ndarray:
+    """(samples, 6) wrench that a body needs at even times along a trajectory, N and N m, body frame, in still water."""
+    times = np.linspace(0.0, path.duration_s, samples)
+    return np.array([required_wrench(body, path.sample(float(t))) for t in times])
+
+
+def required_wrench(body: Body, wanted: Setpoint) -> np.ndarray:
+    """(6,) M dnu/dt + C(nu) nu + D(nu) + g of Fossen's equations for one wanted motion in still water."""
+    q = np.ascontiguousarray(wanted.q_wb)
+    w = np.ascontiguousarray(wanted.w_b)
+    v = rotations.rotate_back(q, np.ascontiguousarray(wanted.v_w))
+    a = rotations.rotate_back(q, np.ascontiguousarray(wanted.a_w)) - np.cross(w, v)
+    nu = np.concatenate([v, w])
+    drag = drag_wrench(body.drag.nodes, body.drag.rotational, body.drag.linear, nu)
+    tau = body.mass @ np.concatenate([a, wanted.alpha_b]) + rigid_body.coriolis_wrench(body.mass, nu) - drag
+    tau[3:] -= rigid_body.restoring_moment(np.ascontiguousarray(body.righting), q)
+    return np.asarray(tau)

@@ -1,0 +1,56 @@
+"""The plant in real time, in a process of its own and on its own clock: `modcube hil plant`, and the other half of `--realtime`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from firmware_py.bus.codec import Codec, Frame
+from firmware_py.bus.port import Port
+from hil.nodes import Nodes, make_nodes
+from hil.scenario import Scenario, make_world
+from hil.signals import TruthRecorder
+
+CHUNK_NS = 2_500_000
+"""The world moves in steps of this; what an MCU samples is at most so old."""
+
+
+class PlantProcess:
+    """The world and its nodes, moved along by a clock. `serve` returns when `stop` says so."""
+
+    def __init__(self, scenario: Scenario, seed: int, rate_hz: int, out: Path | None) -> None:
+        self._world = make_world(scenario, seed, CHUNK_NS)
+        numbers = {module.number: index for index, module in enumerate(scenario.module)}
+        codec = Codec.load()
+        self._sync = codec.message("SYNC")
+        self._nodes: Nodes = make_nodes(self._world, codec, numbers, scenario, tick_ns=1_000_000_000 // rate_hz)
+        thrusters = tuple(len(v.thruster) for v in self._world.vehicles)
+        self._truth = TruthRecorder(out, thrusters) if out is not None else None
+
+    def serve(self, port: Port, now_ns: Callable[[], int], stop: Callable[[], bool]) -> None:
+        """Answers what comes at `port`; `now_ns` starts near zero."""
+        try:
+            while not stop():
+                port.wait(self._world.time_ns + CHUNK_NS)
+                self._advance(now_ns())
+                for frame in port.receive():
+                    self._answer(port, frame)
+        finally:
+            if self._truth is not None:
+                self._truth.close()
+
+    def _advance(self, now_ns: int) -> None:
+        while self._world.time_ns + CHUNK_NS <= now_ns:
+            self._world.advance(CHUNK_NS)
+            self._nodes.watch()
+
+    def _answer(self, port: Port, frame: Frame) -> None:
+        for answer in self._nodes.take(frame, self._world.time_ns):
+            port.send(answer)
+        if self._truth is not None and frame.id == self._sync.id_of(0) and len(frame.data) == self._sync.length:
+            self._record(self._truth, int(self._sync.decode(frame.data)[0]))
+
+    def _record(self, recorder: TruthRecorder, tick: int) -> None:
+        for module in range(len(self._world.vehicles)):
+            t = self._world.truth(module)
+            recorder.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w)

@@ -1,0 +1,97 @@
+"""A scenario in real time: the firmware here, the plant in a process of its own, each on its own clock."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from multiprocessing.synchronize import Event as ProcessEvent
+from pathlib import Path
+from typing import NamedTuple
+
+from firmware_py.app.firmware import compose
+from firmware_py.app.realtime import open_loop
+from firmware_py.bus.port import open_port
+from firmware_py.core.types import Outputs, Request
+from firmware_py.description.parameters import Parameters
+from firmware_py.runtime.clock import MonotonicClock
+from firmware_py.runtime.realtime import quiet_garbage
+from firmware_py.runtime.recorder import Recorder
+from hil.bench import fleet_of, recording
+from hil.plant_process import PlantProcess
+from hil.scenario import Scenario
+from hil.script import Script
+
+PLANT_READY_S = 120.0
+"""Longest that the plant's process may take to start."""
+
+
+class RealTimeFlight(NamedTuple):
+    """How the ticks went."""
+
+    wall_s: float
+    deadline_misses: int
+    unanswered: int
+    lateness_ns: dict[str, int]
+    """p50, p99, worst."""
+
+
+def serve_plant(
+    scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, ready: ProcessEvent, stop: ProcessEvent
+) -> None:
+    """The plant's process: serves until `stop` is set or it is interrupted."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    plant = PlantProcess(scenario, seed, rate_hz, out)
+    clock = MonotonicClock.started_now()
+    with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=threading.Event()) as port:
+        ready.set()
+        plant.serve(port, clock.now_ns, stop.is_set)
+
+
+def fly_in_real_time(
+    scenario: Scenario,
+    seed: int,
+    parameters: Parameters,
+    out: Path,
+    bus: str,
+    rate_hz: int = 100,
+    progress: Callable[[float], None] | None = None,
+) -> RealTimeFlight:
+    """Flies `scenario` against the clock; the logs are in `out`. Raises DescriptionError and PortError."""
+    context = multiprocessing.get_context("spawn")
+    ready, stop = context.Event(), context.Event()
+    arguments = (scenario, seed, bus, rate_hz, out, ready, stop)
+    plant = context.Process(target=serve_plant, args=arguments, name="plant", daemon=True)
+    with ExitStack() as stack:
+        plant.start()
+        stack.callback(plant.join)
+        stack.callback(stop.set)
+        fleet = fleet_of(scenario, bus, rate_hz)
+        firmware = compose(fleet, parameters)
+        while not ready.wait(timeout=1.0):
+            if not plant.is_alive():
+                raise RuntimeError("the plant's process ended before it was ready")
+        script = Script(scenario, fleet)
+        recorder = Recorder(out, {"scenario": scenario.name, "seed": seed, "rate_hz": rate_hz})
+        stack.callback(recorder.close)
+        start_ns = 0
+
+        def requests(time_ns: int, last: Outputs | None) -> Sequence[Request]:
+            return script.requests(time_ns - start_ns, last)
+
+        def stop_at_end(tick: int, outputs: Outputs) -> bool:
+            if progress is not None and tick % rate_hz == 0:
+                progress(tick / rate_hz)
+            return tick >= script.ticks
+
+        loop = open_loop(stack, firmware, requests, [recording(recorder, rate_hz)])
+        loop.listen()
+        stack.enter_context(quiet_garbage())
+        start_ns = loop.clock.now_ns()
+        loop.rate_keeper.start(start_ns + fleet.period_ns)
+        loop.run(stop_at_end)
+    keeper = loop.rate_keeper
+    lateness = {"p50": keeper.lateness.quantile_ns(0.5), "p99": keeper.lateness.quantile_ns(0.99), "worst": keeper.lateness.worst_ns}
+    return RealTimeFlight(script.ticks / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness)

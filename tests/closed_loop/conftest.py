@@ -1,0 +1,56 @@
+"""Whole flights for tests: the real firmware against the plant in lockstep, judged by the scenario's own checks.
+
+What is broken on purpose is broken on the plant's side; the firmware flies unchanged.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import hil.scenario
+from firmware_py.bus.codec import Frame
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import Vehicle, load_vehicle
+from hil.checks import Result
+from hil.flight import fly_and_judge
+from hil.nodes import Nodes
+from hil.scenario import Scenario
+from tests.closed_loop.flights import Corrupt, Fly, Rebuild
+
+
+@pytest.fixture
+def fly(tmp_path: Path) -> Fly:
+    """Flies a scenario on a bus of its own; the logs are in the test's folder."""
+
+    def fly_it(scenario: Scenario, seed: int = 0, parameters: Parameters | None = None, folder: str = "run") -> Result:
+        return fly_and_judge(scenario, seed, parameters or Parameters(), tmp_path / folder, f"virtual:{tmp_path.name}")
+
+    return fly_it
+
+
+@pytest.fixture
+def rebuild(monkeypatch: pytest.MonkeyPatch) -> Rebuild:
+    """rebuild(change): the robot in the water is `change` of its vehicle file; the firmware knows only the file."""
+
+    def rebuild_it(change: Callable[[Vehicle], Vehicle]) -> None:
+        monkeypatch.setattr(hil.scenario, "load_vehicle", lambda name: change(load_vehicle(name)))
+
+    return rebuild_it
+
+
+@pytest.fixture
+def corrupt(monkeypatch: pytest.MonkeyPatch) -> Corrupt:
+    """corrupt(change, to_plant): every frame to the plant, or from it, passes through `change`."""
+
+    def corrupt_it(change: Callable[[Frame], Frame], to_plant: bool) -> None:
+        step = Nodes.step
+
+        def changed_step(nodes: Nodes, frames: list[Frame]) -> list[Frame]:
+            if to_plant:
+                return step(nodes, [change(frame) for frame in frames])
+            return [change(frame) for frame in step(nodes, frames)]
+
+        monkeypatch.setattr(Nodes, "step", changed_step)
+
+    return corrupt_it

@@ -1,0 +1,34 @@
+"""One module holds its place in the tank, closed loop over real frames."""
+
+import pytest
+
+from tests.closed_loop.flights import Fly, shortened
+
+HOVER_S = 20.0
+"""Of the scenario's 60 s; the full length belongs to `make accept`."""
+SINGLE_SEED_LIMIT_M = 0.005
+
+
+def test_module_in_still_water_with_ideal_sensors_keeps_its_place_within_half_a_millimetre(fly: Fly) -> None:
+    result = fly(shortened("hover", HOVER_S).with_calm_world().with_ideal_sensors())
+    assert result.passed
+    assert result.metrics["position_rmse_m"] <= 0.0005  # 0.18 mm measured; the tag's frame has steps of 0.5 mm
+    assert result.metrics["attitude_rmse_rad"] <= 0.001
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_module_with_real_sensors_in_a_gusty_current_keeps_its_place_within_five_millimetres(
+    fly: Fly, seed: int
+) -> None:
+    result = fly(shortened("hover", HOVER_S), seed)
+    assert result.passed
+    assert 0.0005 <= result.metrics["position_rmse_m"] <= SINGLE_SEED_LIMIT_M  # better than 0.5 mm would be a leak
+    assert result.metrics["ticks"] == pytest.approx(100 * HOVER_S, abs=1)
+    assert result.metrics["unmatched_ticks"] == 0
+
+
+def test_estimate_of_a_hovering_module_is_as_good_as_it_says(fly: Fly) -> None:
+    metrics = fly(shortened("hover", HOVER_S), 2).metrics
+    assert 0.7 <= metrics["nis_mean"] <= 1.4
+    assert metrics["sigma3_share"] >= 0.95
+    assert metrics["estimate_position_rmse_m"] <= 0.003

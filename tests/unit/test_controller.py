@@ -1,0 +1,213 @@
+"""The control law by inverse dynamics: in the equations of motion its wrench must give the motion that was wanted."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from firmware_py.core import propagation
+from firmware_py.core.body import Body
+from firmware_py.core.controller import Controller
+from firmware_py.core.propagation import STATES
+from firmware_py.core.rotations import difference, exp, from_euler, multiply, rotate
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.types import Estimate, Setpoint
+from firmware_py.description.parameters import Control
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+ATTITUDES = {
+    "level": LEVEL,
+    "rolled": from_euler(1.0, 0.0, 0.3),
+    "pitch 90": from_euler(0.0, 0.5 * math.pi, 0.0),
+    "on its head": from_euler(math.pi, 0.2, -2.0),
+}
+
+
+@pytest.fixture(scope="module", params=[1, 3], ids=["one module", "L of three"])
+def body(request: pytest.FixtureRequest) -> Body:
+    cells = [(0, 0, 0), (1, 0, 0), (1, 1, 0)][: request.param]
+    return assemble(cells, [0, 4, 12][: request.param], [load_vehicle("modcube")] * request.param)
+
+
+def plant(body: Body) -> tuple[np.ndarray, ...]:
+    drag = body.drag
+    return body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear
+
+
+def believed(p_wb: np.ndarray, q_wb: np.ndarray, nu: np.ndarray, disturbance: np.ndarray | None = None) -> Estimate:
+    """disturbance: (6,) force in the world, moment in the body."""
+    zero, d = np.zeros(3), np.zeros(6) if disturbance is None else disturbance
+    return Estimate(p_wb, q_wb, nu, d[:3].copy(), d[3:].copy(), zero, zero, 0, math.nan, 0, 0, True)
+
+
+def moving(q_wb: np.ndarray, seed: int = 0) -> Setpoint:
+    """A set-point in full motion: velocities and accelerations in all six axes."""
+    p, v, w, a, alpha = np.random.default_rng(seed).normal(scale=0.4, size=(5, 3))
+    return Setpoint(p, q_wb, v, w, a, alpha)
+
+
+def velocity_of(setpoint: Setpoint) -> np.ndarray:
+    turn = Rotation.from_quat(setpoint.q_wb[[1, 2, 3, 0]])
+    return np.r_[turn.inv().apply(setpoint.v_w), setpoint.w_b]
+
+
+def acceleration_of(setpoint: Setpoint) -> np.ndarray:
+    """(6,) dnu/dt in the turning body frame that the set-point asks for."""
+    turn = Rotation.from_quat(setpoint.q_wb[[1, 2, 3, 0]])
+    nu = velocity_of(setpoint)
+    return np.r_[turn.inv().apply(setpoint.a_w) - np.cross(nu[3:], nu[:3]), setpoint.alpha_b]
+
+
+# ---------------------------------------------------------------- feed-forward
+
+
+def surprise(body: Body, parameters: Control, q_wb: np.ndarray) -> float:
+    """Largest difference between the acceleration that the wrench gives and the wanted one, with no error at all."""
+    setpoint = moving(q_wb)
+    disturbance = np.array([2.0, -1.0, 0.5, 0.1, 0.2, -0.1])
+    nu = velocity_of(setpoint)
+    estimate = believed(setpoint.p_wb, q_wb, nu, disturbance)
+    wrench = Controller(body, parameters).step(setpoint, setpoint, estimate)
+    turn = Rotation.from_quat(q_wb[[1, 2, 3, 0]])
+    external = wrench + np.r_[turn.inv().apply(disturbance[:3]), disturbance[3:]]
+    return float(np.abs(propagation.acceleration(nu, q_wb, external, *plant(body)) - acceleration_of(setpoint)).max())
+
+
+@pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
+@pytest.mark.parametrize("law", ["model", "paper"])
+def test_robot_on_its_path_accelerates_as_the_path_does(body: Body, law: str, q_wb: np.ndarray) -> None:
+    assert surprise(body, Control(law=law), q_wb) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "spoilt", [Control(drag_feedforward=-1.0), Control(drag_feedforward=0.0), Control(disturbance_feedforward=0.0)]
+)
+def test_feed_forward_of_the_wrong_sign_or_none_would_be_noticed(body: Body, spoilt: Control) -> None:
+    assert surprise(body, spoilt, LEVEL) > 0.01
+
+
+@pytest.mark.parametrize("term", ["mass", "righting", "drag"])
+def test_model_that_is_not_the_robots_would_be_noticed(body: Body, term: str) -> None:
+    """The controller of a robot with one term of the wrong sign or size, on the right robot."""
+    spoilt = {
+        "mass": replace(body, mass=1.1 * body.mass),
+        "righting": replace(body, righting=-body.righting),
+        "drag": replace(body, drag=replace(body.drag, rotational=-body.drag.rotational)),
+    }[term]
+    setpoint = moving(ATTITUDES["rolled"])
+    nu = velocity_of(setpoint)
+    wrench = Controller(spoilt, Control()).step(setpoint, setpoint, believed(setpoint.p_wb, setpoint.q_wb, nu))
+    got = propagation.acceleration(nu, setpoint.q_wb, wrench, *plant(body))
+    assert np.abs(got - acceleration_of(setpoint)).max() > 0.01
+
+
+def test_robot_at_rest_is_only_held_upright(body: Body) -> None:
+    for q_wb in ATTITUDES.values():
+        setpoint = rest_at(np.ones(3), q_wb)
+        wrench = Controller(body, Control()).step(setpoint, setpoint, believed(np.ones(3), q_wb, np.zeros(6)))
+        up = Rotation.from_quat(q_wb[[1, 2, 3, 0]]).inv().apply([0.0, 0.0, -1.0])
+        np.testing.assert_allclose(wrench, np.r_[0.0, 0.0, 0.0, -np.cross(body.righting, up)], atol=1e-12)
+
+
+# ---------------------------------------------------------------- feedback
+
+
+@pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
+@pytest.mark.parametrize("axis", range(6))
+def test_error_along_one_axis_is_answered_along_it_by_mass_times_bandwidth_squared(
+    body: Body, axis: int, q_wb: np.ndarray
+) -> None:
+    c = Control()
+    error = 0.01 * np.eye(6)[axis]
+    aim = rest_at(rotate(q_wb, error[:3].copy()), multiply(q_wb, exp(error[3:].copy())))
+    controller = Controller(body, c)
+    still = believed(np.zeros(3), q_wb, np.zeros(6))
+    at_rest = controller.step(rest_at(np.zeros(3), q_wb), rest_at(np.zeros(3), q_wb), still)
+    stiffness = np.repeat([c.position_bandwidth**2, c.attitude_bandwidth**2], 3)
+    np.testing.assert_allclose(controller.step(aim, aim, still) - at_rest, body.mass @ (stiffness * error), atol=1e-9)
+
+
+def test_quaternion_of_either_sign_is_the_same_attitude(body: Body) -> None:
+    estimate = believed(np.zeros(3), from_euler(0.3, 0.2, 0.1), np.zeros(6))
+    aim = rest_at(np.zeros(3), from_euler(-0.2, 0.4, 1.0))
+    negative = aim._replace(q_wb=-aim.q_wb)
+    controller = Controller(body, Control())
+    np.testing.assert_allclose(
+        controller.step(aim, aim, estimate), controller.step(negative, negative, estimate), atol=1e-12
+    )
+
+
+def test_paper_law_feeds_measured_velocity_into_drag_and_the_default_does_not(body: Body) -> None:
+    """At rest it wants no drag made up; pushed at 0.5 m/s the paper's law cancels the water's own damping."""
+    nu = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+    hold = rest_at(np.zeros(3), LEVEL)
+    pushed = believed(np.zeros(3), LEVEL, nu)
+    model, paper = (Controller(body, Control(law=law)).step(hold, hold, pushed) for law in ("model", "paper"))
+    damping = -2.0 * Control().position_damping * Control().position_bandwidth * body.mass[:, 0] * 0.5
+    np.testing.assert_allclose(model[:3], damping[:3], atol=1e-9)
+    assert paper[0] > model[0] + 1.0
+
+
+def test_feed_forward_looks_ahead_and_the_error_does_not(body: Body) -> None:
+    now, ahead = rest_at(np.zeros(3), LEVEL), rest_at(np.ones(3), LEVEL)._replace(a_w=np.array([0.1, 0.0, 0.0]))
+    still = believed(np.zeros(3), LEVEL, np.zeros(6))
+    controller = Controller(body, Control())
+    extra = controller.step(now, ahead, still) - controller.step(now, now, still)
+    np.testing.assert_allclose(extra, 0.1 * body.mass[:, 0], atol=1e-12)
+
+
+# ---------------------------------------------------------------- closed loop
+
+
+def fly(body: Body, x: np.ndarray, aim: Setpoint, seconds: float, parameters: Control) -> np.ndarray:
+    """(n, 26) states of an ideal robot (no lag, no limits, state known) under the controller, every 10 ms."""
+    controller, states = Controller(body, parameters), [x]
+    for _ in range(round(seconds / 0.01)):
+        x = states[-1]
+        wrench = controller.step(aim, aim, believed(x[:3].copy(), x[3:7].copy(), x[7:13].copy()))
+        states.append(propagation.step(x, wrench, 0.01, *plant(body)))
+    return np.array(states)
+
+
+def displaced(error: np.ndarray) -> np.ndarray:
+    x = np.zeros(STATES)
+    x[:3], x[3:7] = error[:3], exp(error[3:].copy())
+    return x
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_error_decays_by_the_bandwidth_that_was_asked_for(body: Body, axis: int) -> None:
+    """Critically damped, an error falls as (1 + w t) exp(-w t): the same for every shape and axis."""
+    dry = replace(body, drag=replace(body.drag, nodes=0.0 * body.drag.nodes, rotational=np.zeros(3)))
+    c = Control(position_bandwidth=1.5, attitude_bandwidth=2.5)
+    states = fly(dry, displaced(0.02 * np.eye(6)[axis]), rest_at(np.zeros(3), LEVEL), 2.0, c)
+    errors = [np.r_[x[:3], difference(x[3:7].copy(), LEVEL)][axis] for x in states]
+    wt = (1.5 if axis < 3 else 2.5) * 0.01 * np.arange(len(states))
+    np.testing.assert_allclose(errors, 0.02 * (1.0 + wt) * np.exp(-wt), atol=0.02 * 0.02)
+
+
+@pytest.mark.parametrize("start", [e for k, e in ATTITUDES.items() if k != "level"], ids=lambda q: str(np.round(q, 2)))
+def test_robot_comes_home_from_far_away_and_any_attitude(body: Body, start: np.ndarray) -> None:
+    x = np.zeros(STATES)
+    x[:3], x[3:7], x[7:13] = [1.5, -1.0, 0.7], start, [0.3, -0.2, 0.1, 0.5, -0.5, 0.8]
+    end = fly(body, x, rest_at(np.zeros(3), LEVEL), 8.0, Control())[-1]
+    np.testing.assert_allclose(end[:3], 0.0, atol=2e-3)
+    np.testing.assert_allclose(difference(end[3:7].copy(), LEVEL), 0.0, atol=1e-3)
+
+
+def test_steady_run_with_current_is_followed_without_error(body: Body) -> None:
+    """0.3 m/s through the water against a known disturbance: nothing is left for the feedback to do."""
+    setpoint = Setpoint(np.zeros(3), LEVEL, np.array([0.3, 0.1, 0.0]), np.zeros(3), np.zeros(3), np.zeros(3))
+    disturbance = np.array([1.0, 0.0, -0.5, 0.0, 0.0, 0.0])
+    x = np.zeros(STATES)
+    x[3:7], x[7:10], x[19:25] = LEVEL, setpoint.v_w, disturbance
+    controller = Controller(body, Control())
+    for k in range(200):
+        aim = setpoint._replace(p_wb=setpoint.v_w * 0.01 * k)
+        wrench = controller.step(aim, aim, believed(x[:3].copy(), x[3:7].copy(), x[7:13].copy(), disturbance))
+        x = propagation.step(x, wrench, 0.01, *plant(body))
+    np.testing.assert_allclose(x[:3], setpoint.v_w * 2.0, atol=1e-9)
