@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import sys
 from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated
 
 import typer
+from typer.exceptions import TyperException
 
 from firmware_py.bus.port import PortError
+from firmware_py.description.fleet import load_fleet, single
+from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
 
 CANNOT_RUN = 2
@@ -23,12 +28,56 @@ def modcube() -> None:
     """Controller of a self-reconfigurable underwater robot."""
 
 
+@app.command()
+def run(
+    bus: Annotated[str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")] = "socketcan:can0",
+    fleet: Annotated[Path | None, typer.Option(help="fleet file; without it one module, number 1")] = None,
+    vehicle: Annotated[str, typer.Option(help="vehicle of the one module")] = "modcube",
+    parameters: Annotated[Path | None, typer.Option(help="file of parameters")] = None,
+    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="ticks a second")] = 100,
+    hold: Annotated[bool, typer.Option("--hold", help="arm as soon as the vehicle may, and hold the place")] = False,
+    out: Annotated[Path | None, typer.Option(help="folder for the logs")] = None,
+    stats: Annotated[bool, typer.Option("--stats", help="print how the ticks kept their deadlines")] = False,
+) -> None:
+    """Run the vehicle until SIGINT or SIGTERM."""
+    from firmware_py.app.vehicle import run_vehicle
+
+    described = load_fleet(fleet) if fleet is not None else single(vehicle, bus, rate_hz)
+    chosen = load_parameters(parameters) if parameters is not None else Parameters()
+    summary = run_vehicle(described, chosen, hold, out, say=lambda line: typer.echo(line))
+    if stats:
+        for name, value in summary._asdict().items():
+            typer.echo(f"{name:20s} {value}")
+
+
 def main() -> None:
     """Runs the command line; wrong input ends in one line on stderr and status 2."""
     for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):
         app.add_typer(entry.load(), name=entry.name)
     try:
-        app()
+        status = app(prog_name="modcube", standalone_mode=False)
+    except TyperException as error:
+        status = _refuse(usage_error(error))
     except (DescriptionError, PortError) as error:
-        print(f"modcube: {error}", file=sys.stderr)
-        sys.exit(CANNOT_RUN)
+        status = _refuse(f"modcube: {error}")
+    except OSError as error:
+        if error.filename is None:  # no file or folder of the user's is to blame
+            raise
+        status = _refuse(f"modcube: {error.filename}: {error.strerror}")
+    sys.exit(status or 0)
+
+
+def usage_error(error: TyperException) -> str:
+    """One line: which command, what is wrong with its arguments, what there is instead."""
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "modcube"
+    known = list(getattr(context.command, "commands", ())) if context is not None else []
+    hint = f"there are {', '.join(known)}" if known else f"see `{command} --help`"
+    message = " ".join(error.format_message().split())
+    # without any argument the help was printed already, and is the message
+    return f"{command}: {'needs a command' if context is not None and message.startswith('Usage:') else message}; {hint}"
+
+
+def _refuse(line: str) -> int:
+    print(line, file=sys.stderr)
+    return CANNOT_RUN

@@ -8,11 +8,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_py.app.firmware import BusFrame, Firmware, compose
+from firmware_py.app.firmware import Firmware, compose
 from firmware_py.app.lockstep import Lockstep, Observer, drain
+from firmware_py.app.vehicle import recording
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.port import Port, open_port
-from firmware_py.core.types import Inputs, Outputs, Request
+from firmware_py.core.types import Outputs
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.recorder import Recorder
@@ -21,8 +22,6 @@ from hil.scenario import Scenario, make_world
 from hil.script import Script
 from hil.signals import TruthRecorder
 
-FLUSH_EVERY_S = 0.5
-"""How often logs are handed to the operating system."""
 DEFAULT_BUS = "virtual:modcube"
 
 
@@ -84,22 +83,6 @@ def open_bench(
     nodes = make_nodes(world, Codec.load(), numbers, scenario)
     ports = [stack.enter_context(open_port(bus)) for _ in range(2)]
     return Bench(scenario, seed, fleet, firmware, nodes, Script(scenario, fleet), ports[0], ports[1])
-
-
-def recording(recorder: Recorder, rate_hz: int) -> Observer:
-    """An observer that writes every tick to `recorder`."""
-    flush_every = max(1, round(FLUSH_EVERY_S * rate_hz))
-
-    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        # SYNC went out before the answers came; the log keeps that order
-        recorder.sent(outputs.time_ns, 0, [frame for _, frame in sent[:1]])
-        recorder.received(outputs.time_ns, 0, [frame for _, frame in received])
-        recorder.sent(outputs.time_ns, 0, [frame for _, frame in sent[1:]])
-        recorder.record(inputs, outputs)
-        if outputs.tick % flush_every == 0:
-            outputs.events += recorder.flush()
-
-    return observe
 
 
 def fly_scenario(

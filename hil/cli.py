@@ -93,6 +93,20 @@ def campaign(
     raise typer.Exit(0 if summary["succeeded"] == summary["trials"] else FAILED)
 
 
+@app.command()
+def plant(
+    scenario: ScenarioName,
+    bus: Annotated[str, typer.Option(help="udp:GROUP:PORT or socketcan:IFACE")],
+    seed: Annotated[int, typer.Option(min=0, help="of the world's every draw")] = 0,
+    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="ticks a second of the firmware")] = 100,
+    out: Annotated[Path | None, typer.Option(help="folder for the truth's log")] = None,
+) -> None:
+    """Run the simulated plant alone, in real time, until SIGINT or SIGTERM: the other end of `modcube run`."""
+    from hil.plant_process import serve_until_signal
+
+    serve_until_signal(load_scenario(scenario), seed, bus, rate_hz, out)
+
+
 @app.command("list")
 def list_scenarios() -> None:
     """The scenarios that the package carries."""

@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
 from firmware_py.bus.codec import Codec, Frame
-from firmware_py.bus.port import Port
+from firmware_py.bus.port import Port, open_port
+from firmware_py.runtime.clock import MonotonicClock
 from hil.nodes import Nodes, make_nodes
 from hil.scenario import Scenario, make_world
 from hil.signals import TruthRecorder
 
 CHUNK_NS = 2_500_000
 """The world moves in steps of this; what an MCU samples is at most so old."""
+
+
+def serve_until_signal(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None) -> None:
+    """Serves `bus` until SIGINT or SIGTERM. Raises PortError and DescriptionError."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    plant = PlantProcess(scenario, seed, rate_hz, out)
+    clock = MonotonicClock.started_now()
+    with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=threading.Event()) as port:
+        print(f"plant of {scenario.name} on {bus}", flush=True)
+        plant.serve(port, clock.now_ns, stop.is_set)
 
 
 class PlantProcess:

@@ -13,13 +13,14 @@ from typing import NamedTuple
 
 from firmware_py.app.firmware import compose
 from firmware_py.app.realtime import open_loop
+from firmware_py.app.vehicle import recording
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.realtime import quiet_garbage
 from firmware_py.runtime.recorder import Recorder
-from hil.bench import fleet_of, recording
+from hil.bench import fleet_of
 from hil.plant_process import PlantProcess
 from hil.scenario import Scenario
 from hil.script import Script

@@ -88,6 +88,10 @@ class Scenario:
         """The same with perfect sensors; quantisation by the frames stays."""
         return dataclasses.replace(self, sensors=dataclasses.replace(self.sensors, **IDEAL))
 
+    def with_vehicle(self, vehicle: str) -> Scenario:
+        """The same with every module of the kind `vehicle`, a name or a file."""
+        return dataclasses.replace(self, module=tuple(dataclasses.replace(m, vehicle=vehicle) for m in self.module))
+
     def with_calm_world(self) -> Scenario:
         """The same in still water, with a robot that is what its vehicle file says."""
         return dataclasses.replace(self, world=dataclasses.replace(self.world, **CALM))  # type: ignore[arg-type]

@@ -1,54 +1,180 @@
-"""The supervisor's transitions, as data: from which state, on which trigger, under which guard, to which state."""
+"""The supervisor's rules, as data: in which state which trigger, under which guard, does what and leads where; and what each mode needs.
+
+`docs/supervisor.md` is drawn from these tables.
+"""
 
 from __future__ import annotations
 
 from enum import IntEnum
 from typing import NamedTuple
 
-from firmware_py.core.types import Action
+from firmware_py.core.types import Action, Mode
 
 
 class State(IntEnum):
-    """What a body does."""
+    """Whether a body's thrusters may turn."""
 
     DISARMED = 0
-    HOLD = 1
-    TRACK = 2
-    ESTOP = 3
+    ARMED = 1
+    ESTOP = 2
+    """Latched: left by CLEAR_ESTOP alone."""
+
+
+class Trigger(IntEnum):
+    """What makes the supervisor look into its table."""
+
+    ESTOP_FRAME = 0
+    """An ESTOP frame came from the bus."""
+    ESTOP = 1
+    CLEAR_ESTOP = 2
+    DISARM = 3
+    ARM = 4
+    FORCED_ARM = 5
+    SET_MODE = 6
+    HOLD = 7
+    TRACK = 8
+    DOCK = 9
+    UNDOCK = 10
+    SET_POINT = 11
+    STICKS = 12
+    MOTOR_TEST = 13
+    TEST_OVER = 14
+    """The motor test that armed the body is over."""
+    FAILSAFE_HOLD = 15
+    FAILSAFE_DEPTH = 16
+    FAILSAFE_SURFACE = 17
+    FAILSAFE_DISARM = 18
+
+
+TRIGGERS = {action: Trigger[action.name] for action in Action if action.name in Trigger.__members__}
+"""Trigger of each request; a request without one is not the supervisor's business."""
 
 
 class Guard(IntEnum):
-    """What must hold for a transition, checked by the supervisor."""
+    """What must hold for a transition."""
 
     ALWAYS = 0
-    MAY_ARM = 1
-    ESTOP_CLEAR = 2
+    ARMING_CHECKS = 1
+    """Every arming check, and what the chosen mode needs."""
+    FORCED_CHECKS = 2
+    """Those arming checks that may not be skipped, and what the chosen mode needs."""
+    MODE_NEEDS = 3
+    """What the wanted mode needs, and no fail-safe forbids it."""
+    ESTOP_QUIET = 4
+    """No ESTOP frame came of late."""
+    IN_MOTOR_DETECT = 5
+    """The mode is MOTOR_DETECT."""
+
+
+class Effect(IntEnum):
+    """What guidance does when a transition is made."""
+
+    NOTHING = 0
+    STOP = 1
+    """Thrusters stop."""
+    ENTER_MODE = 2
+    """Steer by the new mode, from where the body is."""
+    HOLD_AT = 3
+    """Go to the given place and hold it, or hold here."""
+    FOLLOW = 4
+    """Follow the given trajectory."""
+    TAKE_POINT = 5
+    """Note the newest streamed set-point."""
+    TAKE_STICKS = 6
+    """Note the pilot's sticks."""
+    TEST_MOTOR = 7
+    """Turn the given thruster."""
 
 
 class Transition(NamedTuple):
     """One row."""
 
     state: State
-    trigger: Action
+    trigger: Trigger
     guard: Guard
+    effect: Effect
     next_state: State
+    mode: Mode | None = None
+    """The mode afterwards; None: the one that the request names, or as before."""
 
 
-ARMED = frozenset({State.HOLD, State.TRACK})
+ARMED = frozenset({State.ARMED})
 """States in which thrusters may turn."""
 
+D, A, E = State
+T, G, F = Trigger, Guard, Effect
+
 TABLE = (
-    Transition(State.DISARMED, Action.ARM, Guard.MAY_ARM, State.HOLD),
-    Transition(State.HOLD, Action.DISARM, Guard.ALWAYS, State.DISARMED),
-    Transition(State.TRACK, Action.DISARM, Guard.ALWAYS, State.DISARMED),
-    Transition(State.HOLD, Action.HOLD, Guard.ALWAYS, State.HOLD),
-    Transition(State.TRACK, Action.HOLD, Guard.ALWAYS, State.HOLD),
-    Transition(State.HOLD, Action.TRACK, Guard.ALWAYS, State.TRACK),
-    Transition(State.TRACK, Action.TRACK, Guard.ALWAYS, State.TRACK),
-    Transition(State.DISARMED, Action.ESTOP, Guard.ALWAYS, State.ESTOP),
-    Transition(State.HOLD, Action.ESTOP, Guard.ALWAYS, State.ESTOP),
-    Transition(State.TRACK, Action.ESTOP, Guard.ALWAYS, State.ESTOP),
-    Transition(State.ESTOP, Action.CLEAR_ESTOP, Guard.ESTOP_CLEAR, State.DISARMED),
+    Transition(D, T.ESTOP_FRAME, G.ALWAYS, F.STOP, E),
+    Transition(D, T.ESTOP, G.ALWAYS, F.STOP, E),
+    Transition(D, T.CLEAR_ESTOP, G.ALWAYS, F.NOTHING, D),
+    Transition(D, T.DISARM, G.ALWAYS, F.NOTHING, D),
+    Transition(D, T.ARM, G.ARMING_CHECKS, F.ENTER_MODE, A),
+    Transition(D, T.FORCED_ARM, G.FORCED_CHECKS, F.ENTER_MODE, A),
+    Transition(D, T.SET_MODE, G.ALWAYS, F.NOTHING, D),
+    Transition(D, T.SET_POINT, G.ALWAYS, F.TAKE_POINT, D),
+    Transition(D, T.STICKS, G.ALWAYS, F.TAKE_STICKS, D),
+    Transition(D, T.MOTOR_TEST, G.FORCED_CHECKS, F.TEST_MOTOR, A, Mode.MOTOR_DETECT),
+    Transition(A, T.ESTOP_FRAME, G.ALWAYS, F.STOP, E),
+    Transition(A, T.ESTOP, G.ALWAYS, F.STOP, E),
+    Transition(A, T.CLEAR_ESTOP, G.ALWAYS, F.NOTHING, A),
+    Transition(A, T.DISARM, G.ALWAYS, F.STOP, D),
+    Transition(A, T.ARM, G.ALWAYS, F.NOTHING, A),
+    Transition(A, T.FORCED_ARM, G.ALWAYS, F.NOTHING, A),
+    Transition(A, T.SET_MODE, G.MODE_NEEDS, F.ENTER_MODE, A),
+    Transition(A, T.HOLD, G.MODE_NEEDS, F.HOLD_AT, A, Mode.POSHOLD),
+    Transition(A, T.TRACK, G.MODE_NEEDS, F.FOLLOW, A, Mode.AUTO),
+    Transition(A, T.DOCK, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.DOCK),
+    Transition(A, T.UNDOCK, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.DOCK),
+    Transition(A, T.SET_POINT, G.ALWAYS, F.TAKE_POINT, A),
+    Transition(A, T.STICKS, G.ALWAYS, F.TAKE_STICKS, A),
+    Transition(A, T.MOTOR_TEST, G.IN_MOTOR_DETECT, F.TEST_MOTOR, A),
+    Transition(A, T.TEST_OVER, G.IN_MOTOR_DETECT, F.STOP, D, Mode.POSHOLD),
+    Transition(A, T.FAILSAFE_HOLD, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.POSHOLD),
+    Transition(A, T.FAILSAFE_DEPTH, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.ALT_HOLD),
+    Transition(A, T.FAILSAFE_SURFACE, G.ALWAYS, F.ENTER_MODE, A, Mode.SURFACE),
+    Transition(A, T.FAILSAFE_DISARM, G.ALWAYS, F.STOP, D),
+    Transition(E, T.ESTOP_FRAME, G.ALWAYS, F.NOTHING, E),
+    Transition(E, T.ESTOP, G.ALWAYS, F.NOTHING, E),
+    Transition(E, T.CLEAR_ESTOP, G.ESTOP_QUIET, F.NOTHING, D),
+    Transition(E, T.DISARM, G.ALWAYS, F.NOTHING, E),
+    Transition(E, T.SET_POINT, G.ALWAYS, F.TAKE_POINT, E),
+    Transition(E, T.STICKS, G.ALWAYS, F.TAKE_STICKS, E),
 )
 
 ROWS = {(row.state, row.trigger): row for row in TABLE}
+
+
+class Need(IntEnum):
+    """What a mode cannot do without."""
+
+    ATTITUDE = 0
+    DEPTH = 1
+    POSITION = 2
+    PILOT = 3
+
+
+class ModeRow(NamedTuple):
+    """One mode."""
+
+    mode: Mode
+    needs: frozenset[Need]
+    by_pilot: bool
+    """Sticks steer it: the pilot may always take it, whatever fail-safe is on."""
+    request: bool
+    """SET_MODE may ask for it."""
+
+
+MODE_TABLE = (
+    ModeRow(Mode.MANUAL, frozenset({Need.PILOT}), True, True),
+    ModeRow(Mode.STABILIZE, frozenset({Need.ATTITUDE, Need.PILOT}), True, True),
+    ModeRow(Mode.ALT_HOLD, frozenset({Need.ATTITUDE, Need.DEPTH}), True, True),
+    ModeRow(Mode.POSHOLD, frozenset({Need.ATTITUDE, Need.POSITION}), False, True),
+    ModeRow(Mode.AUTO, frozenset({Need.ATTITUDE, Need.POSITION}), False, True),
+    ModeRow(Mode.GUIDED, frozenset({Need.ATTITUDE, Need.POSITION}), False, True),
+    ModeRow(Mode.SURFACE, frozenset(), False, True),
+    ModeRow(Mode.MOTOR_DETECT, frozenset(), False, True),
+    ModeRow(Mode.DOCK, frozenset({Need.ATTITUDE, Need.POSITION}), False, False),
+)
+
+MODES = {row.mode: row for row in MODE_TABLE}

@@ -15,8 +15,9 @@ from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.capability.layout import FRAMES, Layout, of_modules, of_thrusters
 from firmware_py.prepare.capability.polycubes import Cells, polycubes, poses
 from firmware_py.prepare.capability.power import electrical_power, least_squares_forces
+from firmware_py.prepare.capability.programs import reach_by_programs
 from firmware_py.prepare.capability.task import Task, wrenches_along
-from firmware_py.prepare.capability.wrench import WrenchSpace, reach_by_programs
+from firmware_py.prepare.capability.wrench import WrenchSpace
 from firmware_py.prepare.drag_cache import DragCache
 
 _STILL = 1e-6
@@ -76,7 +77,7 @@ def rank(
         progress: called with shapes done and shapes in all.
 
     Raises:
-        ValueError: a count without a list of shapes. DescriptionError: the vehicle cannot be docked to its like.
+        DescriptionError: a count without a list of shapes, or a vehicle that cannot be docked to its like.
     """
     shapes = polycubes(count)
     path = task.trajectory.path() if task.trajectory else None

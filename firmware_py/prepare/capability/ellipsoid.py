@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_GAP = 1e-10
+_GAP = 1e-9
 """Wanted distance from the optimum, in log det."""
 
 _GROWTH = 20.0
 """Factor of the barrier's weight from one centring to the next (Boyd and Vandenberghe, 11.3)."""
 
-_CLOSE = 1e-3
-"""Squared Newton decrement below which full steps are safe."""
+_CLOSE = 0.05
+"""Squared Newton decrement below which a full step stays inside; what it leaves is this, over the barrier's weight."""
 
 _MOST_STEPS = 200
 """Newton steps of one centring; ten are usual."""
@@ -119,10 +119,9 @@ class _Barrier:
         return gradient, hessian
 
     def centred(self, p: np.ndarray, weight: float) -> np.ndarray:
-        """The minimum for one weight, by Newton's method with backtracking.
+        """Close to the minimum for one weight, by Newton's method with backtracking.
 
-        The function is self-concordant: below _CLOSE a full step stays inside and squares what is left of the error, and
-        comparing values would only compare rounding.
+        The function is self-concordant; below _CLOSE comparing values would only compare rounding.
         """
         for _ in range(_MOST_STEPS):
             gradient, hessian = self.derivatives(p, weight)

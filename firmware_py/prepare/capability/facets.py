@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
+from firmware_py.description.schema import DescriptionError
 from firmware_py.prepare.capability.layout import Layout
 
 MOST_SUBSETS = 3_000_000
@@ -157,10 +158,10 @@ def normals_of(layout: Layout) -> np.ndarray:
     Their torque part is scaled so that normals . wrench is in N.
 
     Raises:
-        ValueError: more than MOST_SUBSETS subsets.
+        DescriptionError: more than MOST_SUBSETS subsets.
     """
     if subsets(layout) > MOST_SUBSETS:
-        raise ValueError(f"{layout.name}: {layout.count} thrusters are too many for facets")
+        raise DescriptionError(f"{layout.name}: {layout.count} thrusters are too many for facets")
     columns = _distinct(layout)
     left = np.linalg.svd(layout.scaled)[0][:, layout.rank :]
     out = np.zeros((max(subsets(layout), 1), 6))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from firmware_py.description.schema import DescriptionError
 from firmware_py.prepare.lattice import MATRICES
 
 MOST_CUBES = 5
@@ -18,10 +19,10 @@ _STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 def polycubes(count: int) -> list[Cells]:
     """Every distinct shape of `count` cubes, mirror images apart: 1, 1, 2, 8, 29 (OEIS A000162). Sorted.
 
-    Two shapes are the same if one of the 24 rotations and a shift take one to the other; a robot cannot be mirrored.
+    Raises DescriptionError for another count. Two shapes are the same if one of the 24 rotations and a shift take one to the other; a robot cannot be mirrored.
     """
     if not 1 <= count <= MOST_CUBES:
-        raise ValueError(f"shapes are listed for 1 to {MOST_CUBES} modules, not {count}")
+        raise DescriptionError(f"shapes are listed for 1 to {MOST_CUBES} modules, not {count}")
     shapes: set[Cells] = {((0, 0, 0),)}
     for _ in range(count - 1):
         shapes = {canonical((*shape, cell)) for shape in shapes for cell in _neighbours(shape)}

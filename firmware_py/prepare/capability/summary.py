@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from firmware_py.prepare.capability.ellipsoid import Ellipsoid, largest_inscribed
+from firmware_py.prepare.capability.facets import MOST_SUBSETS, subsets
 from firmware_py.prepare.capability.layout import AXES, FRAMES, Layout
 from firmware_py.prepare.capability.morphology import Harmonics, Shape
 from firmware_py.prepare.capability.power import PowerSpace, power_space
+from firmware_py.prepare.capability.programs import ProgramSpace, reach_by_programs
 from firmware_py.prepare.capability.sphere import fibonacci
-from firmware_py.prepare.capability.wrench import Section, WrenchSpace, embed, reach_by_programs
+from firmware_py.prepare.capability.wrench import Section, WrenchSpace, embed
 
 DIRECTIONS = 1000
 """Directions over the sphere, as in the paper's drag table."""
@@ -87,14 +89,11 @@ def characterise(
         sizes: |w| of the power space by frame; 1 N and 1 N m when left out.
         programs: solve the linear programs too and compare.
         progress: called with what comes next.
-
-    Raises:
-        ValueError: too many thrusters for facets.
     """
     directions = fibonacci(count)
     harmonics = Harmonics(directions)
     say = progress or (lambda text: None)
-    space = WrenchSpace(layout)
+    space = wrench_space(layout)
     reach: dict[str, dict[str, Reach]] = {}
     power: dict[str, PowerSpace] = {}
     differ = 0.0 if programs else math.nan
@@ -124,15 +123,18 @@ def characterise(
     )
 
 
+def wrench_space(layout: Layout) -> WrenchSpace | ProgramSpace:
+    """By facets, or by linear programs where there are too many thrusters for all facets."""
+    return WrenchSpace(layout) if subsets(layout) <= MOST_SUBSETS else ProgramSpace(layout)
+
+
 def _known(power_w: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(power_w), power_w, 0.0)
 
 
 def _all_normalisations(layout: Layout, frame: str, directions: np.ndarray, harmonics: Harmonics) -> dict[str, Reach]:
-    normals = WrenchSpace(layout).normals
-
     def found(how: str) -> Reach:
-        return _reach(WrenchSpace(layout.normalised(how), 0, normals), frame, directions, harmonics)
+        return _reach(wrench_space(layout.normalised(how)), frame, directions, harmonics)
 
     physical, unit = found("physical"), found("unit_thrust")
     share = float(layout.normalised("equal_total_thrust").f_max[0])
@@ -153,7 +155,7 @@ def _scaled(reach: Reach, share: float) -> Reach:
     )
 
 
-def _reach(space: WrenchSpace, frame: str, directions: np.ndarray, harmonics: Harmonics) -> Reach:
+def _reach(space: WrenchSpace | ProgramSpace, frame: str, directions: np.ndarray, harmonics: Harmonics) -> Reach:
     section = space.section(frame)
     if section is None:
         radius = space.reach(embed(directions, FRAMES[frame]))

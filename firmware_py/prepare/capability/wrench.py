@@ -1,20 +1,16 @@
-"""Reachable wrench space: how far the thrusters can push in any direction, exactly by facets and again by linear programs.
+"""Reachable wrench space: how far the thrusters can push in any direction, exactly, by the facets of the zonotope.
 
 lambda(d) = max lambda so that J f = lambda [d; 0] (force frame) or lambda [0; d] (torque frame), f_min <= f <= f_max.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from firmware_py.prepare.capability import facets
 from firmware_py.prepare.capability.layout import FRAMES, Layout
-
-_BATCH = 100
-"""Linear programs solved as one block-diagonal program: 0.13 ms each for 8 thrusters, 1.6 ms each when alone."""
 
 _PARALLEL = 1e-9
 """Share of the largest below which a facet's normal does not enter a frame."""
@@ -54,7 +50,7 @@ class WrenchSpace:
         normals: (m, 6) of facets.normals_of.
 
     Raises:
-        ValueError: more thrusters than facets can be found for; use `reach_by_programs`.
+        DescriptionError: more thrusters than facets can be found for; programs.ProgramSpace serves any number.
     """
 
     def __init__(self, layout: Layout, dead: int = 0, normals: np.ndarray | None = None) -> None:
@@ -75,7 +71,7 @@ class WrenchSpace:
         """(k,) largest factor of each of (k, 6) wrenches; 0 for what the layout cannot push at all."""
         wrenches = np.atleast_2d(np.asarray(wrenches, dtype=float))
         factor = facets.reach(self.layout, self.normals, self._supports, wrenches)
-        return np.where(_in_span(self.layout, wrenches), factor, 0.0)
+        return np.where(in_span(self.layout, wrenches), factor, 0.0)
 
     def worst(self, frame: str) -> float:
         """Smallest lambda over all directions of a frame, N or N m: the distance to the nearest facet."""
@@ -99,7 +95,7 @@ class WrenchSpace:
         keep = size > _PARALLEL * float(size.max())
         normals = both[keep] / size[keep, None]
         offsets = self._supports.T.reshape(-1)[keep] / size[keep]
-        return Section(components, *_irredundant(normals, offsets))
+        return Section(components, *irredundant(normals, offsets))
 
 
 def free_components(layout: Layout, frame: str) -> tuple[int, ...]:
@@ -107,14 +103,15 @@ def free_components(layout: Layout, frame: str) -> tuple[int, ...]:
     return tuple(c for c in FRAMES[frame] if np.any(layout.matrix[c] != 0.0) or c not in layout.passive)
 
 
-def _in_span(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
+def in_span(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
+    """(k,) whether each of (k, 6) wrenches is a combination of the thrusters."""
     scaled = wrenches / np.array([1.0, 1.0, 1.0, *[layout.lever_m] * 3])
     left = np.linalg.svd(layout.scaled)[0][:, layout.rank :]
     size = np.linalg.norm(scaled, axis=1)
     return np.asarray(np.linalg.norm(scaled @ left, axis=1) <= 1e-6 * np.maximum(size, 1e-300))
 
 
-def _irredundant(normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def irredundant(normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The rows of normals @ x <= offsets that are facets: corners of the hull of normals / offsets (polar duality)."""
     from scipy.spatial import ConvexHull  # takes a third of a second to import
 
@@ -134,48 +131,3 @@ def embed(directions: np.ndarray, components: tuple[int, ...]) -> np.ndarray:
     wrenches = np.zeros((len(directions), 6))
     wrenches[:, components] = directions
     return wrenches
-
-
-def reach_by_programs(layout: Layout, wrenches: np.ndarray, progress: Callable[[int], None] | None = None) -> np.ndarray:
-    """(k,) largest factor of each of (k, 6) wrenches, by linear programs (HiGHS), `_BATCH` of them block-diagonal in one.
-
-    Args:
-        progress: called with the number of programs solved so far.
-
-    Raises:
-        RuntimeError: the solver gave up.
-    """
-    wrenches = np.atleast_2d(np.asarray(wrenches, dtype=float))
-    factor = np.zeros(len(wrenches))
-    for begin in range(0, len(wrenches), _BATCH):
-        factor[begin : begin + _BATCH] = _solve(layout, wrenches[begin : begin + _BATCH])
-        if progress:
-            progress(min(begin + _BATCH, len(wrenches)))
-    return factor
-
-
-def _solve(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
-    """(k,) solution of one block-diagonal program; force in units of the largest limit, torque over the lever arm."""
-    from scipy.optimize import linprog  # these take half a second to import
-    from scipy.sparse import block_diag
-
-    unit = float(max(layout.f_max.max(), -layout.f_min.min()))
-    rows = np.array([1.0, 1.0, 1.0, *[layout.lever_m] * 3])
-    targets = wrenches / rows
-    sizes = np.linalg.norm(targets, axis=1)
-    targets = targets / np.where(sizes > 0.0, sizes, 1.0)[:, None]
-    blocks = [np.column_stack([layout.scaled, -target]) for target in targets]
-    k, n = len(wrenches), layout.count
-    limits = np.column_stack([np.r_[layout.f_min / unit, 0.0], np.r_[layout.f_max / unit, np.inf]])
-    cost = np.tile(np.r_[np.zeros(n), -1.0], k)
-    result = linprog(
-        cost,
-        A_eq=block_diag(blocks, format="csc"),
-        b_eq=np.zeros(6 * k),
-        bounds=np.tile(limits, (k, 1)),
-        method="highs-ds",
-        options={"primal_feasibility_tolerance": 1e-9, "dual_feasibility_tolerance": 1e-9},
-    )
-    if result.x is None:
-        raise RuntimeError(f"{layout.name}: the linear program failed: {result.message}")
-    return np.asarray(result.x.reshape(k, n + 1)[:, -1] * unit / np.where(sizes > 0.0, sizes, 1.0))

@@ -1,0 +1,143 @@
+"""The process on the vehicle: `modcube run`. It stays disarmed until it is told otherwise, and disarms before it ends."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from firmware_py.app.firmware import BusFrame, compose
+from firmware_py.app.lockstep import Observer
+from firmware_py.app.realtime import RealTimeLoop, open_loop
+from firmware_py.core.transitions import ARMED
+from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
+from firmware_py.description.fleet import Fleet
+from firmware_py.description.parameters import Parameters
+from firmware_py.runtime.realtime import quiet_garbage
+from firmware_py.runtime.recorder import Recorder
+
+FAREWELL_TICKS = 10
+"""Ticks that go on saying `disarmed` after a stop was asked for."""
+ARM_EVERY_S = 1.0
+"""How often arming is tried again with `--hold`."""
+FLUSH_EVERY_S = 0.5
+
+
+class Summary(NamedTuple):
+    """How a run went."""
+
+    ticks: int
+    overruns: int
+    skipped: int
+    unanswered: int
+    lateness_p50_ns: int
+    lateness_p99_ns: int
+    lateness_worst_ns: int
+
+
+@dataclass(slots=True)
+class Operator:
+    """Stands in for a person: arms and holds when told to, and disarms when the process is asked to stop."""
+
+    bodies: Sequence[int]
+    rate_hz: int
+    hold: bool
+    stopping: bool = False
+    farewell: int = 0
+    _ticks: int = 0
+
+    def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
+        """The requests of this tick."""
+        self._ticks += 1
+        if self.stopping:
+            self.farewell += 1
+            return [Request(Action.DISARM, body) for body in self.bodies] if self.farewell == 1 else []
+        if not self.hold or last is None or self._ticks % round(ARM_EVERY_S * self.rate_hz):
+            return []
+        return [Request(Action.ARM, record.body) for record in last.records if record.state not in ARMED]
+
+    def is_done(self, tick: int, outputs: Outputs) -> bool:
+        """Whether every module has been told for long enough."""
+        return self.farewell >= FAREWELL_TICKS
+
+
+def run_vehicle(
+    fleet: Fleet, parameters: Parameters, hold: bool = False, out: Path | None = None, say: Callable[[str], None] = print
+) -> Summary:
+    """Runs the firmware against the clock until SIGINT or SIGTERM. Raises DescriptionError and PortError before the first tick."""
+    firmware = compose(fleet, parameters)
+    operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
+    with ExitStack() as stack:
+        observers: list[Observer] = [telling(say)]
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            recorder = Recorder(out, {"rate_hz": fleet.rate_hz})
+            stack.callback(recorder.close)
+            observers.append(recording(recorder, fleet.rate_hz))
+        loop = open_loop(stack, firmware, operator.requests, observers)
+        loop.listen()
+        stack.enter_context(_stopping_by_signal(operator))
+        stack.enter_context(quiet_garbage())
+        say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
+        loop.run(operator.is_done)
+        return _summary(loop)
+
+
+def telling(say: Callable[[str], None]) -> Observer:
+    """An observer that says every event."""
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        for event in outputs.events:
+            say(event_line(outputs.time_ns, event))
+
+    return observe
+
+
+def event_line(time_ns: int, event: Event) -> str:
+    """One event as a line."""
+    return f"{time_ns * 1e-9:9.3f} s  {event.text}"
+
+
+def recording(recorder: Recorder, rate_hz: int) -> Observer:
+    """An observer that writes every tick to `recorder`, in the order in which frames went over the bus."""
+    flush_every = max(1, round(FLUSH_EVERY_S * rate_hz))
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        buses = sorted({bus for bus, _ in sent})
+        syncs = len(buses)
+        for bus in buses:
+            recorder.sent(outputs.time_ns, bus, [f for b, f in sent[:syncs] if b == bus])
+            recorder.received(outputs.time_ns, bus, [f for b, f in received if b == bus])
+            recorder.sent(outputs.time_ns, bus, [f for b, f in sent[syncs:] if b == bus])
+        recorder.record(inputs, outputs)
+        if outputs.tick % flush_every == 0:
+            outputs.events += recorder.flush()
+
+    return observe
+
+
+@contextmanager
+def _stopping_by_signal(operator: Operator) -> Iterator[None]:
+    """SIGINT and SIGTERM ask for a stop instead of killing the process."""
+
+    def stop(number: int, frame: object) -> None:
+        operator.stopping = True
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _summary(loop: RealTimeLoop) -> Summary:
+    keeper = loop.rate_keeper
+    late = keeper.lateness
+    return Summary(
+        late.total, keeper.overruns, keeper.skipped, loop.unanswered,
+        late.quantile_ns(0.5), late.quantile_ns(0.99), late.worst_ns,
+    )  # fmt: skip

@@ -1,0 +1,104 @@
+"""What the robot says it is. Clients choose the encoding of modes by it; the two overlap, so one holds and none is guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from firmware_py.core.types import Mode
+
+AUTOPILOT_GENERIC, AUTOPILOT_ARDUPILOT = 0, 3
+TYPE_SUBMARINE = 12
+COMPONENT_AUTOPILOT = 1
+"""Clients find no autopilot under another component id."""
+CUSTOM_MODE_ENABLED, ARMED = 1, 128
+_FLAGS: Mapping[Mode, int] = {
+    Mode.MANUAL: 64,
+    Mode.STABILIZE: 64 | 16,
+    Mode.ALT_HOLD: 64 | 16,
+    Mode.POSHOLD: 64 | 16 | 8,
+    Mode.GUIDED: 16 | 8,
+    Mode.AUTO: 16 | 8 | 4,
+    Mode.SURFACE: 16 | 8 | 4,
+    Mode.DOCK: 16 | 8 | 4,
+    Mode.MOTOR_DETECT: 64,
+}
+"""MAV_MODE_FLAG: manual input 64, stabilize 16, guided 8, auto 4."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """One encoding.
+
+    Attributes:
+        autopilot: MAV_AUTOPILOT.
+        numbers: custom mode of each mode; the first is what is reported.
+        pairs: the second and third parameter of DO_SET_MODE are a main and a sub mode, as PX4 has it.
+        mission_has_home: item 0 of a mission is the home position and is not flown, as ArduPilot has it.
+    """
+
+    name: str
+    autopilot: int
+    numbers: Mapping[Mode, tuple[int, ...]]
+    pairs: bool
+    mission_has_home: bool
+
+    def custom_mode(self, mode: Mode) -> int:
+        """The number that HEARTBEAT carries."""
+        return self.numbers[mode][0]
+
+    def mode(self, custom: int) -> Mode | None:
+        """The mode of a number, or None."""
+        return next((mode for mode, numbers in self.numbers.items() if custom in numbers), None)
+
+    def mode_of_command(self, main: float, sub: float) -> Mode | None:
+        """The mode of DO_SET_MODE's parameters 2 and 3, which may be NaN."""
+        if main != main or not 0 <= main < 2**16:
+            return None
+        second = int(sub) if 0 <= sub < 256 else 0  # NaN fails the comparison
+        return self.mode(px4(int(main), second) if self.pairs else int(main))
+
+
+def px4(main: int, sub: int = 0) -> int:
+    """PX4's custom mode: main mode in bits 16 to 23, sub mode above."""
+    return (main & 0xFF) << 16 | (sub & 0xFF) << 24
+
+
+def base_mode(mode: Mode, armed: bool) -> int:
+    """MAV_MODE_FLAG bits of HEARTBEAT."""
+    return CUSTOM_MODE_ENABLED | _FLAGS[mode] | (ARMED if armed else 0)
+
+
+GENERIC = Identity(
+    name="generic",
+    autopilot=AUTOPILOT_GENERIC,
+    numbers={
+        Mode.MANUAL: (px4(1),),
+        Mode.ALT_HOLD: (px4(2),),
+        Mode.POSHOLD: (px4(4, 3), px4(3)),  # hold, position
+        Mode.AUTO: (px4(4, 4),),  # mission
+        Mode.GUIDED: (px4(6),),  # offboard
+        Mode.STABILIZE: (px4(7),),
+        Mode.SURFACE: (px4(4, 6), px4(4, 5)),  # land, return
+        Mode.DOCK: (px4(4, 9),),  # precision land
+        Mode.MOTOR_DETECT: (px4(4, 1),),  # ready
+    },
+    pairs=True,
+    mission_has_home=False,
+)
+
+ARDUSUB = Identity(
+    name="ardusub",
+    autopilot=AUTOPILOT_ARDUPILOT,
+    numbers={mode: (int(mode),) for mode in Mode},
+    pairs=False,
+    mission_has_home=True,
+)
+
+IDENTITIES = {identity.name: identity for identity in (GENERIC, ARDUSUB)}
+"""By the name that the command line takes."""
+
+SETTABLE = (
+    Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.SURFACE, Mode.MOTOR_DETECT,
+)  # fmt: skip
+"""Modes that a person may choose; DOCK is entered by asking for it."""

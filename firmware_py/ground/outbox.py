@@ -1,0 +1,66 @@
+"""What one system sends: to whom, and how often. Each channel has its own sequence and its own rates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from firmware_py.ground.dialect import Dialect
+from firmware_py.ground.identity import COMPONENT_AUTOPILOT
+from firmware_py.ground.signing import Signing
+from firmware_py.ground.wire import Encoder
+
+NS_PER_US = 1_000
+
+
+class Outgoing(NamedTuple):
+    """A frame for one channel."""
+
+    channel: int
+    frame: bytes
+
+
+class Rates:
+    """Which message is due on one channel."""
+
+    def __init__(self, intervals_ns: Mapping[str, int], now_ns: int) -> None:
+        self.intervals_ns = dict(intervals_ns)
+        self._next_ns = dict.fromkeys(intervals_ns, now_ns)
+
+    def set(self, name: str, interval_ns: int, now_ns: int) -> None:
+        """Send `name` every `interval_ns`; 0 ends it."""
+        if interval_ns <= 0:
+            self.intervals_ns.pop(name, None)
+            self._next_ns.pop(name, None)
+        else:
+            self.intervals_ns[name] = interval_ns
+            self._next_ns[name] = now_ns
+
+    def due(self, now_ns: int) -> list[str]:
+        """What is to be sent now; what was missed is not made up."""
+        names = [name for name, next_ns in self._next_ns.items() if next_ns <= now_ns]
+        for name in names:
+            interval = self.intervals_ns[name]
+            self._next_ns[name] += interval * ((now_ns - self._next_ns[name]) // interval + 1)
+        return names
+
+
+class Outbox:
+    """Frames of one system, until somebody takes them."""
+
+    def __init__(self, dialect: Dialect, signing: Signing, system: int, frames: list[Outgoing]) -> None:
+        self._dialect, self._signing = dialect, signing
+        self.system = system
+        self._frames = frames
+        self._encoders: dict[int, Encoder] = {}
+
+    def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
+        """Send one message. Raises KeyError for a message or field that there is not."""
+        encoder = self._encoders.get(channel)
+        if encoder is None:
+            encoder = self._encoders[channel] = Encoder(self._dialect, self._signing, self.system, COMPONENT_AUTOPILOT)
+        self._frames.append(Outgoing(channel, encoder.encode(name, values, channel)))
+
+    def forget(self, channel: int) -> None:
+        """The channel is gone."""
+        self._encoders.pop(channel, None)

@@ -1,0 +1,135 @@
+"""What is known of the fleet, gathered tick by tick from Inputs and Outputs: the one thing that telemetry reads."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.transitions import ARMED, State
+from firmware_py.core.types import BodyRecord, Event, Inputs, Mode, ModuleInputs, Outputs
+from firmware_py.description.parameters import Supervision
+
+_THRUSTERS = 8
+_MOST_EVENTS = 64
+NEVER_NS = -(2**62)
+
+
+@dataclass(slots=True)
+class ModulePicture:
+    """The newest of every slow reading of one module; NaN before the first."""
+
+    voltage_v: float = math.nan
+    current_a: float = math.nan
+    pressure_pa: float = math.nan
+    cabin_pressure_pa: float = math.nan
+    cabin_temperature_c: float = math.nan
+    leak: bool = False
+    dock_current_ma: list[float] = field(default_factory=lambda: [math.nan] * 6)
+    rpm: list[float] = field(default_factory=lambda: [0.0] * _THRUSTERS)
+    esc_current_a: list[float] = field(default_factory=lambda: [0.0] * _THRUSTERS)
+    esc_status: list[int] = field(default_factory=lambda: [0] * _THRUSTERS)
+    esc_frames: int = 0
+    command: np.ndarray = field(default_factory=lambda: np.zeros(_THRUSTERS))
+    """(8,) share of full command, as sent."""
+    gyro_ns: int = NEVER_NS
+    accel_ns: int = NEVER_NS
+    pressure_ns: int = NEVER_NS
+    answered_ns: int = NEVER_NS
+
+    def take(self, inputs: ModuleInputs, time_ns: int) -> None:
+        """Keep what is fresh."""
+        if inputs.gyro is not None:
+            self.gyro_ns = time_ns
+        if inputs.accel is not None:
+            self.accel_ns = time_ns
+        if inputs.pressure_pa is not None:
+            self.pressure_ns, self.pressure_pa = time_ns, inputs.pressure_pa
+        if inputs.answered:
+            self.answered_ns = time_ns
+        if inputs.voltage_v is not None:
+            self.voltage_v = inputs.voltage_v
+        if inputs.current_a is not None:
+            self.current_a = inputs.current_a
+        if inputs.cabin_pressure_pa is not None:
+            self.cabin_pressure_pa = inputs.cabin_pressure_pa
+        if inputs.cabin_temperature_c is not None:
+            self.cabin_temperature_c = inputs.cabin_temperature_c
+        if inputs.leak is not None:
+            self.leak = inputs.leak
+        for i, current in enumerate(inputs.dock_current_ma):
+            if current is not None:
+                self.dock_current_ma[i] = current
+        for esc in inputs.esc:
+            self.esc_frames += 1
+            pair = slice(esc.first, esc.first + 2)
+            self.rpm[pair], self.esc_current_a[pair], self.esc_status[pair] = esc.rpm, esc.current_a, esc.status
+
+
+class Picture:
+    """The fleet as the last tick left it."""
+
+    def __init__(self, modules: int, supervision: Supervision) -> None:
+        self._supervision = supervision
+        self.modules = [ModulePicture() for _ in range(modules)]
+        self.records: dict[int, BodyRecord] = {}
+        self.bodies: dict[int, Body] = {}
+        self.time_ns = 0
+        self.ticks = 0
+        self.estop = False
+        self.dropped_frames = 0
+        self.events: deque[Event] = deque(maxlen=_MOST_EVENTS)
+        """Not yet told to anybody."""
+
+    def observe(self, inputs: Inputs, outputs: Outputs, bodies: Sequence[Body]) -> None:
+        """Take one tick in."""
+        self.time_ns = outputs.time_ns
+        self.ticks += 1
+        self.estop = inputs.estop or outputs.estop
+        self.dropped_frames = inputs.dropped_frames
+        for module, fresh, command in zip(self.modules, inputs.modules, outputs.modules, strict=True):
+            module.take(fresh, outputs.time_ns)
+            module.command = command.thrusters
+        self.records = {record.body: record for record in outputs.records}
+        self.bodies = {body.index: body for body in bodies}
+        self.events += outputs.events
+
+    def members(self, body: int) -> tuple[int, ...]:
+        """Fleet indices of a body's modules."""
+        return self.bodies[body].modules if body in self.bodies else (body,)
+
+    def is_armed(self, body: int) -> bool:
+        """Whether its thrusters may turn."""
+        record = self.records.get(body)
+        return record is not None and record.state in ARMED
+
+    def mode(self, body: int) -> Mode:
+        """How it is steered, or would be once armed."""
+        record = self.records.get(body)
+        if record is None:
+            return Mode.POSHOLD
+        return Mode.AUTO if record.state == State.TRACK else Mode.POSHOLD
+
+    def is_stopped(self, body: int) -> bool:
+        """Whether the e-stop holds it."""
+        record = self.records.get(body)
+        return self.estop or (record is not None and record.state == State.ESTOP)
+
+    def pose_is_fresh(self, body: int) -> bool:
+        """Whether tags were seen lately."""
+        record = self.records.get(body)
+        if record is None or not record.estimate.ready:
+            return False
+        return record.estimate.tag_age_ns <= self._supervision.tag_fresh_ms * 1e6
+
+    def may_arm(self, body: int) -> bool:
+        """Whether ARM would be granted, as far as can be seen from here."""
+        record = self.records.get(body)
+        if record is None or self.is_stopped(body) or not self.pose_is_fresh(body):
+            return False
+        answered = all(self.modules[m].answered_ns == self.time_ns for m in self.members(body))
+        return answered and float(np.max(record.estimate.sigma_p)) <= self._supervision.arm_sigma_m

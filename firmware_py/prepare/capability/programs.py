@@ -1,0 +1,146 @@
+"""Reachable wrench space by linear programs (HiGHS): checks the facets, and serves bodies with too many thrusters for them.
+
+lambda(w) = max lambda so that J f = lambda w, f_min <= f <= f_max. The program's dual is the normal of a facet where w leaves
+the reachable wrenches, so a section's facets can be found one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from firmware_py.prepare.capability.layout import Layout
+from firmware_py.prepare.capability.sphere import fibonacci
+from firmware_py.prepare.capability.wrench import Section, embed, free_components, irredundant
+
+_BATCH = 100
+"""Programs solved as one block-diagonal program: 0.13 ms each for 8 thrusters, 1.6 ms each when alone."""
+
+_FIRST_DIRECTIONS = 40
+"""Directions in which the search for a section's facets begins."""
+
+_BEYOND = 1e-9
+"""A corner of the facets found so far counts as reachable when it is this close, as a share."""
+
+_MOST_ROUNDS = 100
+"""Rounds of the search; six to ten are usual."""
+
+
+def reach_by_programs(layout: Layout, wrenches: np.ndarray, progress: Callable[[int], None] | None = None) -> np.ndarray:
+    """(k,) largest factor of each of (k, 6) wrenches.
+
+    Args:
+        progress: called with the number of programs solved so far.
+
+    Raises:
+        RuntimeError: the solver gave up.
+    """
+    return solve(layout, wrenches, progress)[0]
+
+
+def solve(
+    layout: Layout, wrenches: np.ndarray, progress: Callable[[int], None] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Factors (k,) and duals (k, 6): y . w = 1 with y . v <= factor for every reachable v. Arguments as `reach_by_programs`."""
+    wrenches = np.atleast_2d(np.asarray(wrenches, dtype=float))
+    factor, dual = np.zeros(len(wrenches)), np.zeros(wrenches.shape)
+    for begin in range(0, len(wrenches), _BATCH):
+        part = slice(begin, begin + _BATCH)
+        factor[part], dual[part] = _batch(layout, wrenches[part])
+        if progress:
+            progress(min(begin + _BATCH, len(wrenches)))
+    return factor, dual
+
+
+def _batch(layout: Layout, wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One block-diagonal program; force in units of the largest limit, torque over the lever arm."""
+    from scipy.optimize import linprog  # these take half a second to import
+    from scipy.sparse import block_diag
+
+    unit = float(max(layout.f_max.max(), -layout.f_min.min()))
+    rows = np.array([1.0, 1.0, 1.0, *[layout.lever_m] * 3])
+    targets = wrenches / rows
+    sizes = np.linalg.norm(targets, axis=1)
+    sizes = np.where(sizes > 0.0, sizes, 1.0)
+    targets = targets / sizes[:, None]
+    k, n = len(wrenches), layout.count
+    limits = np.column_stack([np.r_[layout.f_min / unit, 0.0], np.r_[layout.f_max / unit, np.inf]])
+    result = linprog(
+        np.tile(np.r_[np.zeros(n), -1.0], k),
+        A_eq=block_diag([np.column_stack([layout.scaled, -target]) for target in targets], format="csc"),
+        b_eq=np.zeros(6 * k),
+        bounds=np.tile(limits, (k, 1)),
+        method="highs-ds",
+        options={"primal_feasibility_tolerance": 1e-9, "dual_feasibility_tolerance": 1e-9},
+    )
+    if result.x is None:
+        raise RuntimeError(f"{layout.name}: the linear program failed: {result.message}")
+    factor = result.x.reshape(k, n + 1)[:, -1] * unit / sizes
+    dual = result.eqlin.marginals.reshape(k, 6)
+    along = np.sum(dual * targets, axis=1)
+    return factor, dual / np.where(along == 0.0, 1.0, along)[:, None] / rows / sizes[:, None]
+
+
+class ProgramSpace:
+    """As wrench.WrenchSpace, for any number of thrusters: every answer is a linear program."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+
+    def reach(self, wrenches: np.ndarray) -> np.ndarray:
+        """(k,) largest factor of each of (k, 6) wrenches; 0 for what the layout cannot push at all."""
+        return reach_by_programs(self.layout, wrenches)
+
+    def section(self, frame: str) -> Section | None:
+        """The polytope in one frame; None where the layout does not span it.
+
+        Begins with the facets that a few directions meet and then tries the corners of what these enclose: a corner that
+        cannot be reached lies beyond a facet not found yet.
+
+        Raises:
+            RuntimeError: no end was found.
+        """
+        components = free_components(self.layout, frame)
+        if not components or not self.layout.spans(components):
+            return None
+        dimensions = len(components)
+        normals, offsets = np.zeros((0, dimensions)), np.zeros(0)
+        probes = _first_directions(dimensions)
+        for _ in range(_MOST_ROUNDS):
+            factor, dual = solve(self.layout, embed(probes, components))
+            beyond = factor < 1.0 - _BEYOND if len(normals) else np.ones(len(probes), dtype=bool)
+            if not np.any(beyond):
+                return Section(components, normals, offsets)
+            sizes = np.linalg.norm(dual[beyond][:, components], axis=1)
+            heights = _supports(self.layout, dual[beyond]) / sizes
+            normals = np.concatenate([normals, dual[beyond][:, components] / sizes[:, None]])
+            normals, offsets = irredundant(normals, np.concatenate([offsets, heights]))
+            probes = _corners(normals, offsets)
+        raise RuntimeError(f"{self.layout.name}: the facets of the {frame} frame were not all found")
+
+
+def _supports(layout: Layout, normals: np.ndarray) -> np.ndarray:
+    along = normals @ layout.matrix
+    return np.asarray(np.maximum(along * layout.f_max, along * layout.f_min).sum(axis=1))
+
+
+def _first_directions(dimensions: int) -> np.ndarray:
+    if dimensions == 3:
+        return np.concatenate([np.eye(3), -np.eye(3), fibonacci(_FIRST_DIRECTIONS)])
+    if dimensions == 2:
+        turn = 2.0 * np.pi * np.arange(_FIRST_DIRECTIONS) / _FIRST_DIRECTIONS
+        return np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return np.array([[1.0], [-1.0]])
+
+
+def _corners(normals: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """(c, d) corners of {x : normals @ x <= offsets}: faces of the hull of the polar points."""
+    from scipy.spatial import ConvexHull
+
+    if normals.shape[1] == 1:
+        return np.asarray(normals * offsets[:, None])
+    equations = ConvexHull(normals / offsets[:, None]).equations
+    corners = equations[:, :-1] / -equations[:, -1:]
+    _, distinct = np.unique(np.round(corners / np.abs(corners).max(), 9), axis=0, return_index=True)
+    return np.asarray(corners[distinct])

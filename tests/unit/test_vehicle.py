@@ -1,0 +1,246 @@
+"""Vehicle files: thrusters as published, turned from FLU into FRD where the source is FLU; tags on their faces."""
+
+import itertools
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+from scipy.spatial.transform import Rotation
+
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import (
+    FACE_NAMES,
+    FACE_NORMALS,
+    Vehicle,
+    flu_to_frd,
+    is_right_handed,
+    load_vehicle,
+    vehicle_names,
+)
+
+MODULES = ("modcube", "modcube_sim")
+S, A, B = 0.70710678, 0.848048, 0.529919
+
+PUBLISHED = {
+    "modcube": ("FLU", [
+        [0.07, 0.07, -0.07, S, S, 0], [0.07, -0.07, -0.07, S, -S, 0], [-0.07, 0.07, 0.07, -S, S, 0],
+        [-0.07, -0.07, 0.07, -S, -S, 0], [0.07, 0.07, 0.07, 0, S, S], [0.07, -0.07, 0.07, 0, -S, S],
+        [-0.07, 0.07, -0.07, 0, -S, -S], [-0.07, -0.07, -0.07, 0, S, -S],
+    ]),
+    "modcube_sim": ("FLU", [
+        [0.07, 0.07, -0.07, S, -S, 0], [0.07, -0.07, -0.07, S, S, 0], [-0.07, 0.07, 0.07, -S, -S, 0],
+        [-0.07, -0.07, 0.07, -S, S, 0], [0.07, 0.07, 0.07, 0, 0, 1], [0.07, -0.07, 0.07, 0, 0, 1],
+        [-0.07, 0.07, -0.07, 0, 0, 1], [-0.07, -0.07, -0.07, 0, 0, 1],
+    ]),
+    "bluerov2": ("FLU", [
+        [0.14, -0.092, -0.011, S, S, 0], [0.14, 0.092, -0.011, S, -S, 0], [-0.15, -0.092, -0.011, -S, S, 0],
+        [-0.15, 0.092, -0.011, -S, -S, 0], [0, -0.109, 0.066, 0, 0, 1], [0, 0.109, 0.066, 0, 0, 1],
+    ]),
+    "bluerov2_heavy": ("FLU", [
+        [0.14, -0.092, -0.011, S, S, 0], [0.14, 0.092, -0.011, S, -S, 0], [-0.15, -0.092, -0.011, -S, S, 0],
+        [-0.15, 0.092, -0.011, -S, -S, 0], [0.118, -0.215, 0.053, 0, 0, 1], [0.118, 0.215, 0.053, 0, 0, 1],
+        [-0.118, -0.215, 0.053, 0, 0, 1], [-0.118, 0.215, 0.053, 0, 0, 1],
+    ]),
+    "girona500": ("FRD", [
+        [-0.3297, -0.2587, -0.021, 1, 0, 0], [-0.3297, 0.2587, -0.021, 1, 0, 0], [0.5347, 0, -0.3137, 0, 0, 1],
+        [-0.5827, 0, -0.3137, 0, 0, 1], [-0.0627, 0.0307, -0.021, 0, 1, 0],
+    ]),
+    "chasing_m2": ("FLU", [
+        [0.13, -0.1, 0, A, B, 0], [0.13, 0.1, 0, A, -B, 0], [-0.13, -0.1, 0, -A, B, 0], [-0.13, 0.1, 0, -A, -B, 0],
+        [0.13, -0.1, 0.05, 0, 0, 1], [0.13, 0.1, 0.05, 0, 0, 1], [-0.13, -0.1, 0.05, 0, 0, 1],
+        [-0.13, 0.1, 0.05, 0, 0, 1],
+    ]),
+}  # fmt: skip
+"""Axes and rows [position m, direction] as their sources have them; each vehicle file names its source."""
+
+
+def wrench_matrix(vehicle: Vehicle) -> np.ndarray:
+    """(6, n) [direction; position x direction], by numpy alone."""
+    return np.vstack([vehicle.directions.T, np.cross(vehicle.positions, vehicle.directions).T])
+
+
+def test_every_shipped_vehicle_has_a_published_layout_here() -> None:
+    assert set(vehicle_names()) == set(PUBLISHED)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_thrusters_are_the_published_ones_in_frd(name: str) -> None:
+    axes, rows = PUBLISHED[name]
+    published = np.array(rows, dtype=float)
+    turn = flu_to_frd if axes == "FLU" else np.asarray
+    vehicle = load_vehicle(name)
+    np.testing.assert_allclose(vehicle.positions, turn(published[:, :3]), atol=1e-12)
+    np.testing.assert_allclose(vehicle.directions, turn(published[:, 3:]), atol=1e-4)
+
+
+def test_flu_becomes_frd_by_a_half_turn_about_x() -> None:
+    """Left and up change sign, ahead does not; handedness stays. Singular values alone would not notice a mirror."""
+    np.testing.assert_array_equal(flu_to_frd(np.eye(3)), np.diag([1.0, -1.0, -1.0]))
+    np.testing.assert_allclose(flu_to_frd(np.eye(3)), Rotation.from_euler("x", np.pi).as_matrix(), atol=1e-15)
+    assert is_right_handed(flu_to_frd(np.eye(3)))
+    assert not is_right_handed(np.diag([1.0, -1.0, 1.0]))
+
+
+@pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy"])
+def test_vertical_thrusters_sit_above_the_middle_and_push_up(name: str) -> None:
+    """Up is -z in FRD; their water leaves downward at a positive command."""
+    vehicle = load_vehicle(name)
+    vertical = np.abs(vehicle.directions[:, 2]) > 0.9
+    assert np.all(vehicle.directions[vertical, 2] < 0) and np.all(vehicle.positions[vertical, 2] < 0)
+
+
+def test_front_right_thruster_of_the_bluerov_is_on_the_right() -> None:
+    """In FRD starboard is +y; its force ahead and to port turns the nose to port, which is negative yaw."""
+    vehicle = load_vehicle("bluerov2")
+    assert vehicle.positions[0, 0] > 0 and vehicle.positions[0, 1] > 0
+    assert wrench_matrix(vehicle)[5, 0] < 0
+
+
+SINGULAR = {
+    "modcube": [2.0012, 1.4142, 1.4142, 0.1714, 0.14, 0.07],
+    "modcube_sim": [2.0, 1.4142, 1.4142, 0.2335, 0.1715, 0.1187],
+}
+"""The errata's, calculated apart from this code."""
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_singular_values_are_those_of_the_paper_and_its_simulation(name: str) -> None:
+    got = np.linalg.svd(wrench_matrix(load_vehicle(name)), compute_uv=False)
+    np.testing.assert_allclose(got, SINGULAR[name], atol=6e-5)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_rank_tells_which_vehicles_leave_a_freedom_to_buoyancy(name: str) -> None:
+    vehicle = load_vehicle(name)
+    rank = 5 if name in ("bluerov2", "girona500") else 6
+    assert np.linalg.matrix_rank(wrench_matrix(vehicle), tol=1e-6) == rank
+    assert len(vehicle.passive_dof) == 6 - rank
+
+
+def largest_moment(vehicle: Vehicle, direction: np.ndarray) -> float:
+    """N m about `direction` without any force, within the limits of the thrusters."""
+    n = len(vehicle.thruster)
+    rows = np.c_[wrench_matrix(vehicle), -np.r_[np.zeros(3), direction]]
+    bounds = [(vehicle.force_min_n, vehicle.force_max_n)] * n + [(0, None)]
+    return float(linprog(np.r_[np.zeros(n), -1.0], A_eq=rows, b_eq=np.zeros(6), bounds=bounds).x[-1])
+
+
+def test_moments_of_the_module_are_those_of_the_errata() -> None:
+    vehicle = load_vehicle("modcube")
+    for axis, expected in enumerate([1.78, 3.17, 1.58]):
+        weaker = min(largest_moment(vehicle, sign * np.eye(3)[axis]) for sign in (1.0, -1.0))
+        assert weaker == pytest.approx(expected, abs=0.006)
+
+
+def test_module_without_any_one_thruster_still_moves_in_all_six_axes() -> None:
+    matrix = wrench_matrix(load_vehicle("modcube"))
+    for dead in range(8):
+        assert np.linalg.matrix_rank(np.delete(matrix, dead, axis=1), tol=1e-6) == 6
+
+
+def test_three_pairs_of_dead_thrusters_cost_an_axis() -> None:
+    matrix = wrench_matrix(load_vehicle("modcube"))
+    lost = {
+        pair
+        for pair in itertools.combinations(range(8), 2)
+        if np.linalg.matrix_rank(np.delete(matrix, pair, axis=1), tol=1e-6) < 6
+    }
+    assert lost == {(4, 7), (5, 6), (2, 3)}
+
+
+# ---------------------------------------------------------------- tags and faces
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_tags_lie_in_their_faces_and_look_out(name: str) -> None:
+    """A tag on a face has the face's number, sits on the hull, and its z axis points into the face."""
+    vehicle = load_vehicle(name)
+    for tag in vehicle.tag:
+        normal = FACE_NORMALS[tag.id]
+        z_axis = Rotation.from_quat(np.array(tag.quaternion[[1, 2, 3, 0]])).as_matrix()[:, 2]
+        np.testing.assert_allclose(z_axis, -normal, atol=1e-9)
+        np.testing.assert_allclose(tag.position_m, 0.5 * vehicle.hull.size_m * normal, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_module_carries_a_tag_on_every_face(name: str) -> None:
+    assert sorted(tag.id for tag in load_vehicle(name).tag) == list(range(6))
+
+
+def test_faces_are_named_after_their_normals() -> None:
+    for name, normal in zip(FACE_NAMES, FACE_NORMALS, strict=True):
+        expected = np.zeros(3)
+        expected["xyz".index(name[1])] = 1.0 if name[0] == "+" else -1.0
+        np.testing.assert_array_equal(normal, expected)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_inertia_of_every_vehicle_is_one_that_a_body_can_have(name: str) -> None:
+    """Symmetric, positive, and no principal moment above the sum of the others."""
+    inertia = np.array(load_vehicle(name).inertial.inertia)
+    np.testing.assert_array_equal(inertia, inertia.T)
+    a, b, c = np.linalg.eigvalsh(inertia)
+    assert a > 0.0 and c <= a + b + 1e-12
+
+
+def test_what_is_assumed_is_said() -> None:
+    for name in vehicle_names():
+        vehicle = load_vehicle(name)
+        assert vehicle.source and vehicle.assumption
+    assert "layout" in load_vehicle("chasing_m2").assumption
+
+
+def test_drag_along_the_diagonal_follows_from_face_and_edge() -> None:
+    """cd = c0 + c4 (x^4 + y^4 + z^4): face 1, edge 1/2, corner 1/3."""
+    vehicle = load_vehicle("modcube")
+    slope = (vehicle.drag.cd_face - vehicle.drag.cd_edge) / 0.5
+    assert vehicle.cd_corner == pytest.approx(vehicle.drag.cd_face - slope * 2.0 / 3.0)
+
+
+# ---------------------------------------------------------------- refusals
+
+
+def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
+    """The module's file with one thing changed."""
+    text = (resources.files("firmware_py") / "vehicles" / "modcube.toml").read_text()
+    assert old in text
+    path = folder / "odd.toml"
+    path.write_text(text.replace(old, new, count))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("direction = [0.7071067811865476, -0", "direction = [0.9, -0", r":\d+: thruster\[0\]: .* has not length 1"),
+        ("quaternion = [1.0, 0.0, 0.0", "quaternion = [1.0, 0.5, 0.0", r":\d+: tag\[5\]: .* has not length 1"),
+        ("id = 3", "id = 2", r"two \[\[tag\]\] tables have the same id"),
+        ('faces = "PDPDPD"', 'faces = "PDPD"', "needs six letters out of P, D and -"),
+        ('faces = "PDPDPD"', 'faces = "PDPDPX"', "needs six letters out of P, D and -"),
+        ("dry_kg = 2.6", "dry_kg = 0.0", r"inertial.dry_kg: 0.0 is out of range; permitted: 0.01 to 5000 kg"),
+        ("force_min_n = -8.0", "force_min_n = 8.0", r"force_min_n: 8.0 is out of range"),
+        ("lag_s = 0.08", "lag_s = nan", r"curve.lag_s: nan is out of range; permitted: 0 to 2 s"),
+        ("id = 0", "id = 16", r"tag\[0\].id: 16 is out of range; permitted: 0 to 15"),
+    ],
+)
+def test_odd_vehicle_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
+    with pytest.raises(DescriptionError, match=words):
+        load_vehicle(str(changed(tmp_path, old, new)))
+
+
+def test_vehicle_without_thrusters_is_refused(tmp_path: Path) -> None:
+    path = changed(tmp_path, "[[thruster]]", "[[propeller]]", count=-1)
+    with pytest.raises(DescriptionError, match="propeller: unknown key"):
+        load_vehicle(str(path))
+
+
+def test_unknown_vehicle_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(DescriptionError, match=r"vehicle 'submarine' is unknown; there are .*modcube, modcube_sim"):
+        load_vehicle("submarine")
+
+
+def test_vehicle_file_may_lie_anywhere(tmp_path: Path) -> None:
+    path = changed(tmp_path, 'name = "modcube"', 'name = "mine"')
+    assert load_vehicle(str(path)).name == load_vehicle(path.name, tmp_path).name == "mine"

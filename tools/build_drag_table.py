@@ -1,0 +1,187 @@
+"""Build the drag tables of docked modules, draw their drag spaces and compare the ways to an outline.
+
+python tools/build_drag_table.py                              the paper's three shapes
+python tools/build_drag_table.py --cells "0,0,0 1,0,0 1,1,0"  any other; --compare adds the paper's sampling
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from firmware_py.core import drag_lookup
+from firmware_py.core.body import DragTable
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.prepare import alpha, drag_table, shape_key
+from firmware_py.prepare.assembly import PITCH_M, assemble
+from firmware_py.prepare.drag_cache import DragCache, default_folder
+from firmware_py.prepare.joints import Placement
+from firmware_py.prepare.projected_area import areas_and_centroids
+
+Cell = tuple[int, int, int]
+
+PAPER_SHAPES: dict[str, list[Cell]] = {
+    "one module": [(0, 0, 0)],
+    "line of two": [(0, 0, 0), (0, 1, 0)],
+    "2x2": [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)],
+}
+
+FLOWS = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 1, 1)]
+"""The paper's seven flow directions."""
+
+SPEED_M_S = 1.0
+"""The paper's CFD runs at 1 m/s."""
+
+SMALLEST_MOMENT_NM = 5e-4
+"""Moments below it are not printed."""
+
+RANDOM_SEED = 0
+METHODS = {
+    "exact": areas_and_centroids,
+    "alpha": alpha.lattice_method(),
+    "random": alpha.random_method(RANDOM_SEED),
+}
+app = typer.Typer(add_completion=False)
+
+
+def parse_cells(text: str) -> list[Cell]:
+    """Cells out of "0,0,0 1,0,0". Raises DescriptionError."""
+    try:
+        cells = [tuple(int(c) for c in word.split(",")) for word in text.replace(";", " ").split()]
+    except ValueError:
+        cells = []
+    if not cells or any(len(c) != 3 for c in cells):
+        raise DescriptionError(f"cells {text!r}: write whole numbers x,y,z with spaces between modules, as 0,0,0 1,0,0")
+    return [(c[0], c[1], c[2]) for c in cells]
+
+
+def table_of(vehicle: Vehicle, cells: Sequence[Cell], mode: str, cache: DragCache | None) -> DragTable:
+    """The drag table of modules that all sit upright, about their centre of mass."""
+    body = assemble(cells, [0] * len(cells), [vehicle] * len(cells))
+    placements = [Placement(vehicle, c, 0) for c in cells]
+    centre = PITCH_M * np.array(cells[0]) - body.r_bm[0]
+    return drag_table.build(placements, centre, PITCH_M, cache, mode, METHODS[mode])
+
+
+def force_at(table: DragTable, flow: Sequence[float]) -> tuple[float, float]:
+    """Size of force, N, and of moment, N m, at SPEED_M_S along a flow direction."""
+    unit = np.array(flow, dtype=float) / np.linalg.norm(flow)
+    nu = np.concatenate([SPEED_M_S * unit, np.zeros(3)])
+    wrench = drag_lookup.drag_wrench(table.nodes, table.rotational, table.linear, nu)
+    return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
+
+
+def fibonacci(n: int) -> np.ndarray:
+    """(n, 3) directions of Algorithm 1 with its poles put right."""
+    i = np.arange(n)
+    phi, theta = np.arccos(1.0 - (2 * i + 1) / n), math.pi * (1.0 + math.sqrt(5.0)) * i
+    return np.stack([np.cos(theta) * np.sin(phi), np.sin(theta) * np.sin(phi), np.cos(phi)], axis=1)
+
+
+def print_forces(console: Console, tables: dict[str, dict[str, DragTable]]) -> None:
+    """Force, and moment about the centre of mass, in the seven flow directions."""
+    view = Table(title=f"drag at {SPEED_M_S:g} m/s")
+    for heading in ("shape", "mode", "", *("(" + ",".join(map(str, flow)) + ")" for flow in FLOWS)):
+        view.add_column(heading, justify="left" if len(view.columns) < 3 else "right", no_wrap=True)
+    for shape, modes in tables.items():
+        for mode, table in modes.items():
+            forces, moments = zip(*(force_at(table, flow) for flow in FLOWS), strict=True)
+            view.add_row(shape, mode, "N", *(f"{f:.2f}" for f in forces))
+            if max(moments) > SMALLEST_MOMENT_NM:
+                view.add_row("", "", "N m", *(f"{m:.3f}" for m in moments))
+    console.print(view)
+
+
+def print_comparison(console: Console, vehicle: Vehicle, shapes: dict[str, list[Cell]], count: int) -> None:
+    """Areas by every mode against the exact ones over `count` directions, and what each takes."""
+    view = Table(title=f"projected area over {count} directions against the exact outline")
+    for heading in ("shape", "mode", "mean m^2", "bias %", "rms %", "max %", "time s"):
+        view.add_column(heading, justify="left" if heading in ("shape", "mode") else "right")
+    directions = fibonacci(count)
+    for shape, cells in shapes.items():
+        solids = shape_key.solids([shape_key.part(vehicle, c, 0) for c in cells], PITCH_M)
+        exact = None
+        for mode, method in METHODS.items():
+            start = time.perf_counter()
+            areas = method(solids, directions)[0]
+            taken = time.perf_counter() - start
+            exact = areas if exact is None else exact
+            error = 100.0 * (areas / exact - 1.0)
+            figures = (areas.mean(), error.mean(), math.sqrt(np.mean(error**2)), np.abs(error).max(), taken)
+            view.add_row(shape, mode, *(f"{x:.4g}" if abs(x) >= 1e-9 else "0" for x in figures))
+    console.print(view)
+
+
+def draw(path: Path, tables: dict[str, DragTable]) -> None:
+    """The drag spaces: in each direction of motion, a point at the size of the force."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    azimuth, polar = np.meshgrid(np.linspace(-math.pi, math.pi, 145), np.linspace(0.0, math.pi, 73))
+    d = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=-1)
+    figure = plt.figure(figsize=(5.0 * len(tables), 5.2), layout="constrained")
+    for k, (name, table) in enumerate(tables.items(), 1):
+        flat = np.ascontiguousarray(d.reshape(-1, 3))
+        force = np.array([drag_lookup.look_up(table.nodes, x)[0] for x in flat]).reshape(d.shape[:2]) * SPEED_M_S**2
+        axes = figure.add_subplot(1, len(tables), k, projection="3d")
+        colours = matplotlib.colormaps["viridis"]((force - force.min()) / max(float(np.ptp(force)), 1e-12))
+        surface = np.moveaxis(force[..., None] * d, -1, 0)
+        axes.plot_surface(*surface, facecolors=colours, rstride=1, cstride=1, shade=False)
+        limit = float(force.max())
+        axes.set(xlim=(-limit, limit), ylim=(-limit, limit), zlim=(limit, -limit))
+        axes.set(xlabel="x N", ylabel="y N", zlabel="z N")
+        axes.set_box_aspect((1, 1, 1))
+        axes.set_title(f"{name}: {force.min():.1f} to {force.max():.1f} N at {SPEED_M_S:g} m/s")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+@app.command()
+def main(
+    vehicle: Annotated[str, typer.Option(help="vehicle name or file")] = "modcube",
+    cells: Annotated[str, typer.Option(help="cells, as '0,0,0 1,0,0'; the paper's three shapes if left out")] = "",
+    mode: Annotated[str, typer.Option(help="way to the outline: exact, alpha or random")] = "exact",
+    compare: Annotated[bool, typer.Option(help="set the three modes side by side (minutes)")] = False,
+    directions: Annotated[int, typer.Option(min=10, max=100000, help="directions of the comparison")] = 1000,
+    out: Annotated[Path, typer.Option(help="picture of the drag spaces")] = Path("drag_spaces.png"),
+    cache: Annotated[Path | None, typer.Option(help="folder of kept outlines; the user's cache when left out")] = None,
+) -> None:
+    """Build drag tables, print the force in the paper's seven flow directions, draw the drag spaces."""
+    console = Console(highlight=False)
+    store = DragCache(cache or default_folder(os.environ, Path.home()))
+    try:
+        if mode not in METHODS:
+            raise DescriptionError(f"mode {mode!r} is unknown; there are {', '.join(METHODS)}")
+        description = load_vehicle(vehicle)
+        shapes = {f"{len(parse_cells(cells))} modules": parse_cells(cells)} if cells else PAPER_SHAPES
+        modes = list(METHODS) if compare else [mode]
+        tables = {
+            shape: {m: table_of(description, placed, m, store) for m in modes} for shape, placed in shapes.items()
+        }
+    except DescriptionError as error:
+        Console(stderr=True, highlight=False).print(str(error), soft_wrap=True)
+        raise typer.Exit(2) from None
+    if description.assumption:
+        console.print(f"assumed: {description.assumption}")
+    print_forces(console, tables)
+    if compare:
+        print_comparison(console, description, shapes, directions)
+    draw(out, {shape: by_mode[modes[0]] for shape, by_mode in tables.items()})
+    console.print(f"drag spaces: {out}; outlines kept in {store.folder}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,253 @@
+#!/usr/bin/env python3
+"""What a vehicle, an assembly or the paper's seven robots can do; or which shape to dock for a task.
+
+    characterise.py modcube bluerov2_heavy --out runs/capability
+    characterise.py --assembly 2x2x1 --module modcube
+    characterise.py --table1 --out runs/table1
+    characterise.py --choose 4 --task task.toml
+"""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Any
+
+import characterise_table as table
+import click
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from firmware_py.description.fleet import load_fleet
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.prepare.capability.layout import AXES, FRAMES, UNITS, Layout, of_modules, of_rows, of_vehicle
+from firmware_py.prepare.capability.summary import DIRECTIONS, Capability, characterise
+
+DATA = Path(__file__).with_name("data")
+MODULE_PRICE_USD = 800.0
+"""The paper's price of one module."""
+WIDTH = 170
+"""Characters of a table that does not go to a terminal."""
+LARGEST_BOX = 64
+"""Modules of an assembly."""
+
+
+def main() -> None:
+    """Command line; bad input is one line and exit status 2."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(run)
+    try:
+        app(standalone_mode=False)
+    except (DescriptionError, click.ClickException) as error:
+        print(error.format_message() if isinstance(error, click.ClickException) else error, file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def run(
+    vehicle: Annotated[list[str] | None, typer.Argument(help="vehicle names or .toml files")] = None,
+    assembly: Annotated[str, typer.Option(help="AxBxC modules, cells such as '0,0,0 1,0,0', or a fleet file")] = "",
+    module: Annotated[str, typer.Option(help="vehicle of every module of an assembly")] = "modcube",
+    table1: Annotated[bool, typer.Option("--table1", help="the paper's seven robots beside its Table I")] = False,
+    choose: Annotated[int, typer.Option(help="rank all shapes of so many modules", min=0)] = 0,
+    task: Annotated[Path | None, typer.Option(help="task file for --choose")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for CSV, JSON, figure (PNG) and report (HTML)")] = None,
+    directions: Annotated[int, typer.Option(help="directions over the sphere", min=121, max=100000)] = DIRECTIONS,
+    force_n: Annotated[float, typer.Option(help="wrench of the power space, force frame, N", min=1e-6)] = 1.0,
+    torque_nm: Annotated[float, typer.Option(help="wrench of the power space, torque frame, N m", min=1e-6)] = 1.0,
+    jobs: Annotated[int, typer.Option(help="processes", min=1)] = 2,
+) -> None:
+    """Reachable wrench, power, thrust variance and their surfaces' energies."""
+    asked = [bool(vehicle), bool(assembly), table1, choose > 0]
+    if sum(asked) != 1:
+        raise DescriptionError("characterise: give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE")
+    if choose:
+        if task is None:
+            raise DescriptionError("characterise: --choose needs --task FILE")
+        return _choose(choose, task, out)
+    settings = {"count": directions, "sizes": {"force": force_n, "torque": torque_nm}}
+    if table1:
+        return _table1(settings, jobs, out)
+    layouts = [of_vehicle(load_vehicle(name)) for name in vehicle or []] or _assemblies(assembly, load_vehicle(module))
+    found = _all({layout.name: layout for layout in layouts}, settings, jobs)
+    _print(found)
+    if out:
+        _write(out, "capability", found, table.rows_of(found), {name: name for name in found})
+
+
+def _console(error: bool = False) -> Console:
+    console = Console(stderr=error)
+    return console if console.is_terminal else Console(stderr=error, width=WIDTH)
+
+
+def _assemblies(shape: str, module: Vehicle) -> list[Layout]:
+    """The layouts that an --assembly names. Raises DescriptionError."""
+    if shape.endswith(".toml"):
+        return _fleet(Path(shape))
+    cells = _cells(shape)
+    return [of_modules(cells, [0] * len(cells), [module] * len(cells), name=f"{module.name} {shape}")]
+
+
+def _fleet(path: Path) -> list[Layout]:
+    fleet = load_fleet(path)
+    bodies: dict[object, list[int]] = {}
+    for index, member in enumerate(fleet.module):
+        bodies.setdefault(member.body if member.body >= 0 else (index,), []).append(index)
+    layouts = []
+    for indices in bodies.values():
+        members = [fleet.module[i] for i in indices]
+        cells = np.rint([m.cell for m in members]).astype(int)
+        vehicles = [load_vehicle(m.vehicle) for m in members]
+        name = f"{path.stem} body {indices[0]}"
+        layouts.append(of_modules(cells.tolist(), [m.rotation for m in members], vehicles, fleet.pitch_m, name))
+    return layouts
+
+
+def _cells(shape: str) -> list[tuple[int, int, int]]:
+    """Cells of `2x2x1` or of `0,0,0 1,0,0`."""
+    wrong = f"--assembly {shape!r}: needs AxBxC, cells such as '0,0,0 1,0,0', or a fleet file (.toml); 64 modules at most"
+    try:
+        if "," in shape:
+            found = [tuple(int(c) for c in cell.split(",")) for cell in shape.replace(";", " ").split()]
+        else:
+            a, b, c = (int(edge) for edge in shape.split("x"))
+            if min(a, b, c) < 1 or a * b * c > LARGEST_BOX:
+                raise ValueError
+            found = [(x, y, z) for x in range(a) for y in range(b) for z in range(c)]
+    except ValueError:
+        raise DescriptionError(wrong) from None
+    if not 1 <= len(found) <= LARGEST_BOX or any(len(cell) != 3 for cell in found):
+        raise DescriptionError(wrong)
+    return [(cell[0], cell[1], cell[2]) for cell in found]
+
+
+def _all(layouts: dict[str, Layout], settings: dict[str, Any], jobs: int) -> dict[str, Capability]:
+    """Every layout characterised, with progress on the terminal; in `jobs` processes where there are several layouts."""
+    work = partial(characterise, **settings)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    console = _console(error=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        mark = bar.add_task("characterise", total=len(layouts))
+        found: dict[str, Capability] = {}
+
+        def done(name: str, result: Capability) -> None:
+            found[name] = result
+            bar.update(mark, advance=1, description=name)
+            if not console.is_terminal and len(layouts) > 1:
+                console.print(f"{len(found)}/{len(layouts)} {name}", highlight=False)
+
+        if min(jobs, len(layouts)) == 1:
+            for name, layout in layouts.items():
+                done(name, work(layout, progress=partial(_describe, bar, mark, name)))
+        else:
+            with ProcessPoolExecutor(min(jobs, len(layouts)), mp_context=get_context("spawn")) as pool:
+                largest_first = sorted(layouts, key=lambda n: -layouts[n].count)
+                waiting = {pool.submit(work, layouts[name]): name for name in largest_first}
+                for future in as_completed(waiting):
+                    done(waiting[future], future.result())
+    return {name: found[name] for name in layouts}
+
+
+def _describe(bar: Progress, mark: Any, name: str, text: str) -> None:
+    bar.update(mark, description=f"{name}: {text}")
+
+
+def _print(found: dict[str, Capability]) -> None:
+    """One column a vehicle."""
+    console = _console()
+    shown = Table(title="What the body can do", title_justify="left")
+    shown.add_column("figure")
+    for name in found:
+        shown.add_column(name, justify="right")
+
+    def add(label: str, value: Callable[[Capability], table.Cell]) -> None:
+        shown.add_row(label, *(table.text(value(c)) for c in found.values()))
+
+    add("thrusters", lambda c: float(c.layout.count))
+    add("rank", lambda c: float(c.rank))
+    for k, axis in enumerate(AXES):
+        unit = UNITS["force"] if k < 3 else UNITS["torque"]
+        shown.add_row(f"{axis} + / -, {unit}", *(f"{c.axes[k, 0]:.4g} / {c.axes[k, 1]:.4g}" for c in found.values()))
+    for row in table.rows_of(found):
+        if row.metric not in ("thrusters", "rank"):
+            label = row.metric if row.space == "-" else f"{row.space} {row.frame} {row.metric}"
+            shown.add_row(label.replace("[", r"\["), *(table.text(row.cells[name]) for name in found))
+    console.print(shown)
+    for name, result in found.items():
+        for note in result.notes:
+            console.print(f"{name}: {note}", highlight=False, markup=False)
+
+
+def _write(
+    out: Path, stem: str, found: dict[str, Capability], rows: Sequence[table.Row], titles: dict[str, str], html: str = ""
+) -> None:
+    """CSV, JSON, PNG and HTML into `out`."""
+    from characterise_draw import draw  # matplotlib takes a second to import
+    from characterise_report import write_report
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        table.write_csv(out / f"{stem}.csv", rows, list(found))
+        table.write_json(out / f"{stem}.json", found)
+        shown = {name: found[name] for name in titles}
+        draw(out / f"{stem}.png", shown, titles)
+        write_report(out / f"{stem}.html", shown, titles, html)
+    except OSError as error:
+        raise DescriptionError(f"{error.filename}: cannot be written: {error.strerror}") from None
+    for ending in ("csv", "json", "png", "html"):
+        print(out / f"{stem}.{ending}")
+
+
+def _table1(settings: dict[str, Any], jobs: int, out: Path | None) -> None:
+    """The paper's seven robots, and beside them the authors' own files and the paper's text."""
+    from characterise_table1 import build_rows, show
+
+    robots = tomllib.loads((DATA / "robots.toml").read_text(encoding="utf-8"))
+    raw = tomllib.loads((DATA / "authors_layouts.toml").read_text(encoding="utf-8"))
+    layouts = {robot["column"]: _robot(robot, raw) for robot in (*robots["robot"], *robots["beside"])}
+    found = _all(layouts, settings, jobs)
+    paper = table.read_paper(DATA / "table1.csv")
+    rows = build_rows(found, robots, MODULE_PRICE_USD)
+    console = _console()
+    show(console, rows, paper, robots, found)
+    if out:
+        titles = {robot["column"]: f"{robot['letter']}: {robot['title']}" for robot in robots["robot"]}
+        record = Console(record=True, width=WIDTH, file=open_nowhere())
+        show(record, rows, paper, robots, found)
+        page = record.export_html(inline_styles=True, code_format="<pre>{code}</pre>")
+        _write(out, "table1", found, rows, titles, page)
+
+
+def open_nowhere() -> Any:
+    """A file that keeps nothing."""
+    import io
+
+    return io.StringIO()
+
+
+def _robot(robot: dict[str, Any], raw: dict[str, Any]) -> Layout:
+    vehicle = load_vehicle(robot["vehicle"])
+    if "rows" in robot:
+        source = raw[robot["rows"]]
+        return of_rows(robot["title"], np.array(source["thrusters"]), source["f_min"], source["f_max"], vehicle)
+    cells = robot["cells"]
+    return of_modules(cells, [0] * len(cells), [vehicle] * len(cells), name=robot["title"])
+
+
+def _choose(count: int, path: Path, out: Path | None) -> None:
+    """All shapes of `count` modules, best first."""
+    from characterise_choose import choose
+
+    choose(count, path, out, _console(), _console(error=True))
+
+
+if __name__ == "__main__":
+    main()
