@@ -71,11 +71,9 @@ def usage_error(error: TyperException) -> str:
     """One line: which command, what is wrong with its arguments, what there is instead."""
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "modcube"
-    known = list(getattr(context.command, "commands", ())) if context is not None else []
-    hint = f"there are {', '.join(known)}" if known else f"see `{command} --help`"
-    message = " ".join(error.format_message().split())
-    # without any argument the help was printed already, and is the message
-    return f"{command}: {'needs a command' if context is not None and message.startswith('Usage:') else message}; {hint}"
+    known = ", ".join(getattr(context.command, "commands", ())) if context is not None else ""
+    message = " ".join(error.format_message().split()).rstrip(".") or "needs a command"
+    return f"{command}: {message}; {f'there are {known}' if known else f'see {command} --help'}"
 
 
 def _refuse(line: str) -> int:

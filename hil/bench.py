@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_py.app.firmware import Firmware, compose
-from firmware_py.app.lockstep import Lockstep, Observer, drain
+from firmware_py.app.firmware import BusFrame, Firmware, compose
+from firmware_py.app.lockstep import PATIENCE_LOOKS, Lockstep, Observer, drain, send
 from firmware_py.app.vehicle import recording
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.port import Port, open_port
@@ -37,38 +37,37 @@ class Bench:
     script: Script
     firmware_port: Port
     plant_port: Port
+    patience_looks: int = PATIENCE_LOOKS
+    """Looks at a socket before a frame counts as lost by the bus."""
 
     def fly(
         self, observers: Sequence[Observer] = (), progress: Callable[[float], None] | None = None, truth: TruthRecorder | None = None
     ) -> float:
         """Flies to the end of the script; returns the wall time it took, s."""
-        lockstep = Lockstep(self.firmware, [self.firmware_port], observers)
+        lockstep = Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks)
+        plant_ports = [self.plant_port]
         period_ns = self.fleet.period_ns
-        sent, began = 0, time.perf_counter()
+        sent: list[BusFrame] = []
+        began = time.perf_counter()
         outputs: Outputs | None = None
         for tick in range(1, self.script.ticks + 1):
             time_ns = tick * period_ns
             sent += lockstep.start_tick(tick, time_ns)
-            answers = self.nodes.step([frame for _, frame in drain([self.plant_port], sent)])
-            for frame in answers:
-                self.plant_port.send(frame)
+            heard = drain(plant_ports, sent, self.patience_looks)
+            answers = send(plant_ports, [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
             if truth is not None:
-                self._record_truth(truth, tick)
-            outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), len(answers))
+                truth.record_world(tick, self.nodes.world)
+            outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), answers)
             if progress is not None and tick % self.fleet.rate_hz == 0:
                 progress(time_ns * 1e-9)
         return time.perf_counter() - began
 
-    def _record_truth(self, recorder: TruthRecorder, tick: int) -> None:
-        world = self.nodes.world
-        for module in range(len(self.fleet.module)):
-            t = world.truth(module)
-            recorder.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w)
-
 
 def fleet_of(scenario: Scenario, bus: str, rate_hz: int) -> Fleet:
     """The fleet that a scenario's modules make up, all on one bus."""
-    modules = tuple(Module(number=m.number, vehicle=m.vehicle) for m in scenario.module)
+    modules = tuple(
+        Module(number=m.number, vehicle=m.vehicle, body=m.body, cell=m.cell, rotation=m.rotation) for m in scenario.module
+    )
     return Fleet(module=modules, buses=(bus,), rate_hz=rate_hz)
 
 

@@ -1,4 +1,4 @@
-"""Many seeds of one scenario, in processes; results are kept as they come, so that an interrupted campaign goes on."""
+"""Many seeds of one scenario, in processes of their own; campaign.json says what came of them."""
 
 from __future__ import annotations
 
@@ -82,18 +82,3 @@ def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
 def _quantiles(values: Iterable[float | None]) -> Mapping[str, float | None]:
     known = np.array([v for v in values if v is not None and np.isfinite(v)])
     return {name: float(np.quantile(known, q)) if known.size else None for name, q in QUANTILES.items()}
-
-
-def print_campaign(summary: Mapping[str, Any]) -> None:
-    """The summary as a table."""
-    from rich.console import Console
-    from rich.table import Table
-
-    low, high = summary["confidence_interval"]
-    table = Table(title=f"{summary['scenario']}: {summary['succeeded']} of {summary['trials']} passed ({low:.1%} to {high:.1%})")
-    for column in ("metric", "median", "worst", "best"):
-        table.add_column(column, justify="left" if column == "metric" else "right")
-    for name, quantiles in summary["metrics"].items():
-        if quantiles["median"] is not None:
-            table.add_row(name, *(f"{quantiles[q]:.5g}" for q in ("median", "max", "min")))
-    Console().print(table)

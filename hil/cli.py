@@ -84,11 +84,14 @@ def campaign(
     sensors: Sensors = "real",
 ) -> None:
     """Fly many seeds of a scenario; prints a table and leaves campaign.json."""
-    from hil.campaign import print_campaign, run_campaign
+    from hil.campaign import run_campaign
+    from hil.console import campaign_progress, print_campaign
 
     chosen = scenario_of(scenario, vehicle, sensors)
     folder = out if out is not None else Path("runs") / f"{chosen.name}-campaign"
-    summary = run_campaign(chosen, parameters_of(controller), range(seed, seed + trials), jobs, folder)
+    parameters, seeds = parameters_of(controller), range(seed, seed + trials)
+    with campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
+        summary = run_campaign(chosen, parameters, seeds, jobs, folder, progress=progress)
     print_campaign(summary)
     raise typer.Exit(0 if summary["succeeded"] == summary["trials"] else FAILED)
 

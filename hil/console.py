@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -42,6 +42,61 @@ def flight_progress(title: str, duration_s: float, console: Console | None = Non
             progress.update(task, completed=done_s)
 
         yield advance
+
+
+class Count(Protocol):
+    """Tells how many of a campaign's trials are done."""
+
+    def __call__(self, done: int, total: int) -> None:
+        """`done` of `total` trials have been flown."""
+        ...
+
+
+@contextmanager
+def campaign_progress(title: str, trials: int, console: Console | None = None) -> Iterator[Count]:
+    """A progress bar over trials; where the output is no terminal, it shows nothing."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f} of {task.total:.0f} flown"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    console = console or Console()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(title, total=trials)
+
+        def count(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        yield count
+
+
+def campaign_table(summary: Mapping[str, Any]) -> Table:
+    """Quantiles of every metric over the trials of a campaign.json; its title says how many passed."""
+    low, high = summary["confidence_interval"]
+    passed = f"{summary['succeeded']} of {summary['trials']} passed ({low:.1%} to {high:.1%}, 95 % confidence)"
+    title = Text(f"{summary['scenario']}: {passed}", style="bold")
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    for column in ("metric", "smallest", "median", "95 %", "largest"):
+        table.add_column(column, justify="left" if column == "metric" else "right")
+    for name in metric_order(summary["metrics"]):
+        quantiles = summary["metrics"][name]
+        if quantiles["median"] is not None:
+            values = (shown_value(name, quantiles[q]) for q in ("min", "median", "q95", "max"))
+            table.add_row(SHOWN[name].label if name in SHOWN else name, *values)
+    return table
+
+
+def print_campaign(summary: Mapping[str, Any], console: Console | None = None) -> None:
+    """The table, what the failures were, and the seeds to look at first."""
+    console = console or Console()
+    console.print(campaign_table(summary))
+    failures = [f"{name} {count}" for name, count in summary["outcomes"].items() if name != "passed"]
+    if failures:
+        console.print(f"FAILED: {', '.join(failures)}", style="bold red", highlight=False)
+    console.print(f"worst seeds: {', '.join(str(seed) for seed in summary['worst_seeds'])}", highlight=False)
 
 
 def result_table(result: Result) -> Table:

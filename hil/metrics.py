@@ -84,7 +84,12 @@ def rotation_vectors(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def body_positions(flight: Flight, com_m: np.ndarray) -> np.ndarray:
-    """(k, 3) true positions of the point that the firmware controls: the module's nominal centre of mass, world, m."""
+    """(k, 3) true positions of the point that the firmware controls: the body's nominal centre of mass, world, m.
+
+    A log without bodies has one module: `com_m` (3,) is that point in its frame.
+    """
+    if "p_wb" in flight.truth:
+        return flight.truth["p_wb"]
     p_wm, q_wm = flight.truth["p_wm"], flight.truth["q_wm"]
     if not np.any(com_m):
         return p_wm
@@ -98,7 +103,7 @@ def flight_metrics(
     wall_s: float = 0.0,
     deadline_misses: int = 0,
 ) -> dict[str, float]:
-    """All metrics of result.json of a flight of one module.
+    """All metrics of result.json of a flight of one body.
 
     Args:
         flight: the ticks of the trajectory, from its start to its end (`Flight.between`).
@@ -106,12 +111,12 @@ def flight_metrics(
         wall_s: time that the machine took for the same ticks, s; 0 where it is not known gives a real-time factor of 0.
         deadline_misses: ticks that began late; 0 in lockstep.
     """
-    firmware, truth = flight.firmware, flight.truth
+    firmware = flight.firmware
     position = body_positions(flight, np.zeros(3) if com_m is None else com_m)
     error = np.linalg.norm(position - firmware["setpoint_p_wb"], axis=1)
-    angle = np.linalg.norm(rotation_vectors(truth["q_wm"], firmware["setpoint_q_wb"]), axis=1)
+    angle = np.linalg.norm(rotation_vectors(flight.q_wb, firmware["setpoint_q_wb"]), axis=1)
     estimate_error = firmware["p_wb"] - position
-    estimate_angle = rotation_vectors(truth["q_wm"], firmware["q_wb"])
+    estimate_angle = rotation_vectors(flight.q_wb, firmware["q_wb"])
     time_s = flight.time_s
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     duration_s = float(time_s[-1]) + period_s

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import Port, open_port
-from firmware_py.runtime.clock import MonotonicClock
 from hil.nodes import Nodes, make_nodes
 from hil.scenario import Scenario, make_world
 from hil.signals import TruthRecorder
 
 CHUNK_NS = 2_500_000
 """The world moves in steps of this; what an MCU samples is at most so old."""
+
+
+def started_clock() -> Callable[[], int]:
+    """The plant's own clock: nanoseconds since now."""
+    start_ns = time.monotonic_ns()
+    return lambda: time.monotonic_ns() - start_ns
 
 
 def serve_until_signal(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None) -> None:
@@ -26,10 +32,10 @@ def serve_until_signal(scenario: Scenario, seed: int, bus: str, rate_hz: int, ou
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     plant = PlantProcess(scenario, seed, rate_hz, out)
-    clock = MonotonicClock.started_now()
-    with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=threading.Event()) as port:
+    now_ns = started_clock()
+    with open_port(bus, reader=True, now_ns=now_ns, arrival=threading.Event()) as port:
         print(f"plant of {scenario.name} on {bus}", flush=True)
-        plant.serve(port, clock.now_ns, stop.is_set)
+        plant.serve(port, now_ns, stop.is_set)
 
 
 class PlantProcess:
@@ -65,9 +71,4 @@ class PlantProcess:
         for answer in self._nodes.take(frame, self._world.time_ns):
             port.send(answer)
         if self._truth is not None and frame.id == self._sync.id_of(0) and len(frame.data) == self._sync.length:
-            self._record(self._truth, int(self._sync.decode(frame.data)[0]))
-
-    def _record(self, recorder: TruthRecorder, tick: int) -> None:
-        for module in range(len(self._world.vehicles)):
-            t = self._world.truth(module)
-            recorder.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w)
+            self._truth.record_world(int(self._sync.decode(frame.data)[0]), self._world)

@@ -86,9 +86,9 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
     inside = _inside(flight, window)
     _path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m, inside)
     time_s = flight.time_s
-    error_mm = 1e3 * np.linalg.norm(flight.truth["p_wm"] - flight.firmware["setpoint_p_wb"], axis=1)
+    error_mm = 1e3 * np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
     angle_deg = np.degrees(
-        np.linalg.norm(rotation_vectors(flight.truth["q_wm"], flight.firmware["setpoint_q_wb"]), axis=1)
+        np.linalg.norm(rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"]), axis=1)
     )
     for row, (values, unit, what) in enumerate(((error_mm, "mm", "Position"), (angle_deg, "deg", "Attitude"))):
         axes = figure.add_subplot(grid[row, 1])
@@ -116,8 +116,8 @@ def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray, inside: np.ndarray) 
                 axes.plot(*line.T, color="#9fb4c7", linewidth=0.9)
     wanted = flight.firmware["setpoint_p_wb"][inside]
     axes.plot(*wanted.T, color=REFERENCE, linestyle="--", linewidth=1.1, label="reference")
-    axes.plot(*flight.truth["p_wm"].T, color=TRUTH, linewidth=1.6, label="truth")
-    axes.scatter(*flight.truth["p_wm"][0], color=TRUTH, s=28, label="start")
+    axes.plot(*flight.p_wb.T, color=TRUTH, linewidth=1.6, label="truth")
+    axes.scatter(*flight.p_wb[0], color=TRUTH, s=28, label="start")
     for which, text in (("x", "north x (m)"), ("y", "east y (m)"), ("z", "down z (m)")):
         getattr(axes, f"set_{which}label")(text, labelpad=7)
     axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), zlim=(high[2], low[2]))
@@ -133,7 +133,7 @@ def position(flight: Flight, window: Window) -> Any:
     """Position per axis, and beside it what it is off by."""
     figure = _figure(11.0, 6.6)
     cells = figure.subplots(3, 2, sharex=True)
-    truth, wanted, believed = flight.truth["p_wm"], flight.firmware["setpoint_p_wb"], flight.firmware["p_wb"]
+    truth, wanted, believed = flight.p_wb, flight.firmware["setpoint_p_wb"], flight.firmware["p_wb"]
     for axis, name in enumerate(("x (north)", "y (east)", "z (down)")):
         left, right = cells[axis]
         left.plot(flight.time_s, believed[:, axis], color=ESTIMATE, linewidth=3.0, alpha=0.55, label="estimate")
@@ -159,7 +159,7 @@ def attitude(flight: Flight, window: Window) -> Any:
     figure = _figure(11.0, 5.6)
     cells = figure.subplots(3, 1, sharex=True)
     wanted = flight.firmware["setpoint_q_wb"]
-    truth = np.degrees(rotation_vectors(flight.truth["q_wm"], wanted))
+    truth = np.degrees(rotation_vectors(flight.q_wb, wanted))
     believed = np.degrees(rotation_vectors(flight.firmware["q_wb"], wanted))
     for axis, name in enumerate(("roll x", "pitch y", "yaw z")):
         cells[axis].plot(flight.time_s, believed[:, axis], color=ESTIMATE, linewidth=0.9, label="estimate - reference")
@@ -177,8 +177,8 @@ def estimate(flight: Flight, window: Window) -> Any:
     """Estimation errors inside three standard deviations, and the normalised innovation."""
     figure = _figure(11.0, 7.6)
     cells = figure.subplots(4, 2, sharex=True, gridspec_kw={"height_ratios": (1, 1, 1, 0.9)})
-    off_mm = 1e3 * (flight.firmware["p_wb"] - flight.truth["p_wm"])
-    off_deg = np.degrees(rotation_vectors(flight.truth["q_wm"], flight.firmware["q_wb"]))
+    off_mm = 1e3 * (flight.firmware["p_wb"] - flight.p_wb)
+    off_deg = np.degrees(rotation_vectors(flight.q_wb, flight.firmware["q_wb"]))
     bands = 3e3 * flight.firmware["sigma_p"], 3.0 * np.degrees(flight.firmware["sigma_q"])
     names = (("x, mm", "y, mm", "z, mm"), ("roll, deg", "pitch, deg", "yaw, deg"))
     for column, (error, band) in enumerate(zip((off_mm, off_deg), bands, strict=True)):

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from firmware_py.app.firmware import compose
+from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import open_loop
 from firmware_py.app.vehicle import recording
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.clock import MonotonicClock
-from firmware_py.runtime.realtime import quiet_garbage
+from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from hil.bench import fleet_of
 from hil.plant_process import PlantProcess
@@ -37,6 +38,8 @@ class RealTimeFlight(NamedTuple):
     unanswered: int
     lateness_ns: dict[str, int]
     """p50, p99, worst."""
+    refused: list[str]
+    """What the system would not give of real time, a line each."""
 
 
 def serve_plant(
@@ -46,7 +49,11 @@ def serve_plant(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     plant = PlantProcess(scenario, seed, rate_hz, out)
     clock = MonotonicClock.started_now()
-    with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=threading.Event()) as port:
+    with (
+        real_time(PLANT_PRIORITY - 1),
+        open_port(bus, reader=True, now_ns=clock.now_ns, arrival=threading.Event()) as port,
+    ):
+        use_priority(PLANT_PRIORITY)
         ready.set()
         plant.serve(port, clock.now_ns, stop.is_set)
 
@@ -59,9 +66,16 @@ def fly_in_real_time(
     bus: str,
     rate_hz: int = 100,
     progress: Callable[[float], None] | None = None,
+    start_method: str = "spawn",
+    observers: Sequence[Observer] = (),
 ) -> RealTimeFlight:
-    """Flies `scenario` against the clock; the logs are in `out`. Raises DescriptionError and PortError."""
-    context = multiprocessing.get_context("spawn")
+    """Flies `scenario` against the clock; the logs are in `out`. Raises DescriptionError and PortError.
+
+    Args:
+        start_method: of the plant's process. `fork` spares its imports; only for a process without threads.
+        observers: called after each tick, besides the recorder.
+    """
+    context = multiprocessing.get_context(start_method)
     ready, stop = context.Event(), context.Event()
     arguments = (scenario, seed, bus, rate_hz, out, ready, stop)
     plant = context.Process(target=serve_plant, args=arguments, name="plant", daemon=True)
@@ -87,7 +101,9 @@ def fly_in_real_time(
                 progress(tick / rate_hz)
             return tick >= script.ticks
 
-        loop = open_loop(stack, firmware, requests, [recording(recorder, rate_hz)])
+        refused = stack.enter_context(real_time())
+        loop = open_loop(stack, firmware, requests, [recording(recorder, rate_hz), *observers])
+        use_priority(TICK_PRIORITY)
         loop.listen()
         stack.enter_context(quiet_garbage())
         start_ns = loop.clock.now_ns()
@@ -95,4 +111,4 @@ def fly_in_real_time(
         loop.run(stop_at_end)
     keeper = loop.rate_keeper
     lateness = {"p50": keeper.lateness.quantile_ns(0.5), "p99": keeper.lateness.quantile_ns(0.99), "worst": keeper.lateness.worst_ns}
-    return RealTimeFlight(script.ticks / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness)
+    return RealTimeFlight(script.ticks / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness, refused)

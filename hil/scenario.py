@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy as np
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
 from firmware_py.description.vehicle import load_vehicle
+from hil.plant.build import nominal_centre
+from hil.plant.lattice import is_connected, place
 from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
 
@@ -22,12 +25,20 @@ class ModuleStart:
 
     number: int = quantity(low=1, high=29, help="number on the bus")
     vehicle: str = quantity("modcube", help="vehicle name or file")
-    position_m: np.ndarray = quantity(unit="m", low=-1000, high=1000, shape=(3,), help="hull centre, world")
-    euler_deg: np.ndarray = quantity([0, 0, 0], unit="deg", low=-360, high=360, shape=(3,), help="roll, pitch, yaw")
+    position_m: np.ndarray = quantity(
+        [0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,),
+        help="world; of a module alone its hull's centre, of docked ones the body's centre of mass, given with the first",
+    )  # fmt: skip
+    euler_deg: np.ndarray = quantity(
+        [0, 0, 0], unit="deg", low=-360, high=360, shape=(3,), help="roll, pitch, yaw of the body, given with the first"
+    )
+    body: int = quantity(-1, low=-1, high=63, help="modules with the same number start docked; -1: alone")
+    cell: np.ndarray = quantity([0, 0, 0], unit="lattice", low=-64, high=64, shape=(3,), help="place in its body")
+    rotation: int = quantity(0, low=0, high=23, help="which of the 24 rotations of the cube it has in its body")
 
     @property
     def start(self) -> Start:
-        """Pose at time 0."""
+        """Pose at time 0 of a module alone, or of the body that it leads."""
         return Start(np.array(self.position_m), rotations.from_euler(*np.radians(self.euler_deg)))
 
 
@@ -35,14 +46,18 @@ class ModuleStart:
 class Task:
     """What the robot is to do."""
 
-    kind: str = quantity(choices=("hover", "spiral"), help="hover: hold the place; spiral: climb on a cylinder")
+    kind: str = quantity(
+        choices=("hover", "spiral", "moebius"),
+        help="hover: hold the place; spiral: climb on a cylinder; moebius: along the rim of a Moebius strip",
+    )
     settle_s: float = quantity(15.0, unit="s", low=0, high=600, help="held at the start before the task begins")
     duration_s: float = quantity(unit="s", low=0.1, high=7200, help="of the task itself, rest to rest")
-    radius_m: float = quantity(0.30, unit="m", low=0.01, high=100, help="spiral: radius")
+    radius_m: float = quantity(0.30, unit="m", low=0.01, high=100, help="spiral: radius; moebius: of the centre circle")
     climb_m: float = quantity(0.40, unit="m", low=-100, high=100, help="spiral: height gained")
-    turns: float = quantity(2.0, low=0.01, high=1000, help="spiral: turns, seen from above clockwise")
+    turns: float = quantity(2.0, low=0.01, high=1000, help="spiral: turns, seen from above clockwise; moebius: laps")
+    half_width_m: float = quantity(0.30, unit="m", low=0, high=100, help="moebius: half-width of the strip")
     centre_m: np.ndarray = quantity(
-        [0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,), help="hover: place; spiral: bottom of its axis"
+        [0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,), help="hover: place; spiral: bottom of its axis; moebius: centre"
     )
 
 
@@ -73,6 +88,20 @@ class Scenario:
     def __post_init__(self) -> None:
         if not self.module:
             raise DescriptionError("has no [[module]] table; a scenario needs at least one")
+        for members in self.groups:
+            cells = np.array([self.module[m].cell for m in members])
+            if len(members) > 1 and not is_connected(cells):
+                numbers = ", ".join(str(self.module[m].number) for m in members)
+                raise DescriptionError(f"modules {numbers} share a body, but their cells do not hang together")
+
+    @property
+    def groups(self) -> list[tuple[int, ...]]:
+        """Modules of each body at the start, by index, the leader first."""
+        found: dict[tuple[str, int], list[int]] = {}
+        for index, module in enumerate(self.module):
+            key = ("body", module.body) if module.body >= 0 else ("alone", index)
+            found.setdefault(key, []).append(index)
+        return [tuple(members) for members in found.values()]
 
     @property
     def duration_s(self) -> float:
@@ -97,10 +126,34 @@ class Scenario:
         return dataclasses.replace(self, world=dataclasses.replace(self.world, **CALM))  # type: ignore[arg-type]
 
 
+PITCH_M = 0.21
+"""Lattice pitch of docked modules (the paper's)."""
+
+
 def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
     """The world of a scenario at time 0. Raises DescriptionError."""
     vehicles = [load_vehicle(m.vehicle) for m in scenario.module]
-    return World(scenario.world, scenario.tank, vehicles, [m.start for m in scenario.module], seed, period_ns)
+    groups = scenario.groups
+    places = [place(m.cell, m.rotation, PITCH_M, _origin(scenario, groups, i)) for i, m in enumerate(scenario.module)]
+    starts = [m.start for m in scenario.module]
+    for members in groups:
+        start = starts[members[0]]
+        centre = nominal_centre([vehicles[m] for m in members], [places[m] for m in members])
+        if len(members) == 1:
+            centre = np.zeros(3)
+        for m in members:
+            lever = rotations.rotate(start.q_wm, places[m].position - centre)
+            q_wm = rotations.multiply(start.q_wm, places[m].quaternion)
+            starts[m] = Start(start.p_wm + lever, q_wm)
+    return World(
+        scenario.world, scenario.tank, vehicles, starts, seed, period_ns, groups=groups, places=places
+    )  # fmt: skip
+
+
+def _origin(scenario: Scenario, groups: Sequence[Sequence[int]], module: int) -> np.ndarray:
+    """Cell of the module that leads the body of `module`."""
+    leader = next(members[0] for members in groups if module in members)
+    return np.array(scenario.module[leader].cell)
 
 
 def scenario_names() -> list[str]:

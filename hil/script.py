@@ -56,6 +56,10 @@ def _spiral(task: Task, q_wb: np.ndarray) -> Trajectory:
     return paths.spiral(task.centre_m, task.radius_m, task.climb_m, task.turns, task.duration_s, attitude=q_wb)
 
 
-TASKS: dict[str, Callable[[Task, np.ndarray], Trajectory]] = {"hover": _hover, "spiral": _spiral}
+def _moebius(task: Task, q_wb: np.ndarray) -> Trajectory:
+    return paths.moebius(task.centre_m, task.duration_s, task.radius_m, task.half_width_m, task.turns)
+
+
+TASKS: dict[str, Callable[[Task, np.ndarray], Trajectory]] = {"hover": _hover, "moebius": _moebius, "spiral": _spiral}
 """Trajectory of each kind of task."""
 

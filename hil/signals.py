@@ -5,14 +5,19 @@ The plant writes with another library than the firmware (mcap here, foxglove the
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from firmware_py.description.signals import Columns, Layout, Signal, read_signals
+
+if TYPE_CHECKING:
+    from hil.plant.world import World
 
 TRUTH_LOG = "truth.mcap"
 SIGNAL_LOG = "signals.mcap"
@@ -34,8 +39,21 @@ def module_signals(thrusters: int) -> tuple[Signal, ...]:
     )
 
 
+def body_signals(modules: int) -> tuple[Signal, ...]:
+    """Truth of one body in one tick, in the order of `TruthRecorder.record_body`."""
+    return (
+        Signal("tick", kind="int"),
+        Signal("time_ns", unit="ns", kind="int"),
+        Signal("member", modules),
+        Signal("p_wb", 3, "m"),
+        Signal("q_wb", 4),
+        Signal("v_w", 3, "m/s"),
+        Signal("w_b", 3, "rad/s"),
+    )
+
+
 class TruthRecorder:
-    """Writes /plant/moduleN, a message per tick and module. A context manager. Raises OSError when the disk is full."""
+    """Writes /plant/moduleN and /plant/bodyN (N: its leader), a message per tick and module or body. A context manager. Raises OSError when the disk is full."""
 
     def __init__(self, folder: Path, thrusters: tuple[int, ...]) -> None:
         """`thrusters` has the number of thrusters of each module of the fleet, in its order."""
@@ -49,6 +67,43 @@ class TruthRecorder:
             schema = self._writer.register_schema(layout.schema_name, "protobuf", layout.schema)
             channel = self._writer.register_channel(f"/plant/module{module}", "protobuf", schema)
             self._modules.append((channel, layout.row()))
+        self._body_layout = Layout("Body", body_signals(len(thrusters)))
+        self._body_schema = self._writer.register_schema(self._body_layout.schema_name, "protobuf", self._body_layout.schema)
+        self._bodies: dict[int, Any] = {}
+
+    def record_world(self, tick: int, world: World) -> None:
+        """Truth of everything at the moment of SYNC `tick`."""
+        for module in range(len(world.vehicles)):
+            t = world.truth(module)
+            self.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w)
+        for body in range(len(world.bodies)):
+            b = world.body_truth(body)
+            self.record_body(tick, b.time_ns, b.modules, b.p_wb, b.q_wb, b.v_w, b.w_b)
+
+    def record_body(
+        self,
+        tick: int,
+        time_ns: int,
+        modules: Sequence[int],
+        p_wb: np.ndarray,
+        q_wb: np.ndarray,
+        v_w: np.ndarray,
+        w_b: np.ndarray,
+    ) -> None:
+        """Truth of the body that `modules` make up, its leader first, at the moment of SYNC `tick`.
+
+        Args:
+            p_wb, q_wb: (3,) m nominal centre of mass and (4,) body frame in the world.
+            v_w: (3,) velocity of that point, world, m/s. w_b: (3,) angular rate, body frame, rad/s.
+        """
+        leader = modules[0]
+        if leader not in self._bodies:
+            channel = self._writer.register_channel(f"/plant/body{leader}", "protobuf", self._body_schema)
+            self._bodies[leader] = (channel, self._body_layout.row())
+        channel, row = self._bodies[leader]
+        member = np.zeros(len(self._modules))
+        member[list(modules)] = 1.0
+        self._add(channel, time_ns, row.encode((tick, time_ns, member, p_wb, q_wb, v_w, w_b)))
 
     def record(
         self,
@@ -70,7 +125,9 @@ class TruthRecorder:
             force_n: (n,) force that each thruster gives, N. water_w: (3,) velocity of the undisturbed water there, m/s.
         """
         channel, row = self._modules[module]
-        data = row.encode((tick, time_ns, p_wm, q_wm, v_w, w_b, force_n, water_w))
+        self._add(channel, time_ns, row.encode((tick, time_ns, p_wm, q_wm, v_w, w_b, force_n, water_w)))
+
+    def _add(self, channel: int, time_ns: int, data: bytes) -> None:
         self._sequence += 1
         self._writer.add_message(channel, log_time=time_ns, data=data, publish_time=time_ns, sequence=self._sequence)
 
@@ -91,7 +148,11 @@ class TruthRecorder:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One body over the ticks that both logs hold, row by row; `unmatched` ticks of the firmware have no truth."""
+    """One body over the ticks that both logs hold, row by row; `unmatched` ticks of the firmware have no truth.
+
+    `truth` has the columns of the body's leading module (its `force_n` those of all its modules), and with them
+    `member`, `p_wb`, `q_wb`, `v_wb`, `w_bb` of the body where the log has them.
+    """
 
     firmware: Columns
     truth: Columns
@@ -104,6 +165,16 @@ class Flight:
         """(k,) firmware time since the first joined tick, s."""
         time_ns = self.firmware["time_ns"]
         return (time_ns - time_ns[0]) / 1e9
+
+    @property
+    def p_wb(self) -> np.ndarray:
+        """(k, 3) where the point that the firmware steers really is, world, m; the hull's centre in a log without bodies."""
+        return self.truth.get("p_wb", self.truth["p_wm"])
+
+    @property
+    def q_wb(self) -> np.ndarray:
+        """(k, 4) true attitude of the body; that of the module in a log without bodies."""
+        return self.truth.get("q_wb", self.truth["q_wm"])
 
     def between(self, start_ns: int, end_ns: int) -> Flight:
         """The ticks with start <= time <= end."""
@@ -124,6 +195,7 @@ def read_flight(folder: Path, body: int = 0, module: int = 0) -> Flight:
     firmware, truth = signals.get(f"/firmware/body{body}"), truths.get(f"/plant/module{module}")
     if firmware is None or truth is None:
         raise ValueError(f"{folder}: no signals of body {body} or no truth of module {module} in the logs")
+    truth = _joined(truth, truths.get(f"/plant/body{body}"), truths)
     _, mine, theirs = np.intersect1d(firmware["tick"], truth["tick"], return_indices=True)
     if not len(mine):
         raise ValueError(f"{folder}: the two logs share no tick")
@@ -135,3 +207,26 @@ def read_flight(folder: Path, body: int = 0, module: int = 0) -> Flight:
         signals.get("/firmware/ticks", {}),
         len(firmware["tick"]) - len(mine),
     )
+
+
+def _joined(module: Columns, body: Columns | None, truths: Mapping[str, Columns]) -> Columns:
+    """The module's truth with that of the body it leads, over the ticks of both."""
+    if body is None:
+        return module
+    _, mine, theirs = np.intersect1d(module["tick"], body["tick"], return_indices=True)
+    joined = {name: column[mine] for name, column in module.items()}
+    joined |= {name: body[name][theirs] for name in ("member", "p_wb", "q_wb")}
+    joined |= {"v_wb": body["v_w"][theirs], "w_bb": body["w_b"][theirs]}
+    members = np.flatnonzero(joined["member"].any(axis=0))
+    if len(members) > 1:
+        others = [truths[f"/plant/module{m}"] for m in members]
+        joined["force_n"] = np.hstack([
+            np.where(joined["member"][:, [m]] > 0.0, _at(other, joined["tick"], "force_n"), np.nan)
+            for m, other in zip(members, others, strict=True)
+        ])  # fmt: skip
+    return joined
+
+
+def _at(columns: Columns, ticks: np.ndarray, name: str) -> np.ndarray:
+    """Rows of a column at these ticks; every tick of a module's truth has all modules."""
+    return columns[name][np.searchsorted(columns["tick"], ticks)]

@@ -1,14 +1,17 @@
 #!/usr/bin/env python3
 """What a vehicle, an assembly or the paper's seven robots can do; or which shape to dock for a task.
 
-    characterise.py modcube bluerov2_heavy --out runs/capability
-    characterise.py --assembly 2x2x1 --module modcube
-    characterise.py --table1 --out runs/table1
-    characterise.py --choose 4 --task task.toml
+characterise.py modcube bluerov2_heavy --out runs/capability
+characterise.py --assembly 2x2x1 --module modcube
+characterise.py --table1 --out runs/table1
+characterise.py --choose 4 --task task.toml
 """
 
 from __future__ import annotations
 
+import argparse
+import io
+import math
 import sys
 import tomllib
 from collections.abc import Callable, Sequence
@@ -16,12 +19,10 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, NoReturn
 
 import characterise_table as table
-import click
 import numpy as np
-import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -29,7 +30,7 @@ from rich.table import Table
 from firmware_py.description.fleet import load_fleet
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle, load_vehicle
-from firmware_py.prepare.capability.layout import AXES, FRAMES, UNITS, Layout, of_modules, of_rows, of_vehicle
+from firmware_py.prepare.capability.layout import AXES, UNITS, Layout, of_modules, of_rows, of_vehicle
 from firmware_py.prepare.capability.summary import DIRECTIONS, Capability, characterise
 
 DATA = Path(__file__).with_name("data")
@@ -39,48 +40,87 @@ WIDTH = 170
 """Characters of a table that does not go to a terminal."""
 LARGEST_BOX = 64
 """Modules of an assembly."""
+LEAST_DIRECTIONS, MOST_DIRECTIONS = 121, 100_000
+"""Harmonics of degree ten have 121 coefficients."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line; exit status 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}\n")
 
 
 def main() -> None:
     """Command line; bad input is one line and exit status 2."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(run)
     try:
-        app(standalone_mode=False)
-    except (DescriptionError, click.ClickException) as error:
-        print(error.format_message() if isinstance(error, click.ClickException) else error, file=sys.stderr)
+        run(arguments())
+    except DescriptionError as error:
+        print(error, file=sys.stderr)
         raise SystemExit(2) from None
 
 
-def run(
-    vehicle: Annotated[list[str] | None, typer.Argument(help="vehicle names or .toml files")] = None,
-    assembly: Annotated[str, typer.Option(help="AxBxC modules, cells such as '0,0,0 1,0,0', or a fleet file")] = "",
-    module: Annotated[str, typer.Option(help="vehicle of every module of an assembly")] = "modcube",
-    table1: Annotated[bool, typer.Option("--table1", help="the paper's seven robots beside its Table I")] = False,
-    choose: Annotated[int, typer.Option(help="rank all shapes of so many modules", min=0)] = 0,
-    task: Annotated[Path | None, typer.Option(help="task file for --choose")] = None,
-    out: Annotated[Path | None, typer.Option(help="folder for CSV, JSON, figure (PNG) and report (HTML)")] = None,
-    directions: Annotated[int, typer.Option(help="directions over the sphere", min=121, max=100000)] = DIRECTIONS,
-    force_n: Annotated[float, typer.Option(help="wrench of the power space, force frame, N", min=1e-6)] = 1.0,
-    torque_nm: Annotated[float, typer.Option(help="wrench of the power space, torque frame, N m", min=1e-6)] = 1.0,
-    jobs: Annotated[int, typer.Option(help="processes", min=1)] = 2,
-) -> None:
-    """Reachable wrench, power, thrust variance and their surfaces' energies."""
-    asked = [bool(vehicle), bool(assembly), table1, choose > 0]
-    if sum(asked) != 1:
-        raise DescriptionError("characterise: give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE")
-    if choose:
-        if task is None:
-            raise DescriptionError("characterise: --choose needs --task FILE")
-        return _choose(choose, task, out)
-    settings = {"count": directions, "sizes": {"force": force_n, "torque": torque_nm}}
-    if table1:
-        return _table1(settings, jobs, out)
-    layouts = [of_vehicle(load_vehicle(name)) for name in vehicle or []] or _assemblies(assembly, load_vehicle(module))
-    found = _all({layout.name: layout for layout in layouts}, settings, jobs)
-    _print(found)
-    if out:
-        _write(out, "capability", found, table.rows_of(found), {name: name for name in found})
+def arguments() -> argparse.Namespace:
+    """What is asked for."""
+    assert __doc__ is not None
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("vehicle", nargs="*", help="vehicle names or .toml files")
+    parser.add_argument(
+        "--assembly", metavar="SHAPE", help="AxBxC modules, cells such as '0,0,0 1,0,0', or a fleet file"
+    )
+    parser.add_argument("--module", default="modcube", help="vehicle of every module of an assembly")
+    parser.add_argument("--table1", action="store_true", help="the paper's seven robots beside its Table I")
+    parser.add_argument("--choose", type=_count, metavar="N", help="rank all shapes of N modules, 1 to 5")
+    parser.add_argument("--task", type=Path, metavar="FILE", help="task file for --choose")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="CSV, JSON, figure (PNG) and report (HTML) go there")
+    parser.add_argument("--directions", type=_count, default=DIRECTIONS, help="directions over the sphere, 121 or more")
+    parser.add_argument("--force", type=_size, default=1.0, metavar="N", help="wrench of the power space, force frame")
+    parser.add_argument(
+        "--torque", type=_size, default=1.0, metavar="NM", help="wrench of the power space, torque frame"
+    )
+    parser.add_argument("--jobs", type=_count, default=2, help="processes")
+    given = parser.parse_args()
+    if sum([bool(given.vehicle), given.assembly is not None, given.table1, given.choose is not None]) != 1:
+        parser.error("give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE")
+    if (given.choose is None) != (given.task is None):
+        parser.error("--choose N and --task FILE go together")
+    if not LEAST_DIRECTIONS <= given.directions <= MOST_DIRECTIONS:
+        parser.error(f"--directions {given.directions}: permitted: {LEAST_DIRECTIONS} to {MOST_DIRECTIONS}")
+    return given
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
+    return int(text)
+
+
+def _size(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above zero")
+    return value
+
+
+def run(given: argparse.Namespace) -> None:
+    """Does what is asked for. Raises DescriptionError."""
+    settings = {"count": given.directions, "sizes": {"force": given.force, "torque": given.torque}}
+    if given.choose is not None:
+        from characterise_choose import choose
+
+        choose(given.choose, given.task, given.out, _console(), _console(error=True))
+    elif given.table1:
+        _table1(settings, given.jobs, given.out)
+    else:
+        layouts = [of_vehicle(load_vehicle(name)) for name in given.vehicle]
+        layouts += _assemblies(given.assembly, load_vehicle(given.module)) if given.assembly is not None else []
+        found = _all({layout.name: layout for layout in layouts}, settings, given.jobs)
+        _print(found)
+        if given.out:
+            _write(given.out, "capability", found, table.rows_of(found), {name: name for name in found})
 
 
 def _console(error: bool = False) -> Console:
@@ -113,7 +153,9 @@ def _fleet(path: Path) -> list[Layout]:
 
 def _cells(shape: str) -> list[tuple[int, int, int]]:
     """Cells of `2x2x1` or of `0,0,0 1,0,0`."""
-    wrong = f"--assembly {shape!r}: needs AxBxC, cells such as '0,0,0 1,0,0', or a fleet file (.toml); 64 modules at most"
+    wrong = (
+        f"--assembly {shape!r}: needs AxBxC, cells such as '0,0,0 1,0,0', or a fleet file (.toml); 64 modules at most"
+    )
     try:
         if "," in shape:
             found = [tuple(int(c) for c in cell.split(",")) for cell in shape.replace(";", " ").split()]
@@ -130,7 +172,7 @@ def _cells(shape: str) -> list[tuple[int, int, int]]:
 
 
 def _all(layouts: dict[str, Layout], settings: dict[str, Any], jobs: int) -> dict[str, Capability]:
-    """Every layout characterised, with progress on the terminal; in `jobs` processes where there are several layouts."""
+    """Every layout characterised, with progress; in `jobs` processes where there are several."""
     work = partial(characterise, **settings)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     console = _console(error=True)
@@ -177,7 +219,7 @@ def _print(found: dict[str, Capability]) -> None:
         unit = UNITS["force"] if k < 3 else UNITS["torque"]
         shown.add_row(f"{axis} + / -, {unit}", *(f"{c.axes[k, 0]:.4g} / {c.axes[k, 1]:.4g}" for c in found.values()))
     for row in table.rows_of(found):
-        if row.metric not in ("thrusters", "rank"):
+        if row.metric not in ("thrusters", "rank", "assumption"):
             label = row.metric if row.space == "-" else f"{row.space} {row.frame} {row.metric}"
             shown.add_row(label.replace("[", r"\["), *(table.text(row.cells[name]) for name in found))
     console.print(shown)
@@ -187,7 +229,12 @@ def _print(found: dict[str, Capability]) -> None:
 
 
 def _write(
-    out: Path, stem: str, found: dict[str, Capability], rows: Sequence[table.Row], titles: dict[str, str], html: str = ""
+    out: Path,
+    stem: str,
+    found: dict[str, Capability],
+    rows: Sequence[table.Row],
+    titles: dict[str, str],
+    html: str = "",
 ) -> None:
     """CSV, JSON, PNG and HTML into `out`."""
     from characterise_draw import draw  # matplotlib takes a second to import
@@ -211,7 +258,7 @@ def _table1(settings: dict[str, Any], jobs: int, out: Path | None) -> None:
     from characterise_table1 import build_rows, show
 
     robots = tomllib.loads((DATA / "robots.toml").read_text(encoding="utf-8"))
-    raw = tomllib.loads((DATA / "authors_layouts.toml").read_text(encoding="utf-8"))
+    raw = tomllib.loads((DATA / "published_layouts.toml").read_text(encoding="utf-8"))
     layouts = {robot["column"]: _robot(robot, raw) for robot in (*robots["robot"], *robots["beside"])}
     found = _all(layouts, settings, jobs)
     paper = table.read_paper(DATA / "table1.csv")
@@ -220,17 +267,10 @@ def _table1(settings: dict[str, Any], jobs: int, out: Path | None) -> None:
     show(console, rows, paper, robots, found)
     if out:
         titles = {robot["column"]: f"{robot['letter']}: {robot['title']}" for robot in robots["robot"]}
-        record = Console(record=True, width=WIDTH, file=open_nowhere())
+        record = Console(record=True, width=WIDTH, file=io.StringIO())
         show(record, rows, paper, robots, found)
         page = record.export_html(inline_styles=True, code_format="<pre>{code}</pre>")
         _write(out, "table1", found, rows, titles, page)
-
-
-def open_nowhere() -> Any:
-    """A file that keeps nothing."""
-    import io
-
-    return io.StringIO()
 
 
 def _robot(robot: dict[str, Any], raw: dict[str, Any]) -> Layout:
@@ -240,13 +280,6 @@ def _robot(robot: dict[str, Any], raw: dict[str, Any]) -> Layout:
         return of_rows(robot["title"], np.array(source["thrusters"]), source["f_min"], source["f_max"], vehicle)
     cells = robot["cells"]
     return of_modules(cells, [0] * len(cells), [vehicle] * len(cells), name=robot["title"])
-
-
-def _choose(count: int, path: Path, out: Path | None) -> None:
-    """All shapes of `count` modules, best first."""
-    from characterise_choose import choose
-
-    choose(count, path, out, _console(), _console(error=True))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Tables of characterise.py: rows as in the paper's Table I, ours beside the paper's with a word on each cell, CSV and JSON."""
+"""Tables of characterise.py: rows as in the paper's Table I, a word on each cell, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -26,10 +26,19 @@ TABLE_NORMALISATION = "unit_thrust"
 Cell = float | str
 
 WHY = {
-    ("power", "dirichlet_energy"): "paper: idle power and an unstated wrench; ours: measured power above idle, 1 N or 1 N m",
+    (
+        "power",
+        "dirichlet_energy",
+    ): "paper: idle power and an unstated wrench; ours: measured power above idle, 1 N or 1 N m",
     ("power", "willmore_energy"): "1e11 and more comes from degenerate meshes; ours on the fitted surface",
-    ("power", "total_power_w"): "paper: 31.4 kW a thruster, so idle power summed over directions; ours: mean above idle",
-    ("power", "thrust_variance"): "compared as ratio to column A: the paper's wrench is not stated; ours is 1 N or 1 N m",
+    (
+        "power",
+        "total_power_w",
+    ): "paper: 31.4 kW a thruster, so idle power summed over directions; ours: mean above idle",
+    (
+        "power",
+        "thrust_variance",
+    ): "compared as ratio to column A: the paper's wrench is not stated; ours is 1 N or 1 N m",
     ("wrench", "dirichlet_energy"): "the paper's figures follow no scaling of thrust or size",
     ("wrench", "willmore_energy"): "1e9 to 1e17 comes from degenerate meshes; ours on the fitted surface",
     ("wrench", "max_inscribed_ellipsoid_volume"): "unit thrust; torque: the paper exceeds what these arms allow",
@@ -56,7 +65,7 @@ class Row:
 
 
 def rows_of(found: Mapping[str, Capability]) -> list[Row]:
-    """Rows of table1.csv in its order, then ours: every normalisation, passive degrees of freedom declared, quality figures."""
+    """Rows of table1.csv in its order, then ours: normalisations, passive degrees of freedom declared, quality."""
 
     def row(space: str, frame: str, metric: str, better: str, cells: dict[str, Cell]) -> Row:
         return Row(space, frame, metric, better, cells)
@@ -84,7 +93,9 @@ def _further_rows(found: Mapping[str, Capability]) -> list[Row]:
     for frame in FRAMES:
         scale_free = {n: c.power_shape[frame].dirichlet_scale_free for n, c in found.items()}
         rows.append(Row("power", frame, "dirichlet_energy[scale_free]", "lower", dict(scale_free)))
-        rows.append(Row("power", frame, "residual", "lower", {n: _clean(c.power[frame].residual) for n, c in found.items()}))
+        rows.append(
+            Row("power", frame, "residual", "lower", {n: _clean(c.power[frame].residual) for n, c in found.items()})
+        )
         over = {n: c.power[frame].over_limit for n, c in found.items()}
         rows.append(Row("power", frame, "share_over_limits", "lower", dict(over)))
         for how in NORMALISATIONS:
@@ -92,7 +103,9 @@ def _further_rows(found: Mapping[str, Capability]) -> list[Row]:
             name = f"max_inscribed_ellipsoid_volume[{how}]"
             rows.append(Row("wrench", frame, name, "higher", {n: _volume(r) for n, r in parts.items()}))
         parts = {n: c.reach[frame]["physical"] for n, c in found.items()}
-        rows.append(Row("wrench", frame, "worst_direction[physical]", "higher", {n: _worst(r) for n, r in parts.items()}))
+        rows.append(
+            Row("wrench", frame, "worst_direction[physical]", "higher", {n: _worst(r) for n, r in parts.items()})
+        )
         free = {n: _energy(c.reach[frame][TABLE_NORMALISATION], "dirichlet_scale_free") for n, c in found.items()}
         rows.append(Row("wrench", frame, "dirichlet_energy[scale_free]", "lower", dict(free)))
         declared = {n: _declared(c, frame) for n, c in found.items()}
@@ -102,6 +115,8 @@ def _further_rows(found: Mapping[str, Capability]) -> list[Row]:
     rows.append(Row("-", "-", "rank", "higher", {n: float(c.rank) for n, c in found.items()}))
     held: dict[str, Cell] = {n: " ".join(AXES[k] for k in c.layout.passive) or "-" for n, c in found.items()}
     rows.append(Row("-", "-", "passive", "-", held))
+    assumed: dict[str, Cell] = {n: c.layout.assumption or "-" for n, c in found.items()}
+    rows.append(Row("-", "-", "assumption", "-", assumed))
     rows.append(Row("-", "-", "program_facet_difference", "lower", {n: c.programs_differ for n, c in found.items()}))
     return rows
 
@@ -172,7 +187,7 @@ def size_word(ours: Sequence[float], theirs: Sequence[float]) -> str:
 
 
 def spearman(ours: Mapping[str, Cell], paper: Mapping[str, float]) -> tuple[float, int]:
-    """Rank correlation of ours with the paper's and the number of columns in it; degenerate and refused cells are left out."""
+    """Rank correlation of ours with the paper's, and over how many columns; degenerate and refused cells left out."""
     pairs = [(v, paper[n]) for n, v in ours.items() if n in paper and isinstance(v, float) and math.isfinite(v)]
     if len(pairs) < 3:
         return math.nan, len(pairs)
@@ -198,7 +213,7 @@ def text(cell: Cell) -> str:
 
 
 def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> None:
-    """The columns of table1.csv: space, frame, metric, better, then one a vehicle; a degenerate or refused cell says so."""
+    """The columns of table1.csv: space, frame, metric, better, one a vehicle; a degenerate or refused cell says so."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["space", "frame", "metric", "better", *columns])

@@ -1,4 +1,4 @@
-"""`characterise.py --table1`: ours beside the paper's, a word on each cell, rank correlation, thrust variance over 1, 2, 4 modules."""
+"""`characterise.py --table1`: ours beside the paper's, a word on each cell, rank correlation, thrust variance."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rich.table import Table
 
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M
-from firmware_py.prepare.capability.layout import FRAMES
-from firmware_py.prepare.capability.summary import Capability
+from firmware_py.prepare.capability.layout import AXES, FRAMES, NORMALISATIONS, UNITS
+from firmware_py.prepare.capability.summary import Capability, Reach
 
 _COLOURS = {table.AGREES: "green", table.DIFFERS: "yellow", table.INCONSISTENT: "red", table.NOTHING: "dim"}
 _SHORT = {"max_inscribed_ellipsoid_volume": "V_MIE", "dirichlet_energy": "E_D", "willmore_energy": "E_W"}
@@ -77,12 +77,14 @@ def show(
             shown.add_row(_label(row), *(_size_cell(robot) for robot in robots["robot"]), "-")
     console.print(shown)
     for (space, metric), why in table.WHY.items():
-        console.print(f"{_SPACES.get(space, '')} {_SHORT.get(metric, metric)}: {why}".strip(), markup=False, highlight=False)
+        console.print(
+            f"{_SPACES.get(space, '')} {_SHORT.get(metric, metric)}: {why}".strip(), markup=False, highlight=False
+        )
     console.print("D repeats the paper's Double ModCube; its layout here is an assumption.", highlight=False)
-    _further(console, rows, robots)
+    _further(console, robots, found)
     _variance(console, found, paper)
     for robot in robots["robot"]:
-        for note in found[robot["column"]].notes:
+        for note in dict.fromkeys(found[robot["column"]].notes):
             console.print(f"{robot['letter']}: {note}", markup=False, highlight=False)
 
 
@@ -101,20 +103,44 @@ def _size_cell(robot: Mapping[str, Any]) -> str:
     return _cell(_size_text(ours), _size_text(robot["size_cm"]), table.size_word(ours, robot["size_cm"]))
 
 
-def _further(console: Console, rows: Sequence[table.Row], robots: Mapping[str, Any]) -> None:
-    """Ours alone: all normalisations, passive declared, the layouts beside."""
-    everyone = (*robots["robot"], *robots["beside"])
-    shown = Table(title="Ours: all normalisations, and the layouts beside the paper's columns", title_justify="left")
-    shown.add_column("row")
-    for robot in everyone:
-        shown.add_column(robot["title"], justify="right")
-    for row in rows:
-        short = row.metric
-        for name, brief in _SHORT.items():
-            short = short.replace(name, brief)
-        label = f"{_SPACES[row.space]} {row.frame} {short}" if row.space in _SPACES else short
-        shown.add_row(label.replace("[", r"\["), *(table.text(row.cells[robot["column"]]) for robot in everyone))
-    console.print(shown)
+def _further(console: Console, robots: Mapping[str, Any], found: Mapping[str, Capability]) -> None:
+    """Ours alone, one robot a line: all normalisations, passive degrees of freedom declared, worst direction."""
+    for frame, unit in UNITS.items():
+        volume = f"V, ({unit})^3" if " " in unit else f"V, {unit}^3"
+        shown = Table(title=f"Ours, {frame} frame", title_justify="left")
+        heads = (
+            "robot",
+            "n",
+            "rank",
+            "passive",
+            f"{volume}\nphysical",
+            "V\nunit thrust",
+            "V\nequal total",
+            "V unit thrust\npassive declared",
+        )
+        for k, head in enumerate((*heads, f"worst, {unit}\nphysical", "E_D/a00^2\npower", "E_D/a00^2\nwrench")):
+            shown.add_column(head, justify="right" if k else "left")
+        for robot in (*robots["robot"], *robots["beside"]):
+            c = found[robot["column"]]
+            cells = [
+                robot["title"],
+                str(c.layout.count),
+                str(c.rank),
+                " ".join(AXES[k] for k in c.layout.passive) or "-",
+            ]
+            cells += [_volume(c.reach[frame][how]) for how in NORMALISATIONS]
+            cells.append(_volume(c.declared[frame][table.TABLE_NORMALISATION], frame) if c.declared else "-")
+            shape = c.reach[frame][table.TABLE_NORMALISATION].shape
+            cells += [f"{c.reach[frame]['physical'].worst:.4g}", f"{c.power_shape[frame].dirichlet_scale_free:.3g}"]
+            shown.add_row(*cells, f"{shape.dirichlet_scale_free:.3g}" if shape else "-")
+        console.print(shown)
+
+
+def _volume(reach: Reach, frame: str = "") -> str:
+    if reach.section is None:
+        return "0 (degenerate)"
+    area = " (N m)^2" if frame == "torque" and len(reach.section.components) == 2 else ""
+    return f"{reach.volume:.4g}{area}"
 
 
 def _variance(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 from firmware_py.app.firmware import BusFrame, Firmware
@@ -10,45 +11,75 @@ from firmware_py.core.types import Inputs, Outputs, Request
 
 Observer = Callable[[Sequence[BusFrame], Sequence[BusFrame], Inputs, Outputs], None]
 """Called after each tick with the frames received and sent, the inputs and the outputs."""
-DRAIN_ROUNDS = 100_000
-"""Looks at the sockets before frames count as lost by the kernel: about a second; not reached on a working bus."""
+PATIENCE_LOOKS = 20_000
+"""Looks at the sockets before frames count as lost by the bus: about half a second; not reached on a working bus."""
+NOT_SENT = ("down", "full", "gone", "send")
+"""Faults of a port that mean that a frame did not go out."""
 
 
 class Lockstep:
     """The firmware's side of a lockstep run."""
 
-    def __init__(self, firmware: Firmware, ports: Sequence[Port], observers: Sequence[Observer] = ()) -> None:
+    def __init__(
+        self,
+        firmware: Firmware,
+        ports: Sequence[Port],
+        observers: Sequence[Observer] = (),
+        patience_looks: int = PATIENCE_LOOKS,
+    ) -> None:
         self._firmware = firmware
         self._ports = ports
         self._observers = observers
+        self._patience_looks = patience_looks
         self._sync: list[BusFrame] = []
 
-    def start_tick(self, tick: int, time_ns: int) -> int:
-        """Sends SYNC on every bus; returns the number of frames sent."""
+    def start_tick(self, tick: int, time_ns: int) -> list[BusFrame]:
+        """Sends SYNC on every bus; returns what went out."""
         self._sync = self._firmware.sync(tick, time_ns)
-        return self._send(self._sync)
+        return send(self._ports, self._sync)
 
-    def finish_tick(self, tick: int, time_ns: int, requests: Sequence[Request], expected: int) -> tuple[Outputs, int]:
-        """Takes the `expected` frames that the other side sent, steps, sends the commands; returns how many."""
-        received = drain(self._ports, expected)
+    def finish_tick(
+        self, tick: int, time_ns: int, requests: Sequence[Request], expected: Sequence[BusFrame]
+    ) -> tuple[Outputs, list[BusFrame]]:
+        """Takes the `expected` frames that the other side sent, steps, sends the commands; returns those that went out."""
+        received = drain(self._ports, expected, self._patience_looks)
         inputs, outputs, frames = self._firmware.step(tick, time_ns, received, requests)
-        sent = self._send(frames)
+        sent = send(self._ports, frames)
         for observer in self._observers:
             observer(received, self._sync + frames, inputs, outputs)
         return outputs, sent
 
-    def _send(self, frames: Sequence[BusFrame]) -> int:
-        for bus, frame in frames:
-            self._ports[bus].send(frame)
-        return len(frames)
+
+def send(ports: Sequence[Port], frames: Sequence[BusFrame]) -> list[BusFrame]:
+    """Sends `frames`; returns those that the bus took, which the other side may wait for."""
+    taken = []
+    for bus, frame in frames:
+        faults = ports[bus].faults
+        before = sum(faults[kind] for kind in NOT_SENT)
+        ports[bus].send(frame)
+        if sum(faults[kind] for kind in NOT_SENT) == before:
+            taken.append((bus, frame))
+    return taken
 
 
-def drain(ports: Sequence[Port], expected: int) -> list[BusFrame]:
-    """Everything that is there, until `expected` frames are through; nothing waits for a particular one."""
+def drain(
+    ports: Sequence[Port], expected: Sequence[BusFrame], patience_looks: int = PATIENCE_LOOKS
+) -> list[BusFrame]:
+    """Everything that is there, until every frame of `expected` is among it.
+
+    Other senders' frames come as they come and stand for none of the expected ones. Nothing waits for ever: a frame
+    that the bus lost is given up after `patience_looks` looks.
+    """
     received: list[BusFrame] = []
-    for _ in range(DRAIN_ROUNDS):
-        for bus, port in enumerate(ports):
-            received += [(bus, frame) for frame in port.receive()]
-        if len(received) >= expected:
+    missing: Counter[BusFrame] | None = None
+    for _ in range(patience_looks):
+        fresh = [(bus, frame) for bus, port in enumerate(ports) for frame in port.receive()]
+        received += fresh
+        if missing is None:
+            if received == expected:  # by far the most frequent case, and the cheapest to see
+                break
+            missing = Counter(expected)
+        missing -= Counter(fresh)
+        if not missing:
             break
     return received

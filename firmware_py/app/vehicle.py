@@ -16,7 +16,7 @@ from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
-from firmware_py.runtime.realtime import quiet_garbage
+from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 
 FAREWELL_TICKS = 10
@@ -77,7 +77,10 @@ def run_vehicle(
             recorder = Recorder(out, {"rate_hz": fleet.rate_hz})
             stack.callback(recorder.close)
             observers.append(recording(recorder, fleet.rate_hz))
+        for line in stack.enter_context(real_time()):
+            say(f"warning: {line}")
         loop = open_loop(stack, firmware, operator.requests, observers)
+        use_priority(TICK_PRIORITY)
         loop.listen()
         stack.enter_context(_stopping_by_signal(operator))
         stack.enter_context(quiet_garbage())

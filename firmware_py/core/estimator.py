@@ -16,6 +16,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.history import WINDOW_S, History
 from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rotations import conjugate, exp, log, multiply, rotate
+from firmware_py.core.topology import Motion
 from firmware_py.core.types import BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 
@@ -80,6 +81,21 @@ class Estimator:
         if self._accepted:
             self._advance(max(self._anchor_ns, time_ns - int(WINDOW_S * 1e9)))
             self._carry()
+        return self._estimate(time_ns)
+
+    @property
+    def motion(self) -> Motion:
+        """State and covariance now, for a body that joins or parts."""
+        return Motion(self._now.copy(), self._covariance.copy())
+
+    def restart(self, time_ns: int, motion: Motion) -> Estimate:
+        """Goes on from `motion` at `time_ns`, as after a dock; returns the estimate of the same tick."""
+        self._history.push(time_ns, np.zeros(6), None, None, None)
+        self._x, self._covariance = motion.x.copy(), motion.covariance.copy()
+        self._now = self._x
+        self._anchor_ns = self._last_tag_ns = time_ns
+        self._accepted, self._refused_in_row = READY_AFTER, 0
+        self._nis, self._nis_dof = math.nan, 0
         return self._estimate(time_ns)
 
     # ------------------------------------------------------------ fusion at the anchor

@@ -1,4 +1,4 @@
-"""Last stage of a tick, after everything else: per thruster force, slew and arm state, per module supply power; then the command.
+"""Last stage of a tick, after everything else: per thruster force, slew and arm state, per module supply power and magnets; then the command.
 
 Whatever asks for a force, nothing leaves that this file has not passed.
 """
@@ -17,6 +17,9 @@ VOLTAGE_RANGE = (0.6, 1.4)
 """Share of the nominal voltage outside of which a reading is not believed."""
 POWER_HALVINGS = 12
 """Bisections of the share that meets the supply limit."""
+OFF, FORWARD, REVERSE = 0, 1, 2
+"""States of a docking relay."""
+FACES = 6
 
 
 class Limiter:
@@ -34,16 +37,20 @@ class Limiter:
         ]
         self._curves = (t.forward, t.reverse, t.deadband_n)
         self._full = np.ones(t.f_max.size)
-        self._scale = np.ones(t.f_max.size)
+        self.magnets = [MagnetLimiter(parameters, dt_s) for _ in body.modules]
+        """One for each module."""
         self.force_n = np.zeros(t.f_max.size)
 
-    def step(self, wanted_n: np.ndarray, armed: bool, voltage_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def step(
+        self, wanted_n: np.ndarray, armed: bool, voltage_v: np.ndarray, alive: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Limited forces (n,) N and commands (n,) in -1..1.
 
         Args:
             wanted_n: (n,) N; a value that is not finite counts as zero.
             armed: without it every command is zero in this very tick.
             voltage_v: (m,) measured supply of each module.
+            alive: (n,) bool, thrusters that may turn; the others stop in this very tick. None: all.
         """
         if not armed:
             self.force_n = np.zeros_like(self.force_n)
@@ -51,6 +58,8 @@ class Limiter:
         wanted = np.where(np.isfinite(wanted_n), wanted_n, 0.0)
         wanted = np.clip(wanted, self.force_n - self._step, self.force_n + self._step)
         wanted = np.clip(wanted, self._low, self._high)
+        if alive is not None:
+            wanted[~alive] = 0.0
         for module in range(len(self._of_module)):
             self._limit_power(wanted, module)
         self.force_n = wanted
@@ -59,16 +68,17 @@ class Limiter:
         return wanted, out
 
     def _limit_power(self, wanted: np.ndarray, module: int) -> None:
-        """Scales the forces of one module down until its supply can give their power."""
+        """Scales the forces of one module down until its supply can give their power besides its magnets'."""
         index = self._of_module[module]
         force = wanted[index]
         forward, reverse = self._power[module]
-        if total_power(force, forward, reverse) <= self._supply[module]:
+        supply = max(0.0, self._supply[module] - self.magnets[module].power_w)
+        if total_power(force, forward, reverse) <= supply:
             return
         low, high = 0.0, 1.0
         for _ in range(POWER_HALVINGS):
             share = 0.5 * (low + high)
-            if total_power(force * share, forward, reverse) <= self._supply[module]:
+            if total_power(force * share, forward, reverse) <= supply:
                 low = share
             else:
                 high = share
@@ -77,3 +87,27 @@ class Limiter:
     def _voltage_scale(self, voltage_v: np.ndarray) -> np.ndarray:
         ratio = np.clip(voltage_v[self._t.module] / self._t.voltage_v, *VOLTAGE_RANGE)
         return np.asarray(ratio**VOLTAGE_EXPONENT)
+
+
+class MagnetLimiter:
+    """Keeps the docking magnets of one module from burning: each may be on for a while, and for a share of time for ever.
+
+    A magnet's account falls by the time that it is on, and fills at the rate of its duty. An empty one goes off until it is half full.
+    """
+
+    def __init__(self, parameters: LimiterParameters, dt_s: float) -> None:
+        self._p, self._dt_s = parameters, dt_s
+        self._left_s = np.full(FACES, parameters.relay_on_s)
+        self._resting = np.zeros(FACES, dtype=bool)
+        self.power_w = 0.0
+        """What the magnets that are on take, W."""
+
+    def step(self, wanted: tuple[int, ...]) -> tuple[int, ...]:
+        """The relay states that are permitted in this tick; a state that does not exist is off. To be called in every tick."""
+        asked = np.array([state in (FORWARD, REVERSE) for state in wanted])
+        on = asked & ~self._resting
+        full = self._p.relay_on_s
+        self._left_s = np.minimum(full, self._left_s + self._dt_s * (self._p.relay_duty - on))
+        self._resting = np.where(self._resting, self._left_s < 0.5 * full, self._left_s <= 0.0)
+        self.power_w = float(np.sum(on)) * self._p.relay_w
+        return tuple(int(state) if lit else OFF for state, lit in zip(wanted, on, strict=True))

@@ -1,24 +1,40 @@
-"""The tick, as in the paper's block diagram: measure, estimate, decide, guide, control, allocate, limit. One call serves the whole fleet."""
+"""The tick, as in the paper's block diagram: measure, estimate, dock, decide, guide, control, allocate, limit. One call serves the whole fleet."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.controller import Controller
+from firmware_py.core.docking import Decisions, DockingStage, Join, Part, tag_table
 from firmware_py.core.estimator import Estimator, TagOnlyEstimator
+from firmware_py.core.faults import FaultDetector
+from firmware_py.core.glide import Glide
+from firmware_py.core.guidance_modes import Guidance
+from firmware_py.core.health import HealthMonitor
 from firmware_py.core.limiter import Limiter
 from firmware_py.core.measurements import Measurements
-from firmware_py.core.setpoint import Guidance
-from firmware_py.core.supervisor import Supervisor
+from firmware_py.core.motor_test import MotorTest
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.supervisor import WARNING, Decision, Supervisor
 from firmware_py.core.thruster import ThrusterLag
-from firmware_py.core.types import Action, BodyRecord, Estimate, Inputs, ModuleCommand, Outputs, Request
+from firmware_py.core.topology import join, part_of
+from firmware_py.core.transitions import DOCKING, Effect, Trigger
+from firmware_py.core.types import (
+    Action, BodyRecord, DockRequest, Estimate, Event, Inputs, Measured, Mode, ModuleCommand, Outputs, Thrust,
+)  # fmt: skip
 from firmware_py.description.parameters import Parameters
 
 ESTIMATORS = {"full": Estimator, "paper": TagOnlyEstimator}
 CHANNELS = 8
 """Thruster commands that one module's frames carry."""
+FOR_ALL = frozenset({Action.ESTOP, Action.CLEAR_ESTOP, Action.GROUND_ALIVE})
+"""Requests that concern every body, whichever they name: ESTOP frames stop all modules."""
+VOLTAGE_SMOOTHING = 0.5
+"""Share of a new voltage reading (10 Hz) that is believed: settles in half a second."""
 
 
 class BodyPipeline:
@@ -28,43 +44,83 @@ class BodyPipeline:
         self.body = body
         self.measurements = Measurements(body)
         self.estimator = ESTIMATORS[parameters.estimation.kind](body, parameters.estimation, period_ns)
-        self.supervisor = Supervisor(body.modules, parameters.supervision)
-        self.guidance = Guidance(parameters.control.lead_s)
+        self.faults = FaultDetector(body, parameters.faults, period_ns)
+        self.health = HealthMonitor(body, parameters, period_ns)
+        self.supervisor = Supervisor(parameters)
+        self.guidance = Guidance(body, parameters)
+        self.motor_test = MotorTest(body, parameters.steering)
+        self.dock_over = False
         self.controller = Controller(body, parameters.control)
         self.allocator = Allocator(body, parameters.allocation)
         self.limiter = Limiter(body, parameters.limiter, period_ns * 1e-9)
         self.lag = ThrusterLag(body.thrusters, period_ns * 1e-9)
         self.voltage_v = np.array([body.thrusters.voltage_v[body.thrusters.module == m][0] for m in range(len(body.modules))])
 
-    def step(self, inputs: Inputs) -> tuple[BodyRecord, np.ndarray]:
-        """Record of every signal, and the (n,) thruster commands."""
+    def measure(self, inputs: Inputs) -> Estimate:
+        """Sensors -> estimate."""
         self._read_supply(inputs)
-        applied = self.body.thrusters.matrix @ self.lag.step()
+        mean_n = self.lag.step()
         measured = self.measurements.fuse(inputs.modules, self.estimator.q_wb)
-        estimate = self.estimator.step(inputs.time_ns, measured, applied)
-        self._decide(inputs, estimate)
-        setpoint, ahead = self.guidance.step(inputs.time_ns)
+        estimate = self.estimator.step(inputs.time_ns, measured, self.body.thrusters.matrix @ mean_n)
+        self._find_faults(inputs, measured, estimate, mean_n)
+        return estimate
+
+    def _find_faults(self, inputs: Inputs, measured: Measured, estimate: Estimate, mean_n: np.ndarray) -> None:
+        """Thrusters that are dead or lie leave the allocation at once."""
+        self.faults.step(inputs.modules, measured, estimate, self.lag.force_n, mean_n, self.supervisor.armed)
+        if self.faults.changed:
+            self.allocator.set_alive(self.faults.now.alive)
+
+    def decide(self, inputs: Inputs, estimate: Estimate) -> list[DockRequest]:
+        """Requests and fail-safes -> state and mode. Returns the docks and undocks that were granted."""
+        mine = [r for r in inputs.requests if r.body == self.body.index or r.action in FOR_ALL]
+        self.health.step(inputs, estimate, mine, self.faults.now)
+        was_armed = self.supervisor.armed
+        decisions = self.supervisor.step(inputs.estop, self.health.now, mine, self._endings())
+        for decision in decisions:
+            self._apply(decision, inputs.time_ns, estimate)
+        self.supervisor.events += [Event(WARNING, words) for words in self.faults.words]
+        if self.supervisor.armed and not was_armed:
+            self.faults.reset()
+            self.allocator.set_alive(self.faults.now.alive)
+        if not self.supervisor.armed:
+            self.guidance.rest(estimate)
+            self.motor_test.stop()
+        return [decision.argument for decision in decisions if decision.trigger in DOCKING]
+
+    def _endings(self) -> list[Trigger]:
+        """What has come to its end by itself."""
+        ended = [Trigger.DOCK_OVER] if self.dock_over else []
+        self.dock_over = False
+        return ended if self.motor_test.running else [*ended, Trigger.TEST_OVER]
+
+    def _apply(self, decision: Decision, time_ns: int, estimate: Estimate) -> None:
+        self.guidance.apply(decision, time_ns, estimate)
+        if decision.effect == Effect.TEST_MOTOR:
+            self.motor_test.start(decision.argument, time_ns)
+        elif decision.effect == Effect.ENTER_MODE and decision.mode == Mode.MOTOR_DETECT:
+            self.motor_test.detect(time_ns)
+
+    def control(self, time_ns: int, estimate: Estimate) -> tuple[BodyRecord, np.ndarray]:
+        """Guide, control, allocate, limit: record of every signal, and the (n,) thruster commands."""
+        health = self.health.now
+        setpoint, ahead = self.guidance.step(time_ns, estimate, health)
         wrench = self.controller.step(setpoint, ahead, estimate)
-        thrust = self.allocator.step(wrench)
-        force, command = self.limiter.step(thrust.force_n, self.supervisor.armed, self.voltage_v)
+        wrench = self.guidance.mix(wrench, time_ns, estimate, health)
+        thrust = self._allocate(wrench, time_ns)
+        armed, alive = self.supervisor.armed, self.faults.now.alive
+        force, command = self.limiter.step(thrust.force_n, armed, self.voltage_v, alive)
         self.lag.command(force)
-        record = BodyRecord(self.body.index, self.supervisor.state, estimate, setpoint, wrench, thrust, force)
+        state, mode = self.supervisor.state, self.supervisor.mode
+        record = BodyRecord(self.body.index, state, mode, estimate, setpoint, wrench, thrust, force)
         return record, command
 
-    def _decide(self, inputs: Inputs, estimate: Estimate) -> None:
-        mine = [r for r in inputs.requests if r.body == self.body.index]
-        for request in self.supervisor.step(inputs, estimate, mine):
-            self._apply(request, inputs.time_ns, estimate)
-        if not self.supervisor.armed:
-            self.guidance.hold_here(estimate)
-
-    def _apply(self, request: Request, time_ns: int, estimate: Estimate) -> None:
-        if request.action == Action.TRACK:
-            self.guidance.follow(request.argument, time_ns)
-        elif request.action == Action.HOLD and request.argument is not None:
-            self.guidance.hold(request.argument)
-        else:
-            self.guidance.hold_here(estimate)
+    def _allocate(self, wrench: np.ndarray, time_ns: int) -> Thrust:
+        """Forces for the wrench, less what the thrusters left cannot make; or those of a motor test."""
+        if self.supervisor.mode == Mode.MOTOR_DETECT:
+            force = self.motor_test.step(time_ns)
+            return Thrust(force, self.body.thrusters.matrix @ force, (1.0, 1.0))
+        return self.allocator.step(self.faults.now.keep @ wrench if self.faults.now.lost_axes else wrench)
 
     def _read_supply(self, inputs: Inputs) -> None:
         for i, module in enumerate(self.body.modules):
@@ -72,9 +128,34 @@ class BodyPipeline:
             if voltage is not None:
                 self.voltage_v[i] += VOLTAGE_SMOOTHING * (voltage - self.voltage_v[i])
 
+    def take_over(self, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
+        """Goes on from the bodies that this one is made of, or was part of: motion, forces, supplies, arm state. Returns its estimate."""
+        if len(before) == 1:
+            motion = part_of(before[0].body, before[0].estimator.motion, self.body)
+        else:
+            motion = join([(chain.body, chain.estimator.motion) for chain in before], self.body)
+        for chain in before:
+            self._take_forces(chain)
+        self.supervisor.take_over([chain.supervisor for chain in before])
+        estimate = self.estimator.restart(time_ns, motion)
+        self.guidance.take_over(self.supervisor.mode, estimate, self.body.thrusters.matrix @ self.limiter.force_n)
+        return estimate
 
-VOLTAGE_SMOOTHING = 0.5
-"""Share of a new voltage reading (10 Hz) that is believed: settles in half a second."""
+    def _take_forces(self, other: BodyPipeline) -> None:
+        """Thrusters keep the forces they have, so that no command jumps."""
+        mine, theirs = self.body, other.body
+        forces = [array.copy() for array in self.lag.forces]
+        limited = self.limiter.force_n.copy()
+        for i, module in enumerate(mine.modules):
+            if module in theirs.modules:
+                j = theirs.modules.index(module)
+                here, there = mine.thrusters.module == i, theirs.thrusters.module == j
+                for array, source in zip(forces, other.lag.forces, strict=True):
+                    array[here] = source[there]
+                limited[here] = other.limiter.force_n[there]
+                self.voltage_v[i] = other.voltage_v[j]
+        self.lag.restart(*forces)
+        self.limiter.force_n = limited
 
 
 class Pipeline:
@@ -82,31 +163,93 @@ class Pipeline:
 
     def __init__(self, bodies: list[Body], parameters: Parameters, period_ns: int) -> None:
         self.parameters = parameters
-        self._chains = [BodyPipeline(body, parameters, period_ns) for body in bodies]
+        self._period_ns = period_ns
+        self._chains = [self.chain_of(body) for body in bodies]
         self._modules = sum(len(body.modules) for body in bodies)
+        self.docking = DockingStage(parameters.docking, tag_table(bodies), self._modules)
+        self.docking.watch_joints(bodies)
 
     @property
     def bodies(self) -> list[Body]:
         """The bodies as they are docked now."""
         return [chain.body for chain in self._chains]
 
+    def chain_of(self, body: Body) -> BodyPipeline:
+        """The stages of a body that is not there yet: made beside the loop, swapped in by a join or part."""
+        return BodyPipeline(body, self.parameters, self._period_ns)
+
     def step(self, inputs: Inputs) -> Outputs:
         """One tick."""
         outputs = Outputs(inputs.tick, inputs.time_ns, [IDLE] * self._modules, False, [], [])
+        estimates = {chain.body.index: chain.measure(inputs) for chain in self._chains}
+        self._dock(inputs, estimates, outputs)
         for chain in self._chains:
-            record, command = chain.step(inputs)
+            estimate = estimates[chain.body.index]
+            outputs.preparations += chain.decide(inputs, estimate)
+            if chain.supervisor.mode != Mode.DOCK and chain.body.index in self.docking.busy:
+                self.docking.abort(chain.body.index, inputs.time_ns, "the mode was changed")
+            record, command = chain.control(inputs.time_ns, estimate)
             outputs.records.append(record)
             outputs.events += chain.supervisor.events
+            outputs.estop = outputs.estop or chain.supervisor.raises_estop
             self._command(chain, command, outputs)
         return outputs
 
+    def _dock(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
+        """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
+        decisions = self.docking.step(inputs, {c.body.index: (c.body, estimates[c.body.index]) for c in self._chains})
+        outputs.docks += self.docking.records
+        outputs.events += self.docking.events
+        self._steer(decisions)
+        for joined in decisions.joins:
+            self._join(joined, inputs.time_ns, estimates)
+        for parted in decisions.parts:
+            self._part(parted, inputs.time_ns, estimates)
+
+    def _steer(self, decisions: Decisions) -> None:
+        for chain in self._chains:
+            number = chain.body.index
+            if number in decisions.setpoints:
+                chain.guidance.dock(decisions.setpoints[number])
+            elif number in decisions.ended:
+                chain.dock_over = True
+
+    def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
+        before = [self._chain(joined.target), self._chain(joined.active)]
+        estimate = joined.chain.take_over(before, time_ns)
+        self._swap(before, [joined.chain], estimates, [estimate])
+
+    def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
+        before = [self._chain(parted.whole)]
+        after = [parted.stays, parted.leaves]
+        found = [chain.take_over(before, time_ns) for chain in after]
+        start = rest_at(found[1].p_wb, found[1].q_wb)
+        parted.leaves.supervisor.mode = parted.leaves.guidance.mode = Mode.AUTO
+        parted.leaves.guidance.follow(Glide(start, parted.away_w))
+        self._swap(before, after, estimates, found)
+
+    def _swap(
+        self, before: Sequence[BodyPipeline], after: Sequence[BodyPipeline], estimates: dict[int, Estimate], found: Sequence[Estimate]
+    ) -> None:
+        for chain in before:
+            del estimates[chain.body.index]
+        for chain, estimate in zip(after, found, strict=True):
+            estimates[chain.body.index] = estimate
+        kept = [chain for chain in self._chains if chain not in before]
+        self._chains = sorted([*kept, *after], key=lambda chain: chain.body.index)
+        self.docking.watch_joints(self.bodies)
+
+    def _chain(self, body: int) -> BodyPipeline:
+        return next(chain for chain in self._chains if chain.body.index == body)
+
     def _command(self, chain: BodyPipeline, command: np.ndarray, outputs: Outputs) -> None:
-        """Hands each module its own thrusters."""
+        """Hands each module its own thrusters, and its relays when they are due."""
         thrusters = chain.body.thrusters
         channels = np.zeros((len(chain.body.modules), CHANNELS))
         channels[thrusters.module, thrusters.channel] = command
         for i, module in enumerate(chain.body.modules):
-            outputs.modules[module] = ModuleCommand(chain.supervisor.armed, channels[i], None)
+            relays = self.docking.relays(module, outputs.time_ns)
+            outputs.modules[module] = ModuleCommand(chain.supervisor.armed, channels[i], relays)
 
 
 IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)

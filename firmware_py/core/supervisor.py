@@ -1,73 +1,189 @@
-"""Stage 3 of a tick: runs the transition table of `transitions` for one body and says in words why it refuses."""
+"""Stage 3 of a tick: runs the tables of `transitions` and `failsafes` for one body and says in words what it does and refuses."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
-from firmware_py.core.transitions import ARMED, ROWS, Guard, State
-from firmware_py.core.types import Action, Estimate, Event, Inputs, Request
-from firmware_py.description.parameters import Supervision
+from firmware_py.core.arming import Question, against_arming, missing
+from firmware_py.core.failsafes import Failsafes, Level
+from firmware_py.core.health import NEVER_S, Health, is_sticks
+from firmware_py.core.transitions import ARMED, MODES, ROWS, TRIGGERS, Effect, Guard, State, Transition, Trigger
+from firmware_py.core.types import Action, Event, Mode, Request, Setpoint
+from firmware_py.description.parameters import Parameters
 
-WARNING, INFORMATION = 4, 6
+CRITICAL, WARNING, INFORMATION = 2, 4, 6
+
+LADDER = {
+    Level.HOLD: (Trigger.FAILSAFE_HOLD, Trigger.FAILSAFE_DEPTH, Trigger.FAILSAFE_SURFACE),
+    Level.DEPTH: (Trigger.FAILSAFE_DEPTH, Trigger.FAILSAFE_SURFACE),
+    Level.SURFACE: (Trigger.FAILSAFE_SURFACE,),
+    Level.DISARM: (Trigger.FAILSAFE_DISARM,),
+}
+"""What a fail-safe tries, one after the other until one is possible."""
+
+
+class Decision(NamedTuple):
+    """A transition that was made: its trigger, what guidance is to do, the mode after it, and the request's argument."""
+
+    trigger: Trigger
+    effect: Effect
+    mode: Mode
+    argument: Any = None
 
 
 class Supervisor:
-    """State of one body. Refusals and changes leave as events."""
+    """State and mode of one body.
 
-    def __init__(self, modules: tuple[int, ...], parameters: Supervision) -> None:
-        self._modules = modules
+    Attributes:
+        state, mode: now. While disarmed `mode` is the one to arm in.
+        level: what a fail-safe has done to the mode; NONE when a person chose it.
+        raises_estop: the e-stop came as a request, so the firmware itself raises ESTOP on the bus.
+        events: of this tick.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
         self._p = parameters
+        self._failsafes = Failsafes(parameters.failsafes)
         self.state = State.DISARMED
+        self.mode = Mode.POSHOLD
+        self.level = Level.NONE
+        self.raises_estop = False
         self.events: list[Event] = []
+        self._estop_ns: int | None = None
+        self._testing = False
 
     @property
     def armed(self) -> bool:
         """Whether thrusters may turn."""
         return self.state in ARMED
 
-    def step(self, inputs: Inputs, estimate: Estimate, requests: list[Request]) -> list[Request]:
-        """Runs this tick's triggers; returns the requests that were granted, in order."""
+    def step(self, estop: bool, health: Health, requests: list[Request], endings: Sequence[Trigger] = ()) -> list[Decision]:
+        """Runs this tick's triggers in order: e-stop, requests, what has ended by itself, fail-safes.
+
+        Args:
+            estop: an ESTOP frame came since the previous tick.
+            health: of this tick.
+            requests: for this body, and e-stops for all.
+            endings: TEST_OVER while no motor test runs, DOCK_OVER when a dock has ended; nothing is said where they do not apply.
+        """
         self.events = []
-        if inputs.estop and self.state != State.ESTOP:
-            self._try(Request(Action.ESTOP), inputs, estimate)
-        return [r for r in requests if self._try(r, inputs, estimate)]
+        decisions: list[Decision | None] = []
+        if estop:
+            self._estop_ns = health.time_ns
+            decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
+        decisions += [self._request(request, health) for request in requests]
+        decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger)]
+        decisions += self._guard(health)
+        return [decision for decision in decisions if decision is not None]
 
-    def _try(self, request: Request, inputs: Inputs, estimate: Estimate) -> bool:
-        row = ROWS.get((self.state, request.action))
+    def _request(self, request: Request, health: Health) -> Decision | None:
+        trigger = TRIGGERS.get(request.action)
+        if trigger is None:
+            return None
+        if not _is_sound(request):
+            self._say(WARNING, f"{request.action.name} refused: its argument makes no sense")
+            return None
+        if trigger == Trigger.ARM and request.argument is True:
+            trigger = Trigger.FORCED_ARM
+        decision = self._try(trigger, request.argument, health)
+        if decision is not None and trigger in (Trigger.ESTOP, Trigger.CLEAR_ESTOP):
+            self.raises_estop = trigger == Trigger.ESTOP
+        return decision
+
+    def _guard(self, health: Health) -> list[Decision | None]:
+        """Runs the fail-safes."""
+        decisions: list[Decision | None] = []
+        alarms = self._failsafes.step(health, self.mode, self.level > Level.NONE, self.armed)
+        for alarm in alarms:
+            severity = INFORMATION if not alarm.begins else CRITICAL if alarm.level > Level.HOLD else WARNING
+            self._say(severity, f"fail-safe {'on' if alarm.begins else 'over'}: {alarm.words}")
+        begun = [alarm.level for alarm in alarms if alarm.begins and alarm.level > Level.WARN]
+        level = self._failsafes.level
+        if self.armed and begun and level > self.level:
+            for trigger in LADDER[level]:
+                decision = self._try(trigger, None, health)
+                if decision is not None:
+                    decisions.append(decision)
+                    self.level = level
+                    break
+        return decisions
+
+    def _try(self, trigger: Trigger, argument: Any, health: Health) -> Decision | None:
+        """Makes the transition of the table's row, or says why not."""
+        row = ROWS.get((self.state, trigger))
         if row is None:
-            self._say(WARNING, f"{request.action.name} refused: not possible in {self.state.name}")
-            return False
-        reasons = self._reasons(row.guard, inputs, estimate)
+            self._say(WARNING, f"{trigger.name} refused: not possible in {self.state.name}")
+            return None
+        mode = row.mode if row.mode is not None else argument if trigger == Trigger.SET_MODE else self.mode
+        reasons = self._reasons(row.guard, mode, health)
         if reasons:
-            self._say(WARNING, f"{request.action.name} refused: {'; '.join(reasons)}")
-            return False
-        if row.next_state != self.state:
-            self._say(INFORMATION, f"{self.state.name} -> {row.next_state.name}")
-        self.state = row.next_state
-        return True
+            self._say(WARNING, f"{trigger.name} refused: {'; '.join(reasons)}")
+            return None
+        self._go(row, mode)
+        return Decision(trigger, row.effect, mode, argument)
 
-    def _reasons(self, guard: Guard, inputs: Inputs, estimate: Estimate) -> list[str]:
+    def _go(self, row: Transition, mode: Mode) -> None:
+        if (row.next_state, mode) != (self.state, self.mode):
+            self._say(INFORMATION, f"{self.state.name} {self.mode.name} -> {row.next_state.name} {mode.name}")
+        if row.next_state != self.state or row.effect in TAKES_OVER:
+            self.level = Level.NONE
+        if row.effect == Effect.TEST_MOTOR:
+            self._testing = self._testing or self.state not in ARMED
+        elif row.effect in TAKES_OVER or row.next_state not in ARMED:
+            self._testing = False
+        self.state, self.mode = row.next_state, mode
+
+    def _reasons(self, guard: Guard, mode: Mode, health: Health) -> list[str]:
         """Why `guard` does not hold, in words; empty when it does."""
-        if guard == Guard.MAY_ARM:
-            return self._against_arming(inputs, estimate)
-        if guard == Guard.ESTOP_CLEAR and inputs.estop:
+        if guard in (Guard.ARMING_CHECKS, Guard.FORCED_CHECKS):
+            question = Question(health, mode, self._p, self._failsafes, self._estop_age_ms(health))
+            return against_arming(question, guard == Guard.FORCED_CHECKS)
+        if guard == Guard.MODE_NEEDS:
+            return missing(mode, health, self._p)
+        if guard == Guard.MODE_PERMITTED:
+            return missing(mode, health, self._p) + self._failsafes.against(mode, health)
+        if guard == Guard.ESTOP_QUIET and self._estop_age_ms(health) < self._p.supervision.estop_quiet_ms:
             return ["the e-stop is still raised"]
+        if guard == Guard.IN_MOTOR_DETECT and self.mode != Mode.MOTOR_DETECT:
+            return ["the mode is not MOTOR_DETECT"]
         return []
 
-    def _against_arming(self, inputs: Inputs, estimate: Estimate) -> list[str]:
-        reasons = []
-        if not estimate.ready:
-            reasons.append("no pose yet")
-        elif estimate.tag_age_ns > self._p.tag_fresh_ms * 1e6:
-            reasons.append(f"pose is {estimate.tag_age_ns / 1e6:.0f} ms old, {self._p.tag_fresh_ms:.0f} permitted")
-        elif float(np.max(estimate.sigma_p)) > self._p.arm_sigma_m:
-            reasons.append(f"pose sigma {np.max(estimate.sigma_p) * 1e3:.0f} mm, {self._p.arm_sigma_m * 1e3:.0f} permitted")
-        silent = [str(m) for m in self._modules if not inputs.modules[m].answered]
-        if silent:
-            reasons.append(f"module {', '.join(silent)} does not answer")
-        if inputs.estop:
-            reasons.append("e-stop raised")
-        return reasons
+    def _applies(self, trigger: Trigger) -> bool:
+        """Whether the end of something concerns the present state."""
+        row = ROWS.get((self.state, trigger))
+        return row is not None and {Guard.TESTING: self._testing, Guard.IN_DOCK: self.mode == Mode.DOCK}[row.guard]
+
+    def take_over(self, before: Sequence[Supervisor], mode: Mode = Mode.POSHOLD) -> None:
+        """Goes on from the bodies that this one is made of, or was part of: armed when all were, stopped when one was."""
+        states = {other.state for other in before}
+        self.state = State.ESTOP if State.ESTOP in states else State.DISARMED if State.DISARMED in states else State.ARMED
+        self.mode, self.level = mode, max(other.level for other in before)
+        self.raises_estop = any(other.raises_estop for other in before)
+        self._estop_ns = max((other._estop_ns for other in before if other._estop_ns is not None), default=None)
+
+    def _estop_age_ms(self, health: Health) -> float:
+        return NEVER_S if self._estop_ns is None else (health.time_ns - self._estop_ns) * 1e-6
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))
+
+
+TAKES_OVER = (Effect.ENTER_MODE, Effect.HOLD_AT, Effect.FOLLOW)
+"""Effects by which a person chooses how the body is steered."""
+
+
+def _is_sound(request: Request) -> bool:
+    """Whether a request's argument is what its action needs."""
+    argument = request.argument
+    if request.action == Action.SET_MODE:
+        return isinstance(argument, Mode) and MODES[argument].request
+    if request.action == Action.STICKS:
+        return is_sticks(argument)
+    if request.action == Action.SET_POINT:
+        return isinstance(argument, Setpoint)
+    if request.action == Action.HOLD:
+        return argument is None or isinstance(argument, Setpoint)
+    if request.action == Action.TRACK:
+        return hasattr(argument, "sample") and hasattr(argument, "duration_s")
+    return True

@@ -100,6 +100,15 @@ class ThrusterLag:
         self._acting = self._pending
         return mean
 
+    @property
+    def forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Believed force, force aimed at now, and force aimed at next, (n,) each: all there is to remember."""
+        return self.force_n, self._acting, self._pending
+
+    def restart(self, force_n: np.ndarray, acting_n: np.ndarray, pending_n: np.ndarray) -> None:
+        """Goes on from what `forces` gave."""
+        self.force_n, self._acting, self._pending = force_n, acting_n, pending_n
+
     def command(self, force_n: np.ndarray) -> None:
         """The forces asked for in this tick."""
         self._pending = force_n

@@ -40,14 +40,20 @@ class Trigger(IntEnum):
     MOTOR_TEST = 13
     TEST_OVER = 14
     """The motor test that armed the body is over."""
-    FAILSAFE_HOLD = 15
-    FAILSAFE_DEPTH = 16
-    FAILSAFE_SURFACE = 17
-    FAILSAFE_DISARM = 18
+    DOCK_OVER = 15
+    """The docking sequence has given up."""
+    FAILSAFE_HOLD = 16
+    FAILSAFE_DEPTH = 17
+    FAILSAFE_SURFACE = 18
+    FAILSAFE_DISARM = 19
 
 
 TRIGGERS = {action: Trigger[action.name] for action in Action if action.name in Trigger.__members__}
 """Trigger of each request; a request without one is not the supervisor's business."""
+
+
+DOCKING = frozenset({Trigger.DOCK, Trigger.UNDOCK})
+"""Requests whose preparation takes a while."""
 
 
 class Guard(IntEnum):
@@ -58,12 +64,18 @@ class Guard(IntEnum):
     """Every arming check, and what the chosen mode needs."""
     FORCED_CHECKS = 2
     """Those arming checks that may not be skipped, and what the chosen mode needs."""
-    MODE_NEEDS = 3
-    """What the wanted mode needs, and no fail-safe forbids it."""
-    ESTOP_QUIET = 4
+    MODE_PERMITTED = 3
+    """The wanted mode has what it needs, and no fail-safe forbids it."""
+    MODE_NEEDS = 4
+    """The wanted mode has what it needs."""
+    ESTOP_QUIET = 5
     """No ESTOP frame came of late."""
-    IN_MOTOR_DETECT = 5
+    IN_MOTOR_DETECT = 6
     """The mode is MOTOR_DETECT."""
+    TESTING = 7
+    """A motor test has armed the body."""
+    IN_DOCK = 8
+    """The mode is DOCK."""
 
 
 class Effect(IntEnum):
@@ -121,15 +133,16 @@ TABLE = (
     Transition(A, T.DISARM, G.ALWAYS, F.STOP, D),
     Transition(A, T.ARM, G.ALWAYS, F.NOTHING, A),
     Transition(A, T.FORCED_ARM, G.ALWAYS, F.NOTHING, A),
-    Transition(A, T.SET_MODE, G.MODE_NEEDS, F.ENTER_MODE, A),
-    Transition(A, T.HOLD, G.MODE_NEEDS, F.HOLD_AT, A, Mode.POSHOLD),
-    Transition(A, T.TRACK, G.MODE_NEEDS, F.FOLLOW, A, Mode.AUTO),
-    Transition(A, T.DOCK, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.DOCK),
-    Transition(A, T.UNDOCK, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.DOCK),
+    Transition(A, T.SET_MODE, G.MODE_PERMITTED, F.ENTER_MODE, A),
+    Transition(A, T.HOLD, G.MODE_PERMITTED, F.HOLD_AT, A, Mode.POSHOLD),
+    Transition(A, T.TRACK, G.MODE_PERMITTED, F.FOLLOW, A, Mode.AUTO),
+    Transition(A, T.DOCK, G.MODE_PERMITTED, F.ENTER_MODE, A, Mode.DOCK),
+    Transition(A, T.UNDOCK, G.MODE_PERMITTED, F.ENTER_MODE, A, Mode.DOCK),
     Transition(A, T.SET_POINT, G.ALWAYS, F.TAKE_POINT, A),
     Transition(A, T.STICKS, G.ALWAYS, F.TAKE_STICKS, A),
     Transition(A, T.MOTOR_TEST, G.IN_MOTOR_DETECT, F.TEST_MOTOR, A),
-    Transition(A, T.TEST_OVER, G.IN_MOTOR_DETECT, F.STOP, D, Mode.POSHOLD),
+    Transition(A, T.TEST_OVER, G.TESTING, F.STOP, D, Mode.POSHOLD),
+    Transition(A, T.DOCK_OVER, G.IN_DOCK, F.ENTER_MODE, A, Mode.POSHOLD),
     Transition(A, T.FAILSAFE_HOLD, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.POSHOLD),
     Transition(A, T.FAILSAFE_DEPTH, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.ALT_HOLD),
     Transition(A, T.FAILSAFE_SURFACE, G.ALWAYS, F.ENTER_MODE, A, Mode.SURFACE),

@@ -165,6 +165,8 @@ class Inputs:
     """Frames dropped by the codec so far, all kinds."""
     foreign_sync: bool = False
     """Somebody else sends SYNC on one of our buses."""
+    prepared: list[Any] = field(default_factory=list)
+    """Results of the worker: docking.Prepared."""
 
 
 # ---------------------------------------------------------------- between the stages
@@ -275,6 +277,9 @@ class BodyRecord(NamedTuple):
 
     body: int
     state: int
+    """core.transitions.State"""
+    mode: int
+    """Mode; while disarmed the one to arm in."""
     estimate: Estimate
     setpoint: Setpoint
     wrench: Array
@@ -282,6 +287,26 @@ class BodyRecord(NamedTuple):
     thrust: Thrust
     commanded_n: Array
     """(n,) force of each thruster after the limiter."""
+
+
+class DockRecord(NamedTuple):
+    """One pair of faces in one tick."""
+
+    module_a: int
+    face_a: int
+    module_b: int
+    face_b: int
+    stage: int
+    """docking_sequence.Stage."""
+    tries: int
+    current_ma: tuple[float, float]
+    current_holds: bool
+    position_holds: bool
+    gap_m: float
+    """Between the faces, by the estimates; NaN once they are one body."""
+    lateral_m: float
+    position_error_m: float
+    """Off one pitch, by fresh pictures."""
 
 
 @dataclass(slots=True)
@@ -295,3 +320,6 @@ class Outputs:
     """The firmware raises ESTOP."""
     events: list[Event]
     records: list[BodyRecord]
+    docks: list[DockRecord] = field(default_factory=list)
+    preparations: list[DockRequest] = field(default_factory=list)
+    """Docks, and undocks of modules of one body, to be prepared beside the loop; they come back in Inputs.prepared."""

@@ -7,7 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from firmware_py.description.failsafe_parameters import Failsafes, Faults, Fence
+from firmware_py.description.ground_parameters import Ground
 from firmware_py.description.schema import DescriptionError, Limits, build, describe, limits_of, quantity, read_toml
+from firmware_py.description.steering_parameters import Steering
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +66,9 @@ class Limiter:
 
     force_share: float = quantity(1.0, low=0.05, high=1.0, help="share of each thruster's limit that may be used", mavlink="LIM_FORCE")
     slew_n_per_s: float = quantity(200.0, unit="N/s", low=1, high=1e4, help="fastest change of a thruster's force", mavlink="LIM_SLEW")
+    relay_on_s: float = quantity(60.0, unit="s", low=1, high=3600, help="longest time a cold docking magnet stays on", mavlink="LIM_MAG_ON")
+    relay_duty: float = quantity(1.0, low=0.01, high=1, help="share of time a docking magnet may be on for ever", mavlink="LIM_MAG_DUTY")
+    relay_w: float = quantity(6.0, unit="W", low=0, high=1000, help="power that a docking magnet takes from the thrusters", mavlink="LIM_MAG_W")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +77,37 @@ class Supervision:
 
     tag_fresh_ms: float = quantity(500.0, unit="ms", low=10, high=60000, help="a pose older than this is stale", mavlink="TAG_FRESH_MS")
     arm_sigma_m: float = quantity(0.05, unit="m", low=1e-3, high=10, help="largest position sigma to arm with", mavlink="ARM_SIGMA")
+    answer_ms: float = quantity(200.0, unit="ms", low=5, high=5000, help="a module that has not answered for longer is silent", mavlink="ARM_ANSWER_MS")
+    esc_fresh_ms: float = quantity(1000.0, unit="ms", low=50, high=10000, help="ESC feedback older than this is none", mavlink="ARM_ESC_MS")
+    frame_errors_per_s: float = quantity(20.0, unit="1/s", low=0, high=10000, help="bad frames a second to arm with", mavlink="ARM_FRAME_ERR")
+    estop_quiet_ms: float = quantity(200.0, unit="ms", low=50, high=5000, help="an e-stop is over when no frame came for so long", mavlink="ESTOP_QUIET_MS")
+    rearm: int = quantity(0, low=0, high=1, help="1: after a restart in flight hold at once, 0: wait to be armed", mavlink="REARM")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Docking:
+    """Detector and sequence of docking."""
+
+    current_threshold_ma: float = quantity(70.0, unit="mA", low=1, high=8000, help="paper: +-70 mA on the face", mavlink="DOCK_MA")
+    current_hysteresis_ma: float = quantity(15.0, unit="mA", low=0, high=1000, help="held down to the threshold less this", mavlink="DOCK_MA_HYST")
+    position_tolerance_m: float = quantity(0.006, unit="m", low=1e-4, high=0.1, help="relative position off one pitch", mavlink="DOCK_TOL")
+    settled_m: float = quantity(0.004, unit="m", low=1e-4, high=0.1, help="movement of the relative position that still counts as settled", mavlink="DOCK_SETTLED")
+    hysteresis_m: float = quantity(0.004, unit="m", low=0, high=0.1, help="more is permitted once docked", mavlink="DOCK_HYST")
+    debounce_ms: float = quantity(150.0, unit="ms", low=0, high=5000, help="how long a condition is seen before it is believed", mavlink="DOCK_DEBOUNCE")
+    current_fresh_ms: float = quantity(250.0, unit="ms", low=10, high=5000, help="age at which a current no longer counts", mavlink="DOCK_MA_AGE")
+    pose_fresh_ms: float = quantity(300.0, unit="ms", low=10, high=5000, help="age at which a picture no longer counts", mavlink="DOCK_POSE_AGE")
+    standoff_m: float = quantity(0.12, unit="m", low=0.02, high=2, help="gap at which the bodies are aligned", mavlink="DOCK_STANDOFF")
+    align_m: float = quantity(0.004, unit="m", low=1e-4, high=0.1, help="lateral error to begin the approach with", mavlink="DOCK_ALIGN")
+    align_rad: float = quantity(0.035, unit="rad", low=1e-3, high=1, help="angle error to begin the approach with", mavlink="DOCK_ALIGN_ANG")
+    align_s: float = quantity(1.0, unit="s", low=0, high=30, help="how long the alignment must hold", mavlink="DOCK_ALIGN_T")
+    speed_m_s: float = quantity(0.04, unit="m/s", low=0.001, high=0.5, help="fastest approach", mavlink="DOCK_SPEED")
+    contact_speed_m_s: float = quantity(0.012, unit="m/s", low=0.001, high=0.5, help="approach at contact", mavlink="DOCK_TOUCH")
+    push_s: float = quantity(3.0, unit="s", low=0, high=60, help="how long the faces are pushed together before a jam is declared", mavlink="DOCK_PUSH_T")
+    push_m: float = quantity(0.010, unit="m", low=0, high=0.1, help="how far beyond contact the set-point goes", mavlink="DOCK_PUSH")
+    release_s: float = quantity(1.0, unit="s", low=0.01, high=60, help="how long the magnets push apart after a jam", mavlink="DOCK_RELEASE")
+    sigma_m: float = quantity(0.005, unit="m", low=1e-4, high=0.1, help="relative sigma that aborts", mavlink="DOCK_SIGMA")
+    tries: int = quantity(4, low=1, high=20, help="attempts before it gives up", mavlink="DOCK_TRIES")
+    timeout_s: float = quantity(60.0, unit="s", low=1, high=600, help="longest time in one stage", mavlink="DOCK_TIMEOUT")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +119,12 @@ class Parameters:
     allocation: Allocation = quantity(Allocation())
     limiter: Limiter = quantity(Limiter())
     supervision: Supervision = quantity(Supervision())
+    docking: Docking = quantity(Docking())
+    steering: Steering = quantity(Steering())
+    failsafes: Failsafes = quantity(Failsafes())
+    faults: Faults = quantity(Faults())
+    fence: Fence = quantity(Fence())
+    ground: Ground = quantity(Ground())
 
     def replace(self, dotted: str, value: float | str) -> Parameters:
         """A copy with `group.field` set. Raises DescriptionError when there is no such field or the value is out of range."""
@@ -121,6 +164,18 @@ def registry() -> Iterator[tuple[str, Limits]]:
         cls = group.default.__class__
         for field in dataclasses.fields(cls):
             yield f"{group.name}.{field.name}", limits_of(cls, field.name)
+
+
+def invalid(parameters: Parameters) -> list[str]:
+    """What is out of range in a set of parameters, in words; empty when nothing is."""
+    reasons = []
+    for dotted, limits in registry():
+        group, _, name = dotted.partition(".")
+        value = getattr(getattr(parameters, group), name)
+        ok = value in limits.choices if limits.choices else limits.low <= value <= limits.high
+        if not ok:
+            reasons.append(f"parameter {dotted}: {value!r} is out of range; permitted: {describe(limits)}")
+    return reasons
 
 
 def load_parameters(path: Path) -> Parameters:

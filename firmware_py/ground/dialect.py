@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -90,7 +92,8 @@ class Definition:
         return flat
 
 
-class Message(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Message:
     """One message, from `system` and `component` (0, 0 before it is sent)."""
 
     name: str
@@ -98,7 +101,7 @@ class Message(NamedTuple):
     system: int = 0
     component: int = 0
 
-    def __getitem__(self, name: Any) -> Any:
+    def __getitem__(self, name: str) -> Any:
         return self.values[name]
 
 
@@ -110,8 +113,9 @@ class Dialect:
         self.by_name = {d.name: d for d in definitions}
 
 
+@cache
 def load_dialect() -> Dialect:
-    """The dialect of this package: `all`, and modcube.xml on top."""
+    """The dialect of this package: `all`, and modcube.xml on top. Read once; nobody changes it."""
     definitions = [_of_class(cls) for cls in shipped.mavlink_map.values()]
     with resources.as_file(resources.files("firmware_py.ground") / "modcube.xml") as path:
         definitions += [_of_xml(message) for message in mavparse.MAVXML(str(path), mavparse.PROTOCOL_2_0).message]

@@ -267,6 +267,7 @@ class Links:
         self._trusted: list[bool] = []
         self._by_peer: dict[tuple[int, Any], int] = {}
         self._next = 0
+        self._gone: list[int] = []
         try:
             for address in addresses:
                 self.links.append(open_link(address.removesuffix(TRUSTED)))
@@ -319,6 +320,11 @@ class Links:
                     self.counts["send"] += 1
                 channel.queue.popleft()
 
+    def take_gone(self) -> list[int]:
+        """Channels that are no more, since the last call."""
+        gone, self._gone = self._gone, []
+        return gone
+
     @property
     def dropped(self) -> int:
         """Frames that gave way to newer ones, all channels that are there."""
@@ -330,8 +336,11 @@ class Links:
             link.close()
 
     def _channel(self, index: int, peer: Any) -> int:
+        """Number of a peer; the one that was silent longest gives way to a new one."""
         key = (index, peer)
-        if key not in self._by_peer:
+        if key in self._by_peer:
+            self._by_peer[key] = self._by_peer.pop(key)
+        else:
             same = [k for k in self._by_peer if k[0] == index]
             if len(same) >= _MOST_PEERS:
                 self._forget(*same[0])
@@ -344,4 +353,5 @@ class Links:
         number = self._by_peer.pop((index, peer), None)
         if number is not None:
             self.counts["gone"] += 1
+            self._gone.append(number)
             self.counts["dropped"] += self.channels.pop(number).dropped

@@ -61,6 +61,11 @@ class Outbox:
             encoder = self._encoders[channel] = Encoder(self._dialect, self._signing, self.system, COMPONENT_AUTOPILOT)
         self._frames.append(Outgoing(channel, encoder.encode(name, values, channel)))
 
+    def name_of(self, number: int) -> str:
+        """Name of a message number; empty when there is none."""
+        definition = self._dialect.by_number.get(number)
+        return "" if definition is None else definition.name
+
     def forget(self, channel: int) -> None:
         """The channel is gone."""
         self._encoders.pop(channel, None)

@@ -107,12 +107,17 @@ class Picture:
         record = self.records.get(body)
         return record is not None and record.state in ARMED
 
+    @property
+    def any_armed(self) -> bool:
+        """Whether any thruster of the fleet may turn."""
+        return any(self.is_armed(body) for body in self.records)
+
     def mode(self, body: int) -> Mode:
         """How it is steered, or would be once armed."""
         record = self.records.get(body)
         if record is None:
             return Mode.POSHOLD
-        return Mode.AUTO if record.state == State.TRACK else Mode.POSHOLD
+        return Mode(getattr(record, "mode", Mode.POSHOLD))
 
     def is_stopped(self, body: int) -> bool:
         """Whether the e-stop holds it."""

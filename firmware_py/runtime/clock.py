@@ -46,3 +46,8 @@ class MonotonicClock:
     def now_ns(self) -> int:
         """Nanoseconds since the origin."""
         return time.clock_gettime_ns(time.CLOCK_MONOTONIC) - self.origin_ns
+
+
+def unix_ns() -> int:
+    """The time of day, ns since 1970: for what leaves the process (signing, files), never for control."""
+    return time.time_ns()

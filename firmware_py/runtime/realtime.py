@@ -1,10 +1,93 @@
-"""What makes a process keep its deadlines: no garbage collection while it flies, locked memory, a real-time priority."""
+"""What makes a process keep its deadlines: real-time priority, fine timers, locked memory, no garbage collection while it flies.
+
+None of it is required: what the system refuses is said in a line, and the process runs without.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import gc
+import os
+import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+TICK_PRIORITY = 50
+"""SCHED_FIFO priority of the thread that ticks: where Linux puts its own interrupt threads, above ordinary threads."""
+READER_PRIORITY = 49
+"""Of the threads that read the buses: a flood must not keep the tick from starting."""
+PLANT_PRIORITY = 40
+"""Of a simulated plant on the same machine; its reader is one below it."""
+
+_PR_SET_TIMERSLACK = 29  # linux/prctl.h
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # sys/mman.h
+
+
+@contextmanager
+def real_time(priority: int = READER_PRIORITY) -> Iterator[list[str]]:
+    """This process in real time, as far as the system lets it. Enter it before threads start: they inherit it.
+
+    Args:
+        priority: SCHED_FIFO priority of this thread and of those that it starts, 1..99. The thread that ticks takes
+            TICK_PRIORITY for itself when its readers run.
+
+    Yields:
+        One line for each thing that the system refused; empty when all is well.
+    """
+    refused = [line for line in (use_fine_timers(), lock_memory(), use_priority(priority)) if line]
+    try:
+        yield [f"{line}: ticks may start later than they could" for line in refused]
+    finally:
+        _leave()
+
+
+def use_priority(priority: int) -> str:
+    """SCHED_FIFO for this thread, and for the threads that it starts from now on; "" or why not."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except OSError as error:
+        return f"no real-time priority ({error.strerror}; needs CAP_SYS_NICE or an rtprio limit of {priority})"
+    except AttributeError:
+        return "no real-time priority (not Linux)"
+    return ""
+
+
+def use_fine_timers(slack_ns: int = 1) -> str:
+    """Timers of this thread, and of those that it starts, fire on time instead of up to 50 us late; "" or why not.
+
+    Threads of real-time priority have no slack anyway: this is for those that may not have it.
+    """
+    try:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0) == 0:
+            return ""
+        return f"no fine timers ({os.strerror(ctypes.get_errno())})"
+    except AttributeError:
+        return "no fine timers (not Linux)"
+
+
+def lock_memory() -> str:
+    """What this process has touched stays in memory, now and from now on; "" or why not.
+
+    With a limit on locked memory nothing is locked: later allocations would fail.
+    """
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
+        return f"memory not locked (limit of {soft // 1024} KiB; needs memlock unlimited)"
+    try:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) == 0:
+            return ""
+        return f"memory not locked ({os.strerror(ctypes.get_errno())})"
+    except AttributeError:
+        return "memory not locked (not Linux)"
+
+
+def _leave() -> None:
+    """Back to an ordinary thread with ordinary memory: a bench goes on after its flight."""
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        ctypes.CDLL(None).munlockall()
 
 
 @contextmanager

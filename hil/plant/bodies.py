@@ -17,6 +17,7 @@ import numpy as np
 from numba import types
 
 from hil.plant import drag
+from hil.plant.shelter import F5, seen_share
 from hil.plant.vectors import (
     F2,
     F3,
@@ -78,10 +79,16 @@ class Modules(NamedTuple):
     """(m, 6) linear damping."""
     quadratic: np.ndarray
     """(m, 6) quadratic damping that a vehicle file publishes in place of areas."""
+    shelter: np.ndarray
+    """(m,) row of the module's map; -1: it swims alone."""
+    sides: np.ndarray
+    """(m, 3) share of its sides across x, y, z that no other module covers."""
+    maps: np.ndarray
+    """(k, 3, n, n, 4) see `shelter.seen_share`."""
 
 
 BODIES = types.NamedTuple((F2, F3, F3, F3, F2, F2, F2), Bodies)
-MODULES = types.NamedTuple((I1, F2, F3, F2, F2, F2, F2, F2), Modules)
+MODULES = types.NamedTuple((I1, F2, F3, F2, F2, F2, F2, F2, I1, F2, F5), Modules)
 
 
 @compiled(types.void(F2, I8, V3, V3))
@@ -130,21 +137,28 @@ def _add_drag(bodies, modules, m, water, x, flow):
     v = turn_back(inside, plus(minus(triple(x, b, 7), turn_back(r, flow)), cross(rate, at)))
     w = turn_back(inside, rate)
     sx, sy, sz = triple(modules.size, m, 0)
+    ox, oy, oz = triple(modules.sides, m, 0)
     c, linear, quadratic, half_rho = modules.drag, modules.linear, modules.quadratic, 0.5 * water.density
     factor = half_rho * drag.translation(sx, sy, sz, c[m, 0], c[m, 1], v[0], v[1], v[2])
+    share, lever = 1.0, (0.0, 0.0, 0.0)
+    if modules.shelter[m] >= 0 and factor > 0.0:
+        share, x_off, y_off, z_off = seen_share(modules.maps, modules.shelter[m], v)
+        lever = (x_off, y_off, z_off)
+    n = cross(lever, times(-factor, v))
+    factor *= share
     f = (
         -(factor + linear[m, 0] + quadratic[m, 0] * abs(v[0])) * v[0],
         -(factor + linear[m, 1] + quadratic[m, 1] * abs(v[1])) * v[1],
         -(factor + linear[m, 2] + quadratic[m, 2] * abs(v[2])) * v[2],
     )
     n = (
-        -half_rho * c[m, 2] * drag.rotation(sy, sz, sx, v[1], v[2], w[0])
+        n[0] - half_rho * c[m, 2] * drag.rotation(sy, sz, sx, v[1], v[2], w[0], oy, oz)
         - (linear[m, 3] + quadratic[m, 3] * abs(w[0])) * w[0],
-        -half_rho * c[m, 3] * drag.rotation(sz, sx, sy, v[2], v[0], w[1])
+        n[1] - half_rho * c[m, 3] * drag.rotation(sz, sx, sy, v[2], v[0], w[1], oz, ox)
         - (linear[m, 4] + quadratic[m, 4] * abs(w[1])) * w[1],
-        -half_rho * c[m, 4] * drag.rotation(sx, sy, sz, v[0], v[1], w[2])
+        n[2] - half_rho * c[m, 4] * drag.rotation(sx, sy, sz, v[0], v[1], w[2], ox, oy)
         - (linear[m, 5] + quadratic[m, 5] * abs(w[2])) * w[2],
-    )
+    )  # fmt: skip
     add_force(bodies.wrench, b, at, turn(inside, f))
     n = turn(inside, n)
     for i in range(3):

@@ -38,7 +38,10 @@ def strip(v, w, h):
     return math.copysign(inner, w)
 
 
-@compiled(F8(F8, F8, F8, F8, F8, F8))
-def rotation(a, b, c, vx, vy, wz):
-    """Integral, m^5/s^2, of a box with edges a, b and c along z: times 1/2 rho Cd the moment against its rate wz."""
-    return c * (strip(vy, wz, 0.5 * a) + strip(-vx, wz, 0.5 * b))
+@compiled(F8(F8, F8, F8, F8, F8, F8, F8, F8))
+def rotation(a, b, c, vx, vy, wz, open_x, open_y):
+    """Integral, m^5/s^2, of a box with edges a, b and c along z: times 1/2 rho Cd the moment against its rate wz.
+
+    open_x, open_y: shares of the sides across x and y that the water reaches.
+    """
+    return c * (open_y * strip(vy, wz, 0.5 * a) + open_x * strip(-vx, wz, 0.5 * b))

@@ -105,6 +105,7 @@ class SensorSpec:
     tag_incidence_deg: float = quantity(
         65.0, unit="deg", low=1, high=90, help="a tag seen more obliquely is not read (synthetic)"
     )
+    tag_all: bool = quantity(False, help="report every readable tag of a picture, in place of each module's best")
     voltage_sigma_v: float = quantity(0.01, unit="V", low=0, high=10, help="noise of the battery voltage (synthetic)")
     current_sigma_a: float = quantity(0.02, unit="A", low=0, high=10, help="noise of the battery current (synthetic)")
     rpm_sigma: float = quantity(5.0, unit="1/min", low=0, high=1000, help="noise of the propeller speeds (synthetic)")

@@ -5,7 +5,6 @@ Time moves only by `advance`. Modules that are docked share a body; one module e
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,12 +14,12 @@ from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from hil.plant import thrusters as thrusters_module
-from hil.plant.bodies import Bodies, Modules
-from hil.plant.draw import ModuleDraw, carried, draw_module, rigid_matrix, stream
+from hil.plant.build import fill_body, make_bodies, make_modules, make_thrusters, nominal_centre, seat_thrusters
+from hil.plant.draw import ModuleDraw, draw_module, stream
 from hil.plant.integrator import advance
 from hil.plant.jets import add_jets
+from hil.plant.lattice import Place
 from hil.plant.spec import Tank, WorldSpec
-from hil.plant.thrusters import Thrusters
 from hil.plant.water import Gusts, make_water
 
 STEP_NS = 2_500_000
@@ -84,11 +83,15 @@ class World:
         seed: int,
         period_ns: int,
         step_ns: int = STEP_NS,
+        groups: Sequence[Sequence[int]] | None = None,
+        places: Sequence[Place] | None = None,
     ) -> None:
         """A world at time 0.
 
         Args:
-            vehicles, starts: one per module.
+            vehicles, starts: one per module; of modules that start docked the start of the first counts.
+            groups: modules of each body, the leader first; each module alone when left out.
+            places: where each module sits in its body, whose frame starts at the leader's hull centre.
             seed: of every draw; the same seed gives the same world.
             period_ns: what `advance` will be called with. Raises DescriptionError when step_ns does not divide it.
         """
@@ -102,24 +105,34 @@ class World:
         self._step_ns = step_ns
         self._draws = [draw_module(v, spec, seed, m) for m, v in enumerate(vehicles)]
         self._first = [0, *np.cumsum([len(v.thruster) for v in vehicles]).tolist()]
-        self.bodies: list[tuple[int, ...]] = [(m,) for m in range(len(vehicles))]
         self._water = make_water(spec, tank)
         self._gusts = Gusts(spec, stream(seed, "gusts"), 1e-9 * period_ns)
         self._water.flow[0], self._water.flow[1] = self._gusts.mean, self._gusts.start
-        self._thrusters = _make_thrusters(vehicles, self._draws, spec, step_ns)
-        self._modules = _make_modules(vehicles, self._draws)
-        self._body_arrays = _make_bodies(vehicles, self._draws, spec)
-        for m, start in enumerate(starts):
-            self._body_arrays.state[m, :3] = start.p_wm
-            self._body_arrays.state[m, 3:7] = rotations.normalise(np.array(start.q_wm, dtype=np.float64))
+        self._thrusters = make_thrusters(vehicles, self._draws, spec, step_ns)
         self._seen = np.zeros((len(vehicles), 16))
-        self._work(len(vehicles))
+        alone = [Place(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) for _ in vehicles]
+        self._seat(groups or [(m,) for m in range(len(vehicles))], places or alone)
+        for b, members in enumerate(self.bodies):
+            start, q_bm = starts[members[0]], self._modules.quaternion[members[0]]
+            q_wm = rotations.normalise(np.array(start.q_wm, dtype=np.float64))
+            self._body_arrays.state[b, 3:7] = rotations.normalise(rotations.multiply(q_wm, rotations.conjugate(q_bm)))
+            lever = rotations.rotate(self._body_arrays.state[b, 3:7].copy(), self._modules.position[members[0]].copy())
+            self._body_arrays.state[b, :3] = start.p_wm - lever
         self._step(0)
 
-    def _work(self, bodies: int) -> None:
-        self._stage = np.zeros((6, bodies, 13))
-        self._external = np.zeros((bodies, 6))
-        self._thrust = np.zeros((bodies, 6))
+    def _seat(self, groups: Sequence[Sequence[int]], places: Sequence[Place]) -> None:
+        """Puts the modules into bodies; their states are the caller's business."""
+        self.bodies: list[tuple[int, ...]] = [tuple(members) for members in groups]
+        self.places = list(places)
+        self._modules = make_modules(self.vehicles, self._draws, self.bodies, places)
+        seat_thrusters(self._thrusters, self.vehicles, self._modules)
+        self._body_arrays = make_bodies(len(self.bodies))
+        for b, members in enumerate(self.bodies):
+            parts = [(self._draws[m], self._modules.position[m], self._modules.turn[m]) for m in members]
+            fill_body(self._body_arrays, b, parts, self.spec)
+        self._stage = np.zeros((6, len(self.bodies), 13))
+        self._external = np.zeros((len(self.bodies), 6))
+        self._thrust = np.zeros((len(self.bodies), 6))
 
     def set_command(self, module: int, u: Sequence[float] | np.ndarray, armed: bool) -> None:
         """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call; disarmed is zero."""
@@ -162,9 +175,7 @@ class World:
         modules = self.bodies[body]
         x = self._body_arrays.state[body]
         r_wb = rotations.to_matrix(x[3:7])
-        masses = [self.vehicles[m].inertial.dry_kg + self.vehicles[m].inertial.entrained_kg for m in modules]
-        centres = [self._modules.position[m] + self._modules.turn[m] @ self.vehicles[m].inertial.com_m for m in modules]
-        nominal = np.average(centres, axis=0, weights=masses)
+        nominal = nominal_centre([self.vehicles[m] for m in modules], [self.places[m] for m in modules])
         rigid = self._body_arrays.rigid[body]
         com = np.array([rigid[5, 1], rigid[3, 2], rigid[4, 0]]) / rigid[0, 0]
         v_w = r_wb @ (x[7:10] + np.cross(x[10:13], nominal))
@@ -203,90 +214,3 @@ class World:
             p = r_wb @ total[:3]
             out[b] = np.concatenate([p, r_wb @ total[3:] + np.cross(x[:3], p)])
         return out
-
-
-def _make_thrusters(
-    vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec, step_ns: int
-) -> Thrusters:
-    module = np.array([m for m, v in enumerate(vehicles) for _ in v.thruster], dtype=np.int64)
-    curves = [vehicles[m].curve for m in module]
-    constants = np.column_stack([
-        np.concatenate([d.gain for d in draws]),
-        np.concatenate([d.deadband_n for d in draws]),
-        np.array([c.rpm_at_full for c in curves]),
-    ])  # fmt: skip
-    supply = np.array([
-        [v.curve.voltage_v, v.supply.voltage_v, spec.supply_resistance_ohm,
-         v.supply.current_a if spec.supply_limit else math.inf, v.supply.idle_w]
-        for v in vehicles
-    ])  # fmt: skip
-    lag = spec.thruster_lag_s
-    decay = np.exp(-0.5e-9 * step_ns / lag * np.arange(3)) if lag > 0.0 else np.zeros(3)
-    return Thrusters(
-        module,
-        module.copy(),
-        np.concatenate([np.hstack([v.directions, np.cross(v.positions, v.directions)]) for v in vehicles]),
-        np.concatenate([v.positions for v in vehicles]),
-        np.array([[c.forward, c.reverse] for c in curves]),
-        np.array([[c.power_forward, c.power_reverse] for c in curves]),
-        constants,
-        np.tile(decay, (len(module), 1)),
-        np.zeros((len(module), 2)),
-        np.zeros(len(module)),
-        supply,
-        np.zeros((len(vehicles), 2)),
-    )
-
-
-def _make_modules(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw]) -> Modules:
-    n = len(vehicles)
-    published = [v.drag.quadratic if len(v.drag.quadratic) == 6 else np.zeros(6) for v in vehicles]
-    coefficients = [d.drag * (0.0 if len(v.drag.quadratic) else 1.0) for v, d in zip(vehicles, draws, strict=True)]
-    return Modules(
-        np.arange(n, dtype=np.int64),
-        np.zeros((n, 3)),
-        np.tile(np.eye(3), (n, 1, 1)),
-        np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
-        np.array([v.hull.size_m for v in vehicles]),
-        np.array(coefficients),
-        np.array([v.drag.linear for v in vehicles]),
-        np.array(published),
-    )
-
-
-def _make_bodies(vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec) -> Bodies:
-    n = len(vehicles)
-    bodies = Bodies(
-        np.zeros((n, 13)),
-        np.zeros((n, 6, 6)),
-        np.zeros((n, 6, 6)),
-        np.zeros((n, 6, 6)),
-        np.zeros((n, 8)),
-        np.zeros((n, 4)),
-        np.zeros((n, 6)),
-    )
-    for m in range(n):
-        _fill_body(bodies, m, [(draws[m], np.zeros(3), np.eye(3))], spec)
-    return bodies
-
-
-def _fill_body(
-    bodies: Bodies, b: int, parts: Sequence[tuple[ModuleDraw, np.ndarray, np.ndarray]], spec: WorldSpec
-) -> None:
-    """Sums the modules of body b: (draw, position of the hull centre, module to body rotation) of each."""
-    for array in bodies[1:6]:
-        array[b] = 0.0
-    for draw, r, turn in parts:
-        rigid = rigid_matrix(draw.dry_kg + draw.entrained_kg, draw.com, draw.inertia)
-        bodies.rigid[b] += carried(rigid, r, turn)
-        bodies.added[b] += carried(np.diag(draw.added), r, turn)
-        weight = draw.dry_kg * spec.gravity
-        bodies.weight[b, 0] += weight
-        bodies.weight[b, 1] += draw.buoyancy_n
-        bodies.weight[b, 2:5] += weight * (r + turn @ draw.weight_at)
-        bodies.weight[b, 5:8] += draw.buoyancy_n * (r + turn @ draw.buoyancy_at)
-        # Neutral but for the buoyancy error: the hull and what floods it displace what robot and entrained water weigh.
-        displaced = draw.entrained_kg + draw.buoyancy_n / spec.gravity
-        bodies.hull[b, 0] += displaced
-        bodies.hull[b, 1:4] += displaced * r
-    bodies.inverse[b] = np.linalg.inv(bodies.rigid[b] + bodies.added[b])

@@ -103,8 +103,8 @@ def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
     keep = slice(None, None, max(1, round(1.0 / (FRAMES_HZ * period_s))))
     truth, firmware = flight.truth, flight.firmware
-    error_mm = 1e3 * np.linalg.norm(truth["p_wm"] - firmware["setpoint_p_wb"], axis=1)
-    angle = np.degrees(np.linalg.norm(rotation_vectors(truth["q_wm"], firmware["setpoint_q_wb"]), axis=1))
+    error_mm = 1e3 * np.linalg.norm(flight.p_wb - firmware["setpoint_p_wb"], axis=1)
+    angle = np.degrees(np.linalg.norm(rotation_vectors(flight.q_wb, firmware["setpoint_q_wb"]), axis=1))
     return {
         "tank": {"kind": scene.tank, "low": _short(scene.tank_m[0], 3), "high": _short(scene.tank_m[1], 3)},
         "hull": _short(scene.hull_m, 4),

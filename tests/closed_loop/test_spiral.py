@@ -40,7 +40,8 @@ def test_scenario_says_what_the_issue_asks_of_the_spiral() -> None:
         0.40, 0.30, 2.0, 40.0,
     )  # fmt: skip
     sensors, world = scenario.sensors, scenario.world
-    assert (sensors.tag_rate_hz, sensors.tag_delay_ms, sensors.tag_sigma_m, sensors.tag_sigma_axis_m) == (60, 40, 0.002, 0.004)
+    assert (sensors.tag_rate_hz, sensors.tag_delay_ms) == (60, 40)
+    assert (sensors.tag_sigma_m, sensors.tag_sigma_axis_m) == (0.002, 0.004)
     assert (sensors.tag_sigma_deg, sensors.tag_dropped, sensors.tag_flipped) == (0.5, 0.02, 0.005)
     assert (world.current_m_s, world.buoyancy_error_n, world.trim_m, world.thruster_lag_s) == (0.05, 0.5, 0.003, 0.08)
     assert (world.mass_spread, world.inertia_spread, world.drag_spread, world.gain_spread) == (0.15, 0.15, 0.20, 0.05)

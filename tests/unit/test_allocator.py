@@ -245,6 +245,26 @@ def test_preload_without_one_thruster_makes_no_wrench_and_spares_it(single: Body
     np.testing.assert_allclose(single.thrusters.matrix @ force, 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("dead", range(8))
+def test_preload_is_worked_out_anew_when_a_thruster_dies(single: Body, dead: int) -> None:
+    alive = np.arange(8) != dead
+    allocator = Allocator(single, Allocation())
+    allocator.set_alive(alive)
+    thrust = allocator.step(np.zeros(6))
+    np.testing.assert_array_equal(thrust.force_n, preload(single.thrusters, alive, Allocation().preload_n))
+    assert thrust.scale == (1.0, 1.0)
+
+
+def test_preload_is_no_larger_than_it_has_to_be(single: Body) -> None:
+    """The layout allows all eight at the same size; a search of its null space finds that."""
+    force = preload(single.thrusters, np.ones(8, dtype=bool), 0.6)
+    np.testing.assert_allclose(np.abs(force), 0.6, rtol=0.01)
+
+
+def test_preload_of_none_is_none(single: Body) -> None:
+    assert not preload(single.thrusters, np.ones(8, dtype=bool), 0.0).any()
+
+
 def test_preload_is_that_of_each_module_alone(body: Body) -> None:
     """Modules may part at any time: no module may lean on another."""
     t = body.thrusters

@@ -131,6 +131,16 @@ def test_error_along_one_axis_is_answered_along_it_by_mass_times_bandwidth_squar
     np.testing.assert_allclose(controller.step(aim, aim, still) - at_rest, body.mass @ (stiffness * error), atol=1e-9)
 
 
+def test_position_error_is_turned_by_the_attitude_that_is_and_not_the_one_that_is_wanted(body: Body) -> None:
+    q_wb, aside = ATTITUDES["rolled"], np.array([0.1, -0.2, 0.05])
+    near, far = rest_at(np.zeros(3), ATTITUDES["pitch 90"]), rest_at(aside, ATTITUDES["pitch 90"])
+    still = believed(np.zeros(3), q_wb, np.zeros(6))
+    controller = Controller(body, Control())
+    pull = np.r_[Rotation.from_quat(q_wb[[1, 2, 3, 0]]).inv().apply(aside), np.zeros(3)]
+    extra = controller.step(far, far, still) - controller.step(near, near, still)
+    np.testing.assert_allclose(extra, body.mass @ (Control().position_bandwidth ** 2 * pull), atol=1e-9)
+
+
 def test_quaternion_of_either_sign_is_the_same_attitude(body: Body) -> None:
     estimate = believed(np.zeros(3), from_euler(0.3, 0.2, 0.1), np.zeros(6))
     aim = rest_at(np.zeros(3), from_euler(-0.2, 0.4, 1.0))
@@ -158,6 +168,17 @@ def test_feed_forward_looks_ahead_and_the_error_does_not(body: Body) -> None:
     controller = Controller(body, Control())
     extra = controller.step(now, ahead, still) - controller.step(now, now, still)
     np.testing.assert_allclose(extra, 0.1 * body.mass[:, 0], atol=1e-12)
+
+
+def test_damping_is_against_the_velocity_wanted_now_and_not_ahead(body: Body) -> None:
+    dry = replace(body, drag=replace(body.drag, nodes=0.0 * body.drag.nodes))
+    controller, still = Controller(dry, Control()), believed(np.zeros(3), LEVEL, np.zeros(6))
+    rest = rest_at(np.zeros(3), LEVEL)
+    moving_on = rest._replace(v_w=np.array([0.3, 0.0, 0.0]))
+    np.testing.assert_allclose(controller.step(rest, moving_on, still), controller.step(rest, rest, still), atol=1e-12)
+    damping = 2.0 * Control().position_damping * Control().position_bandwidth * 0.3
+    extra = controller.step(moving_on, rest, still) - controller.step(rest, rest, still)
+    np.testing.assert_allclose(extra, damping * body.mass[:, 0], atol=1e-9)
 
 
 # ---------------------------------------------------------------- closed loop

@@ -270,6 +270,6 @@ def test_body_is_built_without_a_folder_that_can_be_written(modcube: Vehicle, tm
 
 def test_cache_is_where_the_user_s_environment_says() -> None:
     home = Path("home")
-    assert default_folder({"XDG_CACHE_HOME": "/var/tmp/x"}, home) == Path("/var/tmp/x/modcube/drag")
+    assert default_folder({"XDG_CACHE_HOME": "/elsewhere"}, home) == Path("/elsewhere/modcube/drag")
     assert default_folder({}, home) == home / ".cache" / "modcube" / "drag"
     assert default_folder({"XDG_CACHE_HOME": "relative"}, home) == home / ".cache" / "modcube" / "drag"

@@ -183,6 +183,17 @@ def test_tag_older_than_the_window_is_refused(body: Body) -> None:
     assert (accepted.rejected, accepted.nis_dof) == (1, 6)
 
 
+def test_picture_with_more_tags_weighs_more(body: Body) -> None:
+    """The noise of a mean falls with the root of the number of tags in it."""
+    moved = []
+    for count in (1, 4, 16):
+        robot = Robot(body)
+        robot.rest(101)
+        aside = tag(robot.time_ns - PERIOD, P_WB + np.array([0.004, 0.0, 0.0]))._replace(count=count)
+        moved.append(robot.step(sensors(P_WB, Q_WB, aside)).p_wb[0] - P_WB[0])
+    assert 0.0 < 1.3 * moved[0] < moved[1] and 1.3 * moved[1] < moved[2] < 0.004
+
+
 # ---------------------------------------------------------------- between tags
 
 

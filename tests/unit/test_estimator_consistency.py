@@ -40,12 +40,12 @@ def tag_of(x: np.ndarray, capture_ns: int, noise: np.ndarray | None = None, leve
     return BodyPose(capture_ns, p_wt, lever, multiply(x[3:7].copy(), exp(e[3:].copy())), 1)
 
 
-def inertial_of(x: np.ndarray, rng: np.random.Generator | None = None) -> Measured:
-    """What gyro, accelerometer and pressure sensor say of a robot in state `x`."""
+def inertial_of(x: np.ndarray, moved: np.ndarray, rng: np.random.Generator | None = None) -> Measured:
+    """What gyro, accelerometer and pressure sensor say of a robot in state `x` that accelerates by `moved` (3,)."""
     down = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, 1.0])
     noise = np.zeros(7) if rng is None else rng.normal(size=7)
     gyro = x[10:13] + x[13:16] + P.gyro_sigma * noise[:3]
-    accel = x[16:19] - 9.80665 * down + P.accel_sigma * noise[3:6]
+    accel = x[16:19] + moved - 9.80665 * down + P.accel_sigma * noise[3:6]
     return Measured(gyro, accel, float(x[2] + x[25] + P.depth_sigma_m * noise[6]), [])
 
 
@@ -112,7 +112,8 @@ def fly(
             taken += 1
         flight.truth.append(x)
         flight.tau.append(tau)
-        flight.measured.append(inertial_of(x, rng)._replace(tags=arriving.pop(k, [])))
+        moved = propagation.inertial_acceleration(x, tau, *plant(body))
+        flight.measured.append(inertial_of(x, moved, rng)._replace(tags=arriving.pop(k, [])))
     return flight
 
 
@@ -155,11 +156,12 @@ class InOrder:
         self.x = propagation.inject(self.x, gain @ residual(self.x))
         self.covariance = (np.eye(ERRORS) - gain @ jacobian) @ self.covariance
 
-    def hear(self, measured: Measured) -> None:
-        """The inertial sensors and depth of one tick."""
+    def hear(self, measured: Measured, tau: np.ndarray) -> None:
+        """The inertial sensors and depth of one tick; how thrusters and drag accelerate the robot is taken as known."""
+        moved = propagation.inertial_acceleration(self.x, tau, *self.plant)
 
         def residual(x: np.ndarray) -> np.ndarray:
-            expected = inertial_of(x)
+            expected = inertial_of(x, moved)
             return np.r_[
                 measured.gyro - expected.gyro, measured.accel - expected.accel, measured.depth_m - expected.depth_m
             ]
@@ -193,7 +195,7 @@ def in_order(body: Body, flight: Flight, p: Estimation = P) -> InOrder:
         if not waiting:
             return reference
         reference.move(tau, time_ns)
-        reference.hear(measured)
+        reference.hear(measured, tau)
         while waiting and waiting[0].capture_ns == time_ns:
             reference.see(waiting.pop(0))
         if not waiting:

@@ -1,6 +1,7 @@
 """Minimum snap against other formulations: B-splines, a dense active-set solver, momentum; and its refusals."""
 
 import dataclasses
+import itertools
 import math
 
 import daqp
@@ -155,55 +156,55 @@ def test_limited_path_of_a_hundred_waypoints_keeps_limits_and_waypoints() -> Non
         np.testing.assert_allclose(found.sample(float(t)).p_wb, p, atol=1e-4)
 
 
+def _row(piece: int, u: float, order: int, times: np.ndarray) -> np.ndarray:
+    """Derivative of one piece as a row over the plain coefficients of all pieces."""
+    found = np.zeros(10 * len(times))
+    for j in range(order, 10):
+        found[10 * piece + j] = math.perm(j, order) * u ** (j - order) / times[piece] ** order
+    return found
+
+
+def _equalities(points: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and targets: positions, continuity to the fourth derivative, rest at both ends."""
+    last, rows, targets = len(times) - 1, [], []
+    for k in range(len(times)):
+        rows += [_row(k, 0.0, 0, times), _row(k, 1.0, 0, times)]
+        targets += [points[k], points[k + 1]]
+        if k < last:
+            rows += [_row(k, 1.0, order, times) - _row(k + 1, 0.0, order, times) for order in range(1, 5)]
+            targets += [0.0] * 4
+    for order in (1, 2, 3):
+        rows += [_row(0, 0.0, order, times), _row(last, 1.0, order, times)]
+        targets += [0.0, 0.0]
+    return np.array(rows), np.array(targets)
+
+
+def _least_snap_by_active_set(points: np.ndarray, times: np.ndarray, bound: float) -> float:
+    """Plain coefficients, equalities taken out by their null space, acceleration bounded on dense samples, daqp."""
+    count = len(times)
+    form = np.zeros((10 * count, 10 * count))
+    for k, i, j in itertools.product(range(count), range(4, 10), range(4, 10)):
+        form[10 * k + i, 10 * k + j] = math.perm(i, 4) * math.perm(j, 4) / (i + j - 7) / times[k] ** 7
+    rows, targets = _equalities(points, times)
+    _, singular, right = np.linalg.svd(rows)
+    null = right[np.sum(singular > 1e-10 * singular[0]) :].T
+    start = np.linalg.lstsq(rows, targets, rcond=None)[0]
+    samples = np.array([_row(k, float(u), 2, times) for k in range(count) for u in np.linspace(0.0, 1.0, 101)])
+    upper, lower = (sign * bound - samples @ start for sign in (1.0, -1.0))
+    bounds = np.ascontiguousarray(samples @ null)
+    free = np.zeros(len(upper), dtype=np.int32)
+    x, _, flag, _ = daqp.solve(null.T @ form @ null, null.T @ form @ start, bounds, upper, lower, free)
+    assert flag == 1
+    return float((start + null @ x) @ form @ (start + null @ x))
+
+
 def test_limited_path_has_the_least_snap_that_another_solver_finds() -> None:
-    """The same problem in plain coefficients, with equality rows and dense samples, by an active-set method (daqp)."""
-    points, pieces = np.array([0.0, 0.7, 0.9, 0.4]), 3
-    times = np.array([2.5, 1.5, 2.0])
+    points, times = np.array([0.0, 0.7, 0.9, 0.4]), np.array([2.5, 1.5, 2.0])
     waypoints = [Waypoint(np.array([x, 0, 0])) for x in points]
     free = plan(waypoints, times, stretch=False)
     bound = 0.8 * float(extremes(free)[1][0])
     ours = plan(waypoints, times, Limits(acceleration=np.full(3, bound)), stretch=False)
-    form, rows, low, high = np.zeros((30, 30)), [], [], []
-
-    def row(piece: int, u: float, order: int) -> np.ndarray:
-        found = np.zeros(30)
-        for j in range(order, 10):
-            found[10 * piece + j] = math.perm(j, order) * u ** (j - order) / times[piece] ** order
-        return found
-
-    def equal(values: np.ndarray, target: float) -> None:
-        rows.append(values)
-        low.append(target)
-        high.append(target)
-
-    for k in range(pieces):
-        for i in range(4, 10):
-            for j in range(4, 10):
-                form[10 * k + i, 10 * k + j] = math.perm(i, 4) * math.perm(j, 4) / (i + j - 7) / times[k] ** 7
-        equal(row(k, 0.0, 0), points[k])
-        equal(row(k, 1.0, 0), points[k + 1])
-        for order in range(1, 5 if k + 1 < pieces else 1):
-            equal(row(k, 1.0, order) - row(k + 1, 0.0, order), 0.0)
-    for order in (1, 2, 3):
-        equal(row(0, 0.0, order), 0.0)
-        equal(row(pieces - 1, 1.0, order), 0.0)
-    fixed = len(rows)
-    for k in range(pieces):
-        for u in np.linspace(0.0, 1.0, 101):
-            rows.append(row(k, float(u), 2))
-            low.append(-bound)
-            high.append(bound)
-    # Columns scaled to unit curvature, equalities taken out by their null space: what is left is well conditioned.
-    matrix = np.array(rows)
-    _, singular, right = np.linalg.svd(matrix[:fixed])
-    null = right[np.sum(singular > 1e-10 * singular[0]) :].T
-    start = np.linalg.lstsq(matrix[:fixed], np.array(low[:fixed]), rcond=None)[0]
-    reduced = null.T @ form @ null
-    upper, lower = (np.array(x[fixed:]) - matrix[fixed:] @ start for x in (high, low))
-    rest = np.ascontiguousarray(matrix[fixed:] @ null)
-    x, _, flag, _ = daqp.solve(reduced, null.T @ form @ start, rest, upper, lower, np.zeros(len(upper), dtype=np.int32))
-    assert flag == 1
-    cost = (start + null @ x) @ form @ (start + null @ x)
+    cost = _least_snap_by_active_set(points, times, bound)
     assert free.snap_cost < 0.95 * cost
     assert ours.snap_cost == pytest.approx(cost, rel=0.02)
 

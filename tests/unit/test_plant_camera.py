@@ -8,7 +8,8 @@ import pytest
 
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import load_vehicle
-from hil.plant.camera import Camera, Sighting, crosses_box, tag_pose
+from hil.plant.camera import Camera, Sighting, tag_pose
+from hil.plant.sight import crosses
 from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
 
@@ -91,11 +92,13 @@ def test_module_above_hides_the_one_below() -> None:
 
 
 def test_segment_and_box() -> None:
-    half, q = np.array([1.0, 2.0, 3.0]), rotations.from_euler(0.0, 0.0, math.pi / 2)
-    a, b = np.array([-5.0, 1.5, 0.0]), np.array([5.0, 1.5, 0.0])
-    assert not crosses_box(a, b, np.zeros(3), q, half), "turned by 90 degrees its y half edge is 1"
-    assert crosses_box(a, b, np.zeros(3), LEVEL, half)
-    assert not crosses_box(a, np.array([-2.0, 1.5, 0.0]), np.zeros(3), LEVEL, half)
+    box = np.array([[0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0]])
+    turned = np.concatenate([np.zeros(3), rotations.from_euler(0.0, 0.0, math.pi / 2)])[None, :]
+    level = np.concatenate([np.zeros(3), LEVEL])[None, :]
+    a, b = (-5.0, 1.5, 0.0), (5.0, 1.5, 0.0)
+    assert not crosses(a, b, box, 0, turned), "turned by 90 degrees its y half edge is 1"
+    assert crosses(a, b, box, 0, level)
+    assert not crosses(a, (-2.0, 1.5, 0.0), box, 0, level)
 
 
 def test_pictures_come_at_60_hz_with_a_phase_per_seed() -> None:

@@ -179,6 +179,25 @@ def test_carried_rate_is_the_gyros_less_its_bias(body: Body) -> None:
     np.testing.assert_allclose(carried[:10], by_hand[:10], atol=1e-15)
 
 
+def test_carried_pose_is_as_uncertain_as_its_derivatives_say(body: Body) -> None:
+    """Variance after carrying for 0.2 s by a given gyro, against finite differences of the carrying itself."""
+    x = state(0)
+    x[7:13] *= 0.1
+    gyros = np.tile(x[10:13] + x[13:16], (20, 1))
+    taus = np.tile(0.1 * TAU, (20, 1))
+    now = propagation.carry(x, taus, gyros, 0.01, 0.01, *plant(body))
+
+    def carried(y: np.ndarray) -> np.ndarray:
+        return error_between(propagation.carry(y, taus, gyros, 0.01, 0.01, *plant(body)), now)[:6]
+
+    jacobian = differences(carried, x)
+    sigma = np.repeat([1e-4, 1e-4, 0.02, 0.0, 0.01, 0.0, 2.0, 0.0, 0.0], [3, 3, 3, 3, 3, 3, 3, 3, 1])
+    expected = np.diag(jacobian @ np.diag(sigma**2) @ jacobian.T)
+    no_noise = np.zeros(ERRORS)
+    got = observation.carried_pose_variance(x, np.diag(sigma**2), no_noise, body.mass_inv, 0.2, 0.0)
+    np.testing.assert_allclose(got, expected, rtol=0.25)
+
+
 # ---------------------------------------------------------------- measurements
 
 
@@ -204,8 +223,9 @@ def test_tag_residual_is_zero_where_the_tag_is() -> None:
 def test_inertial_jacobian_is_the_derivative_of_the_residual(seed: int) -> None:
     x, sigma = state(seed), np.array([0.1, 0.2, 0.3])
     gyro, accel = np.array([0.1, 0.2, 0.3]), np.array([0.5, -0.2, -9.7])
-    _, h, noise = observation.inertial(x, gyro, accel, 1.2, sigma)
-    numeric = differences(lambda y: observation.inertial(y, gyro, accel, 1.2, sigma)[0], x)
+    moved = np.array([0.3, -0.1, 0.2])
+    _, h, noise = observation.inertial(x, gyro, accel, 1.2, sigma, moved)
+    numeric = differences(lambda y: observation.inertial(y, gyro, accel, 1.2, sigma, moved)[0], x)
     np.testing.assert_allclose(h, -numeric, atol=1e-8)
     np.testing.assert_allclose(np.diag(noise), np.repeat(sigma, [3, 3, 1]) ** 2)
 
@@ -214,11 +234,28 @@ def test_accelerometer_of_a_level_robot_at_rest_points_up() -> None:
     """It feels what holds it: -g along z, which is down."""
     x = np.zeros(26)
     x[3] = 1.0
-    residual, _, _ = observation.inertial(x, np.zeros(3), np.array([0.0, 0.0, -9.80665]), 0.0, np.ones(3))
+    residual, _, _ = observation.inertial(x, np.zeros(3), np.array([0.0, 0.0, -9.80665]), 0.0, np.ones(3), np.zeros(3))
     np.testing.assert_allclose(residual, 0.0)
     x[3:7] = from_euler(0.5, 0.0, 0.0)
     felt = np.array([0.0, -9.80665 * np.sin(0.5), -9.80665 * np.cos(0.5)])
-    np.testing.assert_allclose(observation.inertial(x, np.zeros(3), felt, 0.0, np.ones(3))[0], 0.0, atol=1e-14)
+    tilted, _, _ = observation.inertial(x, np.zeros(3), felt, 0.0, np.ones(3), np.zeros(3))
+    np.testing.assert_allclose(tilted, 0.0, atol=1e-14)
+
+
+def test_accelerometer_feels_what_moves_the_robot() -> None:
+    x = np.zeros(26)
+    x[3] = 1.0
+    pushed = np.array([0.5, 0.0, -9.80665])
+    residual, _, _ = observation.inertial(x, np.zeros(3), pushed, 0.0, np.ones(3), np.array([0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(residual, 0.0, atol=1e-15)
+
+
+def test_acceleration_against_the_world_is_the_change_of_the_velocity_in_it(body: Body) -> None:
+    x, h = state(2), 1e-6
+    later = propagation.step(x, TAU, h, *plant(body))
+    before, after = (Rotation.from_quat(y[[4, 5, 6, 3]]).apply(y[7:10]) for y in (x, later))
+    expected = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply((after - before) / h)
+    np.testing.assert_allclose(propagation.inertial_acceleration(x, TAU, *plant(body)), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("gyro", [True, False])
@@ -226,10 +263,16 @@ def test_accelerometer_of_a_level_robot_at_rest_points_up() -> None:
 @pytest.mark.parametrize("depth", [True, False])
 def test_sensor_that_did_not_come_has_no_row(gyro: bool, accel: bool, depth: bool) -> None:
     x, sigma = state(0), np.array([0.1, 0.2, 0.3])
-    full = observation.inertial(x, np.ones(3), 2 * np.ones(3), 3.0, sigma)
+    moved = np.zeros(3)
+    full = observation.inertial(x, np.ones(3), 2 * np.ones(3), 3.0, sigma, moved)
     nothing = np.full(3, np.nan)
     part = observation.inertial(
-        x, np.ones(3) if gyro else nothing, 2 * np.ones(3) if accel else nothing, 3.0 if depth else np.nan, sigma
+        x,
+        np.ones(3) if gyro else nothing,
+        2 * np.ones(3) if accel else nothing,
+        3.0 if depth else np.nan,
+        sigma,
+        moved,
     )
     rows = np.repeat([gyro, accel, depth], [3, 3, 1])
     np.testing.assert_array_equal(part[0], full[0][rows])

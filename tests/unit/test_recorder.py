@@ -50,7 +50,7 @@ def body_record(rng: np.random.Generator, thrusters: int = 8) -> BodyRecord:
     )  # fmt: skip
     setpoint = Setpoint(rng.normal(size=3), q, *rng.normal(size=(4, 3)))
     thrust = Thrust(rng.normal(size=thrusters), rng.normal(size=6), (1.0, 0.75))
-    return BodyRecord(0, 3, estimate, setpoint, rng.normal(size=6), thrust, rng.normal(size=thrusters))
+    return BodyRecord(0, 1, 3, estimate, setpoint, rng.normal(size=6), thrust, rng.normal(size=thrusters))
 
 
 def record_ticks(folder: Path, ticks: int = 120, seed: int = 1, killed: bool = False) -> list[BodyRecord]:
@@ -107,7 +107,7 @@ def test_body_signals_decode_to_what_the_tick_thought(tmp_path: Path) -> None:
         np.testing.assert_array_equal(message.setpoint_alpha_b, record.setpoint.alpha_b)
         np.testing.assert_array_equal(message.wrench_achieved, record.thrust.achieved)
         np.testing.assert_array_equal(message.commanded_n, record.commanded_n)
-        assert (message.state, message.nis_dof, message.rejected, message.ready) == (3, 6, 3, True)
+        assert (message.state, message.mode, message.nis_dof, message.rejected, message.ready) == (1, 3, 6, 3, True)
         assert list(message.scale) == [1.0, 0.75]
 
 

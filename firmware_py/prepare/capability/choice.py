@@ -1,4 +1,4 @@
-"""Which shape for a task: all distinct polycubes ranked by margin, power or thrust variance, with what k dead thrusters leave.
+"""Which shape for a task: all distinct polycubes by margin, power or variance, with what k dead thrusters leave.
 
 The modules stay parallel to each other (so every probe meets a drogue); each shape is tried in every way it can lie.
 """
@@ -89,7 +89,10 @@ def rank(
                 layout, wrenches = of_modules(cells, [0] * count, [vehicle] * count, pitch_m), task.wrench
             else:
                 body = assemble(cells, [0] * count, [vehicle] * count, pitch_m=pitch_m, cache=cache)
-                layout, wrenches = of_thrusters(body.name, body.thrusters), wrenches_along(path, body, task.trajectory.samples)
+                layout, wrenches = (
+                    of_thrusters(body.name, body.thrusters),
+                    wrenches_along(path, body, task.trajectory.samples),
+                )
             tried.append((fitness(cells, layout, wrenches), layout, wrenches))
         best, layout, wrenches = min(tried, key=lambda entry: (_order(task, entry[0]), entry[0].cells))
         found.append(_choice(best, len(tried), layout, wrenches, task.dead))
@@ -111,7 +114,7 @@ def _rows(layout: Layout) -> np.ndarray:
 
 
 def _order(task: Task, part: Fitness) -> tuple[bool, float, float]:
-    """Sorting key: what can do the task comes first. Rounded, so that rounding errors do not part shapes that are alike."""
+    """Sorting key: what can do the task comes first; rounded, so that rounding errors do not part like shapes."""
     value = {"margin": -part.margin, "power": part.power_w, "variance": part.variance}[task.rank_by]
     second = part.power_w if task.rank_by == "margin" else -part.margin
     return part.margin < 1.0, _rounded(value), _rounded(second)

@@ -1,7 +1,7 @@
 """Thruster curves out of measured tables: fifth-order polynomials without a constant term that rise everywhere on 0..1.
 
-Used when a vehicle file is made; `core.thruster` inverts the force polynomial, so it must rise. Plain least squares falls
-near zero command, where a measured thruster does nothing.
+Used when a vehicle file is made; `core.thruster` inverts the force polynomial, so it must rise. Plain least squares
+falls near zero command, where a measured thruster does nothing.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class ThrusterFit:
 
 
 def rising_polynomial(x: np.ndarray, y: np.ndarray, least_slope: float = 0.0) -> Fit:
-    """Least squares over all fifth-order polynomials through the origin whose slope in the Bernstein basis is not below a bound.
+    """Least squares over fifth-order polynomials through the origin with a lower bound on the slope.
 
-    The slope is sum b_k B_k,4(x) with b_k >= least_slope, so it is at least that everywhere on 0..1, not on a grid alone; the
-    bounded problem is solved exactly by non-negative least squares (Lawson and Hanson).
+    The slope is sum b_k B_k,4(x) in Bernstein's basis with b_k >= least_slope, so it is at least that everywhere on
+    0..1, not on a grid alone; non-negative least squares (Lawson and Hanson) solves the bounded problem exactly.
 
     Args:
         x: (n,) abscissa, 0 to 1.
@@ -77,7 +77,9 @@ def _integrated_bernstein() -> np.ndarray:
     return columns
 
 
-def fit_thruster(command: np.ndarray, force_n: np.ndarray, power_w: np.ndarray, least_slope: float = 0.5) -> ThrusterFit:
+def fit_thruster(
+    command: np.ndarray, force_n: np.ndarray, power_w: np.ndarray, least_slope: float = 0.5
+) -> ThrusterFit:
     """The polynomials of one measured thruster.
 
     Args:

@@ -1,6 +1,6 @@
-"""Largest ellipsoid inside a polytope: max log det B, |B a_i| + a_i . x <= b_i (the paper's V_MIE), by an interior-point method.
+"""Largest ellipsoid inside a polytope: max log det B, |B a_i| + a_i . x <= b_i (V_MIE), by an interior-point method.
 
-The problem has nine unknowns, so Newton's method on the logarithmic barrier with dense matrices solves it in milliseconds.
+The problem has nine unknowns: Newton's method on the logarithmic barrier solves it in milliseconds.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Facets of the zonotope of all reachable wrenches, {J f : f_min <= f <= f_max}, in six dimensions. Compiled.
 
-Every facet's normal is orthogonal to five independent columns of J (four, and so on, where J has less than full rank), so all
-normals come out of the exterior products of five columns. Any y gives a true inequality y . w <= h(y), where h is the
-support; a normal too many therefore does no harm.
+Every facet's normal is orthogonal to five independent columns of J (four where J has rank 5, and so on), so all normals
+come out of the exterior products of five columns. Any y gives a true inequality y . w <= h(y), where h is the support;
+a normal too many therefore does no harm.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ _PARALLEL = 1e-9
 
 
 def _wedge_table() -> tuple[np.ndarray, np.ndarray]:
-    """Terms (n, 5) of blade ^ vector for grades 0..4 in six dimensions: source, axis, target, sign; and (6,) where each begins.
+    """Terms (n, 4) of blade ^ vector for grades 0..4 in six dimensions, and (6,) where each grade begins.
 
-    Components of a blade of grade k are numbered by the k-subsets of the axes in lexicographic order.
+    A term is source, axis, target, sign. Components of a blade of grade k are numbered by the k-subsets of the axes in
+    lexicographic order.
     """
     terms: list[tuple[int, int, int, int]] = []
     start = [0]
@@ -104,7 +105,7 @@ def _normals(terms, start, forced, columns, smallest, out):  # type: ignore[no-u
 
 @njit("void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], int64, float64[:,::1])", cache=True)
 def _supports(normals, columns, f_min, f_max, dead, out):  # type: ignore[no-untyped-def]
-    """Supports of the zonotope along +y and -y, out (m, 2), less the `dead` largest contributions of single thrusters."""
+    """Supports along +y and -y, out (m, 2), less the `dead` largest contributions of single thrusters."""
     n = columns.shape[0]
     largest = np.zeros((2, dead + 1))
     for m in range(normals.shape[0]):
@@ -172,7 +173,7 @@ def normals_of(layout: Layout) -> np.ndarray:
 
 
 def supports_of(layout: Layout, normals: np.ndarray, dead: int = 0) -> np.ndarray:
-    """(m, 2) support along each normal and against it, N, if the `dead` thrusters that matter most there give nothing."""
+    """(m, 2) support along each normal and against it, N, the `dead` thrusters that matter most there left out."""
     out = np.zeros((len(normals), 2))
     columns = np.ascontiguousarray(layout.matrix.T)
     _supports(normals, columns, layout.f_min, layout.f_max, min(dead, layout.count), out)
@@ -180,7 +181,7 @@ def supports_of(layout: Layout, normals: np.ndarray, dead: int = 0) -> np.ndarra
 
 
 def reach(layout: Layout, normals: np.ndarray, supports: np.ndarray, wrenches: np.ndarray) -> np.ndarray:
-    """(k,) largest factor by which each of (k, 6) wrenches can be multiplied; wrenches must lie in the layout's span."""
+    """(k,) largest factor of each of (k, 6) wrenches, which must lie in the layout's span."""
     out = np.zeros(len(wrenches))
     lever = layout.lever_m
     for k, wrench in enumerate(np.ascontiguousarray(wrenches, dtype=float)):
@@ -190,7 +191,7 @@ def reach(layout: Layout, normals: np.ndarray, supports: np.ndarray, wrenches: n
 
 
 def _distinct(layout: Layout) -> np.ndarray:
-    """(n, 6) unit columns, torque scaled by the lever arm, one of each set of parallel ones; idle thrusters left out."""
+    """(n, 6) unit columns, torque scaled by the lever arm, parallel and idle ones left out."""
     columns = layout.scaled.T[(layout.f_max > 0.0) | (layout.f_min < 0.0)]
     sizes = np.linalg.norm(columns, axis=1, keepdims=True)
     unit = columns[sizes[:, 0] > 0.0] / sizes[sizes[:, 0] > 0.0]

@@ -1,6 +1,6 @@
-"""An actuation layout: which wrench each thruster gives, how hard it may push and what that costs. Any vehicle, any assembly.
+"""An actuation layout: which wrench each thruster gives, how hard it may push and what that costs.
 
-Columns are [direction; position x direction] about the centre of mass (the paper's Jacobian with its two words put right).
+Columns are [direction; position x direction] about the centre of mass: the paper's Jacobian, its two words put right.
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ class Layout:
         if self.matrix.shape[0] != 6 or self.matrix.shape[1] == 0:
             raise DescriptionError(f"{self.name}: has no thrusters")
         if not np.all(np.isfinite(self.matrix)):
-            raise DescriptionError(f"{self.name}: thruster {_first(~np.isfinite(self.matrix).all(axis=0))} is not finite")
+            raise DescriptionError(
+                f"{self.name}: thruster {_first(~np.isfinite(self.matrix).all(axis=0))} is not finite"
+            )
         if np.any(self.f_min > 0.0) or np.any(self.f_max < 0.0):
             raise DescriptionError(f"{self.name}: force limits must hold zero between them")
 
@@ -72,14 +74,14 @@ class Layout:
 
     @property
     def lever_m(self) -> float:
-        """Root mean square lever arm, by which torque is scaled where forces and torques are compared; 1 if there is none."""
+        """Root mean square lever arm, m, over which torque compares with force; 1 if there is none."""
         size = float(np.sqrt(np.mean(np.sum(self.matrix[3:] ** 2, axis=0))))
         return size if size > 0.0 else 1.0
 
     @property
     def scaled(self) -> np.ndarray:
         """(6, n) matrix with torque over the lever arm, N."""
-        return self.matrix / np.array([1.0, 1.0, 1.0, *[self.lever_m] * 3])[:, None]
+        return np.asarray(self.matrix / np.array([1.0, 1.0, 1.0, *[self.lever_m] * 3])[:, None])
 
     @property
     def rank(self) -> int:
@@ -152,8 +154,11 @@ def of_modules(
     check_joints(placements, range(len(placements)), pitch_m)
     turns = np.array([MATRICES[p.rotation] for p in placements])
     origins = pitch_m * np.array([p.cell for p in placements], dtype=float)
-    lumps = [(mass, origin + turn @ at) for p, turn, origin in zip(placements, turns, origins, strict=True)
-             for mass, at in _lumps(p.vehicle)]
+    lumps = [
+        (mass, origin + turn @ at)
+        for p, turn, origin in zip(placements, turns, origins, strict=True)
+        for mass, at in _lumps(p.vehicle)
+    ]
     total = sum(mass for mass, _ in lumps)
     r_bm = origins - np.sum([mass * at for mass, at in lumps], axis=0) / total
     passive = tuple(AXES.index(a) for a in vehicles[0].passive_dof) if len(vehicles) == 1 else ()

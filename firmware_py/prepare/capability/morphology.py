@@ -1,7 +1,7 @@
 """How smooth a space is: Dirichlet and Willmore energy of the star-shaped surface r(d), through spherical harmonics.
 
-The radius is taken about the wrench origin and never re-centred; harmonics are real and orthonormal, degree 10 at most as in
-the paper. E_D = sum l (l + 1) |a_lm|^2; E_W = int H^2 dA - int K dA on the fitted surface.
+The radius is taken about the wrench origin and never re-centred; harmonics are real and orthonormal, degree 10 at most
+as in the paper. E_D = sum l (l + 1) |a_lm|^2; E_W = int H^2 dA - int K dA on the fitted surface.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ L_MAX = 10
 
 LEAST_RATIO = 1e-3
 """Smallest r_min / r_max for which the Willmore energy means anything."""
+
+_CURVATURE_ERROR = 1e-3
+"""Largest relative error of int K dA = 4 pi with which a Willmore energy is believed."""
 
 _POLAR, _AZIMUTH = 128, 256
 """Nodes of the quadrature: int K is 4 pi to 1e-6 on all seven robots' spaces."""
@@ -54,7 +57,9 @@ class Harmonics:
         polar, azimuth = angles(directions)
         (values,) = _legendre(polar, l_max, 0)
         order = _orders(l_max)
-        turning = np.where(order[:, 1] >= 0, np.cos(np.outer(azimuth, order[:, 1])), -np.sin(np.outer(azimuth, order[:, 1])))
+        turning = np.where(
+            order[:, 1] >= 0, np.cos(np.outer(azimuth, order[:, 1])), -np.sin(np.outer(azimuth, order[:, 1]))
+        )
         self._matrix = values[:, order[:, 0], np.abs(order[:, 1])] * turning
         self._inverse = np.linalg.pinv(self._matrix)
         self._surface = Quadrature(l_max)
@@ -67,7 +72,9 @@ class Harmonics:
         """Both energies of the surface with the given radius along each direction."""
         a = self.fit(radius)
         energy = dirichlet(a)
-        misfit = float(np.sqrt(np.mean((self._matrix @ a - radius) ** 2)) / np.mean(radius)) if radius.any() else math.nan
+        misfit = (
+            float(np.sqrt(np.mean((self._matrix @ a - radius) ** 2)) / np.mean(radius)) if radius.any() else math.nan
+        )
         scale_free = energy / float(a[0] ** 2) if a[0] else math.nan
         ratio = float(radius.min() / radius.max()) if radius.max() > 0.0 else 0.0
         if ratio < LEAST_RATIO:
@@ -75,6 +82,8 @@ class Harmonics:
         value, curvature, fitted_ratio = self._surface.willmore(a)
         if fitted_ratio < LEAST_RATIO:
             return Shape(energy, scale_free, math.nan, "the fitted surface passes the origin", math.nan, misfit)
+        if abs(curvature / (4.0 * math.pi) - 1.0) > _CURVATURE_ERROR:
+            return Shape(energy, scale_free, math.nan, "too sharp for the quadrature", curvature, misfit)
         return Shape(energy, scale_free, value, "", curvature, misfit)
 
 
@@ -104,7 +113,7 @@ class Quadrature:
         if r.min() <= 0.0:
             return math.nan, math.nan, float(r.min() / r.max())
         sin, cos = self._sin, self._cos
-        # First and second fundamental forms of r e_r, in the frame (e_r, e_polar, e_azimuth) that turns with the angles.
+        # First and second fundamental forms of r e_r, in the frame (e_r, e_polar, e_azimuth).
         e, f, g = r_p**2 + r**2, r_p * r_a, r_a**2 + (r * sin) ** 2
         area = np.sqrt(e * g - f * f)
         normal = np.stack([r * r * sin, -r * r_p * sin, -r * r_a]) / area
@@ -146,7 +155,7 @@ def _orders(l_max: int) -> np.ndarray:
 
 
 def _legendre(polar: np.ndarray, l_max: int, derivatives: int) -> tuple[np.ndarray, ...]:
-    """Arrays (n, l, m >= 0): orthonormal real harmonics without their turning, and so many derivatives by the polar angle."""
+    """Arrays (n, l, m >= 0): orthonormal real harmonics without their turning, and derivatives by the polar angle."""
     from scipy.special import sph_harm_y  # a quarter of a second to import
 
     tables = np.zeros((derivatives + 1, len(polar), l_max + 1, l_max + 1))

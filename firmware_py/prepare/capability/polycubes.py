@@ -19,7 +19,10 @@ _STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 def polycubes(count: int) -> list[Cells]:
     """Every distinct shape of `count` cubes, mirror images apart: 1, 1, 2, 8, 29 (OEIS A000162). Sorted.
 
-    Raises DescriptionError for another count. Two shapes are the same if one of the 24 rotations and a shift take one to the other; a robot cannot be mirrored.
+    Two shapes are the same if one of the 24 rotations and a shift take one to the other; a robot cannot be mirrored.
+
+    Raises:
+        DescriptionError: no list for so many.
     """
     if not 1 <= count <= MOST_CUBES:
         raise DescriptionError(f"shapes are listed for 1 to {MOST_CUBES} modules, not {count}")

@@ -1,7 +1,7 @@
-"""Power space and thrust variance: what a wrench of declared size costs in every direction, by the pseudo-inverse f = J^+ w.
+"""Power space and thrust variance: what a wrench of declared size costs in every direction, with f = J^+ w.
 
-P(d) = sum [P(f_i) - P(0)] with the thrusters' measured power; what the electronics draw at rest is apart. The paper's own
-figure is proportional to the number of thrusters, so it measures idle power.
+P(d) = sum [P(f_i) - P(0)] with the thrusters' measured power; what the electronics draw at rest is apart. The paper's
+own figure is proportional to the number of thrusters, so it measures idle power.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def electrical_power(layout: Layout, forces: np.ndarray) -> np.ndarray:
 
 
 def least_squares_forces(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
-    """(k, n) forces with the smallest sum of squares within limits for (k, 6) wrenches; J^+ w where that is out of reach."""
+    """(k, n) forces of least squares within limits for (k, 6) wrenches; J^+ w where a wrench is out of reach."""
     forces = wrenches @ np.linalg.pinv(layout.matrix, rcond=1e-9).T
     n = layout.count
     sense = np.array([0] * n + [_EQUALITY] * 6, dtype=c_int)

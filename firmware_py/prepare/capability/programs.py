@@ -1,7 +1,7 @@
-"""Reachable wrench space by linear programs (HiGHS): checks the facets, and serves bodies with too many thrusters for them.
+"""Reachable wrench space by linear programs (HiGHS): checks the facets, and serves bodies with too many thrusters.
 
-lambda(w) = max lambda so that J f = lambda w, f_min <= f <= f_max. The program's dual is the normal of a facet where w leaves
-the reachable wrenches, so a section's facets can be found one by one.
+lambda(w) = max lambda so that J f = lambda w, f_min <= f <= f_max. The program's dual is the normal of a facet where w
+leaves the reachable wrenches, so a section's facets can be found one by one.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from firmware_py.prepare.capability.layout import Layout
 from firmware_py.prepare.capability.sphere import fibonacci
-from firmware_py.prepare.capability.wrench import Section, embed, free_components, irredundant
+from firmware_py.prepare.capability.wrench import Section, corners_of, embed, free_components, irredundant
 
 _BATCH = 100
 """Programs solved as one block-diagonal program: 0.13 ms each for 8 thrusters, 1.6 ms each when alone."""
@@ -27,7 +27,9 @@ _MOST_ROUNDS = 100
 """Rounds of the search; six to ten are usual."""
 
 
-def reach_by_programs(layout: Layout, wrenches: np.ndarray, progress: Callable[[int], None] | None = None) -> np.ndarray:
+def reach_by_programs(
+    layout: Layout, wrenches: np.ndarray, progress: Callable[[int], None] | None = None
+) -> np.ndarray:
     """(k,) largest factor of each of (k, 6) wrenches.
 
     Args:
@@ -42,7 +44,7 @@ def reach_by_programs(layout: Layout, wrenches: np.ndarray, progress: Callable[[
 def solve(
     layout: Layout, wrenches: np.ndarray, progress: Callable[[int], None] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Factors (k,) and duals (k, 6): y . w = 1 with y . v <= factor for every reachable v. Arguments as `reach_by_programs`."""
+    """Factors (k,) and duals (k, 6): y . w = 1, and y . v <= factor for every reachable v."""
     wrenches = np.atleast_2d(np.asarray(wrenches, dtype=float))
     factor, dual = np.zeros(len(wrenches)), np.zeros(wrenches.shape)
     for begin in range(0, len(wrenches), _BATCH):
@@ -95,8 +97,8 @@ class ProgramSpace:
     def section(self, frame: str) -> Section | None:
         """The polytope in one frame; None where the layout does not span it.
 
-        Begins with the facets that a few directions meet and then tries the corners of what these enclose: a corner that
-        cannot be reached lies beyond a facet not found yet.
+        Begins with the facets that a few directions meet and then tries the corners of what these enclose: a corner
+        that cannot be reached lies beyond a facet not found yet.
 
         Raises:
             RuntimeError: no end was found.
@@ -116,7 +118,7 @@ class ProgramSpace:
             heights = _supports(self.layout, dual[beyond]) / sizes
             normals = np.concatenate([normals, dual[beyond][:, components] / sizes[:, None]])
             normals, offsets = irredundant(normals, np.concatenate([offsets, heights]))
-            probes = _corners(normals, offsets)
+            probes = corners_of(normals, offsets)
         raise RuntimeError(f"{self.layout.name}: the facets of the {frame} frame were not all found")
 
 
@@ -132,15 +134,3 @@ def _first_directions(dimensions: int) -> np.ndarray:
         turn = 2.0 * np.pi * np.arange(_FIRST_DIRECTIONS) / _FIRST_DIRECTIONS
         return np.stack([np.cos(turn), np.sin(turn)], axis=1)
     return np.array([[1.0], [-1.0]])
-
-
-def _corners(normals: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """(c, d) corners of {x : normals @ x <= offsets}: faces of the hull of the polar points."""
-    from scipy.spatial import ConvexHull
-
-    if normals.shape[1] == 1:
-        return np.asarray(normals * offsets[:, None])
-    equations = ConvexHull(normals / offsets[:, None]).equations
-    corners = equations[:, :-1] / -equations[:, -1:]
-    _, distinct = np.unique(np.round(corners / np.abs(corners).max(), 9), axis=0, return_index=True)
-    return np.asarray(corners[distinct])

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def fibonacci(n: int) -> np.ndarray:
-    """(n, 3) unit vectors: polar angle arccos(1 - (2 i + 1) / n), golden angle in azimuth (the paper's 2 i / n misses a pole)."""
+    """(n, 3) unit vectors: polar angle arccos(1 - (2 i + 1) / n), golden angle in azimuth."""
     i = np.arange(n)
     z = 1.0 - (2 * i + 1) / n
     azimuth = np.pi * (1.0 + np.sqrt(5.0)) * i
@@ -21,7 +21,7 @@ def angles(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def grid(polar_count: int, azimuth_count: int) -> np.ndarray:
-    """(polar_count, azimuth_count, 3) unit vectors of a closed mesh for drawing: poles and the seam appear more than once."""
+    """(polar_count, azimuth_count, 3) unit vectors of a closed mesh for drawing; poles and seam come repeatedly."""
     polar = np.linspace(0.0, np.pi, polar_count)[:, None]
     azimuth = np.linspace(0.0, 2.0 * np.pi, azimuth_count)[None]
     parts = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) * np.ones_like(azimuth)

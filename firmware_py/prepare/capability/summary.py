@@ -1,4 +1,4 @@
-"""Everything that is said of one layout: both frames, all normalisations, degenerate cases named. What the tools print and draw."""
+"""Everything that is said of one layout: both frames, all normalisations, degenerate cases named."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def _reach(space: WrenchSpace | ProgramSpace, frame: str, directions: np.ndarray
 
 
 def _difference(layout: Layout, frame: str, directions: np.ndarray, exact: np.ndarray) -> float:
-    """Largest |program - facet| over the largest of the two; over the largest radius where a direction is out of reach."""
+    """Largest |program - facet| as a share of the facets' figure; of the largest where a direction is out of reach."""
     programs = reach_by_programs(layout, embed(directions, FRAMES[frame]))
     scale = np.where(exact > 0.0, exact, max(float(exact.max()), float(layout.f_max.max())))
     return float(np.max(np.abs(programs - exact) / scale))
@@ -178,7 +178,9 @@ def _notes(layout: Layout) -> tuple[str, ...]:
     notes = []
     if layout.rank < 6:
         held = ", ".join(AXES[c] for c in layout.passive) or "none declared"
-        notes.append(f"degenerate: rank {layout.rank}, cannot push {', '.join(layout.unreachable())} alone; passive: {held}")
+        notes.append(
+            f"degenerate: rank {layout.rank}, cannot push {', '.join(layout.unreachable())} alone; passive: {held}"
+        )
     if layout.assumption:
         notes.append(f"assumed: {layout.assumption}")
     return tuple(notes)

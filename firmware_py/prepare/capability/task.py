@@ -31,7 +31,9 @@ class TrajectoryTable:
     half_width_m: float = quantity(0.3, unit="m", low=0.0, high=1e3, help="moebius")
     turns: float = quantity(2.0, low=0.01, high=1e3, help="turns, laps or cycles")
     amplitude_m: np.ndarray = quantity([0.5, 0.5, 0.2], unit="m", low=0, high=1e3, shape=(3,), help="lissajous")
-    frequency: np.ndarray = quantity([1.0, 2.0, 3.0], low=0, high=100, shape=(3,), help="lissajous: per turn, each axis")
+    frequency: np.ndarray = quantity(
+        [1.0, 2.0, 3.0], low=0, high=100, shape=(3,), help="lissajous: per turn, each axis"
+    )
     samples: int = quantity(100, low=2, high=10000, help="moments at which the wrench is looked at")
 
     def path(self) -> paths.Trajectory:

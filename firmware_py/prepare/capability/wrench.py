@@ -36,6 +36,20 @@ class Section:
         ratio = np.divide(self.offsets, along, out=np.full_like(along, np.inf), where=along > 1e-12)
         return np.asarray(ratio.min(axis=1))
 
+    def polygons(self) -> list[np.ndarray]:
+        """Each facet in three dimensions as its corners in order, (k, 3); the border alone in two, (k, 2)."""
+        corners = corners_of(self.normals, self.offsets)
+        if len(self.components) == 2:
+            return [corners[np.argsort(np.arctan2(corners[:, 1], corners[:, 0]))]]
+        tolerance = 1e-7 * float(np.abs(corners).max())
+        found = []
+        for normal, offset in zip(self.normals, self.offsets, strict=True):
+            on = corners[np.abs(corners @ normal - offset) < tolerance]
+            across = np.linalg.svd(normal[None])[2][1:]
+            flat = (on - on.mean(axis=0)) @ across.T
+            found.append(on[np.argsort(np.arctan2(flat[:, 1], flat[:, 0]))])
+        return found
+
     def worst(self) -> float:
         """Smallest lambda over all unit directions: the distance to the nearest facet, N or N m."""
         return float(max(self.offsets.min(), 0.0))
@@ -62,8 +76,8 @@ class WrenchSpace:
     def with_dead(self, dead: int) -> WrenchSpace:
         """The wrenches that are left whichever `dead` thrusters give nothing (exact: see there).
 
-        A facet of what n - dead thrusters can do is spanned by some of them, so its normal is one of the full layout's; along
-        it the worst loss is that of the `dead` largest contributions.
+        A facet of what n - dead thrusters can do is spanned by some of them, so its normal is one of the full layout's;
+        along it the worst loss is that of the `dead` largest contributions.
         """
         return WrenchSpace(self.layout, dead, self.normals)
 
@@ -124,6 +138,18 @@ def irredundant(normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, n
         _, distinct = np.unique(np.round(polar / np.abs(polar).max(), 12), axis=0, return_index=True)
         rows = distinct[ConvexHull(polar[distinct]).vertices]
     return normals[rows], offsets[rows]
+
+
+def corners_of(normals: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """(c, d) corners of {x : normals @ x <= offsets}, the origin inside: faces of the hull of the polar points."""
+    from scipy.spatial import ConvexHull
+
+    if normals.shape[1] == 1:
+        return np.asarray(normals * offsets[:, None])
+    equations = ConvexHull(normals / offsets[:, None]).equations
+    corners = equations[:, :-1] / -equations[:, -1:]
+    _, distinct = np.unique(np.round(corners / np.abs(corners).max(), 9), axis=0, return_index=True)
+    return np.asarray(corners[distinct])
 
 
 def embed(directions: np.ndarray, components: tuple[int, ...]) -> np.ndarray:

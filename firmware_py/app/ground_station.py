@@ -1,0 +1,160 @@
+"""The ground side beside the loop: links and GroundStation in a thread of their own. A tick hands over its results, no more.
+
+Missions are planned in a process of their own, so that planning takes nothing from the tick.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from types import TracebackType
+
+from firmware_py.app.firmware import BusFrame, Firmware
+from firmware_py.app.mission_plan import plan_mission
+from firmware_py.core.types import Inputs, Outputs, Request
+from firmware_py.description.schema import DescriptionError
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.link import LinkError, Links
+from firmware_py.ground.mission_flight import Plan, PlanJob
+from firmware_py.ground.signing import Signing, load_signing
+from firmware_py.ground.station import GroundStation
+from firmware_py.runtime.clock import unix_ns
+
+_WAIT_S = 0.005
+"""How long the thread sleeps when nothing comes: telemetry is late by so much at most."""
+_MOST_TICKS = 200
+"""Ticks that may wait for the thread; the oldest go."""
+_MOST_REQUESTS = 256
+_SAVE_EVERY_NS = 1_000_000_000
+"""How often the signing time stamp is stored; the store is that much ahead."""
+
+
+class GroundSide:
+    """Links, station, and what passes between them and the loop. `pump` does one round of the work.
+
+    Args of the constructor:
+        executor: plans missions; None starts a process for it when the first mission comes.
+        unix_now_ns: the time of day, for signing.
+    """
+
+    def __init__(
+        self,
+        config: GroundConfig,
+        firmware: Firmware,
+        executor: Executor | None = None,
+        unix_now_ns: Callable[[], int] = unix_ns,
+    ) -> None:
+        """Opens the links. Raises DescriptionError for a link, key file or parameter file that is wrong."""
+        self._config, self._pipeline, self._unix_now_ns = config, firmware.pipeline, unix_now_ns
+        self.station = GroundStation(config, firmware.fleet, firmware.parameters, _signing_of(config))
+        try:
+            self.links = Links(config.links)
+        except LinkError as error:
+            raise DescriptionError(str(error)) from None
+        self._executor = executor
+        self._plans: list[tuple[PlanJob, Future[Plan]]] = []
+        self._ticks: deque[tuple[Inputs, Outputs]] = deque(maxlen=_MOST_TICKS)
+        self._requests: deque[Request] = deque(maxlen=_MOST_REQUESTS)
+        self._thread: threading.Thread | None = None
+        self._stopping = False
+        self._saved_ns = 0
+        self.error: Exception | None = None
+        """What ended the thread; the vehicle goes on without it."""
+
+    def observe(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        """Observer of the loop: hands the tick over."""
+        self._ticks.append((inputs, outputs))
+
+    def requests(self) -> list[Request]:
+        """What ground stations ask of this tick."""
+        return [self._requests.popleft() for _ in range(len(self._requests))]
+
+    def pump(self, wait_s: float = 0.0) -> None:
+        """One round: take ticks and bytes, answer, stream."""
+        if wait_s:
+            self.links.wait(wait_s)
+        station = self.station
+        while self._ticks:
+            inputs, outputs = self._ticks.popleft()
+            station.observe(inputs, outputs, self._pipeline.bodies)
+        now_ns = station.picture.time_ns
+        station.signing.advance(self._unix_now_ns())
+        for got in self.links.receive():
+            station.take(got.channel, got.data, now_ns, got.datagram, self.links.channels[got.channel].trusted)
+        for number in self.links.channels:
+            station.join(number, now_ns)
+        for number in self.links.take_gone():
+            station.leave(number)
+        self._plan()
+        self._requests += station.requests()
+        for channel, frame in station.frames(now_ns):
+            self.links.send(channel, frame)
+        self.links.flush()
+        self._save(now_ns)
+
+    @property
+    def reboot_asked(self) -> bool:
+        """Whether a client wants the process started anew."""
+        return self.station.reboot_asked
+
+    def __enter__(self) -> GroundSide:
+        """Start the thread."""
+        self._thread = threading.Thread(target=self._run, name="ground", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Stop the thread and close everything."""
+        self._stopping = True
+        if self._thread is not None:
+            self._thread.join()
+        self.close()
+
+    def close(self) -> None:
+        """Close the links and end the planning process."""
+        self.links.close()
+        if isinstance(self._executor, ProcessPoolExecutor):
+            self._executor.shutdown(wait=True, cancel_futures=True)
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping:
+                self.pump(_WAIT_S)
+        except Exception as error:  # the flight is worth more than its telemetry
+            self.error = error
+
+    def _plan(self) -> None:
+        """Hand out what is to be planned; take back what is."""
+        bodies = {body.index: body for body in self._pipeline.bodies}
+        for job in self.station.jobs():
+            if self._executor is None:
+                self._executor = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+            self._plans.append((job, self._executor.submit(plan_mission, job, bodies.get(job.body))))
+        for job, future in list(self._plans):
+            if not future.done():
+                continue
+            self._plans.remove((job, future))
+            error = future.exception()
+            plan = future.result() if error is None else Plan(job.serial, None, (), f"planning failed: {error}")
+            self.station.planned(job.body, plan)
+
+    def _save(self, now_ns: int) -> None:
+        signing, path = self.station.signing, self._config.key_file
+        if path is None or not signing.changed or now_ns - self._saved_ns < _SAVE_EVERY_NS:
+            return
+        self._saved_ns = now_ns
+        try:
+            signing.save(path)
+        except OSError as error:
+            signing.changed = False
+            self.station.say(f"signing key is not stored: {error.strerror}")
+
+
+def _signing_of(config: GroundConfig) -> Signing:
+    try:
+        return load_signing(config.key_file) if config.key_file is not None else Signing()
+    except (ValueError, OSError) as error:
+        raise DescriptionError(str(error)) from None

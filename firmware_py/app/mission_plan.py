@@ -1,0 +1,105 @@
+"""From the legs of a mission to one trajectory by minimum snap, with rests where it stops. Slow: runs beside the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.rotations import from_euler
+from firmware_py.core.setpoint import Trajectory
+from firmware_py.core.types import Setpoint
+from firmware_py.ground.mission_flight import Leg, Plan, PlanJob
+from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan
+
+_SAME_PLACE_M, _SAME_ATTITUDE = 1e-3, 1e-6
+_ANGULAR_RATE, _ANGULAR_ACCELERATION = 0.5, 0.5
+"""rad/s and rad/s^2: turning on the way is gentle, so that the tag stays readable."""
+_THRUSTER_SHARE = 0.6
+"""What a mission may ask of each thruster; the rest fights the current."""
+
+
+@dataclass(frozen=True, slots=True)
+class Consecutive:
+    """Trajectories one after the other, each from rest to rest."""
+
+    parts: tuple[tuple[float, Trajectory], ...]
+    """Start, s, and trajectory; each rests at its end until the next begins."""
+    duration_s: float
+
+    def sample(self, t_s: float) -> Setpoint:
+        """The set-point at `t_s`; the ends are held."""
+        start, part = self.parts[0]
+        for begin, candidate in self.parts[1:]:
+            if t_s < begin:
+                break
+            start, part = begin, candidate
+        return part.sample(t_s - start)
+
+
+def plan_mission(job: PlanJob, body: Body | None) -> Plan:
+    """The plan of `job`; one that cannot be flown comes back with its reason."""
+    parts: list[tuple[float, Trajectory]] = []
+    arrivals: list[float] = []
+    at_s, p_wb, q_wb = 0.0, job.p_wb, job.q_wb
+    try:
+        for section in _sections(job.legs):
+            points, places = _waypoints(p_wb, q_wb, section)
+            if len(points) > 1:
+                path = plan(points, None, _limits(job, section[0].speed_m_s), body)
+                parts.append((at_s, path))
+                arrivals += [at_s + float(path.breaks[place]) for place in places]
+                at_s += path.duration_s
+            else:
+                arrivals += [at_s] * len(section)
+            p_wb, q_wb = _end(points)
+            at_s += section[-1].hold_s
+    except (InfeasibleError, ValueError) as error:
+        return Plan(job.serial, None, (), str(error))
+    if not parts:
+        parts.append((0.0, plan([Waypoint(job.p_wb, job.q_wb), Waypoint(job.p_wb, job.q_wb)], 1.0)))
+    return Plan(job.serial, Consecutive(tuple(parts), max(at_s, 1e-3)), tuple(arrivals))
+
+
+def _sections(legs: Sequence[Leg]) -> Iterator[list[Leg]]:
+    """Runs of legs that are flown through: cut where it stops, and where the speed changes."""
+    section: list[Leg] = []
+    for leg in legs:
+        if section and (section[-1].hold_s > 0 or leg.speed_m_s != section[-1].speed_m_s):
+            yield section
+            section = []
+        section.append(leg)
+    yield section
+
+
+def _waypoints(p_wb: np.ndarray, q_wb: np.ndarray, section: Sequence[Leg]) -> tuple[list[Waypoint], list[int]]:
+    """The waypoints from a pose through a section, and for each leg the number of its own; equal neighbours are one."""
+    points, places = [Waypoint(p_wb, q_wb)], []
+    for leg in section:
+        q = q_wb if leg.yaw is None else from_euler(0.0, 0.0, leg.yaw)
+        moved = float(np.linalg.norm(leg.p_wb - points[-1].p_wb)) > _SAME_PLACE_M
+        if moved or abs(float(q @ q_wb)) < 1.0 - _SAME_ATTITUDE:
+            points.append(Waypoint(leg.p_wb, q))
+        q_wb = q
+        places.append(len(points) - 1)
+    return points, places
+
+
+def _end(points: Sequence[Waypoint]) -> tuple[np.ndarray, np.ndarray]:
+    last = points[-1]
+    assert last.q_wb is not None
+    return last.p_wb, last.q_wb
+
+
+def _limits(job: PlanJob, speed_m_s: float) -> Limits:
+    """Per axis, so that the speed keeps to its bound in every direction."""
+    return Limits(
+        velocity=np.full(3, speed_m_s / np.sqrt(3.0)),
+        acceleration=np.full(3, job.acceleration),
+        corridor_m=job.corridor_m,
+        angular_rate=_ANGULAR_RATE,
+        angular_acceleration=_ANGULAR_ACCELERATION,
+        thruster_share=_THRUSTER_SHARE,
+    )

@@ -1,0 +1,106 @@
+"""How full a bus is, from the DBC alone: worst-case bits of every frame, how often it comes, the fullest tick.
+
+Used by `tools/bus_load.py` and `modcube doctor`; nothing here runs in a tick.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from firmware_py.bus.codec import Codec, MessageCodec
+
+BIT_RATE = 1_000_000
+"""bit/s of every bus."""
+MEAN_LIMIT = 0.5
+"""Most of a bus that may be in use on average (DESIGN section 5)."""
+TICK_LIMIT = 0.8
+"""Most of any one tick."""
+FRAME_BITS, BYTE_BITS = 55, 10
+"""A classic frame with 11-bit id and n bytes takes at most 55 + 10 n bits: 47 + 8 n, a stuff bit after each four of the
+34 + 8 n that are stuffed, and the interframe space (ISO 11898-1)."""
+HEARTBEATS = 2
+"""Nodes that send nothing else periodically: the firmware on a quiet bus, the e-stop box."""
+NUMBER_STEP = 3
+"""By how many ticks the slow frames of the next module are shifted."""
+
+
+class MessageLoad(NamedTuple):
+    """What one message takes of a bus."""
+
+    name: str
+    bits: int
+    frames_per_s: float
+    share: float
+
+
+class BusLoad(NamedTuple):
+    """What all frames take of a bus, as shares of it: on average, and in the fullest tick."""
+
+    mean: float
+    fullest_tick: float
+    messages: tuple[MessageLoad, ...]
+
+    @property
+    def is_allowed(self) -> bool:
+        """Whether both shares keep their limits."""
+        return self.mean <= MEAN_LIMIT and self.fullest_tick <= TICK_LIMIT
+
+
+def frame_bits(length: int) -> int:
+    """Most bits that a frame of `length` bytes takes on the wire, the space behind it included."""
+    return FRAME_BITS + BYTE_BITS * length
+
+
+def slow_schedule(codec: Codec, number: int, rate_hz: int) -> list[tuple[MessageCodec, int, int]]:
+    """(message, every so many ticks, in which of them) of a module's slow frames, staggered by message and module."""
+    slow = [message for message in codec.messages if _from_module(message) and not message.per_tick]
+    every = [max(1, round(message.cycle_ms * rate_hz / 1000)) for message in slow]
+    return [(m, n, (i + NUMBER_STEP * number) % n) for i, (m, n) in enumerate(zip(slow, every, strict=True))]
+
+
+def bus_load(codec: Codec, numbers: Sequence[int], rate_hz: int) -> BusLoad:
+    """The load of a bus with modules `numbers` at `rate_hz` ticks a second, one tag of each module in every picture.
+
+    The fullest tick holds all that comes in every tick, the slow frames of that tick by their schedule, and besides a
+    picture, docking commands to all modules, an e-stop and heartbeats, which come when they like.
+    """
+    messages = []
+    for message in codec.messages:
+        senders = _senders(message, len(numbers))
+        rate = senders * (float(rate_hz) if message.per_tick else 1000.0 / message.cycle_ms)
+        bits = frame_bits(message.length)
+        messages.append(MessageLoad(message.name, bits, rate, rate * bits / BIT_RATE))
+    fullest = _steady_bits(codec, len(numbers), rate_hz) + _most_slow_bits(codec, numbers, rate_hz)
+    return BusLoad(sum(m.share for m in messages), fullest * rate_hz / BIT_RATE, tuple(messages))
+
+
+def _from_module(message: MessageCodec) -> bool:
+    """GYRO and everything behind it up to HEARTBEAT: by the DBC's ids what a module's MCU says."""
+    return 0x100 >> 5 <= message.function < 0x700 >> 5
+
+
+def _senders(message: MessageCodec, modules: int) -> int:
+    """How many ids of one bus carry the message."""
+    return {"ESTOP": 1, "SYNC": 1, "HEARTBEAT": HEARTBEATS}.get(message.name, modules)
+
+
+def _steady_bits(codec: Codec, modules: int, rate_hz: int) -> int:
+    """Bits in a tick of everything but the modules' slow frames."""
+    bits = 0
+    for message in codec.messages:
+        if message.per_tick or not _from_module(message):
+            times = 1 if message.per_tick else math.ceil(1000 / (message.cycle_ms * rate_hz))
+            bits += _senders(message, modules) * times * frame_bits(message.length)
+    return bits
+
+
+def _most_slow_bits(codec: Codec, numbers: Sequence[int], rate_hz: int) -> int:
+    """Bits of the modules' slow frames in the fullest tick of the whole schedule."""
+    schedule = [entry for number in numbers for entry in slow_schedule(codec, number, rate_hz)]
+    ticks = math.lcm(*(every for _, every, _ in schedule)) if schedule else 1
+    return max(
+        sum(frame_bits(message.length) for message, every, phase in schedule if tick % every == phase)
+        for tick in range(ticks)
+    )

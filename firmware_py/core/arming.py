@@ -1,0 +1,141 @@
+"""Arming checks as a table, each with its reason in words; and what each mode needs. The supervisor asks, nobody else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from firmware_py.core.failsafes import Failsafes
+from firmware_py.core.health import Health
+from firmware_py.core.transitions import MODES, Need
+from firmware_py.core.types import Mode
+from firmware_py.description.parameters import Parameters, invalid
+
+
+class Question(NamedTuple):
+    """All that a check may look at."""
+
+    health: Health
+    mode: Mode
+    """The mode that is to be armed in."""
+    parameters: Parameters
+    failsafes: Failsafes
+    estop_age_ms: float
+
+
+class Check(NamedTuple):
+    """One arming check."""
+
+    name: str
+    reason: Callable[[Question], str]
+    """Why it fails, in words; empty when it holds."""
+    may_be_skipped: bool
+    """Forced arming passes over it."""
+
+
+def _estop(q: Question) -> str:
+    return "e-stop raised" if q.estop_age_ms < q.parameters.supervision.estop_quiet_ms else ""
+
+
+def _answers(q: Question) -> str:
+    return f"module {', '.join(str(m) for m in q.health.silent)} does not answer" if q.health.silent else ""
+
+
+def _needs(q: Question) -> str:
+    return "; ".join(missing(q.mode, q.health, q.parameters))
+
+
+def _pose_fresh(q: Question) -> str:
+    fresh_ms, age_ms = q.parameters.supervision.tag_fresh_ms, q.health.tag_age_s * 1e3
+    if Need.POSITION in MODES[q.mode].needs and q.health.ready and age_ms > fresh_ms:
+        return f"pose is {age_ms:.0f} ms old, {fresh_ms:.0f} permitted"
+    return ""
+
+
+def _pose_sure(q: Question) -> str:
+    permitted, sigma = q.parameters.supervision.arm_sigma_m, q.health.sigma_m
+    if Need.POSITION in MODES[q.mode].needs and q.health.ready and sigma > permitted:
+        return f"pose sigma {sigma * 1e3:.0f} mm, {permitted * 1e3:.0f} permitted"
+    return ""
+
+
+def _pose_consistent(q: Question) -> str:
+    permitted, ratio = q.parameters.failsafes.estimator_limit, q.health.nis_ratio
+    if Need.POSITION in MODES[q.mode].needs and ratio > permitted:
+        return f"sensors and model disagree: {ratio:.1f} of the expected, {permitted:.1f} permitted"
+    return ""
+
+
+def _sticks(q: Question) -> str:
+    steering, age_s = q.parameters.steering, q.health.pilot_age_s
+    if age_s <= steering.stick_timeout_s and q.health.stick > steering.stick_dead:
+        return "sticks are not neutral"
+    return ""
+
+
+def _escs(q: Question) -> str:
+    return f"ESC {', '.join(str(i + 1) for i in q.health.esc_missing)} does not answer" if q.health.esc_missing else ""
+
+
+def _thrusters(q: Question) -> str:
+    return "the thrusters left cannot make every wrench" if q.health.lost_axes else ""
+
+
+def _failsafes(q: Question) -> str:
+    return "; ".join(q.failsafes.active(q.health))
+
+
+def _frames(q: Question) -> str:
+    permitted, rate = q.parameters.supervision.frame_errors_per_s, q.health.frame_errors_per_s
+    return f"{rate:.0f} bad frames a second, {permitted:.0f} permitted" if rate > permitted else ""
+
+
+def _parameters(q: Question) -> str:
+    return "; ".join(invalid(q.parameters))
+
+
+def _warm(q: Question) -> str:
+    return "" if q.health.warm else "compiled code is not warm yet"
+
+
+def _topology(q: Question) -> str:
+    return q.health.topology
+
+
+CHECKS = (
+    Check("e-stop clear", _estop, False),
+    Check("modules answer", _answers, False),
+    Check("mode has what it needs", _needs, False),
+    Check("sticks neutral", _sticks, False),
+    Check("parameters valid", _parameters, False),
+    Check("compiled code warm", _warm, False),
+    Check("pose fresh", _pose_fresh, True),
+    Check("pose sure", _pose_sure, True),
+    Check("pose consistent", _pose_consistent, True),
+    Check("every ESC answers", _escs, True),
+    Check("every axis has thrust", _thrusters, True),
+    Check("no fail-safe on", _failsafes, True),
+    Check("few bad frames", _frames, True),
+    Check("topology as configured", _topology, True),
+)
+
+
+def against_arming(question: Question, forced: bool) -> list[str]:
+    """Why the body may not be armed, in words; empty when it may."""
+    reasons = [check.reason(question) for check in CHECKS if not (forced and check.may_be_skipped)]
+    return [reason for reason in reasons if reason]
+
+
+def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:
+    """What `mode` needs and does not have, in words."""
+    limits, needs = parameters.failsafes, MODES[mode].needs
+    reasons = []
+    if Need.ATTITUDE in needs and not health.ready:
+        reasons.append("no pose yet")
+    if Need.POSITION in needs and health.ready and health.tag_age_s > limits.tag_lost_limit:
+        reasons.append(f"no tag for {health.tag_age_s:.1f} s")
+    if Need.DEPTH in needs and min(health.depth_age_s, health.tag_age_s) > limits.depth_unknown_limit:
+        reasons.append("depth unknown")
+    if Need.PILOT in needs and health.pilot_age_s > limits.pilot_lost_limit:
+        reasons.append("pilot input lost")
+    return reasons

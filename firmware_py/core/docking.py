@@ -1,0 +1,277 @@
+"""Stage 3b of a tick: all docks of the fleet. Detects, steers what is docking, and says when bodies join or part.
+
+Works on the estimates of this tick; the pipeline carries out the joins and parts that it returns, within the same tick.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, PairStatus, TagTable
+from firmware_py.core.docking_sequence import (
+    RELAY_OFF,
+    RELAY_PULL,
+    RELAY_PUSH,
+    DockingSequence,
+    DockPlan,
+    Stage,
+    UndockPlan,
+)
+from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back, to_matrix
+from firmware_py.core.types import DockRecord, DockRequest, Estimate, Event, Inputs, Setpoint
+from firmware_py.description.parameters import Docking
+from firmware_py.description.vehicle import FACE_NORMALS
+
+WARNING, INFORMATION = 4, 6
+RELAY_PERIOD_NS = 100_000_000
+"""DOCK_CMD goes out at 10 Hz, and at once when a relay changes."""
+
+
+class Prepared(NamedTuple):
+    """An answer of the worker."""
+
+    request: DockRequest
+    plan: DockPlan | UndockPlan | None
+    chains: tuple[Any, ...]
+    """The pipelines of the bodies that there will be, ready to take over."""
+    refusal: str = ""
+    """Why there is no plan."""
+
+
+class Join(NamedTuple):
+    """Two bodies become one, in this tick."""
+
+    target: int
+    """Numbers of the bodies."""
+    active: int
+    chain: Any
+
+
+class Part(NamedTuple):
+    """One body becomes two, in this tick; the leaving one then glides away along `away_w` (3,), m."""
+
+    whole: int
+    stays: Any
+    leaves: Any
+    away_w: np.ndarray
+
+
+class Decisions(NamedTuple):
+    """What the stage wants of the pipeline."""
+
+    setpoints: dict[int, Setpoint]
+    """By body: steers it in this tick."""
+    joins: list[Join]
+    parts: list[Part]
+    ended: list[int]
+    """Bodies whose dock is over without a join: they hold where they are."""
+
+
+class _Dock(NamedTuple):
+    """A dock under way."""
+
+    sequence: DockingSequence
+    detector: PairDetector
+    active: int
+    target: int
+    prepared: Prepared
+
+
+class _Joint(NamedTuple):
+    """Two faces that hold modules of one body together."""
+
+    detector: PairDetector
+    request: DockRequest
+
+
+class _Undock:
+    """An undock under way: magnets push, and once the current is gone the body parts."""
+
+    def __init__(self, prepared: Prepared, time_ns: int) -> None:
+        self.prepared = prepared
+        self.began_ns = time_ns
+
+
+class DockingStage:
+    """All docks and joints of the fleet."""
+
+    def __init__(self, parameters: Docking, tags: TagTable, modules: int) -> None:
+        self._p = parameters
+        self._tags = tags
+        self._relays = np.zeros((modules, 6), dtype=np.int64)
+        self._sent = np.full((modules, 6), -1, dtype=np.int64)
+        self._sent_ns = [-RELAY_PERIOD_NS] * modules
+        self._docks: list[_Dock] = []
+        self._undocks: list[_Undock] = []
+        self._joints: list[_Joint] = []
+        self._ready: dict[tuple[int, int], Prepared] = {}
+        self.events: list[Event] = []
+        self.records: list[DockRecord] = []
+
+    def watch_joints(self, bodies: Sequence[Body]) -> None:
+        """Watches every joint within the given bodies; their magnets hold."""
+        kept = {(j.request.module, j.request.target_module): j for j in self._joints}
+        self._joints = []
+        for body in bodies:
+            for request, offset in joints_of(body):
+                old = kept.get((request.module, request.target_module))
+                pair = FacePair(request.target_module, request.target_face, request.module, request.face, offset)
+                self._joints.append(old or _Joint(PairDetector(pair, self._p), request))
+                self._set_relays(request, RELAY_PULL)
+
+    @property
+    def busy(self) -> frozenset[int]:
+        """Bodies that a dock steers."""
+        return frozenset(dock.active for dock in self._docks)
+
+    def abort(self, body: int, time_ns: int, reason: str) -> None:
+        """Ends every dock that a body takes part in."""
+        for dock in self._docks:
+            if body in (dock.active, dock.target):
+                dock.sequence.abort(time_ns, reason)
+
+    def step(self, inputs: Inputs, estimates: Mapping[int, tuple[Body, Estimate]]) -> Decisions:
+        """One tick. `estimates`: body and its estimate, by the body's number."""
+        self.events, self.records = [], []
+        decisions = Decisions({}, [], [], [])
+        poses = ModulePoses(inputs.modules, self._tags)
+        for prepared in inputs.prepared:
+            self._begin(prepared, inputs.time_ns, estimates)
+        for joint in self._joints:
+            status = joint.detector.step(inputs.time_ns, inputs.modules, poses)
+            self.records.append(_record(joint.detector, status, Stage.DOCKED, 1, math.nan, math.nan))
+        for dock in list(self._docks):
+            self._steer(dock, inputs, estimates, poses, decisions)
+        for undock in list(self._undocks):
+            self._release(undock, inputs.time_ns, estimates, decisions)
+        return decisions
+
+    def relays(self, module: int, time_ns: int) -> tuple[int, ...] | None:
+        """The relay states that a module is to be sent in this tick, or None."""
+        changed = not np.array_equal(self._relays[module], self._sent[module])
+        if not changed and time_ns - self._sent_ns[module] < RELAY_PERIOD_NS:
+            return None
+        self._sent[module], self._sent_ns[module] = self._relays[module], time_ns
+        return tuple(int(r) for r in self._relays[module])
+
+    # ------------------------------------------------------------ beginnings
+
+    def _begin(self, prepared: Prepared, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]]) -> None:
+        request = prepared.request
+        if prepared.plan is None:
+            self._say(WARNING, f"dock refused: {prepared.refusal}")
+        elif isinstance(prepared.plan, UndockPlan):
+            self._undocks.append(_Undock(prepared, time_ns))
+            self._say(INFORMATION, f"undocking module {request.module} from {request.target_module}")
+        else:
+            active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
+            sequence = DockingSequence(prepared.plan, estimates[active][0], estimates[target][0], self._p, time_ns)
+            pair = FacePair(
+                request.target_module, request.target_face, request.module, request.face, prepared.plan.place_t
+            )
+            self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared))
+            self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
+
+    # ------------------------------------------------------------ each tick
+
+    def _steer(
+        self,
+        dock: _Dock,
+        inputs: Inputs,
+        estimates: Mapping[int, tuple[Body, Estimate]],
+        poses: ModulePoses,
+        decisions: Decisions,
+    ) -> None:
+        active, target = estimates[dock.active][1], estimates[dock.target][1]
+        status = dock.detector.step(inputs.time_ns, inputs.modules, poses)
+        before = dock.sequence.stage
+        steering = dock.sequence.step(inputs.time_ns, active, target, status)
+        stage = dock.sequence.stage
+        self._set_relays(dock.prepared.request, steering.relay)
+        errors = dock.sequence.errors(active, target)
+        record = _record(dock.detector, status, stage, dock.sequence.tries, errors.gap_m, errors.lateral_m)
+        self.records.append(record)
+        if stage != before:
+            reason = f": {dock.sequence.reason}" if dock.sequence.reason and stage > Stage.DOCKED else ""
+            self._say(WARNING if stage > Stage.DOCKED else INFORMATION, f"dock {before.name} -> {stage.name}{reason}")
+        if stage == Stage.DOCKED:
+            decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))
+            self._docks.remove(dock)
+        elif stage in (Stage.ABORTED, Stage.FAILED) and steering.gap_m >= self._p.standoff_m:
+            decisions.ended.append(dock.active)
+            self._docks.remove(dock)
+        else:
+            decisions.setpoints[dock.active] = steering.active
+
+    def _release(
+        self, undock: _Undock, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions
+    ) -> None:
+        plan = undock.prepared.plan
+        assert isinstance(plan, UndockPlan)
+        request = plan.request
+        waited_s = (time_ns - undock.began_ns) * 1e-9
+        self._set_relays(request, RELAY_PUSH)
+        if waited_s < self._p.release_s:
+            return
+        self._set_relays(request, RELAY_OFF)
+        whole = _body_of(request.module, estimates)
+        estimate = estimates[whole][1]
+        away_w = rotate(estimate.q_wb, plan.axis_b) * self._p.standoff_m
+        decisions.parts.append(Part(whole, *undock.prepared.chains, away_w))
+        self._undocks.remove(undock)
+        self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
+
+    def _set_relays(self, request: DockRequest, relay: int) -> None:
+        self._relays[request.module, request.face] = relay
+        self._relays[request.target_module, request.target_face] = relay
+
+    def _say(self, severity: int, text: str) -> None:
+        self.events.append(Event(severity, text))
+
+
+def joints_of(body: Body) -> list[tuple[DockRequest, np.ndarray]]:
+    """Every joint of a body: its faces, and the second module's centre in the frame of the first (3,), m."""
+    joints = []
+    count = len(body.modules)
+    for i in range(count):
+        for j in range(i + 1, count):
+            step = (body.cells[j] - body.cells[i]).astype(np.float64)
+            if np.abs(step).sum() == 1:
+                turn_i, turn_j = (to_matrix(np.ascontiguousarray(body.q_bm[k])) for k in (i, j))
+                near = int(np.argmax(FACE_NORMALS @ (turn_i.T @ step)))
+                far = int(np.argmax(FACE_NORMALS @ (turn_j.T @ -step)))
+                offset = rotate_back(np.ascontiguousarray(body.q_bm[i]), body.r_bm[j] - body.r_bm[i])
+                joints.append((DockRequest(body.modules[j], far, body.modules[i], near), offset))
+    return joints
+
+
+def tag_table(bodies: Sequence[Body]) -> TagTable:
+    """Tags of every module in its own frame: centre (3,), and module frame to tag frame (4,)."""
+    table: TagTable = {}
+    for body in bodies:
+        for k, tag in enumerate(body.tag_ids):
+            i = int(body.tag_module[k])
+            q_bm = np.ascontiguousarray(body.q_bm[i])
+            r_mt = rotate_back(q_bm, body.r_bt[k] - body.r_bm[i])
+            q_tm = multiply(conjugate(np.ascontiguousarray(body.q_bt[k])), q_bm)
+            table[body.modules[i], int(tag)] = (r_mt, q_tm)
+    return table
+
+
+def _body_of(module: int, estimates: Mapping[int, tuple[Body, Estimate]]) -> int:
+    return next(number for number, (body, _) in estimates.items() if module in body.modules)
+
+
+def _record(
+    detector: PairDetector, status: PairStatus, stage: Stage, tries: int, gap_m: float, lateral_m: float
+) -> DockRecord:
+    pair = detector.pair
+    return DockRecord(
+        pair.module_a, pair.face_a, pair.module_b, pair.face_b, int(stage), tries, detector.currents_ma,
+        status.current, status.position, gap_m, lateral_m, status.position_error_m,
+    )  # fmt: skip

@@ -1,0 +1,269 @@
+"""Docking as a sequence of stages, a table: what each stage does, what ends it, and what comes then.
+
+The active body is steered against the target's estimated pose, so that the target's wandering is followed. The gap is the distance
+between the two faces; lateral and angle error are those of the active module against its place before the target's face.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.docking_detector import PairStatus
+from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, rotate_back
+from firmware_py.core.types import DockRequest, Estimate, Setpoint
+from firmware_py.description.parameters import Docking
+
+RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
+SLOWING_PER_S = 0.5
+"""The approach slows as this much of the gap a second."""
+TURN_RAD = 0.03
+"""How far the active module turns about the docking axis after a jam, to and fro."""
+RETREAT_M_S = 0.04
+"""Fastest growth of the gap when backing off."""
+CONE = 1.5
+"""The approach waits while the lateral error is above this many times the alignment limit, or the angle."""
+
+
+class Stage(IntEnum):
+    """Stages in the order of a dock that goes well, then the others."""
+
+    PRE_APPROACH = 0
+    ALIGN = 1
+    APPROACH = 2
+    PUSH = 3
+    VERIFY = 4
+    DOCKED = 5
+    RELEASE = 6
+    BACK_OFF = 7
+    ABORTED = 8
+    FAILED = 9
+
+
+class Row(NamedTuple):
+    """What a stage does."""
+
+    relay: int
+    """Magnets of both faces."""
+    on_timeout: Stage
+    limit_s: str
+    """Field of `Docking` that holds the longest time; empty: none."""
+
+
+TABLE = {
+    Stage.PRE_APPROACH: Row(RELAY_OFF, Stage.ABORTED, "timeout_s"),
+    Stage.ALIGN: Row(RELAY_OFF, Stage.ABORTED, "timeout_s"),
+    Stage.APPROACH: Row(RELAY_PULL, Stage.RELEASE, "timeout_s"),
+    Stage.PUSH: Row(RELAY_PULL, Stage.RELEASE, "push_s"),
+    Stage.VERIFY: Row(RELAY_PULL, Stage.RELEASE, "push_s"),
+    Stage.DOCKED: Row(RELAY_PULL, Stage.DOCKED, ""),
+    Stage.RELEASE: Row(RELAY_PUSH, Stage.BACK_OFF, "release_s"),
+    Stage.BACK_OFF: Row(RELAY_OFF, Stage.ABORTED, "timeout_s"),
+    Stage.ABORTED: Row(RELAY_OFF, Stage.ABORTED, ""),
+    Stage.FAILED: Row(RELAY_OFF, Stage.FAILED, ""),
+}
+ENDED = frozenset({Stage.DOCKED, Stage.ABORTED, Stage.FAILED})
+
+
+class DockPlan(NamedTuple):
+    """A dock, prepared: the geometry of the two faces and the body that they will make."""
+
+    request: DockRequest
+    merged: Body
+    axis_t: np.ndarray
+    """(3,) outward normal of the target's face, target module frame."""
+    place_t: np.ndarray
+    """(3,) where the active module's centre will be, target module frame, m."""
+    q_ta: np.ndarray
+    """(4,) active module frame to target module frame when docked."""
+
+
+class UndockPlan(NamedTuple):
+    """An undock, prepared: the two bodies that there will be."""
+
+    request: DockRequest
+    stays: Body
+    """The one with the target module."""
+    leaves: Body
+    axis_b: np.ndarray
+    """(3,) from the target module to the other, frame of the whole body."""
+    offset_near: np.ndarray
+    """(3,) the other module's centre in the target module's frame while they are docked, m."""
+
+
+class Errors(NamedTuple):
+    """Where the active module is against its place."""
+
+    gap_m: float
+    lateral_m: float
+    angle_rad: float
+
+
+class Steering(NamedTuple):
+    """What the sequence wants in one tick."""
+
+    active: Setpoint
+    relay: int
+    gap_m: float
+
+
+class DockingSequence:
+    """One dock of one active body to one target body."""
+
+    def __init__(self, plan: DockPlan, active: Body, target: Body, parameters: Docking, time_ns: int) -> None:
+        self.plan = plan
+        self._p = parameters
+        self._r_a, self._q_a = _module_in(active, plan.request.module)
+        self._r_t, self._q_t = _module_in(target, plan.request.target_module)
+        self.stage = Stage.PRE_APPROACH
+        self.tries = 1
+        self.reason = ""
+        self._entered_ns = time_ns
+        self._good_since_ns: int | None = None
+        self._gap_m = parameters.standoff_m
+        self._last_ns = time_ns
+        self._turn = 0.0
+
+    def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus) -> Steering:
+        """Moves the sequence on by one tick."""
+        errors = self.errors(active, target)
+        dt = (time_ns - self._last_ns) * 1e-9
+        self._last_ns = time_ns
+        self._decide(time_ns, active, target, errors, status)
+        speed = self._speed(errors)
+        self._gap_m = float(np.clip(self._gap_m + speed * dt, -self._p.push_m, self._p.standoff_m))
+        return Steering(self._setpoint(target, speed), TABLE[self.stage].relay, self._gap_m)
+
+    def abort(self, time_ns: int, reason: str) -> None:
+        """Ends the dock; both hold apart."""
+        self.reason = reason
+        self._enter(Stage.ABORTED, time_ns)
+
+    def errors(self, active: Estimate, target: Estimate) -> Errors:
+        """Errors by the two estimates."""
+        p_a, q_a = _pose_of(active, self._r_a, self._q_a)
+        p_t, q_t = _pose_of(target, self._r_t, self._q_t)
+        off = rotate_back(q_t, p_a - p_t) - self.plan.place_t
+        gap = float(off @ self.plan.axis_t)
+        lateral = float(np.linalg.norm(off - gap * self.plan.axis_t))
+        angle = difference(q_a, multiply(q_t, self._q_wanted()))
+        return Errors(gap, lateral, float(np.linalg.norm(angle)))
+
+    # ------------------------------------------------------------ what comes next
+
+    def _decide(self, time_ns: int, active: Estimate, target: Estimate, errors: Errors, status: PairStatus) -> None:
+        if self.stage in ENDED:
+            return
+        if status.docked:
+            self._enter(Stage.DOCKED, time_ns)
+            return
+        sigma = float(np.sqrt(np.max(active.sigma_p**2 + target.sigma_p**2)))
+        if sigma > self._p.sigma_m and self.stage not in (Stage.RELEASE, Stage.BACK_OFF):
+            self.abort(time_ns, f"relative sigma {sigma * 1e3:.1f} mm, {self._p.sigma_m * 1e3:.1f} permitted")
+            return
+        row = TABLE[self.stage]
+        limit_s = getattr(self._p, row.limit_s) if row.limit_s else 0.0
+        if limit_s and time_ns - self._entered_ns > limit_s * 1e9:
+            self._time_out(time_ns, status)
+        elif self._is_done(time_ns, errors, status):
+            self._enter(NEXT[self.stage], time_ns)
+
+    def _is_done(self, time_ns: int, errors: Errors, status: PairStatus) -> bool:
+        p = self._p
+        if self.stage == Stage.PRE_APPROACH:
+            return abs(errors.gap_m - p.standoff_m) < 5 * p.align_m and errors.lateral_m < 5 * p.align_m
+        if self.stage == Stage.ALIGN:
+            return self._good_for(p.align_s, errors.lateral_m < p.align_m and errors.angle_rad < p.align_rad, time_ns)
+        if self.stage == Stage.APPROACH:
+            return self._gap_m <= 0.0
+        if self.stage == Stage.PUSH:
+            return status.current or status.position
+        if self.stage == Stage.BACK_OFF:
+            return errors.gap_m > p.standoff_m - 5 * p.align_m
+        return False
+
+    def _good_for(self, seconds: float, good: bool, time_ns: int) -> bool:
+        if not good:
+            self._good_since_ns = None
+            return False
+        if self._good_since_ns is None:
+            self._good_since_ns = time_ns
+        return time_ns - self._good_since_ns >= seconds * 1e9
+
+    def _time_out(self, time_ns: int, status: PairStatus) -> None:
+        if self.stage in (Stage.PUSH, Stage.VERIFY, Stage.APPROACH):
+            only = "current alone" if status.current else "position alone" if status.position else "neither condition"
+            self.reason = f"jam: {only} after {self.stage.name}"
+            if self.tries >= self._p.tries:
+                self.reason += f", {self.tries} tries"
+                self._enter(Stage.FAILED, time_ns)
+                return
+        elif self.stage != Stage.RELEASE:
+            self.reason = f"{self.stage.name} took longer than {self._p.timeout_s:.0f} s"
+        self._enter(TABLE[self.stage].on_timeout, time_ns)
+
+    def _enter(self, stage: Stage, time_ns: int) -> None:
+        if stage == Stage.RELEASE:
+            self.tries += 1
+            self._turn = TURN_RAD if self.tries % 2 == 0 else -TURN_RAD
+        self.stage = stage
+        self._entered_ns = time_ns
+        self._good_since_ns = None
+
+    # ------------------------------------------------------------ where to be
+
+    def _speed(self, errors: Errors) -> float:
+        """Rate of the wanted gap, m/s."""
+        p = self._p
+        if self.stage == Stage.APPROACH:
+            if errors.lateral_m > CONE * p.align_m or errors.angle_rad > CONE * p.align_rad:
+                return 0.0
+            return -float(np.clip(SLOWING_PER_S * self._gap_m, p.contact_speed_m_s, p.speed_m_s))
+        if self.stage in (Stage.PUSH, Stage.VERIFY):
+            return -p.contact_speed_m_s if self._gap_m > -p.push_m else 0.0
+        if self.stage in (Stage.BACK_OFF, Stage.ABORTED, Stage.FAILED, Stage.PRE_APPROACH, Stage.ALIGN):
+            return RETREAT_M_S if self._gap_m < p.standoff_m else 0.0
+        return 0.0
+
+    def _setpoint(self, target: Estimate, speed: float) -> Setpoint:
+        """The active body's centre of mass such that its module is at the wanted gap before the target's face, moving with it."""
+        p_t, q_t = _pose_of(target, self._r_t, self._q_t)
+        q_module = normalise(multiply(q_t, self._q_wanted()))
+        q_wb = normalise(multiply(q_module, conjugate(self._q_a)))
+        axis_w = rotate(q_t, self.plan.axis_t)
+        p_module = p_t + rotate(q_t, self.plan.place_t) + axis_w * self._gap_m
+        v_w = rotate(target.q_wb, target.nu[:3].copy()) + axis_w * speed
+        zero = np.zeros(3)
+        return Setpoint(p_module - rotate(q_wb, self._r_a), q_wb, v_w, zero, zero, zero)
+
+    def _q_wanted(self) -> np.ndarray:
+        """(4,) active module to target module, turned a little about the axis after a jam."""
+        if self._turn == 0.0 or self.stage not in TURNED:
+            return self.plan.q_ta
+        return np.asarray(multiply(exp(self.plan.axis_t * self._turn), self.plan.q_ta))
+
+
+NEXT = {
+    Stage.PRE_APPROACH: Stage.ALIGN,
+    Stage.ALIGN: Stage.APPROACH,
+    Stage.APPROACH: Stage.PUSH,
+    Stage.PUSH: Stage.VERIFY,
+    Stage.BACK_OFF: Stage.ALIGN,
+}
+"""What follows a stage that has done its work."""
+TURNED = frozenset({Stage.APPROACH, Stage.PUSH, Stage.VERIFY, Stage.ALIGN})
+"""Stages that use the small turn."""
+
+
+def _module_in(body: Body, module: int) -> tuple[np.ndarray, np.ndarray]:
+    """Place (3,) of a module's centre in its body, and module frame to body frame (4,)."""
+    i = body.modules.index(module)
+    return np.ascontiguousarray(body.r_bm[i]), np.ascontiguousarray(body.q_bm[i])
+
+
+def _pose_of(estimate: Estimate, r_b: np.ndarray, q_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of a module in the world by its body's estimate."""
+    return estimate.p_wb + rotate(estimate.q_wb, r_b), normalise(multiply(estimate.q_wb, q_b))

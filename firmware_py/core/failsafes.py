@@ -1,0 +1,182 @@
+"""Fail-safes as a table: what is measured, in which modes it counts, and the words for it; limits, delays and actions are parameters.
+
+The first row is the gravest. `Failsafes` keeps the time of each row; the supervisor acts on what it reports.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import NamedTuple
+
+from firmware_py.core.health import Health
+from firmware_py.core.types import Mode
+from firmware_py.description.failsafe_parameters import Failsafes as FailsafeParameters
+
+
+class Level(IntEnum):
+    """What a fail-safe does, milder first; each is done in the best way that is possible."""
+
+    NONE = 0
+    WARN = 1
+    HOLD = 2
+    """Hold the place; without position, depth and attitude; without depth, surface."""
+    DEPTH = 3
+    """Hold depth and attitude."""
+    SURFACE = 4
+    DISARM = 5
+
+
+ANY = frozenset(Mode)
+"""The vehicle itself is at fault: counts in every mode, and disarmed too."""
+PLACED = frozenset({Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK})
+"""Modes that hold or follow a place."""
+MOVING = PLACED - {Mode.POSHOLD}
+PILOTED = frozenset({Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD})
+
+PERMITTED = {
+    Level.NONE: ANY,
+    Level.WARN: ANY,
+    Level.HOLD: PILOTED | {Mode.POSHOLD, Mode.SURFACE, Mode.MOTOR_DETECT},
+    Level.DEPTH: PILOTED | {Mode.SURFACE},
+    Level.SURFACE: PILOTED | {Mode.SURFACE},
+    Level.DISARM: frozenset[Mode](),
+}
+"""Modes that may be entered while the cause of a fail-safe of that level lasts. A pilot may always take over."""
+
+
+class Row(NamedTuple):
+    """One fail-safe. Its parameters are `name`_limit (unless `value` is yes or no), _delay_s, _action and _latched."""
+
+    name: str
+    words: str
+    """For people; `{}` takes the value."""
+    value: Callable[[Health], float | bool]
+    below: bool = False
+    """Low values are bad."""
+    modes: frozenset[Mode] = ANY
+    forced_modes: frozenset[Mode] = frozenset()
+    """Modes in which it counts besides, where a fail-safe and no person chose them."""
+
+
+TABLE = (
+    Row("leak", "water in a cabin", lambda h: h.leak),
+    Row("bus_silent", "bus silent for {:.1f} s", lambda h: h.bus_silent_s),
+    Row("foreign_sync", "somebody else sends SYNC", lambda h: h.foreign_sync),
+    Row("battery_critical", "battery critical: {:.0%} of its voltage", lambda h: h.voltage_share, below=True),
+    Row("cabin_hot", "cabin at {:.0f} degC", lambda h: h.cabin_c),
+    Row("cabin_pressure", "cabin pressure off by {:.0f} Pa", lambda h: h.cabin_change_pa),
+    Row("axis_lost", "the thrusters left cannot make every wrench", lambda h: h.lost_axes > 0),
+    Row(
+        "depth_unknown", "depth unknown for {:.1f} s", lambda h: min(h.depth_age_s, h.tag_age_s), modes=PLACED | {Mode.ALT_HOLD}
+    ),
+    Row("tag_gone", "no tag for {:.1f} s", lambda h: h.tag_age_s, modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
+    Row("partner_lost", "a docked partner is lost", lambda h: h.partner_lost),
+    Row("estimator", "sensors and model disagree: {:.1f} of the expected", lambda h: h.nis_ratio, modes=PLACED),
+    Row("rejected", "{:.0%} of the tags refused", lambda h: h.rejected_share, modes=PLACED),
+    Row("tag_lost", "no tag for {:.1f} s", lambda h: h.tag_age_s, modes=PLACED),
+    Row("tag_late", "no tag for {:.1f} s", lambda h: h.tag_age_s, modes=MOVING),
+    Row("depth_lost", "no pressure for {:.1f} s", lambda h: h.depth_age_s),
+    Row("module_silent", "a module is silent for {:.1f} s", lambda h: h.silent_s),
+    Row("ticks_missed", "{:.0f} ticks missed in a second", lambda h: h.missed_ticks_per_s),
+    Row("fence", "{:.2f} m outside the fence", lambda h: h.outside_m, modes=MOVING),
+    Row("ground_lost", "ground station silent for {:.1f} s", lambda h: h.ground_age_s, modes=ANY - {Mode.AUTO, Mode.SURFACE}),
+    Row("pilot_lost", "pilot silent for {:.1f} s", lambda h: h.pilot_age_s, modes=PILOTED),
+    Row("thruster_lost", "a thruster is out", lambda h: len(h.dead) > 0),
+    Row("battery_low", "battery low: {:.0%} of its voltage", lambda h: h.voltage_share, below=True),
+)
+
+
+class Alarm(NamedTuple):
+    """A fail-safe that has just begun or ended."""
+
+    name: str
+    words: str
+    level: Level
+    begins: bool
+
+
+class Watch:
+    """One row and its time."""
+
+    def __init__(self, row: Row, parameters: FailsafeParameters) -> None:
+        self.row = row
+        self.limit: float = getattr(parameters, f"{row.name}_limit", 0.0)
+        self.level = Level(getattr(parameters, f"{row.name}_action"))
+        self.latched = bool(getattr(parameters, f"{row.name}_latched"))
+        self._delay_ns = round(getattr(parameters, f"{row.name}_delay_s") * 1e9)
+        self._clear_ns = round(parameters.clear_s * 1e9)
+        self._since_ns: int | None = None
+        self._gone_ns: int | None = None
+        self.active = False
+
+    def beyond(self, health: Health) -> bool:
+        """Whether its cause holds now, whatever the mode. A NaN is no cause."""
+        value = self.row.value(health)
+        return value < self.limit if self.row.below else value > self.limit
+
+    def counts(self, mode: Mode, forced: bool, armed: bool) -> bool:
+        """Whether it counts now."""
+        if not armed:
+            return self.row.modes == ANY
+        return mode in self.row.modes or (forced and mode in self.row.forced_modes)
+
+    def words(self, health: Health) -> str:
+        """What is wrong, for people."""
+        return self.row.words.format(self.row.value(health))
+
+    def step(self, health: Health, counts: bool, armed: bool) -> bool:
+        """Moves its time on; whether it has begun or ended in this tick."""
+        now, cause = health.time_ns, counts and self.beyond(health)
+        if cause:
+            self._gone_ns = None
+            if self._since_ns is None:
+                self._since_ns = now
+        else:
+            self._since_ns = None
+            if self._gone_ns is None:
+                self._gone_ns = now
+        before = self.active
+        if self._since_ns is not None and now - self._since_ns >= self._delay_ns:
+            self.active = True
+        elif self._gone_ns is not None and now - self._gone_ns >= self._clear_ns and not (self.latched and armed):
+            self.active = False
+        return self.active != before
+
+
+class Failsafes:
+    """All fail-safes of one body."""
+
+    def __init__(self, parameters: FailsafeParameters) -> None:
+        self._watches = [watch for watch in (Watch(row, parameters) for row in TABLE) if watch.level != Level.NONE]
+
+    def step(self, health: Health, mode: Mode, forced: bool, armed: bool) -> list[Alarm]:
+        """Those that begin or end in this tick, gravest row first.
+
+        Args:
+            forced: a fail-safe and no person chose `mode`.
+        """
+        return [
+            Alarm(watch.row.name, watch.words(health), watch.level, watch.active)
+            for watch in self._watches
+            if watch.step(health, watch.counts(mode, forced, armed), armed)
+        ]
+
+    @property
+    def level(self) -> Level:
+        """What the gravest of those that are on asks for."""
+        return max((watch.level for watch in self._watches if watch.active), default=Level.NONE)
+
+    def active(self, health: Health) -> list[str]:
+        """Those that are on and more than a warning, in words."""
+        return [watch.words(health) for watch in self._watches if watch.active and watch.level > Level.WARN]
+
+    def against(self, mode: Mode, health: Health) -> list[str]:
+        """Why `mode` must not be entered now, in words; empty when it may."""
+        return [
+            watch.words(health)
+            for watch in self._watches
+            if mode not in PERMITTED[watch.level]
+            and (watch.beyond(health) or (watch.active and watch.latched))
+            and watch.counts(mode, False, True)
+        ]

@@ -1,0 +1,282 @@
+"""Stage 4 of a tick: what each mode makes of set-points, trajectories and sticks; and what it keeps of the controller's wrench.
+
+No change of mode jumps: set-points go on from where they are, and the wrench moves over within `blend_s`.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.health import Health
+from firmware_py.core.rotations import difference, from_euler, rotate, rotate_back, to_matrix
+from firmware_py.core.setpoint import Glider, Trajectory, Wish, ahead_of, at_estimate, rest_at
+from firmware_py.core.supervisor import Decision
+from firmware_py.core.transitions import Effect
+from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
+from firmware_py.description.parameters import Parameters
+
+NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+ZERO = np.zeros(3)
+ZERO.flags.writeable = False
+NEAR_M, NEAR_RAD = 0.2, 0.35
+"""A set-point no farther from the body is gone on from; otherwise the body itself is."""
+
+
+class Keep(IntEnum):
+    """What of the controller's force or moment is kept; the rest is the sticks'."""
+
+    NOTHING = 0
+    VERTICAL = 1
+    """The vertical force."""
+    ALL = 2
+
+
+class Steering(NamedTuple):
+    """How a mode steers."""
+
+    force: Keep
+    moment: Keep
+
+
+STEERING = {
+    Mode.MANUAL: Steering(Keep.NOTHING, Keep.NOTHING),
+    Mode.STABILIZE: Steering(Keep.NOTHING, Keep.ALL),
+    Mode.ALT_HOLD: Steering(Keep.VERTICAL, Keep.ALL),
+    Mode.POSHOLD: Steering(Keep.ALL, Keep.ALL),
+    Mode.AUTO: Steering(Keep.ALL, Keep.ALL),
+    Mode.GUIDED: Steering(Keep.ALL, Keep.ALL),
+    Mode.DOCK: Steering(Keep.ALL, Keep.ALL),
+    Mode.SURFACE: Steering(Keep.ALL, Keep.ALL),
+    Mode.MOTOR_DETECT: Steering(Keep.NOTHING, Keep.NOTHING),
+}
+
+
+class Guidance:
+    """Keeps what was asked for, and makes each tick's set-point of it."""
+
+    def __init__(self, body: Body, parameters: Parameters) -> None:
+        p = parameters.steering
+        self._p, self._fence = p, parameters.fence
+        self._lead_s = parameters.control.lead_s
+        self._no_place_s, self._no_depth_s = parameters.failsafes.tag_lost_limit, parameters.failsafes.depth_unknown_limit
+        reach = 0.5 * np.abs(body.thrusters.matrix) @ (body.thrusters.f_max - body.thrusters.f_min)
+        self._full_stick = p.stick_share * reach
+        self._lift_n = p.surface_force_n * len(body.modules)
+        self._glider = Glider(p.bandwidth, p.speed_m_s, p.rate_rad_s)
+        self._trajectory: Trajectory | None = None
+        self._start_ns: int | None = None
+        self._goal: Setpoint | None = None
+        self._point: tuple[int, Setpoint] | None = None
+        self._docking: Setpoint | None = None
+        self._sticks, self._sticks_ns = NEUTRAL, 0
+        self._time_ns: int | None = None
+        self._offset, self._offset_ns = np.zeros(6), 0
+        self._wrench = np.zeros(6)
+        self._blend = False
+        self.mode = Mode.POSHOLD
+
+    # ------------------------------------------------------------ what is asked for
+
+    def apply(self, decision: Decision, time_ns: int, estimate: Estimate) -> None:
+        """Does what the supervisor decided."""
+        effect, argument = decision.effect, decision.argument
+        if effect == Effect.TAKE_STICKS:
+            self._sticks, self._sticks_ns = argument, time_ns
+        elif effect == Effect.TAKE_POINT:
+            self._point = (time_ns, argument)
+        elif effect == Effect.STOP:
+            self.rest(estimate)
+        elif effect in (Effect.ENTER_MODE, Effect.HOLD_AT, Effect.FOLLOW, Effect.TEST_MOTOR):
+            self._enter(decision.mode, estimate)
+            if effect == Effect.HOLD_AT and argument is not None:
+                self._goal = rest_at(self._inside(argument.p_wb), argument.q_wb)
+            elif effect == Effect.FOLLOW:
+                self.follow(argument)
+
+    def rest(self, estimate: Estimate) -> None:
+        """The body is disarmed: the set-point stays where it is believed to be."""
+        self._glider.put(rest_at(estimate.p_wb, estimate.q_wb))
+        self._trajectory = self._goal = self._docking = None
+        self._wrench, self._blend = np.zeros(6), True
+
+    def take_over(self, mode: Mode, estimate: Estimate, wrench: np.ndarray) -> None:
+        """Starts in `mode` where a new body is, from the wrench (6,) that its thrusters give."""
+        self._glider.put(at_estimate(estimate))
+        self.mode, self._wrench, self._blend = mode, wrench, True
+
+    def follow(self, trajectory: Trajectory) -> None:
+        """AUTO's next trajectory."""
+        self._trajectory, self._start_ns = trajectory, None
+
+    def dock(self, setpoint: Setpoint) -> None:
+        """Where the docking sequence wants the body in this tick."""
+        self._docking = setpoint
+
+    def finished(self, time_ns: int) -> bool:
+        """Whether no trajectory is under way."""
+        if self.mode != Mode.AUTO or self._trajectory is None:
+            return True
+        return self._start_ns is not None and (time_ns - self._start_ns) * 1e-9 >= self._trajectory.duration_s
+
+    def _enter(self, mode: Mode, estimate: Estimate) -> None:
+        at = self._glider.at
+        gap, turn = np.linalg.norm(at.p_wb - estimate.p_wb), np.linalg.norm(difference(at.q_wb, estimate.q_wb))
+        if STEERING[self.mode] != STEERING[Mode.POSHOLD] or gap > NEAR_M or turn > NEAR_RAD:
+            self._glider.put(at_estimate(estimate))
+        self._trajectory = self._goal = self._docking = None
+        self.mode, self._blend = mode, True
+
+    # ------------------------------------------------------------ the set-point
+
+    def step(self, time_ns: int, estimate: Estimate, health: Health) -> tuple[Setpoint, Setpoint]:
+        """The set-point at `time_ns`, and the one that the thrusters' force will meet."""
+        dt_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) * 1e-9
+        self._time_ns = time_ns
+        if self.mode == Mode.AUTO and self._trajectory is not None and self._joined(self._trajectory, time_ns):
+            return self._sample(self._trajectory, time_ns)
+        if self.mode == Mode.DOCK and self._docking is not None:
+            self._glider.put(self._docking)
+            return self._docking, ahead_of(self._docking, self._lead_s)
+        now = self._glider.step(self._wish(time_ns, estimate, health), dt_s)
+        if STEERING[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and not self._placed(health)):
+            now = self._let_go(now, estimate)
+        return now, ahead_of(now, self._lead_s)
+
+    def _sample(self, trajectory: Trajectory, time_ns: int) -> tuple[Setpoint, Setpoint]:
+        assert self._start_ns is not None
+        t = (time_ns - self._start_ns) * 1e-9
+        now = trajectory.sample(t)
+        self._glider.put(now)
+        return now, trajectory.sample(t + self._lead_s)
+
+    def _joined(self, trajectory: Trajectory, time_ns: int) -> bool:
+        """Whether the trajectory runs; it starts when the set-point is near its start."""
+        if self._start_ns is None:
+            start, at = trajectory.sample(0.0), self._glider.at
+            gap, turn = np.linalg.norm(start.p_wb - at.p_wb), np.linalg.norm(difference(start.q_wb, at.q_wb))
+            if gap <= self._p.join_m and turn <= self._p.join_rad:
+                self._start_ns = time_ns
+        return self._start_ns is not None
+
+    def _wish(self, time_ns: int, estimate: Estimate, health: Health) -> Wish:
+        """Where the glider goes in this mode."""
+        p, at = self._p, self._glider.at
+        if self.mode == Mode.AUTO and self._trajectory is not None:
+            start = self._trajectory.sample(0.0)
+            return Wish(ZERO, ZERO, start.p_wb, start.q_wb)
+        if self.mode == Mode.GUIDED:
+            return self._guided(time_ns)
+        if self.mode == Mode.SURFACE:
+            up = -p.surface_speed_m_s if at.p_wb[2] > p.surface_depth_m else 0.0
+            return Wish(np.array([0.0, 0.0, up]), ZERO, None, heading(at.q_wb))
+        if self.mode in (Mode.AUTO, Mode.DOCK):
+            return Wish(ZERO, ZERO)
+        sticks = self._read_sticks(time_ns)
+        rate = p.rate_rad_s * np.array(sticks.moment)
+        if self.mode == Mode.ALT_HOLD:
+            return Wish(np.array([0.0, 0.0, p.speed_m_s * sticks.force[2]]), rate)
+        if any(sticks.force) or any(sticks.moment):
+            self._goal = None
+        if self._goal is not None:
+            return Wish(ZERO, ZERO, self._goal.p_wb, self._goal.q_wb)
+        v_w = np.asarray(rotate(at.q_wb, p.speed_m_s * np.array(sticks.force)))
+        return Wish(self._held_in(at.p_wb, v_w), rate)
+
+    def _guided(self, time_ns: int) -> Wish:
+        """The newest set-point, moved on by its own speed; without a successor it moves no more."""
+        if self._point is None:
+            return Wish(ZERO, ZERO)
+        came_ns, point = self._point
+        age_s = (time_ns - came_ns) * 1e-9
+        v_w, w_b = (np.where(np.isnan(value), 0.0, value) for value in (point.v_w, point.w_b))
+        q_wb = None if np.isnan(point.q_wb).any() else point.q_wb
+        if age_s > self._p.guided_timeout_s:
+            v_w, w_b, age_s = ZERO, ZERO, self._p.guided_timeout_s
+            age_s = 0.0 if np.isnan(point.p_wb).any() else age_s
+        moved = np.where(np.isnan(point.v_w), 0.0, point.v_w) * min(age_s, self._p.guided_timeout_s)
+        return Wish(self._held_in(self._glider.at.p_wb, v_w), w_b, self._inside(point.p_wb + moved), q_wb)
+
+    def _let_go(self, setpoint: Setpoint, estimate: Estimate) -> Setpoint:
+        """The set-point drifts along with the body where position is not held: horizontally, or wholly."""
+        p_wb = estimate.p_wb.copy()
+        if STEERING[self.mode].force != Keep.NOTHING:
+            p_wb[2] = setpoint.p_wb[2]
+        moved = setpoint._replace(p_wb=p_wb)
+        self._glider.put(moved)
+        return moved
+
+    def _read_sticks(self, time_ns: int) -> Sticks:
+        """The sticks, neutral when they are old or hardly moved."""
+        if time_ns - self._sticks_ns > self._p.stick_timeout_s * 1e9:
+            return NEUTRAL
+        dead = self._p.stick_dead
+        force, moment = ((0.0 if abs(v) <= dead else v for v in group) for group in self._sticks)
+        return Sticks(tuple(force), tuple(moment))  # type: ignore[arg-type]
+
+    def _inside(self, p_wb: np.ndarray) -> np.ndarray:
+        """The place, or the nearest one inside the fence."""
+        f = self._fence
+        low = np.array([-f.north_m, -f.east_m, f.top_m])
+        return np.asarray(np.clip(p_wb, low, np.array([f.north_m, f.east_m, f.bottom_m])))
+
+    def _held_in(self, p_wb: np.ndarray, v_w: np.ndarray) -> np.ndarray:
+        """The speed without what would lead out of the fence within a second."""
+        soon = p_wb + v_w
+        return np.where(self._inside(soon) == soon, v_w, 0.0)
+
+    def _placed(self, health: Health) -> bool:
+        return health.ready and health.tag_age_s <= self._no_place_s
+
+    # ------------------------------------------------------------ the wrench
+
+    def mix(self, wrench: np.ndarray, time_ns: int, estimate: Estimate, health: Health) -> np.ndarray:
+        """What the mode makes of the controller's wrench, (6,), body frame; passes over from the last mode's within `blend_s`."""
+        out = self._kept(wrench, time_ns, estimate, health)
+        if self._blend:
+            self._offset, self._offset_ns, self._blend = self._wrench - out, time_ns, False
+        left = 1.0 - (time_ns - self._offset_ns) * 1e-9 / max(self._p.blend_s, 1e-9)
+        if left > 0.0:
+            out = out + left * self._offset
+        self._wrench = out
+        return np.asarray(out)
+
+    def _kept(self, wrench: np.ndarray, time_ns: int, estimate: Estimate, health: Health) -> np.ndarray:
+        sticks = self._read_sticks(time_ns)
+        wanted = self._full_stick * np.r_[sticks.force, sticks.moment]
+        if self.mode == Mode.SURFACE:
+            return self._surfacing(wrench, estimate, health)
+        force, moment = STEERING[self.mode]
+        out = wrench.copy()
+        if moment == Keep.NOTHING:
+            out[3:] = wanted[3:]
+        if force == Keep.NOTHING:
+            out[:3] = wanted[:3]
+        elif force == Keep.VERTICAL:
+            level_w = np.asarray(rotate(heading(estimate.q_wb), np.r_[wanted[:2], 0.0]))
+            out[:3] = rotate_back(estimate.q_wb, np.r_[level_w[:2], rotate(estimate.q_wb, wrench[:3].copy())[2]])
+        return out
+
+    def _surfacing(self, wrench: np.ndarray, estimate: Estimate, health: Health) -> np.ndarray:
+        """Up by the controller, or by a constant force where depth is unknown; sideways only where the place is known."""
+        if not health.ready:
+            return np.r_[0.0, 0.0, -self._lift_n, 0.0, 0.0, 0.0]
+        out = wrench.copy()
+        force_w = np.asarray(rotate(estimate.q_wb, wrench[:3].copy()))
+        if not self._placed(health):
+            force_w[:2] = 0.0
+        if min(health.depth_age_s, health.tag_age_s) > self._no_depth_s:
+            force_w[2] = -self._lift_n
+        out[:3] = rotate_back(estimate.q_wb, force_w)
+        return np.asarray(out)
+
+
+def heading(q_wb: np.ndarray) -> np.ndarray:
+    """The level attitude (4,) that looks the way the body looks; where it looks up or down, the way that its top or bottom does."""
+    r = np.asarray(to_matrix(q_wb))
+    x = r[:, 0] if math.hypot(r[0, 0], r[1, 0]) > 0.3 else r[:, 2] * (1.0 if r[2, 0] < 0.0 else -1.0)
+    return np.asarray(from_euler(0.0, 0.0, math.atan2(x[1], x[0])))

@@ -1,0 +1,237 @@
+"""How a body is: one row of figures per tick, from what its modules say and what the estimator believes. Supervisor and fail-safes judge it.
+
+Figures that are not known yet are NaN, so that no comparison with them holds.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.faults import ThrusterFaults
+from firmware_py.core.types import Action, Estimate, Inputs, ModuleInputs, Request, Sticks
+from firmware_py.description.failsafe_parameters import Fence
+from firmware_py.description.parameters import Parameters
+
+NEVER_S = 1e9
+"""Age of what never came."""
+MEAN_S = 1.0
+"""Time over which rates and shares are averaged."""
+VOLTAGE_SHARE = 0.2
+"""Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
+
+
+class Health(NamedTuple):
+    """Figures of one tick. Ages in s."""
+
+    time_ns: int
+    ready: bool
+    """A pose has been found."""
+    tag_age_s: float
+    sigma_m: float
+    """Largest standard deviation of the position, m."""
+    nis_ratio: float
+    """Squared innovations over their expectation, mean of a second; 1 is right."""
+    rejected_share: float
+    """Share of tag observations that the gate refused, mean of a second."""
+    depth_age_s: float
+    voltage_share: float
+    """Lowest supply of a module over its nominal one; NaN before the first reading."""
+    leak: bool
+    cabin_c: float
+    """Hottest cabin; NaN before the first reading."""
+    cabin_change_pa: float
+    """Largest change of a cabin's pressure since its first reading."""
+    silent: tuple[int, ...]
+    """Fleet indices of modules that did not answer of late."""
+    silent_s: float
+    """Longest silence of a module."""
+    bus_silent_s: float
+    """Shortest silence of a module."""
+    esc_missing: tuple[int, ...]
+    """Thrusters whose ESC does not answer, or reports a fault."""
+    frame_errors_per_s: float
+    missed_ticks_per_s: float
+    foreign_sync: bool
+    ground_age_s: float
+    """NaN before a ground station was heard."""
+    pilot_age_s: float
+    """NaN before a pilot was heard."""
+    stick: float
+    """Largest deflection of the sticks, 0 to 1."""
+    outside_m: float
+    """How far the body is beyond the fence; negative inside; NaN without a pose."""
+    dead: tuple[int, ...]
+    """Thrusters that count as dead or lying."""
+    lost_axes: int
+    """Rank that is missing because of them."""
+    partner_lost: bool
+    """A docked module is no longer where it should be (docking detector)."""
+    warm: bool
+    """Every stage has run at least once."""
+    topology: str
+    """What about the topology is not as configured, in words; empty when all is."""
+
+
+class HealthMonitor:
+    """Keeps the ages and means of one body."""
+
+    def __init__(self, body: Body, parameters: Parameters, period_ns: int) -> None:
+        count = len(body.modules)
+        t = body.thrusters
+        self._modules = body.modules
+        self._fence = parameters.fence
+        self._answer_s = parameters.supervision.answer_ms * 1e-3
+        self._esc_fresh_s = parameters.supervision.esc_fresh_ms * 1e-3
+        self._period_ns = period_ns
+        self._nominal_v = np.array([t.voltage_v[t.module == m][0] for m in range(count)])
+        self._channels = [(int(m), int(c)) for m, c in zip(t.module, t.channel, strict=True)]
+        self._heard_ns: list[int | None] = [None] * count
+        self._answered_ns: list[int | None] = [None] * count
+        self._voltage = np.full(count, math.nan)
+        self._leak = [False] * count
+        self._cabin_c = np.full(count, math.nan)
+        self._cabin_pa = np.full(count, math.nan)
+        self._cabin_start_pa = np.full(count, math.nan)
+        self._esc_ns: dict[tuple[int, int], int] = {}
+        self._depth_ns: int | None = None
+        self._ground_ns: int | None = None
+        self._pilot_ns: int | None = None
+        self._stick = 0.0
+        self._nis_ratio, self._rejected_share = 1.0, 0.0
+        self._rejected = 0
+        self._errors, self._error_rate = 0, 0.0
+        self._time_ns: int | None = None
+        self._missed_rate = 0.0
+        self.now: Health
+        self.partner_lost = False
+        """Set by whoever watches the docked faces."""
+        self.topology = ""
+        """Set by whoever knows the configured topology."""
+        self.warm = True
+        """Cleared and set by whoever compiles."""
+
+    def step(self, inputs: Inputs, estimate: Estimate, requests: list[Request], faults: ThrusterFaults) -> Health:
+        """The figures of this tick; `now` keeps them."""
+        now = inputs.time_ns
+        dt_s = 0.0 if self._time_ns is None else (now - self._time_ns) * 1e-9
+        for index, module in enumerate(self._modules):
+            self._listen(index, inputs.modules[module], now)
+        self._people(requests, now)
+        self._rates(inputs, estimate, dt_s)
+        self._time_ns = now
+        silences = [_age_s(heard, now) for heard in self._heard_ns]
+        silent = [m for m, at in zip(self._modules, self._answered_ns, strict=True) if _age_s(at, now) > self._answer_s]
+        self.now = Health(
+            time_ns=now,
+            ready=estimate.ready,
+            tag_age_s=estimate.tag_age_ns * 1e-9,
+            sigma_m=float(np.max(estimate.sigma_p)),
+            nis_ratio=self._nis_ratio,
+            rejected_share=self._rejected_share,
+            depth_age_s=_age_s(self._depth_ns, now),
+            voltage_share=_worst(-self._voltage / self._nominal_v, -1.0),
+            leak=any(self._leak),
+            cabin_c=_worst(self._cabin_c),
+            cabin_change_pa=_worst(np.abs(self._cabin_pa - self._cabin_start_pa)),
+            silent=tuple(silent),
+            silent_s=max(silences),
+            bus_silent_s=min(silences),
+            esc_missing=self._missing(now),
+            frame_errors_per_s=self._error_rate,
+            missed_ticks_per_s=self._missed_rate,
+            foreign_sync=inputs.foreign_sync,
+            ground_age_s=_age_s(self._ground_ns, now, math.nan),
+            pilot_age_s=_age_s(self._pilot_ns, now, math.nan),
+            stick=self._stick,
+            outside_m=outside(estimate.p_wb, self._fence) if estimate.ready else math.nan,
+            dead=faults.dead,
+            lost_axes=faults.lost_axes,
+            partner_lost=self.partner_lost,
+            warm=self.warm,
+            topology=self.topology,
+        )
+        return self.now
+
+    def _listen(self, index: int, module: ModuleInputs, now: int) -> None:
+        if module.heard or module.answered:
+            self._heard_ns[index] = now
+        if module.answered:
+            self._answered_ns[index] = now
+        if module.pressure_pa is not None:
+            self._depth_ns = now
+        if module.voltage_v is not None:
+            before = self._voltage[index]
+            change = module.voltage_v - before
+            self._voltage[index] = module.voltage_v if math.isnan(before) else before + VOLTAGE_SHARE * change
+        if module.leak is not None:
+            self._leak[index] = module.leak
+        if module.cabin_temperature_c is not None:
+            self._cabin_c[index] = module.cabin_temperature_c
+        if module.cabin_pressure_pa is not None:
+            self._cabin_pa[index] = module.cabin_pressure_pa
+            if math.isnan(self._cabin_start_pa[index]):
+                self._cabin_start_pa[index] = module.cabin_pressure_pa
+        for esc in module.esc:
+            for offset, status in enumerate(esc.status):
+                if status in ESC_ALIVE:
+                    self._esc_ns[index, esc.first + offset] = now
+
+    def _people(self, requests: list[Request], now: int) -> None:
+        for request in requests:
+            if request.action == Action.GROUND_ALIVE:
+                self._ground_ns = now
+            elif request.action == Action.STICKS and is_sticks(request.argument):
+                self._pilot_ns = now
+                self._stick = max(abs(value) for group in request.argument for value in group)
+
+    def _rates(self, inputs: Inputs, estimate: Estimate, dt_s: float) -> None:
+        keep = math.exp(-dt_s / MEAN_S)
+        errors = inputs.dropped_frames - self._errors
+        self._errors = inputs.dropped_frames
+        self._error_rate = keep * self._error_rate + errors / MEAN_S
+        missed = max(0, round(dt_s * 1e9 / self._period_ns) - 1)
+        self._missed_rate = keep * self._missed_rate + missed / MEAN_S
+        refused, self._rejected = estimate.rejected - self._rejected, estimate.rejected
+        if estimate.nis_dof:
+            self._nis_ratio += TAG_SHARE * (estimate.nis / estimate.nis_dof - self._nis_ratio)
+            self._rejected_share -= TAG_SHARE * self._rejected_share
+        if refused > 0:
+            self._rejected_share += TAG_SHARE * (1.0 - self._rejected_share)
+
+    def _missing(self, now: int) -> tuple[int, ...]:
+        ages = [_age_s(self._esc_ns.get(channel), now) for channel in self._channels]
+        return tuple(i for i, age in enumerate(ages) if age > self._esc_fresh_s)
+
+
+ESC_ALIVE = (0, 2)
+"""EscStatus OK and OVERTEMPERATURE."""
+TAG_SHARE = 1.0 / 60.0
+"""Weight of one tag observation in a mean of a second: tags come at 60 Hz."""
+
+
+def _age_s(at_ns: int | None, now_ns: int, never: float = NEVER_S) -> float:
+    return never if at_ns is None else (now_ns - at_ns) * 1e-9
+
+
+def _worst(values: np.ndarray, sign: float = 1.0) -> float:
+    """Largest of the values that are known, times `sign`; NaN when none is."""
+    known = values[np.isfinite(values)]
+    return sign * float(known.max()) if known.size else math.nan
+
+
+def is_sticks(argument: object) -> bool:
+    """Whether a request's argument is six deflections within -1 to 1."""
+    if not isinstance(argument, Sticks):
+        return False
+    return all(len(group) == 3 and all(-1.0 <= value <= 1.0 for value in group) for group in argument)
+
+
+def outside(p_w: np.ndarray, fence: Fence) -> float:
+    """How far a place (3,) is beyond the fence, m; negative: how far inside."""
+    north, east, down = (float(value) for value in p_w)
+    beyond = (abs(north) - fence.north_m, abs(east) - fence.east_m, fence.top_m - down, down - fence.bottom_m)
+    return max(beyond)

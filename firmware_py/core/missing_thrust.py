@@ -1,0 +1,153 @@
+"""Finds the thruster whose force is missing in the motion, whatever its ESC says. Part of `faults`.
+
+The wrench that the motion shows, less the one that was commanded and modelled, is averaged over tenths of a second. When it changes, and one
+thruster's lost force explains the change in all six components, that thruster lies. Slow changes (current, trim, buoyancy) are not looked at.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.drag_lookup import drag_wrench
+from firmware_py.core.observation import GRAVITY
+from firmware_py.core.rigid_body import restoring_moment
+from firmware_py.core.rotations import cross, rotate_back
+from firmware_py.core.types import Estimate, Measured
+from firmware_py.description.failsafe_parameters import Faults
+
+BLOCK_NS = 100_000_000
+"""Length of a block."""
+RECENT, GAP, BASE = 5, 12, 30
+"""Blocks: what is judged is the mean of the last half second; against that of three seconds that ended 1.2 s before now."""
+SIGMA_FORCE_N, SIGMA_MOMENT = 0.15, 0.010
+"""What a healthy module's half-second mean is off, N and N m: accelerometer tilt and noise, gains, gusts (measured on the bench)."""
+MODEL_SHARE = 0.12
+"""What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too."""
+EXPLAINED = 0.8
+"""Share of the change (squared, in sigmas) that one thruster must explain."""
+RUNNER_UP = 0.5
+"""What it leaves unexplained must be less than this share of what the next best leaves."""
+SIGNIFICANT = 12.0
+"""Squared sigmas that it must explain."""
+MOST = 2.6
+"""A thruster cannot lose more than this many times its force: 2 is reversed."""
+
+
+class MissingThrust:
+    """Watches one body's motion."""
+
+    def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
+        t = body.thrusters
+        self._body, self._p = body, parameters
+        self._columns = t.matrix.T.copy()
+        self._ticks = max(1, round(BLOCK_NS / period_ns))
+        count = len(body.modules)
+        self._sigma = np.repeat([SIGMA_FORCE_N * np.sqrt(count), SIGMA_MOMENT * count], 3)
+        self._period_s = period_ns * 1e-9
+        self.forget()
+
+    def reset(self) -> None:
+        """All is forgotten."""
+        self.forget()
+
+    def forget(self) -> None:
+        """What was seen no longer counts, because the body has changed."""
+        self._rest = np.full((GAP + BASE, 6), np.nan)
+        self._force = np.zeros((GAP + BASE, self._columns.shape[0]))
+        self._acted = np.zeros((GAP + BASE, 6))
+        self._suspect, self._count = -1, 0
+        self._start_block(None)
+
+    def _start_block(self, gyro: np.ndarray | None) -> None:
+        self._n, self._accels = 0, 0
+        self._first = self._last = gyro
+        self._first_n = self._last_n = 0
+        self._sum_a, self._sum_f = np.zeros(3), np.zeros(self._columns.shape[0])
+        self._sum_model, self._sum_tau = np.zeros(6), np.zeros(6)
+
+    def step(
+        self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool
+    ) -> int | None:
+        """The thruster that lies, once it is sure. `force_n`: (n,) believed mean forces since the last tick, N."""
+        if not estimate.ready:
+            return None
+        self._add(measured, estimate, force_n)
+        if self._n < self._ticks:
+            return None
+        full = self._close()
+        self._start_block(self._last if self._last_n == self._n else None)
+        if not (full and armed):
+            self._count = 0
+            return None
+        return self._decide(alive)
+
+    def _add(self, measured: Measured, estimate: Estimate, force_n: np.ndarray) -> None:
+        """Adds one tick to the block."""
+        b, nu = self._body, estimate.nu
+        self._n += 1
+        if measured.gyro is not None:
+            if self._first is None:
+                self._first, self._first_n = measured.gyro, self._n
+            self._last, self._last_n = measured.gyro, self._n
+        if measured.accel is not None:
+            self._accels += 1
+            self._sum_a += measured.accel + rotate_back(estimate.q_wb, DOWN)
+        tau = self._columns.T @ force_n
+        model = np.asarray(drag_wrench(b.drag.nodes, b.drag.rotational, b.drag.linear, nu))
+        model[3:] += restoring_moment(b.righting, estimate.q_wb)
+        model[3:] -= cross(nu[3:].copy(), b.mass[3:, 3:] @ nu[3:])
+        self._sum_f += force_n
+        self._sum_tau += tau
+        self._sum_model += model
+
+    def _close(self) -> bool:
+        """Ends the block; whether it is whole."""
+        n = self._n
+        span = (self._last_n - self._first_n) * self._period_s
+        whole = self._accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
+        rest = np.full(6, np.nan)
+        if whole and self._last is not None and self._first is not None:
+            motion = np.r_[self._sum_a / self._accels, (self._last - self._first) / span]
+            rest = self._body.mass @ motion - (self._sum_tau + self._sum_model) / n
+        for rows, new in ((self._rest, rest), (self._force, self._sum_f / n), (self._acted, self._sum_tau / n)):
+            rows[:-1] = rows[1:]
+            rows[-1] = new
+        return whole
+
+    def _decide(self, alive: np.ndarray) -> int | None:
+        """Judges the change; returns a thruster that was suspected often enough in a row."""
+        best = self._explain(alive)
+        if best < 0 or best != self._suspect:
+            self._suspect, self._count = best, int(best >= 0)
+            return None
+        self._count += 1
+        return best if self._count >= self._p.lie_count else None
+
+    def _explain(self, alive: np.ndarray) -> int:
+        """The one thruster that explains the change, or -1."""
+        base = ~np.isnan(self._rest[:BASE, 0])
+        recent = ~np.isnan(self._rest[-RECENT:, 0])
+        if base.sum() < BASE // 3 or recent.sum() < RECENT - 1:
+            return -1
+        change = self._rest[-RECENT:][recent].mean(axis=0) - self._rest[:BASE][base].mean(axis=0)
+        now = self._force[-RECENT:][recent].mean(axis=0)
+        before = self._force[:BASE][base].mean(axis=0)
+        acted = self._acted[-RECENT:][recent].mean(axis=0) - self._acted[:BASE][base].mean(axis=0)
+        sigma = np.sqrt(self._sigma**2 + (MODEL_SHARE * np.abs(acted)) ** 2)
+        y = change / sigma
+        total = float(y @ y)
+        left = np.full(alive.size, total)
+        for force in (now, now - before):  # lost since, or lost all along
+            phi = -(self._columns * force[:, None]) / sigma
+            size = np.einsum("ij,ij->i", phi, phi)
+            share = (phi @ y) / np.maximum(size, 1e-12)
+            fits = alive & (share >= self._p.lie_share) & (share <= MOST) & (size >= 1.0)
+            left = np.where(fits, np.minimum(left, total - share * (phi @ y)), left)
+        order = np.argsort(left)
+        best, second = int(order[0]), int(order[1])
+        sure = total - left[best] >= SIGNIFICANT and left[best] <= (1.0 - EXPLAINED) * total
+        return best if sure and left[best] <= RUNNER_UP * left[second] else -1
+
+
+DOWN = np.array([0.0, 0.0, GRAVITY])

@@ -1,0 +1,62 @@
+"""Turns one thruster, or one after the other (MOTOR_DETECT), past controller and allocator; the limiter still has the last word."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.description.steering_parameters import Steering
+
+PAUSE_SHARE = 0.5
+"""Pause after each thruster over the time that it turns."""
+LONGEST_S = 10.0
+"""A test that is asked to last longer ends then."""
+
+
+class MotorTest:
+    """The forces of the running test."""
+
+    def __init__(self, body: Body, parameters: Steering) -> None:
+        self._p = parameters
+        self._high, self._low = body.thrusters.f_max, body.thrusters.f_min
+        self._plan: list[tuple[int, int, float]] = []
+
+    @property
+    def running(self) -> bool:
+        """Whether a test is on."""
+        return bool(self._plan)
+
+    def start(self, argument: object, time_ns: int) -> None:
+        """One thruster: (index, share of full command, seconds). Nonsense starts nothing."""
+        self.stop()
+        if not isinstance(argument, tuple) or len(argument) != 3:
+            return
+        index, share, seconds = argument
+        if not isinstance(index, int) or not 0 <= index < self._high.size or not math.isfinite(share + seconds):
+            return
+        share = max(-self._p.test_share, min(self._p.test_share, share))
+        self._plan = [(time_ns + round(1e9 * max(0.0, min(seconds, LONGEST_S))), index, share)]
+
+    def detect(self, time_ns: int) -> None:
+        """All thrusters, one after the other."""
+        self.stop()
+        turn, pause = round(1e9 * self._p.test_s), round(1e9 * self._p.test_s * PAUSE_SHARE)
+        for index in range(self._high.size):
+            begin = time_ns + index * (turn + pause)
+            self._plan += [(begin + turn, index, self._p.test_share), (begin + turn + pause, index, 0.0)]
+
+    def stop(self) -> None:
+        """Ends it at once."""
+        self._plan = []
+
+    def step(self, time_ns: int) -> np.ndarray:
+        """(n,) forces of this tick, N."""
+        while self._plan and time_ns >= self._plan[0][0]:
+            self._plan.pop(0)
+        force = np.zeros(self._high.size)
+        if self._plan:
+            _, index, share = self._plan[0]
+            force[index] = share * (self._high[index] if share > 0.0 else -self._low[index])
+        return force

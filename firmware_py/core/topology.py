@@ -1,0 +1,118 @@
+"""Which modules form which bodies, as state: what merging and parting does to motion, estimate and forces. Swaps only; nothing is built here.
+
+The new Body comes prepared (prepare.docking). Velocities follow from momentum: what two bodies have together before, they have after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.propagation import ERRORS, STATES
+from firmware_py.core.rotations import conjugate, cross, multiply, normalise, rotate, rotate_back, skew, to_matrix
+
+JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
+"""What is added to a joined or parted body's sigma: position m, attitude rad, velocity m/s, rate rad/s. The faces' play, and the shock."""
+
+
+class Motion(NamedTuple):
+    """State of one body's estimator at one time: x (26,) and covariance (25, 25), as core.propagation orders them."""
+
+    x: np.ndarray
+    covariance: np.ndarray
+
+
+def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
+    """State of `body`, made of the bodies `parts`; its first module is one of the first part."""
+    x = np.zeros(STATES)
+    first, motion = parts[0]
+    x[3:7] = _attitude(first, motion.x, body)
+    x[:3] = _position(first, motion.x, body, x[3:7])
+    momentum, force, moment = np.zeros(6), np.zeros(3), np.zeros(3)
+    for part, moved in parts:
+        lever_b, turn = _place(part, body)
+        h = _transport(lever_b, turn)
+        momentum += h.T @ part.mass @ moved.x[7:13]
+        share_b = rotate_back(x[3:7].copy(), moved.x[19:22].copy())
+        force += moved.x[19:22]
+        moment += turn.T @ moved.x[22:25] + cross(lever_b, share_b)
+    x[7:13] = body.mass_inv @ momentum
+    x[19:22], x[22:25] = force, moment
+    x[13:19] = np.mean([_biases(part, moved.x, body) for part, moved in parts], axis=0)
+    x[25] = np.mean([moved.x[25] for _, moved in parts])
+    return Motion(x, _covariance(parts[0][1].covariance, first, body))
+
+
+def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
+    """State of `body`, which was a piece of `whole`. The disturbance is shared out by mass."""
+    x = motion.x.copy()
+    x[3:7] = _attitude(whole, motion.x, body)
+    x[:3] = _position(whole, motion.x, body, x[3:7])
+    lever_b, turn = _place(body, whole)
+    x[7:13] = _transport(lever_b, turn) @ motion.x[7:13]
+    share = body.rigid_mass_kg / whole.rigid_mass_kg
+    x[19:22] = motion.x[19:22] * share
+    x[22:25] = turn @ motion.x[22:25] * share
+    x[13:19] = _biases(whole, motion.x, body)
+    return Motion(x, _covariance(motion.covariance, whole, body))
+
+
+def _common(a: Body, b: Body) -> tuple[int, int]:
+    """Index within each body of the first module that both hold."""
+    for i, module in enumerate(a.modules):
+        if module in b.modules:
+            return i, b.modules.index(module)
+    raise ValueError(f"bodies {a.modules} and {b.modules} share no module")
+
+
+def _place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Centre of mass of `part` from that of `whole` (3,), and (3, 3) whole frame to part frame."""
+    i, j = _common(part, whole)
+    q_wp = multiply(np.ascontiguousarray(whole.q_bm[j]), conjugate(np.ascontiguousarray(part.q_bm[i])))
+    r_wp = to_matrix(normalise(q_wp))
+    return whole.r_bm[j] - r_wp @ part.r_bm[i], np.ascontiguousarray(r_wp.T)
+
+
+def _transport(lever_b: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """(6, 6) H with nu_part = H nu_whole, for a part at `lever_b` whose axes are `turn` @ those of the whole."""
+    h = np.zeros((6, 6))
+    h[:3, :3] = h[3:, 3:] = turn
+    h[:3, 3:] = -turn @ skew(np.ascontiguousarray(lever_b))
+    return h
+
+
+def _attitude(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
+    """(4,) attitude of `new` from that of `old`, by a module that both hold."""
+    i, j = _common(old, new)
+    turn = multiply(np.ascontiguousarray(old.q_bm[i]), conjugate(np.ascontiguousarray(new.q_bm[j])))
+    return np.asarray(normalise(multiply(x[3:7].copy(), turn)))
+
+
+def _position(old: Body, x: np.ndarray, new: Body, q_new: np.ndarray) -> np.ndarray:
+    i, j = _common(old, new)
+    p_wm = x[:3] + rotate(x[3:7].copy(), np.ascontiguousarray(old.r_bm[i]))
+    return np.asarray(p_wm - rotate(q_new, np.ascontiguousarray(new.r_bm[j])))
+
+
+def _biases(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
+    """(6,) gyro and accelerometer bias in the axes of `new`."""
+    _, turn = _place(new, old) if len(new.modules) <= len(old.modules) else _inverse_place(old, new)
+    return np.concatenate([turn @ x[13:16], turn @ x[16:19]])
+
+
+def _inverse_place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
+    lever_b, turn = _place(part, whole)
+    return -turn @ lever_b, np.ascontiguousarray(turn.T)
+
+
+def _covariance(old: np.ndarray, before: Body, after: Body) -> np.ndarray:
+    """(25, 25) covariance of the new body: that of the old, uncorrelated, larger by the play of the faces, disturbance by mass."""
+    variance = old.diagonal().copy()
+    variance[18:21] *= (after.rigid_mass_kg / before.rigid_mass_kg) ** 2
+    variance[21:24] *= (np.trace(after.mass[3:, 3:]) / np.trace(before.mass[3:, 3:])) ** 2
+    variance[:12] += np.repeat(np.array(JOINED_SIGMA), 3) ** 2
+    assert variance.size == ERRORS
+    return np.diag(variance)

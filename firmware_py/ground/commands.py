@@ -1,0 +1,303 @@
+"""Commands: COMMAND_LONG, COMMAND_INT and SET_MODE. Each is acknowledged: at once, or when the supervisor has decided."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+from firmware_py.core.types import Action, DockRequest, Event, Mode
+from firmware_py.ground.identity import SETTABLE
+from firmware_py.ground.mission_flight import MissionFlight
+from firmware_py.ground.steering import Steering
+from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
+from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS
+
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
+DECISION_NS = 400_000_000
+"""The supervisor decides within a tick or two; clients ask again after 0.5 s."""
+_FORCED = (21196, 2989)
+"""Second parameter of a forced arm or disarm: MAVLink's, and ArduPilot's for arming."""
+_MODULES, _FACES = 64, 6
+
+DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
+"""User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
+
+_WARNING = 4
+
+
+class Command(NamedTuple):
+    """One command, however it came."""
+
+    number: int
+    parameters: tuple[float, ...]
+    """Seven; those that are not used may be NaN."""
+    arrival: Arrival
+
+    def get(self, index: int, default: float = 0.0) -> float:
+        """Parameter `index` (1 to 7), or `default` where it is NaN or infinite."""
+        value = self.parameters[index - 1]
+        return value if math.isfinite(value) else default
+
+
+@dataclass(frozen=True, slots=True)
+class Pending:
+    """A command that the supervisor decides on."""
+
+    command: Command
+    action: Action
+    is_done: Callable[[], bool]
+    deadline_ns: int
+
+
+Answer = int | None
+"""A MAV_RESULT, or None when it comes later."""
+
+
+class CommandService:
+    """The commands of one system."""
+
+    def __init__(
+        self, system: System, missions: MissionFlight, steering: Steering, extra: Mapping[str, Callable[[Arrival], bool]]
+    ) -> None:
+        """`extra` answers REQUEST_MESSAGE for messages that are not streamed; False means it cannot."""
+        self._system, self._missions, self._steering, self._extra = system, missions, steering, extra
+        self._pending: list[Pending] = []
+        self.reboot_asked = False
+        self._table: dict[int, Callable[[Command], Answer]] = {
+            20: self._surface,  # NAV_RETURN_TO_LAUNCH
+            21: self._surface,  # NAV_LAND
+            176: self._set_mode,
+            178: self._change_speed,
+            185: self._terminate,
+            192: self._reposition,
+            193: self._pause,
+            209: self._motor_test,
+            224: self._set_current,
+            246: self._reboot,
+            300: lambda c: self._start_mission(c, max(0, int(c.get(1)))),
+            400: self._arm,
+            410: lambda c: self._request(c, "HOME_POSITION"),
+            510: self._get_interval,
+            511: self._set_interval,
+            512: self._request_message,
+            520: lambda c: self._request(c, "AUTOPILOT_VERSION"),
+            DOCK: lambda c: self._dock(c, Action.DOCK),
+            UNDOCK: lambda c: self._dock(c, Action.UNDOCK),
+            ESTOP: self._estop,
+            CLEAR_ESTOP: self._clear_estop,
+        }
+
+    def handlers(self) -> dict[str, Handler]:
+        """By message name."""
+        return {"COMMAND_LONG": self._long, "COMMAND_INT": self._int, "SET_MODE": self._set_mode_message}
+
+    def hear(self, event: Event) -> None:
+        """An event of the tick: it may be a refusal of what is pending."""
+        for pending in list(self._pending):
+            if event.text.startswith(f"{pending.action.name} refused"):
+                self._finish(pending, DENIED)
+
+    def step(self, time_ns: int) -> None:
+        """Answer what is decided by now."""
+        for pending in list(self._pending):
+            if pending.is_done():
+                self._finish(pending, ACCEPTED)
+            elif time_ns > pending.deadline_ns:
+                self._finish(pending, FAILED)
+
+    def _finish(self, pending: Pending, result: int) -> None:
+        self._pending.remove(pending)
+        self._acknowledge(pending.command, result)
+
+    def _long(self, arrival: Arrival) -> None:
+        m = arrival.message
+        self._run(Command(m["command"], tuple(m[f"param{i}"] for i in range(1, 8)), arrival))
+
+    def _int(self, arrival: Arrival) -> None:
+        m = arrival.message
+        parameters = (*(m[f"param{i}"] for i in range(1, 5)), m["x"] * 1e-7, m["y"] * 1e-7, m["z"])
+        self._run(Command(m["command"], parameters, arrival))
+
+    def _run(self, command: Command) -> None:
+        handler = self._table.get(command.number)
+        answer = UNSUPPORTED if handler is None else handler(command)
+        if answer is not None:
+            self._acknowledge(command, answer)
+
+    def _acknowledge(self, command: Command, result: int) -> None:
+        values = {"command": command.number, "result": result, **command.arrival.sender}
+        self._system.send(command.arrival.channel, "COMMAND_ACK", values)
+
+    def _later(self, command: Command, action: Action, is_done: Callable[[], bool]) -> None:
+        deadline_ns = command.arrival.time_ns + DECISION_NS
+        self._pending.append(Pending(command, action, is_done, deadline_ns))
+
+    def _ask(self, command: Command, action: Action, argument: Any, is_done: Callable[[], bool]) -> Answer:
+        self._system.ask(action, argument)
+        self._later(command, action, is_done)
+        return None
+
+    # ------------------------------------------------------------ arming and modes
+
+    def _arm(self, command: Command) -> Answer:
+        subject = self._system.subject
+        forced = int(command.get(2)) in _FORCED
+        if command.get(1) < 0.5:
+            return self._ask(command, Action.DISARM, forced, lambda: not subject.armed)
+        return self._ask(command, Action.ARM, forced, lambda: subject.armed)
+
+    def _set_mode(self, command: Command) -> Answer:
+        identity = self._system.subject.identity
+        mode = identity.mode_of_command(command.parameters[1], command.parameters[2])
+        number = None
+        if mode is not None and identity.pairs:
+            number = int(command.parameters[1]) << 16 | int(command.get(3)) << 24
+        return self._enter(command, mode, number)
+
+    def _set_mode_message(self, arrival: Arrival) -> None:
+        """The old message, which has no acknowledgement of its own."""
+        custom = arrival.message["custom_mode"]
+        command = Command(176, (1.0, *[math.nan] * 6), arrival)
+        answer = self._enter(command, self._system.subject.identity.mode(custom), custom)
+        if answer is not None:
+            self._acknowledge(command, answer)
+
+    def _enter(self, command: Command, mode: Mode | None, number: int | None = None) -> Answer:
+        if mode is None or mode not in SETTABLE:
+            return UNSUPPORTED
+        if mode == Mode.AUTO:
+            return self._start_mission(command, None)
+        if mode == Mode.GUIDED and not self._steering.has_setpoint(command.arrival.time_ns):
+            self._system.say(_WARNING, "SET_MODE refused: set-points must stream before guided mode")
+            return TEMPORARILY_REJECTED
+        subject = self._system.subject
+        subject.mode_number = number
+        return self._ask(command, Action.SET_MODE, mode, lambda: subject.picture.mode(subject.body) == mode)
+
+    def _surface(self, command: Command) -> Answer:
+        return self._enter(command, Mode.SURFACE)
+
+    # ------------------------------------------------------------ missions
+
+    def _start_mission(self, command: Command, first: int | None) -> Answer:
+        reason = self._missions.start(first)
+        if reason:
+            self._system.say(_WARNING, f"mission refused: {reason}")
+            return TEMPORARILY_REJECTED
+        return ACCEPTED
+
+    def _pause(self, command: Command) -> Answer:
+        if command.get(1) >= 0.5:
+            return self._start_mission(command, None)
+        return self._enter(command, Mode.POSHOLD)
+
+    def _set_current(self, command: Command) -> Answer:
+        reason = self._missions.jump(int(command.get(1)))
+        if reason:
+            self._system.say(_WARNING, f"mission refused: {reason}")
+            return DENIED
+        return ACCEPTED
+
+    def _change_speed(self, command: Command) -> Answer:
+        return ACCEPTED if self._missions.set_speed(command.get(2)) else DENIED
+
+    def _reposition(self, command: Command) -> Answer:
+        latitude, longitude, altitude = command.parameters[4:7]
+        if not all(map(math.isfinite, (latitude, longitude, altitude))):
+            return DENIED
+        reason = self._missions.go_to(latitude, longitude, altitude, command.parameters[3])
+        if reason:
+            self._system.say(_WARNING, f"reposition refused: {reason}")
+            return TEMPORARILY_REJECTED
+        return ACCEPTED
+
+    # ------------------------------------------------------------ safety, docking, thrusters
+
+    def _estop(self, command: Command) -> Answer:
+        s = self._system.subject
+        return self._ask(command, Action.ESTOP, None, lambda: s.picture.is_stopped(s.body))
+
+    def _clear_estop(self, command: Command) -> Answer:
+        s = self._system.subject
+        return self._ask(command, Action.CLEAR_ESTOP, None, lambda: not s.picture.is_stopped(s.body))
+
+    def _terminate(self, command: Command) -> Answer:
+        return self._estop(command) if command.get(1) >= 0.5 else self._clear_estop(command)
+
+    def _reboot(self, command: Command) -> Answer:
+        if int(command.get(1)) not in (1, 3):
+            return UNSUPPORTED
+        if self._system.subject.armed:
+            return DENIED
+        self.reboot_asked = True
+        return ACCEPTED
+
+    def _dock(self, command: Command, action: Action) -> Answer:
+        module, face, target, target_face, turns = (int(command.get(i)) for i in range(1, 6))
+        known = len(self._system.subject.picture.modules)
+        faces_exist = face in range(_FACES) and target_face in range(_FACES)
+        if module not in range(known) or target not in range(known) or module == target or not faces_exist:
+            return DENIED
+        if turns not in range(4):
+            return DENIED
+        request = DockRequest(module, face, target, target_face, turns, command.get(6) >= 0.5)
+        s = self._system.subject
+        return self._ask(command, action, request, lambda: s.picture.mode(s.body) == Mode.DOCK)
+
+    def _motor_test(self, command: Command) -> Answer:
+        """Motor (from 1), throttle type (0: -100 to 100 %, 1: PWM 1100 to 1900), throttle, seconds."""
+        count = 8 * len(self._system.subject.modules)
+        thruster, kind, throttle = int(command.get(1)) - 1, int(command.get(2)), command.get(3)
+        share = {0: throttle / 100, 1: (throttle - 1500) / 400}.get(kind)
+        if thruster not in range(count) or share is None or not -1 <= share <= 1:
+            return DENIED
+        seconds = min(max(command.get(4, 1.0), 0.0), 10.0)
+        s = self._system.subject
+        is_turning = lambda: s.picture.mode(s.body) == Mode.MOTOR_DETECT and s.armed  # noqa: E731
+        return self._ask(command, Action.MOTOR_TEST, (thruster, share, seconds), is_turning)
+
+    # ------------------------------------------------------------ messages and their rates
+
+    def _set_interval(self, command: Command) -> Answer:
+        name = self._name(command.get(1))
+        if name not in STREAMS:
+            return UNSUPPORTED
+        interval_us = command.get(2)
+        rates = self._system.channels[command.arrival.channel]
+        if interval_us == 0:
+            hz = DEFAULT_HZ.get(name, 0.0)
+            interval_ns = round(NS_PER_S / hz) if hz else 0
+        else:
+            interval_ns = max(round(interval_us * 1e3), 0)
+        if name == "HEARTBEAT" and not 0 < interval_ns <= NS_PER_S:
+            return DENIED  # without it clients lose the vehicle
+        rates.set(name, interval_ns, command.arrival.time_ns)
+        return ACCEPTED
+
+    def _get_interval(self, command: Command) -> Answer:
+        name = self._name(command.get(1))
+        if name not in STREAMS:
+            return UNSUPPORTED
+        interval_ns = self._system.channels[command.arrival.channel].intervals_ns.get(name, 0)
+        interval_us = interval_ns // 1000 if interval_ns else -1
+        values = {"message_id": int(command.get(1)), "interval_us": interval_us}
+        self._system.send(command.arrival.channel, "MESSAGE_INTERVAL", values)
+        return ACCEPTED
+
+    def _request_message(self, command: Command) -> Answer:
+        return self._request(command, self._name(command.get(1)), command.get(2))
+
+    def _request(self, command: Command, name: str, index: float = 0.0) -> Answer:
+        if name in self._extra:
+            message = replace(command.arrival.message, values={"index": int(index)})
+            return ACCEPTED if self._extra[name](command.arrival._replace(message=message)) else DENIED
+        if name not in STREAMS or self._system.body not in self._system.subject.picture.records:
+            return UNSUPPORTED
+        for values in STREAMS[name](self._system.subject):
+            self._system.send(command.arrival.channel, name, values)
+        return ACCEPTED
+
+    def _name(self, number: float) -> str:
+        return self._system.name_of(int(number))

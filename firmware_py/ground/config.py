@@ -1,0 +1,48 @@
+"""How a ground station finds the robot: links, identity, what it stores. Fixed for one run; tunables are parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from firmware_py.description.schema import DescriptionError, quantity
+from firmware_py.ground.identity import IDENTITIES, Identity
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundConfig:
+    """One ground side."""
+
+    links: tuple[str, ...] = quantity(
+        ("udpout:127.0.0.1:14550",), help="udpin:, udpout:, tcpin:HOST:PORT, /dev/NAME,BAUD; `+trusted` lets it set the key"
+    )
+    identity: str = quantity("generic", choices=tuple(IDENTITIES), help="generic: PX4's modes; ardusub: ArduSub's")
+    first_system: int = quantity(1, low=1, high=200, help="system id of body 0; body n is that much higher")
+    watch_system: int = quantity(0, low=0, high=255, help="system id of the ground station that must not be lost; 0: the first")
+    watch_component: int = quantity(0, low=0, high=255, help="its component id; 0: the first")
+    store: str = quantity("", help="folder of parameters and signing key; empty: nothing is kept")
+    dock_button: tuple[int, ...] = quantity(
+        (), low=0, high=63, help="what the dock buttons ask for: module, face, target module, target face; empty: nothing"
+    )
+    logs: str = quantity("", help="folder of the logs that may be fetched; empty: none")
+
+    def __post_init__(self) -> None:
+        if not self.links:
+            raise DescriptionError("has no links; a ground side needs at least one")
+        if len(self.dock_button) not in (0, 4):
+            raise DescriptionError("dock_button needs four numbers: module, face, target module, target face")
+
+    @property
+    def encoding(self) -> Identity:
+        """Of modes."""
+        return IDENTITIES[self.identity]
+
+    @property
+    def parameter_file(self) -> Path | None:
+        """Where parameters are kept."""
+        return Path(self.store) / "parameters.toml" if self.store else None
+
+    @property
+    def key_file(self) -> Path | None:
+        """Where key and time stamp are kept."""
+        return Path(self.store) / "signing.json" if self.store else None

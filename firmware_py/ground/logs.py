@@ -1,0 +1,104 @@
+"""The last flights, fetched by a ground station: LOG_REQUEST_LIST and LOG_REQUEST_DATA over the files of one folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from firmware_py.ground.system import Arrival, Handler, System
+
+_PIECE = 90
+_PIECES_AT_ONCE = 40
+"""Pieces sent in one round, so that telemetry keeps its place in the queue."""
+_MOST_LOGS = 100
+_SUFFIXES = (".mcap", ".log")
+
+
+@dataclass(slots=True)
+class _Transfer:
+    arrival: Arrival
+    number: int
+    path: Path
+    at: int
+    left: int
+
+
+class LogService:
+    """The logs of one process, oldest first, numbered from 1."""
+
+    def __init__(self, system: System, folder: Path | None) -> None:
+        self._system, self._folder = system, folder
+        self._transfer: _Transfer | None = None
+        self._files: list[Path] = []
+
+    def handlers(self) -> dict[str, Handler]:
+        """By message name."""
+        return {
+            "LOG_REQUEST_LIST": self._list,
+            "LOG_REQUEST_DATA": self._data,
+            "LOG_REQUEST_END": self._end,
+            "LOG_ERASE": self._erase,
+        }
+
+    def step(self) -> None:
+        """Send the next pieces of what is being fetched."""
+        t = self._transfer
+        if t is None:
+            return
+        try:
+            with t.path.open("rb") as file:
+                file.seek(t.at)
+                data = file.read(min(t.left, _PIECE * _PIECES_AT_ONCE))
+        except OSError:
+            data = b""
+        for start in range(0, len(data), _PIECE):
+            self._piece(t, data[start : start + _PIECE])
+        if not data or t.left <= 0:
+            if t.left > 0:
+                self._piece(t, b"")  # the end of the file, as the protocol tells it
+            self._transfer = None
+
+    def _piece(self, t: _Transfer, data: bytes) -> None:
+        values = {"id": t.number, "ofs": t.at, "count": len(data), "data": tuple(data)}
+        self._system.send(t.arrival.channel, "LOG_DATA", values)
+        t.at += len(data)
+        t.left -= len(data)
+
+    def _list(self, arrival: Arrival) -> None:
+        self._files = self._find()
+        first, last = max(arrival.message["start"], 1), min(arrival.message["end"], len(self._files))
+        if not self._files:
+            self._system.send(arrival.channel, "LOG_ENTRY", {})
+        for number in range(first, last + 1):
+            try:
+                status = self._files[number - 1].stat()
+            except OSError:
+                continue
+            values = {
+                "id": number, "num_logs": len(self._files), "last_log_num": len(self._files),
+                "time_utc": int(status.st_mtime), "size": status.st_size,
+            }  # fmt: skip
+            self._system.send(arrival.channel, "LOG_ENTRY", values)
+
+    def _data(self, arrival: Arrival) -> None:
+        number = arrival.message["id"]
+        if not self._files:
+            self._files = self._find()
+        if number in range(1, len(self._files) + 1):
+            path = self._files[number - 1]
+            self._transfer = _Transfer(arrival, number, path, arrival.message["ofs"], arrival.message["count"])
+
+    def _end(self, arrival: Arrival) -> None:
+        self._transfer = None
+
+    def _erase(self, arrival: Arrival) -> None:
+        self._system.say(4, "logs are not erased from a ground station")
+
+    def _find(self) -> list[Path]:
+        if self._folder is None:
+            return []
+        try:
+            found = [path for path in self._folder.rglob("*") if path.suffix in _SUFFIXES and path.is_file()]
+            return sorted(found, key=lambda path: path.stat().st_mtime)[-_MOST_LOGS:]
+        except OSError:
+            return []

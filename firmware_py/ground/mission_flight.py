@@ -1,0 +1,250 @@
+"""Missions in the water: from items to legs, a plan asked of whoever can plan, and where on it the body is.
+
+Planning takes a second and happens elsewhere: a PlanJob goes out, a Plan comes back, and the body tracks it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core.setpoint import Trajectory
+from firmware_py.core.types import Action, Event, Mode
+from firmware_py.description.parameters import Parameters
+from firmware_py.ground.mission_items import LOITER_UNLIMITED, Item, MissionError, flight_order
+from firmware_py.ground.system import NS_PER_S, System
+
+NONE, READY, ACTIVE, PAUSED, DONE = 1, 2, 3, 4, 5
+"""MISSION_STATE."""
+_SETTLE_TICKS = 3
+"""Ticks from asking for a hold to reading where it is held."""
+_REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
+_INFORMATION, _WARNING = 6, 4
+_GO_TO = -1
+"""Sequence number of a leg that belongs to no mission."""
+
+
+class Leg(NamedTuple):
+    """A place to go to."""
+
+    sequence: int
+    p_wb: np.ndarray
+    yaw: float | None
+    """rad; None: as before."""
+    hold_s: float
+    """How long to stay; above 0 it stops there."""
+    speed_m_s: float
+
+
+class PlanJob(NamedTuple):
+    """What is to be planned."""
+
+    body: int
+    serial: int
+    p_wb: np.ndarray
+    q_wb: np.ndarray
+    legs: tuple[Leg, ...]
+    acceleration: float
+    corridor_m: float
+
+
+class Plan(NamedTuple):
+    """A planned flight; `arrivals_s` says when each leg's place is reached."""
+
+    serial: int
+    trajectory: Trajectory | None
+    arrivals_s: tuple[float, ...]
+    reason: str = ""
+    """Why there is none."""
+
+
+@dataclass(slots=True)
+class _Flight:
+    """Legs under way."""
+
+    legs: tuple[Leg, ...]
+    arrivals_s: tuple[float, ...] = ()
+    started_ns: int | None = None
+    reached: int = 0
+
+
+class MissionFlight:
+    """The mission of one body."""
+
+    def __init__(self, system: System, parameters: Callable[[], Parameters]) -> None:
+        self._system, self._parameters = system, parameters
+        self.items: tuple[Item, ...] = ()
+        self.jobs: list[PlanJob] = []
+        """To be planned; whoever plans takes them."""
+        self._serial = 0
+        self._flight: _Flight | None = None
+        self._plan_at_tick: int | None = None
+        self._speed: float | None = None
+        self._repeat: list[tuple[int, int]] = []
+
+    # ------------------------------------------------------------ what is asked
+
+    def replace(self, items: tuple[Item, ...]) -> None:
+        """A new mission. What flies goes on."""
+        self.items = items
+        p = self._system.subject.progress
+        p.total, p.current = len(items), min(self._first, max(len(items) - 1, 0))
+        if p.state != ACTIVE:
+            p.state = READY if items else NONE
+
+    def start(self, first: int | None) -> str:
+        """Fly from item `first`, or go on where it stopped. Returns why not, or nothing."""
+        s = self._system.subject
+        if not self.items:
+            return "there is none"
+        if not s.armed:
+            return "the vehicle is disarmed"
+        if first is None and s.progress.state == ACTIVE:
+            return ""
+        if first is None:
+            first = s.progress.current if s.progress.state == PAUSED else self._first
+        try:
+            legs = self._legs(max(first, self._first))
+        except MissionError as error:
+            return str(error)
+        if not legs:
+            return "nothing is left to fly"
+        s.progress.state, s.progress.current = ACTIVE, legs[0].sequence
+        self._begin(legs)
+        return ""
+
+    def jump(self, index: int) -> str:
+        """Go on at item `index`. Returns why not, or nothing."""
+        if index not in range(len(self.items)):
+            return f"item {index} of {len(self.items)} does not exist"
+        p = self._system.subject.progress
+        if p.state == ACTIVE:
+            return self.start(index)
+        p.current, p.state = index, PAUSED
+        return ""
+
+    def set_speed(self, speed_m_s: float) -> bool:
+        """Speed of what is planned from now on; -1: as the parameter says."""
+        if speed_m_s != -1 and not 0.01 <= speed_m_s <= 2.0:
+            return False
+        self._speed = None if speed_m_s == -1 else speed_m_s
+        return True
+
+    def go_to(self, latitude_deg: float, longitude_deg: float, altitude_m: float, yaw: float) -> str:
+        """Fly to one place. Returns why not, or nothing."""
+        s = self._system.subject
+        if not s.armed:
+            return "the vehicle is disarmed"
+        place = s.origin.local(latitude_deg, longitude_deg, altitude_m)
+        if s.progress.state == ACTIVE:
+            s.progress.state = PAUSED
+        turned = yaw if math.isfinite(yaw) else None
+        self._begin((Leg(_GO_TO, place, turned, 0.0, self._cruise),))
+        return ""
+
+    # ------------------------------------------------------------ what happens
+
+    def planned(self, plan: Plan) -> None:
+        """A plan came back."""
+        if plan.serial != self._serial or self._flight is None:
+            return
+        if plan.trajectory is None:
+            self._system.say(_WARNING, f"mission refused: {plan.reason}")
+            self._end(PAUSED)
+            return
+        self._flight.arrivals_s = plan.arrivals_s
+        self._system.ask(Action.TRACK, plan.trajectory)
+
+    def hear(self, event: Event) -> None:
+        """A refusal ends the flight."""
+        if event.text.startswith("TRACK refused") and self._flight is not None and self._flight.started_ns is None:
+            self._end(PAUSED)
+
+    def step(self, time_ns: int) -> None:
+        """Follow the body along its legs."""
+        self._ask_for_plan()
+        flight, s = self._flight, self._system.subject
+        if flight is not None and flight.arrivals_s:
+            tracking = s.armed and s.picture.mode(s.body) == Mode.AUTO
+            if tracking and flight.started_ns is None:
+                flight.started_ns = time_ns
+            if flight.started_ns is not None:
+                self._advance(flight, time_ns)
+                if not tracking and self._flight is flight:
+                    self._end(PAUSED)
+        elif flight is not None and not s.armed:
+            self._end(PAUSED)
+        self._tell_again(time_ns)
+
+    def _ask_for_plan(self) -> None:
+        s = self._system.subject
+        if self._plan_at_tick is None or s.picture.ticks < self._plan_at_tick or self._flight is None:
+            return
+        self._plan_at_tick = None
+        at, ground = s.record.setpoint, self._parameters().ground
+        self._serial += 1
+        self.jobs.append(
+            PlanJob(
+                s.body, self._serial, at.p_wb, at.q_wb, self._flight.legs, ground.mission_acceleration,
+                ground.mission_corridor_m,
+            )
+        )  # fmt: skip
+
+    def _advance(self, flight: _Flight, time_ns: int) -> None:
+        assert flight.started_ns is not None
+        p, t = self._system.subject.progress, (time_ns - flight.started_ns) / NS_PER_S
+        while flight.reached < len(flight.legs) and t >= flight.arrivals_s[flight.reached]:
+            sequence = flight.legs[flight.reached].sequence
+            flight.reached += 1
+            if sequence != _GO_TO:
+                self._repeat = [(sequence, time_ns + n * _REACHED_EVERY_NS) for n in range(_REACHED_REPEATS)]
+                if flight.reached < len(flight.legs):
+                    p.current = flight.legs[flight.reached].sequence
+        last = flight.legs[-1]
+        if flight.reached == len(flight.legs) and t >= flight.arrivals_s[-1] + last.hold_s:
+            if last.sequence != _GO_TO:
+                self._system.say(_INFORMATION, "mission complete")
+            self._end(DONE)
+
+    def _tell_again(self, time_ns: int) -> None:
+        while self._repeat and self._repeat[0][1] <= time_ns:
+            self._system.broadcast("MISSION_ITEM_REACHED", {"seq": self._repeat.pop(0)[0]})
+
+    def _begin(self, legs: Sequence[Leg]) -> None:
+        s = self._system.subject
+        self._flight = _Flight(tuple(legs))
+        self._serial += 1  # a plan that is still being made is no longer wanted
+        self._system.ask(Action.SET_MODE, Mode.POSHOLD)
+        self._plan_at_tick = s.picture.ticks + _SETTLE_TICKS
+
+    def _end(self, state: int) -> None:
+        flight, self._flight, self._plan_at_tick = self._flight, None, None
+        if flight is not None and flight.legs[0].sequence != _GO_TO:
+            self._system.subject.progress.state = state
+
+    @property
+    def _first(self) -> int:
+        return 1 if self._system.subject.identity.mission_has_home else 0
+
+    @property
+    def _cruise(self) -> float:
+        return self._parameters().ground.mission_speed_m_s if self._speed is None else self._speed
+
+    def _legs(self, first: int) -> tuple[Leg, ...]:
+        origin, speed = self._system.subject.origin, self._cruise
+        legs = []
+        for item in flight_order(self.items, first):
+            if item.speed_m_s is not None:
+                speed = item.speed_m_s if item.speed_m_s > 0 else self._cruise
+            place = item.place(origin)
+            if place is not None:
+                legs.append(Leg(item.sequence, place, item.yaw, item.hold_s, speed))
+            elif legs and item.delay_s > 0:
+                legs[-1] = legs[-1]._replace(hold_s=legs[-1].hold_s + item.delay_s)
+            if item.command == LOITER_UNLIMITED:
+                break
+        return tuple(legs)

@@ -1,0 +1,138 @@
+"""Mission items as values: which commands and frames are flown, and in which order. Geodetic frames only.
+
+QGroundControl scales LOCAL_NED wrongly, so items in it are refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.ground.dialect import Message
+from firmware_py.ground.geodesy import Origin
+
+WAYPOINT, LOITER_UNLIMITED, LOITER_TIME, LAST_SPLINE, DELAY, JUMP, CHANGE_SPEED = 16, 17, 19, 82, 93, 177, 178
+PLACES = (WAYPOINT, LOITER_UNLIMITED, LOITER_TIME, LAST_SPLINE)
+_COMMANDS = (*PLACES, DELAY, JUMP, CHANGE_SPEED)
+_GLOBAL, _RELATIVE, _MISSION_FRAME = (0, 5), (3, 6), 2
+"""MAV_FRAME of absolute and relative altitude, and of items that have no place."""
+UNSUPPORTED_FRAME, UNSUPPORTED, INVALID_1, INVALID_X, INVALID_Z = 2, 3, 6, 10, 12
+"""MAV_MISSION_RESULT; the invalid parameters count on from INVALID_1."""
+_MOST_STEPS = 1000
+_LONGEST_S = 86_400.0
+
+
+class MissionError(ValueError):
+    """A mission cannot be flown; one line."""
+
+
+class Item(NamedTuple):
+    """One item, as it came."""
+
+    sequence: int
+    command: int
+    frame: int
+    parameters: tuple[float, float, float, float]
+    x: int
+    y: int
+    """1e-7 deg."""
+    z: float
+    autocontinue: int = 1
+
+    @property
+    def is_place(self) -> bool:
+        """Whether it is flown to."""
+        return self.command in PLACES
+
+    @property
+    def yaw(self) -> float | None:
+        """rad, or None."""
+        return math.radians(self.parameters[3]) if math.isfinite(self.parameters[3]) else None
+
+    @property
+    def hold_s(self) -> float:
+        """Time at the place."""
+        if self.command in (WAYPOINT, LOITER_TIME, LAST_SPLINE) and math.isfinite(self.parameters[0]):
+            return self.parameters[0]
+        return 0.0
+
+    @property
+    def delay_s(self) -> float:
+        """Time that a delay takes."""
+        return self.parameters[0] if self.command == DELAY else 0.0
+
+    @property
+    def speed_m_s(self) -> float | None:
+        """What a change of speed asks for; 0 or less: the default."""
+        if self.command != CHANGE_SPEED or not math.isfinite(self.parameters[1]):
+            return None
+        return self.parameters[1]
+
+    def place(self, origin: Origin) -> np.ndarray | None:
+        """(3,) NED, m; None for an item without a place."""
+        if not self.is_place:
+            return None
+        altitude = self.z + (origin.altitude_m if self.frame in _RELATIVE else 0.0)
+        return origin.local(self.x * 1e-7, self.y * 1e-7, altitude)
+
+
+def item_of(message: Message) -> tuple[Item, int]:
+    """The item of a MISSION_ITEM_INT or MISSION_ITEM, and the MAV_MISSION_RESULT that says what is wrong with it (0: nothing)."""
+    m = message
+    degrees = m.name == "MISSION_ITEM"
+    x, y = m["x"], m["y"]
+    if degrees:
+        x, y = (round(v * 1e7) if math.isfinite(v) and abs(v) <= 180 else 2**31 - 1 for v in (x, y))
+    parameters = (m["param1"], m["param2"], m["param3"], m["param4"])
+    item = Item(m["seq"], m["command"], m["frame"], parameters, x, y, m["z"], m["autocontinue"])
+    return item, _fault(item)
+
+
+def _fault(item: Item) -> int:
+    if item.command not in _COMMANDS:
+        return UNSUPPORTED
+    if item.is_place:
+        if item.frame not in (*_GLOBAL, *_RELATIVE):
+            return UNSUPPORTED_FRAME
+        if abs(item.x) > 900_000_000 or abs(item.y) > 1_800_000_000:
+            return INVALID_X
+        if not math.isfinite(item.z) or abs(item.z) > 11_000:
+            return INVALID_Z
+        if math.isfinite(item.parameters[0]) and not 0 <= item.parameters[0] <= _LONGEST_S:
+            return INVALID_1
+        return 0
+    needed = {DELAY: (0,), JUMP: (0, 1), CHANGE_SPEED: (1,)}[item.command]
+    for index in needed:
+        value = item.parameters[index]
+        if not math.isfinite(value) or abs(value) > _LONGEST_S:
+            return INVALID_1 + index
+    return INVALID_1 if item.command == DELAY and item.parameters[0] < 0 else 0
+
+
+def flight_order(items: Sequence[Item], first: int) -> Iterator[Item]:
+    """The items as they are passed from `first` on, jumps followed.
+
+    Raises:
+        MissionError: it never ends, or a jump leads nowhere.
+    """
+    left = {item.sequence: int(item.parameters[1]) for item in items if item.command == JUMP}
+    at, steps = first, 0
+    while at < len(items):
+        steps += 1
+        if steps > _MOST_STEPS:
+            raise MissionError(f"it has more than {_MOST_STEPS} steps")
+        item = items[at]
+        if item.command != JUMP:
+            yield item
+            at += 1
+            continue
+        target = int(item.parameters[0])
+        if target not in range(len(items)):
+            raise MissionError(f"item {at} jumps to item {target}, which does not exist")
+        if left[item.sequence] < 0:
+            raise MissionError(f"item {at} jumps for ever")
+        at = target if left[item.sequence] > 0 else at + 1
+        left[item.sequence] -= left[item.sequence] > 0

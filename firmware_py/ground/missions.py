@@ -1,0 +1,172 @@
+"""The mission protocol: up, down, clear, set current. A transfer that breaks off leaves the old mission as it was.
+
+Source: MAVLink developer guide, "Mission Protocol". The vehicle asks for each item, and asks again when none comes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from firmware_py.ground.mission_flight import MissionFlight
+from firmware_py.ground.mission_items import CHANGE_SPEED, DELAY, JUMP, Item, item_of
+from firmware_py.ground.system import Arrival, Handler, System
+
+MOST_ITEMS = 500
+_MISSION = 0
+_ACCEPTED, _ERROR, _UNSUPPORTED, _NO_SPACE, _INVALID_SEQUENCE, _DENIED, _CANCELLED = 0, 1, 3, 4, 13, 14, 15
+_ASK_AGAIN_NS, _MOST_ASKED = 250_000_000, 20
+_NO_PLACE_FRAME = 2
+_WARNING = 4
+
+
+@dataclass(slots=True)
+class _Upload:
+    """A mission that is coming in."""
+
+    arrival: Arrival
+    count: int
+    kind: int
+    items: list[Item] = field(default_factory=list)
+    asked_ns: int = 0
+    asked: int = 0
+
+
+class MissionService:
+    """The transfers of one system."""
+
+    def __init__(self, system: System, flight: MissionFlight) -> None:
+        self._system, self._flight = system, flight
+        self._upload: _Upload | None = None
+
+    def handlers(self) -> dict[str, Handler]:
+        """By message name."""
+        return {
+            "MISSION_COUNT": self._count,
+            "MISSION_ITEM_INT": self._item,
+            "MISSION_ITEM": self._item,
+            "MISSION_REQUEST_LIST": self._list,
+            "MISSION_REQUEST_INT": self._request,
+            "MISSION_REQUEST": self._request,
+            "MISSION_ACK": self._acknowledged,
+            "MISSION_CLEAR_ALL": self._clear,
+            "MISSION_SET_CURRENT": self._set_current,
+        }
+
+    def step(self, time_ns: int) -> None:
+        """Ask again for an item that did not come."""
+        upload = self._upload
+        if upload is None or time_ns - upload.asked_ns < _ASK_AGAIN_NS:
+            return
+        if upload.asked >= _MOST_ASKED:
+            self._upload = None
+            self._system.say(_WARNING, "mission transfer broke off: the old mission stays")
+            self._acknowledge(upload.arrival, _CANCELLED, upload.kind)
+        else:
+            self._ask(upload, time_ns)
+
+    # ------------------------------------------------------------ up
+
+    def _count(self, arrival: Arrival) -> None:
+        count, kind = arrival.message["count"], arrival.message["mission_type"]
+        if kind != _MISSION:  # fences and rally points are not kept; none of them is fine
+            self._acknowledge(arrival, _UNSUPPORTED if count else _ACCEPTED, kind)
+            return
+        if count > MOST_ITEMS:
+            self._acknowledge(arrival, _NO_SPACE, kind)
+            return
+        if self._upload is not None and not _same(self._upload.arrival, arrival):
+            self._acknowledge(arrival, _DENIED, kind)
+            return
+        if count == 0:
+            self._upload = None
+            self._flight.replace(())
+            self._acknowledge(arrival, _ACCEPTED, kind)
+            return
+        self._upload = _Upload(arrival, count, kind)
+        self._ask(self._upload, arrival.time_ns)
+
+    def _ask(self, upload: _Upload, time_ns: int) -> None:
+        upload.asked, upload.asked_ns = upload.asked + 1, time_ns
+        values = {"seq": len(upload.items), "mission_type": upload.kind, **upload.arrival.sender}
+        self._system.send(upload.arrival.channel, "MISSION_REQUEST_INT", values)
+
+    def _item(self, arrival: Arrival) -> None:
+        upload = self._upload
+        if upload is None or not _same(upload.arrival, arrival) or arrival.message["mission_type"] != upload.kind:
+            return
+        sequence = arrival.message["seq"]
+        if sequence != len(upload.items):
+            return  # it came twice, or one is missing: that one is asked for again
+        item, fault = item_of(arrival.message)
+        if fault:
+            self._upload = None
+            self._system.say(_WARNING, f"mission refused: item {sequence}, command {item.command}, frame {item.frame}")
+            self._acknowledge(arrival, fault, upload.kind)
+            return
+        upload.items.append(item)
+        upload.asked = 0
+        if len(upload.items) < upload.count:
+            self._ask(upload, arrival.time_ns)
+            return
+        self._upload = None
+        self._flight.replace(tuple(upload.items))
+        self._acknowledge(arrival, _ACCEPTED, upload.kind)
+
+    def _clear(self, arrival: Arrival) -> None:
+        kind = arrival.message["mission_type"]
+        if kind in (_MISSION, 255):
+            self._upload = None
+            self._flight.replace(())
+        self._acknowledge(arrival, _ACCEPTED, kind)
+
+    def _acknowledged(self, arrival: Arrival) -> None:
+        """Of a download: nothing to do. During an upload the client gives up."""
+        if self._upload is not None and _same(self._upload.arrival, arrival) and arrival.message["type"] != _ACCEPTED:
+            self._upload = None
+
+    # ------------------------------------------------------------ down
+
+    def _list(self, arrival: Arrival) -> None:
+        kind = arrival.message["mission_type"]
+        count = len(self._flight.items) if kind == _MISSION else 0
+        values = {"count": count, "mission_type": kind, **arrival.sender}
+        self._system.send(arrival.channel, "MISSION_COUNT", values)
+
+    def _request(self, arrival: Arrival) -> None:
+        sequence, kind = arrival.message["seq"], arrival.message["mission_type"]
+        if kind != _MISSION or sequence not in range(len(self._flight.items)):
+            self._acknowledge(arrival, _INVALID_SEQUENCE, kind)
+            return
+        item = self._flight.items[sequence]
+        whole = arrival.message.name == "MISSION_REQUEST_INT"
+        values = {
+            "seq": sequence, "command": item.command, "frame": _sent_frame(item, whole), "autocontinue": item.autocontinue,
+            "current": int(sequence == self._system.subject.progress.current),
+            **{f"param{i + 1}": value for i, value in enumerate(item.parameters)},
+            "x": item.x if whole or not item.is_place else item.x * 1e-7,
+            "y": item.y if whole or not item.is_place else item.y * 1e-7,
+            "z": item.z, "mission_type": kind, **arrival.sender,
+        }  # fmt: skip
+        self._system.send(arrival.channel, "MISSION_ITEM_INT" if whole else "MISSION_ITEM", values)
+
+    def _set_current(self, arrival: Arrival) -> None:
+        reason = self._flight.jump(arrival.message["seq"])
+        if reason:
+            self._system.say(_WARNING, f"mission refused: {reason}")
+
+    def _acknowledge(self, arrival: Arrival, result: int, kind: int) -> None:
+        values = {"type": result, "mission_type": kind, **arrival.sender}
+        self._system.send(arrival.channel, "MISSION_ACK", values)
+
+
+def _sent_frame(item: Item, whole: bool) -> int:
+    """The item's frame in the INT form or not, as the message has it."""
+    if item.command in (DELAY, JUMP, CHANGE_SPEED):
+        return item.frame
+    pairs = {0: 5, 3: 6} if whole else {5: 0, 6: 3}
+    return pairs.get(item.frame, item.frame)
+
+
+def _same(a: Arrival, b: Arrival) -> bool:
+    """Whether both came from the same client."""
+    return (a.message.system, a.message.component) == (b.message.system, b.message.component)

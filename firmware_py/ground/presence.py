@@ -1,0 +1,104 @@
+"""Who is there: the ground station that must not be lost, time and echo, what the vehicle can do, and the signing key."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from firmware_py.core.types import Action
+from firmware_py.description.parameters import Parameters
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.identity import SETTABLE
+from firmware_py.ground.signing import KEY_BYTES, Signing
+from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
+
+TYPE_GROUND_STATION = 6
+Station = tuple[int, int, int]
+"""System id, component id, MAV_TYPE."""
+_INFORMATION, _WARNING = 6, 4
+CAPABILITIES = 0x2 | 0x4 | 0x8 | 0x80 | 0x100 | 0x800 | 0x2000
+"""MAV_PROTOCOL_CAPABILITY: float parameters 2, MISSION_INT 4, COMMAND_INT 8, set-point of attitude 64 and of local position 128,
+parameters C-cast 0x20000 is not claimed; FLIGHT_TERMINATION 0x800, MAVLINK2 0x2000."""
+VERSION = 0x00010000
+"""0.1.0, as FIRMWARE_VERSION_TYPE packs it."""
+
+
+class Presence:
+    """The watch over one ground station, for one system."""
+
+    def __init__(self, system: System, config: GroundConfig, parameters: Callable[[], Parameters], signing: Signing) -> None:
+        self._system, self._config, self._parameters, self._signing = system, config, parameters, signing
+        self.watched: Station | None = None
+        self._heard_ns = 0
+
+    def handlers(self) -> dict[str, Handler]:
+        """By message name."""
+        return {
+            "HEARTBEAT": self._heartbeat,
+            "TIMESYNC": self._timesync,
+            "PING": self._ping,
+            "SETUP_SIGNING": self._setup_signing,
+        }
+
+    def _heartbeat(self, arrival: Arrival) -> None:
+        """A heartbeat counts when system, component and type are exactly those that are watched."""
+        m = arrival.message
+        station: Station = (m.system, m.component, m["type"])
+        if m["type"] != TYPE_GROUND_STATION:
+            return
+        if self._config.watch_system and m.system != self._config.watch_system:
+            return
+        if self._config.watch_component and m.component != self._config.watch_component:
+            return
+        patience_ns = self._parameters().ground.watch_s * NS_PER_S
+        if self.watched is None or arrival.time_ns - self._heard_ns > patience_ns:
+            if self.watched != station:
+                self._system.say(_INFORMATION, f"ground station {m.system}/{m.component} is watched")
+            self.watched = station
+        if self.watched == station:
+            self._heard_ns = arrival.time_ns
+            self._system.ask(Action.GROUND_ALIVE)
+
+    def _timesync(self, arrival: Arrival) -> None:
+        if arrival.message["tc1"] == 0:
+            values = {"tc1": arrival.time_ns, "ts1": arrival.message["ts1"]}
+            self._system.send(arrival.channel, "TIMESYNC", values)
+
+    def _ping(self, arrival: Arrival) -> None:
+        m = arrival.message
+        if m["target_system"] == 0:
+            values = {"time_usec": m["time_usec"], "seq": m["seq"], **arrival.sender}
+            self._system.send(arrival.channel, "PING", values)
+
+    def _setup_signing(self, arrival: Arrival) -> None:
+        """Only disarmed, and on a link that is trusted. It is never forwarded and never answered."""
+        m = arrival.message
+        if self._system.subject.picture.any_armed or not arrival.trusted:
+            self._system.say(_WARNING, "signing refused: only disarmed, and on a trusted link")
+            return
+        key = bytes(m["secret_key"])
+        if len(key) == KEY_BYTES:
+            self._signing.adopt(key, m["initial_timestamp"])
+            self._system.say(_INFORMATION, "signing key set" if any(key) else "signing is off")
+
+    def autopilot_version(self, arrival: Arrival) -> bool:
+        """Answer to a request of AUTOPILOT_VERSION."""
+        values = {
+            "capabilities": CAPABILITIES | 0x40, "flight_sw_version": VERSION, "uid": self._system.body + 1,
+        }  # fmt: skip
+        self._system.send(arrival.channel, "AUTOPILOT_VERSION", values)
+        return True
+
+    def available_modes(self, arrival: Arrival) -> bool:
+        """Answer to a request of AVAILABLE_MODES: one mode by its number, or all of them for 0."""
+        index, count = arrival.message["index"], len(SETTABLE)
+        if index not in range(count + 1):
+            return False
+        for number in [index] if index else range(1, count + 1):
+            mode = SETTABLE[number - 1]
+            values = {
+                "number_modes": count, "mode_index": number, "standard_mode": 0,
+                "custom_mode": self._system.subject.identity.custom_mode(mode), "properties": 0,
+                "mode_name": mode.name.replace("_", " ").title(),
+            }  # fmt: skip
+            self._system.send(arrival.channel, "AVAILABLE_MODES", values)
+        return True

@@ -1,0 +1,210 @@
+"""The ground side without its clock and its sockets: bytes in, requests and frames out; the fleet's telemetry. Pure, time passed in."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from firmware_py.core.body import Body
+from firmware_py.core.types import DockRequest, Inputs, Outputs, Request
+from firmware_py.description.fleet import Fleet
+from firmware_py.description.parameters import Parameters
+from firmware_py.ground.commands import CommandService
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.dialect import load_dialect
+from firmware_py.ground.geodesy import Origin
+from firmware_py.ground.logs import LogService
+from firmware_py.ground.mission_flight import MissionFlight, Plan, PlanJob
+from firmware_py.ground.missions import MissionService
+from firmware_py.ground.outbox import Outbox, Outgoing
+from firmware_py.ground.parameters import ParameterService, ParameterStore
+from firmware_py.ground.picture import Picture
+from firmware_py.ground.presence import Presence
+from firmware_py.ground.signing import Signing
+from firmware_py.ground.steering import Steering
+from firmware_py.ground.system import Arrival, System
+from firmware_py.ground.telemetry import Subject
+from firmware_py.ground.wire import Framer, Packet
+
+_SYSTEMS = 256
+_NEVER_FORWARDED = ("SETUP_SIGNING", "RADIO_STATUS")
+
+
+class Services:
+    """What one system offers."""
+
+    def __init__(self, station: GroundStation, system: System) -> None:
+        config, store = station.config, station.store
+        self.system = system
+        self.flight = MissionFlight(system, lambda: store.values)
+        self.missions = MissionService(system, self.flight)
+        self.steering = Steering(system, lambda: store.values, _dock_of(config))
+        self.presence = Presence(system, config, lambda: store.values, station.signing)
+        self.logs = LogService(system, Path(config.logs) if config.logs else None)
+        self.parameters = ParameterService(system, store, station.present)
+        extra = {
+            "AUTOPILOT_VERSION": self.presence.autopilot_version,
+            "AVAILABLE_MODES": self.presence.available_modes,
+        }
+        self.commands = CommandService(system, self.flight, self.steering, extra)
+        parts = (self.commands, self.parameters, self.missions, self.steering, self.presence, self.logs)
+        self.handlers = {name: handler for part in parts for name, handler in part.handlers().items()}
+
+    def step(self, time_ns: int) -> None:
+        """Move on what takes longer than one message."""
+        self.commands.step(time_ns)
+        self.parameters.step()
+        self.missions.step(time_ns)
+        self.flight.step(time_ns)
+        self.steering.step(time_ns)
+        self.logs.step()
+
+
+class GroundStation:
+    """All systems of one fleet."""
+
+    def __init__(self, config: GroundConfig, fleet: Fleet, parameters: Parameters, signing: Signing | None = None) -> None:
+        """Raises DescriptionError when the stored parameters are wrong."""
+        self.config = config
+        self.signing = signing if signing is not None else Signing()
+        self.store = ParameterStore(parameters, config.parameter_file)
+        self.counts: Counter[str] = Counter()
+        self.picture = Picture(len(fleet.module), self.store.values.supervision)
+        self._dialect = load_dialect()
+        self._frames: list[Outgoing] = []
+        self._framers: dict[int, Framer] = {}
+        self._routes: dict[int, int] = {}
+        origin = Origin(fleet.latitude_deg, fleet.longitude_deg, fleet.altitude_m)
+        self.services: dict[int, Services] = {}
+        for body in range(len(fleet.module)):
+            number = config.first_system + body
+            outbox = Outbox(self._dialect, self.signing, number, self._frames)
+            self.services[number] = Services(self, System(Subject(body, self.picture, config.encoding, origin), outbox))
+
+    # ------------------------------------------------------------ in
+
+    def observe(self, inputs: Inputs, outputs: Outputs, bodies: Sequence[Body]) -> None:
+        """Take one tick in."""
+        self.picture.observe(inputs, outputs, bodies)
+        for event in outputs.events:
+            for services in self.services.values():
+                services.commands.hear(event)
+                services.flight.hear(event)
+        present = self.present()
+        if present:
+            while self.picture.events:
+                event = self.picture.events.popleft()
+                present[0].say(event.severity, event.text)
+        for services in self.services.values():
+            if services.system.body_is_known:
+                services.step(outputs.time_ns)
+
+    def join(self, channel: int, time_ns: int) -> None:
+        """A channel is there; it gets the default telemetry."""
+        for services in self.services.values():
+            services.system.add_channel(channel, time_ns)
+
+    def leave(self, channel: int) -> None:
+        """A channel is gone."""
+        self._framers.pop(channel, None)
+        self._routes = {system: at for system, at in self._routes.items() if at != channel}
+        for services in self.services.values():
+            services.system.remove_channel(channel)
+
+    def take(self, channel: int, data: bytes, time_ns: int, datagram: bool = True, trusted: bool = False) -> None:
+        """Bytes that came on a channel. Never raises on what is in them."""
+        framer = self._framers.get(channel)
+        if framer is None:
+            framer = self._framers[channel] = Framer(self._dialect, self.signing, self.counts)
+        for packet in framer.feed(data):
+            self._take_packet(packet, channel, time_ns, trusted)
+        if datagram:
+            framer.end()
+
+    def planned(self, body: int, plan: Plan) -> None:
+        """The plan of a job came back."""
+        self.services[self.config.first_system + body].flight.planned(plan)
+
+    # ------------------------------------------------------------ out
+
+    def present(self) -> list[System]:
+        """The systems that are there: one for each body."""
+        return [s.system for s in self.services.values() if s.system.body_is_known]
+
+    def requests(self) -> list[Request]:
+        """What is asked of the next tick since the last call."""
+        asked: list[Request] = []
+        for services in self.services.values():
+            asked += services.system.requests
+            services.system.requests.clear()
+        return asked
+
+    def jobs(self) -> list[PlanJob]:
+        """What is to be planned since the last call."""
+        jobs: list[PlanJob] = []
+        for services in self.services.values():
+            jobs += services.flight.jobs
+            services.flight.jobs.clear()
+        return jobs
+
+    def frames(self, time_ns: int) -> list[Outgoing]:
+        """What is to be sent now: telemetry that is due, and answers."""
+        for system in self.present():
+            system.stream(time_ns)
+        sent = list(self._frames)
+        self._frames.clear()
+        return sent
+
+    @property
+    def reboot_asked(self) -> bool:
+        """Whether a client wants the process started anew."""
+        return any(services.commands.reboot_asked for services in self.services.values())
+
+    def say(self, text: str) -> None:
+        """A warning to everybody."""
+        for system in self.present()[:1]:
+            system.say(4, text)
+
+    # ------------------------------------------------------------ routes
+
+    def _take_packet(self, packet: Packet, channel: int, time_ns: int, trusted: bool) -> None:
+        message = packet.message
+        if message.system in self.services or message.system == 0:
+            return  # our own echo, or nobody
+        if len(self._routes) < _SYSTEMS or message.system in self._routes:
+            self._routes[message.system] = channel
+        self.join(channel, time_ns)
+        target = message.values.get("target_system", message.values.get("target", 0))
+        arrival = Arrival(message, channel, time_ns, trusted)
+        if target not in self.services:
+            self._forward(packet, target, channel)
+        if target != 0 and target not in self.services:
+            return
+        component = message.values.get("target_component", 0)
+        if target and component not in (0, 1):
+            return
+        for number, services in self.services.items():
+            if target in (0, number) and services.system.body_is_known:
+                handler = services.handlers.get(message.name)
+                if handler is not None:
+                    handler(arrival)
+
+    def _forward(self, packet: Packet, target: int, channel: int) -> None:
+        """To whom it is for, where that system was heard; to everybody else what is for all."""
+        if packet.message.name in _NEVER_FORWARDED:
+            return
+        if target:
+            to = self._routes.get(target)
+            if to is not None and to != channel:
+                self._frames.append(Outgoing(to, packet.raw))
+            return
+        for other in set(self._routes.values()) - {channel}:
+            self._frames.append(Outgoing(other, packet.raw))
+
+
+def _dock_of(config: GroundConfig) -> DockRequest | None:
+    if not config.dock_button:
+        return None
+    module, face, target_module, target_face = config.dock_button
+    return DockRequest(module, face, target_module, target_face)

@@ -1,0 +1,224 @@
+"""Pilot and program at the stick: MANUAL_CONTROL, RC_CHANNELS_OVERRIDE, streamed set-points. They become requests; the core decides.
+
+MANUAL_CONTROL: x forward, y right, z up, r clockwise seen from above, s nose up, t right side down; all of +-1000, z by STICK_Z.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from firmware_py.core.rotations import from_euler, multiply, normalise, rotate, to_euler
+from firmware_py.core.types import Action, DockRequest, Mode, Setpoint, Sticks
+from firmware_py.description.parameters import Parameters
+from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
+
+_FULL, _MIDDLE_UP = 1000.0, 500.0
+_ABSENT = 0x7FFF
+_PWM_MIDDLE, _PWM_HALF, _PWM_LOW, _PWM_HIGH = 1500.0, 400.0, 800, 2200
+_FRAMES_WORLD, _FRAMES_BODY = (1, 7), (8, 9, 12)
+"""MAV_FRAME: LOCAL_NED, LOCAL_OFFSET_NED; BODY_NED, BODY_OFFSET_NED, BODY_FRD."""
+_FRAME_OFFSETS = (7, 8, 9)
+_NO_POSITION, _NO_VELOCITY, _NO_ACCELERATION, _NO_YAW, _NO_YAW_RATE = 0x007, 0x038, 0x1C0, 0x400, 0x800
+_WARNING, _NOTICE = 4, 5
+BUTTONS: tuple[str, ...] = (
+    "hold", "manual", "stabilize", "depth", "disarm", "", "arm", "estop", "clear_estop", "dock", "undock", "surface",
+)  # fmt: skip
+"""What each button of a joystick does, first to last."""
+_BUTTON_MODES = {
+    "hold": Mode.POSHOLD, "manual": Mode.MANUAL, "stabilize": Mode.STABILIZE, "depth": Mode.ALT_HOLD, "surface": Mode.SURFACE,
+}  # fmt: skip
+_BUTTON_ACTIONS = {
+    "arm": Action.ARM, "disarm": Action.DISARM, "estop": Action.ESTOP, "clear_estop": Action.CLEAR_ESTOP,
+    "dock": Action.DOCK, "undock": Action.UNDOCK,
+}  # fmt: skip
+
+
+class Steering:
+    """Sticks, buttons and set-points of one system."""
+
+    def __init__(
+        self, system: System, parameters: Callable[[], Parameters], dock: DockRequest | None, buttons: Sequence[str] = BUTTONS
+    ) -> None:
+        """`dock` is what the buttons `dock` and `undock` ask for."""
+        self._system, self._parameters, self._dock, self._buttons = system, parameters, dock, buttons
+        self._pressed = 0
+        self._sticks = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self._sticks_ns: int | None = None
+        self._setpoint_ns: int | None = None
+        self._setpoint: Setpoint | None = None
+
+    def handlers(self) -> dict[str, Handler]:
+        """By message name."""
+        return {
+            "MANUAL_CONTROL": self._manual,
+            "RC_CHANNELS_OVERRIDE": self._override,
+            "SET_POSITION_TARGET_LOCAL_NED": self._target,
+            "SET_ATTITUDE_TARGET": self._attitude_target,
+        }
+
+    def is_neutral(self, time_ns: int) -> bool:
+        """Whether nobody holds a stick."""
+        steering = self._parameters().steering
+        if self._sticks_ns is None or time_ns - self._sticks_ns > steering.stick_timeout_s * NS_PER_S:
+            return True
+        return max(map(abs, (*self._sticks.force, *self._sticks.moment))) <= steering.stick_dead
+
+    def has_setpoint(self, time_ns: int) -> bool:
+        """Whether set-points stream in."""
+        fresh_ns = self._parameters().ground.setpoint_fresh_s * NS_PER_S
+        return self._setpoint_ns is not None and time_ns - self._setpoint_ns <= fresh_ns
+
+    def step(self, time_ns: int) -> None:
+        """End guided mode when its set-points stay away."""
+        s = self._system.subject
+        s.neutral = self.is_neutral(time_ns)
+        guided = s.armed and s.picture.mode(s.body) == Mode.GUIDED
+        if guided and self._setpoint_ns is not None and not self.has_setpoint(time_ns):
+            self._setpoint_ns = None
+            self._system.ask(Action.SET_MODE, Mode.POSHOLD)
+            self._system.say(_WARNING, "set-points stay away: holding the place")
+
+    # ------------------------------------------------------------ pilot
+
+    def _manual(self, arrival: Arrival) -> None:
+        m = arrival.message
+        if m["target"] not in (0, self._system.outbox.system):
+            return
+        extensions = m["enabled_extensions"]
+        force = (_axis(m["x"]), _axis(m["y"]), -self._up(m["z"]))
+        moment = (
+            _axis(m["t"]) if extensions & 2 else 0.0,
+            _axis(m["s"]) if extensions & 1 else 0.0,
+            _axis(m["r"]),
+        )
+        self._steer(Sticks(force, moment), arrival.time_ns)
+        self._press(m["buttons"] | m["buttons2"] << 16)
+
+    def _up(self, z: float) -> float:
+        if z == _ABSENT:
+            return 0.0
+        if self._parameters().ground.stick_z == 1:
+            return _axis(z)
+        return min(max((z - _MIDDLE_UP) / _MIDDLE_UP, -1.0), 1.0)
+
+    def _override(self, arrival: Arrival) -> None:
+        """ArduSub's channels: 1 pitch, 2 roll, 3 up, 4 yaw, 5 forward, 6 right."""
+        m = arrival.message
+        pitch, roll, up, yaw, forward, right = (_channel(m[f"chan{i}_raw"]) for i in range(1, 7))
+        self._steer(Sticks((forward, right, -up), (roll, pitch, yaw)), arrival.time_ns)
+
+    def _steer(self, sticks: Sticks, time_ns: int) -> None:
+        self._sticks, self._sticks_ns = sticks, time_ns
+        self._system.ask(Action.STICKS, sticks)
+
+    def _press(self, buttons: int) -> None:
+        fresh = buttons & ~self._pressed
+        self._pressed = buttons
+        for number, name in enumerate(self._buttons):
+            if fresh >> number & 1:
+                self._do(name)
+
+    def _do(self, name: str) -> None:
+        if name in _BUTTON_MODES:
+            self._system.subject.mode_number = None
+            self._system.ask(Action.SET_MODE, _BUTTON_MODES[name])
+        elif name in ("dock", "undock"):
+            if self._dock is None:
+                self._system.say(_NOTICE, f"{name} refused: no faces are configured for the button")
+            else:
+                self._system.ask(_BUTTON_ACTIONS[name], self._dock)
+        elif name in _BUTTON_ACTIONS:
+            argument = False if name in ("arm", "disarm") else None
+            self._system.ask(_BUTTON_ACTIONS[name], argument)
+
+    # ------------------------------------------------------------ set-points
+
+    def _target(self, arrival: Arrival) -> None:
+        m = arrival.message
+        frame, mask = m["coordinate_frame"], m["type_mask"]
+        if frame not in (*_FRAMES_WORLD, *_FRAMES_BODY) or not self._system.body_is_known:
+            return
+        now = self._system.subject.record.setpoint
+        yaw_now = to_euler(now.q_wb)[2]
+        turn = from_euler(0.0, 0.0, yaw_now) if frame in _FRAMES_BODY else None
+        position = None if mask & _NO_POSITION == _NO_POSITION else _vector(m, "x", "y", "z")
+        velocity = None if mask & _NO_VELOCITY == _NO_VELOCITY else _vector(m, "vx", "vy", "vz")
+        acceleration = None if mask & _NO_ACCELERATION == _NO_ACCELERATION else _vector(m, "afx", "afy", "afz")
+        rate = 0.0 if mask & _NO_YAW_RATE else m["yaw_rate"]
+        yaw = None if mask & _NO_YAW else m["yaw"] + (yaw_now if turn is not None else 0.0)
+        values = [v for v in (position, velocity, acceleration) if v is not None]
+        if not all(np.all(np.isfinite(v)) for v in values) or not math.isfinite(rate) or not (yaw is None or math.isfinite(yaw)):
+            return
+        if position is None and velocity is None:
+            return
+        if turn is not None:
+            position, velocity, acceleration = (None if v is None else rotate(turn, v) for v in (position, velocity, acceleration))
+        if position is not None and frame in _FRAME_OFFSETS:
+            position = position + self._system.subject.record.estimate.p_wb
+        q_wb = self._attitude(now.q_wb, yaw, rate, arrival.time_ns)
+        p_wb = self._place(now.p_wb, position, velocity, arrival.time_ns)
+        zero = np.zeros(3)
+        setpoint = Setpoint(
+            p_wb, q_wb, zero if velocity is None else velocity, np.array([0.0, 0.0, rate]),
+            zero if acceleration is None else acceleration, zero,
+        )  # fmt: skip
+        self._stream(setpoint, arrival.time_ns)
+
+    def _place(self, now: np.ndarray, position: np.ndarray | None, velocity: np.ndarray | None, time_ns: int) -> np.ndarray:
+        """Where to be: as asked for, or further along a velocity that came without a place."""
+        if position is not None:
+            return np.ascontiguousarray(position)
+        assert velocity is not None
+        start, elapsed_s = self._before(time_ns)
+        return np.asarray((now if start is None else start.p_wb) + velocity * elapsed_s)
+
+    def _attitude(self, now: np.ndarray, yaw: float | None, rate: float, time_ns: int) -> np.ndarray:
+        """Level at the given yaw; without one as before, turned on by the rate."""
+        if yaw is not None:
+            return from_euler(0.0, 0.0, yaw)
+        start, elapsed_s = self._before(time_ns)
+        q = now if start is None else start.q_wb
+        return np.asarray(normalise(multiply(from_euler(0.0, 0.0, rate * elapsed_s), q)))
+
+    def _before(self, time_ns: int) -> tuple[Setpoint | None, float]:
+        """The set-point before, while they stream in guided mode, and its age, s."""
+        s = self._system.subject
+        if self._setpoint is None or not self.has_setpoint(time_ns) or s.picture.mode(s.body) != Mode.GUIDED or not s.armed:
+            return None, 0.0
+        assert self._setpoint_ns is not None
+        return self._setpoint, (time_ns - self._setpoint_ns) / NS_PER_S
+
+    def _attitude_target(self, arrival: Arrival) -> None:
+        """An attitude, held at the place where it is: the robot is omnidirectional."""
+        m = arrival.message
+        q = np.array(m["q"], dtype=float)
+        if m["type_mask"] & 0x80 or not np.all(np.isfinite(q)) or not 0.5 < float(np.linalg.norm(q)) < 2.0:
+            return
+        if not self._system.body_is_known:
+            return
+        start, _ = self._before(arrival.time_ns)
+        p_wb = (start or self._system.subject.record.setpoint).p_wb
+        zero = np.zeros(3)
+        self._stream(Setpoint(p_wb, np.asarray(normalise(q)), zero, zero, zero, zero), arrival.time_ns)
+
+    def _stream(self, setpoint: Setpoint, time_ns: int) -> None:
+        self._setpoint, self._setpoint_ns = setpoint, time_ns
+        self._system.ask(Action.SET_POINT, setpoint)
+
+
+def _axis(value: float) -> float:
+    return 0.0 if value == _ABSENT else min(max(value / _FULL, -1.0), 1.0)
+
+
+def _channel(pwm: int) -> float:
+    if not _PWM_LOW <= pwm <= _PWM_HIGH:
+        return 0.0  # 0 and 65535: not overridden
+    return min(max((pwm - _PWM_MIDDLE) / _PWM_HALF, -1.0), 1.0)
+
+
+def _vector(message: Any, *names: str) -> np.ndarray:
+    return np.array([message[name] for name in names], dtype=float)

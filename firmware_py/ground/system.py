@@ -1,0 +1,103 @@
+"""One MAVLink system: one body. What its services (commands, parameters, missions ...) share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from firmware_py.core.types import Action, Request
+from firmware_py.ground.dialect import Message
+from firmware_py.ground.outbox import Outbox, Rates
+from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS, Subject
+
+NS_PER_S = 1_000_000_000
+_TEXT = 50
+"""Characters of one STATUSTEXT."""
+
+
+class Arrival(NamedTuple):
+    """A message for this system."""
+
+    message: Message
+    channel: int
+    time_ns: int
+    trusted: bool
+    """Its link may set the key."""
+
+    @property
+    def sender(self) -> dict[str, int]:
+        """As the target of an answer."""
+        return {"target_system": self.message.system, "target_component": self.message.component}
+
+
+Handler = Callable[[Arrival], None]
+
+
+@dataclass(slots=True)
+class System:
+    """A body as clients see it."""
+
+    subject: Subject
+    outbox: Outbox
+    channels: dict[int, Rates] = field(default_factory=dict)
+    """Everybody who is there, with the rates that they want."""
+    requests: list[Request] = field(default_factory=list)
+    """For the next tick."""
+    _text_number: int = 0
+
+    @property
+    def body(self) -> int:
+        """Number of the body."""
+        return self.subject.body
+
+    @property
+    def body_is_known(self) -> bool:
+        """Whether a tick has told of it."""
+        return self.body in self.subject.picture.records
+
+    def name_of(self, number: int) -> str:
+        """Name of a message number; empty when there is none."""
+        return self.outbox.name_of(number)
+
+    def add_channel(self, channel: int, time_ns: int) -> None:
+        """Somebody came."""
+        if channel not in self.channels:
+            intervals = {name: round(NS_PER_S / hz) for name, hz in DEFAULT_HZ.items()}
+            self.channels[channel] = Rates(intervals, time_ns)
+
+    def remove_channel(self, channel: int) -> None:
+        """Somebody is gone."""
+        self.channels.pop(channel, None)
+        self.outbox.forget(channel)
+
+    def ask(self, action: Action, argument: Any = None) -> None:
+        """Put a request to the next tick."""
+        self.requests.append(Request(action, self.body, argument))
+
+    def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
+        """To one channel."""
+        self.outbox.send(channel, name, values)
+
+    def broadcast(self, name: str, values: Mapping[str, Any]) -> None:
+        """To everybody."""
+        for channel in self.channels:
+            self.outbox.send(channel, name, values)
+
+    def say(self, severity: int, text: str) -> None:
+        """STATUSTEXT to everybody; long texts go in pieces."""
+        pieces = [text[i : i + _TEXT] for i in range(0, len(text), _TEXT)] or [""]
+        self._text_number = self._text_number % 0xFFFF + 1
+        number = self._text_number if len(pieces) > 1 else 0
+        for i, piece in enumerate(pieces):
+            self.broadcast("STATUSTEXT", {"severity": severity, "text": piece, "id": number, "chunk_seq": i})
+
+    def stream(self, time_ns: int) -> None:
+        """Send what is due on every channel; each message is made once."""
+        made: dict[str, list[Mapping[str, Any]]] = {}
+        for channel, rates in self.channels.items():
+            for name in rates.due(time_ns):
+                if name not in made:
+                    made[name] = STREAMS[name](self.subject)
+                for values in made[name]:
+                    self.outbox.send(channel, name, values)

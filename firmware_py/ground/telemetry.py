@@ -1,0 +1,347 @@
+"""The messages that a system streams, each made from the picture of the last tick. World NED, body FRD as MAVLink has them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from firmware_py.core.rotations import rotate, to_euler
+from firmware_py.core.types import BodyRecord
+from firmware_py.description.vehicle import FACE_NAMES
+from firmware_py.ground.geodesy import Origin
+from firmware_py.ground.identity import TYPE_SUBMARINE, Identity, base_mode
+from firmware_py.ground.picture import ModulePicture, Picture
+
+Values = Mapping[str, Any]
+_NAN = math.nan
+_UNKNOWN_16, _UNKNOWN_BATTERY = 0xFFFF, -1
+_STATE_STANDBY, _STATE_ACTIVE, _STATE_EMERGENCY = 3, 4, 6
+_FRAME_LOCAL_NED, _FRAME_BODY_FRD = 1, 12
+_PWM_CENTRE, _PWM_HALF = 1500, 400
+_G = 9.80665
+
+
+@dataclass(slots=True)
+class Progress:
+    """Where a mission is; what MISSION_CURRENT says."""
+
+    current: int = 0
+    total: int = 0
+    state: int = 1
+    """MISSION_STATE: 1 no mission, 2 not started, 3 active, 4 paused, 5 complete."""
+
+
+@dataclass(slots=True)
+class Subject:
+    """Whose telemetry it is."""
+
+    body: int
+    picture: Picture
+    identity: Identity
+    origin: Origin
+    progress: Progress = field(default_factory=Progress)
+    boot_ns: int = 0
+    mode_number: int | None = None
+    """The client's own number of the present mode, where several name the same."""
+    neutral: bool = True
+    """Nobody holds a stick."""
+
+    @property
+    def record(self) -> BodyRecord:
+        """Of the last tick."""
+        return self.picture.records[self.body]
+
+    @property
+    def modules(self) -> Sequence[ModulePicture]:
+        """The body's own, in order."""
+        return [self.picture.modules[m] for m in self.picture.members(self.body)]
+
+    @property
+    def time_ms(self) -> int:
+        """Since start."""
+        return (self.picture.time_ns - self.boot_ns) // 1_000_000
+
+    @property
+    def time_us(self) -> int:
+        """Since start."""
+        return (self.picture.time_ns - self.boot_ns) // 1_000
+
+    @property
+    def v_w(self) -> np.ndarray:
+        """(3,) velocity of the centre of mass, world, m/s."""
+        e = self.record.estimate
+        return np.asarray(rotate(e.q_wb, np.ascontiguousarray(e.nu[:3])))
+
+    @property
+    def armed(self) -> bool:
+        """Whether thrusters may turn."""
+        return self.picture.is_armed(self.body)
+
+    @property
+    def custom_mode(self) -> int:
+        """As the identity has it."""
+        mode = self.picture.mode(self.body)
+        if self.mode_number in self.identity.numbers[mode]:
+            return int(self.mode_number)
+        return self.identity.custom_mode(mode)
+
+
+def heartbeat(s: Subject) -> list[Values]:
+    stopped = s.picture.is_stopped(s.body)
+    state = _STATE_EMERGENCY if stopped else _STATE_ACTIVE if s.armed else _STATE_STANDBY
+    mode = base_mode(s.picture.mode(s.body), s.armed)
+    return [{
+        "type": TYPE_SUBMARINE, "autopilot": s.identity.autopilot, "base_mode": mode, "custom_mode": s.custom_mode,
+        "system_status": state, "mavlink_version": 3,
+    }]  # fmt: skip
+
+
+SENSORS = {
+    "gyro": 0x01, "accel": 0x02, "pressure": 0x08, "vision": 0x80, "rate": 0x400, "attitude": 0x800, "yaw": 0x1000,
+    "depth": 0x2000, "position": 0x4000, "motors": 0x8000, "battery": 0x2000000, "prearm": 0x10000000,
+}  # fmt: skip
+"""MAV_SYS_STATUS_SENSOR."""
+_SENSOR_FRESH_NS = 500_000_000
+
+
+def sys_status(s: Subject) -> list[Values]:
+    now = s.picture.time_ns
+    fresh = s.picture.pose_is_fresh(s.body)
+    modules = s.modules
+    healthy = {
+        "gyro": all(now - m.gyro_ns < _SENSOR_FRESH_NS for m in modules),
+        "accel": all(now - m.accel_ns < _SENSOR_FRESH_NS for m in modules),
+        "pressure": any(now - m.pressure_ns < _SENSOR_FRESH_NS for m in modules),
+        "vision": fresh,
+        "rate": True,
+        "attitude": fresh,
+        "yaw": fresh,
+        "depth": fresh,
+        "position": fresh,
+        "motors": all(now - m.answered_ns < _SENSOR_FRESH_NS for m in modules),
+        "battery": not math.isnan(modules[0].voltage_v),
+        "prearm": s.armed or (s.neutral and s.picture.may_arm(s.body)),
+    }
+    known = sum(SENSORS.values())
+    return [{
+        "onboard_control_sensors_present": known, "onboard_control_sensors_enabled": known,
+        "onboard_control_sensors_health": sum(SENSORS[name] for name, ok in healthy.items() if ok),
+        "voltage_battery": _scaled(modules[0].voltage_v, 1e3, _UNKNOWN_16),
+        "current_battery": _scaled(sum(m.current_a for m in modules), 1e2, -1), "battery_remaining": _UNKNOWN_BATTERY,
+        "errors_comm": s.picture.dropped_frames & 0xFFFF,
+    }]  # fmt: skip
+
+
+def attitude(s: Subject) -> list[Values]:
+    e = s.record.estimate
+    roll, pitch, yaw = to_euler(e.q_wb)
+    p, q, r = e.nu[3:]
+    return [{
+        "time_boot_ms": s.time_ms, "roll": roll, "pitch": pitch, "yaw": yaw, "rollspeed": p, "pitchspeed": q, "yawspeed": r,
+    }]  # fmt: skip
+
+
+def attitude_quaternion(s: Subject) -> list[Values]:
+    e = s.record.estimate
+    q, w = e.q_wb, e.nu[3:]
+    return [{
+        "time_boot_ms": s.time_ms, "q1": q[0], "q2": q[1], "q3": q[2], "q4": q[3],
+        "rollspeed": w[0], "pitchspeed": w[1], "yawspeed": w[2],
+    }]  # fmt: skip
+
+
+def local_position_ned(s: Subject) -> list[Values]:
+    p, v = s.record.estimate.p_wb, s.v_w
+    return [{"time_boot_ms": s.time_ms, "x": p[0], "y": p[1], "z": p[2], "vx": v[0], "vy": v[1], "vz": v[2]}]
+
+
+_DIAGONAL = (0, 6, 11, 15, 18, 20)
+"""Places of a 6x6 matrix's diagonal in its upper triangle, row by row."""
+
+
+def odometry(s: Subject) -> list[Values]:
+    e = s.record.estimate
+    pose, velocity = [0.0] * 21, [_NAN] * 21
+    for place, sigma in zip(_DIAGONAL, (*e.sigma_p, *e.sigma_q), strict=True):
+        pose[place] = float(sigma) ** 2
+    v, w = e.nu[:3], e.nu[3:]
+    quality = 100 if s.picture.pose_is_fresh(s.body) else -1
+    return [{
+        "time_usec": s.time_us, "frame_id": _FRAME_LOCAL_NED, "child_frame_id": _FRAME_BODY_FRD,
+        "x": e.p_wb[0], "y": e.p_wb[1], "z": e.p_wb[2], "q": e.q_wb.tolist(), "vx": v[0], "vy": v[1], "vz": v[2],
+        "rollspeed": w[0], "pitchspeed": w[1], "yawspeed": w[2], "pose_covariance": pose,
+        "velocity_covariance": velocity, "reset_counter": 0, "estimator_type": 2, "quality": quality,
+    }]  # fmt: skip
+
+
+def global_position_int(s: Subject) -> list[Values]:
+    e, v = s.record.estimate, s.v_w
+    latitude, longitude, altitude = s.origin.geodetic(e.p_wb)
+    return [{
+        "time_boot_ms": s.time_ms, "lat": round(latitude * 1e7), "lon": round(longitude * 1e7), "alt": round(altitude * 1e3),
+        "relative_alt": round(-e.p_wb[2] * 1e3), "vx": round(v[0] * 100), "vy": round(v[1] * 100), "vz": round(v[2] * 100),
+        "hdg": round(_heading_deg(s) * 100) % 36000,
+    }]  # fmt: skip
+
+
+def vfr_hud(s: Subject) -> list[Values]:
+    e, v = s.record.estimate, s.v_w
+    speed = math.hypot(v[0], v[1])
+    command = [float(np.abs(m.command).mean()) for m in s.modules]
+    return [{
+        "airspeed": speed, "groundspeed": speed, "heading": round(_heading_deg(s)) % 360,
+        "throttle": round(100 * sum(command) / len(command)), "alt": s.origin.altitude_m - e.p_wb[2], "climb": -v[2],
+    }]  # fmt: skip
+
+
+def battery_status(s: Subject) -> list[Values]:
+    return [{
+        "id": i, "battery_function": 0, "type": 0, "temperature": 0x7FFF,
+        "voltages": [_scaled(m.voltage_v, 1e3, _UNKNOWN_16), *[_UNKNOWN_16] * 9],
+        "current_battery": _scaled(m.current_a, 1e2, -1), "current_consumed": -1, "energy_consumed": -1,
+        "battery_remaining": _UNKNOWN_BATTERY,
+    } for i, m in enumerate(s.modules)]  # fmt: skip
+
+
+def servo_output_raw(s: Subject) -> list[Values]:
+    return [{
+        "time_usec": s.time_us & 0xFFFFFFFF, "port": i,
+        **{f"servo{n + 1}_raw": round(_PWM_CENTRE + _PWM_HALF * float(c)) for n, c in enumerate(m.command)},
+    } for i, m in enumerate(s.modules)]  # fmt: skip
+
+
+def esc_status(s: Subject) -> list[Values]:
+    return [{
+        "index": 8 * i + first, "time_usec": s.time_us, "rpm": [round(r) for r in m.rpm[first : first + 4]],
+        "voltage": [m.voltage_v] * 4, "current": m.esc_current_a[first : first + 4],
+    } for i, m in enumerate(s.modules) for first in (0, 4)]  # fmt: skip
+
+
+def esc_info(s: Subject) -> list[Values]:
+    count = 8 * len(s.modules)
+    now = s.picture.time_ns
+    return [{
+        "index": 8 * i + first, "time_usec": s.time_us, "counter": m.esc_frames & 0xFFFF, "count": count,
+        "connection_type": 5,  # CAN
+        "info": 0x0F if now - m.answered_ns < _SENSOR_FRESH_NS else 0, "failure_flags": m.esc_status[first : first + 4],
+        "error_count": (0, 0, 0, 0), "temperature": (0x7FFF,) * 4,
+    } for i, m in enumerate(s.modules) for first in (0, 4)]  # fmt: skip
+
+
+def scaled_pressure(s: Subject) -> list[Values]:
+    m = s.modules[0]
+    return [_pressure(s, m.cabin_pressure_pa, m.cabin_temperature_c)]
+
+
+def scaled_pressure2(s: Subject) -> list[Values]:
+    return [_pressure(s, s.modules[0].pressure_pa, 0.0)]
+
+
+def _pressure(s: Subject, pressure_pa: float, temperature_c: float) -> Values:
+    return {
+        "time_boot_ms": s.time_ms, "press_abs": pressure_pa / 100, "press_diff": 0.0,
+        "temperature": _scaled(temperature_c, 100, 0),
+    }  # fmt: skip
+
+
+def named_value_float(s: Subject) -> list[Values]:
+    """Docking currents, A, as DOCK0+X (module within the body, face); WRENCH_MRG, the share of thrust that is left."""
+    values = [
+        (f"DOCK{i}{FACE_NAMES[face].upper()}", current * 1e-3)
+        for i, m in enumerate(s.modules)
+        for face, current in enumerate(m.dock_current_ma)
+        if not math.isnan(current)
+    ]
+    values.append(("WRENCH_MRG", wrench_margin(s)))
+    return [{"time_boot_ms": s.time_ms, "name": name, "value": value} for name, value in values]
+
+
+def wrench_margin(s: Subject) -> float:
+    """Share of its range that the busiest thruster has left, 0 to 1; NaN while the body is being swapped."""
+    body, force = s.picture.bodies.get(s.body), s.record.thrust.force_n
+    if body is None or len(force) != len(body.thrusters.f_max):
+        return _NAN
+    share = np.where(force >= 0, force / body.thrusters.f_max, force / body.thrusters.f_min)
+    return float(1.0 - share.max())
+
+
+def extended_sys_state(s: Subject) -> list[Values]:
+    return [{"vtol_state": 0, "landed_state": 2 if s.armed else 1}]
+
+
+def home_position(s: Subject) -> list[Values]:
+    o = s.origin
+    return [{
+        "latitude": round(o.latitude_deg * 1e7), "longitude": round(o.longitude_deg * 1e7),
+        "altitude": round(o.altitude_m * 1e3), "q": (1.0, 0.0, 0.0, 0.0), "time_usec": s.time_us,
+    }]  # fmt: skip
+
+
+def gps_global_origin(s: Subject) -> list[Values]:
+    o = s.origin
+    return [{
+        "latitude": round(o.latitude_deg * 1e7), "longitude": round(o.longitude_deg * 1e7),
+        "altitude": round(o.altitude_m * 1e3), "time_usec": s.time_us,
+    }]  # fmt: skip
+
+
+def mission_current(s: Subject) -> list[Values]:
+    p = s.progress
+    return [{
+        "seq": p.current, "total": p.total or _UNKNOWN_16, "mission_state": p.state, "mission_mode": 1 if p.state == 3 else 2,
+    }]  # fmt: skip
+
+
+def current_mode(s: Subject) -> list[Values]:
+    return [{"standard_mode": 0, "custom_mode": s.custom_mode, "intended_custom_mode": s.custom_mode}]
+
+
+def system_time(s: Subject) -> list[Values]:
+    return [{"time_unix_usec": 0, "time_boot_ms": s.time_ms}]
+
+
+def _heading_deg(s: Subject) -> float:
+    return math.degrees(to_euler(s.record.estimate.q_wb)[2]) % 360.0
+
+
+def _scaled(value: float, factor: float, unknown: int) -> int:
+    return unknown if math.isnan(value) else round(value * factor)
+
+
+STREAMS: Mapping[str, Callable[[Subject], list[Values]]] = {
+    "HEARTBEAT": heartbeat,
+    "SYS_STATUS": sys_status,
+    "ATTITUDE": attitude,
+    "ATTITUDE_QUATERNION": attitude_quaternion,
+    "LOCAL_POSITION_NED": local_position_ned,
+    "ODOMETRY": odometry,
+    "GLOBAL_POSITION_INT": global_position_int,
+    "VFR_HUD": vfr_hud,
+    "BATTERY_STATUS": battery_status,
+    "SERVO_OUTPUT_RAW": servo_output_raw,
+    "ESC_STATUS": esc_status,
+    "ESC_INFO": esc_info,
+    "SCALED_PRESSURE": scaled_pressure,
+    "SCALED_PRESSURE2": scaled_pressure2,
+    "NAMED_VALUE_FLOAT": named_value_float,
+    "EXTENDED_SYS_STATE": extended_sys_state,
+    "HOME_POSITION": home_position,
+    "GPS_GLOBAL_ORIGIN": gps_global_origin,
+    "MISSION_CURRENT": mission_current,
+    "CURRENT_MODE": current_mode,
+    "SYSTEM_TIME": system_time,
+}
+"""Everything that can be streamed or asked for."""
+
+DEFAULT_HZ: Mapping[str, float] = {
+    "HEARTBEAT": 1, "SYS_STATUS": 2, "ATTITUDE": 10, "ATTITUDE_QUATERNION": 10, "LOCAL_POSITION_NED": 10, "ODOMETRY": 5,
+    "GLOBAL_POSITION_INT": 5, "VFR_HUD": 4, "BATTERY_STATUS": 1, "SERVO_OUTPUT_RAW": 2, "ESC_STATUS": 1, "ESC_INFO": 0.5,
+    "SCALED_PRESSURE": 1, "SCALED_PRESSURE2": 1, "NAMED_VALUE_FLOAT": 2, "EXTENDED_SYS_STATE": 1, "HOME_POSITION": 0.5,
+    "MISSION_CURRENT": 1, "CURRENT_MODE": 0.5, "SYSTEM_TIME": 0.5,
+}  # fmt: skip
+"""Before anybody asks for other rates."""
+

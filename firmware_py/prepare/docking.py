@@ -1,0 +1,140 @@
+"""What a dock or an undock needs before it begins: the geometry of the two faces, and the bodies that there will be afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from firmware_py.core import rotations
+from firmware_py.core.body import Body
+from firmware_py.core.docking_sequence import DockPlan, UndockPlan
+from firmware_py.core.types import DockRequest
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS, Vehicle
+from firmware_py.prepare.assembly import PITCH_M, assemble
+from firmware_py.prepare.drag_cache import DragCache
+from firmware_py.prepare.lattice import MATRICES, QUATERNIONS, face_towards, nearest
+
+
+def plan_dock(
+    request: DockRequest,
+    active: Body,
+    target: Body,
+    vehicles: Sequence[Vehicle],
+    pitch_m: float = PITCH_M,
+    cache: DragCache | None = None,
+) -> DockPlan:
+    """The plan of a dock.
+
+    Args:
+        request: which faces are to meet. Of the four rotations that the pins allow, number 0 turns the active module least against the
+            target module, the others follow in quarter turns about the target face's normal.
+        active, target: the two bodies as they are.
+        vehicles: by fleet index.
+
+    Raises:
+        DescriptionError: the two would overlap, or a probe would meet no drogue; the modules are named.
+    """
+    turn_t = _turn_of(target, request.target_module)
+    normal = _rounded(turn_t @ FACE_NORMALS[request.target_face])
+    new_turn = _mated(turn_t, request, normal)
+    cell = _cell_of(target, request.target_module) + normal
+    change = new_turn @ _turn_of(active, request.module).T
+    moved = [cell + _rounded(change @ (c - _cell_of(active, request.module))) for c in active.cells]
+    turns = [nearest(change @ _turn_of(active, m)) for m in active.modules]
+    modules = (*target.modules, *active.modules)
+    merged = assemble(
+        [*target.cells, *moved],
+        [*(nearest(_turn_of(target, m)) for m in target.modules), *turns],
+        [vehicles[m] for m in modules],
+        modules,
+        pitch_m,
+        cache,
+    )
+    return DockPlan(
+        request=request,
+        merged=merged,
+        axis_t=FACE_NORMALS[request.target_face].copy(),
+        place_t=FACE_NORMALS[request.target_face] * pitch_m,
+        q_ta=np.array(QUATERNIONS[nearest(turn_t.T @ new_turn)]),
+    )
+
+
+def plan_undock(
+    request: DockRequest,
+    whole: Body,
+    vehicles: Sequence[Vehicle],
+    pitch_m: float = PITCH_M,
+    cache: DragCache | None = None,
+) -> UndockPlan:
+    """The plan of parting at the joint between two modules of one body.
+
+    Raises:
+        DescriptionError: the two are not neighbours, or something else still holds the pieces together.
+    """
+    near, far = request.target_module, request.module
+    step = _cell_of(whole, far) - _cell_of(whole, near)
+    if int(np.abs(step).sum()) != 1:
+        raise DescriptionError(f"modules {near} and {far} are not docked to each other")
+    piece = _reachable(whole, far, (near, far))
+    if near in piece:
+        raise DescriptionError(f"modules {near} and {far} are also held together by other modules: undock those first")
+    halves = ([m for m in whole.modules if m not in piece], [m for m in whole.modules if m in piece])
+    stays, leaves = (
+        assemble(
+            [_cell_of(whole, m) for m in half],
+            [nearest(_turn_of(whole, m)) for m in half],
+            [vehicles[m] for m in half],
+            half,
+            pitch_m,
+            cache,
+        )
+        for half in halves
+    )
+    normal = tuple(int(c) for c in step)
+    face_near = face_towards(nearest(_turn_of(whole, near)), (normal[0], normal[1], normal[2]))
+    face_far = face_towards(nearest(_turn_of(whole, far)), (-normal[0], -normal[1], -normal[2]))
+    return UndockPlan(
+        request=DockRequest(far, face_far, near, face_near),
+        stays=stays,
+        leaves=leaves,
+        axis_b=step.astype(float),
+        offset_near=FACE_NORMALS[face_near] * pitch_m,
+    )
+
+
+def _mated(turn_t: np.ndarray, request: DockRequest, normal: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation of the active module in the target's lattice, its face against the target's."""
+    fits = [m for m in MATRICES if np.array_equal(_rounded(m @ FACE_NORMALS[request.face]), -normal)]
+    if not fits:
+        raise DescriptionError(f"face {request.face} is none of {', '.join(FACE_NAMES)}")
+    least = max(fits, key=lambda m: float(np.trace(turn_t.T @ m)))
+    quarter = rotations.to_matrix(rotations.exp(normal * (0.5 * np.pi * request.quarter_turns)))
+    return np.asarray(MATRICES[nearest(quarter @ least)])
+
+
+def _reachable(body: Body, start: int, cut: tuple[int, int]) -> set[int]:
+    """Modules that hang together with `start` when the joint between the two of `cut` is open."""
+    reached, ends = {start}, [start]
+    while ends:
+        here = ends.pop()
+        for other in body.modules:
+            if other not in reached and {here, other} != set(cut):
+                if int(np.abs(_cell_of(body, other) - _cell_of(body, here)).sum()) == 1:
+                    reached.add(other)
+                    ends.append(other)
+    return reached
+
+
+def _turn_of(body: Body, module: int) -> np.ndarray:
+    """(3, 3) module frame to body frame."""
+    return np.asarray(rotations.to_matrix(np.ascontiguousarray(body.q_bm[body.modules.index(module)])))
+
+
+def _cell_of(body: Body, module: int) -> np.ndarray:
+    return np.asarray(body.cells[body.modules.index(module)])
+
+
+def _rounded(vector: np.ndarray) -> np.ndarray:
+    return np.rint(vector).astype(np.int64)

@@ -1,0 +1,188 @@
+"""Choice of shape: the list of shapes, tasks, ranking, and the command line of tools/characterise.py."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare import paths
+from firmware_py.prepare.assembly import assemble, assemble_vehicle
+from firmware_py.prepare.capability.choice import fitness, rank
+from firmware_py.prepare.capability.layout import of_modules
+from firmware_py.prepare.capability.polycubes import canonical, polycubes, poses
+from firmware_py.prepare.capability.programs import reach_by_programs
+from firmware_py.prepare.capability.task import Task, load_task, required_wrench, wrenches_along
+from firmware_py.prepare.capability.wrench import WrenchSpace
+from tests.unit.capability_layouts import ROOT
+
+PUSH = np.array([[20.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
+TABLE1_COLUMNS = "space,frame,metric,better"
+
+
+def test_shapes_of_up_to_five_cubes_are_as_many_as_known() -> None:
+    """OEIS A000162 (one-sided) and A001931 (fixed) polycubes."""
+    assert [len(polycubes(n)) for n in range(1, 6)] == [1, 1, 2, 8, 29]
+    assert [sum(len(poses(s)) for s in polycubes(n)) for n in range(1, 6)] == [1, 3, 15, 86, 534]
+    with pytest.raises(DescriptionError, match="1 to 5"):
+        polycubes(6)
+
+
+def test_turned_shape_is_the_same_shape_and_its_mirror_image_is_not() -> None:
+    screw = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1))
+    mirrored = tuple((-x, y, z) for x, y, z in screw)
+    assert {canonical(pose) for pose in poses(screw)} == {canonical(screw)}
+    assert canonical(mirrored) != canonical(screw)
+
+
+def test_best_shape_has_the_margin_that_no_pose_beats() -> None:
+    vehicle = load_vehicle("modcube")
+    found = rank(Task(name="push", wrench=PUSH), 3, vehicle)
+    every = [
+        float(reach_by_programs(of_modules(cells, [0] * 3, [vehicle] * 3), PUSH)[0])
+        for shape in polycubes(3)
+        for cells in poses(shape)
+    ]
+    assert len(found) == 2 and sum(choice.poses for choice in found) == len(every)
+    assert found[0].best.margin == pytest.approx(max(every))
+    assert found[0].best.margin >= found[1].best.margin
+
+
+def test_ranking_follows_what_was_asked_for() -> None:
+    vehicle = load_vehicle("modcube")
+    for what in ("power", "variance"):
+        found = rank(Task(name="push", wrench=PUSH, rank_by=what, dead=0), 3, vehicle)
+        figures = [choice.best.power_w if what == "power" else choice.best.variance for choice in found]
+        assert figures == sorted(figures)
+        assert all(choice.guaranteed_n == choice.whole_n for choice in found)
+
+
+def test_shape_that_cannot_do_the_task_comes_last() -> None:
+    vehicle = load_vehicle("modcube")
+    alone = rank(Task(name="haul", wrench=2.0 * PUSH, rank_by="power"), 1, vehicle)[0]
+    assert alone.best.margin < 1.0
+    asked = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 22.0]])
+    margins = [c.best.margin for c in rank(Task(name="turn", wrench=asked, rank_by="power"), 4, vehicle)]
+    able = [margin >= 1.0 for margin in margins]
+    assert able == sorted(able, reverse=True) and 0 < sum(able) < len(able)
+
+
+def test_guaranteed_margin_holds_whichever_thruster_dies() -> None:
+    vehicle = load_vehicle("modcube")
+    choice = rank(Task(name="push", wrench=PUSH, dead=1), 2, vehicle)[0]
+    layout = of_modules(choice.best.cells, [0] * 2, [vehicle] * 2)
+    worst = min(WrenchSpace(layout.without([k])).reach(PUSH)[0] for k in range(16))
+    assert choice.guaranteed_margin == pytest.approx(worst, rel=1e-9)
+
+
+def test_standing_still_needs_no_wrench_and_drag_needs_one() -> None:
+    body = assemble_vehicle(load_vehicle("bluerov2_heavy"))
+    assert required_wrench(body, paths.at_rest([0.0, 0.0, 1.0])) == pytest.approx(np.zeros(6))
+    moving = paths.at_rest([0.0, 0.0, 1.0])._replace(v_w=np.array([0.5, 0.0, 0.0]))
+    assert required_wrench(body, moving) == pytest.approx([13.7 * 0.5 + 141.0 * 0.25, 0, 0, 0, 0, 0])
+
+
+def test_trajectory_asks_for_momentums_change() -> None:
+    """Without drag, wrench over time adds up to momentum: a line from rest to rest gives none in sum."""
+    body = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
+    line = paths.line(paths.at_rest([0.0, 0.0, 1.0]), paths.at_rest([1.0, 0.5, 1.0]), 10.0)
+    forces = wrenches_along(line, body, 201)
+    first, last = forces[:100], forces[101:]
+    assert first[:, 0].sum() > 0.0 > last[:, 0].sum() - first[:, 0].sum()
+    assert np.abs(forces[[0, -1]]).max() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_trajectory_task_ranks_by_the_wrench_along_it(tmp_path: Path) -> None:
+    path = tmp_path / "task.toml"
+    path.write_text('name = "strip"\nrank_by = "power"\n[trajectory]\nkind = "moebius"\nsamples = 12\n')
+    found = rank(load_task(path), 2, load_vehicle("modcube"))
+    assert len(found) == 1 and found[0].poses == 3
+    assert found[0].best.margin > found[0].guaranteed_margin > 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ('name = "x"\n', "either `wrench` rows or a [trajectory] table"),
+        ('name = "x"\nwrench = [[0, 0, 0, 0, 0, 0]]\n', "row 0 is zero"),
+        ('name = "x"\nwrench = [[1, 0, 0]]\n', "shape"),
+        ('name = "x"\nrank_by = "luck"\nwrench = [[1, 0, 0, 0, 0, 0]]\n', "margin, power, variance"),
+    ],
+)
+def test_wrong_task_file_is_refused_in_one_line(tmp_path: Path, text: str, what: str) -> None:
+    path = tmp_path / "task.toml"
+    path.write_text(text)
+    with pytest.raises(DescriptionError) as refused:
+        load_task(path)
+    assert str(refused.value).startswith(f"{path}:") and what in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_power_of_a_held_wrench_is_that_of_its_forces() -> None:
+    vehicle = load_vehicle("modcube")
+    layout = of_modules([(0, 0, 0)], [0], [vehicle])
+    part = fitness(((0, 0, 0),), layout, np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0], [5.0, 0.0, 0.0, 0.0, 0.0, 0.0]]))
+    assert part.power_w > 0.0 and part.margin == pytest.approx(25.4558 / 5.0, rel=1e-4)
+
+
+def characterise(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "tools" / "characterise.py"), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("modcube", "--table1"),
+        ("no_such_vehicle",),
+        ("no_such_file.toml",),
+        ("--assembly", "2x0x1"),
+        ("--assembly", "0,0,0 2,0,0"),
+        ("modcube", "--directions", "many"),
+        ("--choose", "3"),
+        ("--choose", "9", "--task", "no_such_file.toml"),
+    ],
+)
+def test_wrong_command_line_is_answered_in_one_line(arguments: tuple[str, ...]) -> None:
+    result = characterise(*arguments)
+    assert result.returncode == 2
+    assert result.stdout == "" and result.stderr.count("\n") == 1, result.stderr
+
+
+@pytest.mark.slow
+def test_characterising_writes_table_figure_and_report(tmp_path: Path) -> None:
+    result = characterise("bluerov2", "--directions", "300", "--out", str(tmp_path))
+    assert result.returncode == 0, result.stderr
+    text = (tmp_path / "capability.csv").read_text()
+    assert text.startswith(f"{TABLE1_COLUMNS},bluerov2\n")
+    rows = {(r["space"], r["frame"], r["metric"]): r["bluerov2"] for r in csv.DictReader(text.splitlines())}
+    assert rows["wrench", "force", "max_inscribed_ellipsoid_volume"] == "degenerate"
+    assert json.loads((tmp_path / "capability.json").read_text())["vehicles"]["bluerov2"]["rank"] == 5
+    assert (tmp_path / "capability.png").read_bytes()[:4] == b"\x89PNG"
+    page = (tmp_path / "capability.html").read_text()
+    assert "degenerate" in page and "http" not in page.replace("http://www.w3.org", "")
+    again = characterise("bluerov2", "--directions", "300", "--out", str(tmp_path / "again"))
+    assert again.returncode == 0
+    assert (tmp_path / "again" / "capability.csv").read_text() == text
+
+
+@pytest.mark.slow
+def test_papers_table_is_printed_beside_ours_with_a_word_on_each_cell(tmp_path: Path) -> None:
+    result = characterise("--table1", "--directions", "200", "--out", str(tmp_path))
+    assert result.returncode == 0, result.stderr
+    for word in ("agrees", "differs by", "inconsistent in"):
+        assert word in result.stdout
+    assert "authors' files 16 : 4 : 1" in result.stdout
+    with (tmp_path / "table1.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    with (ROOT / "tools" / "data" / "table1.csv").open(newline="") as file:
+        paper = list(csv.DictReader(file))
+    assert list(rows[0])[: len(paper[0])] == list(paper[0])
+    ours = [(r["space"], r["frame"], r["metric"]) for r in rows]
+    assert set(ours) >= {(r["space"], r["frame"], r["metric"]) for r in paper}

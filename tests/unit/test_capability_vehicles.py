@@ -1,0 +1,167 @@
+"""Vehicle files of the paper's robots: axes, sources, measured curves; and files that are refused."""
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.core.thruster import polynomial
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import flu_to_frd, is_right_handed, load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+from firmware_py.prepare.capability.curves import fit_thruster, rising_polynomial
+from firmware_py.prepare.capability.layout import of_modules, of_vehicle
+from tests.unit.capability_layouts import DATA, LINE, ROOT, SQUARE, published
+
+KILOGRAM_FORCE = 9.80665
+"""N."""
+
+
+def rows_in_frd(name: str) -> np.ndarray:
+    """(n, 6) published rows in FRD; the file whose axes are not stated is taken as FLU, as its vehicle file says."""
+    rows = np.array(published(name)["thrusters"])
+    if published(name)["axes"] == "FRD":
+        return rows
+    return np.hstack([flu_to_frd(rows[:, :3]), flu_to_frd(rows[:, 3:])])
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "source", "axes"),
+    [
+        ("modcube", "A45_single", "FLU"),
+        ("modcube_sim", "A_single", "not stated"),
+        ("bluerov2", "G_bluerov2", "FLU"),
+        ("bluerov2_heavy", "F_bluerov2_heavy", "FLU"),
+        ("girona500", "E_girona500", "FRD"),
+        ("chasing_m2", "D_chasing_m2", "FLU"),
+    ],
+)
+def test_vehicle_file_is_its_published_layout_in_frd(vehicle: str, source: str, axes: str) -> None:
+    found, rows = load_vehicle(vehicle), rows_in_frd(source)
+    assert published(source)["axes"] == axes
+    assert found.positions == pytest.approx(rows[:, :3])
+    assert found.directions == pytest.approx(rows[:, 3:], abs=1e-4)
+    assert (found.force_max_n, found.force_min_n) == (published(source)["f_max"], published(source)["f_min"])
+
+
+def test_turning_flu_into_frd_keeps_handedness() -> None:
+    assert is_right_handed(flu_to_frd(np.eye(3)).T)
+    # Positive thrust of a vertical thruster lifts a BlueROV2: minus z in FRD.
+    assert load_vehicle("bluerov2").directions[4] == pytest.approx([0.0, 0.0, -1.0])
+
+
+def test_vehicles_state_their_sources_and_assumptions() -> None:
+    for name in ("bluerov2", "bluerov2_heavy", "girona500", "chasing_m2"):
+        assert load_vehicle(name).source
+    assert "layout" in load_vehicle("chasing_m2").assumption
+    assert "layout" in of_vehicle(load_vehicle("chasing_m2")).assumption
+    assert "von Benzon" in load_vehicle("bluerov2_heavy").source
+
+
+def test_heavy_has_its_published_dynamics() -> None:
+    """von Benzon et al. (2022): 13.5 + 6.36 kg in surge; 13.7 + 141 |u| N s/m."""
+    body = assemble_vehicle(load_vehicle("bluerov2_heavy"))
+    assert np.diag(body.mass) == pytest.approx([19.86, 20.62, 32.18, 0.449, 0.365, 0.592])
+    assert body.drag.linear == pytest.approx([13.7, 0.0, 33.0, 0.0, 0.8, 0.0])
+    assert body.drag.rotational == pytest.approx([1.19, 0.47, 1.5])
+    ahead, right, down = body.drag.nodes[0, 6, 6, 0], body.drag.nodes[2, 6, 6, 0], body.drag.nodes[4, 6, 6, 0]
+    assert (ahead, right, down) == pytest.approx((141.0, 217.0, 190.0))
+
+
+def t200() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Command, force (N) and power (W) of the measured table."""
+    with (DATA / "t200_16v.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    pulse, force, power = (np.array([float(r[k]) for r in rows]) for k in ("pwm_us", "force_kgf", "power_w"))
+    return (pulse - 1500.0) / 400.0, force * KILOGRAM_FORCE, power
+
+
+@pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy"])
+def test_vehicle_file_carries_the_fit_of_the_measured_thruster(name: str) -> None:
+    curve, fit = load_vehicle(name).curve, fit_thruster(*t200())
+    for part in ("forward", "reverse", "power_forward", "power_reverse"):
+        assert getattr(curve, part) == pytest.approx(getattr(fit, part).coefficients, rel=1e-6)
+    assert curve.deadband_n == pytest.approx(fit.deadband_n, abs=1e-3)
+
+
+def test_measured_thruster_is_fitted_closely_and_rises_everywhere() -> None:
+    fit = fit_thruster(*t200())
+    assert (fit.forward.rms, fit.reverse.rms) == pytest.approx((0.236, 0.201), abs=1e-3)
+    assert max(fit.forward.largest, fit.reverse.largest) < 0.8
+    assert max(fit.power_forward.rms, fit.power_reverse.rms) < 1.6
+    u = np.linspace(0.0, 1.0, 2001)
+    for part in (fit.forward, fit.reverse):
+        force = [polynomial(part.coefficients, x) for x in u]
+        assert np.all(np.diff(force) > 0.0)
+    for part, full in ((fit.power_forward, 51.5), (fit.power_reverse, 40.2)):
+        assert np.all(np.diff([polynomial(part.coefficients, full * x) for x in u]) > 0.0)
+
+
+def test_plain_least_squares_would_not_rise_near_zero_command() -> None:
+    command, force, _ = t200()
+    ahead = command >= 0.0
+    powers = command[ahead][:, None] ** np.arange(1, 6)
+    plain = np.linalg.lstsq(powers, force[ahead], rcond=None)[0]
+    assert plain[0] < 0.0
+    bounded = rising_polynomial(command[ahead], force[ahead], 0.5)
+    assert bounded.rms == pytest.approx(float(np.sqrt(np.mean((powers @ plain - force[ahead]) ** 2))), abs=0.07)
+
+
+def test_fit_returns_a_rising_polynomial_as_it_is() -> None:
+    x = np.linspace(0.0, 1.0, 50)
+    wanted = np.array([1.0, 2.0, 0.5, 0.1, 0.3])
+    fit = rising_polynomial(x, (x[:, None] ** np.arange(1, 6)) @ wanted)
+    assert fit.coefficients == pytest.approx(wanted, abs=1e-9)
+    with pytest.raises(ValueError, match="within 0 to 1"):
+        rising_polynomial(x + 0.5, x)
+
+
+def test_layout_of_docked_modules_is_that_of_the_assembled_body() -> None:
+    from firmware_py.prepare.assembly import assemble
+
+    vehicle = load_vehicle("modcube")
+    for cells in (LINE, SQUARE):
+        count = len(cells)
+        body = assemble(cells, [0] * count, [vehicle] * count)
+        assert of_modules(cells, [0] * count, [vehicle] * count).matrix == pytest.approx(body.thrusters.matrix)
+
+
+def altered(tmp_path: Path, change: tuple[str, str]) -> Path:
+    text = (ROOT / "firmware_py" / "vehicles" / "girona500.toml").read_text()
+    assert change[0] in text
+    path = tmp_path / "wrong.toml"
+    path.write_text(text.replace(*change, 1))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        (("direction = [0.0, 1.0, 0.0]", "direction = [0.0, 0.0, 0.0]"), "direction = [0.0, 0.0, 0.0]"),
+        (("direction = [0.0, 1.0, 0.0]", "direction = [0.0, nan, 0.0]"), "direction = [0.0, nan, 0.0]"),
+        (("force_max_n = 139.97", "force_max_n = nan"), "force_max_n = nan"),
+    ],
+)
+def test_wrong_vehicle_file_is_refused_with_its_line(tmp_path: Path, change: tuple[str, str], where: str) -> None:
+    path = altered(tmp_path, change)
+    lines = path.read_text().splitlines()
+    with pytest.raises(DescriptionError) as refused:
+        load_vehicle(str(path))
+    match = re.match(rf"{re.escape(str(path))}:(\d+): (.+)", str(refused.value))
+    assert match and "\n" not in str(refused.value)
+    at = next(k for k, line in enumerate(lines, 1) if where in line)
+    assert at - 2 <= int(match[1]) <= at  # the key's line, or that of its table's head
+    assert re.search("length 1|finite|out of range", match[2])
+
+
+def test_vehicle_without_thrusters_is_refused(tmp_path: Path) -> None:
+    text = (ROOT / "firmware_py" / "vehicles" / "girona500.toml").read_text()
+    path = tmp_path / "none.toml"
+    path.write_text(text[: text.index("[[thruster]]")])
+    with pytest.raises(DescriptionError, match=rf"{re.escape(str(path))}:\d+: thruster: missing key"):
+        load_vehicle(str(path))
+    path.write_text("thruster = []\n" + path.read_text())
+    with pytest.raises(DescriptionError, match=r"none\.toml:\d+: .*at least one"):
+        load_vehicle(str(path))

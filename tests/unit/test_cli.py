@@ -1,0 +1,159 @@
+"""The command line refuses what is wrong in one line on stderr, with status 2, and says what would be right."""
+
+from pathlib import Path
+
+import pytest
+
+import hil.bench
+from firmware_py.cli import main
+from hil.scenario import scenario_names
+
+SPIRAL = (Path(hil.bench.__file__).parent / "scenarios" / "spiral.toml").read_text(encoding="utf-8")
+
+
+def outcome(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> tuple[int, str]:
+    """Exit status and what came on stderr."""
+    monkeypatch.setattr("sys.argv", ["modcube", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0), capsys.readouterr().err
+
+
+def refusal(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that refuses."""
+    status, error = outcome(arguments, monkeypatch, capsys)
+    assert status == 2
+    assert error.endswith("\n")
+    assert len(error.splitlines()) == 1, error
+    return error.strip()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wrong", "right"),
+    [
+        (["hil", "run", "waltz"], "scenario 'waltz'", "hover, spiral"),
+        (["hil", "campaign", "waltz"], "scenario 'waltz'", "hover, spiral"),
+        (["hil", "run", "waltz.toml"], "waltz.toml", "No such file"),
+        (["hil", "run", "hover", "--bus", "token:ring"], "'token:ring'", "virtual:NAME, udp:GROUP:PORT"),
+        (["hil", "run", "hover", "--bus", "socketcan:nocan7"], "nocan7", "no such interface"),
+        (["hil", "run", "hover", "--bus", "udp:10.0.0.1:5000"], "udp:10.0.0.1:5000", "udp:239.74.163.2:43113"),
+        (["hil", "run", "hover", "--bus", "virtual:"], "virtual:", "virtual:NAME"),
+        (["hil", "run", "hover", "--vehicle", "yacht"], "vehicle 'yacht'", "modcube, modcube_sim"),
+        (["hil", "run", "hover", "--vehicle", "yacht.toml"], "yacht.toml", "cannot be read"),
+        (["hil", "run", "hover", "--controller", "fuzzy"], "controller 'fuzzy'", "modcube, paper"),
+        (["hil", "run", "hover", "--sensors", "magic"], "sensors 'magic'", "real, ideal"),
+    ],
+)
+def test_what_does_not_exist_is_refused_with_what_there_is(
+    arguments: list[str],
+    wrong: str,
+    right: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    line = refusal([*arguments, "--out", str(tmp_path)], monkeypatch, capsys)
+    assert wrong in line
+    assert right in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wrong", "right"),
+    [
+        ([], "needs a command", "hil"),
+        (["fly"], "No such command 'fly'", "hil"),
+        (["hil"], "needs a command", "run, campaign"),
+        (["hil", "fly"], "No such command 'fly'", "run, campaign"),
+        (["hil", "run"], "Missing argument 'scenario'", "--help"),
+        (["hil", "run", "hover", "spiral"], "unexpected extra argument", "--help"),
+        (["hil", "run", "hover", "--speed", "9"], "No such option: --speed", "--help"),
+        (["hil", "run", "hover", "--seed", "-1"], "--seed", "greater than or equal to 0"),
+        (["hil", "run", "hover", "--seed", "one"], "--seed", "integer"),
+        (["hil", "campaign", "hover", "--trials", "0"], "--trials", "greater than or equal to 1"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_one_line(
+    arguments: list[str], wrong: str, right: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal(arguments, monkeypatch, capsys)
+    assert line.startswith("modcube")
+    assert wrong in line
+    assert right in line
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "wrong", "right"),
+    [
+        ("radius_m = 0.30", "radius_m = 0.30\nspeed_m_s = 1.0", "speed_m_s: unknown key", "duration_s, kind, radius_m"),
+        ("radius_m = 0.30", "radius_m = 3000.0", "radius_m: 3000.0 is out of range", "0.01 to 100 m"),
+        ("radius_m = 0.30", "radius_m = nan", "radius_m: nan is out of range", "0.01 to 100 m"),
+        ('kind = "spiral"', 'kind = "waltz"', "'waltz' is unknown", "hover, spiral"),
+        ("radius_m = 0.30", "radius_m = 'wide'", "radius_m: 'wide' is not a number", "spiral.toml:"),
+        ("radius_m = 0.30", "radius_m = 0.30\nradius_m = 0.20", "not valid TOML", "line "),
+        ("duration_s = 40.0", "", "duration_s: missing key", "0.1 to 7200 s"),
+        ("size_m = [1.3, 1.2, 0.76]", "size_m = [1.3, 1.2]", "size_m: has shape (2,)", "(3,)"),
+    ],
+)
+def test_wrong_scenario_file_is_refused_with_line_and_permitted_range(
+    old: str,
+    new: str,
+    wrong: str,
+    right: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert old in SPIRAL
+    path = tmp_path / "spiral.toml"
+    path.write_text(SPIRAL.replace(old, new), encoding="utf-8")
+    line = refusal(["hil", "run", str(path), "--out", str(tmp_path)], monkeypatch, capsys)
+    assert f"{path}:" in line
+    assert wrong in line
+    assert right in line
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong", "right"),
+    [
+        ("[control]\nposition_bandwith = 2.0\n", "position_bandwith: unknown key", "position_bandwidth"),
+        ("[control]\nposition_bandwidth = 99.0\n", "99.0 is out of range", "0.1 to 10 rad/s"),
+        ('[allocation]\nmode = "hope"\n', "'hope' is unknown", "least_squares, pseudo_inverse"),
+    ],
+)
+def test_wrong_parameter_file_is_refused_with_line_and_permitted_range(
+    text: str,
+    wrong: str,
+    right: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "gains.toml"
+    path.write_text(text, encoding="utf-8")
+    arguments = ["hil", "run", "hover", "--controller", str(path), "--out", str(tmp_path)]
+    line = refusal(arguments, monkeypatch, capsys)
+    assert f"{path}:2: " in line
+    assert wrong in line
+    assert right in line
+
+
+def test_folder_that_cannot_be_made_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "taken"
+    file.touch()
+    assert str(file) in refusal(["hil", "run", "hover", "--out", str(file / "run")], monkeypatch, capsys)
+
+
+def test_list_names_every_scenario_with_one_line_of_help(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["modcube", "hil", "list"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    lines = capsys.readouterr().out.splitlines()
+    assert ended.value.code == 0
+    assert [line.split()[0] for line in lines] == scenario_names()
+    assert all(len(line.split()) > 3 for line in lines)

@@ -1,0 +1,105 @@
+"""Joining and parting of bodies: momentum, poses and disturbance are what they were, and parting undoes joining."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from firmware_py.core.body import Body
+from firmware_py.core.propagation import ERRORS, STATES
+from firmware_py.core.topology import Motion, join, part_of
+from firmware_py.core.types import DockRequest
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+from firmware_py.prepare.docking import plan_dock, plan_undock
+
+VEHICLES = [load_vehicle("modcube")] * 3
+
+
+def rotation(q: np.ndarray) -> Rotation:
+    return Rotation.from_quat(np.asarray(q)[[1, 2, 3, 0]])
+
+
+def momentum(body: Body, x: np.ndarray, about: np.ndarray) -> np.ndarray:
+    """(6,) linear and angular momentum in the world, about a point."""
+    r = rotation(x[3:7])
+    body_momentum = body.mass @ x[7:13]
+    linear = r.apply(body_momentum[:3])
+    return np.r_[linear, r.apply(body_momentum[3:]) + np.cross(x[:3] - about, linear)]
+
+
+def module_pose(body: Body, x: np.ndarray, module: int) -> tuple[np.ndarray, Rotation]:
+    i = body.modules.index(module)
+    return x[:3] + rotation(x[3:7]).apply(body.r_bm[i]), rotation(x[3:7]) * rotation(body.q_bm[i])
+
+
+@pytest.fixture
+def two() -> tuple[Body, Body, Body, np.ndarray, np.ndarray]:
+    """A target, an active body against its +x face, the body they make, and a state of each."""
+    target, active = (assemble([(0, 0, 0)], [0], [VEHICLES[0]], [m]) for m in (0, 1))
+    plan = plan_dock(DockRequest(1, 1, 0, 0, quarter_turns=1), active, target, VEHICLES)
+    rng = np.random.default_rng(3)
+    x_t, x_a = np.zeros(STATES), np.zeros(STATES)
+    q_t = Rotation.from_rotvec(rng.normal(size=3))
+    x_t[3:7] = q_t.as_quat()[[3, 0, 1, 2]]
+    x_t[:3] = rng.normal(size=3)
+    q_a = q_t * rotation(plan.q_ta)
+    x_a[3:7] = q_a.as_quat()[[3, 0, 1, 2]]
+    x_a[:3] = x_t[:3] + q_t.apply(plan.place_t)
+    x_t[7:13], x_a[7:13] = rng.normal(size=6), rng.normal(size=6)
+    x_t[19:25], x_a[19:25] = rng.normal(size=6), rng.normal(size=6)
+    return target, active, plan.merged, x_t, x_a
+
+
+def test_bodies_that_dock_keep_their_momentum(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
+    target, active, merged, x_t, x_a = two
+    covariance = np.eye(ERRORS)
+    joined = join([(target, Motion(x_t, covariance)), (active, Motion(x_a, covariance))], merged)
+    about = np.array([0.3, -1.0, 2.0])
+    before = momentum(target, x_t, about) + momentum(active, x_a, about)
+    np.testing.assert_allclose(momentum(merged, joined.x, about), before, atol=1e-9)
+
+
+def test_docked_modules_are_where_they_were(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
+    target, active, merged, x_t, x_a = two
+    covariance = np.eye(ERRORS)
+    joined = join([(target, Motion(x_t, covariance)), (active, Motion(x_a, covariance))], merged)
+    for body, x, module in ((target, x_t, 0), (active, x_a, 1)):
+        p, q = module_pose(body, x, module)
+        p_new, q_new = module_pose(merged, joined.x, module)
+        np.testing.assert_allclose(p_new, p, atol=1e-9)
+        assert (q_new * q.inv()).magnitude() < 1e-9
+
+
+def test_disturbance_of_a_joined_body_is_the_sum(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
+    target, active, merged, x_t, x_a = two
+    covariance = np.eye(ERRORS)
+    joined = join([(target, Motion(x_t, covariance)), (active, Motion(x_a, covariance))], merged)
+    np.testing.assert_allclose(joined.x[19:22], x_t[19:22] + x_a[19:22])
+    moment_w = np.zeros(3)
+    for x in (x_t, x_a):
+        moment_w += rotation(x[3:7]).apply(x[22:25]) + np.cross(x[:3] - joined.x[:3], x[19:22])
+    np.testing.assert_allclose(rotation(joined.x[3:7]).apply(joined.x[22:25]), moment_w, atol=1e-9)
+
+
+def test_parting_undoes_joining_when_nothing_turns_apart(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
+    target, active, merged, x_t, x_a = two
+    covariance = np.eye(ERRORS)
+    joined = join([(target, Motion(x_t, covariance)), (active, Motion(x_a, covariance))], merged)
+    plan = plan_undock(DockRequest(1, 1, 0, 0), merged, VEHICLES)
+    stays, leaves = (part_of(merged, joined, b) for b in (plan.stays, plan.leaves))
+    about = np.zeros(3)
+    after = momentum(plan.stays, stays.x, about) + momentum(plan.leaves, leaves.x, about)
+    np.testing.assert_allclose(after, momentum(merged, joined.x, about), atol=1e-9)
+    np.testing.assert_allclose(stays.x[:3], x_t[:3], atol=1e-9)
+    p, q = module_pose(plan.leaves, leaves.x, 1)
+    p_old, q_old = module_pose(active, x_a, 1)
+    np.testing.assert_allclose(p, p_old, atol=1e-9)
+    assert (q * q_old.inv()).magnitude() < 1e-9
+
+
+def test_third_module_docks_to_a_pair_in_an_l() -> None:
+    pair = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [VEHICLES[0]] * 2, [0, 1])
+    third = assemble([(0, 0, 0)], [0], [VEHICLES[0]], [2])
+    plan = plan_dock(DockRequest(2, 3, 0, 2), third, pair, VEHICLES)
+    assert plan.merged.modules == (0, 1, 2)
+    assert plan.merged.cells.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
