@@ -37,6 +37,7 @@ def fly_and_judge(
 ) -> Result:
     """Flies `scenario`; the logs and result.json are in `out` afterwards. Raises DescriptionError and PortError."""
     out.mkdir(parents=True, exist_ok=True)
+    scenario = scenario.for_seed(seed)
     if realtime:
         flown = fly_in_real_time(scenario, seed, parameters, out, bus, rate_hz, progress)
         result = judge_logs(scenario, seed, out, flown.wall_s, flown.deadline_misses)
@@ -66,6 +67,7 @@ def start_of(flight: Flight) -> int:
 def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
     """Writes plots and report.html of the run in `folder`; returns the report's path."""
     flight = read_flight(folder)
+    scenario = scenario.for_seed(result.seed)
     vehicle = load_vehicle(scenario.module[0].vehicle)
     scene = _scene(scenario, vehicle, flight)
     plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm)

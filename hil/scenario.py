@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.core import rotations
-from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
 from firmware_py.description.vehicle import load_vehicle
 from hil.plant.build import nominal_centre
+from hil.plant.draw import stream
 from hil.plant.lattice import is_connected, place
+from hil.plant.polycube import grow
 from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
 
@@ -47,8 +49,9 @@ class Task:
     """What the robot is to do."""
 
     kind: str = quantity(
-        choices=("hover", "spiral", "moebius"),
-        help="hover: hold the place; spiral: climb on a cylinder; moebius: along the rim of a Moebius strip",
+        choices=("hover", "spiral", "moebius", "lissajous"),
+        help="hover: hold the place; spiral: climb on a cylinder; moebius: along the rim of a Moebius strip; "
+        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns",
     )
     settle_s: float = quantity(15.0, unit="s", low=0, high=600, help="held at the start before the task begins")
     duration_s: float = quantity(unit="s", low=0.1, high=7200, help="of the task itself, rest to rest")
@@ -56,9 +59,25 @@ class Task:
     climb_m: float = quantity(0.40, unit="m", low=-100, high=100, help="spiral: height gained")
     turns: float = quantity(2.0, low=0.01, high=1000, help="spiral: turns, seen from above clockwise; moebius: laps")
     half_width_m: float = quantity(0.30, unit="m", low=0, high=100, help="moebius: half-width of the strip")
+    amplitude_m: np.ndarray = quantity([1, 1, 0], unit="m", low=0, high=100, shape=(3,), help="lissajous: of each axis")
+    frequency: np.ndarray = quantity([1, 2, 1], low=0, high=100, shape=(3,), help="lissajous: of each axis")
+    yaw_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of yaw a turn of u")
+    roll_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of roll a turn of u")
     centre_m: np.ndarray = quantity(
         [0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,), help="hover: place; spiral: bottom of its axis; moebius: centre"
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Polycube:
+    """A random shape in place of the first module; each seed has its own."""
+
+    fewest: int = quantity(2, low=1, high=29, help="smallest number of modules")
+    most: int = quantity(8, low=1, high=29, help="largest number of modules")
+
+    def __post_init__(self) -> None:
+        if self.fewest > self.most:
+            raise DescriptionError("fewest is above most")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,6 +99,7 @@ class Scenario:
     module: tuple[ModuleStart, ...] = quantity()
     tags: tuple[int, ...] = quantity((5,), low=0, high=15, help="tags that the modules carry; 5 is the top face")
     camera: tuple[CameraPose, ...] = quantity(())
+    polycube: Polycube | None = quantity(None)
     task: Task = quantity()
     world: WorldSpec = quantity(WorldSpec())
     sensors: SensorSpec = quantity(SensorSpec())
@@ -112,6 +132,21 @@ class Scenario:
     def checks(self) -> tuple[Check, ...]:
         """What the run must keep."""
         return self.check
+
+    def for_seed(self, seed: int) -> Scenario:
+        """The same with what each seed has of its own written out: the modules of a polycube."""
+        if self.polycube is None:
+            return self
+        rng, first = stream(seed, "shape"), self.module[0]
+        count = int(rng.integers(self.polycube.fewest, self.polycube.most + 1))
+        seats = grow(rng, count, load_vehicle(first.vehicle).faces)
+        modules = tuple(
+            dataclasses.replace(
+                first, number=first.number + i, body=0, cell=frozen_array(seat.cell), rotation=seat.rotation
+            )
+            for i, seat in enumerate(seats)
+        )
+        return dataclasses.replace(self, module=modules, polycube=None)
 
     def with_ideal_sensors(self) -> Scenario:
         """The same with perfect sensors; quantisation by the frames stays."""

@@ -60,6 +60,13 @@ def _moebius(task: Task, q_wb: np.ndarray) -> Trajectory:
     return paths.moebius(task.centre_m, task.duration_s, task.radius_m, task.half_width_m, task.turns)
 
 
-TASKS: dict[str, Callable[[Task, np.ndarray], Trajectory]] = {"hover": _hover, "moebius": _moebius, "spiral": _spiral}
+def _lissajous(task: Task, q_wb: np.ndarray) -> Trajectory:
+    turning = (task.yaw_turns, task.roll_turns)
+    return paths.lissajous(
+        task.centre_m, task.amplitude_m, task.frequency, task.duration_s, turns=task.turns, attitude=q_wb, turning=turning
+    )
+
+
+TASKS: dict[str, Callable[[Task, np.ndarray], Trajectory]] = {"hover": _hover, "lissajous": _lissajous, "moebius": _moebius, "spiral": _spiral}
 """Trajectory of each kind of task."""
 

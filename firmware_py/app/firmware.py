@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from firmware_py.app.preparation import prepare_dock
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.mapping import InputCollector, OutputEncoder
 from firmware_py.core.pipeline import Pipeline
@@ -14,6 +16,7 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from firmware_py.prepare.assembly import assemble_fleet
+from firmware_py.runtime.worker import InlineWorker, Worker
 
 BusFrame = tuple[int, Frame]
 """Index of the bus, and the frame."""
@@ -28,6 +31,9 @@ class Firmware:
     collector: InputCollector
     pipeline: Pipeline
     encoder: OutputEncoder
+    vehicles: Sequence[Vehicle]
+    """By fleet index."""
+    worker: Worker
 
     def sync(self, tick: int, time_ns: int) -> list[BusFrame]:
         """The SYNC frames that start tick `tick` on each bus."""
@@ -41,8 +47,16 @@ class Firmware:
         for bus, frame in received:
             self.collector.take(bus, frame)
         inputs = self.collector.collect(tick, time_ns, requests)
-        outputs = self.pipeline.step(inputs)
+        outputs = self.tick(inputs)
         return inputs, outputs, self.encoder.frames(outputs)
+
+    def tick(self, inputs: Inputs) -> Outputs:
+        """Steps the fleet; what it wants prepared goes to the worker, what the worker has done enters `inputs`."""
+        inputs.prepared = self.worker.results()
+        outputs = self.pipeline.step(inputs)
+        for request in outputs.preparations:
+            self.worker.submit(partial(prepare_dock, request, self.pipeline, self.vehicles, self.fleet.pitch_m))
+        return outputs
 
 
 def vehicles_of(fleet: Fleet, folder: Path | None = None) -> dict[str, Vehicle]:
@@ -50,14 +64,23 @@ def vehicles_of(fleet: Fleet, folder: Path | None = None) -> dict[str, Vehicle]:
     return {name: load_vehicle(name, folder) for name in dict.fromkeys(m.vehicle for m in fleet.module)}
 
 
-def compose(fleet: Fleet, parameters: Parameters, vehicles: Mapping[str, Vehicle] | None = None) -> Firmware:
-    """The firmware of `fleet`, ready to step. Raises DescriptionError for a fleet or vehicle that is wrong."""
+def compose(
+    fleet: Fleet, parameters: Parameters, vehicles: Mapping[str, Vehicle] | None = None, worker: Worker | None = None
+) -> Firmware:
+    """The firmware of `fleet`, ready to step; slow work runs on the spot unless a worker is given.
+
+    Raises:
+        DescriptionError: the fleet or a vehicle is wrong.
+    """
     codec = Codec.load()
-    bodies = assemble_fleet(fleet, vehicles if vehicles is not None else vehicles_of(fleet))
+    described = vehicles if vehicles is not None else vehicles_of(fleet)
+    bodies = assemble_fleet(fleet, described)
     return Firmware(
         fleet=fleet,
         parameters=parameters,
         collector=InputCollector(fleet, codec),
         pipeline=Pipeline(bodies, parameters, fleet.period_ns),
         encoder=OutputEncoder(fleet, codec),
+        vehicles=[described[module.vehicle] for module in fleet.module],
+        worker=worker if worker is not None else InlineWorker(),
     )

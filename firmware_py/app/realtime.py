@@ -67,7 +67,7 @@ class RealTimeLoop:
         self.unanswered += not in_time
         received, self._received = self._received, []
         inputs = collector.collect(tick, time_ns, list(self.requests(time_ns, self._last)))
-        outputs = self.firmware.pipeline.step(inputs)
+        outputs = self.firmware.tick(inputs)
         frames = self.firmware.encoder.frames(outputs)
         self._send(frames)
         for observer in self.observers:

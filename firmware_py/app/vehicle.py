@@ -18,6 +18,7 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
+from firmware_py.runtime.worker import ThreadWorker
 
 FAREWELL_TICKS = 10
 """Ticks that go on saying `disarmed` after a stop was asked for."""
@@ -68,9 +69,11 @@ def run_vehicle(
     fleet: Fleet, parameters: Parameters, hold: bool = False, out: Path | None = None, say: Callable[[str], None] = print
 ) -> Summary:
     """Runs the firmware against the clock until SIGINT or SIGTERM. Raises DescriptionError and PortError before the first tick."""
-    firmware = compose(fleet, parameters)
+    worker = ThreadWorker()
+    firmware = compose(fleet, parameters, worker=worker)
     operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
     with ExitStack() as stack:
+        stack.callback(worker.close)
         observers: list[Observer] = [telling(say)]
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)

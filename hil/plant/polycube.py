@@ -1,0 +1,68 @@
+"""Random connected shapes of docked modules: every joint a probe in a drogue."""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core import rotations
+from firmware_py.description.vehicle import FACE_NORMALS
+from hil.plant.lattice import COUNT, QUATERNIONS
+
+Cell = tuple[int, int, int]
+STEPS = tuple(tuple(int(x) for x in row) for row in FACE_NORMALS)
+"""The six ways from a cell to its neighbours."""
+MATES = ({"P", "D"}, {"D"})
+"""Kinds of two faces that may meet: a probe and a drogue dock, two drogues leave each other alone."""
+
+
+class Seat(NamedTuple):
+    """One module of a shape."""
+
+    cell: Cell
+    rotation: int
+
+
+def grow(rng: np.random.Generator, count: int, faces: str) -> list[Seat]:
+    """A shape of `count` like modules, grown one by one at a random open face, each turned at random.
+
+    Args:
+        faces: kinds of a module's six faces, as in a vehicle file.
+    """
+    looks = [_kinds(rotation, faces) for rotation in range(COUNT)]
+    seats = [Seat((0, 0, 0), 0)]
+    while len(seats) < count:
+        taken = {seat.cell: looks[seat.rotation] for seat in seats}
+        open_cells = sorted({_beside(seat.cell, step) for seat in seats for step in STEPS} - set(taken))
+        choices = [
+            Seat(cell, rotation)
+            for cell, rotation in itertools.product(open_cells, range(COUNT))
+            if _fits(cell, looks[rotation], taken)
+        ]
+        seats.append(choices[int(rng.integers(len(choices)))])
+    return seats
+
+
+def _kinds(rotation: int, faces: str) -> dict[Cell, str]:
+    """Kind of the face that looks each way when the module is turned so."""
+    turn = rotations.to_matrix(QUATERNIONS[rotation].copy())
+    return {tuple(int(round(float(x))) for x in turn @ n): kind for n, kind in zip(FACE_NORMALS, faces, strict=True)}  # type: ignore[misc]
+
+
+def _beside(cell: Cell, step: Cell) -> Cell:
+    return cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]
+
+
+def _fits(cell: Cell, kinds: dict[Cell, str], taken: dict[Cell, dict[Cell, str]]) -> bool:
+    """Whether every face that meets another may, and at least one docks."""
+    docked = False
+    for step in STEPS:
+        other = taken.get(_beside(cell, step))
+        if other is not None:
+            pair = {kinds[step], other[-step[0], -step[1], -step[2]]}
+            if pair not in MATES:
+                return False
+            docked |= pair == {"P", "D"}
+    return docked
