@@ -30,7 +30,9 @@ def modcube() -> None:
 
 @app.command()
 def run(
-    bus: Annotated[str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")] = "socketcan:can0",
+    bus: Annotated[
+        str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")
+    ] = "socketcan:can0",
     fleet: Annotated[Path | None, typer.Option(help="fleet file; without it one module, number 1")] = None,
     vehicle: Annotated[str, typer.Option(help="vehicle of the one module")] = "modcube",
     parameters: Annotated[Path | None, typer.Option(help="file of parameters")] = None,

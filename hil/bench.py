@@ -19,6 +19,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.recorder import Recorder
 from hil.nodes import Nodes, make_nodes
 from hil.scenario import Scenario, make_world
+from hil.dock_script import DockScript
 from hil.script import Script
 from hil.signals import TruthRecorder
 
@@ -34,7 +35,7 @@ class Bench:
     fleet: Fleet
     firmware: Firmware
     nodes: Nodes
-    script: Script
+    script: Script | DockScript
     firmware_port: Port
     plant_port: Port
     patience_looks: int = PATIENCE_LOOKS
@@ -71,6 +72,11 @@ def fleet_of(scenario: Scenario, bus: str, rate_hz: int) -> Fleet:
     return Fleet(module=modules, buses=(bus,), rate_hz=rate_hz)
 
 
+def script_of(scenario: Scenario, fleet: Fleet) -> Script | DockScript:
+    """Whoever gives the orders in a scenario."""
+    return DockScript(scenario, fleet) if scenario.task.kind == "dock" else Script(scenario, fleet)
+
+
 def open_bench(
     stack: ExitStack, scenario: Scenario, seed: int, parameters: Parameters, bus: str = DEFAULT_BUS, rate_hz: int = 100
 ) -> Bench:
@@ -81,7 +87,7 @@ def open_bench(
     numbers = {module.number: index for index, module in enumerate(fleet.module)}
     nodes = make_nodes(world, Codec.load(), numbers, scenario)
     ports = [stack.enter_context(open_port(bus)) for _ in range(2)]
-    return Bench(scenario, seed, fleet, firmware, nodes, Script(scenario, fleet), ports[0], ports[1])
+    return Bench(scenario, seed, fleet, firmware, nodes, script_of(scenario, fleet), ports[0], ports[1])
 
 
 def fly_scenario(

@@ -44,7 +44,7 @@ def run_campaign(
     executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Flies every seed and writes campaign.json into `out`; returns its content. `executor`: any in place of processes."""
+    """Flies every seed and writes campaign.json into `out`; returns its content. `executor` replaces the processes."""
     out.mkdir(parents=True, exist_ok=True)
     pool = executor or ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
     trials: list[Trial] = []

@@ -64,7 +64,9 @@ def run(
     parameters = parameters_of(controller)
     folder = out if out is not None else Path("runs") / chosen.name
     if realtime and bus.startswith("virtual:"):
-        raise DescriptionError(f"bus {bus!r} does not reach another process; --realtime needs udp:GROUP:PORT or socketcan:IFACE")
+        raise DescriptionError(
+            f"bus {bus!r} does not reach another process; --realtime needs udp:GROUP:PORT or socketcan:IFACE"
+        )
     with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:
         result = fly_and_judge(chosen, seed, parameters, folder, bus, rate_hz, progress, realtime)
     report = illustrate(chosen, result, folder) if plots else None
@@ -115,5 +117,3 @@ def list_scenarios() -> None:
     """The scenarios that the package carries."""
     for name in scenario_names():
         typer.echo(f"{name:20s} {load_scenario(name).help}")
-
-

@@ -11,6 +11,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.bench import DEFAULT_BUS, fly_scenario
 from hil.checks import Result, judge, write_result
+from hil.docking_metrics import docking_metrics
 from hil.metrics import PAPER_SPIRAL_RMSE_MM, flight_metrics
 from hil.plant.spec import Tank
 from hil.plots import Window, write_plots
@@ -55,6 +56,8 @@ def judge_logs(scenario: Scenario, seed: int, folder: Path, wall_s: float = 0.0,
     share = scenario.task.duration_s / scenario.duration_s
     vehicle = load_vehicle(scenario.module[0].vehicle)
     metrics = flight_metrics(flight, com_m=vehicle.inertial.com_m, wall_s=wall_s * share, deadline_misses=deadline_misses)
+    if scenario.task.kind == "dock":
+        metrics |= docking_metrics(scenario, folder)
     return judge(scenario.name, seed, metrics, scenario.checks)
 
 

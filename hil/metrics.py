@@ -38,6 +38,11 @@ SHOWN = {
     **{f"sigma3_share_{axis}": Shown(f"Truth inside 3 sigma, {axis}", "%", 100.0, 1) for axis in AXES},
     "thrust_rms_n": Shown("Commanded force of a thruster, RMS", "N"),
     "tags_rejected": Shown("Tag observations refused by the gate", digits=0),
+    "docked": Shown("Together and apart as asked for (1: yes)", digits=0),
+    "tries": Shown("Meetings of a probe with a funnel", digits=0),
+    "jams": Shown("Jams", digits=0),
+    "outcome": Shown("Outcome (0 docked, 1 jammed, 2 unstable, 3 refused, 4 gave up)", digits=0),
+    "false_declarations": Shown("Ticks in which a dock was believed that was none", digits=0),
     "duration_s": Shown("Duration of the judged part", "s"),
     "real_time_factor": Shown("Faster than real time by", "times", digits=1),
     "ticks": Shown("Ticks judged", digits=0),
@@ -135,7 +140,7 @@ def flight_metrics(
     metrics |= {f"sigma3_share_{axis}": float(share) for axis, share in zip(AXES, inside.mean(axis=0), strict=True)}
     return metrics | {
         "sigma3_share": float(inside.mean(axis=0).min()),
-        "thrust_rms_n": _rms(firmware["commanded_n"]),
+        "thrust_rms_n": float(np.sqrt(np.nanmean(np.square(firmware["commanded_n"])))),
         "tags_rejected": float(firmware["rejected"][-1] - firmware["rejected"][0]),
         "duration_s": duration_s,
         "real_time_factor": duration_s / wall_s if wall_s > 0.0 else 0.0,

@@ -44,7 +44,7 @@ class Mcu:
         self.number, self.module = number, module
         self.stopped = False
         self.timed_out = False
-        self.relays = [0] * 6
+        self.relays = world.docks.relays[module].tolist()
         self.errors = 0
         self._world, self._spec = world, spec
         self._sensors = Sensors(spec, world.spec, world.seed, module)
@@ -73,6 +73,7 @@ class Mcu:
                 self.stopped = False
         elif name == "DOCK_CMD":
             self.relays = [int(v) for v in values[:6]]
+            self._world.set_relays(self.module, self.relays)
 
     def estop(self, time_ns: int) -> None:
         """An ESTOP frame came: thrust ends at once, without waiting for SYNC."""
@@ -129,8 +130,8 @@ class Mcu:
             return [self._sensors.pressure_pa(truth), self._world.spec.temperature_c, 0]
         if name.startswith("DOCK_CURRENT"):
             first = 0 if name.endswith("ABC") else 3
-            noise = self._spec.dock_sigma_ma * self._dock.take()
-            return [*noise[first : first + 3].tolist(), *self.relays[first : first + 3]]
+            current = self._world.docks.current_ma()[self.module] + self._spec.dock_sigma_ma * self._dock.take()
+            return [*current[first : first + 3].tolist(), *self.relays[first : first + 3]]
         if name.startswith("ESC_FEEDBACK"):
             return self._esc(2 * (int(name[-1]) - 1))
         if name == "POWER":

@@ -1,4 +1,6 @@
-"""The plant in real time, in a process of its own and on its own clock: `modcube hil plant`, and the other half of `--realtime`."""
+"""The plant in real time, in a process of its own and on its own clock: `modcube hil plant`, and the other half of
+`--realtime`.
+"""
 
 from __future__ import annotations
 

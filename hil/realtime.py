@@ -21,10 +21,9 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
-from hil.bench import fleet_of
+from hil.bench import fleet_of, script_of
 from hil.plant_process import PlantProcess
 from hil.scenario import Scenario
-from hil.script import Script
 
 PLANT_READY_S = 120.0
 """Longest that the plant's process may take to start."""
@@ -68,17 +67,19 @@ def fly_in_real_time(
     progress: Callable[[float], None] | None = None,
     start_method: str = "spawn",
     observers: Sequence[Observer] = (),
+    serve: Callable[..., None] = serve_plant,
 ) -> RealTimeFlight:
     """Flies `scenario` against the clock; the logs are in `out`. Raises DescriptionError and PortError.
 
     Args:
         start_method: of the plant's process. `fork` spares its imports; only for a process without threads.
         observers: called after each tick, besides the recorder.
+        serve: what the plant's process runs, with the arguments of `serve_plant`.
     """
     context = multiprocessing.get_context(start_method)
     ready, stop = context.Event(), context.Event()
     arguments = (scenario, seed, bus, rate_hz, out, ready, stop)
-    plant = context.Process(target=serve_plant, args=arguments, name="plant", daemon=True)
+    plant = context.Process(target=serve, args=arguments, name="plant", daemon=True)
     with ExitStack() as stack:
         plant.start()
         stack.callback(plant.join)
@@ -88,7 +89,7 @@ def fly_in_real_time(
         while not ready.wait(timeout=1.0):
             if not plant.is_alive():
                 raise RuntimeError("the plant's process ended before it was ready")
-        script = Script(scenario, fleet)
+        script = script_of(scenario, fleet)
         recorder = Recorder(out, {"scenario": scenario.name, "seed": seed, "rate_hz": rate_hz})
         stack.callback(recorder.close)
         start_ns = 0
@@ -110,5 +111,9 @@ def fly_in_real_time(
         loop.rate_keeper.start(start_ns + fleet.period_ns)
         loop.run(stop_at_end)
     keeper = loop.rate_keeper
-    lateness = {"p50": keeper.lateness.quantile_ns(0.5), "p99": keeper.lateness.quantile_ns(0.99), "worst": keeper.lateness.worst_ns}
+    lateness = {
+        "p50": keeper.lateness.quantile_ns(0.5),
+        "p99": keeper.lateness.quantile_ns(0.99),
+        "worst": keeper.lateness.worst_ns,
+    }
     return RealTimeFlight(script.ticks / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness, refused)

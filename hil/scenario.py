@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -12,8 +13,9 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import FACE_NAMES, load_vehicle
 from hil.plant.build import nominal_centre
+from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream
 from hil.plant.lattice import is_connected, place
 from hil.plant.polycube import grow
@@ -29,7 +31,7 @@ class ModuleStart:
     vehicle: str = quantity("modcube", help="vehicle name or file")
     position_m: np.ndarray = quantity(
         [0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,),
-        help="world; of a module alone its hull's centre, of docked ones the body's centre of mass, given with the first",
+        help="world; a lone module: its hull's centre; docked ones: their centre of mass, given with the first",
     )  # fmt: skip
     euler_deg: np.ndarray = quantity(
         [0, 0, 0], unit="deg", low=-360, high=360, shape=(3,), help="roll, pitch, yaw of the body, given with the first"
@@ -45,13 +47,47 @@ class ModuleStart:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RandomStart:
+    """How far every body's start is off, each drawn per seed: uniform within these bounds."""
+
+    position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=0, high=100, shape=(3,), help="along each world axis")
+    yaw_deg: float = quantity(0.0, unit="deg", low=0, high=180, help="about the vertical")
+
+    def shifted(self, start: Start, seed: int, leader: int) -> Start:
+        """The start of the body led by that module, in the run `seed`."""
+        drawn = stream(seed, "start", leader).uniform(-1.0, 1.0, 4)
+        turn = rotations.from_euler(0.0, 0.0, math.radians(self.yaw_deg) * float(drawn[3]))
+        return Start(start.p_wm + self.position_m * drawn[:3], rotations.multiply(turn, start.q_wm))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Step:
+    """One thing that a docking task does, after the one before is over."""
+
+    do: str = quantity(
+        choices=("dock", "undock", "move", "moebius", "wait"),
+        help="dock, undock: the faces named here; move: the body of `module` to a place; moebius: it flies the strip",
+    )
+    module: int = quantity(2, low=1, high=29, help="number of the active module")
+    face: str = quantity("-x", choices=FACE_NAMES, help="its face")
+    target_module: int = quantity(1, low=1, high=29, help="number of the other module")
+    target_face: str = quantity("+x", choices=FACE_NAMES, help="its face")
+    quarter_turns: int = quantity(0, low=0, high=3, help="of the active face about its normal")
+    both_approach: bool = quantity(False, help="both bodies move, as in the paper")
+    position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-100, high=100, shape=(3,), help="move: where to, world")
+    duration_s: float = quantity(10.0, unit="s", low=0, high=3600, help="move, moebius, wait: how long")
+    magnets: bool = quantity(False, help="move: `face` and `target_face` are energised on the way")
+    also: bool = quantity(False, help="begins together with the step before")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Task:
     """What the robot is to do."""
 
     kind: str = quantity(
-        choices=("hover", "spiral", "moebius", "lissajous"),
+        choices=("hover", "spiral", "moebius", "lissajous", "dock"),
         help="hover: hold the place; spiral: climb on a cylinder; moebius: along the rim of a Moebius strip; "
-        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns",
+        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns; dock: the [[step]]s",
     )
     settle_s: float = quantity(15.0, unit="s", low=0, high=600, help="held at the start before the task begins")
     duration_s: float = quantity(unit="s", low=0.1, high=7200, help="of the task itself, rest to rest")
@@ -64,7 +100,12 @@ class Task:
     yaw_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of yaw a turn of u")
     roll_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of roll a turn of u")
     centre_m: np.ndarray = quantity(
-        [0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,), help="hover: place; spiral: bottom of its axis; moebius: centre"
+        [0, 0, 0],
+        unit="m",
+        low=-1000,
+        high=1000,
+        shape=(3,),
+        help="hover: place; spiral: bottom of its axis; moebius: centre",
     )
 
 
@@ -100,6 +141,10 @@ class Scenario:
     tags: tuple[int, ...] = quantity((5,), low=0, high=15, help="tags that the modules carry; 5 is the top face")
     camera: tuple[CameraPose, ...] = quantity(())
     polycube: Polycube | None = quantity(None)
+    start: RandomStart = quantity(RandomStart())
+    dock: DockSpec = quantity(DockSpec())
+    jam: JamRule = quantity(JamRule())
+    step: tuple[Step, ...] = quantity(())
     task: Task = quantity()
     world: WorldSpec = quantity(WorldSpec())
     sensors: SensorSpec = quantity(SensorSpec())
@@ -122,6 +167,13 @@ class Scenario:
             key = ("body", module.body) if module.body >= 0 else ("alone", index)
             found.setdefault(key, []).append(index)
         return [tuple(members) for members in found.values()]
+
+    def index_of(self, number: int) -> int:
+        """Index of the module with that number. Raises DescriptionError."""
+        for index, module in enumerate(self.module):
+            if module.number == number:
+                return index
+        raise DescriptionError(f"no module has the number {number}")
 
     @property
     def duration_s(self) -> float:
@@ -172,7 +224,7 @@ def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
     places = [place(m.cell, m.rotation, PITCH_M, _origin(scenario, groups, i)) for i, m in enumerate(scenario.module)]
     starts = [m.start for m in scenario.module]
     for members in groups:
-        start = starts[members[0]]
+        start = scenario.start.shifted(starts[members[0]], seed, members[0])
         centre = nominal_centre([vehicles[m] for m in members], [places[m] for m in members])
         if len(members) == 1:
             centre = np.zeros(3)
@@ -180,9 +232,8 @@ def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
             lever = rotations.rotate(start.q_wm, places[m].position - centre)
             q_wm = rotations.multiply(start.q_wm, places[m].quaternion)
             starts[m] = Start(start.p_wm + lever, q_wm)
-    return World(
-        scenario.world, scenario.tank, vehicles, starts, seed, period_ns, groups=groups, places=places
-    )  # fmt: skip
+    spec = (scenario.world, scenario.tank, vehicles, starts, seed, period_ns)
+    return World(*spec, groups=groups, places=places, dock=scenario.dock, jam=scenario.jam)
 
 
 def _origin(scenario: Scenario, groups: Sequence[Sequence[int]], module: int) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""What the person at the bench does: arm, wait at the start, begin the task. It speaks to the firmware by requests alone."""
+"""What the person at the bench does: arm, wait at the start, begin the task. It speaks to the firmware by requests
+alone.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +17,8 @@ from hil.scenario import Scenario, Task
 
 ARM_FROM_S = 1.0
 """First attempt to arm: the pose needs a few tags."""
+MOEBIUS_RAMP_SHARE = 0.25
+"""Share of the time over which the speed rises, and falls again: 0.25 keeps the peak at 4/3 of the mean, so drag errors stay small."""
 ARM_EVERY_S = 0.5
 """Then again so often until it is granted."""
 
@@ -57,16 +61,28 @@ def _spiral(task: Task, q_wb: np.ndarray) -> Trajectory:
 
 
 def _moebius(task: Task, q_wb: np.ndarray) -> Trajectory:
-    return paths.moebius(task.centre_m, task.duration_s, task.radius_m, task.half_width_m, task.turns)
+    return paths.moebius(
+        task.centre_m, task.duration_s, task.radius_m, task.half_width_m, task.turns, ramp_share=MOEBIUS_RAMP_SHARE
+    )
 
 
 def _lissajous(task: Task, q_wb: np.ndarray) -> Trajectory:
     turning = (task.yaw_turns, task.roll_turns)
     return paths.lissajous(
-        task.centre_m, task.amplitude_m, task.frequency, task.duration_s, turns=task.turns, attitude=q_wb, turning=turning
+        task.centre_m,
+        task.amplitude_m,
+        task.frequency,
+        task.duration_s,
+        turns=task.turns,
+        attitude=q_wb,
+        turning=turning,
     )
 
 
-TASKS: dict[str, Callable[[Task, np.ndarray], Trajectory]] = {"hover": _hover, "lissajous": _lissajous, "moebius": _moebius, "spiral": _spiral}
+TASKS: dict[str, Callable[[Task, np.ndarray], Trajectory]] = {
+    "hover": _hover,
+    "lissajous": _lissajous,
+    "moebius": _moebius,
+    "spiral": _spiral,
+}
 """Trajectory of each kind of task."""
-

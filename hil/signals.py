@@ -52,8 +52,24 @@ def body_signals(modules: int) -> tuple[Signal, ...]:
     )
 
 
+def dock_signals(modules: int) -> tuple[Signal, ...]:
+    """Truth of all docking faces in one tick, in the order of `TruthRecorder.record_docks`."""
+    return (
+        Signal("tick", kind="int"),
+        Signal("time_ns", unit="ns", kind="int"),
+        Signal("joints", kind="int"),
+        Signal("contacts", kind="int"),
+        Signal("jams", kind="int"),
+        Signal("gap_m", unit="m"),
+        Signal("lateral_m", unit="m"),
+        Signal("current_ma", 6 * modules, "mA"),
+    )
+
+
 class TruthRecorder:
-    """Writes /plant/moduleN and /plant/bodyN (N: its leader), a message per tick and module or body. A context manager. Raises OSError when the disk is full."""
+    """Writes /plant/moduleN and /plant/bodyN (N: its leader), a message per tick and module or body. A context
+    manager. Raises OSError when the disk is full.
+    """
 
     def __init__(self, folder: Path, thrusters: tuple[int, ...]) -> None:
         """`thrusters` has the number of thrusters of each module of the fleet, in its order."""
@@ -68,8 +84,15 @@ class TruthRecorder:
             channel = self._writer.register_channel(f"/plant/module{module}", "protobuf", schema)
             self._modules.append((channel, layout.row()))
         self._body_layout = Layout("Body", body_signals(len(thrusters)))
-        self._body_schema = self._writer.register_schema(self._body_layout.schema_name, "protobuf", self._body_layout.schema)
+        self._body_schema = self._writer.register_schema(
+            self._body_layout.schema_name, "protobuf", self._body_layout.schema
+        )
         self._bodies: dict[int, Any] = {}
+        self._docks: Any = None
+        if len(thrusters) > 1:
+            layout = Layout("Docks", dock_signals(len(thrusters)))
+            schema = self._writer.register_schema(layout.schema_name, "protobuf", layout.schema)
+            self._docks = (self._writer.register_channel("/plant/docks", "protobuf", schema), layout.row())
 
     def record_world(self, tick: int, world: World) -> None:
         """Truth of everything at the moment of SYNC `tick`."""
@@ -79,6 +102,12 @@ class TruthRecorder:
         for body in range(len(world.bodies)):
             b = world.body_truth(body)
             self.record_body(tick, b.time_ns, b.modules, b.p_wb, b.q_wb, b.v_w, b.w_b)
+        if self._docks is not None:
+            docks, (channel, row) = world.docks, self._docks
+            jams = sum(contact.jammed for contact in docks.contacts)
+            counts = (len(docks.joints), len(docks.contacts), jams)
+            values = (tick, world.time_ns, *counts, docks.gap_m, docks.lateral_m, docks.current_ma().ravel())
+            self._add(channel, world.time_ns, row.encode(values))
 
     def record_body(
         self,
@@ -168,7 +197,9 @@ class Flight:
 
     @property
     def p_wb(self) -> np.ndarray:
-        """(k, 3) where the point that the firmware steers really is, world, m; the hull's centre in a log without bodies."""
+        """(k, 3) where the point that the firmware steers really is, world, m; the hull's centre in a log without
+        bodies.
+        """
         return self.truth.get("p_wb", self.truth["p_wm"])
 
     @property

@@ -21,6 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NoReturn
 
+import characterise_blas  # noqa: F401
 import characterise_table as table
 import numpy as np
 from rich.console import Console

@@ -49,7 +49,7 @@ def choose(count: int, path: Path, out: Path | None, console: Console, progress:
 
 def _show(console: Console, task: Task, count: int, found: Sequence[Choice], assumption: str) -> None:
     what = f"{len(found)} shapes of {count} x {task.vehicle}"
-    title = f"{task.name}: {what}, by {task.rank_by}; guaranteed: with any {task.dead} thrusters dead"
+    title = f"{task.name}: {what}, by {task.rank_by}; guaranteed: with any {task.dead} dead"
     shown = Table(title=title, title_justify="left")
     heads = (
         "rank", "cells", "box", "poses", "margin", "power, W", "variance, N^2", "margin\nguaranteed",

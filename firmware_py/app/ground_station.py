@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from types import TracebackType
 
+import numpy as np
+
 from firmware_py.app.firmware import BusFrame, Firmware
 from firmware_py.app.mission_plan import plan_mission
 from firmware_py.core.types import Inputs, Outputs, Request
@@ -32,11 +34,15 @@ _SAVE_EVERY_NS = 1_000_000_000
 """How often the signing time stamp is stored; the store is that much ahead."""
 
 
+_NOTHING = PlanJob(0, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), 0.1, 1.0)
+"""A plan of no legs: makes the planning process load what it needs."""
+
+
 class GroundSide:
     """Links, station, and what passes between them and the loop. `pump` does one round of the work.
 
     Args of the constructor:
-        executor: plans missions; None starts a process for it when the first mission comes.
+        executor: plans missions; None starts a process for it.
         unix_now_ns: the time of day, for signing.
     """
 
@@ -101,7 +107,10 @@ class GroundSide:
         return self.station.reboot_asked
 
     def __enter__(self) -> GroundSide:
-        """Start the thread."""
+        """Start the thread, and the process that plans: it takes seconds to be ready."""
+        if self._executor is None:
+            self._executor = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+            self._executor.submit(plan_mission, _NOTHING, None)
         self._thread = threading.Thread(target=self._run, name="ground", daemon=True)
         self._thread.start()
         return self

@@ -71,7 +71,8 @@ def _sections(legs: Sequence[Leg]) -> Iterator[list[Leg]]:
             yield section
             section = []
         section.append(leg)
-    yield section
+    if section:
+        yield section
 
 
 def _waypoints(p_wb: np.ndarray, q_wb: np.ndarray, section: Sequence[Leg]) -> tuple[list[Waypoint], list[int]]:

@@ -1,4 +1,5 @@
-"""Arming checks as a table, each with its reason in words; and what each mode needs. The supervisor asks, nobody else."""
+"""Arming checks as a table, each with its reason in words; and what each mode needs. The supervisor asks, nobody else.
+"""
 
 from __future__ import annotations
 

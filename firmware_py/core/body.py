@@ -44,7 +44,8 @@ class DragTable:
     """Drag of a shape over flow direction, on the six sides of a cube (core.drag_lookup).
 
     Attributes:
-        nodes: (6, n, n, 4) per node: force per squared speed 1/2 rho Cd A (N s^2/m^2), centre of pressure (3,) from the centre of mass, m.
+        nodes: (6, n, n, 4) per node: force per squared speed 1/2 rho Cd A (N s^2/m^2), centre of pressure (3,) from
+            the centre of mass, m.
         rotational: (3,) quadratic damping about the body axes, N m s^2.
         linear: (6,) linear damping, N s/m and N m s.
     """

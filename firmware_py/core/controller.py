@@ -1,4 +1,5 @@
-"""Stage 5 of a tick: PD with model feed-forward (paper, Eq. 4), attitude error on SO(3), gains times the body's mass matrix.
+"""Stage 5 of a tick: PD with model feed-forward (paper, Eq. 4), attitude error on SO(3), gains times the body's mass
+matrix.
 
 tau = M (Kp e + Kd de/dt + dnu_d/dt) + C(nu) nu + D(nu) nu + g - disturbance. K_P = M w^2, K_D = 2 z w M.
 """
@@ -44,7 +45,9 @@ class Controller:
         """
         e = estimate
         return np.asarray(
-            _wrench(*now, *ahead, e.p_wb, e.q_wb, e.nu, e.force_w, e.moment_b, self._kp, self._kd, self._law, *self._plant)
+            _wrench(
+                *now, *ahead, e.p_wb, e.q_wb, e.nu, e.force_w, e.moment_b, self._kp, self._kd, self._law, *self._plant
+            )
         )
 
 

@@ -13,7 +13,9 @@ GLIDE_SPEED_M_S = 0.06
 
 
 class Glide:
-    """From one set-point at rest along a vector, attitude kept; the quintic with zero velocity and acceleration at both ends."""
+    """From one set-point at rest along a vector, attitude kept; the quintic with zero velocity and acceleration at
+    both ends.
+    """
 
     def __init__(self, start: Setpoint, by_w: np.ndarray, peak_m_s: float = GLIDE_SPEED_M_S) -> None:
         """`by_w`: (3,) displacement, world, m."""

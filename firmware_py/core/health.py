@@ -1,4 +1,5 @@
-"""How a body is: one row of figures per tick, from what its modules say and what the estimator believes. Supervisor and fail-safes judge it.
+"""How a body is: one row of figures per tick, from what its modules say and what the estimator believes. Supervisor
+and fail-safes judge it.
 
 Figures that are not known yet are NaN, so that no comparison with them holds.
 """

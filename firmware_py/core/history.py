@@ -1,4 +1,6 @@
-"""What the estimator keeps of the last half second: per tick the thruster wrench and the inertial and depth measurements."""
+"""What the estimator keeps of the last half second: per tick the thruster wrench and the inertial and depth
+measurements.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ class History:
     def push(
         self, time_ns: int, tau: np.ndarray, gyro: np.ndarray | None, accel: np.ndarray | None, depth_m: float | None
     ) -> None:
-        """Appends the sample of the tick at `time_ns`; ticks that were skipped are filled with the same wrench and no sensors."""
+        """Appends the sample of the tick at `time_ns`; ticks that were skipped are filled with the same wrench and no
+        sensors.
+        """
         while self.newest >= 0 and time_ns - self.newest_ns >= 2 * self.period_ns:
             self._write(self.newest_ns + self.period_ns, tau, None, None, None)
         self._write(time_ns, tau, gyro, accel, depth_m)
@@ -46,7 +50,11 @@ class History:
 
     def first_after(self, time_ns: int) -> int:
         """Index of the first sample later than `time_ns`."""
-        return self.newest - (self.newest_ns - time_ns - 1) // self.period_ns if time_ns < self.newest_ns else self.newest + 1
+        return (
+            self.newest - (self.newest_ns - time_ns - 1) // self.period_ns
+            if time_ns < self.newest_ns
+            else self.newest + 1
+        )
 
     def tau(self, index: int) -> np.ndarray:
         """(6,) mean thruster wrench of the tick that ended with sample `index`."""

@@ -20,15 +20,19 @@ BLOCK_NS = 100_000_000
 """Length of a block."""
 RECENT, GAP, BASE = 5, 12, 30
 """Blocks: what is judged is the mean of the last half second; against that of three seconds that ended 1.2 s before now."""
+LEAST_BASE = 5
+"""Blocks that the base needs."""
 SIGMA_FORCE_N, SIGMA_MOMENT = 0.15, 0.010
 """What a healthy module's half-second mean is off, N and N m: accelerometer tilt and noise, gains, gusts (measured on the bench)."""
+UNSURE_ARM_M, UNSURE_LIFT_N = 0.008, 0.5
+"""Righting arm and trim (times dry weight a moment) and buoyancy of a module may be off by this much: felt when the body tilts."""
 MODEL_SHARE = 0.12
 """What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too."""
 EXPLAINED = 0.8
 """Share of the change (squared, in sigmas) that one thruster must explain."""
 RUNNER_UP = 0.5
 """What it leaves unexplained must be less than this share of what the next best leaves."""
-SIGNIFICANT = 12.0
+SIGNIFICANT = 20.0
 """Squared sigmas that it must explain."""
 MOST = 2.6
 """A thruster cannot lose more than this many times its force: 2 is reversed."""
@@ -42,20 +46,22 @@ class MissingThrust:
         self._body, self._p = body, parameters
         self._columns = t.matrix.T.copy()
         self._ticks = max(1, round(BLOCK_NS / period_ns))
-        count = len(body.modules)
+        count = self._modules = len(body.modules)
         self._sigma = np.repeat([SIGMA_FORCE_N * np.sqrt(count), SIGMA_MOMENT * count], 3)
         self._period_s = period_ns * 1e-9
         self.forget()
 
     def reset(self) -> None:
-        """All is forgotten."""
-        self.forget()
+        """Suspicion is dropped; what the disarmed body did stays as the base."""
+        self._suspect, self._count = -1, 0
 
     def forget(self) -> None:
         """What was seen no longer counts, because the body has changed."""
         self._rest = np.full((GAP + BASE, 6), np.nan)
         self._force = np.zeros((GAP + BASE, self._columns.shape[0]))
         self._acted = np.zeros((GAP + BASE, 6))
+        self._down_b = np.zeros((GAP + BASE, 3))
+        self._tilt = np.zeros((GAP + BASE, 1))
         self._suspect, self._count = -1, 0
         self._start_block(None)
 
@@ -75,7 +81,7 @@ class MissingThrust:
         self._add(measured, estimate, force_n)
         if self._n < self._ticks:
             return None
-        full = self._close()
+        full = self._close(estimate)
         self._start_block(self._last if self._last_n == self._n else None)
         if not (full and armed):
             self._count = 0
@@ -101,7 +107,7 @@ class MissingThrust:
         self._sum_tau += tau
         self._sum_model += model
 
-    def _close(self) -> bool:
+    def _close(self, estimate: Estimate) -> bool:
         """Ends the block; whether it is whole."""
         n = self._n
         span = (self._last_n - self._first_n) * self._period_s
@@ -110,7 +116,11 @@ class MissingThrust:
         if whole and self._last is not None and self._first is not None:
             motion = np.r_[self._sum_a / self._accels, (self._last - self._first) / span]
             rest = self._body.mass @ motion - (self._sum_tau + self._sum_model) / n
-        for rows, new in ((self._rest, rest), (self._force, self._sum_f / n), (self._acted, self._sum_tau / n)):
+        down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
+        for rows, new in (
+            (self._rest, rest), (self._force, self._sum_f / n), (self._acted, self._sum_tau / n), (self._down_b, down_b),
+            (self._tilt, np.max(estimate.sigma_q)),
+        ):  # fmt: skip
             rows[:-1] = rows[1:]
             rows[-1] = new
         return whole
@@ -128,13 +138,15 @@ class MissingThrust:
         """The one thruster that explains the change, or -1."""
         base = ~np.isnan(self._rest[:BASE, 0])
         recent = ~np.isnan(self._rest[-RECENT:, 0])
-        if base.sum() < BASE // 3 or recent.sum() < RECENT - 1:
+        if base.sum() < LEAST_BASE or recent.sum() < RECENT - 1:
             return -1
-        change = self._rest[-RECENT:][recent].mean(axis=0) - self._rest[:BASE][base].mean(axis=0)
-        now = self._force[-RECENT:][recent].mean(axis=0)
+        change, now, acted, tilted = (
+            rows[-RECENT:][recent].mean(axis=0) - rows[:BASE][base].mean(axis=0)
+            for rows in (self._rest, self._force, self._acted, self._down_b)
+        )
         before = self._force[:BASE][base].mean(axis=0)
-        acted = self._acted[-RECENT:][recent].mean(axis=0) - self._acted[:BASE][base].mean(axis=0)
-        sigma = np.sqrt(self._sigma**2 + (MODEL_SHARE * np.abs(acted)) ** 2)
+        now = now + before
+        sigma = self._sigmas(acted, float(np.linalg.norm(tilted)), float(self._tilt[:BASE][base].mean()))
         y = change / sigma
         total = float(y @ y)
         left = np.full(alive.size, total)
@@ -148,6 +160,13 @@ class MissingThrust:
         best, second = int(order[0]), int(order[1])
         sure = total - left[best] >= SIGNIFICANT and left[best] <= (1.0 - EXPLAINED) * total
         return best if sure and left[best] <= RUNNER_UP * left[second] else -1
+
+    def _sigmas(self, acted: np.ndarray, tilted: float, tilt_sigma: float) -> np.ndarray:
+        """(6,) what a healthy body's change may be: noise, model, tilt of the body, and doubt about the tilt."""
+        dry_n = self._body.dry_kg * GRAVITY
+        tilt = np.repeat([UNSURE_LIFT_N * np.sqrt(self._modules), UNSURE_ARM_M * dry_n], 3) * tilted
+        doubt = np.repeat([float(self._body.mass[0, 0]) * GRAVITY * tilt_sigma, 0.0], 3)
+        return np.asarray(np.sqrt(self._sigma**2 + (MODEL_SHARE * acted) ** 2 + tilt**2 + doubt**2))
 
 
 DOWN = np.array([0.0, 0.0, GRAVITY])

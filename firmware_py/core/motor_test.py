@@ -1,4 +1,6 @@
-"""Turns one thruster, or one after the other (MOTOR_DETECT), past controller and allocator; the limiter still has the last word."""
+"""Turns one thruster, or one after the other (MOTOR_DETECT), past controller and allocator; the limiter still has the
+last word.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The estimator's measurement models, compiled: residual, Jacobian and noise of the inertial sensors with depth, and of a tag.
+"""The estimator's measurement models, compiled: residual, Jacobian and noise of the inertial sensors with depth, and
+of a tag.
 
 States and errors are those of `propagation`. One row for each number measured; what did not come (NaN) has no row.
 """
@@ -8,15 +9,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
-from numba.types import Tuple, float64
+from numba import float64, njit, types
 
 from firmware_py.core.propagation import ERRORS
 from firmware_py.core.rotations import M, V, difference, skew, to_matrix
 
 GRAVITY = 9.80665
 """m/s^2, standard gravity."""
-MODEL = Tuple((float64[::1], float64[:, ::1], float64[:, ::1]))
+MODEL = types.Tuple((float64[::1], float64[:, ::1], float64[:, ::1]))  # type: ignore[no-untyped-call]
 """Residual (m,), Jacobian (m, 25), noise covariance (m, m)."""
 
 
@@ -24,8 +24,8 @@ MODEL = Tuple((float64[::1], float64[:, ::1], float64[:, ::1]))
 def inertial(x, gyro, accel, depth, sigma, moved):  # type: ignore[no-untyped-def]
     """Gyro (3,), accelerometer (3,) and depth; sigma (3,) in that order.
 
-    The accelerometer gives the tilt: its model is gravity plus `moved` (3,), the acceleration that thrusters and drag give the body by
-    the process model, body frame, taken as known.
+    The accelerometer gives the tilt: its model is gravity plus `moved` (3,), the acceleration that thrusters and drag
+    give the body by the process model, body frame, taken as known.
     """
     residual = np.empty(7)
     h = np.zeros((7, ERRORS))
@@ -55,7 +55,9 @@ def inertial(x, gyro, accel, depth, sigma, moved):  # type: ignore[no-untyped-de
 
 @njit(MODEL(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1]), cache=True)
 def tag(x, p_wt, lever_b, q_wb, variance):  # type: ignore[no-untyped-def]
-    """Tag centre p_wt (3,) at lever_b (3,) and attitude q_wb (4,); variance (6,) of position (world) and attitude (body)."""
+    """Tag centre p_wt (3,) at lever_b (3,) and attitude q_wb (4,); variance (6,) of position (world) and attitude
+    (body).
+    """
     q = x[3:7].copy()
     r = to_matrix(q)
     h = np.zeros((6, ERRORS))
@@ -77,7 +79,8 @@ def normalised_square(residual, h, noise, covariance):  # type: ignore[no-untype
 
 @njit(f"{V}({V},{M},{V},{M},float64,float64)", cache=True)
 def carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance):  # type: ignore[no-untyped-def]
-    """(6,) variance of position (world) and attitude (body) after carrying the state for `lag` seconds by gyro and model.
+    """(6,) variance of position (world) and attitude (body) after carrying the state for `lag` seconds by gyro and
+    model.
 
     Args:
         density: (25,) process noise, per second. rate_variance: of the carried attitude, rad^2/s.
@@ -95,4 +98,3 @@ def carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance):
     out[:3] += density[6:9] * lag**3 / 3.0
     out[3:] += rate_variance * lag
     return out
-

@@ -79,7 +79,7 @@ class BodyPipeline:
         decisions = self.supervisor.step(inputs.estop, self.health.now, mine, self._endings())
         for decision in decisions:
             self._apply(decision, inputs.time_ns, estimate)
-        self.supervisor.events += [Event(WARNING, words) for words in self.faults.words]
+        self.supervisor.events[:0] = [Event(WARNING, words) for words in self.faults.words]
         if self.supervisor.armed and not was_armed:
             self.faults.reset()
             self.allocator.set_alive(self.faults.now.alive)

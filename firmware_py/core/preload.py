@@ -1,4 +1,5 @@
-"""Preload: thrusters of one module pushed against each other, without any wrench, so that small forces stay clear of the deadband.
+"""Preload: thrusters of one module pushed against each other, without any wrench, so that small forces stay clear of
+the deadband.
 
 Worked out when a body is made or a thruster is lost; the allocator adds it to every answer.
 """
@@ -18,7 +19,8 @@ UNEVEN = 5.0
 
 
 def preload(thrusters: ThrusterSet, alive: np.ndarray, smallest_n: float) -> np.ndarray:
-    """(n,) forces without wrench, N: every thruster that can be is at least `smallest_n` from zero, and no more than needed.
+    """(n,) forces without wrench, N: every thruster that can be is at least `smallest_n` from zero, and no more than
+    needed.
 
     Args:
         alive: (n,) bool, thrusters that may be used.

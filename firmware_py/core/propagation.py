@@ -1,9 +1,9 @@
 """The estimator's process model, compiled: the nominal state moved over a step, and the Jacobian of its error.
 
-Nominal state x (26,): position p_wb 0:3, attitude q_wb 3:7, velocity nu 7:13 (body), gyro bias 13:16, accelerometer bias 16:19,
-disturbance force 19:22 (world, N), disturbance moment 22:25 (body, N m), depth bias 25.
-Error state e (25,): the same with the attitude error as a rotation vector in the body frame: dp 0:3, dtheta 3:6, dnu 6:12, dbg 12:15,
-dba 15:18, df 18:21, dm 21:24, dbz 24.
+Nominal state x (26,): position p_wb 0:3, attitude q_wb 3:7, velocity nu 7:13 (body), gyro bias 13:16, accelerometer
+bias 16:19, disturbance force 19:22 (world, N), disturbance moment 22:25 (body, N m), depth bias 25.
+Error state e (25,): the same with the attitude error as a rotation vector in the body frame: dp 0:3, dtheta 3:6, dnu
+6:12, dbg 12:15, dba 15:18, df 18:21, dm 21:24, dbz 24.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ def acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, l
 
 @njit(f"{V}({V},{V},{PLANT})", cache=True)
 def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(3,) acceleration of the centre of mass against the world, body frame, in state x under the thruster wrench tau (6,)."""
+    """(3,) acceleration of the centre of mass against the world, body frame, in state x under the thruster wrench tau
+    (6,).
+    """
     q = x[3:7].copy()
     nu = x[7:13].copy()
     external = tau.copy()
@@ -98,7 +100,8 @@ def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rota
     """(26,) state moved from the anchor to now through stored inputs.
 
     Args:
-        taus: (k, 6) mean thruster wrench of each remaining tick; gyros: (k, 3) measured rate at its end, NaN where none came.
+        taus: (k, 6) mean thruster wrench of each remaining tick; gyros: (k, 3) measured rate at its end, NaN where
+            none came.
         dt: tick, s; until_first: what is left of the first tick, s.
     """
     for i in range(taus.shape[0]):

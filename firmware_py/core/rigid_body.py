@@ -1,4 +1,5 @@
-"""Fossen's equations of motion of one body about its centre of mass: M dnu/dt + C(nu) nu + D + g(eta) = tau. Compiled."""
+"""Fossen's equations of motion of one body about its centre of mass: M dnu/dt + C(nu) nu + D + g(eta) = tau. Compiled.
+"""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ class Supervisor:
         if guard == Guard.MODE_NEEDS:
             return missing(mode, health, self._p)
         if guard == Guard.MODE_PERMITTED:
-            return missing(mode, health, self._p) + self._failsafes.against(mode, health)
+            return missing(mode, health, self._p) or self._failsafes.against(mode, health)
         if guard == Guard.ESTOP_QUIET and self._estop_age_ms(health) < self._p.supervision.estop_quiet_ms:
             return ["the e-stop is still raised"]
         if guard == Guard.IN_MOTOR_DETECT and self.mode != Mode.MOTOR_DETECT:

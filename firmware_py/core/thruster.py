@@ -1,6 +1,7 @@
 """Thruster curves: the paper's fifth-order polynomials force(command) and power(force), supply voltage, and the lag.
 
-The controller's side: it turns wanted forces into commands (limiter) and commands into the forces that it believes in (estimator).
+The controller's side: it turns wanted forces into commands (limiter) and commands into the forces that it believes in
+(estimator).
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def commands(force, scale, forward, reverse, deadband, limit_share, out):  # typ
 def is_monotone(coefficients: np.ndarray) -> bool:
     """Whether a force polynomial rises over commands 0..1, so that it has an inverse."""
     x = np.linspace(0.0, 1.0, 401)
-    return bool(np.all(np.diff([polynomial(np.ascontiguousarray(coefficients), v) for v in x]) > 0.0))
+    return bool(np.all(np.diff([polynomial(np.array(coefficients, dtype=np.float64), v) for v in x]) > 0.0))
 
 
 @njit("float64(float64[::1],float64[:,::1],float64[:,::1])", cache=True)
@@ -98,7 +99,7 @@ class ThrusterLag:
         mean = self._acting + (self.force_n - end) * self._lag_over_dt
         self.force_n = end
         self._acting = self._pending
-        return mean
+        return np.asarray(mean)
 
     @property
     def forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

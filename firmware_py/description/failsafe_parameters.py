@@ -175,7 +175,7 @@ class Faults:
 
     force_n: float = quantity(0.25, unit="N", low=0.05, high=10, help="believed force from which its speed is judged", mavlink="FLT_FORCE")
     dead_share: float = quantity(
-        0.35, low=0.05, high=0.95, help="share of the believed speed below which a propeller stands", mavlink="FLT_DEAD"
+        0.45, low=0.05, high=0.95, help="share of the believed speed below which a propeller stands", mavlink="FLT_DEAD"
     )
     dead_count: int = quantity(3, low=1, high=50, help="feedbacks in a row that must agree", mavlink="FLT_COUNT")
     lie_share: float = quantity(

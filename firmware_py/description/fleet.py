@@ -58,4 +58,6 @@ def load_fleet(path: Path) -> Fleet:
 
 def single(vehicle: str = "modcube", bus: str = "virtual:modcube", rate_hz: int = 100) -> Fleet:
     """A fleet of one module, number 1."""
-    return Fleet(module=(Module(number=1, vehicle=vehicle, cell=frozen_array([0, 0, 0])),), buses=(bus,), rate_hz=rate_hz)
+    return Fleet(
+        module=(Module(number=1, vehicle=vehicle, cell=frozen_array([0, 0, 0])),), buses=(bus,), rate_hz=rate_hz
+    )

@@ -1,4 +1,6 @@
-"""The only registry of tunables: each with unit, range, default, help and its MAVLink name. Frozen; a change is a new object."""
+"""The only registry of tunables: each with unit, range, default, help and its MAVLink name. Frozen; a change is a new
+object.
+"""
 
 from __future__ import annotations
 
@@ -17,46 +19,96 @@ from firmware_py.description.steering_parameters import Steering
 class Control:
     """PD gains as bandwidth and damping, multiplied by the body's mass matrix, so one set serves every shape."""
 
-    law: str = quantity("model", choices=("model", "paper"), help="model: desired velocity in drag and Coriolis; paper: measured")
-    position_bandwidth: float = quantity(2.5, unit="rad/s", low=0.1, high=10, help="of the position loop", mavlink="POS_BW")
-    position_damping: float = quantity(1.0, low=0.1, high=5, help="damping ratio of the position loop", mavlink="POS_DAMP")
-    attitude_bandwidth: float = quantity(3.0, unit="rad/s", low=0.1, high=20, help="of the attitude loop", mavlink="ATT_BW")
-    attitude_damping: float = quantity(1.0, low=0.1, high=5, help="damping ratio of the attitude loop", mavlink="ATT_DAMP")
-    drag_feedforward: float = quantity(1.0, low=-2, high=2, help="share of the modelled drag fed forward", mavlink="FF_DRAG")
+    law: str = quantity(
+        "model", choices=("model", "paper"), help="model: desired velocity in drag and Coriolis; paper: measured"
+    )
+    position_bandwidth: float = quantity(
+        2.5, unit="rad/s", low=0.1, high=10, help="of the position loop", mavlink="POS_BW"
+    )
+    position_damping: float = quantity(
+        1.0, low=0.1, high=5, help="damping ratio of the position loop", mavlink="POS_DAMP"
+    )
+    attitude_bandwidth: float = quantity(
+        3.0, unit="rad/s", low=0.1, high=20, help="of the attitude loop", mavlink="ATT_BW"
+    )
+    attitude_damping: float = quantity(
+        1.0, low=0.1, high=5, help="damping ratio of the attitude loop", mavlink="ATT_DAMP"
+    )
+    drag_feedforward: float = quantity(
+        1.0, low=-2, high=2, help="share of the modelled drag fed forward", mavlink="FF_DRAG"
+    )
     disturbance_feedforward: float = quantity(
         1.0, low=0, high=1, help="share of the estimated disturbance fed forward", mavlink="FF_DIST"
     )
-    lead_s: float = quantity(0.09, unit="s", low=0, high=0.5, help="thruster lag and bus delay made up in feed-forward", mavlink="FF_LEAD")
+    lead_s: float = quantity(
+        0.09, unit="s", low=0, high=0.5, help="thruster lag and bus delay made up in feed-forward", mavlink="FF_LEAD"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimation:
     """Noise of sensors and of what the model leaves out."""
 
-    kind: str = quantity("full", choices=("full", "paper"), help="full: tag, IMU, depth, disturbance; paper: tags alone")
-    tag_sigma_m: float = quantity(0.0021, unit="m", low=1e-5, high=1, help="tag position noise across the camera axis", mavlink="TAG_POS_SD")
-    tag_sigma_axis_m: float = quantity(0.0042, unit="m", low=1e-5, high=1, help="along the camera axis", mavlink="TAG_AXIS_SD")
-    tag_sigma_rad: float = quantity(0.0090, unit="rad", low=1e-5, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD")
+    kind: str = quantity(
+        "full", choices=("full", "paper"), help="full: tag, IMU, depth, disturbance; paper: tags alone"
+    )
+    tag_sigma_m: float = quantity(
+        0.0021, unit="m", low=1e-5, high=1, help="tag position noise across the camera axis", mavlink="TAG_POS_SD"
+    )
+    tag_sigma_axis_m: float = quantity(
+        0.0042, unit="m", low=1e-5, high=1, help="along the camera axis", mavlink="TAG_AXIS_SD"
+    )
+    tag_sigma_rad: float = quantity(
+        0.0090, unit="rad", low=1e-5, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
+    )
     tag_gate: float = quantity(5.0, low=1, high=50, help="innovation gate in standard deviations", mavlink="TAG_GATE")
     gyro_sigma: float = quantity(0.003, unit="rad/s", low=1e-6, high=1, help="gyro noise per sample", mavlink="GYRO_SD")
-    gyro_bias_walk: float = quantity(2e-5, unit="rad/s/sqrt(s)", low=0, high=1, help="gyro bias random walk", mavlink="GYRO_WALK")
-    accel_sigma: float = quantity(0.15, unit="m/s^2", low=1e-4, high=10, help="accelerometer noise and unmodelled acceleration", mavlink="ACC_SD")
-    accel_bias_walk: float = quantity(1e-4, unit="m/s^2/sqrt(s)", low=0, high=1, help="accelerometer bias random walk", mavlink="ACC_WALK")
+    gyro_bias_walk: float = quantity(
+        2e-5, unit="rad/s/sqrt(s)", low=0, high=1, help="gyro bias random walk", mavlink="GYRO_WALK"
+    )
+    accel_sigma: float = quantity(
+        0.15, unit="m/s^2", low=1e-4, high=10, help="accelerometer noise and unmodelled acceleration", mavlink="ACC_SD"
+    )
+    accel_bias_walk: float = quantity(
+        1e-4, unit="m/s^2/sqrt(s)", low=0, high=1, help="accelerometer bias random walk", mavlink="ACC_WALK"
+    )
     depth_sigma_m: float = quantity(0.003, unit="m", low=1e-5, high=1, help="depth noise", mavlink="DEPTH_SD")
-    depth_bias_walk: float = quantity(2e-4, unit="m/sqrt(s)", low=0, high=1, help="depth bias random walk", mavlink="DEPTH_WALK")
-    force_walk: float = quantity(0.012, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass", mavlink="DIST_F_WALK")
-    moment_walk: float = quantity(0.15, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia", mavlink="DIST_M_WALK")
-    accel_process: float = quantity(0.012, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC")
-    alpha_process: float = quantity(0.05, unit="rad/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled angular acceleration", mavlink="PROC_ALPHA")
+    depth_bias_walk: float = quantity(
+        2e-4, unit="m/sqrt(s)", low=0, high=1, help="depth bias random walk", mavlink="DEPTH_WALK"
+    )
+    force_walk: float = quantity(
+        0.015, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass", mavlink="DIST_F_WALK"
+    )
+    moment_walk: float = quantity(
+        0.15, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia", mavlink="DIST_M_WALK"
+    )
+    accel_process: float = quantity(
+        0.012, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC"
+    )
+    alpha_process: float = quantity(
+        0.05,
+        unit="rad/s^2/sqrt(Hz)",
+        low=0,
+        high=10,
+        help="white unmodelled angular acceleration",
+        mavlink="PROC_ALPHA",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Allocation:
     """From wrench to thrusters."""
 
-    mode: str = quantity("least_squares", choices=("least_squares", "pseudo_inverse"), help="pseudo_inverse clips, as the paper's")
+    mode: str = quantity(
+        "least_squares", choices=("least_squares", "pseudo_inverse"), help="pseudo_inverse clips, as the paper's"
+    )
     preload_n: float = quantity(
-        0.6, unit="N", low=0, high=5, help="thrusters pushed against each other to stay clear of the deadband", mavlink="PRELOAD"
+        0.6,
+        unit="N",
+        low=0,
+        high=5,
+        help="thrusters pushed against each other to stay clear of the deadband",
+        mavlink="PRELOAD",
     )
 
 
@@ -64,50 +116,140 @@ class Allocation:
 class Limiter:
     """The last word on every thruster, per module."""
 
-    force_share: float = quantity(1.0, low=0.05, high=1.0, help="share of each thruster's limit that may be used", mavlink="LIM_FORCE")
-    slew_n_per_s: float = quantity(200.0, unit="N/s", low=1, high=1e4, help="fastest change of a thruster's force", mavlink="LIM_SLEW")
-    relay_on_s: float = quantity(60.0, unit="s", low=1, high=3600, help="longest time a cold docking magnet stays on", mavlink="LIM_MAG_ON")
-    relay_duty: float = quantity(1.0, low=0.01, high=1, help="share of time a docking magnet may be on for ever", mavlink="LIM_MAG_DUTY")
-    relay_w: float = quantity(6.0, unit="W", low=0, high=1000, help="power that a docking magnet takes from the thrusters", mavlink="LIM_MAG_W")
+    force_share: float = quantity(
+        1.0, low=0.05, high=1.0, help="share of each thruster's limit that may be used", mavlink="LIM_FORCE"
+    )
+    slew_n_per_s: float = quantity(
+        200.0, unit="N/s", low=1, high=1e4, help="fastest change of a thruster's force", mavlink="LIM_SLEW"
+    )
+    relay_on_s: float = quantity(
+        60.0, unit="s", low=1, high=3600, help="longest time a cold docking magnet stays on", mavlink="LIM_MAG_ON"
+    )
+    relay_duty: float = quantity(
+        1.0, low=0.01, high=1, help="share of time a docking magnet may be on for ever", mavlink="LIM_MAG_DUTY"
+    )
+    relay_w: float = quantity(
+        6.0,
+        unit="W",
+        low=0,
+        high=1000,
+        help="power that a docking magnet takes from the thrusters",
+        mavlink="LIM_MAG_W",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Supervision:
     """When the vehicle may arm, and when it must not go on."""
 
-    tag_fresh_ms: float = quantity(500.0, unit="ms", low=10, high=60000, help="a pose older than this is stale", mavlink="TAG_FRESH_MS")
-    arm_sigma_m: float = quantity(0.05, unit="m", low=1e-3, high=10, help="largest position sigma to arm with", mavlink="ARM_SIGMA")
-    answer_ms: float = quantity(200.0, unit="ms", low=5, high=5000, help="a module that has not answered for longer is silent", mavlink="ARM_ANSWER_MS")
-    esc_fresh_ms: float = quantity(1000.0, unit="ms", low=50, high=10000, help="ESC feedback older than this is none", mavlink="ARM_ESC_MS")
-    frame_errors_per_s: float = quantity(20.0, unit="1/s", low=0, high=10000, help="bad frames a second to arm with", mavlink="ARM_FRAME_ERR")
-    estop_quiet_ms: float = quantity(200.0, unit="ms", low=50, high=5000, help="an e-stop is over when no frame came for so long", mavlink="ESTOP_QUIET_MS")
-    rearm: int = quantity(0, low=0, high=1, help="1: after a restart in flight hold at once, 0: wait to be armed", mavlink="REARM")
+    tag_fresh_ms: float = quantity(
+        500.0, unit="ms", low=10, high=60000, help="a pose older than this is stale", mavlink="TAG_FRESH_MS"
+    )
+    arm_sigma_m: float = quantity(
+        0.05, unit="m", low=1e-3, high=10, help="largest position sigma to arm with", mavlink="ARM_SIGMA"
+    )
+    answer_ms: float = quantity(
+        200.0,
+        unit="ms",
+        low=5,
+        high=5000,
+        help="a module that has not answered for longer is silent",
+        mavlink="ARM_ANSWER_MS",
+    )
+    esc_fresh_ms: float = quantity(
+        1000.0, unit="ms", low=50, high=10000, help="ESC feedback older than this is none", mavlink="ARM_ESC_MS"
+    )
+    frame_errors_per_s: float = quantity(
+        20.0, unit="1/s", low=0, high=10000, help="bad frames a second to arm with", mavlink="ARM_FRAME_ERR"
+    )
+    estop_quiet_ms: float = quantity(
+        200.0,
+        unit="ms",
+        low=50,
+        high=5000,
+        help="an e-stop is over when no frame came for so long",
+        mavlink="ESTOP_QUIET_MS",
+    )
+    rearm: int = quantity(
+        0, low=0, high=1, help="1: after a restart in flight hold at once, 0: wait to be armed", mavlink="REARM"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Docking:
     """Detector and sequence of docking."""
 
-    current_threshold_ma: float = quantity(70.0, unit="mA", low=1, high=8000, help="paper: +-70 mA on the face", mavlink="DOCK_MA")
-    current_hysteresis_ma: float = quantity(15.0, unit="mA", low=0, high=1000, help="held down to the threshold less this", mavlink="DOCK_MA_HYST")
-    position_tolerance_m: float = quantity(0.006, unit="m", low=1e-4, high=0.1, help="relative position off one pitch", mavlink="DOCK_TOL")
-    settled_m: float = quantity(0.004, unit="m", low=1e-4, high=0.1, help="movement of the relative position that still counts as settled", mavlink="DOCK_SETTLED")
-    hysteresis_m: float = quantity(0.004, unit="m", low=0, high=0.1, help="more is permitted once docked", mavlink="DOCK_HYST")
-    debounce_ms: float = quantity(150.0, unit="ms", low=0, high=5000, help="how long a condition is seen before it is believed", mavlink="DOCK_DEBOUNCE")
-    current_fresh_ms: float = quantity(250.0, unit="ms", low=10, high=5000, help="age at which a current no longer counts", mavlink="DOCK_MA_AGE")
-    pose_fresh_ms: float = quantity(300.0, unit="ms", low=10, high=5000, help="age at which a picture no longer counts", mavlink="DOCK_POSE_AGE")
-    standoff_m: float = quantity(0.12, unit="m", low=0.02, high=2, help="gap at which the bodies are aligned", mavlink="DOCK_STANDOFF")
-    align_m: float = quantity(0.004, unit="m", low=1e-4, high=0.1, help="lateral error to begin the approach with", mavlink="DOCK_ALIGN")
-    align_rad: float = quantity(0.035, unit="rad", low=1e-3, high=1, help="angle error to begin the approach with", mavlink="DOCK_ALIGN_ANG")
-    align_s: float = quantity(1.0, unit="s", low=0, high=30, help="how long the alignment must hold", mavlink="DOCK_ALIGN_T")
+    current_threshold_ma: float = quantity(
+        70.0, unit="mA", low=1, high=8000, help="paper: +-70 mA on the face", mavlink="DOCK_MA"
+    )
+    current_hysteresis_ma: float = quantity(
+        15.0, unit="mA", low=0, high=1000, help="held down to the threshold less this", mavlink="DOCK_MA_HYST"
+    )
+    position_tolerance_m: float = quantity(
+        0.006, unit="m", low=1e-4, high=0.1, help="relative position off one pitch", mavlink="DOCK_TOL"
+    )
+    settled_m: float = quantity(
+        0.004,
+        unit="m",
+        low=1e-4,
+        high=0.1,
+        help="movement of the relative position that still counts as settled",
+        mavlink="DOCK_SETTLED",
+    )
+    hysteresis_m: float = quantity(
+        0.004, unit="m", low=0, high=0.1, help="more is permitted once docked", mavlink="DOCK_HYST"
+    )
+    debounce_ms: float = quantity(
+        150.0,
+        unit="ms",
+        low=0,
+        high=5000,
+        help="how long a condition is seen before it is believed",
+        mavlink="DOCK_DEBOUNCE",
+    )
+    current_fresh_ms: float = quantity(
+        250.0, unit="ms", low=10, high=5000, help="age at which a current no longer counts", mavlink="DOCK_MA_AGE"
+    )
+    pose_fresh_ms: float = quantity(
+        300.0, unit="ms", low=10, high=5000, help="age at which a picture no longer counts", mavlink="DOCK_POSE_AGE"
+    )
+    standoff_m: float = quantity(
+        0.12, unit="m", low=0.02, high=2, help="gap at which the bodies are aligned", mavlink="DOCK_STANDOFF"
+    )
+    align_m: float = quantity(
+        0.004, unit="m", low=1e-4, high=0.1, help="lateral error to begin the approach with", mavlink="DOCK_ALIGN"
+    )
+    align_rad: float = quantity(
+        0.035, unit="rad", low=1e-3, high=1, help="angle error to begin the approach with", mavlink="DOCK_ALIGN_ANG"
+    )
+    align_s: float = quantity(
+        1.0, unit="s", low=0, high=30, help="how long the alignment must hold", mavlink="DOCK_ALIGN_T"
+    )
     speed_m_s: float = quantity(0.04, unit="m/s", low=0.001, high=0.5, help="fastest approach", mavlink="DOCK_SPEED")
-    contact_speed_m_s: float = quantity(0.012, unit="m/s", low=0.001, high=0.5, help="approach at contact", mavlink="DOCK_TOUCH")
-    push_s: float = quantity(3.0, unit="s", low=0, high=60, help="how long the faces are pushed together before a jam is declared", mavlink="DOCK_PUSH_T")
-    push_m: float = quantity(0.010, unit="m", low=0, high=0.1, help="how far beyond contact the set-point goes", mavlink="DOCK_PUSH")
-    release_s: float = quantity(1.0, unit="s", low=0.01, high=60, help="how long the magnets push apart after a jam", mavlink="DOCK_RELEASE")
-    sigma_m: float = quantity(0.005, unit="m", low=1e-4, high=0.1, help="relative sigma that aborts", mavlink="DOCK_SIGMA")
+    contact_speed_m_s: float = quantity(
+        0.012, unit="m/s", low=0.001, high=0.5, help="approach at contact", mavlink="DOCK_TOUCH"
+    )
+    push_s: float = quantity(
+        3.0,
+        unit="s",
+        low=0,
+        high=60,
+        help="how long the faces are pushed together before a jam is declared",
+        mavlink="DOCK_PUSH_T",
+    )
+    push_m: float = quantity(
+        0.010, unit="m", low=0, high=0.1, help="how far beyond contact the set-point goes", mavlink="DOCK_PUSH"
+    )
+    release_s: float = quantity(
+        1.0, unit="s", low=0.01, high=60, help="how long the magnets push apart after a jam", mavlink="DOCK_RELEASE"
+    )
+    sigma_m: float = quantity(
+        0.005, unit="m", low=1e-4, high=0.1, help="relative sigma that aborts", mavlink="DOCK_SIGMA"
+    )
     tries: int = quantity(4, low=1, high=20, help="attempts before it gives up", mavlink="DOCK_TRIES")
-    timeout_s: float = quantity(60.0, unit="s", low=1, high=600, help="longest time in one stage", mavlink="DOCK_TIMEOUT")
+    timeout_s: float = quantity(
+        60.0, unit="s", low=1, high=600, help="longest time in one stage", mavlink="DOCK_TIMEOUT"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,13 +269,19 @@ class Parameters:
     ground: Ground = quantity(Ground())
 
     def replace(self, dotted: str, value: float | str) -> Parameters:
-        """A copy with `group.field` set. Raises DescriptionError when there is no such field or the value is out of range."""
+        """A copy with `group.field` set. Raises DescriptionError when there is no such field or the value is out of
+        range.
+        """
         group_name, _, name = dotted.partition(".")
         group = getattr(self, group_name, None)
         if group is None or name not in {f.name for f in dataclasses.fields(group)}:
             raise DescriptionError(f"parameter {dotted!r} is unknown; there are {', '.join(n for n, _ in registry())}")
         limits = limits_of(type(group), name)
-        ok = value in limits.choices if limits.choices else isinstance(value, float | int) and limits.low <= value <= limits.high
+        ok = (
+            value in limits.choices
+            if limits.choices
+            else isinstance(value, float | int) and limits.low <= value <= limits.high
+        )
         if not ok:
             raise DescriptionError(f"parameter {dotted}: {value!r} is out of range; permitted: {describe(limits)}")
         return dataclasses.replace(self, **{group_name: dataclasses.replace(group, **{name: value})})
@@ -161,8 +309,8 @@ CONTROLLERS = {"modcube": Parameters(), "paper": PAPER}
 def registry() -> Iterator[tuple[str, Limits]]:
     """Every tunable as `group.field` with its limits, in a fixed order."""
     for group in dataclasses.fields(Parameters):
-        cls = group.default.__class__
-        for field in dataclasses.fields(cls):
+        cls = type(group.default)
+        for field in dataclasses.fields(cls):  # type: ignore[arg-type]
             yield f"{group.name}.{field.name}", limits_of(cls, field.name)
 
 

@@ -1,4 +1,5 @@
-"""TOML <-> frozen dataclass: every field carries unit, range and help; anything else is refused with file, line and range.
+"""TOML <-> frozen dataclass: every field carries unit, range and help; anything else is refused with file, line and
+range.
 
 Used once at start, by whoever reads a vehicle, fleet, parameter or scenario file. Nothing here runs in a tick.
 """
@@ -92,7 +93,8 @@ class Source:
     text: str
 
     def line_of(self, keys: Sequence[str | int]) -> int:
-        """1-based line of the key or table that `keys` lead to; the nearest enclosing one when it is not written out."""
+        """1-based line of the key or table that `keys` lead to; the nearest enclosing one when it is not written out.
+        """
         best_line, best_depth = 1, 0
         table: tuple[str | int, ...] = ()
         count: dict[tuple[str | int, ...], int] = {}

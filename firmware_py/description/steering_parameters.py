@@ -1,4 +1,6 @@
-"""How modes move the set-point, as parameters: sticks, speeds, surfacing, and how softly one mode follows another. Part of `parameters`."""
+"""How modes move the set-point, as parameters: sticks, speeds, surfacing, and how softly one mode follows another.
+Part of `parameters`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ class Steering:
     stick_share: float = quantity(
         0.5, low=0.05, high=1, help="share of the body's force and moment at full stick", mavlink="STICK_SHARE"
     )
-    speed_m_s: float = quantity(0.3, unit="m/s", low=0.01, high=3, help="speed at full stick, and to a place", mavlink="NAV_SPEED")
+    speed_m_s: float = quantity(
+        0.3, unit="m/s", low=0.01, high=3, help="speed at full stick, and to a place", mavlink="NAV_SPEED"
+    )
     rate_rad_s: float = quantity(
         0.6, unit="rad/s", low=0.01, high=3, help="turning rate at full stick, and to an attitude", mavlink="NAV_RATE"
     )
@@ -24,12 +28,19 @@ class Steering:
     stick_timeout_s: float = quantity(
         0.5, unit="s", low=0.05, high=10, help="older stick input counts as neutral", mavlink="STICK_TIMEOUT"
     )
-    stick_dead: float = quantity(0.03, low=0, high=0.5, help="stick deflection that counts as none", mavlink="STICK_DEAD")
+    stick_dead: float = quantity(
+        0.03, low=0, high=0.5, help="stick deflection that counts as none", mavlink="STICK_DEAD"
+    )
     guided_timeout_s: float = quantity(
         0.5, unit="s", low=0.05, high=60, help="a set-point without successor stops moving", mavlink="GUID_TIMEOUT"
     )
     join_m: float = quantity(
-        0.10, unit="m", low=0, high=10, help="start of a trajectory that is farther is approached first", mavlink="AUTO_JOIN"
+        0.10,
+        unit="m",
+        low=0,
+        high=10,
+        help="start of a trajectory that is farther is approached first",
+        mavlink="AUTO_JOIN",
     )
     join_rad: float = quantity(
         0.20, unit="rad", low=0, high=3.2, help="the same for its attitude", mavlink="AUTO_JOIN_ANG"
@@ -41,8 +52,12 @@ class Steering:
     surface_force_n: float = quantity(
         3.0, unit="N", low=0, high=1000, help="force per module that lifts while depth is unknown", mavlink="SURF_FORCE"
     )
-    blend_s: float = quantity(0.3, unit="s", low=0, high=5, help="time over which a mode takes over", mavlink="MODE_BLEND")
+    blend_s: float = quantity(
+        0.3, unit="s", low=0, high=5, help="time over which a mode takes over", mavlink="MODE_BLEND"
+    )
     test_share: float = quantity(
         0.3, low=0.01, high=1, help="largest share of full force in a motor test", mavlink="MOT_TEST_MAX"
     )
-    test_s: float = quantity(0.8, unit="s", low=0.1, high=10, help="time per thruster in MOTOR_DETECT", mavlink="MOT_TEST_S")
+    test_s: float = quantity(
+        0.8, unit="s", low=0.1, high=10, help="time per thruster in MOTOR_DETECT", mavlink="MOT_TEST_S"
+    )

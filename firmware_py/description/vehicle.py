@@ -70,7 +70,12 @@ class Drag:
         [0, 0, 0, 0, 0, 0], unit="N s/m, N m s", low=0, high=1e4, shape=(6,), help="linear damping, diagonal"
     )
     quadratic: np.ndarray = quantity(
-        [], unit="N s^2/m^2, N m s^2", low=0, high=1e5, shape=(-1,), help="published quadratic damping, in place of areas"
+        [],
+        unit="N s^2/m^2, N m s^2",
+        low=0,
+        high=1e5,
+        shape=(-1,),
+        help="published quadratic damping, in place of areas",
     )
 
 
@@ -190,7 +195,9 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     elif name in vehicle_names():
         path = Path(str(resources.files("firmware_py") / "vehicles" / f"{name}.toml"))
     else:
-        raise DescriptionError(f"vehicle {name!r} is unknown; there are {', '.join(vehicle_names())}, or give a .toml file")
+        raise DescriptionError(
+            f"vehicle {name!r} is unknown; there are {', '.join(vehicle_names())}, or give a .toml file"
+        )
     table, source = read_toml(path)
     vehicle: Vehicle = build(Vehicle, table, source)
     if vehicle.hull.mesh:
@@ -201,7 +208,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
 
 def flu_to_frd(vectors: np.ndarray) -> np.ndarray:
     """(..., 3) positions or directions from FLU to FRD: diag(1, -1, -1), a half-turn about x."""
-    return np.asarray(vectors) * np.array([1.0, -1.0, -1.0])
+    return np.asarray(np.asarray(vectors) * np.array([1.0, -1.0, -1.0]))
 
 
 def is_right_handed(matrix: np.ndarray) -> bool:

@@ -97,7 +97,7 @@ class UdpLink:
                 self._socket.bind((host, port))
             else:
                 self._socket.connect((host, port))
-        except OSError:
+        except (OSError, OverflowError):
             self._socket.close()
             raise
 

@@ -15,9 +15,11 @@ TYPE_GROUND_STATION = 6
 Station = tuple[int, int, int]
 """System id, component id, MAV_TYPE."""
 _INFORMATION, _WARNING = 6, 4
-CAPABILITIES = 0x2 | 0x4 | 0x8 | 0x80 | 0x100 | 0x800 | 0x2000
-"""MAV_PROTOCOL_CAPABILITY: float parameters 2, MISSION_INT 4, COMMAND_INT 8, set-point of attitude 64 and of local position 128,
-parameters C-cast 0x20000 is not claimed; FLIGHT_TERMINATION 0x800, MAVLINK2 0x2000."""
+_NAK, _OPEN_TO_READ, _UNKNOWN_COMMAND, _FILE_NOT_FOUND = 129, 4, 7, 10
+"""Codes of the file transfer protocol."""
+CAPABILITIES = 0x2 | 0x4 | 0x8 | 0x40 | 0x80 | 0x800 | 0x2000
+"""MAV_PROTOCOL_CAPABILITY: float parameters, MISSION_INT, COMMAND_INT, set-points of attitude and of local position, flight
+termination, MAVLINK2. Neither form of integer parameters is claimed."""
 VERSION = 0x00010000
 """0.1.0, as FIRMWARE_VERSION_TYPE packs it."""
 
@@ -37,6 +39,7 @@ class Presence:
             "TIMESYNC": self._timesync,
             "PING": self._ping,
             "SETUP_SIGNING": self._setup_signing,
+            "FILE_TRANSFER_PROTOCOL": self._no_files,
         }
 
     def _heartbeat(self, arrival: Arrival) -> None:
@@ -80,10 +83,19 @@ class Presence:
             self._signing.adopt(key, m["initial_timestamp"])
             self._system.say(_INFORMATION, "signing key set" if any(key) else "signing is off")
 
+    def _no_files(self, arrival: Arrival) -> None:
+        """There is no file service: said at once, so that clients fall back to the parameter protocol without a time-out."""
+        asked = bytes(arrival.message["payload"])
+        low, high = ((asked[0] | asked[1] << 8) + 1 & 0xFFFF).to_bytes(2, "little")
+        reason = _FILE_NOT_FOUND if asked[3] == _OPEN_TO_READ else _UNKNOWN_COMMAND
+        payload = bytes([low, high, asked[2], _NAK, 1, asked[3], 0, 0, 0, 0, 0, 0, reason]).ljust(len(asked), b"\0")
+        values = {"target_network": 0, **arrival.sender, "payload": tuple(payload)}
+        self._system.send(arrival.channel, "FILE_TRANSFER_PROTOCOL", values)
+
     def autopilot_version(self, arrival: Arrival) -> bool:
         """Answer to a request of AUTOPILOT_VERSION."""
         values = {
-            "capabilities": CAPABILITIES | 0x40, "flight_sw_version": VERSION, "uid": self._system.body + 1,
+            "capabilities": CAPABILITIES, "flight_sw_version": VERSION, "uid": self._system.body + 1,
         }  # fmt: skip
         self._system.send(arrival.channel, "AUTOPILOT_VERSION", values)
         return True

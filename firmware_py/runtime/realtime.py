@@ -1,4 +1,5 @@
-"""What makes a process keep its deadlines: real-time priority, fine timers, locked memory, no garbage collection while it flies.
+"""What makes a process keep its deadlines: real-time priority, fine timers, locked memory, no garbage collection while
+it flies.
 
 None of it is required: what the system refuses is said in a line, and the process runs without.
 """

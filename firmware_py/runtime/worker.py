@@ -1,4 +1,6 @@
-"""Runs slow work beside the loop; what it gives comes back as an input of a later tick. In lockstep it runs at once, on the spot."""
+"""Runs slow work beside the loop; what it gives comes back as an input of a later tick. In lockstep it runs at once,
+on the spot.
+"""
 
 from __future__ import annotations
 

@@ -58,6 +58,8 @@ class Bodies(NamedTuple):
     """(b, 4) mass of the water that the hulls displace, entrained water included, kg; mass times centre, kg m."""
     wrench: np.ndarray
     """(b, 6) working memory: force and moment about O, body frame."""
+    clamped: np.ndarray
+    """(b,) 1 where a load cell holds the body in its place."""
 
 
 class Modules(NamedTuple):
@@ -87,7 +89,7 @@ class Modules(NamedTuple):
     """(k, 3, n, n, 4) see `shelter.seen_share`."""
 
 
-BODIES = types.NamedTuple((F2, F3, F3, F3, F2, F2, F2), Bodies)
+BODIES = types.NamedTuple((F2, F3, F3, F3, F2, F2, F2, I1), Bodies)
 MODULES = types.NamedTuple((I1, F2, F3, F2, F2, F2, F2, F2, I1, F2, F5), Modules)
 
 
@@ -197,8 +199,12 @@ def _add_walls(bodies, modules, m, water, x):
 
 
 @compiled(types.void(BODIES, I8, F2, F2, V3, V3))
-def _accelerate(bodies, b, x, out, flow, flow_rate):
-    """Kirchhoff's equations solved for the accelerations, and the kinematics."""
+def accelerate(bodies, b, x, out, flow, flow_rate):
+    """Kirchhoff's equations solved for the accelerations, and the kinematics. A clamped body stays where it is."""
+    if bodies.clamped[b]:
+        for i in range(13):
+            out[b, i] = 0.0
+        return
     q = (x[b, 3], x[b, 4], x[b, 5], x[b, 6])
     r, v, w = matrix_of(q[0], q[1], q[2], q[3]), triple(x, b, 7), triple(x, b, 10)
     u, none = turn_back(r, flow), (0.0, 0.0, 0.0)
@@ -220,15 +226,9 @@ def _accelerate(bodies, b, x, out, flow, flow_rate):
     out[b, 6] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0])
 
 
-@compiled(types.void(BODIES, MODULES, WATER, V3, V3, F2, F2, F2))
-def derivative(bodies, modules, water, flow, flow_rate, thrust, x, out):
-    """Rate of change of the states.
-
-    Args:
-        flow, flow_rate: velocity and acceleration of the water, world.
-        thrust: (b, 6) wrench of all thrusters (and whatever else acts) about O, body frame.
-        x: (b, 13) states; out: (b, 13) written.
-    """
+@compiled(types.void(BODIES, MODULES, WATER, V3, V3, F2, F2))
+def load(bodies, modules, water, flow, flow_rate, thrust, x):
+    """Writes into `bodies.wrench` what thrusters, weight, drag and walls do; arguments as `integrator.derivative`."""
     for b in range(x.shape[0]):
         for i in range(6):
             bodies.wrench[b, i] = thrust[b, i]
@@ -237,8 +237,6 @@ def derivative(bodies, modules, water, flow, flow_rate, thrust, x, out):
         _add_drag(bodies, modules, m, water, x, flow)
         if _touches(modules, m, water, x):
             _add_walls(bodies, modules, m, water, x)
-    for b in range(x.shape[0]):
-        _accelerate(bodies, b, x, out, flow, flow_rate)
 
 
 @compiled(types.void(BODIES, MODULES, F2, F8, F2))

@@ -139,6 +139,7 @@ def make_bodies(count: int) -> Bodies:
         np.zeros((count, 8)),
         np.zeros((count, 4)),
         np.zeros((count, 6)),
+        np.zeros(count, dtype=np.int64),
     )
 
 
@@ -146,7 +147,7 @@ def fill_body(
     bodies: Bodies, b: int, parts: Sequence[tuple[ModuleDraw, np.ndarray, np.ndarray]], spec: WorldSpec
 ) -> None:
     """Sums the modules of body b: (draw, position of the hull centre, module to body rotation) of each."""
-    for array in bodies[1:6]:
+    for array in bodies[1:6]:  # all but state, memory and clamp
         array[b] = 0.0
     for draw, r, turn in parts:
         rigid = rigid_matrix(draw.dry_kg + draw.entrained_kg, draw.com, draw.inertia)

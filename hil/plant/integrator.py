@@ -6,9 +6,10 @@ import math
 
 from numba import types
 
-from hil.plant.bodies import BODIES, MODULES, derivative, observe
+from hil.plant.bodies import BODIES, MODULES, accelerate, load, observe
+from hil.plant.contact import FACES, interact
 from hil.plant.thrusters import THRUSTERS, forces_after, load_supplies, settle
-from hil.plant.vectors import F2, F3, F8, compiled
+from hil.plant.vectors import F2, F3, F8, V3, compiled
 from hil.plant.water import WATER, flow_at
 
 I8 = types.int64
@@ -44,8 +45,24 @@ def close_step(x, h, stage):
             x[b, i] /= norm
 
 
-@compiled(types.void(BODIES, MODULES, THRUSTERS, WATER, F2, I8, F8, F3, F2, F2))
-def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust, seen):
+@compiled(types.void(BODIES, MODULES, FACES, WATER, V3, V3, F2, F2, F2))
+def derivative(bodies, modules, faces, water, flow, flow_rate, thrust, x, out):
+    """Rate of change of the states.
+
+    Args:
+        flow, flow_rate: velocity and acceleration of the water, world.
+        thrust: (b, 6) wrench of all thrusters (and whatever else acts) about O, body frame.
+        x: (b, 13) states; out: (b, 13) written.
+    """
+    load(bodies, modules, water, flow, flow_rate, thrust, x)
+    if x.shape[0] > 1:
+        interact(bodies, modules, faces, x)
+    for b in range(x.shape[0]):
+        accelerate(bodies, b, x, out, flow, flow_rate)
+
+
+@compiled(types.void(BODIES, MODULES, FACES, THRUSTERS, WATER, F2, I8, F8, F3, F2, F2))
+def advance(bodies, modules, faces, thrusters, water, external, steps, h, stage, thrust, seen):
     """Moves everything on by `steps` sub-steps of h seconds.
 
     Args:
@@ -64,7 +81,7 @@ def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust
                 wrenches(thrusters, external, thrust)
             flow, flow_rate = flow_at(water, (s + share) * h)
             along(x, share * h, stage[max(0, k - 1)], trial)
-            derivative(bodies, modules, water, flow, flow_rate, thrust, trial, stage[k])
+            derivative(bodies, modules, faces, water, flow, flow_rate, thrust, trial, stage[k])
         close_step(x, h, stage)
         settle(thrusters)
     flow, flow_rate = flow_at(water, steps * h)
@@ -73,5 +90,5 @@ def advance(bodies, modules, thrusters, water, external, steps, h, stage, thrust
     load_supplies(thrusters, 0)
     forces_after(thrusters, 0)
     wrenches(thrusters, external, thrust)
-    derivative(bodies, modules, water, flow, flow_rate, thrust, x, stage[5])
+    derivative(bodies, modules, faces, water, flow, flow_rate, thrust, x, stage[5])
     observe(bodies, modules, stage[5], water.gravity, seen)

@@ -5,20 +5,23 @@ Time moves only by `advance`. Modules that are docked share a body; one module e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle import FACE_NORMALS, Vehicle
 from hil.plant import thrusters as thrusters_module
 from hil.plant.build import fill_body, make_bodies, make_modules, make_thrusters, nominal_centre, seat_thrusters
+from hil.plant.dock_spec import DockSpec, JamRule
+from hil.plant.docking import DISK_M, Docks, Joint, joints_between
 from hil.plant.draw import ModuleDraw, draw_module, stream
 from hil.plant.integrator import advance
 from hil.plant.jets import add_jets
-from hil.plant.lattice import Place
+from hil.plant.joining import centre_of, force_needed, motion_of, pieces, seats_after_join
+from hil.plant.lattice import QUATERNIONS, Place, nearest
 from hil.plant.spec import Tank, WorldSpec
 from hil.plant.water import Gusts, make_water
 
@@ -85,6 +88,8 @@ class World:
         step_ns: int = STEP_NS,
         groups: Sequence[Sequence[int]] | None = None,
         places: Sequence[Place] | None = None,
+        dock: DockSpec = DockSpec(),
+        jam: JamRule = JamRule(),
     ) -> None:
         """A world at time 0.
 
@@ -92,6 +97,7 @@ class World:
             vehicles, starts: one per module; of modules that start docked the start of the first counts.
             groups: modules of each body, the leader first; each module alone when left out.
             places: where each module sits in its body, whose frame starts at the leader's hull centre.
+            dock, jam: docking faces, and when they jam.
             seed: of every draw; the same seed gives the same world.
             period_ns: what `advance` will be called with. Raises DescriptionError when step_ns does not divide it.
         """
@@ -110,6 +116,8 @@ class World:
         self._water.flow[0], self._water.flow[1] = self._gusts.mean, self._gusts.start
         self._thrusters = make_thrusters(vehicles, self._draws, spec, step_ns)
         self._seen = np.zeros((len(vehicles), 16))
+        self.docks = Docks(vehicles, dock, jam, seed)
+        self.jet_strength = spec.jet_strength
         alone = [Place(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) for _ in vehicles]
         self._seat(groups or [(m,) for m in range(len(vehicles))], places or alone)
         for b, members in enumerate(self.bodies):
@@ -118,6 +126,8 @@ class World:
             self._body_arrays.state[b, 3:7] = rotations.normalise(rotations.multiply(q_wm, rotations.conjugate(q_bm)))
             lever = rotations.rotate(self._body_arrays.state[b, 3:7].copy(), self._modules.position[members[0]].copy())
             self._body_arrays.state[b, :3] = start.p_wm - lever
+        self.docks.energise(joints_between(self._modules, self.docks.faces.kind))
+        self._power_magnets()
         self._step(0)
 
     def _seat(self, groups: Sequence[Sequence[int]], places: Sequence[Place]) -> None:
@@ -145,14 +155,121 @@ class World:
         self._water.flow[2] = self._gusts.step()
         self._step(duration_ns // self._step_ns)
         self.time_ns += duration_ns
+        if len(self.vehicles) > 1 or self.docks.relays.any():
+            self._dock(1e-9 * duration_ns)
+
+    def set_relays(self, module: int, relays: Sequence[int]) -> None:
+        """Relay states of a module's six magnets: 0 off, 1 forward, 2 reverse."""
+        self.docks.set_relays(module, relays)
+        self._power_magnets()
+
+    def _power_magnets(self) -> None:
+        idle = np.array([v.supply.idle_w for v in self.vehicles])
+        self._thrusters.supply[:, 4] = idle + self.docks.magnet_power_w()
+
+    def _dock(self, elapsed_s: float) -> None:
+        state = self._body_arrays.state
+        verdict = self.docks.step(self.time_ns, elapsed_s, self._modules, state, self._pull_on)
+        for joint in verdict.part:
+            self.part(joint)
+        for joint in verdict.join:
+            if self._modules.body[joint.module] != self._modules.body[joint.other]:
+                self.join(joint)
+
+    def join(self, joint: Joint) -> None:
+        """Makes one body of the two that `joint` links, and closes whatever else then meets. Momentum stays as it is."""
+        a, b = sorted((int(self._modules.body[joint.module]), int(self._modules.body[joint.other])))
+        old, total = self._body_arrays, self.momentum()
+        kept = joint.module if joint.module in self.bodies[a] else joint.other
+        q_a, q_b = old.state[a, 3:7].copy(), old.state[b, 3:7].copy()
+        q_ab = rotations.multiply(rotations.conjugate(q_a), q_b)
+        seats = seats_after_join(self.places, self._modules, joint, kept, self.bodies[b], q_ab)
+        lattice = QUATERNIONS[nearest(q_ab)].copy()
+        off = rotations.log(rotations.multiply(q_ab, rotations.conjugate(lattice)))
+        masses = old.rigid[[a, b], 0, 0]
+        centre = np.average([self._to_world(k, centre_of(old, k)) for k in (a, b)], axis=0, weights=masses)
+        groups = [g for k, g in enumerate(self.bodies) if k not in (a, b)]
+        groups = sorted([*groups, tuple(sorted((*self.bodies[a], *self.bodies[b])))])
+        states = {g[0]: old.state[k].copy() for k, g in enumerate(self.bodies)}
+        leader = min(self.bodies[a][0], self.bodies[b][0])
+        self._seat(groups, seats)
+        self._restore(states)
+        new = groups.index(next(g for g in groups if g[0] == leader))
+        x = self._body_arrays.state[new]
+        x[3:7] = rotations.normalise(rotations.multiply(q_a, rotations.exp(off * masses[1] / masses.sum())))
+        x[:3] = centre - rotations.rotate(x[3:7].copy(), centre_of(self._body_arrays, new))
+        motion_of(self._body_arrays, new, total[a] + total[b], self._flow())
+        known = set(self.docks.joints)
+        for met in joints_between(self._modules, self.docks.faces.kind):
+            if met not in known:
+                self.docks.joined(met)
+        self._step(0)
+
+    def part(self, joint: Joint) -> None:
+        """Opens a joint; what no other joint holds becomes a body of its own, moving as it did."""
+        b = int(self._modules.body[joint.module])
+        self.docks.parted(joint)
+        parts = pieces(self.bodies[b], self.docks.joints)
+        if len(parts) == 1:
+            return
+        states = {g[0]: self._body_arrays.state[k].copy() for k, g in enumerate(self.bodies)}
+        places = list(self.places)
+        whole = states[self.bodies[b][0]]
+        for piece in parts:
+            shift = self.places[piece[0]].position
+            states[piece[0]] = _moved_origin(whole, shift)
+            for m in piece:
+                places[m] = Place(self.places[m].position - shift, self.places[m].quaternion)
+        groups = sorted([*(g for k, g in enumerate(self.bodies) if k != b), *parts])
+        self._seat(groups, places)
+        self._restore(states)
+        self._step(0)
+
+    def _restore(self, states: Mapping[int, np.ndarray]) -> None:
+        """Puts back the state of every body whose leader is the same."""
+        for b, members in enumerate(self.bodies):
+            self._body_arrays.state[b] = states[members[0]]
+
+    def _to_world(self, body: int, r: np.ndarray) -> np.ndarray:
+        x = self._body_arrays.state[body]
+        return np.asarray(x[:3] + rotations.rotate(x[3:7].copy(), r))
+
+    def _flow(self) -> np.ndarray:
+        return self._water.flow[0] + self._water.flow[1]
+
+    def _pull_on(self, joint: Joint) -> float:
+        """Force that pulls a joint open, N, a moment counted as a force at the disk's rim; 0 where others hold as well."""
+        b = int(self._modules.body[joint.module])
+        parts = pieces(self.bodies[b], [j for j in self.docks.joints if j != joint])
+        if len(parts) == 1:
+            return 0.0
+        far = next(piece for piece in parts if joint.other in piece)
+        need = force_needed(
+            self._draws, self._modules, far, self._body_arrays.state[b], self._stage[5, b], self.spec.gravity
+        )
+        for t in np.flatnonzero(np.isin(self._thrusters.module, far)):
+            need -= self._thrusters.column[t] * self._thrusters.force[t]
+        outward = self._modules.turn[joint.module] @ FACE_NORMALS[joint.face]
+        at = self._modules.position[joint.module] + 0.5 * self._modules.size[joint.module, joint.face // 2] * outward
+        moment = need[3:] - np.cross(at, need[:3])
+        return float(-outward @ need[:3] + np.linalg.norm(moment) / DISK_M)
+
+    def clamp(self, body: int) -> None:
+        """Holds a body where it is; `load` then says with what force."""
+        self._body_arrays.clamped[body] = 1
+        self._body_arrays.state[body, 7:13] = 0.0
+
+    def load(self, body: int) -> np.ndarray:
+        """(6,) wrench about O that the body gives to whatever clamps it, body frame."""
+        return self._body_arrays.wrench[body].copy()
 
     def _step(self, steps: int) -> None:
         h = 1e-9 * self._step_ns
         self._external[:] = 0.0
-        if len(self.vehicles) > 1 and self.spec.jet_strength > 0.0:
-            jet = (self.spec.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
+        if len(self.vehicles) > 1 and self.jet_strength > 0.0:
+            jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
             add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._external)
-        arrays = (self._body_arrays, self._modules, self._thrusters, self._water)
+        arrays = (self._body_arrays, self._modules, self.docks.faces, self._thrusters, self._water)
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
 
     def truth(self, module: int) -> Truth:
@@ -214,3 +331,11 @@ class World:
             p = r_wb @ total[:3]
             out[b] = np.concatenate([p, r_wb @ total[3:] + np.cross(x[:3], p)])
         return out
+
+
+def _moved_origin(x: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """(13,) the same motion told of the point r (3,) of the body frame in place of its origin."""
+    moved = x.copy()
+    moved[:3] += rotations.rotate(x[3:7].copy(), r.copy())
+    moved[7:10] += np.cross(x[10:13], r)
+    return moved

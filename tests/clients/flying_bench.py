@@ -10,19 +10,21 @@ import select
 import sys
 import time
 from collections import defaultdict
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import numpy as np
 
 from firmware_py.app.ground_station import GroundSide
-from firmware_py.app.lockstep import Lockstep, drain
 from firmware_py.core.transitions import ARMED
-from firmware_py.core.types import Mode, Outputs
+from firmware_py.core.types import Mode, Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
 from hil.bench import open_bench
 from hil.scenario import load_scenario
 
+PERIOD_S = 0.01
+LONGEST_LAG_S = 0.1
+"""What a slow machine falls behind by more than this is not made up."""
 READY_S = 2.0
 """Until the estimator is sure of its place."""
 
@@ -53,6 +55,32 @@ class Errors:
         }
 
 
+class Finished(Exception):
+    """The input has closed."""
+
+
+class Pilot:
+    """In place of the bench's script: hands over what clients ask for, and keeps to the clock."""
+
+    ticks = 2**31
+
+    def __init__(self, side: GroundSide, pace: float) -> None:
+        self._side, self._pace = side, pace
+        self._deadline = time.perf_counter()
+
+    def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
+        if self._side.error is not None:
+            raise self._side.error
+        if select.select([sys.stdin], [], [], 0)[0] and not sys.stdin.read(1):
+            raise Finished
+        if time_ns == round(READY_S * 1e9):
+            print("ready", flush=True)
+        now = time.perf_counter()
+        self._deadline = max(self._deadline + PERIOD_S / self._pace, now - LONGEST_LAG_S)
+        time.sleep(max(0.0, self._deadline - now))
+        return self._side.requests()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("links", nargs="+")
@@ -68,26 +96,15 @@ def main() -> None:
             links=tuple(arguments.links), identity=arguments.identity, store=arguments.store, logs=arguments.logs
         )
         side = stack.enter_context(GroundSide(config, bench.firmware))
-        lockstep = Lockstep(bench.firmware, [bench.firmware_port], [side.observe])
-        com_m = np.array(bench.nodes.world.vehicles[0].inertial.com_m)
-        assert not com_m.any(), "truth is of the hull's centre"
-        errors, sent, tick, period_ns = Errors(), 0, 0, bench.fleet.period_ns
-        deadline = time.perf_counter()
-        while not (select.select([sys.stdin], [], [], 0)[0] and not sys.stdin.read(1)):
-            tick += 1
-            time_ns = tick * period_ns
-            sent += lockstep.start_tick(tick, time_ns)
-            answers = bench.nodes.step([frame for _, frame in drain([bench.plant_port], sent)])
-            for frame in answers:
-                bench.plant_port.send(frame)
-            outputs, sent = lockstep.finish_tick(tick, time_ns, side.requests(), len(answers))
+        bench.script = Pilot(side, arguments.pace)
+        assert not np.any(bench.nodes.world.vehicles[0].inertial.com_m), "truth is of the hull's centre"
+        errors = Errors()
+
+        def observe(received: object, sent: object, inputs: object, outputs: Outputs) -> None:
             errors.add(outputs, bench.nodes.world.truth(0).p_wm)
-            if side.error is not None:
-                raise side.error
-            if time_ns == round(READY_S * 1e9):
-                print("ready", flush=True)
-            deadline = max(deadline + period_ns * 1e-9 / arguments.pace, time.perf_counter() - 0.1)
-            time.sleep(max(0.0, deadline - time.perf_counter()))
+
+        with suppress(Finished):
+            bench.fly([side.observe, observe])
         print(json.dumps(errors.summary()), flush=True)
 
 

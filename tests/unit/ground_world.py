@@ -1,4 +1,6 @@
-"""A robot without physics behind a ground station, and a pymavlink client, joined in memory: for tests of firmware_py.ground."""
+"""A robot without physics behind a ground station, and a pymavlink client, joined in memory: for tests of
+firmware_py.ground.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -58,7 +60,9 @@ class Robot:
         events = [event for request in requests for event in self._take(request)]
         commands = [ModuleCommand(s == State.ARMED, np.linspace(-1, 1, 8), None) for s in self.state]
         records = [self._record(body) for body in range(len(self.state))]
-        return Inputs(self.tick, time_ns, modules, requests), Outputs(self.tick, time_ns, commands, False, events, records)
+        return Inputs(self.tick, time_ns, modules, requests), Outputs(
+            self.tick, time_ns, commands, False, events, records
+        )
 
     def _inputs(self) -> ModuleInputs:
         return ModuleInputs(
@@ -152,7 +156,11 @@ class World:
     """Robot, station and clients; `run` moves time."""
 
     def __init__(
-        self, modules: int = 1, config: GroundConfig | None = None, signing: Signing | None = None, trusted: bool = False
+        self,
+        modules: int = 1,
+        config: GroundConfig | None = None,
+        signing: Signing | None = None,
+        trusted: bool = False,
     ) -> None:
         self.robot = Robot(modules)
         self.config = config or GroundConfig()

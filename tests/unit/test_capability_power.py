@@ -25,9 +25,7 @@ def test_unit_force_costs_five_twelfths_over_the_modules(name: str, modules: int
     assert mean_square_effort(raw(name), "force") == pytest.approx(5 / 12 / modules, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("name", "torque"), [("A_single", 41.100), ("B_double_line", 11.424), ("C_quad_2x2", 3.8615)]
-)
+@pytest.mark.parametrize(("name", "torque"), [("A_single", 41.100), ("B_double_line", 11.424), ("C_quad_2x2", 3.8615)])
 def test_unit_torque_costs_what_is_known(name: str, torque: float) -> None:
     assert mean_square_effort(raw(name), "torque") == pytest.approx(torque, rel=2e-5)
 

@@ -12,7 +12,7 @@ from firmware_py.prepare.capability.layout import FRAMES, Layout, of_modules, of
 from firmware_py.prepare.capability.polycubes import polycubes, poses
 from firmware_py.prepare.capability.programs import ProgramSpace, reach_by_programs
 from firmware_py.prepare.capability.sphere import fibonacci
-from firmware_py.prepare.capability.wrench import WrenchSpace, embed
+from firmware_py.prepare.capability.wrench import Section, WrenchSpace, corners_of, embed
 from tests.unit.capability_layouts import SEVEN, one_of_seven, raw
 
 
@@ -153,16 +153,23 @@ def test_equal_total_thrust_gives_every_robot_eight_newtons() -> None:
         one_of_seven("bluerov2").normalised("fancy")
 
 
-def test_sixty_four_thrusters_are_characterised_without_listing_all_facets() -> None:
-    vehicle = load_vehicle("modcube")
-    cells = list(itertools.product(range(2), range(2), range(2)))
-    layout = of_modules(cells, [0] * 8, [vehicle] * 8)
+def test_facets_of_sixty_four_scattered_thrusters_are_not_even_tried() -> None:
+    layout = of_rows("many", np.random.default_rng(1).standard_normal((64, 6)), -8.0, 10.0)
     with pytest.raises(DescriptionError, match="64 thrusters are too many"):
         WrenchSpace(layout)
+
+
+def test_cube_of_eight_modules_is_characterised_by_programs_alone() -> None:
+    cells = list(itertools.product(range(2), range(2), range(2)))
+    layout = of_modules(cells, [0] * 8, [load_vehicle("modcube_sim")] * 8)
     section = ProgramSpace(layout).section("force")
     assert section is not None
-    wrenches = embed(fibonacci(50), (0, 1, 2))
-    assert section.reach(fibonacci(50)) == pytest.approx(reach_by_programs(layout, wrenches), rel=1e-9)
+    assert section.worst() == pytest.approx(8 * 18.0)
+    assert sum(len(polygon) for polygon in section.polygons()) == 2 * (len(section.offsets) + corners(section) - 2)
+
+
+def corners(section: Section) -> int:
+    return len(corners_of(section.normals, section.offsets))
 
 
 def test_layout_without_thrusters_or_with_a_zero_or_unfinite_one_is_refused() -> None:

@@ -95,7 +95,11 @@ class Tank:
 
     def _escs(self, n: int, k: int) -> list[EscFeedback]:
         t = self.bodies[n].thrusters
-        speed = np.sign(self.forces[n]) * t.rpm_at_full * np.sqrt(np.abs(self.forces[n]) / np.where(self.forces[n] > 0, 10.0, 8.0))
+        speed = (
+            np.sign(self.forces[n])
+            * t.rpm_at_full
+            * np.sqrt(np.abs(self.forces[n]) / np.where(self.forces[n] > 0, 10.0, 8.0))
+        )
         rpm = [float(v) for v in speed[t.module == k]]
         return [EscFeedback(i, (rpm[i], rpm[i + 1]), (1.0, 1.0), (0, 0)) for i in range(0, 8, 2)]
 

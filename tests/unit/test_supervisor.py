@@ -1,209 +1,540 @@
-"""The supervisor: every row of the table, every trigger that has no row, and every refusal in its own words."""
+"""The supervisor: every row of its table, every trigger without a row, every refusal in its words, and what fail-safes make of the mode."""
 
 import itertools
-import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from firmware_py.core.supervisor import INFORMATION, WARNING, Supervisor
-from firmware_py.core.transitions import ARMED, ROWS, TABLE, Guard, State, Transition
-from firmware_py.core.types import Action, Estimate, Inputs, ModuleInputs, Request
-from firmware_py.description.parameters import Supervision
-
-MODULES = (0, 2)
-ZERO = np.zeros(3)
-GOOD = Estimate(
-    ZERO, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6), ZERO, ZERO, np.full(3, 0.002), np.full(3, 0.01),
-    20_000_000, math.nan, 0, 0, True,
+from firmware_py.core.failsafes import Level
+from firmware_py.core.health import Health
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.supervisor import CRITICAL, INFORMATION, WARNING, Decision, Supervisor
+from firmware_py.core.transitions import (
+    ARMED, DOCKING, MODE_TABLE, MODES, ROWS, TABLE, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger,
 )  # fmt: skip
+from firmware_py.core.types import Action, DockRequest, Event, Mode, Request, Sticks
+from firmware_py.description.parameters import Parameters
+from tests.unit.healths import BLIND, GOOD, at
+
+P = Parameters()
+HERE = rest_at(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]))
+STICKS = Sticks((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+DOCK = DockRequest(0, 0, 1, 1)
 
 
-def heard(estop: bool = False, silent: tuple[int, ...] = ()) -> Inputs:
-    """A tick in which all three modules of the fleet answer but `silent`."""
-    modules = [ModuleInputs(answered=index not in silent) for index in range(3)]
-    return Inputs(7, 70_000_000, modules, estop=estop)
+class Path:
+    duration_s = 2.0
+
+    def sample(self, t_s: float) -> Any:
+        return HERE
 
 
-def in_state(state: State) -> Supervisor:
-    supervisor = Supervisor(MODULES, Supervision())
-    supervisor.state = state
+PATH = Path()
+ARGUMENTS: dict[Action, Any] = {
+    Action.SET_MODE: Mode.AUTO, Action.STICKS: STICKS, Action.SET_POINT: HERE, Action.TRACK: PATH, Action.DOCK: DOCK,
+    Action.UNDOCK: DOCK, Action.MOTOR_TEST: (0, 0.1, 1.0),
+}  # fmt: skip
+REQUESTS = {trigger: Request(action, 0, ARGUMENTS.get(action)) for action, trigger in TRIGGERS.items()} | {
+    Trigger.FORCED_ARM: Request(Action.ARM, 0, True)
+}
+"""A request for each trigger that comes by one."""
+
+
+def supervisor_in(state: State = State.ARMED, mode: Mode = Mode.POSHOLD, parameters: Parameters = P) -> Supervisor:
+    supervisor = Supervisor(parameters)
+    supervisor.state, supervisor.mode = state, mode
     return supervisor
 
 
-def ask(supervisor: Supervisor, action: Action, estimate: Estimate = GOOD, inputs: Inputs | None = None) -> bool:
-    """Whether it was granted."""
-    request = Request(action)
-    return supervisor.step(heard() if inputs is None else inputs, estimate, [request]) == [request]
+def ask(supervisor: Supervisor, action: Action, argument: Any = None, health: Health = GOOD) -> list[Decision]:
+    return supervisor.step(False, health, [Request(action, 0, argument)])
 
 
-def refusal(supervisor: Supervisor, action: Action, estimate: Estimate = GOOD, inputs: Inputs | None = None) -> str:
-    """The words of the one refusal; the state has to stay."""
-    before = supervisor.state
-    assert not ask(supervisor, action, estimate, inputs)
-    assert supervisor.state == before
-    (event,) = supervisor.events
-    assert event.severity == WARNING
-    return event.text
+def texts(supervisor: Supervisor) -> list[str]:
+    return [event.text for event in supervisor.events]
 
 
-# ---------------------------------------------------------------- the table
+# ---------------------------------------------------------------- the tables
 
 
-@pytest.mark.parametrize("row", TABLE, ids=lambda row: f"{row.state.name}-{row.trigger.name}")
-def test_every_row_leads_where_it_says(row: Transition) -> None:
-    supervisor = in_state(row.state)
-    assert ask(supervisor, row.trigger)
-    assert supervisor.state == row.next_state
-    assert supervisor.armed == (row.next_state in ARMED)
-    changed = row.next_state != row.state
-    words = [f"{row.state.name} -> {row.next_state.name}"] if changed else []
-    assert [event.text for event in supervisor.events] == words
-    assert all(event.severity == INFORMATION for event in supervisor.events)
+def test_numbers_are_those_of_the_logs() -> None:
+    """A log of last year must mean the same."""
+    assert {state.name: int(state) for state in State} == {"DISARMED": 0, "ARMED": 1, "ESTOP": 2}
+    assert [trigger.name for trigger in sorted(Trigger)] == [
+        "ESTOP_FRAME", "ESTOP", "CLEAR_ESTOP", "DISARM", "ARM", "FORCED_ARM", "SET_MODE", "HOLD", "TRACK", "DOCK", "UNDOCK",
+        "SET_POINT", "STICKS", "MOTOR_TEST", "TEST_OVER", "DOCK_OVER", "FAILSAFE_HOLD", "FAILSAFE_DEPTH", "FAILSAFE_SURFACE",
+        "FAILSAFE_DISARM",
+    ]  # fmt: skip
+    assert [int(trigger) for trigger in Trigger] == list(range(20))
+    assert [int(guard) for guard in Guard] == list(range(9))
+    assert [int(effect) for effect in Effect] == list(range(8))
+    assert [int(need) for need in Need] == list(range(4))
+    assert DOCKING == {Trigger.DOCK, Trigger.UNDOCK} and ARMED == {State.ARMED}
 
 
-NO_ROW = [pair for pair in itertools.product(State, Action) if pair not in ROWS]
-
-
-@pytest.mark.parametrize(("state", "action"), NO_ROW, ids=lambda value: value.name)
-def test_every_trigger_without_a_row_is_refused_in_words(state: State, action: Action) -> None:
-    assert refusal(in_state(state), action) == f"{action.name} refused: not possible in {state.name}"
+def row(state: State, trigger: Trigger) -> tuple[Guard, Effect, State, Mode | None]:
+    return ROWS[state, trigger][2:]
 
 
 def test_table_has_one_row_for_a_state_and_a_trigger() -> None:
-    assert len(ROWS) == len(TABLE)
-    assert len(NO_ROW) + len(TABLE) == len(State) * len(Action)
+    assert len(ROWS) == len(TABLE) == 36
+
+
+@pytest.mark.parametrize("state", State, ids=lambda state: state.name)
+def test_e_stop_comes_through_from_everywhere(state: State) -> None:
+    effect = Effect.NOTHING if state == State.ESTOP else Effect.STOP
+    for trigger in (Trigger.ESTOP_FRAME, Trigger.ESTOP):
+        assert row(state, trigger) == (Guard.ALWAYS, effect, State.ESTOP, None)
+
+
+def test_stopped_robot_is_left_by_clearing_alone() -> None:
+    leads = {r.trigger: r for r in TABLE if r.state == State.ESTOP}
+    assert set(leads) == {
+        Trigger.ESTOP_FRAME, Trigger.ESTOP, Trigger.CLEAR_ESTOP, Trigger.DISARM, Trigger.SET_POINT, Trigger.STICKS,
+    }  # fmt: skip
+    assert {t for t, r in leads.items() if r.next_state != State.ESTOP} == {Trigger.CLEAR_ESTOP}
+    assert row(State.ESTOP, Trigger.CLEAR_ESTOP) == (Guard.ESTOP_QUIET, Effect.NOTHING, State.DISARMED, None)
+    assert row(State.ESTOP, Trigger.DISARM) == (Guard.ALWAYS, Effect.NOTHING, State.ESTOP, None)
 
 
 def test_thrusters_turn_only_after_arming() -> None:
-    """From no state but an armed one leads a row into an armed one without the arming guard."""
-    for row in TABLE:
-        if row.next_state in ARMED and row.state not in ARMED:
-            assert row.trigger == Action.ARM and row.guard == Guard.MAY_ARM
+    arming = {r.trigger: r[2:] for r in TABLE if r.state not in ARMED and r.next_state in ARMED}
+    assert arming == {
+        Trigger.ARM: (Guard.ARMING_CHECKS, Effect.ENTER_MODE, State.ARMED, None),
+        Trigger.FORCED_ARM: (Guard.FORCED_CHECKS, Effect.ENTER_MODE, State.ARMED, None),
+        Trigger.MOTOR_TEST: (Guard.FORCED_CHECKS, Effect.TEST_MOTOR, State.ARMED, Mode.MOTOR_DETECT),
+    }
 
 
-def test_every_armed_state_can_be_left_at_any_time() -> None:
-    for state in ARMED:
-        for action in (Action.DISARM, Action.ESTOP):
-            row = ROWS[(state, action)]
-            assert row.guard == Guard.ALWAYS and row.next_state not in ARMED
+def test_armed_robot_can_be_disarmed_at_any_time() -> None:
+    for trigger in (Trigger.DISARM, Trigger.FAILSAFE_DISARM):
+        assert row(State.ARMED, trigger) == (Guard.ALWAYS, Effect.STOP, State.DISARMED, None)
+    assert row(State.ARMED, Trigger.TEST_OVER) == (Guard.TESTING, Effect.STOP, State.DISARMED, Mode.POSHOLD)
+    disarming = {r.trigger for r in TABLE if r.state == State.ARMED and r.next_state == State.DISARMED}
+    assert disarming == {Trigger.DISARM, Trigger.FAILSAFE_DISARM, Trigger.TEST_OVER}
 
 
-def test_stopped_robot_does_nothing_but_be_cleared() -> None:
-    assert [row.trigger for row in TABLE if row.state == State.ESTOP] == [Action.CLEAR_ESTOP]
+def test_disarmed_robot_takes_a_mode_a_point_and_sticks_and_does_nothing() -> None:
+    quiet = (Guard.ALWAYS, Effect.NOTHING, State.DISARMED, None)
+    for trigger in (Trigger.CLEAR_ESTOP, Trigger.DISARM, Trigger.SET_MODE):
+        assert row(State.DISARMED, trigger) == quiet
+    rest = {r.trigger for r in TABLE if r.state == State.DISARMED}
+    assert rest == {
+        Trigger.ESTOP_FRAME, Trigger.ESTOP, Trigger.CLEAR_ESTOP, Trigger.DISARM, Trigger.ARM, Trigger.FORCED_ARM,
+        Trigger.SET_MODE, Trigger.SET_POINT, Trigger.STICKS, Trigger.MOTOR_TEST,
+    }  # fmt: skip
 
 
-def test_robot_starts_disarmed() -> None:
-    supervisor = Supervisor(MODULES, Supervision())
-    assert supervisor.state == State.DISARMED and not supervisor.armed
+@pytest.mark.parametrize("state", State, ids=lambda state: state.name)
+def test_points_and_sticks_are_heard_in_every_state(state: State) -> None:
+    assert row(state, Trigger.SET_POINT) == (Guard.ALWAYS, Effect.TAKE_POINT, state, None)
+    assert row(state, Trigger.STICKS) == (Guard.ALWAYS, Effect.TAKE_STICKS, state, None)
 
 
-# ---------------------------------------------------------------- guards, and their words
+def test_armed_robot_changes_its_mode_by_these_rows() -> None:
+    a, permitted, needs = State.ARMED, Guard.MODE_PERMITTED, Guard.MODE_NEEDS
+    assert row(a, Trigger.SET_MODE) == (permitted, Effect.ENTER_MODE, a, None)
+    assert row(a, Trigger.HOLD) == (permitted, Effect.HOLD_AT, a, Mode.POSHOLD)
+    assert row(a, Trigger.TRACK) == (permitted, Effect.FOLLOW, a, Mode.AUTO)
+    assert row(a, Trigger.DOCK) == row(a, Trigger.UNDOCK) == (permitted, Effect.ENTER_MODE, a, Mode.DOCK)
+    assert row(a, Trigger.DOCK_OVER) == (Guard.IN_DOCK, Effect.ENTER_MODE, a, Mode.POSHOLD)
+    assert row(a, Trigger.FAILSAFE_HOLD) == (needs, Effect.ENTER_MODE, a, Mode.POSHOLD)
+    assert row(a, Trigger.FAILSAFE_DEPTH) == (needs, Effect.ENTER_MODE, a, Mode.ALT_HOLD)
+    assert row(a, Trigger.FAILSAFE_SURFACE) == (Guard.ALWAYS, Effect.ENTER_MODE, a, Mode.SURFACE)
+    assert row(a, Trigger.MOTOR_TEST) == (Guard.IN_MOTOR_DETECT, Effect.TEST_MOTOR, a, None)
+    for trigger in (Trigger.CLEAR_ESTOP, Trigger.ARM, Trigger.FORCED_ARM):
+        assert row(a, trigger) == (Guard.ALWAYS, Effect.NOTHING, a, None)
 
 
-def test_robot_without_a_pose_does_not_arm() -> None:
-    text = refusal(in_state(State.DISARMED), Action.ARM, GOOD._replace(ready=False, tag_age_ns=1 << 60))
-    assert text == "ARM refused: no pose yet"
+def test_modes_need_and_allow_what_the_table_says() -> None:
+    assert [r.mode for r in MODE_TABLE] == list(MODES) and set(MODES) == set(Mode)
+    assert {mode for mode, r in MODES.items() if r.by_pilot} == {Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD}
+    assert {mode for mode, r in MODES.items() if not r.request} == {Mode.DOCK}
+    for mode in (Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK):
+        assert MODES[mode].needs == {Need.ATTITUDE, Need.POSITION}
+    assert MODES[Mode.MANUAL].needs == {Need.PILOT}
+    assert MODES[Mode.STABILIZE].needs == {Need.ATTITUDE, Need.PILOT}
+    assert MODES[Mode.ALT_HOLD].needs == {Need.ATTITUDE, Need.DEPTH}
+    assert MODES[Mode.SURFACE].needs == MODES[Mode.MOTOR_DETECT].needs == frozenset()
 
 
-def test_robot_with_a_stale_pose_does_not_arm() -> None:
-    text = refusal(in_state(State.DISARMED), Action.ARM, GOOD._replace(tag_age_ns=501_000_000))
-    assert text == "ARM refused: pose is 501 ms old, 500 permitted"
+# ---------------------------------------------------------------- running the table
 
 
-def test_robot_that_is_unsure_of_its_pose_does_not_arm() -> None:
-    text = refusal(in_state(State.DISARMED), Action.ARM, GOOD._replace(sigma_p=np.array([0.01, 0.08, 0.02])))
-    assert text == "ARM refused: pose sigma 80 mm, 50 permitted"
+@pytest.mark.parametrize("r", [r for r in TABLE if r.trigger in REQUESTS], ids=lambda r: f"{r.state.name}-{r.trigger.name}")
+def test_every_requested_row_leads_where_it_says(r: Transition) -> None:
+    before = Mode.MOTOR_DETECT if r.guard == Guard.IN_MOTOR_DETECT else Mode.POSHOLD
+    supervisor = supervisor_in(r.state, before)
+    request = REQUESTS[r.trigger]
+    (decision,) = supervisor.step(False, GOOD, [request])
+    mode = Mode.AUTO if r.trigger == Trigger.SET_MODE else r.mode if r.mode is not None else before
+    assert decision == Decision(r.trigger, r.effect, mode, request.argument)
+    assert (supervisor.state, supervisor.mode) == (r.next_state, mode)
+    assert supervisor.armed == (r.next_state in ARMED)
+    changed = (r.next_state, mode) != (r.state, before)
+    words = f"{r.state.name} {before.name} -> {r.next_state.name} {mode.name}"
+    assert supervisor.events == ([Event(INFORMATION, words)] if changed else [])
 
 
-def test_robot_with_a_silent_module_does_not_arm() -> None:
-    one = refusal(in_state(State.DISARMED), Action.ARM, inputs=heard(silent=(2,)))
-    assert one == "ARM refused: module 2 does not answer"
-    both = refusal(in_state(State.DISARMED), Action.ARM, inputs=heard(silent=(0, 2)))
-    assert both == "ARM refused: module 0, 2 does not answer"
+NO_ROW = [pair for pair in itertools.product(State, REQUESTS) if pair not in ROWS]
 
 
-def test_module_of_another_body_may_be_silent() -> None:
-    assert ask(in_state(State.DISARMED), Action.ARM, inputs=heard(silent=(1,)))
+@pytest.mark.parametrize(("state", "trigger"), NO_ROW, ids=lambda value: value.name)
+def test_every_trigger_without_a_row_is_refused_in_words(state: State, trigger: Trigger) -> None:
+    supervisor = supervisor_in(state)
+    assert supervisor.step(False, GOOD, [REQUESTS[trigger]]) == []
+    assert supervisor.events == [Event(WARNING, f"{trigger.name} refused: not possible in {state.name}")]
+    assert supervisor.state == state
 
 
-def test_all_reasons_are_named_at_once() -> None:
-    text = refusal(in_state(State.DISARMED), Action.ARM, GOOD._replace(ready=False), heard(silent=(0,)))
-    assert text == "ARM refused: no pose yet; module 0 does not answer"
+def test_robot_starts_disarmed_and_would_hold_its_place() -> None:
+    supervisor = Supervisor(P)
+    assert (supervisor.state, supervisor.mode, supervisor.level) == (State.DISARMED, Mode.POSHOLD, Level.NONE)
+    assert not supervisor.armed and not supervisor.raises_estop and supervisor.events == []
 
 
-def test_raised_e_stop_is_not_cleared() -> None:
-    text = refusal(in_state(State.ESTOP), Action.CLEAR_ESTOP, inputs=heard(estop=True))
-    assert text == "CLEAR_ESTOP refused: the e-stop is still raised"
-
-
-@pytest.mark.parametrize(("age_ns", "granted"), [(499_999_999, True), (500_000_000, True), (500_000_001, False)])
-def test_pose_is_stale_just_beyond_the_limit(age_ns: int, granted: bool) -> None:
-    assert ask(in_state(State.DISARMED), Action.ARM, GOOD._replace(tag_age_ns=age_ns)) is granted
-
-
-@pytest.mark.parametrize(("sigma", "granted"), [(0.0499999, True), (0.05, True), (0.0500001, False), (math.inf, False)])
-@pytest.mark.parametrize("axis", range(3))
-def test_pose_is_unsure_just_beyond_the_limit(axis: int, sigma: float, granted: bool) -> None:
-    sigmas = np.full(3, 0.001)
-    sigmas[axis] = sigma
-    assert ask(in_state(State.DISARMED), Action.ARM, GOOD._replace(sigma_p=sigmas)) is granted
-
-
-def test_limits_are_those_of_the_parameters() -> None:
-    strict = Supervisor(MODULES, replace(Supervision(), tag_fresh_ms=10.0))
-    assert not ask(strict, Action.ARM)
-
-
-# ---------------------------------------------------------------- e-stop, and order
-
-
-@pytest.mark.parametrize("state", [State.DISARMED, State.HOLD, State.TRACK])
-def test_e_stop_on_the_bus_stops_the_robot_in_this_tick(state: State) -> None:
-    supervisor = in_state(state)
-    assert supervisor.step(heard(estop=True), GOOD, []) == []
-    assert supervisor.state == State.ESTOP and not supervisor.armed
-    assert [event.text for event in supervisor.events] == [f"{state.name} -> ESTOP"]
-
-
-def test_e_stop_that_stays_raised_is_said_once() -> None:
-    supervisor = in_state(State.HOLD)
-    supervisor.step(heard(estop=True), GOOD, [])
-    supervisor.step(heard(estop=True), GOOD, [])
-    assert supervisor.events == []
-
-
-def test_e_stop_comes_before_any_request_of_its_tick() -> None:
-    supervisor = in_state(State.DISARMED)
-    assert supervisor.step(heard(estop=True), GOOD, [Request(Action.ARM)]) == []
-    assert supervisor.state == State.ESTOP
-
-
-def test_e_stop_that_fell_silent_stays() -> None:
-    supervisor = in_state(State.HOLD)
-    supervisor.step(heard(estop=True), GOOD, [])
-    supervisor.step(heard(), GOOD, [])
-    assert supervisor.state == State.ESTOP
-    assert ask(supervisor, Action.CLEAR_ESTOP)
-    assert supervisor.state == State.DISARMED
+def test_mode_chosen_while_disarmed_is_armed_in() -> None:
+    supervisor = supervisor_in(State.DISARMED)
+    ask(supervisor, Action.SET_MODE, Mode.MANUAL, BLIND)
+    (decision,) = ask(supervisor, Action.ARM, None, BLIND)
+    assert (decision.effect, decision.mode) == (Effect.ENTER_MODE, Mode.MANUAL) and supervisor.armed
 
 
 def test_requests_of_one_tick_are_taken_in_order() -> None:
-    supervisor = in_state(State.DISARMED)
-    requests = [Request(Action.TRACK), Request(Action.ARM), Request(Action.TRACK), Request(Action.CLEAR_ESTOP)]
-    assert supervisor.step(heard(), GOOD, requests) == requests[1:3]
-    assert supervisor.state == State.TRACK
-    assert [event.text for event in supervisor.events] == [
+    supervisor = supervisor_in(State.DISARMED)
+    requests = [REQUESTS[t] for t in (Trigger.TRACK, Trigger.ARM, Trigger.TRACK, Trigger.HOLD)]
+    decisions = supervisor.step(False, GOOD, requests)
+    assert [d.trigger for d in decisions] == [Trigger.ARM, Trigger.TRACK, Trigger.HOLD]
+    assert texts(supervisor) == [
         "TRACK refused: not possible in DISARMED",
-        "DISARMED -> HOLD",
-        "HOLD -> TRACK",
-        "CLEAR_ESTOP refused: not possible in TRACK",
+        "DISARMED POSHOLD -> ARMED POSHOLD",
+        "ARMED POSHOLD -> ARMED AUTO",
+        "ARMED AUTO -> ARMED POSHOLD",
     ]
 
 
-def test_events_are_those_of_the_tick() -> None:
-    supervisor = in_state(State.DISARMED)
+def test_request_that_is_not_the_supervisors_is_passed_over() -> None:
+    supervisor = supervisor_in()
+    assert ask(supervisor, Action.GROUND_ALIVE) == [] == supervisor.events
+    assert ask(supervisor, Action.SET_PARAMETER, ("control.lead_s", 0.1)) == [] == supervisor.events
+
+
+SENSELESS = [
+    (Action.SET_MODE, 3), (Action.SET_MODE, None), (Action.SET_MODE, Mode.DOCK), (Action.STICKS, None),
+    (Action.STICKS, Sticks((1.1, 0.0, 0.0), (0.0, 0.0, 0.0))), (Action.SET_POINT, None), (Action.HOLD, PATH),
+    (Action.TRACK, None), (Action.TRACK, HERE), (Action.TRACK, 2.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("action", "argument"), SENSELESS)
+def test_request_without_sense_is_refused(action: Action, argument: Any) -> None:
+    supervisor = supervisor_in()
+    assert ask(supervisor, action, argument) == []
+    assert supervisor.events == [Event(WARNING, f"{action.name} refused: its argument makes no sense")]
+    assert supervisor.mode == Mode.POSHOLD
+
+
+def test_thing_that_has_only_a_duration_or_only_samples_is_no_trajectory() -> None:
+    for lacking in (type("A", (), {"duration_s": 1.0})(), type("B", (), {"sample": None})()):
+        assert ask(supervisor_in(), Action.TRACK, lacking) == []
+
+
+def test_force_is_the_word_true_alone() -> None:
+    for argument in (False, 1, "yes", None):
+        supervisor = supervisor_in(State.DISARMED)
+        assert ask(supervisor, Action.ARM, argument, GOOD._replace(esc_missing=(0,))) == []
+        assert texts(supervisor) == ["ARM refused: ESC 1 does not answer"]
+    supervisor = supervisor_in(State.DISARMED)
+    assert ask(supervisor, Action.ARM, True, GOOD._replace(esc_missing=(0,))) and supervisor.armed
+
+
+def test_all_reasons_are_named_at_once() -> None:
+    supervisor = supervisor_in(State.DISARMED)
+    ask(supervisor, Action.ARM, True, GOOD._replace(silent=(1,), warm=False))
+    assert texts(supervisor) == ["FORCED_ARM refused: module 1 does not answer; compiled code is not warm yet"]
+
+
+def test_mode_that_lacks_what_it_needs_is_refused() -> None:
+    supervisor = supervisor_in(mode=Mode.MANUAL)
+    assert ask(supervisor, Action.SET_MODE, Mode.POSHOLD, BLIND) == []
+    assert texts(supervisor) == ["SET_MODE refused: no pose yet"] and supervisor.mode == Mode.MANUAL
+
+
+def test_mode_is_refused_while_a_fail_safe_stands_against_it() -> None:
+    supervisor = supervisor_in()
+    assert ask(supervisor, Action.SET_MODE, Mode.AUTO, GOOD._replace(tag_age_s=2.0)) == []
+    assert texts(supervisor) == ["SET_MODE refused: no tag for 2.0 s"]
+    assert ask(supervisor, Action.SET_MODE, Mode.MANUAL, GOOD._replace(leak=True))
+
+
+# ---------------------------------------------------------------- e-stop
+
+
+@pytest.mark.parametrize("state", [State.DISARMED, State.ARMED])
+def test_e_stop_on_the_bus_stops_the_robot_in_this_tick(state: State) -> None:
+    supervisor = supervisor_in(state)
+    (decision,) = supervisor.step(True, GOOD, [])
+    assert decision == Decision(Trigger.ESTOP_FRAME, Effect.STOP, Mode.POSHOLD)
+    assert supervisor.state == State.ESTOP and not supervisor.armed and not supervisor.raises_estop
+    assert texts(supervisor) == [f"{state.name} POSHOLD -> ESTOP POSHOLD"]
+    supervisor.step(True, GOOD, [])
+    assert supervisor.events == [], "said once"
+
+
+def test_e_stop_comes_before_any_request_of_its_tick() -> None:
+    supervisor = supervisor_in(State.DISARMED)
+    supervisor.step(True, GOOD, [Request(Action.ARM, 0, True)])
+    assert supervisor.state == State.ESTOP
+
+
+def test_requested_e_stop_is_raised_on_the_bus_until_it_is_cleared() -> None:
+    supervisor = supervisor_in()
+    ask(supervisor, Action.ESTOP)
+    assert supervisor.raises_estop
+    for action in (Action.ARM, Action.DISARM, Action.HOLD, Action.SET_MODE):
+        ask(supervisor, action, Mode.AUTO if action == Action.SET_MODE else None)
+        assert supervisor.raises_estop and supervisor.state == State.ESTOP
+    ask(supervisor, Action.CLEAR_ESTOP)
+    assert not supervisor.raises_estop and supervisor.state == State.DISARMED
+
+
+def test_e_stop_is_cleared_when_the_bus_has_been_quiet() -> None:
+    supervisor = supervisor_in()
+    supervisor.step(True, GOOD, [Request(Action.ESTOP)])
+    almost = at(GOOD, 0.2)
+    assert ask(supervisor, Action.CLEAR_ESTOP, None, almost._replace(time_ns=almost.time_ns - 1)) == []
+    assert texts(supervisor) == ["CLEAR_ESTOP refused: the e-stop is still raised"] and supervisor.raises_estop
+    assert ask(supervisor, Action.CLEAR_ESTOP, None, almost) and supervisor.state == State.DISARMED
+
+
+def test_robot_does_not_arm_while_an_e_stop_was_just_heard() -> None:
+    supervisor = supervisor_in(State.ARMED)
+    supervisor.step(True, GOOD, [])
+    ask(supervisor, Action.CLEAR_ESTOP, None, at(GOOD, 0.3))
+    supervisor.step(False, at(GOOD, 0.3), [Request(Action.ARM, 0, True)])
+    assert supervisor.armed
+
+
+# ---------------------------------------------------------------- endings
+
+
+def test_motor_test_that_armed_the_robot_disarms_it() -> None:
+    supervisor = supervisor_in(State.DISARMED)
+    ask(supervisor, Action.MOTOR_TEST, (0, 0.1, 1.0))
+    assert (supervisor.state, supervisor.mode) == (State.ARMED, Mode.MOTOR_DETECT)
+    ask(supervisor, Action.STICKS, STICKS)
+    ask(supervisor, Action.MOTOR_TEST, (1, 0.1, 1.0))
+    (decision,) = supervisor.step(False, GOOD, [], [Trigger.TEST_OVER])
+    assert decision == Decision(Trigger.TEST_OVER, Effect.STOP, Mode.POSHOLD)
+    assert (supervisor.state, supervisor.mode) == (State.DISARMED, Mode.POSHOLD)
+    assert supervisor.step(False, GOOD, [], [Trigger.TEST_OVER]) == [] == supervisor.events
+    supervisor.step(False, GOOD, [Request(Action.SET_MODE, 0, Mode.MOTOR_DETECT), Request(Action.ARM)])
+    assert supervisor.step(False, GOOD, [], [Trigger.TEST_OVER]) == [] and supervisor.armed
+
+
+def test_motor_test_of_a_robot_armed_by_hand_leaves_it_armed() -> None:
+    supervisor = supervisor_in(State.ARMED, Mode.MOTOR_DETECT)
+    ask(supervisor, Action.MOTOR_TEST, (0, 0.1, 1.0))
+    assert supervisor.step(False, GOOD, [], [Trigger.TEST_OVER]) == [] == supervisor.events and supervisor.armed
+
+
+def test_mode_taken_during_a_motor_test_ends_it_without_disarming() -> None:
+    supervisor = supervisor_in(State.DISARMED)
+    ask(supervisor, Action.MOTOR_TEST, (0, 0.1, 1.0))
+    ask(supervisor, Action.SET_MODE, Mode.POSHOLD)
+    assert supervisor.step(False, GOOD, [], [Trigger.TEST_OVER]) == [] and supervisor.armed
+
+
+def test_disarming_ends_a_motor_test() -> None:
+    supervisor = supervisor_in(State.DISARMED)
+    ask(supervisor, Action.MOTOR_TEST, (0, 0.1, 1.0))
+    ask(supervisor, Action.DISARM)
     ask(supervisor, Action.ARM)
-    supervisor.step(heard(), GOOD, [])
-    assert supervisor.events == []
+    assert supervisor.step(False, GOOD, [], [Trigger.TEST_OVER]) == [] and supervisor.armed
+
+
+def test_motor_test_in_another_mode_is_refused() -> None:
+    supervisor = supervisor_in(State.ARMED, Mode.AUTO)
+    assert ask(supervisor, Action.MOTOR_TEST, (0, 0.1, 1.0)) == []
+    assert texts(supervisor) == ["MOTOR_TEST refused: the mode is not MOTOR_DETECT"]
+
+
+def test_dock_that_has_given_up_leaves_the_robot_holding() -> None:
+    supervisor = supervisor_in(State.ARMED, Mode.DOCK)
+    (decision,) = supervisor.step(False, GOOD, [], [Trigger.DOCK_OVER])
+    assert decision == Decision(Trigger.DOCK_OVER, Effect.ENTER_MODE, Mode.POSHOLD)
+    assert supervisor.step(False, GOOD, [], [Trigger.DOCK_OVER]) == [] == supervisor.events
+
+
+# ---------------------------------------------------------------- fail-safes
+
+
+QUICK = replace(
+    P,
+    failsafes=replace(
+        P.failsafes, leak_delay_s=0.0, battery_low_delay_s=0.0, cabin_hot_delay_s=0.0, cabin_hot_action=5, module_silent_delay_s=0.0
+    ),
+)
+
+
+def test_leak_brings_the_robot_up() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    (decision,) = supervisor.step(False, GOOD._replace(leak=True), [])
+    assert decision == Decision(Trigger.FAILSAFE_SURFACE, Effect.ENTER_MODE, Mode.SURFACE)
+    assert (supervisor.mode, supervisor.level) == (Mode.SURFACE, Level.SURFACE)
+    assert supervisor.events == [
+        Event(CRITICAL, "fail-safe on: water in a cabin"), Event(INFORMATION, "ARMED AUTO -> ARMED SURFACE"),
+    ]  # fmt: skip
+    assert supervisor.step(False, at(GOOD._replace(leak=True), 1), []) == [] == supervisor.events
+
+
+def test_pilot_takes_over_and_keeps_it_while_the_leak_lasts() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    wet = GOOD._replace(leak=True)
+    supervisor.step(False, wet, [])
+    ask(supervisor, Action.SET_MODE, Mode.MANUAL, at(wet, 1))
+    assert (supervisor.mode, supervisor.level) == (Mode.MANUAL, Level.NONE)
+    assert supervisor.step(False, at(wet._replace(voltage_share=0.85), 2), []) == [], "a warning takes nothing away"
+    (decision,) = supervisor.step(False, at(wet._replace(silent_s=1.0), 3), [])
+    assert decision.mode == Mode.SURFACE, "but the next fail-safe does, to where the gravest leads"
+
+
+def test_milder_fail_safe_does_not_undo_a_graver() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    supervisor.step(False, GOOD._replace(leak=True), [])
+    assert supervisor.step(False, at(GOOD._replace(leak=True, silent_s=1.0), 1), []) == []
+    assert supervisor.events == [Event(WARNING, "fail-safe on: a module is silent for 1.0 s")]
+    assert supervisor.mode == Mode.SURFACE
+
+
+def test_graver_fail_safe_goes_on_from_a_milder() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    supervisor.step(False, GOOD._replace(silent_s=1.0), [])
+    assert (supervisor.mode, supervisor.level) == (Mode.POSHOLD, Level.HOLD)
+    supervisor.step(False, at(GOOD._replace(silent_s=1.0, leak=True), 1), [])
+    assert (supervisor.mode, supervisor.level) == (Mode.SURFACE, Level.SURFACE)
+
+
+def test_warning_changes_nothing_but_is_said() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    assert supervisor.step(False, GOOD._replace(voltage_share=0.85), []) == []
+    assert supervisor.events == [Event(WARNING, "fail-safe on: battery low: 85% of its voltage")]
+    supervisor.step(False, at(GOOD, 1), [])
+    supervisor.step(False, at(GOOD, 3), [])
+    assert supervisor.events == [Event(INFORMATION, "fail-safe over: battery low: 100% of its voltage")]
+
+
+def test_end_of_a_fail_safe_changes_no_mode() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    supervisor.step(False, GOOD._replace(silent_s=1.0), [])
+    supervisor.step(False, at(GOOD, 1), [])
+    assert supervisor.step(False, at(GOOD, 4), []) == [] and supervisor.mode == Mode.POSHOLD
+
+
+def test_end_of_one_fail_safe_does_not_wake_another() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    both = GOOD._replace(leak=True, silent_s=1.0)
+    supervisor.step(False, both, [])
+    ask(supervisor, Action.SET_MODE, Mode.MANUAL, at(both, 1))
+    supervisor.step(False, at(GOOD._replace(leak=True), 2), [])
+    assert supervisor.step(False, at(GOOD._replace(leak=True), 5), []) == [] and supervisor.mode == Mode.MANUAL
+
+
+def test_fail_safe_may_disarm() -> None:
+    supervisor = supervisor_in(mode=Mode.MANUAL, parameters=QUICK)
+    (decision,) = supervisor.step(False, GOOD._replace(cabin_c=90.0), [])
+    assert decision == Decision(Trigger.FAILSAFE_DISARM, Effect.STOP, Mode.MANUAL) and not supervisor.armed
+    assert supervisor.step(False, at(GOOD._replace(cabin_c=90.0), 1), []) == []
+
+
+def test_disarmed_robot_says_what_is_wrong_and_stays() -> None:
+    supervisor = supervisor_in(State.DISARMED, parameters=QUICK)
+    assert supervisor.step(False, GOOD._replace(leak=True), []) == []
+    assert texts(supervisor) == ["fail-safe on: water in a cabin"] and supervisor.mode == Mode.POSHOLD
+
+
+def test_robot_armed_by_force_is_not_taken_away_by_what_was_known() -> None:
+    supervisor = supervisor_in(State.DISARMED, parameters=QUICK)
+    wet = GOOD._replace(leak=True)
+    supervisor.step(False, wet, [])
+    (decision,) = ask(supervisor, Action.ARM, True, at(wet, 1))
+    assert decision.effect == Effect.ENTER_MODE and supervisor.mode == Mode.POSHOLD
+    assert supervisor.step(False, at(wet, 2), []) == []
+
+
+LADDER = [
+    (GOOD._replace(silent_s=1.0), Mode.POSHOLD, []),
+    (GOOD._replace(silent_s=1.0, tag_age_s=8.1), Mode.ALT_HOLD, ["FAILSAFE_HOLD refused: no tag for 8.1 s"]),
+    (
+        GOOD._replace(silent_s=1.0, tag_age_s=8.1, depth_age_s=6.0),
+        Mode.SURFACE,
+        ["FAILSAFE_HOLD refused: no tag for 8.1 s", "FAILSAFE_DEPTH refused: depth unknown"],
+    ),
+]
+
+
+@pytest.mark.parametrize(("health", "mode", "refusals"), LADDER)
+def test_fail_safe_holds_as_well_as_can_be(health: Health, mode: Mode, refusals: list[str]) -> None:
+    supervisor = supervisor_in(mode=Mode.MANUAL, parameters=QUICK)
+    (decision,) = supervisor.step(False, health, [])
+    assert decision.mode == supervisor.mode == mode
+    assert [text for text in texts(supervisor) if "refused" in text] == refusals
+
+
+def test_robot_without_tags_holds_then_holds_depth_then_surfaces() -> None:
+    """As the issue has it: POSHOLD, then depth and attitude, then up."""
+    supervisor = supervisor_in(mode=Mode.AUTO)
+    seen = []
+    for tenth in range(0, 400):
+        health = at(GOOD._replace(tag_age_s=tenth / 10), tenth / 10)
+        seen += [(tenth, decision.mode) for decision in supervisor.step(False, health, [])]
+    assert seen == [(11, Mode.POSHOLD), (81, Mode.ALT_HOLD), (301, Mode.SURFACE)]
+
+
+def test_pilots_depth_hold_needs_no_tags() -> None:
+    supervisor = supervisor_in(mode=Mode.ALT_HOLD)
+    assert supervisor.step(False, GOOD._replace(tag_age_s=100.0, pilot_age_s=0.1), []) == []
+
+
+def test_depth_hold_of_a_fail_safe_that_a_pilot_takes_is_his() -> None:
+    supervisor = supervisor_in(mode=Mode.POSHOLD)
+    supervisor.step(False, GOOD._replace(tag_age_s=9.0), [])
+    assert (supervisor.mode, supervisor.level) == (Mode.ALT_HOLD, Level.DEPTH)
+    ask(supervisor, Action.SET_MODE, Mode.ALT_HOLD, at(GOOD._replace(tag_age_s=10.0), 1))
+    assert supervisor.level == Level.NONE
+    assert supervisor.step(False, at(GOOD._replace(tag_age_s=40.0), 31), []) == []
+
+
+# ---------------------------------------------------------------- joined and parted bodies
+
+
+@pytest.mark.parametrize(
+    ("states", "expected"),
+    [
+        ((State.ARMED, State.ARMED), State.ARMED), ((State.ARMED, State.DISARMED), State.DISARMED),
+        ((State.ESTOP, State.ARMED), State.ESTOP), ((State.DISARMED, State.ESTOP), State.ESTOP), ((State.ARMED,), State.ARMED),
+    ],
+)  # fmt: skip
+def test_joined_robot_is_armed_when_all_were_and_stopped_when_one_was(states: tuple[State, ...], expected: State) -> None:
+    joined = Supervisor(P)
+    joined.take_over([supervisor_in(state) for state in states])
+    assert (joined.state, joined.mode, joined.level) == (expected, Mode.POSHOLD, Level.NONE)
+    joined.take_over([supervisor_in(state) for state in states], Mode.AUTO)
+    assert joined.mode == Mode.AUTO
+
+
+def test_joined_robot_keeps_e_stop_and_fail_safe() -> None:
+    a, b, joined = supervisor_in(), supervisor_in(mode=Mode.AUTO, parameters=QUICK), Supervisor(P)
+    a.step(True, GOOD, [])
+    b.step(False, GOOD._replace(leak=True), [])
+    b.step(True, at(GOOD, 0.1), [Request(Action.ESTOP)])
+    b.level = Level.SURFACE
+    joined.take_over([a, b])
+    assert joined.raises_estop and joined.level == Level.SURFACE and joined.state == State.ESTOP
+    assert ask(joined, Action.CLEAR_ESTOP, None, at(GOOD, 0.29)) == []
+    assert ask(joined, Action.CLEAR_ESTOP, None, at(GOOD, 0.31))
+    calm = Supervisor(P)
+    calm.take_over([supervisor_in(), supervisor_in()])
+    assert not calm.raises_estop

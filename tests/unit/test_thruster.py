@@ -98,7 +98,7 @@ def test_shipped_curves_rise_and_end_at_their_limits(name: str) -> None:
     curve = vehicle.curve
     for side, full in ((curve.forward, vehicle.force_max_n), (curve.reverse, -vehicle.force_min_n)):
         assert thruster.is_monotone(np.array(side))
-        assert np.sum(side) == pytest.approx(full)
+        assert full <= np.sum(side) * (1 + 1e-9) <= 1.03 * full
 
 
 def test_power_is_that_of_the_side_which_turns(thrusters: ThrusterSet) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+FULL_LENGTH = "MODCUBE_FULL"
+"""Set: whole lengths and counts, for `make accept`; not set: reduced ones."""
 RUN = ROOT / "hil" / "guest" / "run"
 
 
@@ -43,6 +45,7 @@ class Guest:
             returncode: the command's; 124 time-out, 125 the guest did not finish, 126 it could not be prepared.
         """
         switches = {"VG_SMP": str(processors), "VG_TIMEOUT": str(timeout_s), "VG_WARM": warm_up}
+        switches["VG_PASS"] = f"{FULL_LENGTH} {os.environ.get('VG_PASS', '')}"
         switches |= {"VG_COUNTED": "1"} if counted else {}
         switches |= {"VG_OUT": str(out)} if out else {}
         return subprocess.run(

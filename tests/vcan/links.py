@@ -6,7 +6,6 @@ What `ip link` does, asked of the kernel directly: a process costs 35 to 75 ms i
 import os
 import socket
 import struct
-import subprocess
 from pathlib import Path
 
 NETLINK_ROUTE = 0
@@ -21,10 +20,17 @@ LINK = struct.Struct("=BxHiII")
 """struct ifinfomsg: family, type, index, flags, which flags change."""
 IFF_UP = 0x1
 """Flag of linux/if.h."""
+RTM_NEWQDISC, RTM_DELQDISC, REPLACE = 36, 37, 0x500
+"""Of linux/rtnetlink.h, and NLM_F_CREATE | NLM_F_REPLACE."""
+TCA_KIND, TCA_OPTIONS, TC_H_ROOT = 1, 2, 0xFFFFFFFF
+QDISC = struct.Struct("=BxxxiIII")
+"""struct tcmsg of linux/rtnetlink.h: family, interface, handle, parent, info."""
+NETEM = struct.Struct("=IIIIII")
+"""struct tc_netem_qopt of linux/pkt_sched.h: latency, limit, loss, gap, duplicate, jitter."""
 HELD_FRAMES = 1
 """Frames that a full buffer holds before it refuses with ENOBUFS."""
-HOLD = "200s"
-"""How long it holds them; tc takes at most 274 s."""
+HOLD_TICKS = 200 * 1_000_000_000 // 64
+"""200 s in the packet scheduler's ticks of 64 ns: how long it holds them; 32 bits take at most 274 s."""
 
 
 def _attribute(kind: int, value: bytes) -> bytes:
@@ -32,10 +38,8 @@ def _attribute(kind: int, value: bytes) -> bytes:
     return struct.pack("=HH", length, kind) + value + bytes(-length % 4)
 
 
-def _change(name: str, kind: int, how: int = 0, flags: int = 0, changed: int = 0, attributes: bytes = b"") -> None:
-    """One request of rtnetlink(7) about the interface, and the kernel's answer to it."""
-    named = _attribute(IFLA_IFNAME, name.encode() + b"\0")
-    body = LINK.pack(socket.AF_UNSPEC, 0, 0, flags, changed) + named + attributes
+def _ask(kind: int, how: int, body: bytes, name: str) -> None:
+    """One request of rtnetlink(7), and the kernel's answer to it."""
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, NETLINK_ROUTE) as kernel:
         kernel.send(HEADER.pack(HEADER.size + len(body), kind, REQUEST_AND_ACK | how, 1, 0) + body)
         (answer,) = struct.unpack_from("=i", kernel.recv(4096), HEADER.size)
@@ -43,10 +47,13 @@ def _change(name: str, kind: int, how: int = 0, flags: int = 0, changed: int = 0
         raise OSError(-answer, os.strerror(-answer), name)
 
 
-def _run(*words: str) -> None:
-    result = subprocess.run(words, capture_output=True, text=True, check=False)
-    if result.returncode:
-        raise OSError(f"{' '.join(words)}: {result.stderr.strip()}")
+def _change(name: str, kind: int, how: int = 0, flags: int = 0, changed: int = 0, attributes: bytes = b"") -> None:
+    named = _attribute(IFLA_IFNAME, name.encode() + b"\0")
+    _ask(kind, how, LINK.pack(socket.AF_UNSPEC, 0, 0, flags, changed) + named + attributes, name)
+
+
+def _queue(name: str, kind: int, how: int = 0, attributes: bytes = b"") -> None:
+    _ask(kind, how, QDISC.pack(socket.AF_UNSPEC, socket.if_nametoindex(name), 0, TC_H_ROOT, 0) + attributes, name)
 
 
 def can_make_interfaces() -> bool:
@@ -64,7 +71,7 @@ class Interface:
     """A vcan interface, by name (at most 15 characters). Each method returns when the kernel has done it.
 
     Raises:
-        OSError: the kernel refused; its errno, or the words of `tc`.
+        OSError: the kernel refused; its errno.
     """
 
     def __init__(self, name: str) -> None:
@@ -101,8 +108,10 @@ class Interface:
 
     def fill(self) -> None:
         """From now on the buffer keeps HELD_FRAMES frames and refuses the next, like a bus that nobody acknowledges."""
-        _run("tc", "qdisc", "replace", "dev", self.name, "root", "netem", "delay", HOLD, "limit", str(HELD_FRAMES))
+        netem = NETEM.pack(HOLD_TICKS, HELD_FRAMES, 0, 0, 0, 0)
+        attributes = _attribute(TCA_KIND, b"netem\0") + _attribute(TCA_OPTIONS, netem)
+        _queue(self.name, RTM_NEWQDISC, REPLACE, attributes)
 
     def empty(self) -> None:
         """Ends `fill`; the frames held are lost."""
-        _run("tc", "qdisc", "delete", "dev", self.name, "root")
+        _queue(self.name, RTM_DELQDISC)

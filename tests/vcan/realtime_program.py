@@ -1,25 +1,30 @@
-"""Run inside the guest: hovers in real time, plant and firmware as two processes, in the company that the plan asks for.
+"""Run inside the guest: hovers in real time, plant and firmware as two processes, in the company that the plan asks
+for.
 
-Argument: JSON, a list of plans (fields of Plan). Leaves `flights.json` in $VG_OUT: how late ticks were, how exactly the
-robot kept its place, and with link events how soon ticks were answered again.
+Argument: JSON, a list of plans (fields of Plan). Leaves in $VG_OUT `flights.json`, how late ticks were and how soon the
+flight went on after link events, and the logs of flight N in folder N.
 """
 
 import dataclasses
 import json
 import multiprocessing
 import os
+import shutil
+import signal
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
 from firmware_py.app.firmware import BusFrame
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
-from hil.flight import judge_logs
-from hil.realtime import RealTimeFlight, fly_in_real_time
+from hil.realtime import fly_in_real_time
 from hil.scenario import Scenario, load_scenario
 from tests.vcan.can_utils import cangen_flood
 from tests.vcan.link_events import break_link
@@ -27,7 +32,9 @@ from tests.vcan.links import Interface
 
 BUS = "vcan0"
 FLOOD_ID = 0x7FE
-"""HEARTBEAT of number 30: stops nobody and commands nothing."""
+"""HEARTBEAT of number 30, with a wrong length: stops nobody and commands nothing."""
+MCU_ARMED = 2
+"""State in MCU_STATUS."""
 
 
 @dataclass(frozen=True)
@@ -50,18 +57,26 @@ def hover(plan: Plan) -> Scenario:
 
 @dataclass
 class TickLog:
-    """When ticks were answered, on the machine's clock."""
+    """What became of each tick; `on_first` and `on_armed` are called once."""
 
     on_first: Callable[[], None]
-    origin_ns: int = 0
-    times_ns: list[int] = field(default_factory=list)
-    answered: list[bool] = field(default_factory=list)
+    on_armed: Callable[[], None]
+    ended_ns: list[int] = field(default_factory=list)
+    """On the machine's clock."""
+    flying: list[bool] = field(default_factory=list)
+    """Every module has answered, and armed modules obey."""
+    readers: int = 0
+    """Threads that read a bus, at the last tick."""
 
     def observe(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        if not self.times_ns:
+        if not self.ended_ns:
             self.on_first()
-        self.times_ns.append(outputs.time_ns)
-        self.answered.append(all(module.answered for module in inputs.modules))
+        flying = all(module.answered and module.mcu_state == MCU_ARMED for module in inputs.modules)
+        if flying and not any(self.flying):
+            self.on_armed()
+        self.ended_ns.append(time.monotonic_ns())
+        self.flying.append(flying)
+        self.readers = sum(thread.name.startswith("reader") for thread in threading.enumerate())
 
 
 def spin(idle: bool) -> None:
@@ -82,52 +97,61 @@ def process(target: Callable[..., None], *arguments: Any) -> Iterator[Any]:
         child.join()
 
 
+def flood(begin: Event) -> None:
+    begin.wait()
+    with cangen_flood(BUS, FLOOD_ID):
+        signal.pause()
+
+
 def fly(plan: Plan, folder: Path) -> dict[str, Any]:
-    """One flight and its figures."""
-    scenario = hover(plan)
+    """One flight and its figures; its logs are in `folder`."""
     folder.mkdir(parents=True)
+    context = multiprocessing.get_context("fork")
+    begin, history = context.Event(), context.SimpleQueue()
     with ExitStack() as stack:
         # An idle machine's counted clock jumps while files are waited for: it is kept busy until the first tick.
         spinner = stack.enter_context(process(spin, True))
         for _ in range(plan.busy_loops):
             stack.enter_context(process(spin, False))
         if plan.flood:
-            stack.enter_context(cangen_flood(BUS, FLOOD_ID))
-        events = multiprocessing.get_context("fork").SimpleQueue()
-        begin = multiprocessing.get_context("fork").Event()
-        breaker = None
+            stack.enter_context(process(flood, begin))
         if plan.link_events:
-            breaker = stack.enter_context(process(break_link, Interface(BUS), plan.seed, plan.link_events, begin, events))
-
-        def on_first() -> None:
-            spinner.kill()
-
-        log = TickLog(on_first)
-        flown = fly_in_real_time(
-            scenario, plan.seed, Parameters(), folder, f"socketcan:{BUS}", start_method="fork", observers=[log.observe]
-        )
-    return figures(plan, scenario, flown, folder, log)
-
-
-def figures(plan: Plan, scenario: Scenario, flown: RealTimeFlight, folder: Path, log: TickLog) -> dict[str, Any]:
-    result = judge_logs(scenario, plan.seed, folder, flown.wall_s, flown.deadline_misses)
+            stack.enter_context(process(break_link, Interface(BUS), plan.seed, plan.link_events, begin, history))
+        log = TickLog(spinner.kill, begin.set)
+        world = hover(plan), plan.seed, Parameters(), folder, f"socketcan:{BUS}"
+        flown = fly_in_real_time(*world, start_method="fork", observers=[log.observe])
+        events = history.get() if plan.link_events else []
     return {
         "plan": dataclasses.asdict(plan),
-        "lateness_ns": flown.lateness_ns,
-        "deadline_misses": flown.deadline_misses,
-        "unanswered": flown.unanswered,
-        "refused": flown.refused,
-        "ticks": len(log.times_ns),
-        "position_rmse_m": result.metrics["position_rmse_m"],
-        "position_max_m": result.metrics["position_max_m"],
+        **flown._asdict(),
+        "ticks": len(log.flying),
+        "flying_at_the_end": log.flying[-1],
+        "readers": log.readers,
+        "events": len(events),
+        "resumed_s": resumed_s(events, log),
     }
+
+
+def resumed_s(events: Sequence[tuple[int, str]], log: TickLog) -> list[float]:
+    """For each time that the link became usable, s until the flight went on, or until the link broke again."""
+    waits = []
+    for index, (time_ns, state) in enumerate(events):
+        if state == "up":
+            broken_ns = events[index + 1][0] if index + 1 < len(events) else log.ended_ns[-1]
+            ticks = zip(log.ended_ns, log.flying, strict=True)
+            on = min((end_ns for end_ns, flying in ticks if flying and end_ns > time_ns), default=log.ended_ns[-1])
+            waits.append((min(on, broken_ns) - time_ns) * 1e-9)
+    return waits
 
 
 def main() -> None:
     plans = [Plan(**plan) for plan in json.loads(sys.argv[1])]
     out = Path(os.environ["VG_OUT"])
-    flights = [fly(plan, Path("/tmp/flights", str(number))) for number, plan in enumerate(plans)]
+    folders = [Path("/tmp/flights", str(number)) for number in range(len(plans))]
+    flights = [fly(plan, folder) for plan, folder in zip(plans, folders, strict=True)]
     (out / "flights.json").write_text(json.dumps(flights, indent=2))
+    for folder in folders:
+        shutil.copytree(folder, out / folder.name)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from firmware_py.prepare.capability.ellipsoid import Ellipsoid, largest_inscribed
-from firmware_py.prepare.capability.facets import MOST_SUBSETS, subsets
+from firmware_py.prepare.capability.facets import subsets
 from firmware_py.prepare.capability.layout import AXES, FRAMES, Layout
 from firmware_py.prepare.capability.morphology import Harmonics, Shape
 from firmware_py.prepare.capability.power import PowerSpace, power_space
@@ -21,6 +21,9 @@ from firmware_py.prepare.capability.wrench import Section, WrenchSpace, embed
 
 DIRECTIONS = 1000
 """Directions over the sphere, as in the paper's drag table."""
+
+FACET_SUBSETS = 250_000
+"""Up to so many subsets of columns (32 thrusters, 1 s) all facets are listed; beyond, programs find a section."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +128,7 @@ def characterise(
 
 def wrench_space(layout: Layout) -> WrenchSpace | ProgramSpace:
     """By facets, or by linear programs where there are too many thrusters for all facets."""
-    return WrenchSpace(layout) if subsets(layout) <= MOST_SUBSETS else ProgramSpace(layout)
+    return WrenchSpace(layout) if subsets(layout) <= FACET_SUBSETS else ProgramSpace(layout)
 
 
 def _known(power_w: np.ndarray) -> np.ndarray:

@@ -1,0 +1,125 @@
+"""What the person at the bench does in a docking scenario: arm everybody, then one step of the scenario after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from firmware_py.core.setpoint import Trajectory, rest_at
+from firmware_py.core.transitions import ARMED
+from firmware_py.core.types import Action, DockRequest, Outputs, Request
+from firmware_py.description.fleet import Fleet
+from firmware_py.description.vehicle import FACE_NAMES
+from firmware_py.prepare import paths
+from hil.scenario import Scenario, Step
+
+ARM_FROM_S = 1.0
+ARM_EVERY_S = 0.5
+SPEED_M_S = 0.05
+"""Mean speed at which a body goes to the start of a path."""
+RETRIES = 3
+"""A dock that the firmware gave up is asked for so often again."""
+
+
+class DockScript:
+    """The requests of one run with [[step]]s."""
+
+    def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
+        self._scenario = scenario
+        self._fleet = fleet
+        self._groups = [list(g) for g in scenario.groups]
+        self._steps = list(scenario.step)
+        self._running: list[_Running] = []
+        self._armed: set[int] = set()
+        self.begin_ns = round(scenario.task.settle_s * 1e9)
+        self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
+        self.ticks = self.end_ns // fleet.period_ns
+
+    def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
+        """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
+        if last is None:
+            return []
+        asked = self._arm(time_ns, last)
+        if time_ns < self.begin_ns:
+            return asked
+        self._running = [r for r in self._running if not self._is_over(r, time_ns, last)]
+        if not self._running and self._steps:
+            while True:
+                asked += self._begin(self._steps.pop(0), time_ns, last)
+                if not self._steps or not self._steps[0].also:
+                    break
+        return asked
+
+    def _arm(self, time_ns: int, last: Outputs) -> list[Request]:
+        """Arms every body once; then each holds where it is."""
+        asked: list[Request] = []
+        every = round(ARM_EVERY_S * self._fleet.rate_hz)
+        due = time_ns >= ARM_FROM_S * 1e9 and (time_ns // self._fleet.period_ns) % every == 0
+        for record in last.records:
+            if record.body not in self._armed:
+                if record.state in ARMED:
+                    self._armed.add(record.body)
+                    here = rest_at(record.estimate.p_wb, record.estimate.q_wb)
+                    asked.append(Request(Action.HOLD, record.body, here))
+                elif due:
+                    asked.append(Request(Action.ARM, record.body))
+        return asked
+
+    def _begin(self, step: Step, time_ns: int, last: Outputs) -> list[Request]:
+        module, target = self._scenario.index_of(step.module), self._scenario.index_of(step.target_module)
+        running = _Running(step, time_ns + round(step.duration_s * 1e9), module, target)
+        self._running.append(running)
+        if step.do == "wait":
+            return []
+        body = self._leader(module)
+        if step.do in ("dock", "undock"):
+            wanted = DockRequest(
+                module, FACE_NAMES.index(step.face), target, FACE_NAMES.index(step.target_face),
+                step.quarter_turns, step.both_approach,
+            )  # fmt: skip
+            return [Request(Action.DOCK if step.do == "dock" else Action.UNDOCK, body, wanted)]
+        record = next(r for r in last.records if r.body == body)
+        return [Request(Action.TRACK, body, _path(step, self._scenario, record.setpoint.p_wb, record.setpoint.q_wb))]
+
+    def _is_over(self, running: _Running, time_ns: int, last: Outputs) -> bool:
+        step, bodies = running.step, {r.body for r in last.records}
+        if step.do == "dock":
+            if self._leader(running.module) in bodies:
+                return False
+            mine, other = self._group(running.module), self._group(running.target)
+            self._groups.remove(mine)
+            other += mine
+            return True
+        if step.do == "undock":
+            if len(bodies) <= len(self._groups):
+                return False
+            whole = self._group(running.module)
+            fresh = sorted(bodies - {g[0] for g in self._groups})
+            piece = [m for m in whole if m == running.module] if fresh == [running.module] else fresh
+            whole[:] = [m for m in whole if m not in piece]
+            self._groups.append(piece)
+            self._armed |= set(fresh)
+            return True
+        return time_ns >= running.end_ns
+
+    def _group(self, module: int) -> list[int]:
+        return next(g for g in self._groups if module in g)
+
+    def _leader(self, module: int) -> int:
+        return self._group(module)[0]
+
+
+class _Running:
+    """A step under way."""
+
+    def __init__(self, step: Step, end_ns: int, module: int, target: int) -> None:
+        self.step, self.end_ns, self.module, self.target = step, end_ns, module, target
+
+
+def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> Trajectory:
+    here = rest_at(np.array(p_wb), np.array(q_wb))
+    if step.do == "move":
+        return paths.line(here, rest_at(np.array(step.position_m), np.array(q_wb)), step.duration_s)
+    task = scenario.task
+    return paths.moebius(task.centre_m, step.duration_s, task.radius_m, task.half_width_m, task.turns)

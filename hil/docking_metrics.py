@@ -1,0 +1,98 @@
+"""What came of the docks of a run, from its logs alone: who ended up together, in how many tries, and how it failed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.description.signals import Columns, read_signals
+from hil.scenario import Scenario
+from hil.signals import SIGNAL_LOG, TRUTH_LOG
+
+OUTCOMES = ("docked", "jammed", "unstable control", "refused", "gave up")
+"""What the metric `outcome` counts."""
+DOCKED, JAMMED, UNSTABLE, REFUSED, GAVE_UP = range(len(OUTCOMES))
+UNSTABLE_RAD = math.radians(30.0)
+"""A module that ever tilts or turns so far from where it was bound is out of control."""
+
+
+def expected_pairs(scenario: Scenario) -> dict[tuple[int, int], bool]:
+    """Pairs of modules (fleet indices) that the steps leave docked (True) or apart."""
+    pairs: dict[tuple[int, int], bool] = {}
+    for step in scenario.step:
+        if step.do in ("dock", "undock"):
+            pair = sorted((scenario.index_of(step.module), scenario.index_of(step.target_module)))
+            pairs[pair[0], pair[1]] = step.do == "dock"
+    return pairs
+
+
+def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
+    """`docked`: everything is together or apart as the steps want; `tries`: meetings of a probe and a funnel; `jams`;
+    `outcome`: index into OUTCOMES; `false_declarations`: ticks in which the firmware believed in a dock that was none.
+
+    Raises:
+        OSError: a log is missing. ValueError: it holds no docks.
+    """
+    truths, signals = read_signals(folder / TRUTH_LOG), read_signals(folder / SIGNAL_LOG)
+    docks = truths.get("/plant/docks")
+    if docks is None:
+        raise ValueError(f"{folder}: no truth of docks in the logs")
+    together = _together(truths, int(docks["tick"][-1]))
+    docked = all(together[pair] == wanted for pair, wanted in expected_pairs(scenario).items())
+    outcome = DOCKED if docked else _failure(docks, signals)
+    return {
+        "docked": float(docked),
+        "tries": float(docks["contacts"][-1]),
+        "jams": float(docks["jams"][-1]),
+        "outcome": float(outcome),
+        "false_declarations": float(_false_declarations(truths, signals)),
+    }
+
+
+def _together(truths: Mapping[str, Columns], tick: int) -> Mapping[tuple[int, int], bool]:
+    """Whether two modules share a body in that tick."""
+    rows = [c["member"][c["tick"] == tick] for name, c in truths.items() if name.startswith("/plant/body")]
+    count = rows[0].shape[1]
+    found = {(i, j): False for i in range(count) for j in range(i + 1, count)}
+    for row in rows:
+        for member in row:
+            inside = np.flatnonzero(member)
+            found |= {(int(i), int(j)): True for i in inside for j in inside if i < j}
+    return found
+
+
+def _bodies(channels: Mapping[str, Columns], prefix: str, ticks: np.ndarray) -> np.ndarray:
+    """(k,) number of bodies in each of the ticks."""
+    count = np.zeros(len(ticks), dtype=np.int64)
+    for name, columns in channels.items():
+        if name.startswith(prefix):
+            count += np.isin(ticks, columns["tick"])
+    return count
+
+
+def _false_declarations(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> int:
+    ticks = truths["/plant/docks"]["tick"]
+    believed, real = _bodies(signals, "/firmware/body", ticks), _bodies(truths, "/plant/body", ticks)
+    return int(((believed > 0) & (believed < real)).sum())
+
+
+def _failure(docks: Columns, signals: Mapping[str, Columns]) -> int:
+    said: Sequence[str] = [str(text) for text in signals.get("/events", {}).get("text", np.zeros(0, str))]
+    if _off_attitude(signals) > UNSTABLE_RAD:
+        return UNSTABLE
+    if docks["jams"][-1] > 0:
+        return JAMMED
+    return REFUSED if any("refused" in text for text in said) else GAVE_UP
+
+
+def _off_attitude(signals: Mapping[str, Columns]) -> float:
+    """Largest angle between set-point and estimate of any body."""
+    worst = 0.0
+    for name, columns in signals.items():
+        if name.startswith("/firmware/body"):
+            cosine = np.abs(np.sum(columns["q_wb"] * columns["setpoint_q_wb"], axis=1))
+            worst = max(worst, float(2.0 * np.arccos(np.clip(cosine, 0.0, 1.0)).max()))
+    return worst

@@ -1,0 +1,209 @@
+"""What becomes of faces over time: coils rise and fall, probes meet funnels, jam or lock, joints give way. Once per tick.
+
+The forces are in contact.py; the world carries out what is decided here.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.description.vehicle import FACE_NORMALS, Vehicle
+from hil.plant.bodies import Modules
+from hil.plant.contact import Faces, mating, near
+from hil.plant.dock_spec import DockSpec, JamRule
+from hil.plant.draw import stream
+
+KINDS = {"P": 1.0, "D": -1.0, "-": 0.0}
+RELAY = (0.0, 1.0, -1.0, 0.0)
+"""Current that each relay state asks for: off, forward, reverse, fault."""
+FORWARD = 1
+LEAST_HOLD = 0.05
+"""Share of the full pull below which magnets no longer hold a joint."""
+DISK_M = 0.07
+"""Radius of a docking disk: a moment on a joint is borne by a pull at its rim (synthetic)."""
+
+
+class Joint(NamedTuple):
+    """Two faces that are one."""
+
+    module: int
+    face: int
+    other: int
+    other_face: int
+
+
+class Contact(NamedTuple):
+    """A probe met a funnel."""
+
+    time_ns: int
+    module: int
+    other: int
+    lateral_m: float
+    speed_m_s: float
+    tilt_deg: float
+    jammed: bool
+
+
+class Verdict(NamedTuple):
+    """What the world has to do now."""
+
+    join: list[Joint]
+    part: list[Joint]
+
+
+class Docks:
+    """All docking faces of the world."""
+
+    def __init__(self, vehicles: Sequence[Vehicle], spec: DockSpec, jam: JamRule, seed: int) -> None:
+        m = len(vehicles)
+        self.spec, self.jam_rule = spec, jam
+        self.faces = Faces(
+            np.array([[KINDS[k] for k in v.faces] for v in vehicles]),
+            np.zeros((m, 6)), np.zeros((m, m)), np.zeros((m, m)),
+            spec.pull_n, spec.magnet_gap_m, spec.guide_n_m, spec.guide_ns_m, spec.turn_nm, spec.turn_nms,
+            spec.contact_n_m, spec.contact_ns_m,
+        )  # fmt: skip
+        self.relays = np.zeros((m, 6), dtype=np.int64)
+        self.joints: list[Joint] = []
+        self.contacts: list[Contact] = []
+        self.gap_m = self.lateral_m = math.nan
+        """Between the faces of the pair that is nearest to docking."""
+        self._surge = np.zeros((m, 6))
+        self._engaged = np.zeros((m, 6))
+        self._busy = False
+        self._jam = stream(seed, "jam")
+        self._magnet_w = np.array([v.supply.magnet_w for v in vehicles])
+
+    def set_relays(self, module: int, relays: Sequence[int]) -> None:
+        """What a DOCK_CMD asks of one module's six coils."""
+        wanted = np.array(relays, dtype=np.int64)
+        changed = wanted != self.relays[module]
+        if changed.any():
+            self._surge[module, changed] = 1.0
+            self.relays[module] = wanted
+            self._busy = True
+
+    def energise(self, joints: Sequence[Joint]) -> None:
+        """Modules that start docked start with their magnets on, long since."""
+        self.joints = list(joints)
+        for joint in joints:
+            for m, f in ((joint.module, joint.face), (joint.other, joint.other_face)):
+                self.relays[m, f] = FORWARD
+                self.faces.coil[m, f] = self._engaged[m, f] = 1.0
+        self._busy = bool(joints)
+
+    def magnet_power_w(self) -> np.ndarray:
+        """(m,) what the coils of each module take from its supply."""
+        return np.asarray(self._magnet_w * (self.relays % 3 != 0).sum(axis=1))
+
+    def current_ma(self) -> np.ndarray:
+        """(m, 6) current of every coil now, without the noise of its measurement."""
+        s = self.spec
+        size = s.idle_ma + s.engaged_ma * self._engaged + s.surge_ma * self._surge
+        return np.asarray(self.faces.coil * size)
+
+    def step(
+        self,
+        time_ns: int,
+        elapsed_s: float,
+        modules: Modules,
+        state: np.ndarray,
+        load_n: Callable[[Joint], float],
+    ) -> Verdict:
+        """What happened during the last tick; `load_n` gives the pull on a joint."""
+        verdict = Verdict([], [])
+        if self._busy:
+            self._coils(elapsed_s)
+        pairs = itertools.combinations(range(len(self.relays)), 2)
+        self._engaged[:] = 0.0
+        self.gap_m = self.lateral_m = math.nan
+        for i, j in pairs:
+            if near(modules, state, i, j):
+                self._pair(time_ns, i, j, modules, state, verdict)
+            elif self.faces.inside[i, j] and modules.body[i] != modules.body[j]:
+                self._let_go(i, j)
+        for joint in self.joints:
+            self._engaged[joint.module, joint.face] = self._engaged[joint.other, joint.other_face] = 1.0
+            coil = self.faces.coil
+            hold = 0.5 * (coil[joint.module, joint.face] + coil[joint.other, joint.other_face])
+            if hold < LEAST_HOLD or load_n(joint) > hold * self.spec.pull_n:
+                verdict.part.append(joint)
+        return verdict
+
+    def joined(self, joint: Joint) -> None:
+        """The world has made one body of two."""
+        self.joints.append(joint)
+
+    def parted(self, joint: Joint) -> None:
+        """The world has opened a joint: the probe is still in its funnel."""
+        self.joints.remove(joint)
+        i, j = sorted((joint.module, joint.other))
+        self.faces.inside[i, j], self.faces.stop[i, j] = 1.0, 0.0
+
+    def _coils(self, elapsed_s: float) -> None:
+        wanted = np.array(RELAY)[self.relays]
+        self.faces.coil[:] += (wanted - self.faces.coil) * -math.expm1(-elapsed_s / self.spec.coil_lag_s)
+        self._surge *= math.exp(-elapsed_s / self.spec.surge_s)
+        self._busy = bool(self.relays.any() or np.abs(self.faces.coil).max() > 1e-9)
+
+    def _pair(self, time_ns: int, i: int, j: int, modules: Modules, state: np.ndarray, verdict: Verdict) -> None:
+        """Two modules of different bodies that are close."""
+        face_i, face_j, gap, lateral, tilt, roll, closing, fits = mating(modules, self.faces, state, i, j)
+        if not fits:
+            return
+        s, f_i, f_j = self.spec, int(face_i), int(face_j)
+        if not self.gap_m + self.lateral_m <= gap + lateral:
+            self.gap_m, self.lateral_m = gap, lateral
+        near_by = math.exp(-max(0.0, gap) / s.engage_m - (lateral / s.engage_side_m) ** 2)
+        self._engaged[i, f_i], self._engaged[j, f_j] = max(self._engaged[i, f_i], near_by), max(self._engaged[j, f_j], near_by)
+        if not self.faces.inside[i, j]:
+            if gap <= s.probe_m and lateral <= s.mouth_m and math.degrees(tilt) <= s.funnel_deg:
+                self._meet(Contact(time_ns, i, j, lateral, closing, math.degrees(tilt), False))
+        elif gap > s.rearm_m or lateral > s.mouth_m:
+            self._let_go(i, j)
+        elif self._locks(gap, lateral, tilt, roll, f_i, f_j, i, j):
+            verdict.join.append(Joint(i, f_i, j, f_j))
+
+    def _meet(self, contact: Contact) -> None:
+        i, j, rule = contact.module, contact.other, self.jam_rule
+        chance, depth = self._jam.random(2)
+        jammed = bool(chance < rule.probability(contact.lateral_m, contact.speed_m_s, contact.tilt_deg))
+        self.faces.inside[i, j] = 1.0
+        self.faces.stop[i, j] = self.spec.probe_m * (rule.shallowest + (1.0 - rule.shallowest) * depth) if jammed else 0.0
+        self.contacts.append(contact._replace(jammed=jammed))
+
+    def _let_go(self, i: int, j: int) -> None:
+        self.faces.inside[i, j] = self.faces.stop[i, j] = 0.0
+
+    def _locks(
+        self, gap: float, lateral: float, tilt: float, roll: float, f_i: int, f_j: int, i: int, j: int
+    ) -> bool:
+        s = self.spec
+        pull = 0.5 * (self.faces.coil[i, f_i] + self.faces.coil[j, f_j])
+        return (
+            self.faces.stop[i, j] == 0.0
+            and pull > 2.0 * LEAST_HOLD
+            and gap <= s.lock_m
+            and lateral <= s.lock_m
+            and max(abs(tilt), abs(roll)) <= math.radians(s.lock_deg)
+        )
+
+
+def joints_between(modules: Modules, kinds: np.ndarray) -> list[Joint]:
+    """Joints of modules that sit side by side in one body: probe against drogue."""
+    found = []
+    for i, j in itertools.combinations(range(len(modules.body)), 2):
+        if modules.body[i] != modules.body[j]:
+            continue
+        way = modules.position[j] - modules.position[i]
+        f_i = int(np.argmax(FACE_NORMALS @ (modules.turn[i].T @ way)))
+        f_j = int(np.argmax(FACE_NORMALS @ (modules.turn[j].T @ -way)))
+        reach = 0.5 * (modules.size[i, f_i // 2] + modules.size[j, f_j // 2])
+        if abs(np.linalg.norm(way) - reach) < 0.01 * reach and kinds[i, f_i] * kinds[j, f_j] < 0.0:
+            found.append(Joint(i, f_i, j, f_j))
+    return found

@@ -1,0 +1,96 @@
+"""Bodies that merge and part: where their modules come to sit, and the motion that keeps the momentum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from firmware_py.core import rotations
+from firmware_py.description.vehicle import FACE_NORMALS
+from hil.plant.bodies import Bodies, Modules
+from hil.plant.docking import Joint
+from hil.plant.draw import ModuleDraw, carried, rigid_matrix
+from hil.plant.lattice import QUATERNIONS, Place, nearest
+
+
+def seats_after_join(
+    places: Sequence[Place], modules: Modules, joint: Joint, kept: int, moved: Sequence[int], q_kl: np.ndarray
+) -> list[Place]:
+    """Places of all modules once the body of `moved` has come to the body that has module `kept`, faces on each other.
+
+    Args:
+        q_kl: (4,) attitude of the moved body's frame in the kept one's, to be made a rotation of the lattice.
+    """
+    near_face, far, far_face = (
+        (joint.face, joint.other, joint.other_face) if kept == joint.module else (joint.other_face, joint.module, joint.face)
+    )
+    lattice = QUATERNIONS[nearest(q_kl)].copy()
+    turn = rotations.to_matrix(lattice)
+    normal = modules.turn[kept] @ FACE_NORMALS[near_face]
+    reach = 0.5 * (modules.size[kept, near_face // 2] + modules.size[far, far_face // 2])
+    origin = places[kept].position + reach * normal - turn @ places[far].position
+    seats = list(places)
+    for m in moved:
+        quaternion = QUATERNIONS[nearest(rotations.multiply(lattice, places[m].quaternion))].copy()
+        seats[m] = Place(origin + turn @ places[m].position, quaternion)
+    return seats
+
+
+def pieces(members: Sequence[int], joints: Sequence[Joint]) -> list[tuple[int, ...]]:
+    """The modules of a body, by what still hangs together; each piece in ascending order."""
+    linked: Mapping[int, set[int]] = {m: set() for m in members}
+    for joint in joints:
+        if joint.module in linked and joint.other in linked:
+            linked[joint.module].add(joint.other)
+            linked[joint.other].add(joint.module)
+    left, found = set(members), []
+    while left:
+        front = [min(left)]
+        piece = set(front)
+        while front:
+            fresh = linked[front.pop()] - piece
+            piece |= fresh
+            front += fresh
+        left -= piece
+        found.append(tuple(sorted(piece)))
+    return found
+
+
+def motion_of(bodies: Bodies, b: int, momentum: np.ndarray, flow_w: np.ndarray) -> None:
+    """Gives body b, whose pose is set, the velocity at which it has a momentum (6,) about the world's origin, world."""
+    x = bodies.state[b]
+    turn = rotations.to_matrix(x[3:7].copy())
+    p = turn.T @ momentum[:3]
+    spin = turn.T @ (momentum[3:] - np.cross(x[:3], momentum[:3]))
+    carried_along = bodies.added[b] @ np.concatenate([turn.T @ flow_w, np.zeros(3)])
+    x[7:13] = np.linalg.solve(bodies.rigid[b] + bodies.added[b], np.concatenate([p, spin]) + carried_along)
+
+
+def centre_of(bodies: Bodies, b: int) -> np.ndarray:
+    """(3,) centre of mass of body b, water included, in its frame."""
+    rigid = bodies.rigid[b]
+    return np.array([rigid[5, 1], rigid[3, 2], rigid[4, 0]]) / rigid[0, 0]
+
+
+def force_needed(
+    draws: Sequence[ModuleDraw], modules: Modules, members: Sequence[int], x: np.ndarray, rate: np.ndarray, gravity: float
+) -> np.ndarray:
+    """(6,) wrench about O, body frame, that these modules of a body need besides their weight to move as they do.
+
+    x, rate: (13,) state of the body and its derivative. Still water; drag is left out: it is shared by all and small at
+    the speeds of docking.
+    """
+    mass = np.zeros((6, 6))
+    down = rotations.to_matrix(x[3:7].copy())[2]
+    weight = np.zeros(6)
+    for m in members:
+        d, r, turn = draws[m], modules.position[m], modules.turn[m]
+        mass += carried(rigid_matrix(d.dry_kg + d.entrained_kg, d.com, d.inertia) + np.diag(d.added), r, turn)
+        w = d.dry_kg * gravity
+        weight[:3] += (w - d.buoyancy_n) * down
+        weight[3:] += np.cross(w * (r + turn @ d.weight_at) - d.buoyancy_n * (r + turn @ d.buoyancy_at), down)
+    p = mass @ x[7:13]
+    v, omega = x[7:10], x[10:13]
+    gyroscopic = np.concatenate([np.cross(omega, p[:3]), np.cross(omega, p[3:]) + np.cross(v, p[:3])])
+    return np.asarray(mass @ rate[7:13] + gyroscopic - weight)

@@ -1,0 +1,90 @@
+"""The board under the C node: thrusters and sensors of one simulated module, without any of the bus's rules."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+
+from firmware_py.bus.codec import Codec
+from hil.nodes import SLOW, Mcu, Nodes
+from hil.scenario import Scenario
+
+NS_PER_S = 1_000_000_000
+THRUSTERS, FACES = 8, 6
+OUTPUTS_ALONE = -1.0
+"""`due` of a request that wants no answer."""
+
+
+class Outputs(ctypes.Structure):
+    """struct node_outputs."""
+
+    _fields_ = (
+        ("tick", ctypes.c_double),
+        ("thruster", ctypes.c_double * THRUSTERS),
+        ("relay", ctypes.c_double * FACES),
+    )
+
+
+class Readings(ctypes.Structure):
+    """struct node_readings."""
+
+    _fields_ = (
+        ("gyro", ctypes.c_double * 4),
+        ("accel", ctypes.c_double * 4),
+        ("depth", ctypes.c_double * 3),
+        ("dock", ctypes.c_double * 6 * 2),
+        ("esc", ctypes.c_double * 6 * 4),
+        ("power", ctypes.c_double * 3),
+        ("environment", ctypes.c_double * 3),
+    )
+
+
+class Request(ctypes.Structure):
+    """struct request of main.c."""
+
+    _fields_ = (("due", ctypes.c_double), ("outputs", Outputs))
+
+
+class Answer(ctypes.Structure):
+    """struct answer of main.c."""
+
+    _fields_ = (("tick", ctypes.c_double), ("readings", Readings))
+
+
+class Board(Mcu):
+    """The plant's MCU, of which only thrusters, relays and sensors are used."""
+
+    def drive(self, outputs: Outputs) -> None:
+        """The node's outputs take effect."""
+        self.relays = [int(relay) for relay in outputs.relay]
+        self._apply(list(outputs.thruster))
+
+    def sample(self, due: int, readings: Readings) -> None:
+        """Fills `readings` with the fast sensors and, of the slow ones, those whose bit of `due` is set."""
+        truth = self._world.truth(self.module)
+        readings.gyro[:] = [*self._sensors.gyro(truth).tolist(), 0.0]
+        readings.accel[:] = [*self._sensors.accel(truth).tolist(), 0.0]
+        for position, name in enumerate(SLOW):
+            if due >> position & 1:
+                place(readings, name, self._reading(name, truth))
+
+
+def place(readings: Readings, name: str, values: Sequence[float]) -> None:
+    """The values of slow message `name`, in the order of its fields, go where the C node looks for them."""
+    if name.startswith("DOCK_CURRENT"):
+        readings.dock[0 if name.endswith("ABC") else 1][:] = [float(v) for v in values]
+    elif name.startswith("ESC_FEEDBACK"):
+        readings.esc[int(name[-1]) - 1][:] = [float(v) for v in values]
+    else:
+        getattr(readings, name.lower())[:] = [float(v) for v in values]
+
+
+def take_boards(nodes: Nodes, scenario: Scenario, rate_hz: int) -> dict[int, Board]:
+    """The boards of the modules of `nodes`, by number; the plant's own MCUs go."""
+    codec, tick_ns = Codec.load(), NS_PER_S // rate_hz
+    boards = {
+        number: Board(codec, number, mcu.module, nodes.world, scenario.sensors, tick_ns)
+        for number, mcu in nodes.mcus.items()
+    }
+    nodes.mcus = {}
+    return boards

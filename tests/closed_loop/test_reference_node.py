@@ -1,0 +1,144 @@
+"""The C reference node flies: in place of the plant's own MCU, frame for frame the same as it."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from ctypes import CDLL
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.bus.codec import Codec, Frame
+from firmware_py.core.types import Inputs, Outputs
+from firmware_py.description.parameters import Parameters
+from hil.bench import Bench, open_bench
+from hil.nodes import make_nodes
+from hil.reference_node import CNodes, load_library
+from hil.scenario import make_world
+from tests.closed_loop.flights import shortened
+
+FOLDER = Path(__file__).resolve().parents[2] / "hil" / "reference_node"
+RATE_HZ, PERIOD_NS = 100, 10_000_000
+NUMBER = 1
+CODEC = Codec.load()
+pytestmark = pytest.mark.skipif(
+    shutil.which("gcc") is None or shutil.which("make") is None, reason="gcc is missing (make setup-system)"
+)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> CDLL:
+    build = tmp_path_factory.mktemp("node")
+    command = ["make", "-C", str(FOLDER), f"BUILD={build}", f"PYTHON={sys.executable}"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return load_library(build / "libmodcube_node.so")
+
+
+def fly(bench: Bench) -> tuple[list[Any], float]:
+    """The frames of every tick, and how fast the module was in the end, m/s."""
+    log: list[Any] = []
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        log.append((tuple(received), tuple(sent)))
+
+    bench.fly([observe])
+    return log, float(abs(bench.nodes.world.truth(0).v_w).max())
+
+
+def test_hover_with_the_c_node_is_the_hover_with_the_plants_own_frame_for_frame(library: CDLL) -> None:
+    flights = []
+    for is_c in (False, True):
+        with ExitStack() as stack:
+            bench = open_bench(stack, shortened("hover", 6.0), 0, Parameters())
+            if is_c:
+                bench.nodes = CNodes(bench.nodes, bench.scenario, library, RATE_HZ)  # type: ignore[assignment]
+            flights.append(fly(bench))
+    (python, _), (c, speed) = flights
+    assert c == python
+    assert speed < 0.02
+    thrust = {frame.data[:6] for _, sent in c for _, frame in sent if frame.id == 0x081}
+    assert len(thrust) > 100  # it flew
+
+
+@pytest.fixture
+def nodes(library: CDLL) -> CNodes:
+    scenario = shortened("hover", 1.0)
+    world = make_world(scenario, 0, PERIOD_NS)
+    return CNodes(make_nodes(world, CODEC, {NUMBER: 0}, scenario), scenario, library, RATE_HZ)
+
+
+def command(share: float, counter: int, mode: int = 1) -> list[Frame]:
+    values = (share, share, share, share, mode)
+    return [CODEC.message(f"THRUSTER_CMD_{half}").encode(NUMBER, values, counter) for half in "AB"]
+
+
+def sync(tick: int) -> Frame:
+    return CODEC.message("SYNC").encode(0, (tick,))
+
+
+def status(frames: Sequence[Frame]) -> tuple[int, int, int]:
+    """Tick, errors and state of the last frame of a tick."""
+    tick, _, errors, state = CODEC.message("MCU_STATUS").decode(frames[-1].data)
+    return tick, errors, state
+
+
+def applied(nodes: CNodes) -> list[float]:
+    return nodes.c_nodes[NUMBER].board._applied
+
+
+def test_node_applies_a_command_with_the_next_sync_and_says_that_it_is_armed(nodes: CNodes) -> None:
+    nodes.step([sync(1), *command(0.5, 1)])
+    assert not any(applied(nodes))
+    answers = nodes.step([sync(2)])
+    assert applied(nodes) == [0.5] * 8
+    assert status(answers) == (2, 0, 2)
+
+
+def test_node_commands_zero_after_100_ms_of_silence_without_any_sync(nodes: CNodes) -> None:
+    nodes.step([*command(0.5, 1), sync(1)])
+    for _ in range(10):
+        nodes.step([])
+        assert any(applied(nodes))
+    nodes.step([])
+    assert not any(applied(nodes))
+    assert status(nodes.step([sync(13)])) == (13, 8, 3)
+
+
+def test_half_of_the_thrusters_times_out_by_itself(nodes: CNodes) -> None:
+    nodes.step([*command(0.5, 1), sync(1)])
+    for counter in range(2, 14):
+        nodes.step([command(0.5, counter)[1]])
+    assert applied(nodes) == [0.0] * 4 + [0.5] * 4
+
+
+def test_estop_ends_thrust_at_once_and_only_a_disarmed_command_after_200_ms_of_none_releases_it(nodes: CNodes) -> None:
+    nodes.step([*command(0.5, 1), sync(1)])
+    nodes.step([Frame(0x01E, b"whatever")])
+    assert not any(applied(nodes))
+    assert status(nodes.step([*command(0.0, 2, mode=0), sync(2)]))[2] == 4
+    for counter in range(3, 25):
+        nodes.step(command(0.5, counter & 15))
+    assert status(nodes.step([sync(30)]))[2] == 4
+    nodes.step(command(0.0, 14, mode=0))
+    assert status(nodes.step([sync(31)]))[2] == 1
+
+
+def test_node_reports_bad_frames_once_in_its_next_status(nodes: CNodes) -> None:
+    good = command(0.5, 1)
+    torn = Frame(good[0].id, good[0].data[:-1] + bytes([good[0].data[-1] ^ 1]))
+    short = Frame(good[1].id, good[1].data[:5])
+    answers = nodes.step([*good, torn, short, good[0], sync(1)])
+    assert status(answers)[1] == 1 | 2 | 4
+    assert status(nodes.step([sync(2)]))[1] == 0
+
+
+def test_node_starts_again_wherever_the_tick_jumps_to(nodes: CNodes) -> None:
+    assert status(nodes.step([sync(70_000)]))[0] == 70_000 & 0xFFFF
+    assert status(nodes.step([sync(3)]))[0] == 3

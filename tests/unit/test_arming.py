@@ -1,0 +1,158 @@
+"""Arming checks: each alone, in its words, at its boundary; which of them force passes over; and what each mode needs."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from firmware_py.core.arming import CHECKS, Question, against_arming, missing
+from firmware_py.core.failsafes import Failsafes
+from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.types import Mode
+from firmware_py.description.parameters import Limiter, Parameters
+from tests.unit.healths import BLIND, GOOD
+
+P = Parameters()
+PLACED = (Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK)
+
+
+def reasons(health: Health = GOOD, mode: Mode = Mode.POSHOLD, forced: bool = False, **more: Any) -> list[str]:
+    parameters = more.pop("parameters", P)
+    failsafes = more.pop("failsafes", Failsafes(parameters.failsafes))
+    return against_arming(Question(health, mode, parameters, failsafes, more.pop("estop_age_ms", NEVER_S)), forced)
+
+
+def above(value: float) -> float:
+    return math.nextafter(value, math.inf)
+
+
+@pytest.mark.parametrize("mode", Mode, ids=lambda mode: mode.name)
+@pytest.mark.parametrize("forced", [False, True])
+def test_healthy_robot_may_be_armed_in_every_mode(mode: Mode, forced: bool) -> None:
+    assert reasons(mode=mode, forced=forced) == []
+
+
+HARD: list[tuple[Health, str]] = [
+    (GOOD._replace(silent=(1,)), "module 1 does not answer"),
+    (GOOD._replace(silent=(1, 4)), "module 1, 4 does not answer"),
+    (BLIND, "no pose yet"),
+    (GOOD._replace(pilot_age_s=0.5, stick=0.04), "sticks are not neutral"),
+    (GOOD._replace(warm=False), "compiled code is not warm yet"),
+    (GOOD._replace(tag_age_s=8.1), "no tag for 8.1 s"),
+]
+SOFT: list[tuple[Health, str]] = [
+    (GOOD._replace(tag_age_s=0.6), "pose is 600 ms old, 500 permitted"),
+    (GOOD._replace(sigma_m=0.06), "pose sigma 60 mm, 50 permitted"),
+    (GOOD._replace(nis_ratio=6.0), "sensors and model disagree: 6.0 of the expected, 5.0 permitted"),
+    (GOOD._replace(esc_missing=(0, 7)), "ESC 1, 8 does not answer"),
+    (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
+    (GOOD._replace(frame_errors_per_s=21.0), "21 bad frames a second, 20 permitted"),
+    (GOOD._replace(topology="module 2 is not docked as configured"), "module 2 is not docked as configured"),
+]
+
+
+@pytest.mark.parametrize(("health", "words"), HARD, ids=[words for _, words in HARD])
+def test_check_that_no_force_passes_over(health: Health, words: str) -> None:
+    assert words in reasons(health)
+    assert words in "; ".join(reasons(health, forced=True))
+
+
+@pytest.mark.parametrize(("health", "words"), SOFT, ids=[words for _, words in SOFT])
+def test_check_that_force_passes_over(health: Health, words: str) -> None:
+    assert reasons(health) == [words]
+    assert reasons(health, forced=True) == []
+
+
+def test_e_stop_is_never_passed_over() -> None:
+    for forced in (False, True):
+        assert reasons(estop_age_ms=199.999, forced=forced) == ["e-stop raised"]
+        assert reasons(estop_age_ms=200.0, forced=forced) == []
+
+
+def test_active_fail_safe_hinders_arming_and_force_passes_over_it() -> None:
+    failsafes = Failsafes(replace(P.failsafes, leak_delay_s=0.0, cabin_hot_delay_s=0.0))
+    wet = GOOD._replace(leak=True, cabin_c=75.0)
+    failsafes.step(wet, Mode.POSHOLD, False, False)
+    assert reasons(wet, failsafes=failsafes) == ["water in a cabin; cabin at 75 degC"]
+    assert reasons(wet, failsafes=failsafes, forced=True) == []
+
+
+def test_parameters_out_of_range_are_never_passed_over() -> None:
+    wrong = replace(P, limiter=replace(Limiter(), force_share=1.5, slew_n_per_s=0.0))
+    for forced in (False, True):
+        (words,) = reasons(parameters=wrong, forced=forced)
+        assert words == (
+            "parameter limiter.force_share: 1.5 is out of range; permitted: 0.05 to 1; "
+            "parameter limiter.slew_n_per_s: 0.0 is out of range; permitted: 1 to 10000 N/s"
+        )
+
+
+def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
+    assert [check.name for check in CHECKS if not check.may_be_skipped] == [
+        "e-stop clear", "modules answer", "mode has what it needs", "sticks neutral", "parameters valid", "compiled code warm",
+    ]  # fmt: skip
+    assert [check.name for check in CHECKS if check.may_be_skipped] == [
+        "pose fresh", "pose sure", "pose consistent", "every ESC answers", "every axis has thrust", "no fail-safe on",
+        "few bad frames", "topology as configured",
+    ]  # fmt: skip
+    both = GOOD._replace(silent=(2,), tag_age_s=0.7)
+    assert reasons(both) == ["module 2 does not answer", "pose is 700 ms old, 500 permitted"]
+
+
+BOUNDARIES = [
+    ("tag_age_s", 0.5), ("sigma_m", 0.05), ("nis_ratio", 5.0), ("frame_errors_per_s", 20.0), ("tag_age_s", 8.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("field", "limit"), BOUNDARIES)
+def test_check_fails_just_beyond_its_limit(field: str, limit: float) -> None:
+    there, beyond = GOOD._replace(**{field: limit}), GOOD._replace(**{field: above(limit)})
+    assert len(reasons(beyond)) == len(reasons(there)) + 1
+
+
+def test_sticks_count_while_they_are_fresh_and_beyond_the_dead_zone() -> None:
+    dead = P.steering.stick_dead
+    assert reasons(GOOD._replace(pilot_age_s=0.5, stick=dead)) == []
+    assert reasons(GOOD._replace(pilot_age_s=0.5, stick=above(dead))) == ["sticks are not neutral"]
+    assert reasons(GOOD._replace(pilot_age_s=above(0.5), stick=1.0)) == []
+    assert reasons(GOOD._replace(pilot_age_s=math.nan, stick=1.0)) == []
+
+
+@pytest.mark.parametrize("mode", [mode for mode in Mode if mode not in PLACED], ids=lambda mode: mode.name)
+def test_mode_without_a_place_asks_for_no_good_pose(mode: Mode) -> None:
+    assert reasons(GOOD._replace(tag_age_s=4.0, sigma_m=9.0, nis_ratio=50.0), mode) == []
+
+
+@pytest.mark.parametrize("mode", PLACED, ids=lambda mode: mode.name)
+def test_mode_with_a_place_asks_for_a_good_pose(mode: Mode) -> None:
+    assert len(reasons(GOOD._replace(tag_age_s=4.0, sigma_m=9.0, nis_ratio=50.0), mode)) == 3
+
+
+def test_robot_that_never_had_a_pose_hears_that_once() -> None:
+    assert reasons(BLIND) == ["no pose yet"]
+
+
+# ---------------------------------------------------------------- what each mode needs
+
+
+@pytest.mark.parametrize("mode", Mode, ids=lambda mode: mode.name)
+def test_mode_needs_what_it_steers_by(mode: Mode) -> None:
+    blind = BLIND._replace(depth_age_s=6.0)
+    expected = {
+        Mode.STABILIZE: ["no pose yet"], Mode.ALT_HOLD: ["no pose yet", "depth unknown"],
+        **dict.fromkeys(PLACED, ["no pose yet"]),
+    }  # fmt: skip
+    assert missing(mode, blind, P) == expected.get(mode, [])
+    lost = GOOD._replace(tag_age_s=above(8.0), depth_age_s=above(5.0))
+    expected = {Mode.ALT_HOLD: ["depth unknown"], **dict.fromkeys(PLACED, ["no tag for 8.0 s"])}
+    assert missing(mode, lost, P) == expected.get(mode, [])
+    nearly = GOOD._replace(tag_age_s=8.0, depth_age_s=5.0)
+    assert missing(mode, nearly, P) == []
+
+
+@pytest.mark.parametrize("mode", Mode, ids=lambda mode: mode.name)
+def test_sticks_steer_while_the_pilot_is_there(mode: Mode) -> None:
+    gone = ["pilot input lost"] if mode in (Mode.MANUAL, Mode.STABILIZE) else []
+    assert missing(mode, GOOD._replace(pilot_age_s=above(1.0)), P) == gone
+    assert missing(mode, GOOD._replace(pilot_age_s=1.0), P) == []

@@ -1,0 +1,274 @@
+"""Fail-safes: of each the limit, the delay, the modes, the action and what ends it, to the nanosecond and the last bit."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from firmware_py.core.failsafes import ANY, MOVING, PERMITTED, PILOTED, PLACED, TABLE, Alarm, Failsafes, Level, Row, Watch
+from firmware_py.core.health import Health
+from firmware_py.core.types import Mode
+from firmware_py.description.failsafe_parameters import Failsafes as Parameters
+from tests.unit.healths import GOOD, at
+
+P = Parameters()
+ROWS = {row.name: row for row in TABLE}
+POSE_MODES = {Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK}
+
+FIELDS: dict[str, str] = {
+    "leak": "leak", "bus_silent": "bus_silent_s", "foreign_sync": "foreign_sync", "battery_critical": "voltage_share",
+    "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
+    "tag_gone": "tag_age_s", "partner_lost": "partner_lost", "estimator": "nis_ratio", "rejected": "rejected_share",
+    "tag_lost": "tag_age_s", "tag_late": "tag_age_s", "depth_lost": "depth_age_s", "module_silent": "silent_s",
+    "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
+    "thruster_lost": "dead", "battery_low": "voltage_share",
+}  # fmt: skip
+"""Which figure of Health each fail-safe judges; depth_unknown needs two."""
+YES: dict[str, Any] = {"leak": True, "foreign_sync": True, "axis_lost": 1, "partner_lost": True, "thruster_lost": (3,)}
+
+
+def spoilt(name: str, value: float) -> Health:
+    """`GOOD` with the figure of fail-safe `name` at `value`."""
+    if name == "depth_unknown":
+        return GOOD._replace(tag_age_s=value, depth_age_s=value)
+    return GOOD._replace(**{FIELDS[name]: value})
+
+
+def bad(name: str) -> Health:
+    """`GOOD` with fail-safe `name`'s cause just there."""
+    if name in YES:
+        return GOOD._replace(**{FIELDS[name]: YES[name]})
+    limit = getattr(P, f"{name}_limit")
+    return spoilt(name, math.nextafter(limit, -math.inf if ROWS[name].below else math.inf))
+
+
+def quick(name: str) -> Parameters:
+    """Parameters with which only `name` acts, and at once."""
+    none = {f"{row.name}_action": 0 for row in TABLE if row.name != name}
+    return replace(P, **none, **{f"{name}_delay_s": 0.0})
+
+
+def alarms_of(parameters: Parameters, health: Health, mode: Mode = Mode.AUTO, forced: bool = False, armed: bool = True) -> list[Alarm]:
+    return Failsafes(parameters).step(health, mode, forced, armed)
+
+
+def test_every_fail_safe_is_tried_here() -> None:
+    assert [row.name for row in TABLE] == list(FIELDS)
+
+
+def test_levels_are_numbered_as_the_parameters_say() -> None:
+    assert [level.name for level in sorted(Level)] == ["NONE", "WARN", "HOLD", "DEPTH", "SURFACE", "DISARM"]
+    assert [int(level) for level in Level] == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_healthy_robot_has_no_alarm(name: str) -> None:
+    for mode in Mode:
+        assert alarms_of(quick(name), GOOD, mode) == []
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_alarm_comes_just_beyond_the_limit(name: str) -> None:
+    mode = next(m for m in (Mode.AUTO, Mode.MANUAL) if m in ROWS[name].modes)
+    (alarm,) = alarms_of(quick(name), bad(name), mode)
+    level = Level(getattr(P, f"{name}_action"))
+    assert (alarm.name, alarm.level, alarm.begins) == (name, level, True)
+    if name not in YES:
+        assert alarms_of(quick(name), spoilt(name, getattr(P, f"{name}_limit")), mode) == []
+
+
+@pytest.mark.parametrize("name", [name for name in FIELDS if name not in YES])
+def test_what_is_not_known_is_no_alarm(name: str) -> None:
+    assert alarms_of(quick(name), spoilt(name, math.nan), Mode.AUTO) == []
+    assert alarms_of(quick(name), spoilt(name, math.nan), Mode.MANUAL) == []
+
+
+def test_depth_is_known_by_pressure_or_by_tags() -> None:
+    lost = math.nextafter(P.depth_unknown_limit, math.inf)
+    assert alarms_of(quick("depth_unknown"), GOOD._replace(depth_age_s=lost)) == []
+    assert alarms_of(quick("depth_unknown"), GOOD._replace(tag_age_s=lost)) == []
+    assert alarms_of(quick("depth_unknown"), GOOD._replace(depth_age_s=lost, tag_age_s=lost))
+
+
+COUNTS = {
+    "depth_unknown": POSE_MODES | {Mode.ALT_HOLD},
+    "tag_gone": POSE_MODES,
+    "estimator": POSE_MODES,
+    "rejected": POSE_MODES,
+    "tag_lost": POSE_MODES,
+    "tag_late": POSE_MODES - {Mode.POSHOLD},
+    "fence": POSE_MODES - {Mode.POSHOLD},
+    "ground_lost": set(Mode) - {Mode.AUTO, Mode.SURFACE},
+    "pilot_lost": {Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD},
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("mode", Mode, ids=lambda mode: mode.name)
+def test_fail_safe_counts_in_its_modes_alone(name: str, mode: Mode) -> None:
+    assert bool(alarms_of(quick(name), bad(name), mode)) == (mode in COUNTS.get(name, set(Mode)))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("mode", Mode, ids=lambda mode: mode.name)
+def test_mode_that_a_fail_safe_chose_is_left_when_tags_do_not_come_back(name: str, mode: Mode) -> None:
+    expected = mode in COUNTS.get(name, set(Mode)) or (name == "tag_gone" and mode == Mode.ALT_HOLD)
+    assert bool(alarms_of(quick(name), bad(name), mode, forced=True)) == expected
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_disarmed_robot_minds_only_what_is_wrong_with_itself(name: str) -> None:
+    for mode in (Mode.AUTO, Mode.MANUAL, Mode.POSHOLD):
+        assert bool(alarms_of(quick(name), bad(name), mode, armed=False)) == (name not in COUNTS)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_alarm_waits_for_its_delay_to_the_nanosecond(name: str) -> None:
+    one = replace(P, **{f"{row.name}_action": 0 for row in TABLE if row.name != name}, **{f"{name}_delay_s": 0.5})
+    mode = next(m for m in (Mode.AUTO, Mode.MANUAL) if m in ROWS[name].modes)
+    failsafes, begin = Failsafes(one), bad(name)
+    assert failsafes.step(begin, mode, False, True) == []
+    assert failsafes.step(begin._replace(time_ns=begin.time_ns + 499_999_999), mode, False, True) == []
+    (alarm,) = failsafes.step(begin._replace(time_ns=begin.time_ns + 500_000_000), mode, False, True)
+    assert alarm.begins
+    assert failsafes.step(at(begin, 0.6), mode, False, True) == [], "said once"
+
+
+def test_cause_that_comes_and_goes_starts_anew() -> None:
+    failsafes = Failsafes(replace(P, leak_delay_s=1.0))
+    wet = GOOD._replace(leak=True)
+    failsafes.step(wet, Mode.AUTO, False, True)
+    failsafes.step(at(GOOD, 0.9), Mode.AUTO, False, True)
+    assert failsafes.step(at(wet, 1.1), Mode.AUTO, False, True) == []
+    assert failsafes.step(at(wet, 2.0), Mode.AUTO, False, True) == []
+    assert failsafes.step(at(wet, 2.1), Mode.AUTO, False, True)
+
+
+def test_alarm_ends_when_its_cause_is_gone_for_a_while() -> None:
+    failsafes = Failsafes(quick("cabin_hot"))
+    failsafes.step(GOOD._replace(cabin_c=80.0), Mode.AUTO, False, True)
+    assert failsafes.level == Level.SURFACE
+    assert failsafes.step(at(GOOD, 1.0), Mode.AUTO, False, True) == []
+    assert failsafes.step(at(GOOD._replace(cabin_c=80.0), 2.0), Mode.AUTO, False, True) == []
+    assert failsafes.step(at(GOOD, 3.0), Mode.AUTO, False, True) == []
+    late = at(GOOD, 5.0)
+    assert failsafes.step(late._replace(time_ns=late.time_ns - 1), Mode.AUTO, False, True) == []
+    (alarm,) = failsafes.step(late, Mode.AUTO, False, True)
+    assert alarm == Alarm("cabin_hot", "cabin at 30 degC", Level.SURFACE, False)
+    assert failsafes.level == Level.NONE
+    assert failsafes.step(at(GOOD, 6.0), Mode.AUTO, False, True) == [], "said once"
+
+
+def test_latched_alarm_ends_by_disarming_alone() -> None:
+    failsafes = Failsafes(quick("leak"))
+    failsafes.step(GOOD._replace(leak=True), Mode.AUTO, False, True)
+    for second in range(1, 60):
+        assert failsafes.step(at(GOOD, second), Mode.AUTO, False, True) == []
+    assert failsafes.level == Level.SURFACE
+    (alarm,) = failsafes.step(at(GOOD, 60), Mode.AUTO, False, False)
+    assert not alarm.begins and failsafes.level == Level.NONE
+
+
+def test_latched_alarm_stays_while_its_cause_does() -> None:
+    failsafes, wet = Failsafes(quick("leak")), GOOD._replace(leak=True)
+    failsafes.step(wet, Mode.AUTO, False, True)
+    assert failsafes.step(at(wet, 60), Mode.AUTO, False, False) == []
+    assert failsafes.level == Level.SURFACE
+
+
+def test_parameters_say_which_alarms_are_latched() -> None:
+    latched = {name for name in FIELDS if Watch(ROWS[name], P).latched}
+    assert latched == {
+        "leak", "foreign_sync", "battery_critical", "cabin_pressure", "axis_lost", "thruster_lost",
+    }  # fmt: skip
+
+
+def test_fail_safe_that_does_nothing_is_not_watched() -> None:
+    assert alarms_of(replace(quick("leak"), leak_action=0), GOOD._replace(leak=True)) == []
+
+
+def test_gravest_action_counts() -> None:
+    failsafes = Failsafes(replace(P, battery_low_delay_s=0.0, leak_delay_s=0.0))
+    assert failsafes.level == Level.NONE
+    failsafes.step(GOOD._replace(voltage_share=0.85), Mode.AUTO, False, True)
+    assert failsafes.level == Level.WARN
+    alarms = failsafes.step(at(GOOD._replace(voltage_share=0.85, leak=True, foreign_sync=True), 1), Mode.AUTO, False, True)
+    assert [alarm.name for alarm in alarms] == ["leak", "foreign_sync"], "gravest first"
+    assert failsafes.level == Level.SURFACE
+
+
+def test_only_what_is_more_than_a_warning_hinders_arming() -> None:
+    failsafes = Failsafes(replace(P, battery_low_delay_s=0.0, cabin_hot_delay_s=0.0, module_silent_delay_s=0.0))
+    health = GOOD._replace(voltage_share=0.85, cabin_c=81.0, silent_s=0.7)
+    assert failsafes.active(health) == []
+    failsafes.step(health, Mode.AUTO, False, False)
+    assert failsafes.active(health) == ["cabin at 81 degC", "a module is silent for 0.7 s"]
+
+
+WORDS = {
+    "leak": "water in a cabin",
+    "bus_silent": "bus silent for 2.0 s",
+    "foreign_sync": "somebody else sends SYNC",
+    "battery_critical": "battery critical: 80% of its voltage",
+    "cabin_hot": "cabin at 70 degC",
+    "cabin_pressure": "cabin pressure off by 20000 Pa",
+    "axis_lost": "the thrusters left cannot make every wrench",
+    "depth_unknown": "depth unknown for 5.0 s",
+    "tag_gone": "no tag for 30.0 s",
+    "partner_lost": "a docked partner is lost",
+    "estimator": "sensors and model disagree: 5.0 of the expected",
+    "rejected": "80% of the tags refused",
+    "tag_lost": "no tag for 8.0 s",
+    "tag_late": "no tag for 1.0 s",
+    "depth_lost": "no pressure for 1.0 s",
+    "module_silent": "a module is silent for 0.5 s",
+    "ticks_missed": "5 ticks missed in a second",
+    "fence": "0.00 m outside the fence",
+    "ground_lost": "ground station silent for 5.0 s",
+    "pilot_lost": "pilot silent for 1.0 s",
+    "thruster_lost": "a thruster is out",
+    "battery_low": "battery low: 87% of its voltage",
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_every_alarm_has_its_words(name: str) -> None:
+    assert Watch(ROWS[name], P).words(bad(name)) == WORDS[name]
+
+
+# ---------------------------------------------------------------- modes that are refused while a cause lasts
+
+
+def test_pilot_may_take_over_from_every_fail_safe_but_disarming() -> None:
+    for level in (Level.NONE, Level.WARN, Level.HOLD, Level.DEPTH, Level.SURFACE):
+        assert {Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD} <= PERMITTED[level]
+    assert PERMITTED[Level.DISARM] == frozenset()
+    assert PERMITTED[Level.NONE] == PERMITTED[Level.WARN] == frozenset(Mode)
+    extra = {Mode.POSHOLD, Mode.SURFACE, Mode.MOTOR_DETECT}
+    assert PERMITTED[Level.HOLD] - PILOTED == extra
+    assert PERMITTED[Level.DEPTH] - PILOTED == PERMITTED[Level.SURFACE] - PILOTED == {Mode.SURFACE}
+    assert PLACED == POSE_MODES and MOVING == POSE_MODES - {Mode.POSHOLD} and ANY == set(Mode)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("mode", Mode, ids=lambda mode: mode.name)
+def test_mode_is_refused_while_a_fail_safe_would_leave_it_at_once(name: str, mode: Mode) -> None:
+    failsafes = Failsafes(quick(name))
+    level = Level(getattr(P, f"{name}_action"))
+    refused = mode in COUNTS.get(name, set(Mode)) and mode not in PERMITTED[level]
+    words = [Watch(ROWS[name], P).words(bad(name))]
+    assert failsafes.against(mode, bad(name)) == (words if refused else [])
+    assert failsafes.against(mode, GOOD) == []
+
+
+def test_mode_is_permitted_as_soon_as_the_cause_is_gone_unless_it_is_latched() -> None:
+    for name, stays in (("leak", True), ("cabin_hot", False)):
+        failsafes = Failsafes(quick(name))
+        failsafes.step(bad(name), Mode.AUTO, False, True)
+        assert bool(failsafes.against(Mode.AUTO, at(GOOD, 0.1))) is stays
+
+
+def test_row_needs_neither_limit_nor_mode() -> None:
+    row = Row("leak", "", lambda health: health.leak)
+    assert not row.below and row.modes == ANY and row.forced_modes == frozenset()

@@ -1,0 +1,192 @@
+"""Links over loopback: several at once, routed by system, bounded, and never in the way of a tick."""
+
+import os
+import pty
+import socket
+import time
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from firmware_py.app.ground_station import GroundSide
+from firmware_py.description.parameters import Parameters
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.link import Channel, LinkError, Links, open_link
+from tests.unit.ground_world import Robot, World, fleet_of
+from tests.unit.test_ground_walk import free_port
+
+PATIENCE_S = 5.0
+
+
+def received(links: Links, count: int) -> list[Any]:
+    """What came, waited for."""
+    got: list[Any] = []
+    end = time.monotonic() + PATIENCE_S
+    while len(got) < count and time.monotonic() < end:
+        links.wait(0.05)
+        got += links.receive()
+    return got
+
+
+def heartbeat(system: int = 255) -> bytes:
+    mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=190)
+    return bytes(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(mav))
+
+
+def test_udpin_answers_each_client_on_its_own_channel() -> None:
+    port = free_port()
+    links = Links([f"udpin:127.0.0.1:{port}"])
+    with closing(links):
+        clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
+        for client in clients:
+            client.settimeout(PATIENCE_S)
+            client.sendto(b"hello", ("127.0.0.1", port))
+        got = received(links, 2)
+        assert len({r.channel for r in got}) == 2
+        links.send(got[1].channel, b"for the second")
+        links.send(None, b"for all")
+        links.flush()
+        assert clients[1].recv(100) == b"for the second"
+        assert clients[0].recv(100) == b"for all"
+        for client in clients:
+            client.close()
+
+
+def test_udpout_speaks_first_and_survives_that_nobody_listens() -> None:
+    port = free_port()
+    links = Links([f"udpout:127.0.0.1:{port}"])
+    with closing(links):
+        for _ in range(5):
+            links.send(None, b"anybody?")
+            links.flush()
+            links.receive()
+        with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as client:
+            client.bind(("127.0.0.1", port))
+            client.settimeout(PATIENCE_S)
+            links.send(None, b"now")
+            links.flush()
+            if links.channels[0].queue or links.counts["send"]:
+                links.send(None, b"now")
+                links.flush()
+            assert client.recv(100) == b"now"
+
+
+def test_tcp_clients_come_and_go() -> None:
+    port = free_port()
+    links = Links([f"tcpin:127.0.0.1:{port}"])
+    with closing(links):
+        client = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+        client.sendall(b"hello")
+        (got,) = received(links, 1)
+        assert not got.datagram
+        links.send(got.channel, b"x" * 1000)
+        links.flush()
+        assert client.recv(1000, socket.MSG_WAITALL) == b"x" * 1000
+        client.close()
+        end = time.monotonic() + PATIENCE_S
+        while links.channels and time.monotonic() < end:
+            links.wait(0.05)
+            links.receive()
+        assert links.take_gone() == [got.channel] and not links.channels
+
+
+def test_a_client_that_does_not_read_loses_the_oldest_and_delays_nobody() -> None:
+    port = free_port()
+    links = Links([f"tcpin:127.0.0.1:{port}"])
+    with closing(links), closing(socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)) as client:
+        client.sendall(b"hello")
+        (got,) = received(links, 1)
+        start = time.monotonic()
+        for _ in range(30_000):
+            links.send(got.channel, bytes(280))
+            links.flush()
+        assert links.dropped > 1000
+        assert time.monotonic() - start < PATIENCE_S
+        assert len(links.channels[got.channel].queue) <= 256
+
+
+def test_queue_keeps_the_newest() -> None:
+    channel = Channel(0, None, None, False)  # type: ignore[arg-type]
+    for i in range(300):
+        channel.put(bytes([i % 256]))
+    assert channel.dropped == 44 and channel.queue[-1] == bytes([299 % 256]) and channel.queue[0] == bytes([44])
+
+
+def test_serial_link_carries_frames_both_ways() -> None:
+    ours, theirs = pty.openpty()
+    links = Links([f"{os.ttyname(theirs)},115200"])
+    with closing(links):
+        os.write(ours, heartbeat())
+        assert b"".join(r.data for r in received(links, 1))[:1] == b"\xfd"
+        links.send(None, b"answer")
+        links.flush()
+        assert os.read(ours, 100) == b"answer"
+    os.close(ours)
+    os.close(theirs)
+
+
+@pytest.mark.parametrize("address", ["nonsense", "udpin:127.0.0.1:no", "udpin:127.0.0.1:99999", "/dev/no-such-port,9600", "tcpin:256.0.0.1:5"])
+def test_an_address_that_cannot_be_opened_is_refused_in_one_line(address: str) -> None:
+    with pytest.raises(LinkError, match="link ") as error:
+        open_link(address)
+    assert "\n" not in str(error.value)
+
+
+def test_messages_for_others_are_passed_on_to_where_they_were_heard() -> None:
+    world = World()
+    first, second, third = world.client(255), world.client(201), world.client(202)
+    for client in (first, second, third):
+        client.heartbeat()
+    world.run(1)
+    for client in (first, second, third):
+        client.clear()
+    first.send("COMMAND_LONG", 201, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+    world.run(1)
+    assert second.all("COMMAND_LONG") and not third.all("COMMAND_LONG") and not world.robot.asked[3:]
+    first.heartbeat()
+    world.run(1)
+    assert [m.get_srcSystem() for m in third.all("HEARTBEAT") if m.get_srcSystem() != 1] == [255]
+
+
+def test_a_tick_only_hands_over_its_results() -> None:
+    """Observer and requests cost microseconds, whatever the link does."""
+    firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
+    side = GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",)), firmware)
+    with closing(side):
+        robot = Robot()
+        inputs, outputs = robot.step([])
+        start = time.perf_counter()
+        for _ in range(10_000):
+            side.observe([], [], inputs, outputs)
+            side.requests()
+        assert (time.perf_counter() - start) / 10_000 < 50e-6
+        assert len(side._ticks) == 200
+
+
+def test_logs_are_listed_and_fetched(tmp_path: Path) -> None:
+    (tmp_path / "flight1").mkdir()
+    data = bytes(i % 251 for i in range(9_999))
+    (tmp_path / "flight1" / "signals.mcap").write_bytes(data)
+    os.utime(tmp_path / "flight1" / "signals.mcap", (1_000_000, 1_000_000))
+    (tmp_path / "can.log").write_bytes(b"frames")
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    client = world.client()
+    client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(1)
+    assert [(e.id, e.size, e.num_logs) for e in client.all("LOG_ENTRY")] == [(1, 9_999, 2), (2, 6, 2)]
+    client.send("LOG_REQUEST_DATA", 1, 1, 1, 0, 0xFFFFFFFF)
+    world.run(20)
+    pieces = {m.ofs: bytes(m.data[: m.count]) for m in client.all("LOG_DATA")}
+    assert b"".join(pieces[at] for at in sorted(pieces)) == data
+    assert client.last("LOG_DATA").count == 0 or sum(map(len, pieces.values())) == len(data)
+    client.clear()
+    client.send("LOG_REQUEST_DATA", 1, 1, 1, 90, 180)
+    world.run(5)
+    assert b"".join(bytes(m.data[: m.count]) for m in client.all("LOG_DATA")) == data[90:270]
+    client.send("LOG_ERASE", 1, 1)
+    world.run(1)
+    assert "logs are not erased" in client.texts and (tmp_path / "can.log").exists()

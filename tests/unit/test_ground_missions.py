@@ -1,0 +1,295 @@
+"""Missions: the protocol with pymavlink's messages, what is refused, and how the body is followed along the plan."""
+
+import math
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from firmware_py.core.types import Action, Mode, Setpoint
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.geodesy import Origin
+from firmware_py.ground.mission_flight import Plan, PlanJob
+from tests.unit.ground_world import Client, World
+
+NAN = float("nan")
+PLACES = [(302084010, 1201614010, -0.4), (302084020, 1201614000, -0.3), (302084000, 1201614000, -0.5)]
+
+
+class Path:
+    """A trajectory of ten seconds a leg that stands still."""
+
+    duration_s = 30.0
+
+    def sample(self, t_s: float) -> Setpoint:
+        zero = np.zeros(3)
+        return Setpoint(zero, np.array([1.0, 0, 0, 0]), zero, zero, zero, zero)
+
+
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+@pytest.fixture
+def client(world: World) -> Client:
+    return world.client()
+
+
+def item(sequence: int, place: tuple[int, int, float], command: int = 16, frame: int = 6, p: tuple[float, ...] = (0, 0, 0, NAN)) -> tuple:  # type: ignore[type-arg]
+    return (1, 1, sequence, frame, command, 0, 1, *p, *place)
+
+
+def upload(world: World, client: Client, items: list[tuple], kind: int = 0) -> int:  # type: ignore[type-arg]
+    """Send items as they are asked for; the result."""
+    client.clear()
+    client.send("MISSION_COUNT", 1, 1, len(items), kind)
+    answered = 0
+    for _ in range(400):
+        world.run(1)
+        if client.all("MISSION_ACK"):
+            return int(client.last("MISSION_ACK").type)
+        asked = client.all("MISSION_REQUEST_INT")
+        if len(asked) > answered:
+            client.send("MISSION_ITEM_INT", *items[asked[-1].seq], kind)
+            answered = len(asked)
+    raise AssertionError("no acknowledgement")
+
+
+def fly(world: World, client: Client, first_arrival_s: float = 10.0) -> PlanJob:
+    """Arm, start by mode, plan: the body tracks."""
+    client.command(400, 1)
+    world.run(3)
+    client.command(176, 1, 4, 4)
+    world.run(10)
+    (job,) = world.station.jobs()
+    arrivals = tuple(first_arrival_s * (i + 1) for i in range(len(job.legs)))
+    world.station.planned(0, Plan(job.serial, Path(), arrivals))
+    world.run(3)
+    return job
+
+
+def test_mission_goes_up_and_comes_down_the_same(world: World, client: Client) -> None:
+    items = [item(i, place) for i, place in enumerate(PLACES)]
+    assert upload(world, client, items) == mavlink.MAV_MISSION_ACCEPTED
+    client.clear()
+    client.send("MISSION_REQUEST_LIST", 1, 1, 0)
+    for i in range(3):
+        client.send("MISSION_REQUEST_INT", 1, 1, i, 0)
+    client.send("MISSION_REQUEST", 1, 1, 0, 0)
+    world.run(1)
+    assert client.last("MISSION_COUNT").count == 3
+    down = client.all("MISSION_ITEM_INT")
+    assert [(m.x, m.y, pytest.approx(m.z)) for m in down] == PLACES and {m.frame for m in down} == {6}
+    old = client.last("MISSION_ITEM")
+    assert (old.frame, old.x) == (3, pytest.approx(30.208401, abs=1e-5))
+    world.run(120)
+    assert client.last("MISSION_CURRENT").total == 3
+
+
+def test_an_item_that_is_lost_is_asked_for_again(world: World, client: Client) -> None:
+    client.send("MISSION_COUNT", 1, 1, 2, 0)
+    world.run(100)
+    assert [m.seq for m in client.all("MISSION_REQUEST_INT")] == [0] * 5
+    client.send("MISSION_ITEM_INT", *item(0, PLACES[0]), 0)
+    client.send("MISSION_ITEM_INT", *item(0, PLACES[0]), 0)
+    client.send("MISSION_ITEM_INT", *item(1, PLACES[1]), 0)
+    world.run(1)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_ACCEPTED
+
+
+def test_a_transfer_that_breaks_off_leaves_the_old_mission(world: World, client: Client) -> None:
+    upload(world, client, [item(0, PLACES[0])])
+    client.clear()
+    client.send("MISSION_COUNT", 1, 1, 3, 0)
+    world.run(600)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_OPERATION_CANCELLED
+    assert len(world.station.services[1].flight.items) == 1
+
+
+@pytest.mark.parametrize(
+    ("bad", "result"),
+    [
+        (item(0, (1000, 1000, -0.4), frame=1), mavlink.MAV_MISSION_UNSUPPORTED_FRAME),
+        (item(0, PLACES[0], command=22), mavlink.MAV_MISSION_UNSUPPORTED),
+        (item(0, (2**31 - 1, 0, -0.4)), mavlink.MAV_MISSION_INVALID_PARAM5_X),
+        (item(0, (0, 0, NAN)), mavlink.MAV_MISSION_INVALID_PARAM7),
+        (item(0, PLACES[0], p=(-1, 0, 0, 0)), mavlink.MAV_MISSION_INVALID_PARAM1),
+    ],
+)
+def test_items_that_cannot_be_flown_are_refused_when_they_come(world: World, client: Client, bad: tuple, result: int) -> None:  # type: ignore[type-arg]
+    assert upload(world, client, [bad]) == result
+    assert "mission refused: item 0" in client.texts
+
+
+def test_local_frame_is_refused_and_fences_are_told_to_be_unsupported(world: World, client: Client) -> None:
+    assert upload(world, client, [item(0, PLACES[0])], kind=1) == mavlink.MAV_MISSION_UNSUPPORTED
+    client.send("MISSION_REQUEST_LIST", 1, 1, 1)
+    world.run(1)
+    assert (client.last("MISSION_COUNT").count, client.last("MISSION_COUNT").mission_type) == (0, 1)
+
+
+def test_too_many_items_find_no_space_and_clear_removes_all(world: World, client: Client) -> None:
+    client.send("MISSION_COUNT", 1, 1, 501, 0)
+    world.run(1)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_NO_SPACE
+    upload(world, client, [item(0, PLACES[0])])
+    client.send("MISSION_CLEAR_ALL", 1, 1, 0)
+    world.run(1)
+    assert not world.station.services[1].flight.items
+
+
+def test_places_are_about_the_tanks_origin() -> None:
+    """Against the series of metres a degree of WGS 84 (Defense Mapping Agency; valid to 0.01 m)."""
+    f = math.radians(30.2084)
+    north = 111132.92 - 559.82 * math.cos(2 * f) + 1.175 * math.cos(4 * f) - 0.0023 * math.cos(6 * f)
+    east = 111412.84 * math.cos(f) - 93.5 * math.cos(3 * f) + 0.118 * math.cos(5 * f)
+    origin = Origin(30.2084, 120.1614, 4.0)
+    assert origin.local(30.2094, 120.1614, 3.0) == pytest.approx([north * 1e-3, 0.0, 1.0], abs=1e-3)
+    assert origin.local(30.2084, 120.1624, 4.0) == pytest.approx([0.0, east * 1e-3, 0.0], abs=1e-3)
+    for p in ([0.1, -0.2, 0.5], [50.0, 80.0, -3.0]):
+        assert origin.local(*origin.geodetic(np.array(p))) == pytest.approx(p, abs=1e-6)
+    assert Origin(0.0, 179.9999, 0.0).local(0.0, -179.9999, 0.0)[1] == pytest.approx(22.26, abs=0.01)
+
+
+def test_mission_starts_by_mode_holds_first_and_tracks_the_plan(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    job = fly(world, client)
+    assert [leg.sequence for leg in job.legs] == [0, 1, 2]
+    assert job.legs[0].p_wb == pytest.approx([0.11, 0.096, 0.4], abs=2e-3)
+    assert np.array_equal(job.p_wb, world.robot.p_wb[0])
+    asked = [r.action for r in world.robot.asked]
+    assert asked.index(Action.SET_MODE) < asked.index(Action.TRACK)
+    assert world.robot.mode[0] == Mode.AUTO
+    world.run(1100)
+    assert (client.last("MISSION_ITEM_REACHED").seq, client.last("MISSION_CURRENT").seq) == (0, 1)
+    assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_ACTIVE
+    world.run(2200)
+    assert client.last("MISSION_ITEM_REACHED").seq == 2
+    assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_COMPLETE
+    assert "mission complete" in client.texts
+
+
+def test_pause_and_resume_go_on_at_the_same_item(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    world.run(1100)
+    client.command(193, 0)
+    world.run(120)
+    assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_PAUSED
+    client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [1, 2]
+
+
+def test_jump_replans_from_where_the_body_is(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    client.clear()
+    client.command(224, 2)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [2]
+    client.send("MISSION_SET_CURRENT", 1, 1, 7)
+    world.run(2)
+    assert "item 7 of 3 does not exist" in client.texts
+
+
+def test_jump_items_repeat_and_endless_ones_are_refused(world: World, client: Client) -> None:
+    jump = item(2, (0, 0, 0), command=177, frame=2, p=(0, 2, 0, 0))
+    upload(world, client, [item(0, PLACES[0]), item(1, PLACES[1]), jump])
+    assert [leg.sequence for leg in fly(world, client).legs] == [0, 1] * 3
+    world = World()
+    client = world.client()
+    upload(world, client, [item(0, PLACES[0]), item(1, (0, 0, 0), command=177, frame=2, p=(0, -1, 0, 0))])
+    client.command(400, 1)
+    world.run(3)
+    client.clear()
+    client.command(300, 0, 0)
+    world.run(3)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+    assert "jumps for ever" in client.texts
+
+
+def test_holds_delays_and_speeds_belong_to_their_items(world: World, client: Client) -> None:
+    items = [
+        item(0, (0, 0, 0), command=178, frame=2, p=(1, 0.3, -1, 0)),
+        item(1, PLACES[0], p=(2.5, 0, 0, 90)),
+        item(2, (0, 0, 0), command=93, frame=2, p=(4, -1, -1, -1)),
+        item(3, PLACES[1]),
+    ]
+    upload(world, client, items)
+    first, second = fly(world, client).legs
+    assert (first.hold_s, first.speed_m_s, first.yaw) == (6.5, pytest.approx(0.3), pytest.approx(math.pi / 2))
+    assert (second.hold_s, second.yaw) == (0.0, None)
+
+
+def test_ardupilots_missions_begin_with_home_which_is_not_flown() -> None:
+    world = World(config=GroundConfig(identity="ardusub"))
+    client = world.client()
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    client.command(400, 1)
+    world.run(3)
+    client.command(300, 0, 0)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [1, 2]
+
+
+def test_a_mission_is_refused_disarmed_or_when_there_is_none(world: World, client: Client) -> None:
+    client.command(300, 0, 0)
+    world.run(2)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+    upload(world, client, [item(0, PLACES[0])])
+    client.clear()
+    client.command(300, 0, 0)
+    world.run(2)
+    assert "the vehicle is disarmed" in client.texts
+
+
+def test_a_plan_that_cannot_be_made_is_told_and_the_body_holds(world: World, client: Client) -> None:
+    upload(world, client, [item(0, PLACES[0])])
+    client.command(400, 1)
+    world.run(3)
+    client.command(176, 1, 4, 4)
+    world.run(10)
+    (job,) = world.station.jobs()
+    world.station.planned(0, Plan(job.serial, None, (), "the thrusters would be used to 120 %"))
+    world.run(2)
+    assert "the thrusters would be used to 120 %" in client.texts
+    assert world.robot.mode[0] == Mode.POSHOLD
+
+
+def test_a_plan_that_is_no_longer_wanted_is_not_flown(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    client.command(400, 1)
+    world.run(3)
+    client.command(176, 1, 4, 4)
+    world.run(10)
+    (old,) = world.station.jobs()
+    client.command(224, 2)
+    world.run(10)
+    world.station.planned(0, Plan(old.serial, Path(), (10.0, 20.0, 30.0)))
+    world.run(3)
+    assert Action.TRACK not in [r.action for r in world.robot.asked]
+
+
+def test_mission_goes_on_when_every_client_is_gone(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    world.station.leave(client.channel)
+    world.run(2500)
+    assert world.robot.mode[0] == Mode.AUTO
+    assert world.station.services[1].system.subject.progress.current == 2
+
+
+def test_reposition_plans_one_leg(world: World, client: Client) -> None:
+    client.command(400, 1)
+    world.run(3)
+    client.clear()
+    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 1.0, 302084010, 1201614000, -0.4)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert job.legs[0].p_wb == pytest.approx([0.111, 0, 0.4], abs=2e-3)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED

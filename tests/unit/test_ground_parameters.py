@@ -1,0 +1,108 @@
+"""Parameters over MAVLink: all REAL32, ranges kept, saved whole or not at all."""
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.core.types import Action
+from firmware_py.description.parameters import Parameters, load_parameters, registry
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.parameters import ParameterStore, wire_value
+from tests.unit.ground_world import Client, World
+
+EXPOSED = [limits.mavlink for _, limits in registry() if limits.mavlink]
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    return World(config=GroundConfig(store=str(tmp_path)))
+
+
+@pytest.fixture
+def client(world: World) -> Client:
+    return world.client()
+
+
+def put(world: World, client: Client, name: str, value: float, kind: int = 9) -> float:
+    """Set one and return what was echoed."""
+    client.clear()
+    client.send("PARAM_SET", 1, 1, name.encode(), value, kind)
+    world.run(2)
+    return float(client.last("PARAM_VALUE").param_value)
+
+
+def test_every_parameter_is_listed_once_as_real32_with_a_short_name(world: World, client: Client) -> None:
+    client.send("PARAM_REQUEST_LIST", 1, 0)
+    world.run(100)
+    values = client.all("PARAM_VALUE")
+    assert [v.param_id for v in values] == EXPOSED
+    assert {v.param_type for v in values} == {9} and {v.param_count for v in values} == {len(EXPOSED)}
+    assert [v.param_index for v in values] == list(range(len(EXPOSED)))
+    assert max(map(len, EXPOSED)) <= 16 and len(set(EXPOSED)) == len(EXPOSED)
+
+
+def test_one_parameter_is_read_by_name_and_by_number(world: World, client: Client) -> None:
+    client.send("PARAM_REQUEST_READ", 1, 1, b"ATT_BW", -1)
+    client.send("PARAM_REQUEST_READ", 1, 1, b"", 0)
+    world.run(1)
+    assert [v.param_id for v in client.all("PARAM_VALUE")] == ["ATT_BW", EXPOSED[0]]
+
+
+def test_a_set_parameter_reaches_the_next_tick_and_the_file(world: World, client: Client, tmp_path: Path) -> None:
+    assert put(world, client, "POS_BW", 2.75) == 2.75
+    assert world.robot.asked[-1].action == Action.SET_PARAMETER
+    assert world.robot.asked[-1].argument == ("control.position_bandwidth", 2.75)
+    assert load_parameters(tmp_path / "parameters.toml").control.position_bandwidth == 2.75
+    again = World(config=world.config)
+    assert again.station.store.get("POS_BW") == 2.75
+
+
+def test_out_of_range_is_refused_in_words_and_the_old_value_echoed(world: World, client: Client) -> None:
+    assert put(world, client, "POS_BW", 1000.0) == 2.5
+    assert "out of range; permitted: 0.1 to 10 rad/s" in client.texts
+    for nonsense in (math.nan, math.inf, -math.inf):
+        assert put(world, client, "POS_BW", nonsense) == 2.5
+    assert not world.robot.asked
+
+
+def test_unknown_parameter_is_told_of(world: World, client: Client) -> None:
+    client.send("PARAM_SET", 1, 1, b"NO_SUCH", 1.0, 9)
+    world.run(2)
+    assert "parameter NO_SUCH is unknown" in client.texts and not client.all("PARAM_VALUE")
+
+
+def test_integer_types_are_taken_cast_and_bytewise(world: World, client: Client) -> None:
+    bytewise = struct.unpack("<f", struct.pack("<i", 7))[0]
+    assert put(world, client, "DOCK_TRIES", 5.0, 6) == 5.0
+    assert put(world, client, "DOCK_TRIES", bytewise, 6) == 7.0
+    assert world.station.store.values.docking.tries == 7
+    assert wire_value(struct.unpack("<f", struct.pack("<i", -3))[0], 6) == -3.0
+
+
+def test_the_ends_of_a_range_survive_single_precision(tmp_path: Path) -> None:
+    store = ParameterStore(Parameters())
+    for name, (_, limits) in store.names.items():
+        for end in (limits.low, limits.high):
+            store.set(name, wire_value(float(np.float32(end)), 9))
+
+
+def test_a_file_that_cannot_be_written_changes_nothing(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    store = ParameterStore(Parameters(), blocked / "parameters.toml")
+    with pytest.raises(OSError):
+        store.set("POS_BW", 3.0)
+    assert store.get("POS_BW") == 2.5
+
+
+def test_a_save_that_breaks_off_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "parameters.toml"
+    store = ParameterStore(Parameters(), path)
+    store.set("POS_BW", 3.0)
+    (tmp_path / "parameters.toml.new").write_text("[control]\nposition_band")  # what a crash would leave
+    assert ParameterStore(Parameters(), path).get("POS_BW") == 3.0
+    store.set("POS_BW", 3.5)
+    assert ParameterStore(Parameters(), path).get("POS_BW") == 3.5

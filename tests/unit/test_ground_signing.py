@@ -1,0 +1,176 @@
+"""Signing: once keyed only the key holder acts; the two defects of pymavlink's parser are not there."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from firmware_py.core.types import Action
+from firmware_py.ground.signing import Signing, load_signing, units_of
+from tests.unit.ground_world import Client, World
+
+KEY = bytes(range(1, 33))
+NOW_NS = 1_800_000_000 * 1_000_000_000
+NOW = units_of(NOW_NS)
+
+
+def keyed_world(floor: int = 0) -> World:
+    signing = Signing(key=KEY, floor=floor)
+    signing.advance(NOW_NS)
+    return World(signing=signing)
+
+
+def with_key(client: Client, key: bytes = KEY, at: int = NOW, link: int = 0) -> Client:
+    signing = client.mav.signing
+    signing.secret_key, signing.timestamp, signing.link_id, signing.sign_outgoing = key, at, link, True
+    return client
+
+
+def armed(world: World, client: Client) -> bool:
+    client.command(400, 1)
+    world.run(3)
+    return any(r.action == Action.ARM for r in world.robot.asked)
+
+
+def test_signed_commands_act_and_what_we_send_is_signed() -> None:
+    world = keyed_world()
+    client = with_key(world.client())
+    client.mav.signing.allow_unsigned_callback = None
+    assert armed(world, client)
+    assert client.last("COMMAND_ACK").get_signed()
+    assert client.mav.signing.badsig_count == 0 and client.mav.signing.goodsig_count > 0
+
+
+def test_signature_is_that_of_the_specification() -> None:
+    signing = Signing(key=KEY, timestamp=41)
+    tail = signing.sign(b"frame", 3)
+    assert tail[:7] == bytes([3]) + (42).to_bytes(6, "little")
+    assert tail[7:] == hashlib.sha256(KEY + b"frame" + tail[:7]).digest()[:6]
+
+
+def test_unsigned_frames_do_nothing_once_keyed() -> None:
+    world = keyed_world()
+    client = world.client()
+    client.heartbeat()
+    assert not armed(world, client)
+    assert not world.robot.asked, "an unsigned heartbeat is no ground station either"
+
+
+def test_radio_status_is_the_one_message_that_is_believed_unsigned() -> None:
+    world = keyed_world()
+    client = world.client()
+    before = world.station.counts["good"]
+    client.send("RADIO_STATUS", 1, 1, 1, 1, 1, 1, 1)
+    assert world.station.counts["good"] == before + 1
+
+
+def test_wrong_key_is_refused_and_is_not_passed_as_unsigned() -> None:
+    world = keyed_world()
+    client = with_key(world.client(), key=bytes(32))
+    client.send("RADIO_STATUS", 1, 1, 1, 1, 1, 1, 1)
+    assert not armed(world, client)
+    assert world.station.counts["good"] == 0 and world.station.signing.counts["bad"] == 2
+
+
+def test_replayed_frames_are_refused() -> None:
+    world = keyed_world()
+    client = with_key(world.client())
+    frame = client.pack("COMMAND_LONG", 1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+    client.send_raw(frame)
+    world.run(1)
+    asked = len(world.robot.asked)
+    for _ in range(5):
+        client.send_raw(frame)
+    world.run(2)
+    assert len(world.robot.asked) == asked == 1
+
+
+def test_one_forged_frame_from_the_future_does_not_lock_the_station_out() -> None:
+    world = keyed_world()
+    real = with_key(world.client())
+    forger = with_key(world.client(), key=bytes(31) + b"x", at=2**47)
+    forger.heartbeat()
+    assert armed(world, real)
+
+
+def test_a_stream_older_than_a_minute_or_than_the_last_start_is_refused() -> None:
+    world = keyed_world()
+    assert not armed(world, with_key(world.client(), at=NOW - 61 * 100_000))
+    assert armed(world, with_key(world.client(), at=NOW - 59 * 100_000, link=1))
+    world = keyed_world(floor=NOW)
+    assert not armed(world, with_key(world.client(), at=NOW - 100))
+    assert armed(world, with_key(world.client(), at=NOW + 100, link=1))
+
+
+def setup(client: Client, key: bytes = KEY) -> None:
+    client.send("SETUP_SIGNING", 1, 1, list(key), NOW)
+
+
+def test_key_is_taken_only_disarmed_and_on_a_trusted_link() -> None:
+    world = World()
+    client = world.client()
+    setup(client)
+    assert world.station.signing.key is None
+    world = World(trusted=True)
+    client = world.client()
+    client.command(400, 1)
+    world.run(3)
+    setup(client)
+    assert world.station.signing.key is None
+    client.command(400, 0)
+    world.run(3)
+    setup(client)
+    assert world.station.signing.key == KEY
+    assert "signing refused" in client.texts
+
+
+def test_a_new_key_must_come_under_the_old_one_and_zeros_end_signing() -> None:
+    signing = Signing(key=KEY)
+    signing.advance(NOW_NS)
+    world = World(signing=signing, trusted=True)
+    client = world.client()
+    setup(client, bytes(range(2, 34)))
+    assert world.station.signing.key == KEY
+    setup(with_key(client), bytes(32))
+    assert world.station.signing.key is None
+
+
+def test_key_file_is_the_owners_alone_and_its_time_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "store" / "signing.json"
+    signing = Signing()
+    signing.adopt(KEY, NOW)
+    signing.streams[(0, 255, 190)] = NOW + 500
+    signing.save(path)
+    assert path.stat().st_mode & 0o777 == 0o600
+    again = load_signing(path)
+    assert again.key == KEY and again.floor > NOW + 500 and again.timestamp == again.floor
+
+
+def test_a_key_file_that_is_open_or_broken_is_no_reason_to_fly_without_key(tmp_path: Path) -> None:
+    path = tmp_path / "signing.json"
+    Signing(key=KEY).save(path)
+    path.chmod(0o640)
+    with pytest.raises(ValueError, match="chmod 600"):
+        load_signing(path)
+    path.chmod(0o600)
+    for text in ("", "{}", '{"key": "12", "timestamp": 0}', '{"key": 5, "timestamp": 0}'):
+        path.write_text(text)
+        with pytest.raises(ValueError, match="signing.json"):
+            load_signing(path)
+
+
+def test_the_watched_station_is_exactly_one() -> None:
+    """Its loss is not hidden by another system, another component or another type."""
+    world = World()
+    pilot, other = world.client(255, 190), world.client(254, 190)
+    pilot.heartbeat()
+    world.run(1)
+    for stranger, kind in ((other, 6), (world.client(255, 191), 6), (pilot, 27)):
+        stranger.heartbeat(kind)
+        world.run(1)
+    alive = [r for r in world.robot.asked if r.action == Action.GROUND_ALIVE]
+    assert len(alive) == 1
+    world.run(600)
+    other.heartbeat()
+    world.run(1)
+    assert world.station.services[1].presence.watched == (254, 190, 6)

@@ -1,0 +1,75 @@
+"""README.md: what it names exists, and its tables of figures are written by a tool."""
+
+import ast
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PLACES = sorted(set(re.findall(r"`((?:firmware_py|hil|tests|tools|can_dbc)/[^` :]+?)(?::(\w+))?`", README)))
+
+
+def tool(name: str) -> ModuleType:
+    """A script of tools/ as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(("path", "name"), PLACES, ids=[":".join(place).rstrip(":") for place in PLACES])
+def test_file_and_function_that_the_readme_names_exist(path: str, name: str) -> None:
+    assert (ROOT / path).exists()
+    if name:
+        tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+        assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+
+
+def test_links_and_pictures_of_the_readme_lead_to_files() -> None:
+    targets = re.findall(r"\]\(([^)#]+)\)", README)
+    assert any(target.endswith(".png") for target in targets)
+    assert [target for target in targets if "://" not in target and not (ROOT / target).exists()] == []
+
+
+def test_picture_stands_on_the_first_screen() -> None:
+    assert "![" in "\n".join(README.splitlines()[:12])
+
+
+def test_make_targets_of_the_readme_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert set(re.findall(r"(?:^|`)make ([a-z-]+)", README, re.MULTILINE)) <= targets
+
+
+def test_tables_of_figures_come_from_the_measurements() -> None:
+    readme_tables = tool("readme_tables")
+    accept = [
+        {"name": "spiral: RMSE", "value": 3.5265, "unit": "mm", "limit": "<= 5", "passed": True, "command": "x",
+         "group": "spiral"},
+        {"name": "hover: RMSE", "value": 7.0, "unit": "mm", "limit": "<= 5", "passed": False, "command": "y",
+         "group": "hover"},
+    ]  # fmt: skip
+    text = "<!-- table: accept spiral -->\nold\n<!-- end -->\n\n<!-- table: bench -->\nkept\n<!-- end -->\n"
+    filled = readme_tables.filled(text, {"accept": accept})
+    assert "| spiral: RMSE | 3.53 mm | <= 5 mm | passed | `x` |" in filled
+    assert "hover" not in filled
+    assert "old" not in filled
+    assert "kept" in filled
+    assert readme_tables.filled(filled, {"accept": accept}) == filled
+    everything = readme_tables.filled(text.replace("accept spiral", "accept"), {"accept": accept})
+    assert "| 7 mm | <= 5 mm | **failed** |" in everything
+
+
+def test_every_table_of_the_readme_is_of_a_known_kind_and_filled() -> None:
+    readme_tables = tool("readme_tables")
+    found = list(readme_tables.MARKER.finditer(README))
+    assert len(found) == README.count("<!-- table:") == README.count("<!-- end -->")
+    for match in found:
+        assert match["kind"] in readme_tables.TABLES
+        assert match[0].count("\n|") >= 2, f"empty table: {match[1].strip()}"

@@ -1,0 +1,186 @@
+"""The bench in lockstep on real SocketCAN: the bytes of the virtual bus, beside strangers, through link events.
+
+Reduced lengths here; with MODCUBE_FULL=1 the whole spiral and a thousand link events.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.bus.codec import Codec, Frame, Receiver
+from firmware_py.bus.port import open_port
+from firmware_py.core.transitions import ARMED
+from firmware_py.core.types import Inputs, Outputs
+from hil.scenario import Scenario
+from tests.vcan.can_utils import LoggedFrame, candump, cangen_flood, canplayer, cansend
+from tests.vcan.flight_bench import FULL, bench_on, between, frame_of, record, sent, short
+from tests.vcan.link_events import BadDay
+from tests.vcan.links import Interface
+
+SPIRAL_S, WHOLE_SPIRAL_S, WHOLE_SETTLE_S = 1.0, 40.0, 15.0
+HEARD_TICKS = 40
+"""Ticks that candump is read along with."""
+FLOOD_ID = 0x7FE
+"""HEARTBEAT of number 30, with a wrong length: stops nobody and commands nothing. 0x000..0x01F would stop everyone."""
+FLOOD_GAP_MS = 2.0
+"""A flood at full speed overruns what a reader in Python can take; that is for real time, where it may lose frames."""
+ARMED_TICK = 150
+CHUNK_FRAMES, CHUNKS = 120, 3
+"""Played back at once; a socket holds 278 unread frames at least."""
+EVENTS = 1000 if FULL else 40
+TICKS_APART = (1, 25)
+RESUMED_TICKS = 50
+"""0.5 s."""
+MCU_ARMED = 2
+
+
+class Flown(NamedTuple):
+    """One flight on vcan0: its log, and what candump heard of its first ticks."""
+
+    log: Path
+    lines: list[str]
+    heard: list[LoggedFrame]
+
+
+def scenario_of_the_comparison() -> Scenario:
+    return short("spiral", WHOLE_SPIRAL_S, WHOLE_SETTLE_S) if FULL else short("spiral", SPIRAL_S)
+
+
+@pytest.fixture(scope="module")
+def on_virtual(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    with bench_on("virtual:reference", scenario_of_the_comparison()) as bench:
+        return record(bench, tmp_path_factory.mktemp("virtual"))
+
+
+@pytest.fixture(scope="module")
+def on_vcan(vcan0: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
+    folder = tmp_path_factory.mktemp("vcan")
+    frames: list[LoggedFrame] = []
+    with bench_on(f"socketcan:{vcan0}", scenario_of_the_comparison()) as bench, candump(vcan0) as listener:
+
+        def listen(
+            received: Sequence[BusFrame], to_bus: Sequence[BusFrame], inputs: Inputs, outputs: Outputs
+        ) -> None:
+            if outputs.tick <= HEARD_TICKS:
+                frames.extend(listener.take(len(received) + len(to_bus)))
+                if outputs.tick == HEARD_TICKS:
+                    listener.close()
+
+        yield Flown(folder / "can.log", record(bench, folder, [listen]), frames)
+
+
+def test_spiral_over_socketcan_is_the_spiral_over_virtual_byte_for_byte(
+    on_virtual: list[str], on_vcan: Flown
+) -> None:
+    assert len(sent(on_vcan.lines)) >= 3 * 100 * SPIRAL_S
+    assert sent(on_vcan.lines) == sent(on_virtual)
+    assert on_vcan.lines == on_virtual
+
+
+def test_candump_hears_every_frame_of_the_flight_in_the_order_of_the_log(on_vcan: Flown) -> None:
+    logged = [frame_of(line) for line in on_vcan.lines[: len(on_vcan.heard)]]
+    assert len(logged) >= 5 * HEARD_TICKS
+    assert [Frame(frame.identifier, frame.data) for frame in on_vcan.heard] == logged
+
+
+def test_log_of_a_flight_played_back_decodes_to_the_same_messages(
+    on_vcan: Flown, link: Interface, tmp_path: Path
+) -> None:
+    codec = Codec.load()
+    starts = range(0, len(on_vcan.lines) - CHUNK_FRAMES, (len(on_vcan.lines) - CHUNK_FRAMES) // CHUNKS)
+    with open_port(f"socketcan:{link.name}") as port:
+        for start in starts:
+            lines = on_vcan.lines[start : start + CHUNK_FRAMES]
+            (tmp_path / "part.log").write_text("\n".join(lines) + "\n")
+            canplayer(tmp_path / "part.log", link.name, logged="can0")
+            played = port.receive()
+            recorded, heard = Receiver(codec), Receiver(codec)
+            messages = [recorded.accept(frame_of(line)) for line in lines]
+            assert None not in messages
+            assert [heard.accept(frame) for frame in played] == messages
+
+
+def test_flight_beside_a_stranger_s_frames_sends_what_it_sends_alone(link: Interface, tmp_path: Path) -> None:
+    scenario = short("hover", 1.0, settle_s=1.0)
+    with bench_on("virtual:alone", scenario) as bench:
+        alone = sent(record(bench, tmp_path / "alone"))
+    with ExitStack() as stack:
+        bench = stack.enter_context(bench_on(f"socketcan:{link.name}", scenario))
+
+        def flood(received: Sequence[BusFrame], to_bus: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+            if outputs.tick == ARMED_TICK:  # before, so many bad frames are a reason not to arm
+                assert outputs.records[0].state in ARMED
+                stack.enter_context(cangen_flood(link.name, FLOOD_ID, FLOOD_GAP_MS))
+
+        beside = sent(record(bench, tmp_path / "beside", [flood]))
+        assert bench.firmware.collector.dropped["length"] >= 20
+        assert bench.nodes.receiver.dropped["length"] >= 20
+    assert beside == alone
+
+
+def test_foreign_sync_is_seen_and_an_estop_stops_the_thrusters(link: Interface) -> None:
+    events: list[str] = []
+    armed: list[bool] = []
+    turning: list[bool] = []
+    with bench_on(f"socketcan:{link.name}", short("hover", 1.0)) as bench:
+
+        def watch(received: Sequence[BusFrame], to_bus: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+            if outputs.tick == 200:
+                cansend(link.name, 0x020, (12345).to_bytes(4, "little"))
+            if outputs.tick == 250:
+                cansend(link.name, 0x01E, b"")
+            events.extend(event.text for event in outputs.events)
+            armed.append(outputs.records[0].state in ARMED)
+            turning.append(bool(np.any(outputs.modules[0].thrusters)))
+
+        bench.fly([watch])
+        assert bench.firmware.collector.faults["foreign_sync"] == 1
+        assert bench.nodes.mcus[1].stopped
+    assert any("SYNC" in text for text in events), events
+    assert all(armed[201:249])
+    assert not any(armed[252:])
+    assert not any(turning[252:])
+
+
+def test_flight_goes_on_through_random_link_events(link: Interface) -> None:
+    day = BadDay(link, seed=0)
+    scenario = short("hover", duration_s=EVENTS * (sum(TICKS_APART) / 2 + 1) / 100 + 1.0)
+    resumed: list[int] = []
+    errors: list[float] = []
+    with bench_on(f"socketcan:{link.name}", scenario) as bench:
+        countdown = 200 + day.random.randint(*TICKS_APART)
+        place = day.random.randint(0, 1)
+        waiting = 0
+
+        def strike_when_due(here: int) -> None:
+            nonlocal countdown, place, waiting
+            if here != place or countdown > 0 or (sum(day.counts.values()) >= EVENTS and day.state == "up"):
+                return
+            was_up = day.state == "up"
+            if day.strike() == "up" and not was_up:
+                waiting = 0
+            countdown, place = day.random.randint(*TICKS_APART), day.random.randint(0, 1)
+
+        def watch(received: Sequence[BusFrame], to_bus: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+            nonlocal countdown, waiting
+            module = inputs.modules[0]
+            flying = module.answered and module.mcu_state == MCU_ARMED and outputs.records[0].state in ARMED
+            if outputs.tick > 200:
+                waiting = 0 if flying or day.state != "up" else waiting + 1
+                resumed.append(waiting)
+                errors.append(float(np.linalg.norm(bench.nodes.world.truth(0).p_wm - scenario.task.centre_m)))
+            strike_when_due(1)
+            countdown -= 1
+
+        between(bench, lambda: strike_when_due(0))
+        bench.fly([watch])
+        assert sum(day.counts.values()) >= EVENTS
+        assert day.state == "up"
+    print(f"{dict(day.counts)}: resumed within {max(resumed)} ticks, off by {1e3 * max(errors):.0f} mm at most")
+    assert max(resumed) <= RESUMED_TICKS
+    assert resumed[-1] == 0

@@ -1,0 +1,6 @@
+"""One thread in linear algebra, set before numpy is loaded: the matrices are small, two processes share two cores."""
+
+import os
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")

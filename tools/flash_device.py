@@ -1,0 +1,363 @@
+#!/usr/bin/env python3
+"""Runs on the vehicle, shipped there by flash.py: installs releases, switches between them, rolls back.
+
+Layout of the root folder (say /opt/modcube):
+
+    wheels/            every wheel ever shipped and still used, checked by SHA-256
+    releases/ID/       one release: its own environment, `bin/modcube`, `release.json`; ID.partial while it is made
+    current, previous  links to releases; the service starts `current/bin/modcube`
+    trial.json         while a new release has not proved itself: what to go back to, and who is watching
+
+Whatever is interrupted, and wherever: before the switch `current` is untouched; from the switch on, a release that is
+on trial without its watcher is taken back by `boot`, which the service runs before every start. Standard library alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from flash_files import RefusedError, file_digest, remove, run, sync_folder, unpack, watcher, watches, write_whole
+
+SERVICE = "modcube.service"
+UNIT_FOLDER = Path("/etc/systemd/system")
+HEALTHY_S = 5.0
+"""How long a new release must run well."""
+HEALTH_LIMIT_S = 60.0
+"""Longest wait for that."""
+POLL_S = 0.5
+KEPT_RELEASES = 3
+STATUS_FIELDS = ("ActiveState", "SubState", "MainPID", "NRestarts", "StatusText")
+
+
+class Device:
+    """One vehicle's root folder.
+
+    Args:
+        root: the folder.
+        run: runs a command, returns its output; raises RefusedError when it fails.
+        sleep: waits so many seconds.
+        step: told the name of every step before it is done (tests pull the plug there).
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        run: Callable[[Sequence[str]], str],
+        sleep: Callable[[float], None] = time.sleep,
+        step: Callable[[str], None] = lambda name: None,
+    ) -> None:
+        self.root = root
+        self.releases, self.wheels = root / "releases", root / "wheels"
+        self.current, self.previous, self.trial = root / "current", root / "previous", root / "trial.json"
+        self._run, self._sleep, self._step = run, sleep, step
+
+    def missing_wheels(self, wheels: dict[str, str]) -> list[str]:
+        """Those of `wheels` (name -> SHA-256) that have to be shipped. What is there and wrong is removed."""
+        self._step("folders")
+        for folder in (self.releases, self.wheels):
+            folder.mkdir(parents=True, exist_ok=True)
+        missing = []
+        for name, digest in wheels.items():
+            path = self.wheels / name
+            if not path.is_file() or file_digest(path) != digest:
+                path.unlink(missing_ok=True)
+                missing.append(name)
+        return missing
+
+    def install(self, release: str, wheels: dict[str, str], facts: dict[str, str]) -> None:
+        """Makes releases/`release` of wheels that are there; nothing to do when it exists. Raises RefusedError."""
+        target = self.releases / release
+        if (target / "release.json").is_file():
+            return
+        if wrong := [name for name, digest in wheels.items() if file_digest(self.wheels / name) != digest]:
+            raise RefusedError(f"{wrong[0]} did not arrive whole")
+        partial = self.releases / f"{release}.partial"
+        self._step("clear")
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(target, ignore_errors=True)
+        packages = self._make_environment(partial)
+        for name in wheels:
+            self._step(f"unpack {name}")
+            unpack(self.wheels / name, packages)
+        self._step("check")
+        self._run([str(partial / "bin" / "modcube"), "doctor", "--warm"])
+        (partial / "release.json").write_text(json.dumps({"release": release, "wheels": wheels, **facts}, indent=1))
+        self._step("sync")
+        os.sync()
+        self._step("name")
+        partial.rename(target)
+        sync_folder(self.releases)
+
+    def _make_environment(self, partial: Path) -> Path:
+        """A virtual environment without pip, and the command; returns where packages go."""
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        packages = partial / "lib" / f"python{version}" / "site-packages"
+        packages.mkdir(parents=True)
+        (partial / "bin").mkdir()
+        interpreter = Path(sys.executable).resolve()
+        (partial / "bin" / "python").symlink_to(interpreter)
+        (partial / "pyvenv.cfg").write_text(f"home = {interpreter.parent}\nversion = {sys.version.split()[0]}\n")
+        command = partial / "bin" / "modcube"
+        # The release is renamed when it is whole, so nothing in it may know its own path.
+        command.write_text(
+            '#!/bin/sh\nhere=$(dirname "$(readlink -f "$0")")\n'
+            'export NUMBA_CACHE_DIR="${NUMBA_CACHE_DIR:-$here/../cache}"\n'
+            'exec "$here/python" -c "import sys; from firmware_py.cli import main; sys.exit(main())" "$@"\n'
+        )
+        command.chmod(0o755)
+        return packages
+
+    def activate(self, release: str) -> None:
+        """Switches to `release`, restarts the service, waits for its health, goes back when it has none.
+
+        Raises:
+            RefusedError: it was not healthy; the old release runs again, or the service is stopped if there was none.
+        """
+        target = self.releases / release
+        if not (target / "release.json").is_file():
+            raise RefusedError(f"there is no release {release}; there are {', '.join(self.names()) or 'none'}")
+        old = self.linked(self.current)
+        if old == release and not self.trial.exists():
+            self._install_units(release)
+            self._start_and_wait(release)
+            return
+        self._step("trial")
+        write_whole(self.trial, json.dumps({"release": release, "old": old, **watcher()}))
+        try:
+            self._switch(self.current, release)
+            self._install_units(release)
+            self._start_and_wait(release)
+        except RefusedError as error:
+            raise RefusedError(f"{release}: {error}; {self._go_back(old)}") from None
+        if old is not None and old != release:
+            self._switch(self.previous, old)
+        self._step("confirm")
+        remove(self.trial)
+        self.prune()
+
+    def roll_back(self) -> str:
+        """Activates the release before this one; returns its name. Raises RefusedError."""
+        old = self.linked(self.previous)
+        if old is None:
+            raise RefusedError("there is no earlier release to go back to")
+        self.activate(old)
+        return old
+
+    def boot(self) -> str:
+        """Before the service starts: takes back a release on trial whose watcher is gone. Returns what it did."""
+        if not self.trial.is_file():
+            return ""
+        try:
+            trial = json.loads(self.trial.read_text())
+            if watches(trial):
+                return ""
+            old = trial["old"]
+        except (ValueError, KeyError):
+            remove(self.trial)  # torn while it was written: the switch had not come yet
+            return "removed a torn trial.json"
+        if old is not None and (self.releases / old / "release.json").is_file():
+            self._switch(self.current, old)
+        remove(self.trial)
+        return f"release {trial['release']} had not proved itself: back to {old}"
+
+    def status(self) -> dict[str, object]:
+        """What is installed and how the service is."""
+        return {
+            "current": self.linked(self.current),
+            "previous": self.linked(self.previous),
+            "trial": self.trial.exists(),
+            "releases": self.names(),
+            "service": self.service(),
+        }
+
+    def names(self) -> list[str]:
+        """Whole releases, oldest first."""
+        if not self.releases.is_dir():
+            return []
+        whole = [path for path in self.releases.iterdir() if (path / "release.json").is_file()]
+        return [path.name for path in sorted(whole, key=lambda path: path.stat().st_mtime) if path.suffix != ".partial"]
+
+    def linked(self, link: Path) -> str | None:
+        """The release that a link leads to; None where there is no link or no such release."""
+        if not link.is_symlink():
+            return None
+        name = Path(os.readlink(link)).name
+        return name if (self.releases / name / "release.json").is_file() else None
+
+    def service(self) -> dict[str, str]:
+        """What systemd says of the service; empty where it does not answer."""
+        try:
+            text = self._run(["systemctl", "show", SERVICE, *(f"--property={field}" for field in STATUS_FIELDS)])
+        except RefusedError:
+            return {}
+        return dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
+
+    def prune(self) -> None:
+        """Removes releases beyond KEPT_RELEASES, and wheels that none of the rest needs."""
+        self._step("prune")
+        kept = {self.linked(self.current), self.linked(self.previous), *self.names()[-KEPT_RELEASES:]}
+        for path in self.releases.iterdir():
+            if path.name not in kept:
+                shutil.rmtree(path, ignore_errors=True)
+        needed: set[str] = set()
+        for name in self.names():
+            needed |= set(json.loads((self.releases / name / "release.json").read_text())["wheels"])
+        for wheel in self.wheels.iterdir():
+            if wheel.name not in needed:
+                wheel.unlink()
+
+    def _switch(self, link: Path, release: str) -> None:
+        """Lets `link` lead to `release`, in one step that happens or does not."""
+        self._step(f"switch {link.name}")
+        fresh = link.with_name(f"{link.name}.new")
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(Path("releases") / release)
+        os.replace(fresh, link)
+        sync_folder(self.root)
+
+    def _install_units(self, release: str) -> None:
+        """The release's systemd units, where they differ from those that are installed."""
+        self._step("units")
+        found = list((self.releases / release / "lib").glob("python*/site-packages/firmware_py/deploy/*.service"))
+        changed = False
+        for unit in found:
+            text = unit.read_text()
+            for word, value in (("@ROOT@", self.root), ("@USER@", user_name()), ("@PYTHON@", sys.executable)):
+                text = text.replace(word, str(value))
+            installed = UNIT_FOLDER / unit.name
+            if installed.is_file() and installed.read_text() == text:
+                continue
+            rendered = self.root / f"{unit.name}.new"
+            write_whole(rendered, text)
+            self._run([*as_root(), "install", "-m", "644", str(rendered), str(installed)])
+            rendered.unlink()
+            changed = True
+        if changed:
+            self._run([*as_root(), "systemctl", "daemon-reload"])
+            self._run([*as_root(), "systemctl", "enable", "--quiet", *(unit.name for unit in found)])
+
+    def _start_and_wait(self, release: str) -> None:
+        """Restarts the service and waits until it has run well for HEALTHY_S. Raises RefusedError."""
+        self._step("restart")
+        with contextlib.suppress(RefusedError):  # it may not be loaded yet
+            self._run([*as_root(), "systemctl", "reset-failed", SERVICE])
+        self._run([*as_root(), "systemctl", "restart", SERVICE])
+        first: dict[str, str] = {}
+        waited = well = 0.0
+        while waited < HEALTH_LIMIT_S:
+            self._step("health")
+            now = self.service()
+            if now.get("ActiveState") == "failed":
+                raise RefusedError("the service failed")
+            if first and (now.get("NRestarts"), now.get("MainPID")) != (first.get("NRestarts"), first.get("MainPID")):
+                raise RefusedError("the service ended and was started again")
+            if now.get("ActiveState") == "active" and ticks(now) is not None:
+                moves = first and ticks(now) != ticks(first)
+                first = first or now
+                well = well + POLL_S if moves else well
+                if well >= HEALTHY_S:
+                    return
+            self._sleep(POLL_S)
+            waited += POLL_S
+        raise RefusedError(f"no health report within {HEALTH_LIMIT_S:.0f} s")
+
+    def _go_back(self, old: str | None) -> str:
+        """After a release that was not healthy; returns what became of the service."""
+        if old is None:
+            with contextlib.suppress(RefusedError):
+                self._run([*as_root(), "systemctl", "stop", SERVICE])
+            remove(self.current)
+            remove(self.trial)
+            return "there was no earlier release; the service is stopped"
+        self._switch(self.current, old)
+        self._install_units(old)
+        try:
+            self._start_and_wait(old)
+        except RefusedError as error:
+            remove(self.trial)
+            return f"rolled back to {old}, which is not healthy either: {error}"
+        remove(self.trial)
+        return f"rolled back to {old}, which runs"
+
+
+def ticks(status: dict[str, str]) -> int | None:
+    """The tick that the service reported last; None before its first report."""
+    words = dict(word.split("=", 1) for word in status.get("StatusText", "").split() if "=" in word)
+    return int(words["tick"]) if words.get("tick", "").isdigit() else None
+
+
+def user_name() -> str:
+    """Whose files the releases are, and who runs the service."""
+    import pwd
+
+    return pwd.getpwuid(os.getuid()).pw_name
+
+
+def as_root() -> list[str]:
+    """What goes before a command that only root may run."""
+    return [] if os.geteuid() == 0 else ["sudo", "-n"]
+
+
+def main(words: Sequence[str]) -> int:
+    """flash_device.py ROOT COMMAND, with the command's JSON on standard input where it takes any.
+
+    Prints one line of JSON: {"error": line} or the command's result. Exit status 0 or 1.
+    """
+    # A lost connection must not end what it began.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    device, command = Device(Path(words[0]), run), words[1]
+    given = json.loads(sys.stdin.read() or "{}") if command in ("missing", "install", "activate") else {}
+    device.root.mkdir(parents=True, exist_ok=True)
+    try:
+        with alone(device.root, command):
+            answer = {"result": perform(device, command, given)}
+    except (RefusedError, OSError) as error:
+        answer = {"error": str(error)}
+    if command in ("activate", "rollback"):
+        write_whole(device.root / "last.json", json.dumps(answer))
+    with contextlib.suppress(BrokenPipeError):
+        print(json.dumps(answer), flush=True)
+    return 1 if "error" in answer else 0
+
+
+def perform(device: Device, command: str, given: dict[str, Any]) -> object:
+    """One command. Raises RefusedError."""
+    if command == "missing":
+        return device.missing_wheels(given["wheels"])
+    if command == "install":
+        device.install(given["release"], given["wheels"], given["facts"])
+        return None
+    if command == "activate":
+        device.activate(given["release"])
+        return None
+    if command == "rollback":
+        return device.roll_back()
+    return device.boot() if command == "boot" else device.status()
+
+
+@contextlib.contextmanager
+def alone(root: Path, command: str) -> Iterator[None]:
+    """Two flashes at once are refused; the service's start and a look at the status never wait."""
+    if command in ("boot", "status"):
+        yield
+        return
+    with (root / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise RefusedError("somebody else is flashing this vehicle") from None
+        yield
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,142 @@
+"""One vehicle over OpenSSH: runs commands there, streams files, says in one line what is wrong."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import tarfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from shlex import quote
+from typing import IO, Any, cast
+
+CONNECT_TIMEOUT_S = 10
+OPTIONS = (
+    "BatchMode=yes", f"ConnectTimeout={CONNECT_TIMEOUT_S}", "ServerAliveInterval=5", "ServerAliveCountMax=4",
+)  # fmt: skip
+DEVICE_FILES = ("flash_device.py", "flash_files.py")
+LOST = 255
+"""ssh's own exit status."""
+REASONS = (
+    ("Could not resolve hostname", "there is no host of this name"),
+    ("Permission denied", "it accepts none of your keys: try `ssh-copy-id {host}`"),
+    ("REMOTE HOST IDENTIFICATION HAS CHANGED", "its host key has changed: if you know why, `ssh-keygen -R` it"),
+    ("Host key verification failed", "its host key is unknown: connect once with `ssh {host}`"),
+    ("Connection refused", "nothing listens for ssh there"),
+    ("timed out", "it does not answer"),
+    ("No route to host", "it cannot be reached from here"),
+    ("Network is unreachable", "it cannot be reached from here"),
+)
+
+
+class VehicleError(Exception):
+    """The vehicle cannot be reached, or refused; one line."""
+
+
+class LostError(VehicleError):
+    """The connection went while a command ran: what it began may go on."""
+
+
+class Vehicle:
+    """USER@HOST.
+
+    Args:
+        host: as ssh takes it.
+        options: further words for ssh, such as -p PORT.
+        root: the folder for releases there.
+    """
+
+    def __init__(self, host: str, options: Sequence[str], root: str) -> None:
+        self.host = host
+        self.root = root
+        self.python = "python3"
+        self._ssh = ["ssh", *(word for option in OPTIONS for word in ("-o", option)), *options, host]
+
+    def shell(self, script: str, data: bytes = b"") -> str:
+        """The output of a shell command there. Raises VehicleError."""
+        try:
+            done = subprocess.run([*self._ssh, script], input=data, capture_output=True, check=False)
+        except OSError as error:
+            raise VehicleError(f"ssh: {error.strerror}") from None
+        output = done.stdout.decode(errors="replace")
+        if done.returncode:
+            raise self._error(done.returncode, done.stderr.decode(errors="replace"), output)
+        return output
+
+    def send(self, paths: Sequence[Path], folder: str, progress: Callable[[int], None]) -> None:
+        """Streams files into a folder there, as one tar; `progress` is told bytes. Raises VehicleError."""
+        command = [*self._ssh, f"mkdir -p {quote(folder)} && tar -x -C {quote(folder)}"]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as ssh:
+            assert ssh.stdin is not None and ssh.stderr is not None
+            try:
+                with tarfile.open(fileobj=cast(IO[bytes], _Counted(ssh.stdin, progress)), mode="w|") as archive:
+                    for path in paths:
+                        archive.add(path, path.name, filter=_anonymous)
+                ssh.stdin.close()
+            except BrokenPipeError:
+                pass
+            text = ssh.stderr.read().decode(errors="replace")
+            ssh.stdin = None  # closed, or broken: not to be flushed again
+        if ssh.returncode:
+            raise self._error(ssh.returncode, text, "")
+
+    def install_tools(self, paths: Sequence[Path]) -> None:
+        """The device's own scripts, switched to as one: the service needs them to start. Raises VehicleError."""
+        digest = hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()[:8]
+        folder, link = f"tools/{digest}", quote(f"{self.root}/flash")
+        self.send(paths, f"{self.root}/{folder}", lambda size: None)
+        self.shell(f"sync; rm -f {link}.new; ln -s {folder} {link}.new && mv -T {link}.new {link}")
+
+    def device(self, command: str, given: Mapping[str, Any] | None = None) -> Any:
+        """Runs a command of flash_device.py there; returns its result. Raises VehicleError."""
+        words = [self.python, f"{self.root}/flash/flash_device.py", self.root, command]
+        script = " ".join(quote(word) for word in words)
+        try:
+            text = self.shell(script, json.dumps(given or {}).encode())
+        except LostError:
+            raise
+        except VehicleError as error:
+            raise VehicleError(_device_error(str(error))) from None
+        try:
+            return json.loads(text.splitlines()[-1])["result"]
+        except (ValueError, KeyError, IndexError):
+            raise VehicleError(f"{self.host}: unexpected answer to {command}") from None
+
+    def _error(self, status: int, stderr: str, stdout: str) -> VehicleError:
+        if status == LOST:
+            for sign, reason in REASONS:
+                if sign in stderr:
+                    return VehicleError(f"{self.host}: {reason.format(host=self.host)}")
+            last = stderr.strip().splitlines()
+            return LostError(f"{self.host}: connection lost{': ' + last[-1] if last else ''}")
+        said = (stdout.strip() or stderr.strip()).splitlines()
+        return VehicleError(said[-1] if said else f"{self.host}: a command ended with {status}")
+
+
+def _device_error(text: str) -> str:
+    """The line in flash_device.py's own answer, or the text as it is."""
+    try:
+        return str(json.loads(text)["error"])
+    except (ValueError, KeyError, TypeError):
+        return text
+
+
+def _anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:
+    entry.uid = entry.gid = 0
+    entry.uname = entry.gname = ""
+    entry.mode = 0o644
+    return entry
+
+
+class _Counted:
+    """What tarfile writes to: counts bytes on their way."""
+
+    def __init__(self, sink: IO[bytes], progress: Callable[[int], None]) -> None:
+        self._sink, self._progress = sink, progress
+
+    def write(self, data: bytes) -> int:
+        """All of it."""
+        self._sink.write(data)
+        self._progress(len(data))
+        return len(data)

@@ -1,0 +1,278 @@
+"""Mutation tests of what must be trusted: changes one thing at a time in limiter, supervisor, tables and fail-safes, and runs their tests.
+
+    python tools/mutants.py [MODULE ...] [--jobs N] [--list]
+
+Prints killed and survived per module, names each survivor with its line, and exits 1 when there is one. A mutant lives in a forked process
+alone: no file is touched. Everything heavy is imported before the fork.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+TIMEOUT_S = 60
+"""A mutant that runs longer is killed."""
+SUPERVISOR_TESTS = ("tests/unit/test_supervisor.py", "tests/unit/test_arming.py", "tests/unit/test_failsafes.py")
+TARGETS: dict[str, tuple[str, ...]] = {
+    "firmware_py.core.transitions": SUPERVISOR_TESTS[:1],
+    "firmware_py.core.supervisor": SUPERVISOR_TESTS[:1],
+    "firmware_py.core.arming": SUPERVISOR_TESTS[1:2],
+    "firmware_py.core.failsafes": SUPERVISOR_TESTS[2:],
+    "firmware_py.core.limiter": ("tests/unit/test_limiter.py",),
+}
+"""The tests of each module, those that must kill its mutants."""
+HEAVY = (
+    "numba", "numpy", "pytest", "scipy.spatial.transform", "firmware_py.core.drag_lookup", "firmware_py.core.rotations",
+    "firmware_py.core.thruster", "firmware_py.core.missing_thrust", "firmware_py.core.body", "firmware_py.prepare.assembly",
+)  # fmt: skip
+"""Imported before the fork. None of them imports a target."""
+
+COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
+    ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,),
+}  # fmt: skip
+OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.BitOr: ast.BitAnd,
+    ast.BitAnd: ast.BitOr,
+}  # fmt: skip
+CELLS = {"G": "ALWAYS", "F": "NOTHING", "Need": "DEPTH"}
+"""Short names of the tables: a cell is replaced by this member, so that no row's guard or effect can be lost unseen."""
+STATES = {"D": "A", "A": "E", "E": "D"}
+
+
+class Mutant(NamedTuple):
+    """One change."""
+
+    line: int
+    what: str
+    tree: ast.Module
+
+
+def mutants(source: str) -> Iterator[Mutant]:
+    """All mutants of a module's text, in the order of its lines."""
+    tree = ast.parse(source)
+    skipped = {id(node) for node in _annotations(tree)}
+    count = sum(1 for _ in ast.walk(tree))
+    for index in range(count):
+        node = _at(tree, index)
+        if id(node) in skipped:
+            continue
+        for change in range(len(_changes(node))):
+            other = copy.deepcopy(tree)
+            target = _at(other, index)
+            what = _changes(target)[change]
+            before = ast.unparse(node)
+            what[1]()
+            yield Mutant(getattr(node, "lineno", 0), f"{what[0]}: {before.splitlines()[0][:70]}", ast.fix_missing_locations(other))
+
+
+def _at(tree: ast.Module, index: int) -> ast.AST:
+    for number, node in enumerate(ast.walk(tree)):
+        if number == index:
+            return node
+    raise IndexError(index)
+
+
+def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
+    """Nodes whose change means nothing at run time: annotations and text alone on a line."""
+    for node in ast.walk(tree):
+        roots: list[ast.AST | None] = []
+        if isinstance(node, ast.AnnAssign):
+            roots.append(node.annotation)
+        elif isinstance(node, ast.arg):
+            roots.append(node.annotation)
+        elif isinstance(node, ast.FunctionDef):
+            roots.append(node.returns)
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            roots.append(node)
+        for root in roots:
+            if root is not None:
+                yield from ast.walk(root)
+
+
+Change = tuple[str, "object"]
+
+
+def _changes(node: ast.AST) -> list[tuple[str, object]]:
+    """What can be changed at a node: a name, and the function that changes it in place."""
+    found: list[tuple[str, object]] = []
+    if isinstance(node, ast.Compare):
+        for i, op in enumerate(node.ops):
+            for new in COMPARISONS[type(op)]:
+                found.append((f"{type(op).__name__} -> {new.__name__}", lambda i=i, new=new: node.ops.__setitem__(i, new())))
+    elif isinstance(node, ast.BoolOp):
+        new_op = ast.Or if isinstance(node.op, ast.And) else ast.And
+        found.append((f"-> {new_op.__name__}", lambda: setattr(node, "op", new_op())))
+    elif isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
+        op_type = OPERATORS[type(node.op)]
+        found.append((f"-> {op_type.__name__}", lambda: setattr(node, "op", op_type())))
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.USub | ast.Invert):
+        found.append(("sign or not gone", lambda: _become(node, node.operand)))
+    elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
+        found.append(("flipped", lambda: setattr(node, "value", not node.value)))
+    elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+        found.append(("one more", lambda: setattr(node, "value", node.value + 1)))  # type: ignore[operator]
+    elif isinstance(node, ast.If | ast.IfExp):
+        found.append(("condition turned", lambda: setattr(node, "test", ast.UnaryOp(ast.Not(), node.test))))
+    elif isinstance(node, ast.Tuple | ast.List) and len(node.elts) > 1 and all(isinstance(e, ast.Call) for e in node.elts):
+        for i in range(len(node.elts)):
+            found.append((f"row {i + 1} gone", lambda i=i: node.elts.__delitem__(i)))
+    elif isinstance(node, ast.Call):
+        found += _cells(node)
+    elif isinstance(node, ast.FunctionDef):
+        found += _statements(node)
+    return found
+
+
+def _cells(call: ast.Call) -> list[tuple[str, object]]:
+    """Cells of a table's row."""
+    found: list[tuple[str, object]] = []
+    for i, cell in enumerate(call.args):
+        if isinstance(cell, ast.Attribute) and isinstance(cell.value, ast.Name) and CELLS.get(cell.value.id, cell.attr) != cell.attr:
+            found.append((f"{ast.unparse(cell)} -> {CELLS[cell.value.id]}", lambda c=cell: setattr(c, "attr", CELLS[c.value.id])))
+        elif isinstance(cell, ast.Name) and cell.id in STATES and isinstance(call.func, ast.Name) and call.func.id == "Transition":
+            found.append((f"{cell.id} -> {STATES[cell.id]}", lambda c=cell: setattr(c, "id", STATES[c.id])))
+        del i
+    return found
+
+
+def _statements(function: ast.FunctionDef) -> list[tuple[str, object]]:
+    """Statements that do something and can be left out."""
+    found: list[tuple[str, object]] = []
+    for holder in ast.walk(function):
+        for name in ("body", "orelse"):
+            block = getattr(holder, name, None)
+            if not isinstance(block, list):
+                continue
+            for i, statement in enumerate(block):
+                if _acts(statement):
+                    words = f"line {statement.lineno} left out: {ast.unparse(statement)[:50]}"
+                    found.append((words, lambda block=block, i=i: block.__setitem__(i, ast.Pass())))
+    return found
+
+
+def _acts(statement: ast.AST) -> bool:
+    if isinstance(statement, ast.Expr):
+        return not isinstance(statement.value, ast.Constant)
+    if isinstance(statement, ast.Assign):
+        return any(isinstance(t, ast.Attribute | ast.Subscript) for t in statement.targets)
+    return isinstance(statement, ast.AugAssign)
+
+
+def _become(node: ast.AST, other: ast.AST) -> None:
+    """Turns `node` into a copy of `other`, in place."""
+    node.__class__ = other.__class__
+    node.__dict__.clear()
+    node.__dict__.update(other.__dict__)
+
+
+# ---------------------------------------------------------------- running one
+
+
+class Loader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Serves the mutant in place of its module."""
+
+    def __init__(self, name: str, code: CodeType) -> None:
+        self._name, self._code = name, code
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """The mutant's spec, or None for every other module."""
+        return importlib.util.spec_from_loader(fullname, self) if fullname == self._name else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Runs the mutant."""
+        exec(self._code, module.__dict__)
+
+
+def start(name: str, mutant: Mutant | None) -> int:
+    """Forks a process that runs the tests of module `name` on a mutant; its exit status is pytest's. Returns its id."""
+    process = os.fork()
+    if process:
+        return process
+    sink = os.open(os.devnull, os.O_WRONLY)
+    if mutant is not None:
+        os.dup2(sink, 1)
+        os.dup2(sink, 2)
+    signal.alarm(TIMEOUT_S)
+    status = 99
+    try:
+        import pytest
+
+        if mutant is not None:
+            sys.meta_path.insert(0, Loader(name, compile(mutant.tree, name, "exec")))
+        status = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *TARGETS[name]]))
+    except BaseException as error:  # whatever a mutant does, it ends here
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+    finally:
+        sys.stdout.flush()
+        os._exit(status)
+
+
+def run(name: str, todo: list[Mutant], jobs: int) -> list[Mutant]:
+    """The mutants that survive."""
+    waiting, running, survivors = list(reversed(todo)), dict[int, Mutant](), list[Mutant]()
+    while waiting or running:
+        while waiting and len(running) < jobs:
+            mutant = waiting.pop()
+            running[start(name, mutant)] = mutant
+        process, status = os.wait()
+        mutant = running.pop(process)
+        if os.waitstatus_to_exitcode(status) == 0:
+            survivors.append(mutant)
+            print(f"  SURVIVED {name}:{mutant.line}: {mutant.what}", flush=True)
+    return survivors
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs all mutants of the modules asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("module", nargs="*", help="last part of a module's name; all when none is given")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--list", action="store_true", help="only say what would be tried")
+    options = parser.parse_args(arguments)
+    os.chdir(ROOT)
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    sys.path.insert(0, str(ROOT))
+    for heavy in HEAVY:
+        importlib.import_module(heavy)
+    names = [name for name in TARGETS if not options.module or name.rpartition(".")[2] in options.module]
+    loaded = [name for name in TARGETS if name in sys.modules]
+    if loaded:
+        print(f"cannot mutate what is loaded already: {', '.join(loaded)}", file=sys.stderr)
+        return 2
+    total = alive = 0
+    for name in names:
+        todo = list(mutants((ROOT / (name.replace(".", "/") + ".py")).read_text()))
+        if options.list:
+            print("\n".join(f"{name}:{m.line}: {m.what}" for m in todo))
+            continue
+        began = time.monotonic()
+        _, status = os.waitpid(start(name, None), 0)
+        if os.waitstatus_to_exitcode(status) != 0:
+            print(f"{name}: its tests fail without any mutant", file=sys.stderr)
+            return 2
+        survivors = run(name, todo, options.jobs)
+        total, alive = total + len(todo), alive + len(survivors)
+        print(f"{name}: {len(todo) - len(survivors)} killed, {len(survivors)} survived, {time.monotonic() - began:.0f} s", flush=True)
+    print(f"mutants: {total - alive} killed, {alive} survived")
+    return 1 if alive else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

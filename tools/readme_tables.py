@@ -1,0 +1,86 @@
+"""Writes README.md's tables between their markers, out of accept.json and bench.json: no figure is typed by hand.
+
+A marker names a table: `<!-- table: accept -->` (all groups), `<!-- table: accept hover spiral -->` (those groups),
+`<!-- table: bench -->`, or `<!-- table: bench WORD -->` (names with WORD in them). Each ends at `<!-- end -->`. Only
+what was measured is written; a table whose file is missing stays as it is.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+README = Path("README.md")
+SOURCES = {"accept": Path("accept.json"), "bench": Path("bench.json")}
+MARKER = re.compile(r"(<!-- table: (?P<kind>\w+)(?P<words>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+Entries = Sequence[dict[str, Any]]
+
+
+def number(value: float | None) -> str:
+    """Three figures that mean something: `3.53`, `26.4`, `0.0411`."""
+    if value is None:
+        return ""
+    return f"{value:.0f}" if abs(value) >= 100 or float(value).is_integer() else f"{value:.3g}"
+
+
+def rows(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *body]
+    return "".join(f"| {' | '.join(cell.replace('|', ',') for cell in line)} |\n" for line in lines)
+
+
+def accept_table(entries: Entries, groups: Sequence[str]) -> str:
+    """The figures of these groups, or of all, with limit, verdict and the command that measures them."""
+    body = [
+        (
+            e["name"], f"{number(e['value'])} {e['unit']}".strip(), f"{e['limit']} {e['unit']}".strip(),
+            "passed" if e["passed"] else "**failed**", f"`{e['command']}`",
+        )
+        for e in entries if not groups or e["group"] in groups
+    ]  # fmt: skip
+    return rows(("figure", "measured", "limit", "", "command"), body)
+
+
+def bench_table(entries: Entries, words: Sequence[str]) -> str:
+    """What `make bench` measured, beside its peers."""
+    body = [
+        (
+            e["name"], f"{number(e['value'])} {e['unit']}", e["peer"] or "",
+            f"{number(e['peer_value'])} {e['unit']}" if e["peer_value"] is not None else "", number(e["ratio"]),
+        )
+        for e in entries if not words or any(word in e["name"] for word in words)
+    ]  # fmt: skip
+    return rows(("what", "measured", "beside", "its figure", "times better"), body)
+
+
+TABLES = {"accept": accept_table, "bench": bench_table}
+
+
+def filled(text: str, sources: dict[str, Entries]) -> str:
+    """`text` with every table written anew whose source is there. Raises KeyError for a table of no known kind."""
+
+    def table(match: re.Match[str]) -> str:
+        make = TABLES[match["kind"]]
+        if match["kind"] not in sources:
+            return match[0]
+        return match[1] + make(sources[match["kind"]], match["words"].split()) + match[4]
+
+    return MARKER.sub(table, text)
+
+
+def main() -> int:
+    """Writes README.md; says what is missing."""
+    sources = {kind: json.loads(path.read_text(encoding="utf-8")) for kind, path in SOURCES.items() if path.exists()}
+    for kind in set(SOURCES) - set(sources):
+        print(f"readme: no {SOURCES[kind]}; its tables stay as they are (make {kind})", file=sys.stderr)
+    README.write_text(filled(README.read_text(encoding="utf-8"), sources), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
