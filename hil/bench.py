@@ -59,6 +59,8 @@ class Bench:
             if truth is not None:
                 truth.record_world(tick, self.nodes.world)
             outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), answers)
+            if self.script.is_over(time_ns):
+                break
             if progress is not None and tick % self.fleet.rate_hz == 0:
                 progress(time_ns * 1e-9)
         return time.perf_counter() - began

@@ -18,8 +18,8 @@ ARM_FROM_S = 1.0
 ARM_EVERY_S = 0.5
 SPEED_M_S = 0.05
 """Mean speed at which a body goes to the start of a path."""
-RETRIES = 3
-"""A dock that the firmware gave up is asked for so often again."""
+AFTERWARDS_NS = 3_000_000_000
+"""The run goes on so long after the last step: what was joined or parted must stay so."""
 
 
 class DockScript:
@@ -32,6 +32,7 @@ class DockScript:
         self._steps = list(scenario.step)
         self._running: list[_Running] = []
         self._armed: set[int] = set()
+        self._over_ns: int | None = None
         self.begin_ns = round(scenario.task.settle_s * 1e9)
         self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
         self.ticks = self.end_ns // fleet.period_ns
@@ -49,7 +50,13 @@ class DockScript:
                 asked += self._begin(self._steps.pop(0), time_ns, last)
                 if not self._steps or not self._steps[0].also:
                     break
+        if not self._running and not self._steps and self._over_ns is None:
+            self._over_ns = time_ns
         return asked
+
+    def is_over(self, time_ns: int) -> bool:
+        """Whether every step is over, and has been for a while."""
+        return self._over_ns is not None and time_ns >= self._over_ns + AFTERWARDS_NS
 
     def _arm(self, time_ns: int, last: Outputs) -> list[Request]:
         """Arms every body once; then each holds where it is."""

@@ -13,6 +13,8 @@ from hil.checks import UNBOUNDED, limit_text
 from hil.signals import Flight
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+WARNING = 4
+"""syslog severity."""
 PAPER_SPIRAL_RMSE_MM = 20.92
 """Position RMSE of the paper's robot on its spiral in a real tank (RS-ModCubes)."""
 
@@ -43,6 +45,7 @@ SHOWN = {
     "jams": Shown("Jams", digits=0),
     "outcome": Shown("Outcome (0 docked, 1 jammed, 2 unstable, 3 refused, 4 gave up)", digits=0),
     "false_declarations": Shown("Ticks in which a dock was believed that was none", digits=0),
+    "warnings": Shown("Warnings of the firmware, whole flight", digits=0),
     "duration_s": Shown("Duration of the judged part", "s"),
     "real_time_factor": Shown("Faster than real time by", "times", digits=1),
     "ticks": Shown("Ticks judged", digits=0),
@@ -142,12 +145,19 @@ def flight_metrics(
         "sigma3_share": float(inside.mean(axis=0).min()),
         "thrust_rms_n": float(np.sqrt(np.nanmean(np.square(firmware["commanded_n"])))),
         "tags_rejected": float(firmware["rejected"][-1] - firmware["rejected"][0]),
+        "warnings": float(warnings(flight.events["severity"], flight.events["text"])),
         "duration_s": duration_s,
         "real_time_factor": duration_s / wall_s if wall_s > 0.0 else 0.0,
         "ticks": float(len(time_s)),
         "unmatched_ticks": float(flight.unmatched),
         "deadline_misses": float(deadline_misses),
     }
+
+
+def warnings(severity: np.ndarray, text: np.ndarray) -> int:
+    """Events of syslog severity warning or worse in the whole flight. That arming waits for the first tags is none."""
+    waiting = np.char.startswith(text, "ARM refused") if text.size else np.zeros(0, bool)
+    return int(np.count_nonzero((severity <= WARNING) & ~waiting))
 
 
 def nis_mean(nis: np.ndarray, dof: np.ndarray) -> float:

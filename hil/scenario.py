@@ -76,7 +76,6 @@ class Step:
     both_approach: bool = quantity(False, help="both bodies move, as in the paper")
     position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-100, high=100, shape=(3,), help="move: where to, world")
     duration_s: float = quantity(10.0, unit="s", low=0, high=3600, help="move, moebius, wait: how long")
-    magnets: bool = quantity(False, help="move: `face` and `target_face` are energised on the way")
     also: bool = quantity(False, help="begins together with the step before")
 
 

@@ -51,6 +51,10 @@ class Script:
         every = round(ARM_EVERY_S * self._fleet.rate_hz)
         return [Request(Action.ARM)] if (time_ns // self._fleet.period_ns) % every == 0 else []
 
+    def is_over(self, time_ns: int) -> bool:
+        """Whether the run may end before its time; a trajectory is flown to its end."""
+        return False
+
 
 def _hover(task: Task, q_wb: np.ndarray) -> Trajectory:
     return paths.hold(paths.at_rest(task.centre_m, q_wb), task.duration_s)

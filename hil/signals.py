@@ -226,14 +226,18 @@ def read_flight(folder: Path, body: int = 0, module: int = 0) -> Flight:
     firmware, truth = signals.get(f"/firmware/body{body}"), truths.get(f"/plant/module{module}")
     if firmware is None or truth is None:
         raise ValueError(f"{folder}: no signals of body {body} or no truth of module {module} in the logs")
+    thrusters = truth["force_n"].shape[1]
     truth = _joined(truth, truths.get(f"/plant/body{body}"), truths)
     _, mine, theirs = np.intersect1d(firmware["tick"], truth["tick"], return_indices=True)
     if not len(mine):
         raise ValueError(f"{folder}: the two logs share no tick")
     nothing: Columns = {"tick": np.zeros(0, np.int64), "severity": np.zeros(0, np.int64), "text": np.zeros(0, str)}
+    believed = {name: column[mine] for name, column in firmware.items()}
+    true = {name: column[theirs] for name, column in truth.items()}
+    _tell_of_same_body(believed, true, thrusters)
     return Flight(
-        {name: column[mine] for name, column in firmware.items()},
-        {name: column[theirs] for name, column in truth.items()},
+        believed,
+        true,
         signals.get("/events", nothing),
         signals.get("/firmware/ticks", {}),
         len(firmware["tick"]) - len(mine),
@@ -261,3 +265,12 @@ def _joined(module: Columns, body: Columns | None, truths: Mapping[str, Columns]
 def _at(columns: Columns, ticks: np.ndarray, name: str) -> np.ndarray:
     """Rows of a column at these ticks; every tick of a module's truth has all modules."""
     return columns[name][np.searchsorted(columns["tick"], ticks)]
+
+
+def _tell_of_same_body(firmware: Columns, truth: Columns, thrusters: int) -> None:
+    """Between the moment two faces lock and that in which the firmware knows, it steers the module: so is the truth told."""
+    if "member" in truth:
+        alone = np.isfinite(firmware["commanded_n"]).sum(axis=1) == thrusters
+        early = alone & (truth["member"].sum(axis=1) > 1)
+        for body, module in (("p_wb", "p_wm"), ("q_wb", "q_wm")):
+            truth[body] = np.where(early[:, None], truth[module], truth[body])

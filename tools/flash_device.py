@@ -112,7 +112,7 @@ class Device:
         command.write_text(
             '#!/bin/sh\nhere=$(dirname "$(readlink -f "$0")")\n'
             'export NUMBA_CACHE_DIR="${NUMBA_CACHE_DIR:-$here/../cache}"\n'
-            'exec "$here/python" -c "import sys; from firmware_py.cli import main; sys.exit(main())" "$@"\n'
+            'exec "$here/python" -I -c "import sys; from firmware_py.cli import main; sys.exit(main())" "$@"\n'
         )
         command.chmod(0o755)
         return packages

@@ -1,4 +1,4 @@
-"""The ground side beside the loop: links and GroundStation in a thread of their own. A tick hands over its results, no more.
+"""The ground side beside the loop: links and GroundStation in a thread of their own. A tick only hands results over.
 
 Missions are planned in a process of their own, so that planning takes nothing from the tick.
 """
@@ -115,7 +115,9 @@ class GroundSide:
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Stop the thread and close everything."""
         self._stopping = True
         if self._thread is not None:

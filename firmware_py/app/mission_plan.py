@@ -1,18 +1,19 @@
-"""From the legs of a mission to one trajectory by minimum snap, with rests where it stops. Slow: runs beside the loop."""
+"""From the legs of a mission to one trajectory by minimum snap, with rests. Slow: runs beside the loop."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.rotations import from_euler
-from firmware_py.core.setpoint import Trajectory
 from firmware_py.core.types import Setpoint
 from firmware_py.ground.mission_flight import Leg, Plan, PlanJob
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan
+from firmware_py.prepare.piecewise import Piecewise
 
 _SAME_PLACE_M, _SAME_ATTITUDE = 1e-3, 1e-6
 _ANGULAR_RATE, _ANGULAR_ACCELERATION = 0.5, 0.5
@@ -21,13 +22,17 @@ _THRUSTER_SHARE = 0.6
 """What a mission may ask of each thruster; the rest fights the current."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Consecutive:
     """Trajectories one after the other, each from rest to rest."""
 
-    parts: tuple[tuple[float, Trajectory], ...]
+    parts: tuple[tuple[float, Piecewise], ...]
     """Start, s, and trajectory; each rests at its end until the next begins."""
     duration_s: float
+
+    def describe(self) -> dict[str, Any]:
+        """What is logged of it."""
+        return {"kind": "mission", "parts": [(start, part.duration_s) for start, part in self.parts]}
 
     def sample(self, t_s: float) -> Setpoint:
         """The set-point at `t_s`; the ends are held."""
@@ -41,7 +46,7 @@ class Consecutive:
 
 def plan_mission(job: PlanJob, body: Body | None) -> Plan:
     """The plan of `job`; one that cannot be flown comes back with its reason."""
-    parts: list[tuple[float, Trajectory]] = []
+    parts: list[tuple[float, Piecewise]] = []
     arrivals: list[float] = []
     at_s, p_wb, q_wb = 0.0, job.p_wb, job.q_wb
     try:

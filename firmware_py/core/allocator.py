@@ -18,8 +18,10 @@ from firmware_py.description.parameters import Allocation
 
 MOMENT_PRIORITY = 100.0
 """How much more a lost share of the moment costs than a lost share of the force."""
-SHARE_WEIGHT = 1e4
-"""Cost of losing the whole force against one N^2 in one thruster."""
+SHARE_WEIGHT = 1e3
+"""Cost of losing the whole force against all thrusters at their limits: high enough that feasible force is not given away."""
+BEYOND = 2.0
+"""A wrench above this many times what all thrusters together could give is scaled down first, so that the problem stays well scaled."""
 EQUALITY = 5
 """daqp's mark of an equality row."""
 SOLVED = (1, 2)
@@ -36,7 +38,11 @@ class Allocator:
         self._f_min, self._f_max = body.thrusters.f_min.copy(), body.thrusters.f_max.copy()
         self._matrix = np.ascontiguousarray(body.thrusters.matrix)
         self._pinv = np.ascontiguousarray(body.thrusters.pinv)
-        self._h = np.diag(np.r_[np.full(n, 2.0), 2 * SHARE_WEIGHT, 2 * SHARE_WEIGHT * MOMENT_PRIORITY])
+        weight = SHARE_WEIGHT * float(np.sum(self._f_max**2))
+        self.weights = np.array([weight, weight * MOMENT_PRIORITY])
+        self._h = np.diag(np.r_[np.full(n, 2.0), 2 * self.weights])
+        reach = np.maximum(self._f_max, -self._f_min)
+        self._most = np.array([np.linalg.norm(self._matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
         self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
         self._preload = preload(body.thrusters, np.ones(n, dtype=bool), self._smallest_n)
         self._sense = np.array([0] * (n + 2) + [EQUALITY] * 6, dtype=c_int)
@@ -62,20 +68,23 @@ class Allocator:
     def _saturated(self, wrench: np.ndarray) -> Thrust:
         """min |f - f_preload|^2 + w_f (1 - a)^2 + w_m (1 - b)^2, J f = [a F; b M], f within limits, 0 <= a, b <= 1."""
         n = self._f_max.size
+        sizes = np.array([np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])])
+        down = np.minimum(1.0, BEYOND * self._most / np.maximum(sizes, 1e-9))
         rows = np.zeros((6, n + 2))
         rows[:, :n] = self._matrix
-        rows[:3, n] = -wrench[:3]
-        rows[3:, n + 1] = -wrench[3:]
+        rows[:3, n] = -wrench[:3] * down[0]
+        rows[3:, n + 1] = -wrench[3:] * down[1]
         upper = np.r_[self._f_max, 1.0, 1.0, np.zeros(6)]
         lower = np.r_[self._f_min, 0.0, 0.0, np.zeros(6)]
-        linear = np.r_[-2 * self._preload, -2 * SHARE_WEIGHT, -2 * SHARE_WEIGHT * MOMENT_PRIORITY]
+        linear = np.r_[-2 * self._preload, -2 * self.weights]
         x, _, flag, _ = daqp.solve(self._h, linear, rows, upper, lower, self._sense)
         if flag not in SOLVED:
             share = self._common_share(wrench)
             force = self._pinv @ wrench * share
             return Thrust(force, self._matrix @ force, (share, share))
         force = np.clip(x[:n], self._f_min, self._f_max)
-        return Thrust(force, self._matrix @ force, (float(x[n]), float(x[n + 1])))
+        kept = np.clip(x[n:], 0.0, 1.0) * down
+        return Thrust(force, self._matrix @ force, (float(kept[0]), float(kept[1])))
 
     def _common_share(self, wrench: np.ndarray) -> float:
         """Largest share of the pseudo-inverse's answer that is within limits."""

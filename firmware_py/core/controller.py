@@ -76,5 +76,7 @@ def _wrench(  # type: ignore[no-untyped-def]
     modelled = ahead if law[0] > 0.5 else nu
     tau = mass @ rate + coriolis_wrench(mass, modelled) - law[1] * drag_wrench(nodes, rotational, linear, modelled)
     tau[:3] -= law[2] * rotate_back(q, force_w)
-    tau[3:] -= law[2] * (moment_b + restoring_moment(righting, q))
+    tau[3:] -= law[2] * moment_b
+    if law[0] > 0.5:  # the paper's law takes g(eta) as zero
+        tau[3:] -= restoring_moment(righting, q)
     return tau

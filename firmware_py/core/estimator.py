@@ -75,6 +75,8 @@ class Estimator:
             tau: (6,) mean thruster wrench since the previous tick, body frame.
         """
         self._nis, self._nis_dof = math.nan, 0
+        if self._history.newest >= 0 and time_ns - self._history.newest_ns > int(WINDOW_S * 1e9):
+            self._accepted = 0  # the process stood still: what is remembered joins on to nothing
         self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
         for pose in measured.tags:
             self._take(pose)
@@ -101,7 +103,9 @@ class Estimator:
     # ------------------------------------------------------------ fusion at the anchor
 
     def _take(self, pose: BodyPose) -> None:
-        if not self._accepted:
+        if not (np.isfinite(pose.p_wt).all() and np.isfinite(pose.q_wb).all()):
+            self._rejected += 1
+        elif not self._accepted:
             self._start(pose)
         elif pose.capture_ns >= self._anchor_ns:
             self._advance(min(pose.capture_ns, self._history.newest_ns))
@@ -120,6 +124,7 @@ class Estimator:
         self._anchor_ns = pose.capture_ns
         self._last_tag_ns = pose.capture_ns
         self._accepted, self._refused_in_row = 1, 0
+        self._now = self._x
 
     def _advance(self, to_ns: int) -> None:
         """Moves the filter to `to_ns`, fusing the inertial and depth measurements on the way."""
@@ -148,7 +153,7 @@ class Estimator:
         variance = self._tag_variance / pose.count
         residual, h, noise = observation.tag(self._x, pose.p_wt, pose.lever_b, pose.q_wb, variance)
         nis = observation.normalised_square(residual, h, noise, self._covariance)
-        if nis > self._p.tag_gate**2:
+        if not nis <= self._p.tag_gate**2:  # also when it is NaN
             self._refuse(pose)
             return
         self._correct(residual, noise, h)

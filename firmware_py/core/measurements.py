@@ -42,7 +42,7 @@ class Measurements:
         mine = [modules[i] for i in self._modules]
         gyro = self._mean(mine, "gyro")
         accel = self._mean(mine, "accel")
-        return Measured(gyro, accel, self._depth(mine, q_wb), self._poses(mine))
+        return Measured(gyro, accel, self._depth(mine, q_wb), self._poses(mine, q_wb))
 
     def _mean(self, mine: list[ModuleInputs], name: str) -> np.ndarray | None:
         heard = [(i, v) for i, v in enumerate(getattr(m, name) for m in mine) if v is not None]
@@ -61,7 +61,7 @@ class Measurements:
         pressure = sum(p for _, p in heard) / len(heard)
         return (pressure - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - below
 
-    def _poses(self, mine: list[ModuleInputs]) -> list[BodyPose]:
+    def _poses(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> list[BodyPose]:
         """One pose for each picture, oldest first."""
         pictures: dict[int, list[tuple[TagObservation, np.ndarray, np.ndarray]]] = {}
         for index, module in enumerate(mine):
@@ -69,13 +69,17 @@ class Measurements:
                 known = self._tags.get((index, tag.tag_id))
                 if known is not None:
                     pictures.setdefault(tag.capture_ns, []).append((tag, known[0], multiply(tag.q_wt, known[1])))
-        return [_one_pose(capture, seen) for capture, seen in sorted(pictures.items())]
+        return [_one_pose(capture, seen, q_wb) for capture, seen in sorted(pictures.items())]
 
 
-def _one_pose(capture_ns: int, seen: list[tuple[TagObservation, np.ndarray, np.ndarray]]) -> BodyPose:
-    """Mean of the tags of one picture; of three or more, those far from the attitude most agree on are left out."""
-    if len(seen) > 2:
-        seen = _agreeing(seen)
+Seen = list[tuple[TagObservation, np.ndarray, np.ndarray]]
+"""Tag, its place in the body (3,), and the body's attitude by it (4,)."""
+
+
+def _one_pose(capture_ns: int, seen: Seen, q_wb: np.ndarray) -> BodyPose:
+    """Mean of the tags of one picture; those that stand alone against the others are left out as flipped."""
+    if len(seen) > 1:
+        seen = _agreeing(seen, q_wb)
     if len(seen) == 1:
         tag, lever, q_wb = seen[0]
         return BodyPose(capture_ns, tag.p_wt, lever, q_wb, 1)
@@ -86,10 +90,9 @@ def _one_pose(capture_ns: int, seen: list[tuple[TagObservation, np.ndarray, np.n
     return BodyPose(capture_ns, p_wt, np.mean([r for _, r, _ in seen], axis=0), q_wb, len(seen))
 
 
-def _agreeing(
-    seen: list[tuple[TagObservation, np.ndarray, np.ndarray]],
-) -> list[tuple[TagObservation, np.ndarray, np.ndarray]]:
+def _agreeing(seen: Seen, q_wb: np.ndarray) -> Seen:
+    """The largest group of tags that agree on the attitude; of equal groups the one nearest to the estimate `q_wb`."""
     attitudes = np.array([q for _, _, q in seen])
     agreement = np.abs(attitudes @ attitudes.T) > np.cos(0.5 * FLIP_RAD)
-    best = int(np.argmax(agreement.sum(axis=1)))
-    return [s for s, ok in zip(seen, agreement[best], strict=True) if ok]
+    votes = agreement.sum(axis=1) + 0.5 * np.abs(attitudes @ q_wb)
+    return [s for s, ok in zip(seen, agreement[int(np.argmax(votes))], strict=True) if ok]

@@ -125,7 +125,7 @@ class BodyPipeline:
     def _read_supply(self, inputs: Inputs) -> None:
         for i, module in enumerate(self.body.modules):
             voltage = inputs.modules[module].voltage_v
-            if voltage is not None:
+            if voltage is not None and np.isfinite(voltage):
                 self.voltage_v[i] += VOLTAGE_SMOOTHING * (voltage - self.voltage_v[i])
 
     def take_over(self, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
@@ -165,7 +165,7 @@ class Pipeline:
         self.parameters = parameters
         self._period_ns = period_ns
         self._chains = [self.chain_of(body) for body in bodies]
-        self._modules = sum(len(body.modules) for body in bodies)
+        self._modules = 1 + max(module for body in bodies for module in body.modules)
         self.docking = DockingStage(parameters.docking, tag_table(bodies), self._modules)
         self.docking.watch_joints(bodies)
 

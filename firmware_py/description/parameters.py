@@ -273,15 +273,14 @@ class Parameters:
         range.
         """
         group_name, _, name = dotted.partition(".")
-        group = getattr(self, group_name, None)
-        if group is None or name not in {f.name for f in dataclasses.fields(group)}:
+        if dotted not in dict(registry()):
             raise DescriptionError(f"parameter {dotted!r} is unknown; there are {', '.join(n for n, _ in registry())}")
+        group = getattr(self, group_name)
         limits = limits_of(type(group), name)
-        ok = (
-            value in limits.choices
-            if limits.choices
-            else isinstance(value, float | int) and limits.low <= value <= limits.high
-        )
+        if isinstance(getattr(group, name), int) and isinstance(value, float) and value.is_integer():
+            value = int(value)  # MAVLink sends every number as a float
+        fits = type(value) is type(getattr(group, name)) or (type(value) is int and type(getattr(group, name)) is float)
+        ok = fits and (value in limits.choices if limits.choices else limits.low <= value <= limits.high)  # type: ignore[operator]
         if not ok:
             raise DescriptionError(f"parameter {dotted}: {value!r} is out of range; permitted: {describe(limits)}")
         return dataclasses.replace(self, **{group_name: dataclasses.replace(group, **{name: value})})

@@ -1,4 +1,4 @@
-"""Commands: COMMAND_LONG, COMMAND_INT and SET_MODE. Each is acknowledged: at once, or when the supervisor has decided."""
+"""Commands: COMMAND_LONG, COMMAND_INT, SET_MODE. Each is acknowledged: at once, or when the supervisor has decided."""
 
 from __future__ import annotations
 
@@ -59,7 +59,11 @@ class CommandService:
     """The commands of one system."""
 
     def __init__(
-        self, system: System, missions: MissionFlight, steering: Steering, extra: Mapping[str, Callable[[Arrival], bool]]
+        self,
+        system: System,
+        missions: MissionFlight,
+        steering: Steering,
+        extra: Mapping[str, Callable[[Arrival], bool]],
     ) -> None:
         """`extra` answers REQUEST_MESSAGE for messages that are not streamed; False means it cannot."""
         self._system, self._missions, self._steering, self._extra = system, missions, steering, extra

@@ -14,15 +14,18 @@ class GroundConfig:
     """One ground side."""
 
     links: tuple[str, ...] = quantity(
-        ("udpout:127.0.0.1:14550",), help="udpin:, udpout:, tcpin:HOST:PORT, /dev/NAME,BAUD; `+trusted` lets it set the key"
+        ("udpout:127.0.0.1:14550",),
+        help="udpin:, udpout:, tcpin:HOST:PORT, /dev/NAME,BAUD; `+trusted` lets it set the key",
     )
     identity: str = quantity("generic", choices=tuple(IDENTITIES), help="generic: PX4's modes; ardusub: ArduSub's")
     first_system: int = quantity(1, low=1, high=200, help="system id of body 0; body n is that much higher")
-    watch_system: int = quantity(0, low=0, high=255, help="system id of the ground station that must not be lost; 0: the first")
+    watch_system: int = quantity(
+        0, low=0, high=255, help="system id of the ground station that must not be lost; 0: the first"
+    )
     watch_component: int = quantity(0, low=0, high=255, help="its component id; 0: the first")
     store: str = quantity("", help="folder of parameters and signing key; empty: nothing is kept")
     dock_button: tuple[int, ...] = quantity(
-        (), low=0, high=63, help="what the dock buttons ask for: module, face, target module, target face; empty: nothing"
+        (), low=0, high=63, help="what the dock buttons ask for: module, face, target module and face; empty: nothing"
     )
     logs: str = quantity("", help="folder of the logs that may be fetched; empty: none")
 

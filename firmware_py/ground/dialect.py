@@ -20,8 +20,8 @@ Value = float | str | tuple[float, ...]
 """A number (int or float by its field), text of a char array, or an array."""
 
 _LETTERS = {
-    "char": "s", "int8_t": "b", "uint8_t": "B", "uint8_t_mavlink_version": "B", "int16_t": "h", "uint16_t": "H", "int32_t": "i",
-    "uint32_t": "I", "int64_t": "q", "uint64_t": "Q", "float": "f", "double": "d",
+    "char": "s", "int8_t": "b", "uint8_t": "B", "uint8_t_mavlink_version": "B", "int16_t": "h", "uint16_t": "H",
+    "int32_t": "i", "uint32_t": "I", "int64_t": "q", "uint64_t": "Q", "float": "f", "double": "d",
 }  # fmt: skip
 
 
@@ -46,7 +46,7 @@ class Definition:
         self.zero = {f.name: "" if f.letter == "s" else (0,) * f.length if f.length else 0 for f in fields}
 
     def encode(self, values: Mapping[str, Any]) -> bytes:
-        """The payload, trailing zeros cut off; fields that are not given are zero, numbers too large for theirs saturate.
+        """The payload, trailing zeros cut off; fields not given are zero, numbers too large for theirs saturate.
 
         Raises:
             KeyError: a field that the message does not have.
@@ -137,8 +137,8 @@ def _of_xml(message: Any) -> Definition:
 
 
 _RANGES = {
-    "b": (-(2**7), 2**7 - 1), "B": (0, 2**8 - 1), "h": (-(2**15), 2**15 - 1), "H": (0, 2**16 - 1), "i": (-(2**31), 2**31 - 1),
-    "I": (0, 2**32 - 1), "q": (-(2**63), 2**63 - 1), "Q": (0, 2**64 - 1),
+    "b": (-(2**7), 2**7 - 1), "B": (0, 2**8 - 1), "h": (-(2**15), 2**15 - 1), "H": (0, 2**16 - 1),
+    "i": (-(2**31), 2**31 - 1), "I": (0, 2**32 - 1), "q": (-(2**63), 2**63 - 1), "Q": (0, 2**64 - 1),
 }  # fmt: skip
 _LARGEST_FLOAT = 3.4e38
 

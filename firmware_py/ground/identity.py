@@ -1,4 +1,4 @@
-"""What the robot says it is. Clients choose the encoding of modes by it; the two overlap, so one holds and none is guessed."""
+"""What the robot says it is. Clients choose the encoding of modes by it; the two overlap, so none is ever guessed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Links to ground stations: udpout, udpin, tcpin and serial, several at once. Never blocks, never grows: the oldest frame goes.
+"""Links to ground stations: udpout, udpin, tcpin and serial, several at once. Never blocks; the oldest frame gives way.
 
 Everyone at the other end is a channel with a number of its own. Runs beside the tick, never in it.
 """

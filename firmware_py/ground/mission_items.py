@@ -80,7 +80,7 @@ class Item(NamedTuple):
 
 
 def item_of(message: Message) -> tuple[Item, int]:
-    """The item of a MISSION_ITEM_INT or MISSION_ITEM, and the MAV_MISSION_RESULT that says what is wrong with it (0: nothing)."""
+    """The item of a MISSION_ITEM_INT or MISSION_ITEM, and a MAV_MISSION_RESULT: what is wrong with it (0: nothing)."""
     m = message
     degrees = m.name == "MISSION_ITEM"
     x, y = m["x"], m["y"]

@@ -140,7 +140,8 @@ class MissionService:
         item = self._flight.items[sequence]
         whole = arrival.message.name == "MISSION_REQUEST_INT"
         values = {
-            "seq": sequence, "command": item.command, "frame": _sent_frame(item, whole), "autocontinue": item.autocontinue,
+            "seq": sequence, "command": item.command, "frame": _sent_frame(item, whole),
+            "autocontinue": item.autocontinue,
             "current": int(sequence == self._system.subject.progress.current),
             **{f"param{i + 1}": value for i, value in enumerate(item.parameters)},
             "x": item.x if whole or not item.is_place else item.x * 1e-7,

@@ -89,11 +89,8 @@ class ParameterService:
                 self._to_send[channel] = first + _AT_ONCE
 
     def _read(self, arrival: Arrival) -> None:
-        index = arrival.message["param_index"]
-        if 0 <= index < len(self._store.order):
-            name = self._store.order[index]
-        else:
-            name = arrival.message["param_id"]
+        index, order = arrival.message["param_index"], self._store.order
+        name = order[index] if 0 <= index < len(order) else arrival.message["param_id"]
         if name in self._store.names:
             self._system.send(arrival.channel, "PARAM_VALUE", self._value(name))
 

@@ -1,4 +1,4 @@
-"""Who is there: the ground station that must not be lost, time and echo, what the vehicle can do, and the signing key."""
+"""Who is there: the ground station that must not be lost, time, echo, what the vehicle can do, the signing key."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _INFORMATION, _WARNING = 6, 4
 _NAK, _OPEN_TO_READ, _UNKNOWN_COMMAND, _FILE_NOT_FOUND = 129, 4, 7, 10
 """Codes of the file transfer protocol."""
 CAPABILITIES = 0x2 | 0x4 | 0x8 | 0x40 | 0x80 | 0x800 | 0x2000
-"""MAV_PROTOCOL_CAPABILITY: float parameters, MISSION_INT, COMMAND_INT, set-points of attitude and of local position, flight
-termination, MAVLINK2. Neither form of integer parameters is claimed."""
+"""MAV_PROTOCOL_CAPABILITY: float parameters, MISSION_INT, COMMAND_INT, set-points of attitude and of local position,
+flight termination, MAVLINK2. Neither form of integer parameters is claimed."""
 VERSION = 0x00010000
 """0.1.0, as FIRMWARE_VERSION_TYPE packs it."""
 
@@ -27,7 +27,9 @@ VERSION = 0x00010000
 class Presence:
     """The watch over one ground station, for one system."""
 
-    def __init__(self, system: System, config: GroundConfig, parameters: Callable[[], Parameters], signing: Signing) -> None:
+    def __init__(
+        self, system: System, config: GroundConfig, parameters: Callable[[], Parameters], signing: Signing
+    ) -> None:
         self._system, self._config, self._parameters, self._signing = system, config, parameters, signing
         self.watched: Station | None = None
         self._heard_ns = 0
@@ -84,7 +86,7 @@ class Presence:
             self._system.say(_INFORMATION, "signing key set" if any(key) else "signing is off")
 
     def _no_files(self, arrival: Arrival) -> None:
-        """There is no file service: said at once, so that clients fall back to the parameter protocol without a time-out."""
+        """There is no file service: said at once, so that clients fall back to parameters without a time-out."""
         asked = bytes(arrival.message["payload"])
         low, high = ((asked[0] | asked[1] << 8) + 1 & 0xFFFF).to_bytes(2, "little")
         reason = _FILE_NOT_FOUND if asked[3] == _OPEN_TO_READ else _UNKNOWN_COMMAND

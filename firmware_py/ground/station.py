@@ -1,4 +1,4 @@
-"""The ground side without its clock and its sockets: bytes in, requests and frames out; the fleet's telemetry. Pure, time passed in."""
+"""The ground side without clock and sockets: bytes in, requests and frames out, telemetry. Pure, time passed in."""
 
 from __future__ import annotations
 
@@ -64,7 +64,9 @@ class Services:
 class GroundStation:
     """All systems of one fleet."""
 
-    def __init__(self, config: GroundConfig, fleet: Fleet, parameters: Parameters, signing: Signing | None = None) -> None:
+    def __init__(
+        self, config: GroundConfig, fleet: Fleet, parameters: Parameters, signing: Signing | None = None
+    ) -> None:
         """Raises DescriptionError when the stored parameters are wrong."""
         self.config = config
         self.signing = signing if signing is not None else Signing()

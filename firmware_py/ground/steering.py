@@ -1,13 +1,14 @@
-"""Pilot and program at the stick: MANUAL_CONTROL, RC_CHANNELS_OVERRIDE, streamed set-points. They become requests; the core decides.
+"""Pilot and program at the stick: MANUAL_CONTROL, RC_CHANNELS_OVERRIDE, streamed set-points. The core decides.
 
-MANUAL_CONTROL: x forward, y right, z up, r clockwise seen from above, s nose up, t right side down; all of +-1000, z by STICK_Z.
+MANUAL_CONTROL: x forward, y right, z up, r clockwise seen from above, s nose up, t right side down; of +-1000, z by
+STICK_Z.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,7 +30,8 @@ BUTTONS: tuple[str, ...] = (
 )  # fmt: skip
 """What each button of a joystick does, first to last."""
 _BUTTON_MODES = {
-    "hold": Mode.POSHOLD, "manual": Mode.MANUAL, "stabilize": Mode.STABILIZE, "depth": Mode.ALT_HOLD, "surface": Mode.SURFACE,
+    "hold": Mode.POSHOLD, "manual": Mode.MANUAL, "stabilize": Mode.STABILIZE, "depth": Mode.ALT_HOLD,
+    "surface": Mode.SURFACE,
 }  # fmt: skip
 _BUTTON_ACTIONS = {
     "arm": Action.ARM, "disarm": Action.DISARM, "estop": Action.ESTOP, "clear_estop": Action.CLEAR_ESTOP,
@@ -37,11 +39,45 @@ _BUTTON_ACTIONS = {
 }  # fmt: skip
 
 
+class _Wanted(NamedTuple):
+    """What a streamed set-point gives; None where its mask leaves it out."""
+
+    position: np.ndarray | None
+    velocity: np.ndarray | None
+    acceleration: np.ndarray | None
+    yaw: float | None
+    rate: float
+
+    @property
+    def makes_sense(self) -> bool:
+        """Whether everything in it is a number, and it says where to go."""
+        vectors = [v for v in (self.position, self.velocity, self.acceleration) if v is not None]
+        numbers = [self.rate, 0.0 if self.yaw is None else self.yaw]
+        finite = all(np.all(np.isfinite(v)) for v in vectors) and all(map(math.isfinite, numbers))
+        return finite and (self.position is not None or self.velocity is not None)
+
+    def turned(self, yaw: float) -> _Wanted:
+        """From the body's heading to the world."""
+        turn = from_euler(0.0, 0.0, yaw)
+
+        def to_world(v: np.ndarray | None) -> np.ndarray | None:
+            return None if v is None else np.asarray(rotate(turn, v))
+
+        return _Wanted(
+            to_world(self.position), to_world(self.velocity), to_world(self.acceleration),
+            None if self.yaw is None else self.yaw + yaw, self.rate,
+        )  # fmt: skip
+
+
 class Steering:
     """Sticks, buttons and set-points of one system."""
 
     def __init__(
-        self, system: System, parameters: Callable[[], Parameters], dock: DockRequest | None, buttons: Sequence[str] = BUTTONS
+        self,
+        system: System,
+        parameters: Callable[[], Parameters],
+        dock: DockRequest | None,
+        buttons: Sequence[str] = BUTTONS,
     ) -> None:
         """`dock` is what the buttons `dock` and `undock` ask for."""
         self._system, self._parameters, self._dock, self._buttons = system, parameters, dock, buttons
@@ -139,36 +175,33 @@ class Steering:
 
     def _target(self, arrival: Arrival) -> None:
         m = arrival.message
-        frame, mask = m["coordinate_frame"], m["type_mask"]
-        if frame not in (*_FRAMES_WORLD, *_FRAMES_BODY) or not self._system.body_is_known:
+        if m["coordinate_frame"] not in (*_FRAMES_WORLD, *_FRAMES_BODY) or not self._system.body_is_known:
             return
-        now = self._system.subject.record.setpoint
-        yaw_now = to_euler(now.q_wb)[2]
-        turn = from_euler(0.0, 0.0, yaw_now) if frame in _FRAMES_BODY else None
-        position = None if mask & _NO_POSITION == _NO_POSITION else _vector(m, "x", "y", "z")
-        velocity = None if mask & _NO_VELOCITY == _NO_VELOCITY else _vector(m, "vx", "vy", "vz")
-        acceleration = None if mask & _NO_ACCELERATION == _NO_ACCELERATION else _vector(m, "afx", "afy", "afz")
-        rate = 0.0 if mask & _NO_YAW_RATE else m["yaw_rate"]
-        yaw = None if mask & _NO_YAW else m["yaw"] + (yaw_now if turn is not None else 0.0)
-        values = [v for v in (position, velocity, acceleration) if v is not None]
-        if not all(np.all(np.isfinite(v)) for v in values) or not math.isfinite(rate) or not (yaw is None or math.isfinite(yaw)):
+        mask = m["type_mask"]
+        wanted = _Wanted(
+            position=None if mask & _NO_POSITION == _NO_POSITION else _vector(m, "x", "y", "z"),
+            velocity=None if mask & _NO_VELOCITY == _NO_VELOCITY else _vector(m, "vx", "vy", "vz"),
+            acceleration=None if mask & _NO_ACCELERATION == _NO_ACCELERATION else _vector(m, "afx", "afy", "afz"),
+            yaw=None if mask & _NO_YAW else m["yaw"],
+            rate=0.0 if mask & _NO_YAW_RATE else m["yaw_rate"],
+        )
+        if not wanted.makes_sense:
             return
-        if position is None and velocity is None:
-            return
-        if turn is not None:
-            position, velocity, acceleration = (None if v is None else rotate(turn, v) for v in (position, velocity, acceleration))
-        if position is not None and frame in _FRAME_OFFSETS:
-            position = position + self._system.subject.record.estimate.p_wb
-        q_wb = self._attitude(now.q_wb, yaw, rate, arrival.time_ns)
-        p_wb = self._place(now.p_wb, position, velocity, arrival.time_ns)
-        zero = np.zeros(3)
-        setpoint = Setpoint(
-            p_wb, q_wb, zero if velocity is None else velocity, np.array([0.0, 0.0, rate]),
-            zero if acceleration is None else acceleration, zero,
-        )  # fmt: skip
-        self._stream(setpoint, arrival.time_ns)
+        record = self._system.subject.record
+        if m["coordinate_frame"] in _FRAMES_BODY:
+            wanted = wanted.turned(to_euler(record.setpoint.q_wb)[2])
+        if wanted.position is not None and m["coordinate_frame"] in _FRAME_OFFSETS:
+            wanted = wanted._replace(position=wanted.position + record.estimate.p_wb)
+        q_wb = self._attitude(record.setpoint.q_wb, wanted.yaw, wanted.rate, arrival.time_ns)
+        p_wb = self._place(record.setpoint.p_wb, wanted.position, wanted.velocity, arrival.time_ns)
+        zero, rate = np.zeros(3), np.array([0.0, 0.0, wanted.rate])
+        v_w = zero if wanted.velocity is None else wanted.velocity
+        a_w = zero if wanted.acceleration is None else wanted.acceleration
+        self._stream(Setpoint(p_wb, q_wb, v_w, rate, a_w, zero), arrival.time_ns)
 
-    def _place(self, now: np.ndarray, position: np.ndarray | None, velocity: np.ndarray | None, time_ns: int) -> np.ndarray:
+    def _place(
+        self, now: np.ndarray, position: np.ndarray | None, velocity: np.ndarray | None, time_ns: int
+    ) -> np.ndarray:
         """Where to be: as asked for, or further along a velocity that came without a place."""
         if position is not None:
             return np.ascontiguousarray(position)
@@ -187,7 +220,8 @@ class Steering:
     def _before(self, time_ns: int) -> tuple[Setpoint | None, float]:
         """The set-point before, while they stream in guided mode, and its age, s."""
         s = self._system.subject
-        if self._setpoint is None or not self.has_setpoint(time_ns) or s.picture.mode(s.body) != Mode.GUIDED or not s.armed:
+        guided = s.armed and s.picture.mode(s.body) == Mode.GUIDED
+        if self._setpoint is None or not guided or not self.has_setpoint(time_ns):
             return None, 0.0
         assert self._setpoint_ns is not None
         return self._setpoint, (time_ns - self._setpoint_ns) / NS_PER_S

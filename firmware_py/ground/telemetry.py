@@ -1,4 +1,4 @@
-"""The messages that a system streams, each made from the picture of the last tick. World NED, body FRD as MAVLink has them."""
+"""The messages that a system streams, each made from the picture of the last tick. World NED, body FRD."""
 
 from __future__ import annotations
 
@@ -141,7 +141,8 @@ def attitude(s: Subject) -> list[Values]:
     roll, pitch, yaw = to_euler(e.q_wb)
     p, q, r = e.nu[3:]
     return [{
-        "time_boot_ms": s.time_ms, "roll": roll, "pitch": pitch, "yaw": yaw, "rollspeed": p, "pitchspeed": q, "yawspeed": r,
+        "time_boot_ms": s.time_ms, "roll": roll, "pitch": pitch, "yaw": yaw,
+        "rollspeed": p, "pitchspeed": q, "yawspeed": r,
     }]  # fmt: skip
 
 
@@ -182,8 +183,9 @@ def global_position_int(s: Subject) -> list[Values]:
     e, v = s.record.estimate, s.v_w
     latitude, longitude, altitude = s.origin.geodetic(e.p_wb)
     return [{
-        "time_boot_ms": s.time_ms, "lat": round(latitude * 1e7), "lon": round(longitude * 1e7), "alt": round(altitude * 1e3),
-        "relative_alt": round(-e.p_wb[2] * 1e3), "vx": round(v[0] * 100), "vy": round(v[1] * 100), "vz": round(v[2] * 100),
+        "time_boot_ms": s.time_ms, "lat": round(latitude * 1e7), "lon": round(longitude * 1e7),
+        "alt": round(altitude * 1e3), "relative_alt": round(-e.p_wb[2] * 1e3),
+        "vx": round(v[0] * 100), "vy": round(v[1] * 100), "vz": round(v[2] * 100),
         "hdg": round(_heading_deg(s) * 100) % 36000,
     }]  # fmt: skip
 
@@ -292,7 +294,8 @@ def gps_global_origin(s: Subject) -> list[Values]:
 def mission_current(s: Subject) -> list[Values]:
     p = s.progress
     return [{
-        "seq": p.current, "total": p.total or _UNKNOWN_16, "mission_state": p.state, "mission_mode": 1 if p.state == 3 else 2,
+        "seq": p.current, "total": p.total or _UNKNOWN_16, "mission_state": p.state,
+        "mission_mode": 1 if p.state == 3 else 2,
     }]  # fmt: skip
 
 
@@ -338,10 +341,10 @@ STREAMS: Mapping[str, Callable[[Subject], list[Values]]] = {
 """Everything that can be streamed or asked for."""
 
 DEFAULT_HZ: Mapping[str, float] = {
-    "HEARTBEAT": 1, "SYS_STATUS": 2, "ATTITUDE": 10, "ATTITUDE_QUATERNION": 10, "LOCAL_POSITION_NED": 10, "ODOMETRY": 5,
-    "GLOBAL_POSITION_INT": 5, "VFR_HUD": 4, "BATTERY_STATUS": 1, "SERVO_OUTPUT_RAW": 2, "ESC_STATUS": 1, "ESC_INFO": 0.5,
-    "SCALED_PRESSURE": 1, "SCALED_PRESSURE2": 1, "NAMED_VALUE_FLOAT": 2, "EXTENDED_SYS_STATE": 1, "HOME_POSITION": 0.5,
-    "MISSION_CURRENT": 1, "CURRENT_MODE": 0.5, "SYSTEM_TIME": 0.5,
+    "HEARTBEAT": 1, "SYS_STATUS": 2, "ATTITUDE": 10, "ATTITUDE_QUATERNION": 10, "LOCAL_POSITION_NED": 10,
+    "ODOMETRY": 5, "GLOBAL_POSITION_INT": 5, "VFR_HUD": 4, "BATTERY_STATUS": 1, "SERVO_OUTPUT_RAW": 2,
+    "ESC_STATUS": 1, "ESC_INFO": 0.5, "SCALED_PRESSURE": 1, "SCALED_PRESSURE2": 1, "NAMED_VALUE_FLOAT": 2,
+    "EXTENDED_SYS_STATE": 1, "HOME_POSITION": 0.5, "MISSION_CURRENT": 1, "CURRENT_MODE": 0.5, "SYSTEM_TIME": 0.5,
 }  # fmt: skip
 """Before anybody asks for other rates."""
 

@@ -38,7 +38,7 @@ class Framer:
         self._dialect, self._signing = dialect, signing
         self._buffer = bytearray()
         self.counts = counts
-        """Frames by what became of them: good, checksum, unknown, flags, refused; bytes that belong to no frame: garbage."""
+        """Frames by what became of them: good, checksum, unknown, flags, refused; bytes of no frame: garbage."""
 
     def feed(self, data: bytes) -> list[Packet]:
         """The believed messages that `data` completes."""
@@ -136,6 +136,7 @@ class Encoder:
         number, sequence = definition.number, self._sequence
         self._sequence = (sequence + 1) & 0xFF
         low, high = number & 0xFFFF, number >> 16
-        frame = _HEADER_2.pack(_MAGIC_2, len(payload), flags, 0, sequence, self.system, self.component, low, high) + payload
+        sender = (self.system, self.component)
+        frame = _HEADER_2.pack(_MAGIC_2, len(payload), flags, 0, sequence, *sender, low, high) + payload
         frame += _CRC.pack(checksum(frame[1:], definition.crc_extra))
         return frame + self._signing.sign(frame, link) if flags else frame

@@ -34,6 +34,8 @@ class Sighting(NamedTuple):
     p_wt: np.ndarray
     q_wt: np.ndarray
     quality: int
+    carrier: int = -1
+    """Module that carries the camera: the pose is in its frame. -1: a fixed camera, the pose is in the world."""
 
 
 class _Drawn(NamedTuple):
@@ -69,14 +71,17 @@ class Camera:
         tags: Sequence[int],
         seed: int,
         index: int = 0,
+        carrier: int = -1,
     ) -> None:
+        self.carrier = carrier
         self._pose, self._spec = pose, spec
         self._axis = pose.axis / np.linalg.norm(pose.axis)
         self._tags = [(m, t) for m, v in enumerate(vehicles) for t in v.tag if t.id in tags]
         self._rows = _tag_rows(self._tags)
         self._boxes = solid_boxes(vehicles)
         self._period_ns = round(1e9 / spec.tag_rate_hz)
-        phase = spec.tag_phase * stream(seed, "tag_phase", index).uniform()
+        # A carried camera is triggered together with the first one: its node needs both pictures of one moment.
+        phase = spec.tag_phase * stream(seed, "tag_phase", 0 if carrier >= 0 else index).uniform()
         self.next_ns = round(phase * self._period_ns)
         # One stream per module and camera (and tag, where all are read), so that one more changes nothing for the others.
         self._errors = [_Errors(spec, seed, index * 64 + m) for m in range(len(vehicles))]
@@ -108,11 +113,13 @@ class Camera:
         found = []
         for k, errors in zip(chosen, self._tag_errors if self._spec.tag_all else self._errors, strict=True):
             drawn = errors.draw()
-            if k >= 0 and readable[k] and not drawn.lost:
+            if k >= 0 and readable[k] and not drawn.lost and self._tags[k][0] != self.carrier:
                 m, tag = self._tags[k]
                 p, q = tag_pose(poses[m, :3], poses[m, 3:], tag)
                 p, q = self._blur(p, q, drawn, eye, axis)
-                found.append(Sighting(m, tag.id, capture_ns, p, q, round(7 * cosines[k])))
+                if self.carrier >= 0:
+                    p, q = _seen_from(poses[self.carrier], p, q)
+                found.append(Sighting(m, tag.id, capture_ns, p, q, round(7 * cosines[k]), self.carrier))
         return found
 
     def _best(self, cosines: np.ndarray) -> list[int]:
@@ -125,7 +132,10 @@ class Camera:
 
     def _eye(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lens and optical axis, world."""
-        return self._pose.position_m, self._axis
+        if self.carrier < 0:
+            return self._pose.position_m, self._axis
+        p, q = poses[self.carrier, :3], poses[self.carrier, 3:].copy()
+        return p + rotations.rotate(q, np.array(self._pose.position_m)), rotations.rotate(q, self._axis.copy())
 
     def _blur(
         self, p: np.ndarray, q: np.ndarray, drawn: _Drawn, eye: np.ndarray, axis: np.ndarray
@@ -139,6 +149,26 @@ class Camera:
         p = p + axis * (axis @ noise[:3]) * (spec.tag_sigma_axis_m - spec.tag_sigma_m)
         q = rotations.multiply(q, rotations.exp(math.radians(spec.tag_sigma_deg) * noise[3:]))
         return p, rotations.normalise(q)
+
+
+def _seen_from(pose: np.ndarray, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A world pose in the frame of a module at `pose` (7,)."""
+    back = rotations.conjugate(pose[3:].copy())
+    return rotations.rotate(back, p - pose[:3]), rotations.multiply(back, q)
+
+
+def in_the_world(relative: Sighting, carrier: Sighting, tag: Tag) -> Sighting:
+    """What a carried camera saw, told in the world by what a fixed camera saw of the carrier in the same picture.
+
+    Args:
+        carrier: a sighting of `tag` on the module that carries the camera. Its error goes into the result.
+    """
+    back = rotations.conjugate(np.array(tag.quaternion))
+    q_wc = rotations.multiply(carrier.q_wt, back)
+    p_wc = carrier.p_wt - rotations.rotate(q_wc, np.array(tag.position_m))
+    p = p_wc + rotations.rotate(q_wc, relative.p_wt)
+    q = rotations.normalise(rotations.multiply(q_wc, relative.q_wt))
+    return relative._replace(p_wt=p, q_wt=q, carrier=-1)
 
 
 def _tag_rows(tags: Sequence[tuple[int, Tag]]) -> np.ndarray:

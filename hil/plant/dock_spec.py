@@ -29,8 +29,8 @@ class DockSpec:
     contact_ns_m: float = quantity(100.0, unit="N s/m", low=0, high=1e4, help="a corner on a face: damping (synthetic)")
     idle_ma: float = quantity(40.0, unit="mA", low=0, high=8000, help="current of a coil with nothing before it (synthetic)")
     engaged_ma: float = quantity(70.0, unit="mA", low=0, high=8000, help="more when engaged; paper: beyond 70 in all (synthetic)")
-    engage_m: float = quantity(0.008, unit="m", low=1e-4, high=1, help="gap over which that falls to a third (synthetic)")
-    engage_side_m: float = quantity(0.015, unit="m", low=1e-4, high=1, help="lateral error likewise (synthetic)")
+    engage_m: float = quantity(0.020, unit="m", low=1e-4, high=1, help="gap over which that falls to a third (synthetic)")
+    engage_side_m: float = quantity(0.025, unit="m", low=1e-4, high=1, help="lateral error likewise (synthetic)")
     surge_ma: float = quantity(150.0, unit="mA", low=0, high=8000, help="transient when a coil is switched (synthetic)")
     surge_s: float = quantity(0.05, unit="s", low=1e-3, high=10, help="its decay (synthetic)")
 

@@ -137,12 +137,13 @@ class Tank:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraPose:
-    """A tag camera fixed in the world."""
+    """A tag camera, fixed in the world or carried by a module: then position and axis are in that module's frame."""
 
+    module: int = quantity(0, low=0, high=29, help="number of the module that carries it; 0: fixed in the world")
     position_m: np.ndarray = quantity(
-        [0.0, 0.0, -1.2], unit="m", low=-100, high=100, shape=(3,), help="of its lens, world"
+        [0.0, 0.0, -1.2], unit="m", low=-100, high=100, shape=(3,), help="of its lens"
     )
-    axis: np.ndarray = quantity([0.0, 0.0, 1.0], low=-1.001, high=1.001, shape=(3,), help="optical axis, world")
+    axis: np.ndarray = quantity([0.0, 0.0, 1.0], low=-1.001, high=1.001, shape=(3,), help="optical axis")
     half_view_deg: float = quantity(60.0, unit="deg", low=1, high=89, help="half the cone in which it sees")
 
     def __post_init__(self) -> None:

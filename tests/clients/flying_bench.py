@@ -1,7 +1,7 @@
 """The robot in its tank behind a ground link, paced by the clock: a process for real clients to connect to.
 
-`python tests/clients/flying_bench.py ADDRESS... [--identity ardusub] [--store DIR] [--pace X]`. Says `ready` once it swims, ends
-when its input closes, and then prints one line of JSON: how far truth was from the set-point in each mode.
+`python -m tests.clients.flying_bench ADDRESS... [--identity ardusub] [--store DIR] [--pace X]`. Says `ready` once it
+swims, ends when its input closes, and then prints one line of JSON: how far truth was from the set-point in each mode.
 """
 
 import argparse
@@ -10,7 +10,7 @@ import select
 import sys
 import time
 from collections import defaultdict
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 
 import numpy as np
 
@@ -55,10 +55,6 @@ class Errors:
         }
 
 
-class Finished(Exception):
-    """The input has closed."""
-
-
 class Pilot:
     """In place of the bench's script: hands over what clients ask for, and keeps to the clock."""
 
@@ -68,11 +64,12 @@ class Pilot:
         self._side, self._pace = side, pace
         self._deadline = time.perf_counter()
 
+    def is_over(self, time_ns: int) -> bool:
+        return bool(select.select([sys.stdin], [], [], 0)[0]) and not sys.stdin.read(1)
+
     def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
         if self._side.error is not None:
             raise self._side.error
-        if select.select([sys.stdin], [], [], 0)[0] and not sys.stdin.read(1):
-            raise Finished
         if time_ns == round(READY_S * 1e9):
             print("ready", flush=True)
         now = time.perf_counter()
@@ -103,8 +100,7 @@ def main() -> None:
         def observe(received: object, sent: object, inputs: object, outputs: Outputs) -> None:
             errors.add(outputs, bench.nodes.world.truth(0).p_wm)
 
-        with suppress(Finished):
-            bench.fly([side.observe, observe])
+        bench.fly([side.observe, observe])
         print(json.dumps(errors.summary()), flush=True)
 
 

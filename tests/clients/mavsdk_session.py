@@ -1,4 +1,4 @@
-"""What a program with MAVSDK does with the robot, step by step; each step prints one line of JSON. Runs in .venv-clients."""
+"""What a program with MAVSDK does with the robot; each step prints a line of JSON. Runs in .venv-clients."""
 
 import json
 import math
@@ -56,8 +56,8 @@ def fly(url: str) -> None:
     wait("armable", lambda: telemetry.health().is_armable, 20)
     p = wait("position", lambda: telemetry.position_velocity_ned(), 10).position
     euler = telemetry.attitude_euler()
-    say("telemetry", ned=[p.north_m, p.east_m, p.down_m], roll_deg=euler.roll_deg, in_air=telemetry.in_air(),
-        home=wait("home", lambda: telemetry.home().latitude_deg, 10), health=str(telemetry.health()))  # fmt: skip
+    say("telemetry", ned=[p.north_m, p.east_m, p.down_m], roll_deg=euler.roll_deg,
+        in_air=telemetry.in_air(), home=wait("home", lambda: telemetry.home().latitude_deg, 10), health=str(telemetry.health()))  # fmt: skip
     everything = param.get_all_params()
     before = param.get_param_float("POS_BW")
     param.set_param_float("POS_BW", before + 0.1)

@@ -1,6 +1,6 @@
-"""Random, mutated, forged and replayed packets against a ground side. `python -m tests.unit.ground_attack COUNT` runs more of them.
+"""Random, mutated, forged and replayed packets against a ground side: `python -m tests.unit.ground_attack COUNT`.
 
-A quarter each: noise; valid frames with flipped bits; valid frames cut, joined and repeated; random payloads with a right checksum.
+A quarter each: noise; frames with flipped bits; frames cut, joined and repeated; random payloads with a right checksum.
 """
 
 import math

@@ -77,7 +77,8 @@ def best_by_clarabel(body: Body, wrench: np.ndarray) -> tuple[np.ndarray, float]
     """The allocator's problem in clarabel's form: (n + 2,) forces and shares, and the least cost."""
     t = body.thrusters
     n = t.f_max.size
-    weights = np.r_[np.ones(n), SHARE_WEIGHT, SHARE_WEIGHT * MOMENT_PRIORITY]
+    whole = SHARE_WEIGHT * float(t.f_max @ t.f_max)
+    weights = np.r_[np.ones(n), whole, whole * MOMENT_PRIORITY]
     goal = np.r_[np.zeros(n), 1.0, 1.0]
     equality = np.hstack([t.matrix, -np.r_[wrench[:3], 0, 0, 0][:, None], -np.r_[0, 0, 0, wrench[3:]][:, None]])
     a = sparse.csc_matrix(np.vstack([equality, np.eye(n + 2), -np.eye(n + 2)]))
@@ -101,7 +102,7 @@ def test_saturated_answer_is_the_one_another_solver_finds(body: Body, size: floa
             continue
         saturated += 1
         x, cost = best_by_clarabel(body, wrench)
-        weights = np.array([SHARE_WEIGHT, SHARE_WEIGHT * MOMENT_PRIORITY])
+        weights = SHARE_WEIGHT * float(body.thrusters.f_max @ body.thrusters.f_max) * np.array([1.0, MOMENT_PRIORITY])
         ours = float(thrust.force_n @ thrust.force_n + weights @ (1.0 - np.array(thrust.scale)) ** 2)
         assert ours <= cost + 1e-4 * (1.0 + cost)
         np.testing.assert_allclose(thrust.force_n, x[:-2], atol=2e-2)

@@ -33,8 +33,8 @@ def refusal(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytes
 @pytest.mark.parametrize(
     ("arguments", "wrong", "right"),
     [
-        (["hil", "run", "waltz"], "scenario 'waltz'", "hover, spiral"),
-        (["hil", "campaign", "waltz"], "scenario 'waltz'", "hover, spiral"),
+        (["hil", "run", "waltz"], "scenario 'waltz'", "hover, "),
+        (["hil", "campaign", "waltz"], "scenario 'waltz'", "hover, "),
         (["hil", "run", "waltz.toml"], "waltz.toml", "No such file"),
         (["hil", "run", "hover", "--bus", "token:ring"], "'token:ring'", "virtual:NAME, udp:GROUP:PORT"),
         (["hil", "run", "hover", "--bus", "socketcan:nocan7"], "nocan7", "no such interface"),

@@ -80,6 +80,8 @@ def surprise(body: Body, parameters: Control, q_wb: np.ndarray) -> float:
 @pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
 @pytest.mark.parametrize("law", ["model", "paper"])
 def test_robot_on_its_path_accelerates_as_the_path_does(body: Body, law: str, q_wb: np.ndarray) -> None:
+    if law == "paper":  # its g(eta) is zero by design of the robot
+        body = replace(body, righting=np.zeros(3))
     assert surprise(body, Control(law=law), q_wb) < 1e-12
 
 

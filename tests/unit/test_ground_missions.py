@@ -36,11 +36,13 @@ def client(world: World) -> Client:
     return world.client()
 
 
-def item(sequence: int, place: tuple[int, int, float], command: int = 16, frame: int = 6, p: tuple[float, ...] = (0, 0, 0, NAN)) -> tuple:  # type: ignore[type-arg]
+def item(
+    sequence: int, place: tuple[int, int, float], command: int = 16, frame: int = 6, p: tuple[float, ...] = (0, 0, 0, NAN)
+) -> tuple[float, ...]:
     return (1, 1, sequence, frame, command, 0, 1, *p, *place)
 
 
-def upload(world: World, client: Client, items: list[tuple], kind: int = 0) -> int:  # type: ignore[type-arg]
+def upload(world: World, client: Client, items: list[tuple[float, ...]], kind: int = 0) -> int:
     """Send items as they are asked for; the result."""
     client.clear()
     client.send("MISSION_COUNT", 1, 1, len(items), kind)
@@ -117,7 +119,9 @@ def test_a_transfer_that_breaks_off_leaves_the_old_mission(world: World, client:
         (item(0, PLACES[0], p=(-1, 0, 0, 0)), mavlink.MAV_MISSION_INVALID_PARAM1),
     ],
 )
-def test_items_that_cannot_be_flown_are_refused_when_they_come(world: World, client: Client, bad: tuple, result: int) -> None:  # type: ignore[type-arg]
+def test_items_that_cannot_be_flown_are_refused_when_they_come(
+    world: World, client: Client, bad: tuple[float, ...], result: int
+) -> None:
     assert upload(world, client, [bad]) == result
     assert "mission refused: item 0" in client.texts
 

@@ -155,7 +155,7 @@ def test_a_key_file_that_is_open_or_broken_is_no_reason_to_fly_without_key(tmp_p
     path.chmod(0o600)
     for text in ("", "{}", '{"key": "12", "timestamp": 0}', '{"key": 5, "timestamp": 0}'):
         path.write_text(text)
-        with pytest.raises(ValueError, match="signing.json"):
+        with pytest.raises(ValueError, match=r"signing\.json"):
             load_signing(path)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil.checks import Limit, check_metrics, judge, write_result
-from hil.metrics import body_positions, flight_metrics, nis_mean, rotation_vectors
+from hil.metrics import body_positions, flight_metrics, nis_mean, rotation_vectors, warnings
 from hil.signals import Flight, read_flight
 from tests.unit.flights import START_NS, write_flight
 
@@ -119,3 +119,9 @@ def test_missing_truth_is_said_and_not_passed_over(tmp_path: Path) -> None:
         read_flight(tmp_path, module=3)
     with pytest.raises(OSError):
         read_flight(tmp_path / "elsewhere")
+
+
+def test_every_warning_counts_but_waiting_for_the_first_tags() -> None:
+    texts = np.array(["ARM refused: no pose yet", "armed", "thruster 1 does not push as it says: left out", "leak"])
+    assert warnings(np.array([4, 6, 4, 2]), texts) == 2
+    assert warnings(np.zeros(0, np.int64), np.zeros(0, str)) == 0

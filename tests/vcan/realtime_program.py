@@ -31,7 +31,7 @@ from tests.vcan.link_events import break_link
 from tests.vcan.links import Interface
 
 BUS = "vcan0"
-FLOOD_ID = 0x7FE
+FLOOD_ID = 0x71E
 """HEARTBEAT of number 30, with a wrong length: stops nobody and commands nothing."""
 MCU_ARMED = 2
 """State in MCU_STATUS."""
