@@ -64,14 +64,13 @@ test-vcan: setup ## the tests on real SocketCAN: here, or in the virtual machine
 	@$(PY) -m pytest -rs --capture=no -m vcan tests/vcan
 
 hil: setup ## fly the spiral on the bench and name the report
-	@$(BIN)/modcube hil run spiral --out runs/spiral; status=$$?; \
-	[ ! -f runs/spiral/report.html ] || echo 'report: runs/spiral/report.html'; exit $$status
+	@$(BIN)/modcube hil run spiral --out runs/spiral
 
-accept: setup ## every acceptance figure, long ones too; writes accept.json
-	@$(PY) tools/accept.py
+accept: setup ## every acceptance figure, long ones too; writes accept.json and README's tables
+	@$(PY) tools/accept.py $(if $(ONLY),--only $(ONLY)); status=$$?; $(PY) tools/readme_tables.py; exit $$status
 
-bench: setup ## measure the code; writes bench.json
-	@$(PY) tools/bench.py
+bench: setup ## measure the code; writes bench.json and README's tables
+	@$(PY) tools/bench.py && $(PY) tools/readme_tables.py
 
 # The locks pin the newest releases that pyproject.toml allows; `make lock UPGRADE=--upgrade` moves the pins.
 UV_COMPILE = uv pip compile --quiet --python-version 3.11 --generate-hashes --no-emit-index-url \

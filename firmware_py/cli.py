@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from contextlib import ExitStack
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +16,8 @@ from firmware_py.bus.port import PortError
 from firmware_py.description.fleet import load_fleet, single
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.identity import IDENTITIES
 
 CANNOT_RUN = 2
 """Exit status when nothing could be started: wrong usage, no such bus, a file that is wrong."""
@@ -39,17 +43,60 @@ def run(
     rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="ticks a second")] = 100,
     hold: Annotated[bool, typer.Option("--hold", help="arm as soon as the vehicle may, and hold the place")] = False,
     out: Annotated[Path | None, typer.Option(help="folder for the logs")] = None,
+    ground: Annotated[
+        list[str] | None, typer.Option(help="link to ground stations: udpout:, udpin:, tcpin:HOST:PORT, /dev/NAME,BAUD")
+    ] = None,
+    identity: Annotated[str, typer.Option(help="generic (PX4's modes) or ardusub")] = "generic",
+    store: Annotated[str, typer.Option(help="folder for parameters and signing key of ground stations")] = "",
     stats: Annotated[bool, typer.Option("--stats", help="print how the ticks kept their deadlines")] = False,
+    live: Annotated[bool, typer.Option("--live", help="serve a live view for Foxglove")] = False,
+    live_host: Annotated[str, typer.Option(help="address that the live view listens on")] = "127.0.0.1",
+    live_port: Annotated[int, typer.Option(min=1, max=65535, help="and its port")] = 8765,
 ) -> None:
     """Run the vehicle until SIGINT or SIGTERM."""
+    from firmware_py.app.live_view import LiveView
     from firmware_py.app.vehicle import run_vehicle
+    from firmware_py.runtime.notify import Notifier
 
     described = load_fleet(fleet) if fleet is not None else single(vehicle, bus, rate_hz)
     chosen = load_parameters(parameters) if parameters is not None else Parameters()
-    summary = run_vehicle(described, chosen, hold, out, say=lambda line: typer.echo(line))
+    links = ground_config(ground or [], identity, store, out)
+    notifier = Notifier.of(os.environ)
+    with ExitStack() as stack:
+        # Its threads start before this process takes its real-time priority, which they would inherit.
+        view = stack.enter_context(LiveView(live_host, live_port)) if live else None
+        summary = run_vehicle(described, chosen, hold, out, lambda line: typer.echo(line), notifier, links, view)
     if stats:
         for name, value in summary._asdict().items():
             typer.echo(f"{name:20s} {value}")
+
+
+def ground_config(links: list[str], identity: str, store: str, logs: Path | None) -> GroundConfig | None:
+    """What the command line says of ground stations; None without a link. Raises DescriptionError."""
+    if not links:
+        return None
+    if identity not in IDENTITIES:
+        raise DescriptionError(f"identity {identity!r} is unknown; there are {', '.join(IDENTITIES)}")
+    return GroundConfig(links=tuple(links), identity=identity, store=store, logs=str(logs) if logs is not None else "")
+
+
+@app.command()
+def doctor(
+    bus: Annotated[
+        str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")
+    ] = "socketcan:can0",
+    fleet: Annotated[Path | None, typer.Option(help="fleet file; without it one module, number 1")] = None,
+    out: Annotated[Path, typer.Option(help="folder for logs")] = Path(),
+    warm: Annotated[bool, typer.Option("--warm", help="only compile what a tick calls, into the cache")] = False,
+) -> None:
+    """Say whether this machine and its buses are fit to fly."""
+    from firmware_py.app.doctor_report import examine, warm_up
+
+    if warm:
+        typer.echo(f"compiled code is there, after {warm_up():.1f} s")
+        return
+    described = load_fleet(fleet) if fleet is not None else single(bus=bus)
+    raise typer.Exit(examine(described, out, say=lambda line: typer.echo(line)))
 
 
 def main() -> None:

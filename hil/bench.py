@@ -17,13 +17,16 @@ from firmware_py.core.types import Outputs
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.recorder import Recorder
+from hil.dock_script import DockScript
+from hil.faults import Faults
+from hil.force_script import ForceScript
 from hil.nodes import Nodes, make_nodes
 from hil.scenario import Scenario, make_world
-from hil.dock_script import DockScript
 from hil.script import Script
 from hil.signals import TruthRecorder
 
 DEFAULT_BUS = "virtual:modcube"
+Orders = Script | DockScript | ForceScript
 
 
 @dataclass(slots=True)
@@ -35,11 +38,15 @@ class Bench:
     fleet: Fleet
     firmware: Firmware
     nodes: Nodes
-    script: Script | DockScript
+    script: Orders
     firmware_port: Port
     plant_port: Port
+    faults: Faults
+    parameters: Parameters
     patience_looks: int = PATIENCE_LOOKS
     """Looks at a socket before a frame counts as lost by the bus."""
+    is_dead: bool = False
+    """The firmware's process is killed, and another waits to take its place."""
 
     def fly(
         self, observers: Sequence[Observer] = (), progress: Callable[[float], None] | None = None, truth: TruthRecorder | None = None
@@ -53,6 +60,12 @@ class Bench:
         outputs: Outputs | None = None
         for tick in range(1, self.script.ticks + 1):
             time_ns = tick * period_ns
+            if self.faults.process_killed(time_ns):
+                lockstep, outputs, sent = self._without_firmware(observers, sent), None, []
+                if truth is not None:
+                    truth.record_world(tick, self.nodes.world)
+                continue
+            self.is_dead = False
             sent += lockstep.start_tick(tick, time_ns)
             heard = drain(plant_ports, sent, self.patience_looks)
             answers = send(plant_ports, [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
@@ -65,6 +78,15 @@ class Bench:
                 progress(time_ns * 1e-9)
         return time.perf_counter() - began
 
+    def _without_firmware(self, observers: Sequence[Observer], sent: Sequence[BusFrame]) -> Lockstep:
+        """A tick in which the firmware's process is dead; returns the one that will be started in its place."""
+        heard = drain([self.plant_port], sent, self.patience_looks)
+        send([self.plant_port], [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
+        self.firmware_port.receive()
+        if not self.is_dead:
+            self.is_dead, self.firmware = True, compose(self.fleet, self.parameters)
+        return Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks)
+
 
 def fleet_of(scenario: Scenario, bus: str, rate_hz: int) -> Fleet:
     """The fleet that a scenario's modules make up, all on one bus."""
@@ -74,8 +96,10 @@ def fleet_of(scenario: Scenario, bus: str, rate_hz: int) -> Fleet:
     return Fleet(module=modules, buses=(bus,), rate_hz=rate_hz)
 
 
-def script_of(scenario: Scenario, fleet: Fleet) -> Script | DockScript:
+def script_of(scenario: Scenario, fleet: Fleet) -> Orders:
     """Whoever gives the orders in a scenario."""
+    if scenario.task.kind == "force":
+        return ForceScript(scenario, fleet)
     return DockScript(scenario, fleet) if scenario.task.kind == "dock" else Script(scenario, fleet)
 
 
@@ -88,8 +112,9 @@ def open_bench(
     world = make_world(scenario, seed, fleet.period_ns)
     numbers = {module.number: index for index, module in enumerate(fleet.module)}
     nodes = make_nodes(world, Codec.load(), numbers, scenario)
+    faults = nodes.faults = Faults(nodes, scenario.fault)
     ports = [stack.enter_context(open_port(bus)) for _ in range(2)]
-    return Bench(scenario, seed, fleet, firmware, nodes, script_of(scenario, fleet), ports[0], ports[1])
+    return Bench(scenario, seed, fleet, firmware, nodes, script_of(scenario, fleet), ports[0], ports[1], faults, parameters)
 
 
 def fly_scenario(

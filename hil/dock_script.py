@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from firmware_py.core.setpoint import Trajectory, rest_at
+from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, DockRequest, Outputs, Request
 from firmware_py.description.fleet import Fleet
@@ -124,7 +124,7 @@ class _Running:
         self.step, self.end_ns, self.module, self.target = step, end_ns, module, target
 
 
-def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> Trajectory:
+def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> paths.Trajectory:
     here = rest_at(np.array(p_wb), np.array(q_wb))
     if step.do == "move":
         return paths.line(here, rest_at(np.array(step.position_m), np.array(q_wb)), step.duration_s)

@@ -12,6 +12,7 @@ from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.bench import DEFAULT_BUS, fly_scenario
 from hil.checks import Result, judge, write_result
 from hil.docking_metrics import docking_metrics
+from hil.force_metrics import force_metrics
 from hil.metrics import PAPER_SPIRAL_RMSE_MM, flight_metrics
 from hil.plant.spec import Tank
 from hil.plots import Window, write_plots
@@ -53,11 +54,13 @@ def judge_logs(scenario: Scenario, seed: int, folder: Path, wall_s: float = 0.0,
     whole = read_flight(folder)
     begin_ns = start_of(whole) + round(scenario.task.settle_s * 1e9)
     flight = whole.between(begin_ns, begin_ns + round(scenario.task.duration_s * 1e9))
-    share = scenario.task.duration_s / scenario.duration_s
+    share = len(flight.time_s) / len(whole.time_s)
     vehicle = load_vehicle(scenario.module[0].vehicle)
     metrics = flight_metrics(flight, com_m=vehicle.inertial.com_m, wall_s=wall_s * share, deadline_misses=deadline_misses)
     if scenario.task.kind == "dock":
         metrics |= docking_metrics(scenario, folder)
+    if scenario.task.kind == "force":
+        metrics |= force_metrics(scenario, folder, begin_ns)
     return judge(scenario.name, seed, metrics, scenario.checks)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from firmware_py.bus.codec import Codec, Frame, Received, Receiver, pack_quaternion
 from hil.plant.camera import Camera, Sighting, in_the_world
@@ -59,6 +59,9 @@ class Mcu:
         self._dock = Noise(stream(world.seed, "dock", module), 6)
         self._fast = [codec.message(name) for name in ("GYRO", "ACCEL", "MCU_STATUS")]
         self._slow = _schedule(codec, number, tick_ns)
+        self.frozen = self.leaks = False
+        """Faults: the IMU repeats its last sample; water in the cabin."""
+        self._motion: tuple[list[float], list[float]] | None = None
         self._counters = dict.fromkeys(SLOW, 0)
 
     def heard(self, received: Received, time_ns: int) -> None:
@@ -99,9 +102,12 @@ class Mcu:
         self._apply([u if allowed[i // 4] else 0.0 for i, u in enumerate(self._command)])
         truth = self._world.truth(self.module)
         gyro, accel, status = self._fast
+        sample = (self._sensors.gyro(truth).tolist(), self._sensors.accel(truth).tolist())
+        if not self.frozen or self._motion is None:
+            self._motion = sample
         frames = [
-            gyro.encode(self.number, [*self._sensors.gyro(truth).tolist(), 0], tick),
-            accel.encode(self.number, [*self._sensors.accel(truth).tolist(), 0], tick),
+            gyro.encode(self.number, [*self._motion[0], 0], tick),
+            accel.encode(self.number, [*self._motion[1], 0], tick),
         ]
         for message, every, phase in self._slow:
             if tick % every == phase:
@@ -137,7 +143,7 @@ class Mcu:
         if name == "POWER":
             noise = self._power.take() * (self._spec.voltage_sigma_v, self._spec.current_sigma_a)
             return [truth.voltage_v + float(noise[0]), truth.current_a + float(noise[1]), 0]
-        return [CABIN_C, CABIN_PA, 0]
+        return [CABIN_C, CABIN_PA, int(self.leaks)]
 
     def _esc(self, first: int) -> list[float]:
         noise = self._spec.rpm_sigma * self._rpm.take()
@@ -221,6 +227,32 @@ class TagCamera:
         return frames
 
 
+class WireFaults(Protocol):
+    """What may be wrong (hil.faults)."""
+
+    def update(self, time_ns: int) -> None:
+        """Begins and ends what is due."""
+
+    def incoming(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
+        """Frames to the plant, as they arrive."""
+
+    def outgoing(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
+        """Frames from the plant, as they leave."""
+
+
+class NoFaults:
+    """Nothing is wrong."""
+
+    def update(self, time_ns: int) -> None:
+        """Nothing is due."""
+
+    def incoming(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
+        """All of them."""
+        return list(frames)
+
+    outgoing = incoming
+
+
 class Nodes:
     """All nodes of one bus."""
 
@@ -245,18 +277,24 @@ class Nodes:
         self.mcus = {number: Mcu(codec, number, module, world, sensors, tick_ns) for number, module in numbers.items()}
         self.cameras = [TagCamera(codec, cameras, numbers, sensors, world)] if cameras else []
         self._dropped = dict(self.receiver.dropped)
+        self.faults: WireFaults = NoFaults()
 
     def step(self, frames: Iterable[Frame]) -> list[Frame]:
         """One tick of a world that has this one bus: advance a period, take the frames, return the answers."""
         self.world.advance(self.world.period_ns)
         self.watch()
+        return self.answer(frames, self.world.time_ns)
+
+    def answer(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
+        """Takes frames off the wire at `time_ns` and puts the answers on it, through whatever is wrong with the wire."""
         answers: list[Frame] = []
-        for frame in frames:
-            answers += self.take(frame, self.world.time_ns)
-        return answers
+        for frame in self.faults.incoming(frames, time_ns):
+            answers += self.take(frame, time_ns)
+        return self.faults.outgoing(answers, time_ns)
 
     def watch(self) -> None:
-        """What happens without any frame: time-outs and pictures. To be called after every advance of the world."""
+        """What happens without any frame: faults, time-outs, pictures. To be called after every advance of the world."""
+        self.faults.update(self.world.time_ns)
         for camera in self.cameras:
             camera.watch()
         for mcu in self.mcus.values():

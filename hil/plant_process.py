@@ -12,6 +12,7 @@ from pathlib import Path
 
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import Port, open_port
+from hil.faults import Faults
 from hil.nodes import Nodes, make_nodes
 from hil.scenario import Scenario, make_world
 from hil.signals import TruthRecorder
@@ -49,6 +50,7 @@ class PlantProcess:
         codec = Codec.load()
         self._sync = codec.message("SYNC")
         self._nodes: Nodes = make_nodes(self._world, codec, numbers, scenario, tick_ns=1_000_000_000 // rate_hz)
+        self._nodes.faults = Faults(self._nodes, scenario.fault)
         thrusters = tuple(len(v.thruster) for v in self._world.vehicles)
         self._truth = TruthRecorder(out, thrusters) if out is not None else None
 
@@ -70,7 +72,7 @@ class PlantProcess:
             self._nodes.watch()
 
     def _answer(self, port: Port, frame: Frame) -> None:
-        for answer in self._nodes.take(frame, self._world.time_ns):
+        for answer in self._nodes.answer([frame], self._world.time_ns):
             port.send(answer)
         if self._truth is not None and frame.id == self._sync.id_of(0) and len(frame.data) == self._sync.length:
             self._truth.record_world(int(self._sync.decode(frame.data)[0]), self._world)

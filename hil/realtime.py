@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from multiprocessing.synchronize import Event as ProcessEvent
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from firmware_py.app.firmware import compose
 from firmware_py.app.lockstep import Observer
@@ -65,7 +65,7 @@ def fly_in_real_time(
     bus: str,
     rate_hz: int = 100,
     progress: Callable[[float], None] | None = None,
-    start_method: str = "spawn",
+    start_method: Literal["spawn", "fork"] = "spawn",
     observers: Sequence[Observer] = (),
     serve: Callable[..., None] = serve_plant,
 ) -> RealTimeFlight:

@@ -17,6 +17,7 @@ from firmware_py.description.vehicle import FACE_NAMES, load_vehicle
 from hil.plant.build import nominal_centre
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream
+from hil.plant.fault_spec import Fault
 from hil.plant.lattice import is_connected, place
 from hil.plant.polycube import grow
 from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
@@ -39,6 +40,8 @@ class ModuleStart:
     body: int = quantity(-1, low=-1, high=63, help="modules with the same number start docked; -1: alone")
     cell: np.ndarray = quantity([0, 0, 0], unit="lattice", low=-64, high=64, shape=(3,), help="place in its body")
     rotation: int = quantity(0, low=0, high=23, help="which of the 24 rotations of the cube it has in its body")
+
+    clamped: bool = quantity(False, help="a load cell holds its body")
 
     @property
     def start(self) -> Start:
@@ -84,9 +87,9 @@ class Task:
     """What the robot is to do."""
 
     kind: str = quantity(
-        choices=("hover", "spiral", "moebius", "lissajous", "dock"),
+        choices=("hover", "spiral", "moebius", "lissajous", "dock", "force"),
         help="hover: hold the place; spiral: climb on a cylinder; moebius: along the rim of a Moebius strip; "
-        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns; dock: the [[step]]s",
+        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns; dock: the [[step]]s; force: a stick on a load cell",
     )
     settle_s: float = quantity(15.0, unit="s", low=0, high=600, help="held at the start before the task begins")
     duration_s: float = quantity(unit="s", low=0.1, high=7200, help="of the task itself, rest to rest")
@@ -94,6 +97,7 @@ class Task:
     climb_m: float = quantity(0.40, unit="m", low=-100, high=100, help="spiral: height gained")
     turns: float = quantity(2.0, low=0.01, high=1000, help="spiral: turns, seen from above clockwise; moebius: laps")
     half_width_m: float = quantity(0.30, unit="m", low=0, high=100, help="moebius: half-width of the strip")
+    stick: float = quantity(0.6, low=0, high=1, help="force: largest deflection")
     amplitude_m: np.ndarray = quantity([1, 1, 0], unit="m", low=0, high=100, shape=(3,), help="lissajous: of each axis")
     frequency: np.ndarray = quantity([1, 2, 1], low=0, high=100, shape=(3,), help="lissajous: of each axis")
     yaw_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of yaw a turn of u")
@@ -144,6 +148,7 @@ class Scenario:
     dock: DockSpec = quantity(DockSpec())
     jam: JamRule = quantity(JamRule())
     step: tuple[Step, ...] = quantity(())
+    fault: tuple[Fault, ...] = quantity(())
     task: Task = quantity()
     world: WorldSpec = quantity(WorldSpec())
     sensors: SensorSpec = quantity(SensorSpec())
@@ -201,7 +206,7 @@ class Scenario:
 
     def with_ideal_sensors(self) -> Scenario:
         """The same with perfect sensors; quantisation by the frames stays."""
-        return dataclasses.replace(self, sensors=dataclasses.replace(self.sensors, **IDEAL))
+        return dataclasses.replace(self, sensors=dataclasses.replace(self.sensors, **IDEAL))  # type: ignore[arg-type]
 
     def with_vehicle(self, vehicle: str) -> Scenario:
         """The same with every module of the kind `vehicle`, a name or a file."""
@@ -232,7 +237,11 @@ def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
             q_wm = rotations.multiply(start.q_wm, places[m].quaternion)
             starts[m] = Start(start.p_wm + lever, q_wm)
     spec = (scenario.world, scenario.tank, vehicles, starts, seed, period_ns)
-    return World(*spec, groups=groups, places=places, dock=scenario.dock, jam=scenario.jam)
+    world = World(*spec, groups=groups, places=places, dock=scenario.dock, jam=scenario.jam)
+    for body, members in enumerate(world.bodies):
+        if any(scenario.module[m].clamped for m in members):
+            world.clamp(body)
+    return world
 
 
 def _origin(scenario: Scenario, groups: Sequence[Sequence[int]], module: int) -> np.ndarray:

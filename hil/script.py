@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from firmware_py.core.setpoint import Trajectory, rest_at
+from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Outputs, Request
 from firmware_py.description.fleet import Fleet
@@ -56,21 +56,21 @@ class Script:
         return False
 
 
-def _hover(task: Task, q_wb: np.ndarray) -> Trajectory:
+def _hover(task: Task, q_wb: np.ndarray) -> paths.Trajectory:
     return paths.hold(paths.at_rest(task.centre_m, q_wb), task.duration_s)
 
 
-def _spiral(task: Task, q_wb: np.ndarray) -> Trajectory:
+def _spiral(task: Task, q_wb: np.ndarray) -> paths.Trajectory:
     return paths.spiral(task.centre_m, task.radius_m, task.climb_m, task.turns, task.duration_s, attitude=q_wb)
 
 
-def _moebius(task: Task, q_wb: np.ndarray) -> Trajectory:
+def _moebius(task: Task, q_wb: np.ndarray) -> paths.Trajectory:
     return paths.moebius(
         task.centre_m, task.duration_s, task.radius_m, task.half_width_m, task.turns, ramp_share=MOEBIUS_RAMP_SHARE
     )
 
 
-def _lissajous(task: Task, q_wb: np.ndarray) -> Trajectory:
+def _lissajous(task: Task, q_wb: np.ndarray) -> paths.Trajectory:
     turning = (task.yaw_turns, task.roll_turns)
     return paths.lissajous(
         task.centre_m,
@@ -83,7 +83,7 @@ def _lissajous(task: Task, q_wb: np.ndarray) -> Trajectory:
     )
 
 
-TASKS: dict[str, Callable[[Task, np.ndarray], Trajectory]] = {
+TASKS: dict[str, Callable[[Task, np.ndarray], paths.Trajectory]] = {
     "hover": _hover,
     "lissajous": _lissajous,
     "moebius": _moebius,

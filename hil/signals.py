@@ -49,6 +49,7 @@ def body_signals(modules: int) -> tuple[Signal, ...]:
         Signal("q_wb", 4),
         Signal("v_w", 3, "m/s"),
         Signal("w_b", 3, "rad/s"),
+        Signal("load", 6, "N, N m"),
     )
 
 
@@ -101,7 +102,7 @@ class TruthRecorder:
             self.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w)
         for body in range(len(world.bodies)):
             b = world.body_truth(body)
-            self.record_body(tick, b.time_ns, b.modules, b.p_wb, b.q_wb, b.v_w, b.w_b)
+            self.record_body(tick, b.time_ns, b.modules, b.p_wb, b.q_wb, b.v_w, b.w_b, world.load(body))
         if self._docks is not None:
             docks, (channel, row) = world.docks, self._docks
             jams = sum(contact.jammed for contact in docks.contacts)
@@ -118,12 +119,14 @@ class TruthRecorder:
         q_wb: np.ndarray,
         v_w: np.ndarray,
         w_b: np.ndarray,
+        load: np.ndarray | None = None,
     ) -> None:
         """Truth of the body that `modules` make up, its leader first, at the moment of SYNC `tick`.
 
         Args:
             p_wb, q_wb: (3,) m nominal centre of mass and (4,) body frame in the world.
             v_w: (3,) velocity of that point, world, m/s. w_b: (3,) angular rate, body frame, rad/s.
+            load: (6,) what an ideal load cell reads of a clamped body about its leader's hull centre, body frame.
         """
         leader = modules[0]
         if leader not in self._bodies:
@@ -132,7 +135,7 @@ class TruthRecorder:
         channel, row = self._bodies[leader]
         member = np.zeros(len(self._modules))
         member[list(modules)] = 1.0
-        self._add(channel, time_ns, row.encode((tick, time_ns, member, p_wb, q_wb, v_w, w_b)))
+        self._add(channel, time_ns, row.encode((tick, time_ns, member, p_wb, q_wb, v_w, w_b, np.zeros(6) if load is None else load)))
 
     def record(
         self,

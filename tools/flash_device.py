@@ -18,6 +18,7 @@ import contextlib
 import fcntl
 import json
 import os
+import pwd
 import shutil
 import signal
 import sys
@@ -232,8 +233,8 @@ class Device:
         changed = False
         for unit in found:
             text = unit.read_text()
-            for word, value in (("@ROOT@", self.root), ("@USER@", user_name()), ("@PYTHON@", sys.executable)):
-                text = text.replace(word, str(value))
+            for word, value in unit_words(self.root).items():
+                text = text.replace(word, value)
             installed = UNIT_FOLDER / unit.name
             if installed.is_file() and installed.read_text() == text:
                 continue
@@ -244,7 +245,7 @@ class Device:
             changed = True
         if changed:
             self._run([*as_root(), "systemctl", "daemon-reload"])
-            self._run([*as_root(), "systemctl", "enable", "--quiet", *(unit.name for unit in found)])
+            self._run([*as_root(), "systemctl", "enable", "--quiet", SERVICE])
 
     def _start_and_wait(self, release: str) -> None:
         """Restarts the service and waits until it has run well for HEALTHY_S. Raises RefusedError."""
@@ -296,11 +297,15 @@ def ticks(status: dict[str, str]) -> int | None:
     return int(words["tick"]) if words.get("tick", "").isdigit() else None
 
 
-def user_name() -> str:
-    """Whose files the releases are, and who runs the service."""
-    import pwd
-
-    return pwd.getpwuid(os.getuid()).pw_name
+def unit_words(root: Path) -> dict[str, str]:
+    """What stands between @ signs in the units: where releases are, whose they are, which processors may run them."""
+    count = os.cpu_count() or 1
+    return {
+        "@ROOT@": str(root),
+        "@USER@": pwd.getpwuid(os.getuid()).pw_name,
+        "@PYTHON@": sys.executable,
+        "@CPUS@": f"1-{count - 1}" if count > 2 else f"0-{count - 1}",  # the first has the interrupts
+    }
 
 
 def as_root() -> list[str]:

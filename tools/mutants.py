@@ -91,9 +91,7 @@ def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
     """Nodes whose change means nothing at run time: annotations and text alone on a line."""
     for node in ast.walk(tree):
         roots: list[ast.AST | None] = []
-        if isinstance(node, ast.AnnAssign):
-            roots.append(node.annotation)
-        elif isinstance(node, ast.arg):
+        if isinstance(node, (ast.AnnAssign, ast.arg)):
             roots.append(node.annotation)
         elif isinstance(node, ast.FunctionDef):
             roots.append(node.returns)

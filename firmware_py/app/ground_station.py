@@ -6,6 +6,7 @@ Missions are planned in a process of their own, so that planning takes nothing f
 from __future__ import annotations
 
 import multiprocessing
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -27,6 +28,8 @@ from firmware_py.runtime.clock import unix_ns
 
 _WAIT_S = 0.005
 """How long the thread sleeps when nothing comes: telemetry is late by so much at most."""
+_SWITCH_S = 50e-6
+"""A tick that wakes up waits this long at most for the interpreter, where Python's own 5 ms would make it late."""
 _MOST_TICKS = 200
 """Ticks that may wait for the thread; the oldest go."""
 _MOST_REQUESTS = 256
@@ -44,6 +47,7 @@ class GroundSide:
     Args of the constructor:
         executor: plans missions; None starts a process for it.
         unix_now_ns: the time of day, for signing.
+        threaded: work in a thread; False: after each tick, in the loop's own time.
     """
 
     def __init__(
@@ -52,6 +56,7 @@ class GroundSide:
         firmware: Firmware,
         executor: Executor | None = None,
         unix_now_ns: Callable[[], int] = unix_ns,
+        threaded: bool = True,
     ) -> None:
         """Opens the links. Raises DescriptionError for a link, key file or parameter file that is wrong."""
         self._config, self._pipeline, self._unix_now_ns = config, firmware.pipeline, unix_now_ns
@@ -67,12 +72,16 @@ class GroundSide:
         self._thread: threading.Thread | None = None
         self._stopping = False
         self._saved_ns = 0
+        self._threaded = threaded
+        self._switch_s = 0.0
         self.error: Exception | None = None
         """What ended the thread; the vehicle goes on without it."""
 
     def observe(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        """Observer of the loop: hands the tick over."""
+        """Observer of the loop: hands the tick over, once its commands are out."""
         self._ticks.append((inputs, outputs))
+        if not self._threaded and self.error is None:
+            self._guarded_pump(0.0)
 
     def requests(self) -> list[Request]:
         """What ground stations ask of this tick."""
@@ -111,6 +120,10 @@ class GroundSide:
         if self._executor is None:
             self._executor = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
             self._executor.submit(plan_mission, _NOTHING, None)
+        if not self._threaded:
+            return self
+        self._switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_S)
         self._thread = threading.Thread(target=self._run, name="ground", daemon=True)
         self._thread.start()
         return self
@@ -122,6 +135,7 @@ class GroundSide:
         self._stopping = True
         if self._thread is not None:
             self._thread.join()
+            sys.setswitchinterval(self._switch_s)
         self.close()
 
     def close(self) -> None:
@@ -131,9 +145,12 @@ class GroundSide:
             self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _run(self) -> None:
+        while not self._stopping and self.error is None:
+            self._guarded_pump(_WAIT_S)
+
+    def _guarded_pump(self, wait_s: float) -> None:
         try:
-            while not self._stopping:
-                self.pump(_WAIT_S)
+            self.pump(wait_s)
         except Exception as error:  # the flight is worth more than its telemetry
             self.error = error
 

@@ -9,13 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from firmware_py.app.firmware import BusFrame, compose
+from firmware_py.app.firmware import BusFrame, compose, vehicles_of
+from firmware_py.app.live_view import LiveView
+from firmware_py.app.ground_station import GroundSide
 from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import RealTimeLoop, open_loop
+from firmware_py.app.service import reporting
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet
-from firmware_py.description.parameters import Parameters
+from firmware_py.description.parameters import Parameters, load_parameters
+from firmware_py.ground.config import GroundConfig
+from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from firmware_py.runtime.worker import ThreadWorker
@@ -66,9 +71,27 @@ class Operator:
 
 
 def run_vehicle(
-    fleet: Fleet, parameters: Parameters, hold: bool = False, out: Path | None = None, say: Callable[[str], None] = print
+    fleet: Fleet,
+    parameters: Parameters,
+    hold: bool = False,
+    out: Path | None = None,
+    say: Callable[[str], None] = print,
+    notifier: Notifier | None = None,
+    ground: GroundConfig | None = None,
+    live: LiveView | None = None,
 ) -> Summary:
-    """Runs the firmware against the clock until SIGINT or SIGTERM. Raises DescriptionError and PortError before the first tick."""
+    """Runs the firmware against the clock until SIGINT or SIGTERM. Raises DescriptionError and PortError before the first tick.
+
+    Args:
+        hold: arm as soon as the vehicle may, and hold the place.
+        out: folder for the logs; None keeps none.
+        say: told every event, one line each.
+        notifier: of the service manager.
+        live: serves the log's channels and a scene to viewers.
+        ground: links to ground stations; parameters that they stored earlier take the place of `parameters`.
+    """
+    if ground is not None and ground.parameter_file is not None and ground.parameter_file.exists():
+        parameters = load_parameters(ground.parameter_file)
     worker = ThreadWorker()
     firmware = compose(fleet, parameters, worker=worker)
     operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
@@ -77,12 +100,22 @@ def run_vehicle(
         observers: list[Observer] = [telling(say)]
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
-            recorder = Recorder(out, {"rate_hz": fleet.rate_hz})
+        if out is not None or live is not None:
+            recorder = Recorder(out, {"rate_hz": fleet.rate_hz}, live.context if live is not None else None)
             stack.callback(recorder.close)
             observers.append(recording(recorder, fleet.rate_hz))
+        if live is not None:
+            observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
         for line in stack.enter_context(real_time()):
             say(f"warning: {line}")
-        loop = open_loop(stack, firmware, operator.requests, observers)
+        requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
+        if ground is not None:
+            side = stack.enter_context(GroundSide(ground, firmware))
+            observers.append(side.observe)
+            requests = with_ground(operator, side)
+        loop = open_loop(stack, firmware, requests, observers)
+        if notifier is not None and notifier.is_heard:
+            loop.observers = [*observers, reporting(notifier, loop.rate_keeper, fleet.rate_hz)]
         use_priority(TICK_PRIORITY)
         loop.listen()
         stack.enter_context(_stopping_by_signal(operator))
@@ -90,6 +123,16 @@ def run_vehicle(
         say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
         loop.run(operator.is_done)
         return _summary(loop)
+
+
+def with_ground(operator: Operator, side: GroundSide) -> Callable[[int, Outputs | None], list[Request]]:
+    """The operator's requests and those of ground stations; a reboot that was asked for ends the process, the service starts it anew."""
+
+    def requests(time_ns: int, last: Outputs | None) -> list[Request]:
+        operator.stopping = operator.stopping or side.reboot_asked
+        return [*operator.requests(time_ns, last), *side.requests()]
+
+    return requests
 
 
 def telling(say: Callable[[str], None]) -> Observer:

@@ -113,6 +113,10 @@ class DockingStage:
         self.events: list[Event] = []
         self.records: list[DockRecord] = []
 
+    def retune(self, parameters: Docking) -> None:
+        """Takes other parameters for docks that begin from now on."""
+        self._p = parameters
+
     def watch_joints(self, bodies: Sequence[Body]) -> None:
         """Watches every joint within the given bodies; their magnets hold."""
         kept = {(j.request.module, j.request.target_module): j for j in self._joints}
@@ -222,7 +226,8 @@ class DockingStage:
         whole = _body_of(request.module, estimates)
         estimate = estimates[whole][1]
         away_w = rotate(estimate.q_wb, plan.axis_b) * self._p.standoff_m
-        decisions.parts.append(Part(whole, *undock.prepared.chains, away_w))
+        stays, leaves = undock.prepared.chains
+        decisions.parts.append(Part(whole, stays, leaves, away_w))
         self._undocks.remove(undock)
         self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
 

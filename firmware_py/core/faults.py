@@ -39,6 +39,17 @@ class ThrusterFaults(NamedTuple):
     """(6, 6) takes from a wrench what the thrusters left cannot make."""
 
 
+def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    """(6, 6) gives up moment for what cannot be made, so that the force stays; only then force.
+
+    Args:
+        made, lost: (6, r) and (6, 6 - r) orthonormal bases of the wrenches that can be made, and of the rest.
+    """
+    give_up = np.eye(6)
+    give_up[3:] -= np.linalg.pinv(lost[3:].T) @ lost.T
+    return np.asarray(made @ made.T @ give_up)
+
+
 class FaultDetector:
     """Watches the thrusters of one body."""
 
@@ -128,6 +139,5 @@ class FaultDetector:
     def _judge(self, alive: np.ndarray) -> ThrusterFaults:
         u, values, _ = np.linalg.svd(self._t.matrix * alive, full_matrices=False)
         rank = int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1e-12)))
-        keep = np.asarray(u[:, :rank] @ u[:, :rank].T)
         dead = tuple(int(i) for i in np.flatnonzero(~alive))
-        return ThrusterFaults(alive, dead, self._rank - rank, keep)
+        return ThrusterFaults(alive, dead, self._rank - rank, _keep(u[:, :rank], u[:, rank:]))

@@ -259,7 +259,7 @@ class Guidance:
         elif force == Keep.VERTICAL:
             level_w = np.asarray(rotate(heading(estimate.q_wb), np.r_[wanted[:2], 0.0]))
             out[:3] = rotate_back(estimate.q_wb, np.r_[level_w[:2], rotate(estimate.q_wb, wrench[:3].copy())[2]])
-        return out
+        return np.asarray(out)
 
     def _surfacing(self, wrench: np.ndarray, estimate: Estimate, health: Health) -> np.ndarray:
         """Up by the controller, or by a constant force where depth is unknown; sideways only where the place is known."""

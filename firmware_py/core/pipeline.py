@@ -10,7 +10,7 @@ from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.controller import Controller
 from firmware_py.core.docking import Decisions, DockingStage, Join, Part, tag_table
-from firmware_py.core.estimator import Estimator, TagOnlyEstimator
+from firmware_py.core.estimator import Estimator
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.glide import Glide
 from firmware_py.core.guidance_modes import Guidance
@@ -18,17 +18,29 @@ from firmware_py.core.health import HealthMonitor
 from firmware_py.core.limiter import Limiter
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.motor_test import MotorTest
+from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.supervisor import WARNING, Decision, Supervisor
 from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.topology import join, part_of
 from firmware_py.core.transitions import DOCKING, Effect, Trigger
 from firmware_py.core.types import (
-    Action, BodyRecord, DockRequest, Estimate, Event, Inputs, Measured, Mode, ModuleCommand, Outputs, Thrust,
+    Action,
+    BodyRecord,
+    DockRequest,
+    Estimate,
+    Event,
+    Inputs,
+    Measured,
+    Mode,
+    ModuleCommand,
+    Outputs,
+    Thrust,
 )  # fmt: skip
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 
-ESTIMATORS = {"full": Estimator, "paper": TagOnlyEstimator}
+ESTIMATORS: dict[str, type[Estimator] | type[TagOnlyEstimator]] = {"full": Estimator, "paper": TagOnlyEstimator}
 CHANNELS = 8
 """Thruster commands that one module's frames carry."""
 FOR_ALL = frozenset({Action.ESTOP, Action.CLEAR_ESTOP, Action.GROUND_ALIVE})
@@ -55,6 +67,13 @@ class BodyPipeline:
         self.limiter = Limiter(body, parameters.limiter, period_ns * 1e-9)
         self.lag = ThrusterLag(body.thrusters, period_ns * 1e-9)
         self.voltage_v = np.array([body.thrusters.voltage_v[body.thrusters.module == m][0] for m in range(len(body.modules))])
+
+    def retune(self, parameters: Parameters) -> None:
+        """Takes other gains, noise figures and allocation from this tick on; estimate, set-point and forces stay as they are."""
+        self.estimator.retune(parameters.estimation)
+        self.controller = Controller(self.body, parameters.control)
+        self.allocator = Allocator(self.body, parameters.allocation)
+        self.allocator.set_alive(self.faults.now.alive)
 
     def measure(self, inputs: Inputs) -> Estimate:
         """Sensors -> estimate."""
@@ -181,6 +200,7 @@ class Pipeline:
     def step(self, inputs: Inputs) -> Outputs:
         """One tick."""
         outputs = Outputs(inputs.tick, inputs.time_ns, [IDLE] * self._modules, False, [], [])
+        self._retune(inputs, outputs)
         estimates = {chain.body.index: chain.measure(inputs) for chain in self._chains}
         self._dock(inputs, estimates, outputs)
         for chain in self._chains:
@@ -194,6 +214,20 @@ class Pipeline:
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
             self._command(chain, command, outputs)
         return outputs
+
+    def _retune(self, inputs: Inputs, outputs: Outputs) -> None:
+        """Parameters that were set since the last tick. What a ground station's registry let through still may be refused here."""
+        wanted = dict.fromkeys(r.argument for r in inputs.requests if r.action == Action.SET_PARAMETER)
+        if not wanted:
+            return
+        for name, value in wanted:
+            try:
+                self.parameters = self.parameters.replace(name, value)
+            except DescriptionError as error:
+                outputs.events.append(Event(WARNING, str(error)))
+        for chain in self._chains:
+            chain.retune(self.parameters)
+        self.docking.retune(self.parameters.docking)
 
     def _dock(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
         """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""

@@ -19,7 +19,10 @@ LOOP_SHARE = 4.0 / 27.0
 class Trajectory(Protocol):
     """A motion over time. Built by `prepare.paths`; sampled in the tick."""
 
-    duration_s: float
+    @property
+    def duration_s(self) -> float:
+        """Time from start to end."""
+        ...
 
     def sample(self, t_s: float) -> Setpoint:
         """The set-point at `t_s`; before 0 and after `duration_s` it rests at the ends."""

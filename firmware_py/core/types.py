@@ -194,7 +194,7 @@ class BodyPose(NamedTuple):
     """(3,) mean of the tag centres from the centre of mass, body frame, m."""
     q_wb: Array
     """(4,) attitude of the body."""
-    count: int
+    tags: int
     """Tags that went into it; the noise falls with its root."""
 
 

@@ -56,10 +56,18 @@ class Outbox:
 
     def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
         """Send one message. Raises KeyError for a message or field that there is not."""
+        self.send_payload(channel, name, self.payload(name, values))
+
+    def payload(self, name: str, values: Mapping[str, Any]) -> bytes:
+        """A message's payload, to be sent on several channels."""
+        return self._dialect.by_name[name].encode(values)
+
+    def send_payload(self, channel: int, name: str, payload: bytes) -> None:
+        """Send one message that is encoded already."""
         encoder = self._encoders.get(channel)
         if encoder is None:
             encoder = self._encoders[channel] = Encoder(self._dialect, self._signing, self.system, COMPONENT_AUTOPILOT)
-        self._frames.append(Outgoing(channel, encoder.encode(name, values, channel)))
+        self._frames.append(Outgoing(channel, encoder.frame(name, payload, channel)))
 
     def name_of(self, number: int) -> str:
         """Name of a message number; empty when there is none."""

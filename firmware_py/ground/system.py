@@ -94,10 +94,10 @@ class System:
 
     def stream(self, time_ns: int) -> None:
         """Send what is due on every channel; each message is made once."""
-        made: dict[str, list[Mapping[str, Any]]] = {}
+        made: dict[str, list[bytes]] = {}
         for channel, rates in self.channels.items():
             for name in rates.due(time_ns):
                 if name not in made:
-                    made[name] = STREAMS[name](self.subject)
-                for values in made[name]:
-                    self.outbox.send(channel, name, values)
+                    made[name] = [self.outbox.payload(name, values) for values in STREAMS[name](self.subject)]
+                for payload in made[name]:
+                    self.outbox.send_payload(channel, name, payload)

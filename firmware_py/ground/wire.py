@@ -130,8 +130,11 @@ class Encoder:
 
     def encode(self, name: str, values: Mapping[str, Any], link: int = 0) -> bytes:
         """One frame. Raises KeyError for a message or field that there is not."""
+        return self.frame(name, self._dialect.by_name[name].encode(values), link)
+
+    def frame(self, name: str, payload: bytes, link: int = 0) -> bytes:
+        """The frame of a payload that is encoded already."""
         definition = self._dialect.by_name[name]
-        payload = definition.encode(values)
         flags = 0 if self._signing.key is None else _SIGNED
         number, sequence = definition.number, self._sequence
         self._sequence = (sequence + 1) & 0xFF

@@ -83,7 +83,7 @@ def plan_undock(
     halves = ([m for m in whole.modules if m not in piece], [m for m in whole.modules if m in piece])
     stays, leaves = (
         assemble(
-            [_cell_of(whole, m) for m in half],
+            np.array([_cell_of(whole, m) for m in half]),
             [nearest(_turn_of(whole, m)) for m in half],
             [vehicles[m] for m in half],
             half,
@@ -120,10 +120,10 @@ def _reachable(body: Body, start: int, cut: tuple[int, int]) -> set[int]:
     while ends:
         here = ends.pop()
         for other in body.modules:
-            if other not in reached and {here, other} != set(cut):
-                if int(np.abs(_cell_of(body, other) - _cell_of(body, here)).sum()) == 1:
-                    reached.add(other)
-                    ends.append(other)
+            apart = int(np.abs(_cell_of(body, other) - _cell_of(body, here)).sum())
+            if apart == 1 and other not in reached and {here, other} != set(cut):
+                reached.add(other)
+                ends.append(other)
     return reached
 
 
@@ -137,4 +137,4 @@ def _cell_of(body: Body, module: int) -> np.ndarray:
 
 
 def _rounded(vector: np.ndarray) -> np.ndarray:
-    return np.rint(vector).astype(np.int64)
+    return np.asarray(np.rint(vector), dtype=np.int64)

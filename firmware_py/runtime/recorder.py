@@ -17,6 +17,7 @@ The same run writes the same bytes. The files are whole up to the last `flush`, 
 from __future__ import annotations
 
 import json
+import os
 from collections import deque
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -31,6 +32,8 @@ from firmware_py.description.signals import Layout, Row, Signal, TextLayout
 
 CAN_LOG = "can.log"
 SIGNAL_LOG = "signals.mcap"
+LIVE_ONLY = ("/scene", "/tf")
+"""What is drawn from other channels has no place in a log."""
 WARNING = 4
 """syslog severity of a log that failed."""
 
@@ -171,16 +174,33 @@ class Recorder:
     the tick (from the same thread or another), `close` at the end.
     """
 
-    def __init__(self, folder: Path, configuration: Mapping[str, Any] | None = None) -> None:
-        self._can = GuardedFile(folder / CAN_LOG)
-        self._mcap = GuardedFile(folder / SIGNAL_LOG)
+    def __init__(
+        self,
+        folder: Path | None,
+        configuration: Mapping[str, Any] | None = None,
+        context: foxglove.Context | None = None,
+    ) -> None:
+        """Opens both files.
+
+        Args:
+            folder: where they go; None: nowhere, for signals that are only looked at live.
+            configuration: attached to the signals.
+            context: the channels' own; give one to serve them live too. Topics of LIVE_ONLY stay out of the file.
+        """
+        self._can = GuardedFile(folder / CAN_LOG if folder is not None else Path(os.devnull))
+        self._mcap = GuardedFile(folder / SIGNAL_LOG if folder is not None else Path(os.devnull))
         self._frames: deque[tuple[int, int, str, tuple[tuple[int, bytes], ...]]] = deque()
         self._received = 0
         self._reported = False
         self._closed = False
-        self._context = foxglove.Context()
+        self._context = context if context is not None else foxglove.Context()
         options = MCAPWriteOptions(compression=None, disable_seeking=True, profile="")
-        self._writer = foxglove.open_mcap(self._mcap, context=self._context, writer_options=options)
+        self._writer = foxglove.open_mcap(
+            self._mcap,
+            context=self._context,
+            writer_options=options,
+            channel_filter=lambda channel: channel.topic not in LIVE_ONLY,
+        )
         if configuration is not None:
             data = json.dumps(configuration, sort_keys=True).encode()
             self._writer.attach(

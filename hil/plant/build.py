@@ -110,12 +110,12 @@ def _shelter(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row of each module in the maps, its (m, 3) open sides, and the maps of all bodies of more than one module."""
     row, sides = np.full(len(positions), ALONE, dtype=np.int64), np.ones((len(positions), 3))
-    maps = []
+    maps: list[np.ndarray] = []
     for members in groups:
         if len(members) > 1:
             chosen = list(members)
             found = shelter.shelter_maps(positions[chosen], quaternions[chosen], sizes[chosen])
-            row[chosen] = np.arange(len(chosen)) + sum(len(m) for m in maps)
+            row[chosen] = np.arange(len(chosen)) + int(sum(len(m) for m in maps))
             sides[chosen] = shelter.side_shares(found)
             maps.append(found)
     return row, sides, _stack(maps)

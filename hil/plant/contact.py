@@ -12,7 +12,23 @@ import numpy as np
 from numba import types
 
 from hil.plant.bodies import BODIES, MODULES, add_force
-from hil.plant.vectors import F2, F8, M3, V3, compiled, cross, dot, matrix, matrix_of, minus, plus, times, triple, turn, turn_back
+from hil.plant.vectors import (
+    F2,
+    F8,
+    M3,
+    V3,
+    compiled,
+    cross,
+    dot,
+    matrix,
+    matrix_of,
+    minus,
+    plus,
+    times,
+    triple,
+    turn,
+    turn_back,
+)
 
 I8 = types.int64
 NEAR_M = 0.5

@@ -24,6 +24,8 @@ RELAY = (0.0, 1.0, -1.0, 0.0)
 FORWARD = 1
 LEAST_HOLD = 0.05
 """Share of the full pull below which magnets no longer hold a joint."""
+OPENING_M_S = 0.001
+"""Faces that part faster than this do not lock: they were just pulled open."""
 DISK_M = 0.07
 """Radius of a docking disk: a moment on a joint is borne by a pull at its rim (synthetic)."""
 
@@ -73,6 +75,7 @@ class Docks:
         self.contacts: list[Contact] = []
         self.gap_m = self.lateral_m = math.nan
         """Between the faces of the pair that is nearest to docking."""
+        self._hung = np.full((m, 6), -1, dtype=np.int64)
         self._surge = np.zeros((m, 6))
         self._engaged = np.zeros((m, 6))
         self._busy = False
@@ -81,12 +84,17 @@ class Docks:
 
     def set_relays(self, module: int, relays: Sequence[int]) -> None:
         """What a DOCK_CMD asks of one module's six coils."""
-        wanted = np.array(relays, dtype=np.int64)
+        wanted = np.where(self._hung[module] >= 0, self._hung[module], np.array(relays, dtype=np.int64))
         changed = wanted != self.relays[module]
         if changed.any():
             self._surge[module, changed] = 1.0
             self.relays[module] = wanted
             self._busy = True
+
+    def hang(self, module: int, face: int, relay: int | None) -> None:
+        """A fault: this relay stays as it is told here, whatever comes; None: it obeys again, from the next command on."""
+        self._hung[module, face] = -1 if relay is None else relay
+        self.set_relays(module, self.relays[module].tolist())
 
     def energise(self, joints: Sequence[Joint]) -> None:
         """Modules that start docked start with their magnets on, long since."""
@@ -166,7 +174,7 @@ class Docks:
                 self._meet(Contact(time_ns, i, j, lateral, closing, math.degrees(tilt), False))
         elif gap > s.rearm_m or lateral > s.mouth_m:
             self._let_go(i, j)
-        elif self._locks(gap, lateral, tilt, roll, f_i, f_j, i, j):
+        elif closing > -OPENING_M_S and self._locks(gap, lateral, tilt, roll, f_i, f_j, i, j):
             verdict.join.append(Joint(i, f_i, j, f_j))
 
     def _meet(self, contact: Contact) -> None:

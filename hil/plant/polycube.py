@@ -12,7 +12,7 @@ from firmware_py.description.vehicle import FACE_NORMALS
 from hil.plant.lattice import COUNT, QUATERNIONS
 
 Cell = tuple[int, int, int]
-STEPS = tuple(tuple(int(x) for x in row) for row in FACE_NORMALS)
+STEPS: tuple[Cell, ...] = tuple((int(x), int(y), int(z)) for x, y, z in FACE_NORMALS)
 """The six ways from a cell to its neighbours."""
 MATES = ({"P", "D"}, {"D"})
 """Kinds of two faces that may meet: a probe and a drogue dock, two drogues leave each other alone."""
@@ -48,7 +48,8 @@ def grow(rng: np.random.Generator, count: int, faces: str) -> list[Seat]:
 def _kinds(rotation: int, faces: str) -> dict[Cell, str]:
     """Kind of the face that looks each way when the module is turned so."""
     turn = rotations.to_matrix(QUATERNIONS[rotation].copy())
-    return {tuple(int(round(float(x))) for x in turn @ n): kind for n, kind in zip(FACE_NORMALS, faces, strict=True)}  # type: ignore[misc]
+    ways = [turn @ normal for normal in FACE_NORMALS]
+    return {(round(float(x)), round(float(y)), round(float(z))): kind for (x, y, z), kind in zip(ways, faces, strict=True)}
 
 
 def _beside(cell: Cell, step: Cell) -> Cell:

@@ -88,8 +88,8 @@ class World:
         step_ns: int = STEP_NS,
         groups: Sequence[Sequence[int]] | None = None,
         places: Sequence[Place] | None = None,
-        dock: DockSpec = DockSpec(),
-        jam: JamRule = JamRule(),
+        dock: DockSpec | None = None,
+        jam: JamRule | None = None,
     ) -> None:
         """A world at time 0.
 
@@ -116,8 +116,9 @@ class World:
         self._water.flow[0], self._water.flow[1] = self._gusts.mean, self._gusts.start
         self._thrusters = make_thrusters(vehicles, self._draws, spec, step_ns)
         self._seen = np.zeros((len(vehicles), 16))
-        self.docks = Docks(vehicles, dock, jam, seed)
+        self.docks = Docks(vehicles, dock or DockSpec(), jam or JamRule(), seed)
         self.jet_strength = spec.jet_strength
+        self._broken: dict[tuple[int, int], tuple[str, float]] = {}
         alone = [Place(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) for _ in vehicles]
         self._seat(groups or [(m,) for m in range(len(vehicles))], places or alone)
         for b, members in enumerate(self.bodies):
@@ -146,7 +147,40 @@ class World:
 
     def set_command(self, module: int, u: Sequence[float] | np.ndarray, armed: bool) -> None:
         """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call; disarmed is zero."""
-        thrusters_module.command(self._thrusters, self._first[module], np.array(u, dtype=np.float64) * float(armed))
+        wanted = np.array(u, dtype=np.float64) * float(armed)
+        if self._broken:
+            wanted = self._as_broken(module, wanted)
+        thrusters_module.command(self._thrusters, self._first[module], wanted)
+        for (m, t), (how, value) in self._broken.items():
+            if m == module and how == "weak":
+                self._thrusters.level[self._first[m] + t, 0] *= value
+
+    def break_thruster(self, module: int, thruster: int, how: str, value: float = 0.0) -> None:
+        """A fault from the next command on.
+
+        Args:
+            how: dead; weak: `value` is the share of its force left, and its propeller turns slower; reversed; stuck: at
+                the command `value`; fake_rpm: `value` is the share of its force left, and its ESC reports a healthy one.
+        """
+        self.mend_thruster(module, thruster)
+        self._broken[module, thruster] = (how, value)
+        if how == "fake_rpm":
+            self._thrusters.constants[self._first[module] + thruster, 0] *= value
+
+    def mend_thruster(self, module: int, thruster: int) -> None:
+        """As it was drawn at the start."""
+        self._broken.pop((module, thruster), None)
+        self._thrusters.constants[self._first[module] + thruster, 0] = self._draws[module].gain[thruster]
+
+    def _as_broken(self, module: int, wanted: np.ndarray) -> np.ndarray:
+        for (m, t), (how, value) in self._broken.items():
+            if m == module and how in ("dead", "reversed", "stuck"):
+                wanted[t] = {"dead": 0.0, "reversed": -wanted[t], "stuck": value}[how]
+        return wanted
+
+    def sag(self, modules: Sequence[int], volts: float) -> None:
+        """The batteries of these modules give so much less, open circuit."""
+        self._thrusters.supply[list(modules), 1] -= volts
 
     def advance(self, duration_ns: int) -> None:
         """Moves the world on. The duration must be a multiple of the sub-step, else DescriptionError."""
@@ -260,7 +294,9 @@ class World:
         self._body_arrays.state[body, 7:13] = 0.0
 
     def load(self, body: int) -> np.ndarray:
-        """(6,) wrench about O that the body gives to whatever clamps it, body frame."""
+        """(6,) wrench about O that the body gives to whatever clamps it, body frame; zeros for a body that swims."""
+        if not self._body_arrays.clamped[body]:
+            return np.zeros(6)
         return self._body_arrays.wrench[body].copy()
 
     def _step(self, steps: int) -> None:

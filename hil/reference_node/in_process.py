@@ -94,4 +94,3 @@ class CNodes:
         for node in self.c_nodes.values():
             answers += node.take(frame, time_ns)
         return answers
-

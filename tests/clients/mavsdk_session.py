@@ -57,7 +57,8 @@ def fly(url: str) -> None:
     p = wait("position", lambda: telemetry.position_velocity_ned(), 10).position
     euler = telemetry.attitude_euler()
     say("telemetry", ned=[p.north_m, p.east_m, p.down_m], roll_deg=euler.roll_deg,
-        in_air=telemetry.in_air(), home=wait("home", lambda: telemetry.home().latitude_deg, 10), health=str(telemetry.health()))  # fmt: skip
+        in_air=telemetry.in_air(),
+        home=wait("home", lambda: telemetry.home().latitude_deg, 10), health=str(telemetry.health()))  # fmt: skip
     everything = param.get_all_params()
     before = param.get_param_float("POS_BW")
     param.set_param_float("POS_BW", before + 0.1)
@@ -77,7 +78,8 @@ def fly(url: str) -> None:
 def mission(plugin: Mission, action: Action, telemetry: Telemetry) -> None:
     plugin.upload_mission(MissionPlan([place(*w) for w in WAYPOINTS]))
     down = plugin.download_mission().mission_items
-    say("mission", up=len(WAYPOINTS), down=len(down), latitude=down[0].latitude_deg, altitude=down[0].relative_altitude_m)
+    first = down[0]
+    say("mission", up=len(WAYPOINTS), down=len(down), latitude=first.latitude_deg, altitude=first.relative_altitude_m)
     action.arm()
     wait("armed", telemetry.armed, 5)
     say("armed")

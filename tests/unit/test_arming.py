@@ -141,11 +141,11 @@ def test_mode_needs_what_it_steers_by(mode: Mode) -> None:
     blind = BLIND._replace(depth_age_s=6.0)
     expected = {
         Mode.STABILIZE: ["no pose yet"], Mode.ALT_HOLD: ["no pose yet", "depth unknown"],
-        **dict.fromkeys(PLACED, ["no pose yet"]),
+        **{key: ["no pose yet"] for key in PLACED},
     }  # fmt: skip
     assert missing(mode, blind, P) == expected.get(mode, [])
     lost = GOOD._replace(tag_age_s=above(8.0), depth_age_s=above(5.0))
-    expected = {Mode.ALT_HOLD: ["depth unknown"], **dict.fromkeys(PLACED, ["no tag for 8.0 s"])}
+    expected = {Mode.ALT_HOLD: ["depth unknown"], **{key: ["no tag for 8.0 s"] for key in PLACED}}
     assert missing(mode, lost, P) == expected.get(mode, [])
     nearly = GOOD._replace(tag_age_s=8.0, depth_age_s=5.0)
     assert missing(mode, nearly, P) == []

@@ -248,7 +248,7 @@ def test_pilot_may_take_over_from_every_fail_safe_but_disarming() -> None:
     extra = {Mode.POSHOLD, Mode.SURFACE, Mode.MOTOR_DETECT}
     assert PERMITTED[Level.HOLD] - PILOTED == extra
     assert PERMITTED[Level.DEPTH] - PILOTED == PERMITTED[Level.SURFACE] - PILOTED == {Mode.SURFACE}
-    assert PLACED == POSE_MODES and MOVING == POSE_MODES - {Mode.POSHOLD} and ANY == set(Mode)
+    assert PLACED == POSE_MODES and POSE_MODES - {Mode.POSHOLD} == MOVING and set(Mode) == ANY
 
 
 @pytest.mark.parametrize("name", FIELDS)

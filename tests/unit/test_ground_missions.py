@@ -37,7 +37,11 @@ def client(world: World) -> Client:
 
 
 def item(
-    sequence: int, place: tuple[int, int, float], command: int = 16, frame: int = 6, p: tuple[float, ...] = (0, 0, 0, NAN)
+    sequence: int,
+    place: tuple[int, int, float],
+    command: int = 16,
+    frame: int = 6,
+    p: tuple[float, ...] = (0, 0, 0, NAN),
 ) -> tuple[float, ...]:
     return (1, 1, sequence, frame, command, 0, 1, *p, *place)
 

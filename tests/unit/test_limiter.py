@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from firmware_py.core.body import Body
-from firmware_py.core.limiter import Limiter
+from firmware_py.core.limiter import (
+    FACES,
+    FORWARD,
+    OFF,
+    POWER_HALVINGS,
+    REVERSE,
+    VOLTAGE_EXPONENT,
+    VOLTAGE_RANGE,
+    Limiter,
+    MagnetLimiter,
+)  # fmt: skip
 from firmware_py.description import parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -224,3 +234,91 @@ def test_force_too_small_for_the_propeller_is_not_commanded(rich: Body) -> None:
     for size in around(edge):
         _, command = Limiter(rich, QUICK, 1.0).step(np.full(16, size), True, NOMINAL)
         assert command.any() == (size >= edge)
+
+
+# ---------------------------------------------------------------- thrusters that are out
+
+
+def test_thruster_that_is_out_stops_in_this_very_tick(rich: Body) -> None:
+    limiter = Limiter(rich, parameters.Limiter(), DT)
+    for _ in range(20):
+        limiter.step(np.full(16, 9.0), True, NOMINAL)
+    alive = np.arange(16) != 5
+    force, command = limiter.step(np.full(16, 9.0), True, NOMINAL, alive)
+    assert force[5] == 0.0 == command[5]
+    np.testing.assert_array_equal(force[alive], 9.0)
+    force, _ = limiter.step(np.full(16, 9.0), True, NOMINAL, np.ones(16, dtype=bool))
+    assert force[5] == pytest.approx(2.0), "and comes back by the slew limit"
+
+
+# ---------------------------------------------------------------- docking magnets
+
+MAGNETS = parameters.Limiter(relay_on_s=2.0, relay_duty=0.25, relay_w=6.0)
+ON = (1, 0, 0, 0, 0, 2)
+
+
+def test_magnet_may_be_on_for_ever_at_full_duty() -> None:
+    magnets = MagnetLimiter(parameters.Limiter(relay_on_s=1.0, relay_duty=1.0), 0.5)
+    assert all(magnets.step(ON) == ON for _ in range(100))
+
+
+def test_magnet_that_is_on_too_long_rests_until_it_is_half_cool() -> None:
+    """On it loses 0.75 s a second of its 2 s, off it gains 0.25 s a second: so 11 ticks on, 17 off, then 6 and 18."""
+    magnets = MagnetLimiter(MAGNETS, 0.25)
+    seen = [magnets.step(ON) for _ in range(60)]
+    assert {state for states in seen for state in states} == {0, 1, 2}
+    lit = [states == ON for states in seen]
+    assert all(states in (ON, (0,) * 6) for states in seen)
+    edges = [0, *np.flatnonzero(np.diff(lit)) + 1]
+    np.testing.assert_array_equal(np.diff(edges), [11, 17, 6, 18, 6])
+
+
+def test_each_magnet_has_its_own_account() -> None:
+    magnets = MagnetLimiter(MAGNETS, 0.25)
+    for _ in range(11):
+        magnets.step((1, 0, 0, 0, 0, 0))
+    assert magnets.step((1, 1, 0, 0, 0, 0)) == (0, 1, 0, 0, 0, 0)
+
+
+def test_cool_magnet_saves_no_more_than_its_limit() -> None:
+    magnets = MagnetLimiter(MAGNETS, 0.25)
+    for _ in range(1000):
+        magnets.step((0,) * 6)
+    lit = [magnets.step(ON) == ON for _ in range(12)]
+    assert lit == [True] * 11 + [False]
+
+
+def test_relay_state_that_does_not_exist_is_off() -> None:
+    assert MagnetLimiter(MAGNETS, 0.25).step((3, -1, 1, 7, 2, 0)) == (0, 0, 1, 0, 2, 0)
+
+
+def test_magnets_that_are_on_take_their_power() -> None:
+    magnets = MagnetLimiter(MAGNETS, 0.25)
+    assert magnets.power_w == 0.0
+    magnets.step(ON)
+    assert magnets.power_w == 12.0
+    magnets.step((0,) * 6)
+    assert magnets.power_w == 0.0
+
+
+@pytest.mark.parametrize("magnets_w", [10.0, 30.0, 40.0, 50.0])
+def test_thrusters_have_what_the_magnets_leave(body: Body, magnets_w: float) -> None:
+    limiter = Limiter(replace(body, supply_power_w=np.array([40.0, 40.0])), QUICK, 1.0)
+    limiter.magnets[1].power_w = magnets_w
+    force, _ = limiter.step(np.full(16, 5.0), True, NOMINAL)
+    left = max(0.0, 40.0 - magnets_w)
+    assert 0.995 * 40.0 < power_of(body, force, 0) <= 40.0
+    assert 0.99 * left <= power_of(body, force, 1) <= left
+    assert len(limiter.magnets) == 2
+
+
+def test_limits_are_made_of_these_numbers() -> None:
+    assert (VOLTAGE_EXPONENT, VOLTAGE_RANGE, FACES) == (1.2, (0.6, 1.4), 6)
+    assert (OFF, FORWARD, REVERSE) == (0, 1, 2)
+    assert 10 <= POWER_HALVINGS <= 20
+
+
+@pytest.mark.parametrize(("volts", "believed"), [(7.2, 7.2), (7.1, 7.2), (16.8, 16.8), (17.0, 16.8)])
+def test_voltage_is_believed_within_its_range(rich: Body, volts: float, believed: float) -> None:
+    _, command = Limiter(rich, QUICK, 1.0).step(np.full(16, 2.0), True, np.full(2, volts))
+    np.testing.assert_allclose(force_of(rich, command, (believed / 12.0) ** 1.2), 2.0, atol=1e-9)

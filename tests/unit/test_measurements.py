@@ -66,14 +66,14 @@ def assert_is_the_truth(pose: BodyPose) -> None:
 def test_any_tag_of_any_module_tells_the_pose_of_the_body(measurements: Measurements, module: int, face: int) -> None:
     (pose,) = fuse_tags(measurements, (module, tag_seen(module, face)))
     assert_is_the_truth(pose)
-    assert (pose.count, pose.capture_ns) == (1, CAPTURE)
+    assert (pose.tags, pose.capture_ns) == (1, CAPTURE)
 
 
 def test_all_tags_of_one_picture_are_one_pose(measurements: Measurements) -> None:
     everything = [(m, tag_seen(m, f)) for m in range(3) for f in range(6)]
     (pose,) = fuse_tags(measurements, *everything)
     assert_is_the_truth(pose)
-    assert pose.count == 18
+    assert pose.tags == 18
 
 
 def test_tags_of_one_picture_are_averaged(measurements: Measurements) -> None:
@@ -97,14 +97,14 @@ def test_flipped_tag_among_four_is_left_out(measurements: Measurements, flipped:
     seen = [(0, tag_seen(0, face, turn=flip if k == flipped else None)) for k, face in enumerate((5, 4, 0, 2))]
     (pose,) = fuse_tags(measurements, *seen)
     assert_is_the_truth(pose)
-    assert pose.count == 3
+    assert pose.tags == 3
 
 
 def test_noise_of_a_degree_is_not_a_flip(measurements: Measurements) -> None:
     rng = np.random.default_rng(4)
     seen = [(m, tag_seen(m, f, turn=rng.normal(scale=0.02, size=3))) for m in range(3) for f in (4, 5)]
     (pose,) = fuse_tags(measurements, *seen)
-    assert pose.count == 6
+    assert pose.tags == 6
     assert np.linalg.norm(difference(pose.q_wb, Q_WB)) < 0.03
 
 

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body
-from firmware_py.core.estimator import READY_AFTER, TagOnlyEstimator
+from firmware_py.core.estimator import READY_AFTER
+from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
 from firmware_py.core.types import BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation

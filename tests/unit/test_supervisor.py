@@ -12,7 +12,19 @@ from firmware_py.core.health import Health
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.supervisor import CRITICAL, INFORMATION, WARNING, Decision, Supervisor
 from firmware_py.core.transitions import (
-    ARMED, DOCKING, MODE_TABLE, MODES, ROWS, TABLE, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger,
+    ARMED,
+    DOCKING,
+    MODE_TABLE,
+    MODES,
+    ROWS,
+    TABLE,
+    TRIGGERS,
+    Effect,
+    Guard,
+    Need,
+    State,
+    Transition,
+    Trigger,
 )  # fmt: skip
 from firmware_py.core.types import Action, DockRequest, Event, Mode, Request, Sticks
 from firmware_py.description.parameters import Parameters
@@ -71,7 +83,7 @@ def test_numbers_are_those_of_the_logs() -> None:
     assert [int(guard) for guard in Guard] == list(range(9))
     assert [int(effect) for effect in Effect] == list(range(8))
     assert [int(need) for need in Need] == list(range(4))
-    assert DOCKING == {Trigger.DOCK, Trigger.UNDOCK} and ARMED == {State.ARMED}
+    assert {Trigger.DOCK, Trigger.UNDOCK} == DOCKING and {State.ARMED} == ARMED
 
 
 def row(state: State, trigger: Trigger) -> tuple[Guard, Effect, State, Mode | None]:

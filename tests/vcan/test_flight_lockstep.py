@@ -36,7 +36,8 @@ EVENTS = 1000 if FULL else 40
 TICKS_APART = (1, 25)
 RESUMED_TICKS = 50
 """0.5 s."""
-MCU_ARMED = 2
+MCU_DISARMED, MCU_ARMED, MCU_STOPPED = 1, 2, 4
+"""States in MCU_STATUS."""
 
 
 class Flown(NamedTuple):
@@ -122,10 +123,11 @@ def test_flight_beside_a_stranger_s_frames_sends_what_it_sends_alone(
     assert beside == sent(on_virtual)
 
 
-def test_foreign_sync_is_seen_and_an_estop_stops_the_thrusters(link: Interface) -> None:
+def test_foreign_sync_is_an_alarm_and_an_estop_stops_the_thrusters(link: Interface) -> None:
     events: list[str] = []
     armed: list[bool] = []
     turning: list[bool] = []
+    mcu: list[int] = []
     with bench_on(f"socketcan:{link.name}", short("hover", 1.0)) as bench:
 
         def watch(received: Sequence[BusFrame], to_bus: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
@@ -136,14 +138,16 @@ def test_foreign_sync_is_seen_and_an_estop_stops_the_thrusters(link: Interface) 
             events.extend(event.text for event in outputs.events)
             armed.append(outputs.records[0].state in ARMED)
             turning.append(bool(np.any(outputs.modules[0].thrusters)))
+            mcu.append(inputs.modules[0].mcu_state)
 
         bench.fly([watch])
         assert bench.firmware.collector.faults["foreign_sync"] == 1
-        assert bench.nodes.mcus[1].stopped
     assert any("SYNC" in text for text in events), events
     assert all(armed[201:249])
     assert not any(armed[252:])
     assert not any(turning[252:])
+    assert set(mcu[252:268]) == {MCU_STOPPED}
+    assert mcu[-1] == MCU_DISARMED  # 200 ms without ESTOP and told to be disarmed: the module lets go, the robot stays
 
 
 def test_flight_goes_on_through_random_link_events(link: Interface) -> None:

@@ -1,0 +1,192 @@
+"""`modcube doctor`: whether this machine and its buses are fit to fly, in words a person can act on.
+
+Looks, and changes nothing; on a bus where nobody sends SYNC it sends a few, which move no thruster.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from firmware_py.runtime.realtime import real_time
+
+OK, WARNING, FAILED = "ok", "warn", "FAIL"
+SPARE_BYTES, NEEDED_BYTES = 2_000_000_000, 200_000_000
+"""Room for logs: an hour takes 600 MB (0.17 MB/s measured at 100 Hz)."""
+STEADY_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock")
+EARLIEST_YEAR = 2024
+"""A Jetson without a battery for its clock starts in 1970."""
+SLOW_IMPORT_S = 8.0
+"""Longest that importing the tick's code takes when all of it is compiled and cached."""
+WARM_MODULES = ("firmware_py.app.vehicle", "firmware_py.app.firmware")
+"""Importing these compiles everything that a tick calls, or finds it in the cache."""
+
+
+class Finding(NamedTuple):
+    """One thing that was looked at; `advice` says what to do when it is not ok."""
+
+    name: str
+    state: str
+    text: str
+    advice: str = ""
+
+
+Look = Callable[[str], str]
+"""Text of a file; empty where there is none."""
+
+
+def read_file(path: str) -> str:
+    """Text of a file of /proc or /sys; empty where there is none."""
+    try:
+        return Path(path).read_text().strip()
+    except OSError:
+        return ""
+
+
+def check_machine(folder: Path, look: Look = read_file) -> list[Finding]:
+    """Everything but the buses. `folder` is where logs go."""
+    return [
+        check_kernel(look),
+        *check_permissions(),
+        check_governor(look),
+        check_clock(look, time.gmtime().tm_year),
+        check_disk(folder, shutil.disk_usage(folder).free),
+        check_cache(),
+    ]
+
+
+def check_kernel(look: Look) -> Finding:
+    """Kernel and PREEMPT_RT."""
+    release = f"Linux {platform.release()} {platform.machine()}"
+    if look("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version():
+        return Finding("kernel", OK, f"{release}, PREEMPT_RT")
+    advice = "ticks may be late by milliseconds under load; on a Jetson: apt-get install nvidia-l4t-rt-kernel"
+    return Finding("kernel", WARNING, f"{release}, without PREEMPT_RT", advice)
+
+
+def check_permissions() -> Iterator[Finding]:
+    """Real-time priority, fine timers and locked memory, by trying them."""
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    with real_time() as refused:
+        pass
+    if not refused:
+        yield Finding("real time", OK, f"priority, timers and locked memory are granted (rtprio {limit})")
+    for line in refused:
+        yield Finding(
+            "real time", WARNING, line, "run it as modcube.service, or raise rtprio and memlock in limits.conf"
+        )
+
+
+def check_governor(look: Look) -> Finding:
+    """Frequency scaling of the processors."""
+    governor = look("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    text = f"{os.cpu_count()} processors, governor {governor or 'none'}"
+    if governor in ("", "performance"):
+        return Finding("processors", OK, text)
+    return Finding("processors", WARNING, text, "clocks rise too late: sudo jetson_clocks, or governor performance")
+
+
+def check_clock(look: Look, year: int) -> Finding:
+    """Source of time, and whether the date can be true."""
+    source = look("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown"
+    if source not in STEADY_CLOCKS:
+        return Finding("clock", WARNING, f"source {source}", f"slow to read; right are {', '.join(STEADY_CLOCKS)}")
+    if year < EARLIEST_YEAR:
+        return Finding("clock", WARNING, f"the year is {year}", "set the date; a battery or chrony keeps it")
+    return Finding("clock", OK, f"source {source}")
+
+
+def check_disk(folder: Path, free_bytes: int) -> Finding:
+    """Room for logs."""
+    text = f"{free_bytes / 1e9:.1f} GB free for logs in {folder}"
+    if free_bytes >= SPARE_BYTES:
+        return Finding("disk", OK, text)
+    state = WARNING if free_bytes >= NEEDED_BYTES else FAILED
+    return Finding("disk", state, text, "remove old logs, or log elsewhere with --out")
+
+
+def check_cache() -> Finding:
+    """Whether compiled code is there: by how long a fresh process takes to load it."""
+    took_s = warm_up()
+    if took_s <= SLOW_IMPORT_S:
+        return Finding("compiled code", OK, f"loads in {took_s:.1f} s")
+    advice = "it is compiled and cached now; if this comes again the cache cannot be written (NUMBA_CACHE_DIR)"
+    return Finding("compiled code", WARNING, f"took {took_s:.0f} s to load", advice)
+
+
+def warm_up() -> float:
+    """Loads what a tick calls, compiling what is not cached, in a process of its own; returns the seconds it took."""
+    began = time.perf_counter()
+    words = "; ".join(f"import {name}" for name in WARM_MODULES)
+    subprocess.run([sys.executable, "-P", "-c", words], check=True)
+    return time.perf_counter() - began
+
+
+def check_interface(name: str, show: Callable[[str], str] | None = None) -> Finding:
+    """State of a SocketCAN interface, as `ip` tells it."""
+    title = f"bus {name}"
+    text = (show or show_link)(name)
+    try:
+        link: dict[str, Any] = json.loads(text)[0]
+    except (ValueError, IndexError):
+        return Finding(title, FAILED, "there is no such interface", "is its driver loaded? ip link shows all")
+    info = link.get("linkinfo", {})
+    kind, data = info.get("info_kind", ""), info.get("info_data", {})
+    if kind not in ("can", "vcan"):
+        return Finding(title, FAILED, f"is of kind {kind or 'none'}, not CAN", "choose another with --bus")
+    if "UP" not in link.get("flags", []):
+        return Finding(title, FAILED, "is down", f"sudo systemctl start modcube-can@{name}")
+    if kind == "vcan":
+        return Finding(title, OK, "virtual, up")
+    return judge_controller(title, name, data, int(link.get("txqlen", 0)))
+
+
+def judge_controller(title: str, name: str, data: dict[str, Any], queue: int) -> Finding:
+    """A real controller that is up: bit rate, restart, state, queue."""
+    rate, state = int(data.get("bittiming", {}).get("bitrate", 0)), str(data.get("state", "?"))
+    restart = int(data.get("restart_ms", 0))
+    text = f"{rate // 1000} kbit/s, {state}, restart-ms {restart}, queue {queue}"
+    set_up = f"sudo systemctl restart modcube-can@{name}"
+    if rate != 1_000_000:
+        return Finding(title, FAILED, text, f"the bit rate must be 1000 kbit/s: {set_up}")
+    if state in ("BUS-OFF", "STOPPED"):
+        return Finding(title, FAILED, text, "look at wiring, termination (60 ohm across), power of the nodes")
+    if state != "ERROR-ACTIVE":
+        return Finding(title, WARNING, text, "frames are damaged: look at wiring and termination")
+    if restart == 0:
+        return Finding(title, WARNING, text, f"it would not come back after bus-off: {set_up}")
+    if queue < 100:
+        return Finding(title, WARNING, text, f"frames of a busy tick may not fit the queue: {set_up}")
+    return Finding(title, OK, text)
+
+
+def show_link(name: str) -> str:
+    """JSON of `ip` about an interface; empty where there is none."""
+    try:
+        done = subprocess.run(
+            ["ip", "-json", "-details", "link", "show", name], capture_output=True, text=True, check=False
+        )
+    except OSError:
+        return ""
+    return done.stdout
+
+
+def lines_of(findings: Sequence[Finding]) -> list[str]:
+    """What is printed: a line each, and the advice beneath."""
+    lines = []
+    for finding in findings:
+        lines.append(f"{finding.state:4s}  {finding.name:14s} {finding.text}")
+        if finding.advice and finding.state != OK:
+            lines.append(f"      {'':14s} -> {finding.advice}")
+    failed = sum(finding.state == FAILED for finding in findings)
+    warned = sum(finding.state == WARNING for finding in findings)
+    return [*lines, f"{failed} failed, {warned} warnings" if failed or warned else "all is well"]

@@ -1,0 +1,50 @@
+"""`modcube doctor` put together: the machine, each bus of the fleet, and the exit status."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from firmware_py.app.doctor import FAILED, Finding, check_interface, check_machine, lines_of, warm_up
+from firmware_py.app.doctor_bus import judge, look_at
+from firmware_py.bus.codec import Codec
+from firmware_py.bus.port import PortError, open_port
+from firmware_py.description.fleet import Fleet
+
+__all__ = ["examine", "warm_up"]
+
+UNFIT = 1
+"""Exit status when a check failed."""
+
+
+def examine(fleet: Fleet, folder: Path, say: Callable[[str], None], wait: Callable[[float], None] = time.sleep) -> int:
+    """Prints what was found; returns the exit status. Raises OSError where there is no such folder."""
+    codec = Codec.load()
+    findings = check_machine(folder)
+    for index, address in enumerate(fleet.buses):
+        numbers = [module.number for module in fleet.module if module.bus == index]
+        findings += list(check_bus(address, numbers, fleet.rate_hz, codec, wait))
+    for line in lines_of(findings):
+        say(line)
+    return UNFIT if any(finding.state == FAILED for finding in findings) else 0
+
+
+def check_bus(
+    address: str, numbers: list[int], rate_hz: int, codec: Codec, wait: Callable[[float], None]
+) -> Iterator[Finding]:
+    """One bus: its interface, then what can be heard on it."""
+    kind, _, name = address.partition(":")
+    title = f"bus {name if kind == 'socketcan' else address}"
+    if kind == "socketcan":
+        interface = check_interface(name)
+        yield interface
+        if interface.state == FAILED:
+            return
+    try:
+        with open_port(address) as port:
+            seen = look_at(port, codec, wait)
+    except PortError as error:
+        yield Finding(title, FAILED, str(error), "see --bus, and the fleet file")
+        return
+    yield from judge(title, seen, numbers, rate_hz, codec)

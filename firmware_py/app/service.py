@@ -1,0 +1,49 @@
+"""The service's report to systemd, from the tick: ready after a second of ticks, alive while they go on, how they fare.
+
+A tick that hangs tells nothing, so the watchdog of modcube.service ends it and starts it anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.app.lockstep import Observer
+from firmware_py.core.types import Inputs, Outputs
+from firmware_py.runtime.notify import Notifier
+from firmware_py.runtime.rate_keeper import RateKeeper
+
+READY_S = 1.0
+"""Of ticks, before the service calls itself ready."""
+ALIVE_EVERY_S = 0.1
+STATUS_EVERY_S = 1.0
+
+
+def status_text(tick: int, rate_hz: int, answered: int, modules: int, keeper: RateKeeper) -> str:
+    """The health report: words KEY=VALUE, which flash.py and `systemctl status` show."""
+    late_us = keeper.lateness.quantile_ns(0.99) // 1000
+    return (
+        f"tick={tick} rate_hz={rate_hz} answered={answered}/{modules} late_p99_us={late_us} "
+        f"overruns={keeper.overruns} skipped={keeper.skipped}"
+    )
+
+
+def reporting(notifier: Notifier, keeper: RateKeeper, rate_hz: int) -> Observer:
+    """An observer that tells the service manager; costs nothing where there is none."""
+    alive_every = max(1, round(ALIVE_EVERY_S * rate_hz))
+    status_every = max(1, round(STATUS_EVERY_S * rate_hz))
+    ready_at = round(READY_S * rate_hz)
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        tick = outputs.tick
+        if tick % alive_every or not notifier.is_heard:
+            return
+        text = "WATCHDOG=1"
+        if tick % status_every == 0:
+            answered = sum(module.answered for module in inputs.modules)
+            text += f"\nSTATUS={status_text(tick, rate_hz, answered, len(inputs.modules), keeper)}"
+        if tick == ready_at:
+            text += "\nREADY=1"
+        notifier.send(text)
+
+    return observe

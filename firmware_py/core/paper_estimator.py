@@ -1,0 +1,126 @@
+"""The paper's estimator: a constant-velocity Kalman filter on tag poses alone. Stands in for `estimator` with `--controller paper`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from filterpy.kalman import predict, update
+
+from firmware_py.core.body import Body
+from firmware_py.core.estimator import NEVER_NS, READY_AFTER
+from firmware_py.core.propagation import ERRORS, STATES
+from firmware_py.core.rotations import conjugate, exp, log, multiply, rotate
+from firmware_py.core.topology import Motion
+from firmware_py.core.types import BodyPose, Estimate, Measured
+from firmware_py.description.parameters import Estimation
+
+PAPER_ACCEL_DENSITY = 0.05
+"""Acceleration noise of the constant-velocity model, m/s^2/sqrt(Hz); synthetic, the paper gives none."""
+PAPER_ALPHA_DENSITY = 0.5
+"""Angular likewise, rad/s^2/sqrt(Hz); synthetic."""
+PAPER_FLIP_RAD = 0.5
+"""A tag that jumps further than this is a flip; any working tag tracker refuses it."""
+
+
+class TagOnlyEstimator:
+    """The paper's: a constant-velocity Kalman filter on tag poses alone, no delay made up, no disturbance. State: pose, velocity.
+
+    Position and attitude are filtered apart, each with the error state [pose 0:3, velocity 3:6].
+    """
+
+    def __init__(self, body: Body, parameters: Estimation, period_ns: int) -> None:
+        self._p = parameters
+        self._dt = period_ns * 1e-9
+        dt = self._dt
+        self._f = np.eye(6)
+        self._f[:3, 3:] = dt * np.eye(3)
+        shape = np.block([[dt**3 / 3 * np.eye(3), dt**2 / 2 * np.eye(3)], [dt**2 / 2 * np.eye(3), dt * np.eye(3)]])
+        self._q_position = shape * PAPER_ACCEL_DENSITY**2
+        self._q_attitude = shape * PAPER_ALPHA_DENSITY**2
+        self._h = np.eye(3, 6)
+        self._position = np.zeros(6)
+        self._p_position = np.eye(6)
+        self._p_attitude = np.eye(6)
+        self._q_wb = np.array([1.0, 0.0, 0.0, 0.0])
+        self._rate_b = np.zeros(3)
+        self._accepted = 0
+        self._rejected = 0
+        self._last_tag_ns = -NEVER_NS
+
+    def retune(self, parameters: Estimation) -> None:
+        """Takes other noise figures from the next tick on."""
+        self._p = parameters
+
+    @property
+    def q_wb(self) -> np.ndarray:
+        """(4,) latest attitude."""
+        return self._q_wb
+
+    @property
+    def motion(self) -> Motion:
+        """State and covariance now, for a body that joins or parts."""
+        x = np.zeros(STATES)
+        x[:3], x[3:7] = self._position[:3], self._q_wb
+        x[7:10] = rotate(conjugate(self._q_wb), self._position[3:].copy())
+        x[10:13] = self._rate_b
+        variance = np.full(ERRORS, 1e-4)
+        variance[:3], variance[3:6] = self._p_position.diagonal()[:3], self._p_attitude.diagonal()[:3]
+        return Motion(x, np.diag(variance))
+
+    def restart(self, time_ns: int, motion: Motion) -> Estimate:
+        """Goes on from `motion` at `time_ns`; returns the estimate of the same tick."""
+        x = motion.x
+        self._q_wb = x[3:7].copy()
+        self._position = np.concatenate([x[:3], rotate(self._q_wb, x[7:10].copy())])
+        self._rate_b = x[10:13].copy()
+        self._accepted = READY_AFTER
+        self._last_tag_ns = time_ns
+        return self._estimate(time_ns)
+
+    def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:
+        """The estimate at `time_ns` from the tags of `measured` alone."""
+        if self._accepted:
+            self._position, self._p_position = predict(self._position, self._p_position, self._f, self._q_position)
+            self._q_wb = multiply(self._q_wb, exp(self._rate_b * self._dt))
+            _, self._p_attitude = predict(np.zeros(6), self._p_attitude, self._f, self._q_attitude)
+        for pose in measured.tags:
+            self._fuse(pose)
+        return self._estimate(time_ns)
+
+    def _estimate(self, time_ns: int) -> Estimate:
+        nu = np.concatenate([rotate(conjugate(self._q_wb), self._position[3:].copy()), self._rate_b])
+        return Estimate(
+            p_wb=self._position[:3].copy(),
+            q_wb=self._q_wb.copy(),
+            nu=nu,
+            force_w=np.zeros(3),
+            moment_b=np.zeros(3),
+            sigma_p=np.sqrt(self._p_position.diagonal()[:3]),
+            sigma_q=np.sqrt(self._p_attitude.diagonal()[:3]),
+            tag_age_ns=time_ns - self._last_tag_ns,
+            nis=math.nan,
+            nis_dof=0,
+            rejected=self._rejected,
+            ready=self._accepted >= READY_AFTER,
+        )
+
+    def _fuse(self, pose: BodyPose) -> None:
+        p_wb = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
+        self._last_tag_ns = pose.capture_ns
+        if not self._accepted:
+            self._position[:3] = p_wb
+            self._q_wb = pose.q_wb
+            self._accepted = 1
+            return
+        turn = log(multiply(conjugate(self._q_wb), pose.q_wb))
+        if float(np.linalg.norm(turn)) > PAPER_FLIP_RAD and self._accepted > READY_AFTER:
+            self._rejected += 1
+            return
+        along, angle = self._p.tag_sigma_axis_m, self._p.tag_sigma_rad
+        noise = np.diag(np.array([self._p.tag_sigma_m, self._p.tag_sigma_m, along]) ** 2)
+        self._position, self._p_position = update(self._position, self._p_position, p_wb, noise, self._h)
+        error, self._p_attitude = update(np.zeros(6), self._p_attitude, turn, np.eye(3) * angle**2, self._h)
+        self._q_wb = multiply(self._q_wb, exp(error[:3].copy()))
+        self._rate_b = self._rate_b + error[3:]
+        self._accepted += 1

@@ -1,0 +1,201 @@
+"""Everything that can break on purpose, in the plant and on its wire: by the scenario's [[fault]]s or live.
+
+A fault begins, lasts and ends by the plant's clock. Every link and direction draws from a stream of its own, so that one fault more
+changes no other. The controller is never touched.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+
+import numpy as np
+
+from firmware_py.bus.codec import Frame
+from firmware_py.core import rotations
+from hil.nodes import Nodes
+from hil.plant.camera import Sighting
+from hil.plant.draw import stream
+from hil.plant.fault_spec import ALL, DIRECTIONS, FRAME_KINDS, THRUSTER_KINDS, Fault
+
+LOWEST_BABBLE_ID = 0x040
+"""A babbling node takes no id of ESTOP or SYNC: those are faults of another kind."""
+class Wire:
+    """What happens to the frames of one direction of one link."""
+
+    def __init__(self, seed: int, direction: str, link: int = 0) -> None:
+        self._direction = direction
+        self._rng = stream(seed, "faults", 2 * link + DIRECTIONS.index(direction))
+        self._late: deque[tuple[int, Frame]] = deque()
+
+    def pass_on(self, frames: Iterable[Frame], faults: Sequence[Fault], time_ns: int) -> list[Frame]:
+        """The frames that come out at the other end now."""
+        mine = [f for f in faults if f.direction in (self._direction, "both")]
+        if not mine and not self._late:
+            return list(frames)
+        out = [frame for due, frame in self._late if due <= time_ns]
+        self._late = deque((due, frame) for due, frame in self._late if due > time_ns)
+        for frame in frames:
+            out += self._one(frame, mine, time_ns)
+        for fault in mine:
+            if fault.kind == "babble" and self._direction == "from_plant":
+                out += [self._babble() for _ in range(round(fault.value))]
+        return out
+
+    def _one(self, frame: Frame, faults: Sequence[Fault], time_ns: int) -> list[Frame]:
+        copies = [frame]
+        for fault in faults:
+            if fault.kind == "frame_delay":
+                self._late += [(time_ns + round(1e6 * fault.value), f) for f in copies]
+                copies = []
+            elif fault.kind in FRAME_KINDS and fault.kind != "babble" and self._rng.random() < fault.value:
+                if fault.kind == "frame_loss":
+                    copies = []
+                elif fault.kind == "frame_duplicate":
+                    copies = copies + copies
+                elif frame.data:
+                    copies = [self._corrupted(f) for f in copies]
+        return copies
+
+    def _corrupted(self, frame: Frame) -> Frame:
+        """One bit of the payload is wrong."""
+        data = bytearray(frame.data)
+        bit = int(self._rng.integers(8 * len(data)))
+        data[bit // 8] ^= 1 << (bit % 8)
+        return Frame(frame.id, bytes(data))
+
+    def _babble(self) -> Frame:
+        length = int(self._rng.integers(0, 9))
+        return Frame(int(self._rng.integers(LOWEST_BABBLE_ID, 0x800)), self._rng.bytes(length))
+
+
+class Faults:
+    """All faults of one run, on one bus."""
+
+    def __init__(self, nodes: Nodes, faults: Sequence[Fault] = (), link: int = 0) -> None:
+        self._nodes, self._world = nodes, nodes.world
+        self._faults = list(faults)
+        self._on: list[Fault] = []
+        seed = self._world.seed
+        self._to_plant, self._from_plant = Wire(seed, "to_plant", link), Wire(seed, "from_plant", link)
+        self._tags = stream(seed, "faults", 1024 + link)
+        axis = self._tags.standard_normal(3)
+        self._bias_axis = axis / np.linalg.norm(axis)
+        self._began: dict[Fault, Callable[[], None]] = {}
+        for camera in nodes.cameras:
+            camera.change = self._change_tag
+
+    def add(self, fault: Fault) -> None:
+        """A fault more, live."""
+        self._faults.append(fault)
+
+    def clear(self, kind: str = "") -> None:
+        """Ends all faults of a kind, or all."""
+        self._faults = [f for f in self._faults if kind and f.kind != kind]
+        self.update(self._world.time_ns)
+
+    def process_killed(self, time_ns: int) -> bool:
+        """Whether the firmware's process is dead now; the bench sees to that."""
+        return any(f.kind == "process_killed" and f.is_on(time_ns) for f in self._faults)
+
+    def update(self, time_ns: int) -> None:
+        """Begins and ends what is due. To be called after every advance of the world."""
+        on = [f for f in self._faults if f.is_on(time_ns)]
+        if on == self._on:
+            return
+        for fault in [f for f in self._on if f not in on]:
+            self._began.pop(fault, lambda: None)()
+        for fault in [f for f in on if f not in self._on]:
+            end = self._begin(fault)
+            if end is not None:
+                self._began[fault] = end
+        self._on = on
+
+    def incoming(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
+        """Frames to the plant, as they arrive."""
+        return self._to_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
+
+    def outgoing(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
+        """Frames from the plant, as they leave."""
+        return self._from_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
+
+    # ------------------------------------------------------------ in the plant
+
+    def _modules(self, fault: Fault) -> list[int]:
+        return [mcu.module for number, mcu in self._nodes.mcus.items() if fault.module in (0, number)]
+
+    def _begin(self, fault: Fault) -> Callable[[], None] | None:
+        """Breaks it; returns what mends it."""
+        modules = self._modules(fault)
+        if fault.kind in THRUSTER_KINDS:
+            return self._break_thrusters(fault, modules)
+        if fault.kind == "imu_frozen" or fault.kind == "leak":
+            mcus = [mcu for mcu in self._nodes.mcus.values() if mcu.module in modules]
+            name = "frozen" if fault.kind == "imu_frozen" else "leaks"
+
+            def wet_or_frozen(yes: bool) -> None:
+                for mcu in mcus:
+                    setattr(mcu, name, yes)
+
+            wet_or_frozen(True)
+            return partial(wet_or_frozen, False)
+        if fault.kind == "battery_sag":
+            self._world.sag(modules, fault.value)
+            return lambda: self._world.sag(modules, -fault.value)
+        if fault.kind == "magnet":
+            return self._hang_magnets(fault, modules)
+        if fault.kind == "jets":
+            before, self._world.jet_strength = self._world.jet_strength, fault.value
+            return lambda: setattr(self._world, "jet_strength", before)
+        return None
+
+    def _break_thrusters(self, fault: Fault, modules: Sequence[int]) -> Callable[[], None]:
+        broken = [
+            (m, t) for m in modules for t in range(len(self._world.vehicles[m].thruster)) if fault.index in (ALL, t)
+        ]
+        for m, t in broken:
+            self._world.break_thruster(m, t, fault.kind.removeprefix("thruster_"), fault.value)
+
+        def mend() -> None:
+            for m, t in broken:
+                self._world.mend_thruster(m, t)
+
+        return mend
+
+    def _hang_magnets(self, fault: Fault, modules: Sequence[int]) -> Callable[[], None]:
+        docks, relay = self._world.docks, {1: 1, -1: 2}.get(int(fault.value), 0)
+        hung = [(m, f) for m in modules for f in range(6) if fault.index in (ALL, f)]
+        for m, f in hung:
+            docks.hang(m, f, relay)
+
+        def let_go() -> None:
+            for m, f in hung:
+                docks.hang(m, f, None)
+
+        return let_go
+
+    def _change_tag(self, sighting: Sighting) -> Sighting | None:
+        for fault in self._on:
+            if not fault.kind.startswith(("tag_", "camera_")) or sighting.module not in self._modules(fault):
+                continue
+            if fault.kind == "tag_absent":
+                return None
+            if fault.kind == "camera_bias":
+                sighting = sighting._replace(p_wt=sighting.p_wt + fault.value * self._bias_axis)
+            elif fault.kind == "tag_jump":
+                sighting = sighting._replace(p_wt=sighting.p_wt + np.array([fault.value, 0.0, 0.0]))
+            elif self._tags.random() < fault.value:
+                sighting = sighting._replace(q_wt=_flipped(sighting))
+        return sighting
+
+
+TILT_RAD = math.radians(40.0)
+"""A flipped tag is turned by twice its incidence about an axis in its plane: here that of 20 deg."""
+
+
+def _flipped(sighting: Sighting) -> np.ndarray:
+    """(4,) the other pose of a planar tag seen from straight above it, tilted by `TILT_RAD`."""
+    tilt = rotations.exp(np.array([TILT_RAD, 0.0, 0.0]))
+    return np.asarray(rotations.normalise(rotations.multiply(sighting.q_wt, tilt)))

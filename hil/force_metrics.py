@@ -1,0 +1,48 @@
+"""Force tracking: what the load cells measured against what the firmware asked of its thrusters, with and without interference."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.description.signals import Columns, read_signals
+from hil.scenario import Scenario
+from hil.signals import SIGNAL_LOG, TRUTH_LOG
+
+DEGREE = 3
+"""Of the polynomial that is fitted to the measured force over the wanted one."""
+NAMES = {1: "one", 2: "two"}
+
+
+def force_metrics(scenario: Scenario, folder: Path, begin_ns: int) -> dict[str, float]:
+    """RMSE per module of each body, their difference, and the fits; `off` and `on`: before and after the jets interfere.
+
+    Forces are along the body's x axis, per module, N. The difference is that of the two RMSE over that of one module.
+
+    Raises:
+        OSError: a log is missing. KeyError: a body is not in it.
+    """
+    truths, signals = read_signals(folder / TRUTH_LOG), read_signals(folder / SIGNAL_LOG)
+    half_ns = round(0.5e9 * scenario.task.duration_s)
+    metrics: dict[str, float] = {}
+    for phase, start_ns in (("off", begin_ns), ("on", begin_ns + half_ns)):
+        rmse = {}
+        for members in scenario.groups:
+            leader, count = members[0], len(members)
+            firmware, truth = signals[f"/firmware/body{leader}"], truths[f"/plant/body{leader}"]
+            wanted, measured = _forces(firmware, truth, start_ns, start_ns + half_ns)
+            name = NAMES.get(count, str(count))
+            rmse[name] = float(np.sqrt(np.mean(np.square(measured - wanted)))) / count
+            metrics[f"force_rmse_{name}_{phase}_n"] = rmse[name]
+            scaled = np.polynomial.polynomial.polyfit(wanted / count, measured / count, DEGREE)
+            metrics |= {f"force_fit{k}_{name}_{phase}": float(c) for k, c in enumerate(scaled)}
+        metrics[f"force_difference_{phase}"] = abs(rmse["two"] - rmse["one"]) / rmse["one"]
+    return metrics
+
+
+def _forces(firmware: Columns, truth: Columns, start_ns: int, end_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    """(k,) wanted and (k,) measured force along x of the body."""
+    _, mine, theirs = np.intersect1d(firmware["tick"], truth["tick"], return_indices=True)
+    keep = (firmware["time_ns"][mine] >= start_ns) & (firmware["time_ns"][mine] < end_ns)
+    return firmware["wrench_wanted"][mine][keep, 0], truth["load"][theirs][keep, 0]

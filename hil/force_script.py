@@ -1,0 +1,59 @@
+"""What the person at the bench does in the force test: arm the clamped bodies, then move the stick along a force trajectory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from firmware_py.core.transitions import ARMED
+from firmware_py.core.types import Action, Mode, Outputs, Request, Sticks
+from firmware_py.description.fleet import Fleet
+from hil.scenario import Scenario
+
+ARM_FROM_S = 1.0
+ARM_EVERY_S = 0.5
+STICKS_EVERY_S = 0.02
+WAVES = ((0.6, 0.1), (0.4, 0.25))
+"""Share and frequency (Hz) of the sines that make up the trajectory."""
+MANUAL_BEFORE_S = 2.0
+"""Manual mode is on so long before the trajectory begins."""
+
+
+def stick_at(t_s: float, amplitude: float) -> float:
+    """Position of the stick `t_s` after the start of the trajectory, -1 to 1."""
+    return amplitude * sum(share * math.sin(2.0 * math.pi * hertz * t_s) for share, hertz in WAVES)
+
+
+class ForceScript:
+    """The requests of one run: the same stick for every body, so the same share of what it can."""
+
+    def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
+        self._fleet, self._task = fleet, scenario.task
+        self._leaders = [members[0] for members in scenario.groups]
+        self._manual: set[int] = set()
+        self.begin_ns = round(scenario.task.settle_s * 1e9)
+        self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
+        self.ticks = self.end_ns // fleet.period_ns
+
+    def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
+        """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
+        if last is None or time_ns < ARM_FROM_S * 1e9:
+            return []
+        tick, rate = time_ns // self._fleet.period_ns, self._fleet.rate_hz
+        asked: list[Request] = []
+        if tick % round(ARM_EVERY_S * rate) == 0:
+            asked += [Request(Action.ARM, r.body) for r in last.records if r.state not in ARMED]
+        manual = time_ns >= self.begin_ns - MANUAL_BEFORE_S * 1e9
+        if manual and tick % max(1, round(STICKS_EVERY_S * rate)) == 0:
+            moved = 0.0 if time_ns < self.begin_ns else stick_at(1e-9 * (time_ns - self.begin_ns), self._task.stick)
+            sticks = Sticks((moved, 0.0, 0.0), (0.0, 0.0, 0.0))
+            for body in self._leaders:
+                asked.append(Request(Action.STICKS, body, sticks))
+                if body not in self._manual:
+                    self._manual.add(body)
+                    asked.append(Request(Action.SET_MODE, body, Mode.MANUAL))
+        return asked
+
+    def is_over(self, time_ns: int) -> bool:
+        """The trajectory is flown to its end."""
+        return False

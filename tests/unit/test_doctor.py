@@ -1,0 +1,210 @@
+"""The doctor tells what is wrong with a machine or a bus, and what to do about it; the service reports how it fares."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.app.doctor import (
+    FAILED,
+    OK,
+    WARNING,
+    check_clock,
+    check_disk,
+    check_governor,
+    check_interface,
+    check_kernel,
+    lines_of,
+)
+from firmware_py.app.doctor_bus import Seen, judge, look_at
+from firmware_py.app.doctor_report import check_bus
+from firmware_py.app.service import reporting
+from firmware_py.bus.codec import Codec, Frame
+from firmware_py.bus.port import Port, open_port
+from firmware_py.core.types import Inputs, ModuleInputs, Outputs
+from firmware_py.runtime.clock import ManualClock
+from firmware_py.runtime.notify import Notifier
+from firmware_py.runtime.rate_keeper import RateKeeper
+from hil.nodes import Nodes, make_nodes
+from hil.scenario import load_scenario, make_world
+
+CODEC = Codec.load()
+PERIOD_NS = 10_000_000
+UNITS = Path(__file__).resolve().parents[2] / "firmware_py" / "deploy"
+FIT = {"linkinfo": {"info_kind": "can"}, "flags": ["NOARP", "UP"], "txqlen": 1000}
+DATA = {"bittiming": {"bitrate": 1_000_000}, "state": "ERROR-ACTIVE", "restart_ms": 100}
+
+
+def shown(**changes: object) -> str:
+    data = {**DATA, **changes}
+    return json.dumps([{**FIT, "linkinfo": {"info_kind": "can", "info_data": data}}])
+
+
+@pytest.mark.parametrize(
+    ("text", "state", "says"),
+    [
+        (shown(), OK, "1000 kbit/s, ERROR-ACTIVE"),
+        (shown(bittiming={"bitrate": 500_000}), FAILED, "bit rate must be 1000"),
+        (shown(state="BUS-OFF"), FAILED, "termination"),
+        (shown(state="ERROR-PASSIVE"), WARNING, "termination"),
+        (shown(restart_ms=0), WARNING, "bus-off"),
+        (json.dumps([{**FIT, "txqlen": 10, "linkinfo": {"info_kind": "can", "info_data": DATA}}]), WARNING, "queue"),
+        (json.dumps([{**FIT, "flags": []}]), FAILED, "is down"),
+        (json.dumps([{**FIT, "linkinfo": {"info_kind": "vcan"}}]), OK, "virtual"),
+        (json.dumps([{"flags": ["UP"]}]), FAILED, "not CAN"),
+        ("", FAILED, "no such interface"),
+    ],
+)
+def test_interface_is_judged_by_what_ip_says_of_it(text: str, state: str, says: str) -> None:
+    finding = check_interface("can0", lambda name: text)
+    assert finding.state == state
+    assert says in f"{finding.text} {finding.advice}"
+    assert finding.advice or state == OK
+
+
+def test_kernel_without_preempt_rt_is_warned_of_and_one_with_it_is_not() -> None:
+    assert check_kernel(lambda path: "1").state == OK
+    assert check_kernel(lambda path: "").state in (OK, WARNING)
+
+
+@pytest.mark.parametrize(("governor", "state"), [("performance", OK), ("", OK), ("schedutil", WARNING)])
+def test_processors_that_slow_down_are_warned_of(governor: str, state: str) -> None:
+    assert check_governor(lambda path: governor).state == state
+
+
+@pytest.mark.parametrize(
+    ("source", "year", "state"),
+    [("tsc", 2026, OK), ("arch_sys_counter", 2026, OK), ("jiffies", 2026, WARNING), ("tsc", 1970, WARNING)],
+)
+def test_clock_that_is_slow_or_stands_in_1970_is_warned_of(source: str, year: int, state: str) -> None:
+    assert check_clock(lambda path: source, year).state == state
+
+
+@pytest.mark.parametrize(("free", "state"), [(10**10, OK), (10**9, WARNING), (10**7, FAILED)])
+def test_full_disk_is_told(free: int, state: str) -> None:
+    assert check_disk(Path(), free).state == state
+
+
+def test_every_complaint_comes_with_advice_beneath_it() -> None:
+    lines = lines_of([check_disk(Path(), 0), check_interface("can0", lambda name: shown())])
+    assert lines[1].strip().startswith("-> ")
+    assert lines[-1] == "1 failed, 0 warnings"
+    assert lines_of([check_interface("can0", lambda name: shown())])[-1] == "all is well"
+
+
+@pytest.fixture
+def nodes() -> Nodes:
+    scenario = load_scenario("hover")
+    return make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, {1: 0}, scenario)
+
+
+@pytest.fixture
+def far_end(request: pytest.FixtureRequest) -> Iterator[Port]:
+    with open_port(f"virtual:{request.node.name}") as port:
+        yield port
+
+
+def answer(nodes: Nodes, port: Port, extra: list[Frame] | None = None) -> None:
+    for frame in nodes.step(port.receive()):
+        port.send(frame)
+    for frame in extra or []:
+        port.send(frame)
+
+
+def test_module_that_answers_is_found_with_its_version_and_state(nodes: Nodes, far_end: Port) -> None:
+    findings = list(check_bus(far_end.address, [1], 100, CODEC, lambda seconds: answer(nodes, far_end)))
+    assert all(finding.state == OK for finding in findings), findings
+    assert "module 1: version 1" in findings[0].text
+    assert "in flight at 100 Hz 11 %" in findings[-1].text
+    assert not np.any(nodes.world.truth(0).force_n)  # nothing moved
+
+
+def test_module_that_is_silent_and_one_that_is_a_stranger_are_told(nodes: Nodes, far_end: Port) -> None:
+    findings = list(check_bus(far_end.address, [2], 100, CODEC, lambda seconds: answer(nodes, far_end)))
+    assert findings[0].state == FAILED and "module 2 is silent" in findings[0].text
+    assert "module 1 answers and is not in the fleet" in findings[1].text
+
+
+def test_doctor_sends_nothing_where_a_controller_runs(far_end: Port) -> None:
+    sync = CODEC.message("SYNC")
+    with open_port(far_end.address) as port:
+        seen = look_at(port, CODEC, lambda seconds: far_end.send(sync.encode(0, (1,))))
+    assert far_end.receive() == []
+    assert seen.sync > 0
+    assert any("a controller runs on it" in finding.text for finding in judge("bus", seen, [], 100, CODEC))
+
+
+def test_raised_estop_and_bad_frames_are_told(nodes: Nodes, far_end: Port) -> None:
+    bad = [Frame(0x01E, b""), Frame(0x101, bytes(8))]
+    findings = list(check_bus(far_end.address, [1], 100, CODEC, lambda seconds: answer(nodes, far_end, bad)))
+    text = "\n".join(finding.text for finding in findings)
+    assert "e-stop raised by number 30" in text and "bad frames" in text
+
+
+def test_bus_that_will_be_too_full_is_told() -> None:
+    finding = judge("bus", Seen(seconds=1.0), [1, 2, 3, 4], 400, CODEC)[-1]
+    assert finding.state == WARNING
+
+
+def test_service_tells_that_it_is_ready_alive_and_how_it_fares(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
+        notifier = Notifier.of(environment)
+        assert notifier.watchdog_ns == 1_000_000_000
+        keeper = RateKeeper(PERIOD_NS, ManualClock(), lambda deadline_ns: None)
+        observe = reporting(notifier, keeper, 100)
+        heard: list[tuple[int, str]] = []
+        for tick in range(1, 301):
+            module = ModuleInputs()
+            module.answered = True
+            observe([], [], Inputs(tick, 0, [module], [], False, 0, False), outputs(tick))
+            while True:
+                try:
+                    heard.append((tick, manager.recv(4096).decode()))
+                except BlockingIOError:
+                    break
+        notifier.close()
+    assert [tick for tick, text in heard if "READY=1" in text] == [100]
+    alive = [tick for tick, text in heard if "WATCHDOG=1" in text]
+    assert alive == list(range(10, 301, 10))
+    reports = [text for _, text in heard if "STATUS=" in text]
+    assert "tick=300" in reports[-1] and "answered=1/1" in reports[-1]
+
+
+def outputs(tick: int) -> Outputs:
+    return Outputs(tick=tick, time_ns=tick * PERIOD_NS, modules=[], events=[], records=[], estop=False)
+
+
+def test_without_a_service_manager_nothing_is_sent(tmp_path: Path) -> None:
+    assert not Notifier.of({}).is_heard
+    Notifier.of({"NOTIFY_SOCKET": str(tmp_path / "nobody")}).send("READY=1")
+
+
+def test_units_are_what_systemd_understands(tmp_path: Path) -> None:
+    words = {"@ROOT@": str(tmp_path), "@USER@": "root", "@PYTHON@": shutil.which("python3") or "", "@CPUS@": "0-1"}
+    command = tmp_path / "current" / "bin" / "modcube"
+    command.parent.mkdir(parents=True)
+    command.write_text("#!/bin/sh\n")
+    command.chmod(0o755)
+    for unit in UNITS.glob("*.service"):
+        text = unit.read_text()
+        for word, value in words.items():
+            text = text.replace(word, value)
+        assert "@" not in text.replace("modcube-can@", "")
+        (tmp_path / unit.name).write_text(text)
+    assert len(list(tmp_path.glob("*.service"))) == 2
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is missing")
+    said = subprocess.run(
+        ["systemd-analyze", "verify", str(tmp_path / "modcube.service")], capture_output=True, text=True, check=False
+    )
+    assert "Unknown" not in said.stderr and "modcube.service:" not in said.stderr, said.stderr

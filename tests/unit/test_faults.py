@@ -1,0 +1,246 @@
+"""Dead and lying thrusters: found in time from ESCs or from the motion alone, and never where all is well."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from firmware_py.core import propagation
+from firmware_py.core.body import Body
+from firmware_py.core.faults import FaultDetector
+from firmware_py.core.preload import preload
+from firmware_py.core.propagation import STATES
+from firmware_py.core.rotations import difference, from_euler, to_matrix
+from firmware_py.core.thruster import ThrusterLag
+from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
+from firmware_py.description.failsafe_parameters import Faults
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+
+BODY = assemble_vehicle(load_vehicle("modcube"))
+PUSH = preload(BODY.thrusters, np.ones(8, dtype=bool), 0.6)
+"""Thrusters pushed against each other: the least that an armed robot commands, and nothing moves."""
+TICK_NS, DT = 10_000_000, 0.01
+ZERO = np.zeros(3)
+LOST_AXES = {(4, 7): 1, (5, 6): 1, (2, 3): 1}
+"""The paper's errata: pairs without which an axis cannot be made."""
+
+
+class Water:
+    """A robot that holds its place by PD, in water that is the model's but for what every real one is off by; feedback at 10 Hz."""
+
+    def __init__(self, seed: int = 0, body: Body = BODY) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.body, n = body, body.thrusters.f_max.size
+        self.detector = FaultDetector(body, Faults(), TICK_NS)
+        self.believed, self.acts = ThrusterLag(body.thrusters, DT), ThrusterLag(body.thrusters, DT)
+        self.gain = self.rng.uniform(0.95, 1.05, n)
+        self.deadband = self.rng.uniform(0.10, 0.25, n)
+        self.speed_factor = np.ones(n)
+        self.status = np.zeros(n, dtype=int)
+        self.heard = 1.0
+        self.x = np.zeros(STATES)
+        self.x[3:7] = from_euler(0.05, -0.02, 0.3)
+        self.x[19:22], self.x[22:25] = [0.1, -0.05, 0.1], [0.003, -0.004, 0.002]
+        self.start = self.x.copy()
+        self.tick = 0
+
+    def run(self, seconds: float, wanted: np.ndarray = PUSH, armed: bool = True) -> list[tuple[float, str]]:
+        """What is found, with the time since the start of this run."""
+        found = []
+        for n in range(round(seconds / DT)):
+            found += [((n + 1) * DT, words) for words in self._step(wanted if armed else np.zeros(8), armed)]
+        return found
+
+    def _step(self, wanted: np.ndarray, armed: bool) -> list[str]:
+        self.tick += 1
+        if armed:
+            wanted = wanted + BODY.thrusters.pinv @ self._steer()
+        wanted = np.where(self.detector.now.alive, wanted, 0.0)
+        believed, acting = self.believed.step(), self.acts.step()
+        self.believed.command(wanted)
+        self.acts.command(np.where(np.abs(wanted) < self.deadband, 0.0, wanted))
+        b, tau = self.body, self.body.thrusters.matrix @ (self.gain * acting)
+        plant = (b.mass, b.mass_inv, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear)
+        felt = propagation.inertial_acceleration(self.x, tau, *plant)
+        self.x = propagation.step(self.x, tau, DT, *plant)
+        estimate = Estimate(
+            self.x[:3].copy(), self.x[3:7].copy(), self.x[7:13].copy(), ZERO, ZERO, np.full(3, 0.002), np.full(3, 0.0009),
+            0, 1.0, 6, 0, True,
+        )  # fmt: skip
+        gyro = self.x[10:13] + 0.005 + 0.002 * self.rng.normal(size=3)
+        weight = to_matrix(self.x[3:7].copy()).T @ np.array([0.0, 0.0, 9.80665])
+        accel = felt - weight + 0.05 + 0.03 * self.rng.normal(size=3)
+        measured = Measured(gyro, accel, None, [])
+        if self.rng.uniform() >= self.heard:
+            measured = Measured(None, None, None, [])
+        module = ModuleInputs(esc=self._feedback())
+        self.detector.step([module], measured, estimate, self.believed.force_n, believed, armed)
+        return self.detector.words
+
+    def _steer(self) -> np.ndarray:
+        q = self.x[3:7].copy()
+        off = np.r_[to_matrix(q).T @ (self.start[:3] - self.x[:3]), difference(self.start[3:7].copy(), q)]
+        return BODY.mass @ (np.repeat([6.0, 9.0], 3) * off - np.repeat([5.0, 6.0], 3) * self.x[7:13])
+
+    def _feedback(self) -> list[EscFeedback]:
+        frames = []
+        for first in range(0, 8, 2):
+            if self.tick % 10 == first and self.rng.uniform() < self.heard:
+                rpm = [
+                    self.speed_factor[i] * self.detector.believed_rpm(i, float(self.acts.force_n[i])) + 5.0 * self.rng.normal()
+                    for i in (first, first + 1)
+                ]
+                status = (int(self.status[first]), int(self.status[first + 1]))
+                frames.append(EscFeedback(first, (rpm[0], rpm[1]), (0.5, 0.5), status))
+        return frames
+
+    def fly(self, seconds: float = 3.0) -> None:
+        """Disarmed, then armed and healthy; nothing may be found."""
+        assert self.run(1.0, armed=False) == []
+        assert self.run(seconds) == []
+
+
+@pytest.fixture
+def water() -> Water:
+    return Water()
+
+
+# ---------------------------------------------------------------- what the ESCs say
+
+
+@pytest.mark.parametrize("thruster", range(8))
+def test_thruster_that_stands_still_is_found_within_half_a_second(water: Water, thruster: int) -> None:
+    water.fly(1.0)
+    water.gain[thruster] = water.speed_factor[thruster] = 0.0
+    found = water.run(1.0)
+    assert [words for _, words in found] == [f"thruster {thruster + 1} stands still: left out"]
+    assert found[0][0] <= 0.5
+    assert water.detector.now.dead == (thruster,) and not water.detector.now.alive[thruster]
+    assert water.detector.now.lost_axes == 0
+
+
+@pytest.mark.parametrize("thruster", range(8))
+def test_thruster_dead_from_the_start_is_found_within_half_a_second_of_the_first_command(thruster: int) -> None:
+    water = Water(seed=thruster)
+    water.gain[thruster] = water.speed_factor[thruster] = 0.0
+    assert water.run(1.0, armed=False) == []
+    found = water.run(1.0, 0.4 / 0.6 * PUSH)
+    assert [words for t, words in found if t <= 0.5] == [f"thruster {thruster + 1} stands still: left out"]
+
+
+@pytest.mark.parametrize("status", [1, 3])
+def test_esc_that_reports_a_failure_is_believed(water: Water, status: int) -> None:
+    water.fly(0.5)
+    water.status[6] = status
+    found = water.run(1.0)
+    assert found[0][0] <= 0.41 and found[0][1] == "thruster 7 has an ESC that failed: left out"
+
+
+def test_hot_esc_is_no_failure(water: Water) -> None:
+    water.status[6] = 2
+    water.fly(2.0)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 4.0])
+def test_thruster_that_turns_the_wrong_way_or_races_is_found(water: Water, factor: float) -> None:
+    water.fly(0.5)
+    water.speed_factor[3] = factor
+    found = water.run(1.0, 2.0 * PUSH)
+    assert found[0][1] == "thruster 4 does not obey: left out" and found[0][0] <= 0.6
+
+
+def test_slow_thruster_below_its_deadband_is_healthy(water: Water) -> None:
+    """At 0.09 N no propeller turns."""
+    assert water.run(2.0, 0.15 * PUSH) == []
+
+
+def test_disarmed_robot_is_not_judged(water: Water) -> None:
+    water.speed_factor[:], water.status[:] = 0.0, 1
+    assert water.run(2.0, armed=False) == []
+
+
+def test_dead_thruster_is_found_although_frames_are_lost(water: Water) -> None:
+    water.heard = 0.7
+    water.fly(2.0)
+    water.gain[2] = water.speed_factor[2] = 0.0
+    assert water.run(1.5)[0][1].startswith("thruster 3 ")
+
+
+# ---------------------------------------------------------------- what only the motion shows
+
+
+@pytest.mark.parametrize("thruster", range(8))
+@pytest.mark.parametrize("gain", [0.0, -1.0], ids=["fakes its speed", "reversed"])
+def test_lying_thruster_is_found_within_two_seconds(thruster: int, gain: float) -> None:
+    water = Water(seed=thruster)
+    water.fly()
+    water.gain[thruster] *= gain
+    found = water.run(2.0)
+    assert [words for _, words in found] == [f"thruster {thruster + 1} does not push as it says: left out"]
+
+
+def test_lying_thruster_is_found_from_the_moment_of_arming() -> None:
+    water = Water(seed=3)
+    water.gain[5] = 0.0
+    assert water.run(2.0, armed=False) == []
+    water.detector.reset()
+    found = water.run(2.0)
+    assert [words for _, words in found] == ["thruster 6 does not push as it says: left out"]
+
+
+def test_lying_thruster_is_found_although_frames_are_lost() -> None:
+    water = Water(seed=1)
+    water.heard = 0.7
+    water.fly()
+    water.gain[0] = 0.0
+    assert [words for _, words in water.run(2.0)] == ["thruster 1 does not push as it says: left out"]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_healthy_robot_that_is_pushed_about_has_no_liar(seed: int) -> None:
+    """Forces that change twice a second, gains and deadbands off as real ones, a disturbance that turns with the body."""
+    water = Water(seed)
+    assert water.run(1.0, armed=False) == []
+    rng = np.random.default_rng(100 + seed)
+    for _ in range(20):
+        wrench = rng.normal(size=6) * np.repeat([1.5, 0.05], 3)
+        assert water.run(0.5, PUSH + BODY.thrusters.pinv @ wrench) == []
+
+
+# ---------------------------------------------------------------- what follows
+
+
+@pytest.mark.parametrize("pair", list(itertools.combinations(range(8), 2)), ids=str)
+def test_axes_that_are_lost_with_a_pair_are_those_of_the_errata(pair: tuple[int, int]) -> None:
+    water = Water()
+    for thruster in pair:
+        water.gain[thruster] = water.speed_factor[thruster] = 0.0
+    water.run(0.6)
+    now = water.detector.now
+    assert now.dead == pair and now.lost_axes == LOST_AXES.get(pair, 0)
+    matrix = BODY.thrusters.matrix * now.alive
+    wrench = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    kept = now.keep @ wrench
+    np.testing.assert_allclose(matrix @ np.linalg.pinv(matrix) @ kept, kept, atol=1e-9)
+    np.testing.assert_allclose(kept[:3], wrench[:3], atol=1e-9, err_msg="the force, and so the place, is kept")
+    assert np.linalg.matrix_rank(now.keep, tol=1e-6) == 6 - now.lost_axes
+
+
+def test_robot_that_is_armed_anew_trusts_its_thrusters_again(water: Water) -> None:
+    water.speed_factor[1] = 0.0
+    water.run(0.6)
+    assert water.detector.now.dead == (1,)
+    water.detector.reset()
+    assert water.detector.now.dead == () and water.detector.changed and water.detector.now.alive.all()
+    water.detector.reset()
+    assert not water.detector.changed
+
+
+def test_change_is_said_once(water: Water) -> None:
+    water.speed_factor[1] = 0.0
+    changes = []
+    for _ in range(80):
+        water.run(DT)
+        changes.append(water.detector.changed)
+    assert sum(changes) == 1

@@ -1,0 +1,264 @@
+"""Guidance: what each mode makes of sticks, set-points and trajectories, and that no change of mode jumps."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from firmware_py.core.guidance_modes import Guidance, heading
+from firmware_py.core.health import Health
+from firmware_py.core.rotations import difference, from_euler, rotate
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.supervisor import Decision
+from firmware_py.core.transitions import Effect, Trigger
+from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+from tests.unit.healths import BLIND, GOOD
+
+BODY = assemble_vehicle(load_vehicle("modcube"))
+ZERO = np.zeros(3)
+TICK = 10_000_000
+WRENCH = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+FLOWN = [Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.SURFACE, Mode.DOCK]
+
+
+def estimate(p: tuple[float, ...] = (0.0, 0.0, 1.0), q: np.ndarray | None = None, nu: tuple[float, ...] = (0.0,) * 6) -> Estimate:
+    level = np.array([1.0, 0.0, 0.0, 0.0]) if q is None else q
+    return Estimate(
+        np.array(p), level, np.array(nu), ZERO, ZERO, np.full(3, 0.002), np.full(3, 0.002), 20_000_000, 1.0, 0, 0, True
+    )
+
+
+class Flight:
+    """Guidance over ticks, with a body that does what it is told."""
+
+    def __init__(self, parameters: Parameters | None = None) -> None:
+        self.guidance = Guidance(BODY, parameters or Parameters())
+        self.time_ns = 0
+        self.estimate = estimate()
+        self.guidance.rest(self.estimate)
+        self.setpoints: list[Setpoint] = []
+        self.wrenches: list[np.ndarray] = []
+
+    def do(self, effect: Effect, mode: Mode = Mode.POSHOLD, argument: object = None) -> None:
+        self.guidance.apply(Decision(Trigger.SET_MODE, effect, mode, argument), self.time_ns, self.estimate)
+
+    def run(self, seconds: float, sticks: Sticks | None = None, health: Health = GOOD, follows: bool = True) -> Setpoint:
+        for _ in range(round(seconds / 0.01)):
+            self.time_ns += TICK
+            if sticks is not None:
+                self.do(Effect.TAKE_STICKS, self.guidance.mode, sticks)
+            now, _ = self.guidance.step(self.time_ns, self.estimate, health)
+            self.setpoints.append(now)
+            self.wrenches.append(self.guidance.mix(WRENCH, self.time_ns, self.estimate, health))
+            if follows:
+                self.estimate = self.estimate._replace(p_wb=now.p_wb, q_wb=now.q_wb)
+        return self.setpoints[-1]
+
+
+class Ramp:
+    """One metre north in ten seconds, from where it is told."""
+
+    duration_s = 10.0
+
+    def __init__(self, start: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
+        self.start = np.array(start)
+
+    def sample(self, t_s: float) -> Setpoint:
+        inside = 0.0 < t_s < self.duration_s
+        way = 0.1 * min(max(t_s, 0.0), self.duration_s)
+        v = np.array([0.1 if inside else 0.0, 0.0, 0.0])
+        return Setpoint([*self.start, way, 0.0, 0.0], np.array([1.0, 0.0, 0.0, 0.0]), v, ZERO, ZERO, ZERO)
+
+
+def sticks(forward: float = 0.0, right: float = 0.0, down: float = 0.0, yaw: float = 0.0) -> Sticks:
+    return Sticks((forward, right, down), (0.0, 0.0, yaw))
+
+
+@pytest.mark.parametrize("modes", list(itertools.product(FLOWN, FLOWN)), ids=lambda pair: "-".join(m.name for m in pair))
+def test_no_change_of_mode_jumps(modes: tuple[Mode, Mode]) -> None:
+    """Neither the set-point nor the wrench, with sticks held over and a body that moves."""
+    flight = Flight()
+    for mode in modes:
+        flight.do(Effect.ENTER_MODE, mode)
+        flight.run(1.0, sticks(0.5, -0.3, 0.4, 0.2))
+    steps = np.abs(np.diff(np.array(flight.wrenches[1:]), axis=0))
+    assert steps[:, :3].max() < 1.5 and steps[:, 3:].max() < 0.12, "N, N m a tick: the blend's slope"
+    places = np.abs(np.diff(np.array([s.p_wb for s in flight.setpoints]), axis=0))
+    assert places.max() < 0.01
+
+
+def test_armed_robot_starts_from_no_wrench() -> None:
+    flight = Flight()
+    flight.guidance.rest(flight.estimate)
+    flight.do(Effect.ENTER_MODE)
+    flight.run(0.01)
+    np.testing.assert_allclose(flight.wrenches[-1], 0.0, atol=1e-12)
+    flight.run(0.5)
+    np.testing.assert_allclose(flight.wrenches[-1], WRENCH)
+
+
+def test_manual_sticks_are_forces_and_moments_of_the_body() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.MANUAL)
+    flight.run(0.5, Sticks((1.0, 0.0, 0.0), (0.0, 0.0, -1.0)))
+    wrench = flight.wrenches[-1]
+    assert wrench[0] > 5.0 and wrench[5] < -0.3 and not np.any(wrench[1:5])
+    flight.run(1.0)
+    assert not flight.wrenches[-1].any(), "sticks that fell silent are neutral"
+
+
+def test_stabilize_keeps_the_controllers_moment() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.STABILIZE)
+    flight.run(0.5, sticks(0.5))
+    np.testing.assert_allclose(flight.wrenches[-1][3:], WRENCH[3:])
+    assert flight.wrenches[-1][0] > 2.0 and flight.wrenches[-1][2] == 0.0
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.7, np.pi / 2, -np.pi / 2])
+def test_depth_hold_keeps_the_vertical_force_in_every_attitude(pitch: float) -> None:
+    flight = Flight()
+    flight.estimate = estimate(q=from_euler(0.0, pitch, 0.5))
+    flight.guidance.rest(flight.estimate)
+    flight.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    flight.run(0.5, sticks(1.0), follows=False)
+    force_w = rotate(flight.estimate.q_wb, flight.wrenches[-1][:3].copy())
+    wanted_w = rotate(flight.estimate.q_wb, WRENCH[:3].copy())
+    assert force_w[2] == pytest.approx(wanted_w[2])
+    np.testing.assert_allclose(force_w[1] / force_w[0], np.tan(0.5), atol=1e-6)
+    assert force_w[0] > 2.0, "forward is where it looks"
+
+
+def test_depth_hold_climbs_and_drifts_freely() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    flight.run(2.0, sticks(down=-1.0))
+    assert flight.setpoints[-1].p_wb[2] < 0.6
+    flight.estimate = flight.estimate._replace(p_wb=np.array([3.0, -2.0, 0.9]))
+    now = flight.run(0.01, follows=False)
+    np.testing.assert_array_equal(now.p_wb[:2], [3.0, -2.0])
+    assert now.p_wb[2] < 0.6
+
+
+def test_sticks_move_the_held_place_and_leave_it_there() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE)
+    flight.run(2.0, sticks(forward=1.0))
+    assert flight.setpoints[-1].v_w[0] == pytest.approx(0.3, abs=1e-3)
+    flight.run(2.5)
+    there = flight.setpoints[-1]
+    assert np.abs(there.v_w).max() < 1e-4
+    np.testing.assert_allclose(flight.run(1.0).p_wb, there.p_wb, atol=1e-4)
+
+
+def test_robot_glides_to_a_place_that_it_is_to_hold() -> None:
+    flight = Flight()
+    flight.do(Effect.HOLD_AT, Mode.POSHOLD, rest_at(np.array([1.0, 0.5, 2.0]), from_euler(0.0, 0.0, 1.0)))
+    now = flight.run(15.0)
+    np.testing.assert_allclose(now.p_wb, [1.0, 0.5, 2.0], atol=1e-3)
+    assert np.linalg.norm(difference(now.q_wb, from_euler(0.0, 0.0, 1.0))) < 1e-3
+    flight.run(0.2, sticks(right=1.0))
+    assert flight.run(3.0).p_wb[1] > 0.52, "sticks take it away"
+
+
+def test_held_place_stays_within_the_fence() -> None:
+    flight = Flight(Parameters().replace("fence.north_m", 0.5))
+    flight.do(Effect.HOLD_AT, Mode.POSHOLD, rest_at(np.array([3.0, 0.0, 1.0]), estimate().q_wb))
+    assert flight.run(15.0).p_wb[0] == pytest.approx(0.5, abs=1e-3)
+    flight.do(Effect.ENTER_MODE)
+    assert flight.run(15.0, sticks(forward=1.0)).p_wb[0] < 0.6
+
+
+def test_trajectory_is_sampled_now_and_a_thruster_lag_ahead() -> None:
+    flight = Flight()
+    flight.do(Effect.FOLLOW, Mode.AUTO, Ramp())
+    flight.run(0.01)
+    began = flight.time_ns
+    flight.run(2.0)
+    t = (flight.time_ns - began) * 1e-9
+    assert flight.setpoints[-1].p_wb[0] == pytest.approx(0.1 * t)
+    assert not flight.guidance.finished(flight.time_ns)
+    flight.run(9.0)
+    assert flight.guidance.finished(flight.time_ns) and flight.setpoints[-1].p_wb[0] == pytest.approx(1.0)
+
+
+def test_trajectory_that_begins_elsewhere_is_approached_first() -> None:
+    flight = Flight()
+    flight.do(Effect.FOLLOW, Mode.AUTO, Ramp((0.0, 1.0, 1.0)))
+    flight.run(1.0)
+    assert flight.setpoints[-1].p_wb[0] == 0.0 and 0.0 < flight.setpoints[-1].p_wb[1] < 0.5
+    assert not flight.guidance.finished(flight.time_ns)
+    flight.run(20.0)
+    np.testing.assert_allclose(flight.setpoints[-1].p_wb, [1.0, 1.0, 1.0], atol=1e-6)
+
+
+def test_stopped_mission_comes_to_rest_smoothly() -> None:
+    flight = Flight()
+    flight.do(Effect.FOLLOW, Mode.AUTO, Ramp())
+    flight.run(3.0)
+    flight.do(Effect.ENTER_MODE)
+    flight.run(2.0)
+    assert 0.3 < flight.setpoints[-1].p_wb[0] < 0.36 and np.abs(flight.setpoints[-1].v_w).max() < 1e-3
+
+
+def test_streamed_points_are_followed_and_a_stream_that_ends_stops_the_robot() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.GUIDED)
+    for _ in range(40):
+        nan = np.full(3, np.nan)
+        flight.do(Effect.TAKE_POINT, Mode.GUIDED, Setpoint(nan, np.full(4, np.nan), np.array([0.2, 0.0, 0.0]), ZERO, ZERO, ZERO))
+        flight.run(0.1)
+    assert flight.setpoints[-1].v_w[0] == pytest.approx(0.2, abs=1e-3)
+    flight.run(2.5)
+    assert np.abs(flight.setpoints[-1].v_w).max() < 1e-3
+
+
+def test_single_point_is_flown_to_without_a_stream() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.GUIDED)
+    flight.run(0.5)
+    flight.do(Effect.TAKE_POINT, Mode.GUIDED, rest_at(np.array([0.0, 0.0, 2.0]), estimate().q_wb))
+    assert flight.run(15.0).p_wb[2] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_surfacing_robot_rises_levels_and_stays_up() -> None:
+    flight = Flight()
+    flight.estimate = estimate(q=from_euler(0.4, -0.6, 1.0))
+    flight.guidance.rest(flight.estimate)
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    now = flight.run(15.0)
+    assert 0.05 < now.p_wb[2] < 0.13 and np.abs(now.v_w).max() < 1e-3
+    np.testing.assert_allclose(now.p_wb[:2], 0.0, atol=1e-9)
+    assert np.linalg.norm(difference(now.q_wb, heading(now.q_wb))) < 1e-3
+
+
+def test_surfacing_robot_lifts_blindly_when_it_must() -> None:
+    lift = -Parameters().steering.surface_force_n
+    for health, expected in (
+        (BLIND, [0.0, 0.0, lift, 0.0, 0.0, 0.0]),
+        (GOOD._replace(tag_age_s=9.0, depth_age_s=9.0), [0.0, 0.0, lift, *WRENCH[3:]]),
+        (GOOD._replace(tag_age_s=9.0), [0.0, 0.0, *WRENCH[2:]]),
+        (GOOD, WRENCH),
+    ):
+        flight = Flight()
+        flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+        flight.run(0.5, health=health)
+        np.testing.assert_allclose(flight.wrenches[-1], expected, atol=1e-12)
+
+
+def test_docking_sequence_steers_in_its_mode_alone() -> None:
+    flight, place = Flight(), rest_at(np.array([0.1, 0.0, 1.0]), estimate().q_wb)
+    flight.do(Effect.ENTER_MODE, Mode.DOCK)
+    flight.guidance.dock(place)
+    assert flight.run(0.01) is place
+    flight.do(Effect.ENTER_MODE)
+    flight.guidance.dock(rest_at(np.array([9.0, 0.0, 1.0]), estimate().q_wb))
+    assert flight.run(1.0).p_wb[0] < 0.11
+
+
+@pytest.mark.parametrize("pitch", [0.0, 1.0, 1.4, 1.5707, -1.0, -1.4, -1.5707])
+def test_heading_is_kept_through_the_vertical(pitch: float) -> None:
+    np.testing.assert_allclose(difference(heading(from_euler(0.0, pitch, 0.8)), from_euler(0.0, 0.0, 0.8)), 0.0, atol=1e-3)

@@ -1,0 +1,185 @@
+"""The plant's docking faces: magnets, funnel, jams, joints, and bodies that merge and part."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from firmware_py.core import rotations
+from firmware_py.description.vehicle import load_vehicle
+from hil.plant.dock_spec import DockSpec, JamRule
+from hil.plant.docking import Joint
+from hil.plant.spec import CALM, Tank, WorldSpec
+from hil.plant.world import Start, World
+
+PERIOD_NS = 10_000_000
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+OCEAN = Tank(kind="box", size_m=np.array([900.0, 900.0, 900.0]))
+VEHICLE = load_vehicle("modcube")
+PULL, PUSH, OFF = 1, 2, 0
+NEVER, ALWAYS = JamRule(probability_inside=0.0, probability_outside=0.0), JamRule(probability_inside=1.0)
+
+
+def two(gap_m: float, lateral_m: float = 0.0, jam: JamRule = NEVER, q: np.ndarray = LEVEL, **world: float) -> World:
+    """Module 1 before module 0's +x face, -x towards it, in calm deep water."""
+    starts = [Start(np.array([0.0, 0.0, 400.0]), LEVEL), Start(np.array([0.21 + gap_m, lateral_m, 400.0]), q)]
+    return World(WorldSpec(**{**CALM, **world}), OCEAN, [VEHICLE] * 2, starts, 0, PERIOD_NS, jam=jam)
+
+
+def relays(world: World, state: int) -> None:
+    world.set_relays(0, [state, 0, 0, 0, 0, 0])
+    world.set_relays(1, [0, state, 0, 0, 0, 0])
+
+
+def run(world: World, seconds: float) -> None:
+    for _ in range(round(1e9 * seconds / PERIOD_NS)):
+        world.advance(PERIOD_NS)
+
+
+def docked_pair(**world: float) -> World:
+    pair = two(0.02, 0.002, **world)
+    relays(pair, PULL)
+    run(pair, 3.0)
+    assert pair.bodies == [(0, 1)]
+    return pair
+
+
+def test_magnets_draw_two_modules_together_and_lock() -> None:
+    world = docked_pair()
+    between = rotations.rotate_back(world.truth(0).q_wm, world.truth(1).p_wm - world.truth(0).p_wm)
+    np.testing.assert_allclose(between, [0.21, 0.0, 0.0], atol=1e-12)
+    assert world.docks.joints == [Joint(0, 0, 1, 1)]
+    assert [c.jammed for c in world.docks.contacts] == [False]
+
+
+@pytest.mark.parametrize("quarter", [0, 1, 2, 3])
+def test_pins_allow_four_rotations(quarter: int) -> None:
+    q = rotations.from_euler(np.pi / 2 * quarter + 0.05, 0.0, 0.0)
+    world = two(0.015, q=q)
+    relays(world, PULL)
+    run(world, 3.0)
+    assert world.bodies == [(0, 1)]
+    turned = rotations.difference(world.truth(1).q_wm, world.truth(0).q_wm)
+    assert np.cos(turned[0] - np.pi / 2 * quarter) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(turned[1:], 0.0, atol=1e-9)
+
+
+def test_probe_does_not_lock_with_a_probe() -> None:
+    world = two(0.005, q=rotations.from_euler(0.0, 0.0, np.pi))  # +x looks at +x
+    world.set_relays(0, [PULL, 0, 0, 0, 0, 0])
+    world.set_relays(1, [PULL, 0, 0, 0, 0, 0])
+    run(world, 2.0)
+    assert world.bodies == [(0,), (1,)]
+
+
+def test_merging_keeps_momentum() -> None:
+    rng = np.random.default_rng(4)
+    starts = [Start(np.array([0.0, 0.0, 400.0]), LEVEL), Start(np.array([0.2104, 3e-4, 400.0003]), rotations.exp(np.full(3, 0.004)))]
+    world = World(WorldSpec(current_m_s=0.2), OCEAN, [VEHICLE] * 2, starts, 3, PERIOD_NS)
+    for body in (0, 1):
+        world.set_motion(body, 0.2 * rng.standard_normal(3), 0.5 * rng.standard_normal(3))
+    before = world.momentum().sum(axis=0)
+    world.join(Joint(0, 0, 1, 1))
+    np.testing.assert_allclose(world.momentum().sum(axis=0), before, rtol=0, atol=1e-9 * np.abs(before).max())
+
+
+def test_parting_keeps_momentum_and_motion() -> None:
+    world = docked_pair(current_m_s=0.1)
+    world.set_motion(0, [0.1, -0.2, 0.05], [0.4, 0.3, -0.5])
+    before, seen = world.momentum().sum(axis=0), world.seen()
+    world.part(world.docks.joints[0])
+    assert world.bodies == [(0,), (1,)]
+    np.testing.assert_allclose(world.momentum().sum(axis=0), before, rtol=0, atol=1e-9 * np.abs(before).max())
+    np.testing.assert_allclose(world.seen()[:, :13], seen[:, :13], atol=1e-12)
+
+
+def test_magnets_and_funnel_change_no_momentum() -> None:
+    smooth = dataclasses.replace(VEHICLE, drag=dataclasses.replace(VEHICLE.drag, cd_face=0.0, cd_edge=0.0, rotational_cd=0.0))
+    smooth = dataclasses.replace(smooth, inertial=dataclasses.replace(VEHICLE.inertial, righting_arm_m=0.0))
+    starts = [Start(np.array([0.0, 0.0, 2.0]), LEVEL), Start(np.array([0.24, 0.003, 2.0]), LEVEL)]
+    world = World(WorldSpec(**CALM), OCEAN, [smooth] * 2, starts, 0, PERIOD_NS, jam=NEVER)
+    world.set_motion(1, [-0.02, 0.0, 0.0], [0.02, 0.01, 0.0])
+    relays(world, PULL)
+    before = world.momentum().sum(axis=0)
+    run(world, 1.5)
+    assert world.docks.contacts, "they must have met, or the test proves nothing"
+    np.testing.assert_allclose(world.momentum().sum(axis=0), before, rtol=0, atol=1e-6 * np.abs(before).max())
+
+
+def test_reversed_magnets_push_the_pair_apart() -> None:
+    world = docked_pair()
+    relays(world, PUSH)
+    run(world, 1.0)
+    assert world.bodies == [(0,), (1,)]
+    assert np.linalg.norm(world.truth(1).p_wm - world.truth(0).p_wm) > 0.25
+
+
+def test_a_stronger_pull_than_the_magnets_opens_the_joint() -> None:
+    world = docked_pair()
+    assert world._pull_on(world.docks.joints[0]) < 1.0
+    along = VEHICLE.directions[:, 0]
+    for module, sign in ((0, -1.0), (1, 1.0)):
+        world.set_command(module, np.clip(sign * along / np.abs(along).max(), -0.8, 0.8), True)
+    run(world, 0.5)
+    pull = world._pull_on(world.docks.joints[0]) if world.docks.joints else np.inf
+    assert pull > 15.0, "two modules pull against each other"
+    weak = docked_pair()
+    weak.docks.faces.coil[:] *= 0.2
+    weak.docks._busy = False
+    for module, sign in ((0, -1.0), (1, 1.0)):
+        weak.set_command(module, np.clip(sign * along / np.abs(along).max(), -0.8, 0.8), True)
+    run(weak, 0.5)
+    assert weak.bodies == [(0,), (1,)]
+
+
+def test_jam_holds_the_faces_apart_until_they_let_go() -> None:
+    world = two(0.03, jam=ALWAYS)
+    relays(world, PULL)
+    run(world, 5.0)
+    assert world.bodies == [(0,), (1,)]
+    assert world.docks.contacts[0].jammed and world.docks.gap_m > 0.3 * DockSpec().probe_m - 0.001
+    relays(world, PUSH)
+    run(world, 1.0)
+    assert world.docks.gap_m > DockSpec().rearm_m or np.isnan(world.docks.gap_m)
+    assert not world.docks.faces.inside.any()
+
+
+def test_jam_rule_is_that_of_the_issue() -> None:
+    rule = JamRule()
+    assert rule.probability(0.004, 0.060, 5.0) == 0.02
+    assert rule.probability(0.0041, 0.0, 0.0) == rule.probability(0.0, 0.061, 0.0) == rule.probability(0.0, 0.0, 5.1) == 0.5
+
+
+def test_current_rises_with_engagement_and_passes_the_threshold() -> None:
+    world = two(0.10)
+    relays(world, PULL)
+    run(world, 0.5)
+    far = world.docks.current_ma()[0, 0]
+    pair = docked_pair()
+    near = pair.docks.current_ma()[[0, 1], [0, 1]]
+    assert 30.0 < far < 55.0 and np.all(near > 90.0)
+    relays(pair, OFF)
+    run(pair, 0.5)
+    np.testing.assert_allclose(pair.docks.current_ma(), 0.0, atol=1e-3)
+
+
+def test_switching_shows_a_transient() -> None:
+    world = two(0.10)
+    run(world, 0.1)
+    relays(world, PUSH)
+    run(world, 0.03)
+    assert world.docks.current_ma()[0, 0] < -70.0
+    run(world, 0.5)
+    assert -55.0 < world.docks.current_ma()[0, 0] < -30.0
+
+
+def test_colliding_cubes_bounce_off_and_gain_no_energy() -> None:
+    world = two(0.05, 0.12)  # beside the funnel: hulls alone
+    world.set_motion(1, [-0.15, 0.0, 0.0], np.zeros(3))
+    energy = world.kinetic_energy().sum()
+    for _ in range(150):
+        world.advance(PERIOD_NS)
+        away = world.truth(1).p_wm - world.truth(0).p_wm
+        assert np.abs(away).max() > 0.205
+    assert world.kinetic_energy().sum() < energy
+    assert world.truth(0).v_w[0] < -0.01, "the other one was hit"
