@@ -1,0 +1,86 @@
+"""Each of the four uses once, end to end: the vehicle's process, a tuning script, and a dock seen through the bus."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.description.parameters import Parameters
+from hil.flight import fly_and_judge
+from hil.scenario import load_scenario
+from hil.signals import read_flight
+
+MODCUBE = [sys.executable, "-c", "from firmware_py.cli import main; main()"]
+DEADLINE_S = 120.0
+"""Longest that a process may take on a machine that is busy with other tests."""
+
+
+def free_group() -> str:
+    """A multicast address that nobody else on this machine uses now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"udp:239.74.163.9:{probe.getsockname()[1]}"
+
+
+@pytest.mark.slow
+def test_vehicle_process_arms_holds_and_disarms_when_it_is_asked_to_stop(tmp_path: Path) -> None:
+    bus = free_group()
+    plant = subprocess.Popen(
+        [*MODCUBE, "hil", "plant", "hover", "--bus", bus], stdout=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    try:
+        assert plant.stdout is not None
+        assert plant.stdout.readline().startswith("plant of hover")
+        vehicle = subprocess.Popen(
+            [*MODCUBE, "run", "--bus", bus, "--hold", "--stats", "--out", str(tmp_path / "log")],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert vehicle.stdout is not None
+        said = []
+        for line in vehicle.stdout:
+            said.append(line)
+            if "DISARMED" in line and "ARMED POSHOLD" in line:
+                break
+        vehicle.send_signal(signal.SIGINT)
+        rest, _ = vehicle.communicate(timeout=DEADLINE_S)
+        assert vehicle.returncode == 0, said
+        assert "-> DISARMED" in rest
+        assert "lateness_p99_ns" in rest
+    finally:
+        plant.send_signal(signal.SIGTERM)
+        plant.communicate(timeout=DEADLINE_S)
+    assert plant.returncode == 0
+    assert (tmp_path / "log" / "can.log").stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_tuning_script_betters_one_detuned_axis_on_worlds_that_it_never_saw(tmp_path: Path) -> None:
+    start = tmp_path / "detuned.toml"
+    start.write_text("[control]\nposition_bandwidth = 0.9\n", encoding="utf-8")
+    command = [sys.executable, "tools/tune_gains.py", "tools/objectives/hover.toml", "--trials", "4", "--jobs", "1"]
+    subprocess.run([*command, "--start", str(start), "--out", str(tmp_path)], check=True, capture_output=True)
+    result = json.loads((tmp_path / "tuning.json").read_text(encoding="utf-8"))
+    assert result["unseen"]["tuned"]["objective"] < 0.8 * result["unseen"]["start"]["objective"]
+    again = subprocess.run(
+        [*command, "--start", str(start), "--out", str(tmp_path)], check=True, capture_output=True, text=True
+    )
+    assert "trial" not in again.stdout, "four trials were done already"
+
+
+@pytest.mark.slow
+def test_both_conditions_of_a_dock_are_seen_through_real_frames(tmp_path: Path) -> None:
+    scenario = load_scenario("dock")
+    result = fly_and_judge(scenario, 0, Parameters(), tmp_path, "virtual:thin-walk-dock")
+    assert result.passed
+    assert result.metrics["docked"] == 1
+    flight = read_flight(tmp_path)
+    said = [str(text) for text in flight.events["text"]]
+    assert any("VERIFY" in text for text in said)
+    assert any("-> DOCKED" in text for text in said)
+    assert np.isfinite(result.metrics["position_rmse_m"])
