@@ -1,6 +1,6 @@
 # Every target sets up what it needs; a fresh machine needs Python 3.11 or newer, make and git.
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-clients setup-system quick lint test test-vcan hil accept bench lock clean
+.PHONY: help setup setup-clients setup-system quick lint test test-vcan hil accept bench mutants lock clean
 
 BIN := .venv/bin
 PY := $(BIN)/python
@@ -68,6 +68,9 @@ hil: setup ## fly the spiral on the bench and name the report
 
 accept: setup ## every acceptance figure, long ones too; writes accept.json and README's tables
 	@$(PY) tools/accept.py $(if $(ONLY),--only $(ONLY)); status=$$?; $(PY) tools/readme_tables.py; exit $$status
+
+mutants: setup ## change limiter, supervisor and fail-safes one thing at a time: every mutant must fail its tests
+	@$(PY) tools/mutants.py
 
 bench: setup ## measure the code; writes bench.json and README's tables
 	@$(PY) tools/bench.py && $(PY) tools/readme_tables.py

@@ -6,16 +6,16 @@ accepted command, sample and answer, MCU_STATUS last. Nothing here knows the con
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
-from firmware_py.bus.codec import Codec, Frame, Received, Receiver, pack_quaternion
-from hil.plant.camera import Camera, Sighting, in_the_world
+from firmware_py.bus.codec import Codec, Frame, Received, Receiver
+from hil.plant.camera import Camera
 from hil.plant.draw import stream
 from hil.plant.sensors import Noise, Sensors
 from hil.plant.spec import SensorSpec
 from hil.plant.world import World
+from hil.tag_camera import TagCamera
 
 TIMEOUT_NS = 100_000_000
 """A half of THRUSTER_CMD that is older commands zero."""
@@ -158,75 +158,6 @@ class Mcu:
         return values
 
 
-class TagCamera:
-    """The tag computer, number 31: sends what its cameras saw, in the world's frame, when its delay is over.
-
-    It knows where its fixed cameras stand. What a carried camera sees it places in the world by the carrier's own tag in
-    a fixed camera's picture of the same moment; without one the sighting is of no use and is dropped.
-    """
-
-    def __init__(
-        self, codec: Codec, cameras: Sequence[Camera], numbers: Mapping[int, int], spec: SensorSpec, world: World
-    ) -> None:
-        self._position, self._attitude = codec.message("TAG_POSITION"), codec.message("TAG_ATTITUDE")
-        self._cameras, self._world = sorted(cameras, key=lambda c: c.carrier >= 0), world
-        self._number_of = {module: number for number, module in numbers.items()}
-        self._tags = [{tag.id: tag for tag in vehicle.tag} for vehicle in world.vehicles]
-        self._delay_ns = round(1e6 * spec.tag_delay_ms)
-        self._waiting: deque[tuple[Sighting, int, int]] = deque()
-        self._sync: tuple[int, int] | None = None
-        self._counters = dict.fromkeys(self._number_of, 0)
-        self.change: Callable[[Sighting], Sighting | None] = lambda sighting: sighting
-        """What a fault makes of every sighting; None: lost."""
-        self.watch()
-
-    def watch(self) -> None:
-        """Takes the pictures that have become due; each is stamped by the last SYNC heard before it."""
-        for sighting in self._see():
-            if self._sync is None or sighting.module not in self._number_of:
-                continue
-            tick, sync_ns = self._sync
-            offset_ns = sighting.capture_ns - sync_ns
-            if 0 <= offset_ns <= 25_500_000:  # what 8 bits of 0.1 ms can say
-                self._waiting.append((sighting, tick, offset_ns))
-
-    def _see(self) -> list[Sighting]:
-        """All sightings of the pictures that are due, in the world's frame, in the order of their pictures."""
-        fixed: list[Sighting] = []
-        for camera in self._cameras:
-            found = camera.watch(self._world)
-            if camera.carrier < 0:
-                fixed += [s for s in map(self.change, found) if s is not None]
-                continue
-            for relative in found:
-                own = [s for s in fixed if s.module == relative.carrier and s.capture_ns == relative.capture_ns]
-                if own:
-                    tag = self._tags[own[0].module][own[0].tag_id]
-                    seen = self.change(in_the_world(relative, own[0], tag))
-                    fixed += [] if seen is None else [seen]
-        return sorted(fixed, key=lambda s: s.capture_ns)
-
-    def sync(self, tick: int, time_ns: int) -> list[Frame]:
-        """Notes the time of SYNC and sends what is due."""
-        self._sync = (tick, time_ns)
-        frames = []
-        while self._waiting and self._waiting[0][0].capture_ns + self._delay_ns <= time_ns:
-            sighting, capture_tick, offset_ns = self._waiting.popleft()
-            counter = self._counters[sighting.module]
-            self._counters[sighting.module] = (counter + 1) & 15
-            number = self._number_of[sighting.module]
-            frames.append(self._position.encode(number, sighting.p_wt.tolist(), counter))
-            values = [
-                *pack_quaternion(sighting.q_wt.tolist()),
-                sighting.tag_id,
-                sighting.quality,
-                capture_tick & 0xFF,
-                1e-6 * offset_ns,
-            ]
-            frames.append(self._attitude.encode(number, values, counter))
-        return frames
-
-
 class WireFaults(Protocol):
     """What may be wrong (hil.faults)."""
 
@@ -345,9 +276,14 @@ def make_nodes(world: World, codec: Codec, numbers: Mapping[int, int], scenario:
     """The nodes of a scenario on one bus; `numbers` maps numbers on the bus to modules."""
     cameras = [
         Camera(
-            pose, scenario.sensors, world.vehicles, scenario.tags, world.seed, index,
+            pose,
+            scenario.sensors,
+            world.vehicles,
+            scenario.tags,
+            world.seed,
+            index,
             scenario.index_of(pose.module) if pose.module else -1,
-        )  # fmt: skip
+        )
         for index, pose in enumerate(scenario.camera)
     ]
     return Nodes(world, codec, numbers, scenario.sensors, cameras, tick_ns)

@@ -7,6 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from multiprocessing.context import ForkContext, SpawnContext
 from multiprocessing.synchronize import Event as ProcessEvent
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -76,7 +77,8 @@ def fly_in_real_time(
         observers: called after each tick, besides the recorder.
         serve: what the plant's process runs, with the arguments of `serve_plant`.
     """
-    context = multiprocessing.get_context(start_method)
+    spawn, fork = multiprocessing.get_context("spawn"), multiprocessing.get_context("fork")
+    context: SpawnContext | ForkContext = fork if start_method == "fork" else spawn
     ready, stop = context.Event(), context.Event()
     arguments = (scenario, seed, bus, rate_hz, out, ready, stop)
     plant = context.Process(target=serve, args=arguments, name="plant", daemon=True)

@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from flash_files import RefusedError, file_digest, remove, run, sync_folder, unpack, watcher, watches, write_whole
+from flash_files import RefusedError, carry_compiled, file_digest, remove, run, sync_folder, unpack, watcher, watches, write_whole
 
 SERVICE = "modcube.service"
 UNIT_FOLDER = Path("/etc/systemd/system")
@@ -37,6 +37,8 @@ HEALTH_LIMIT_S = 60.0
 """Longest wait for that."""
 POLL_S = 0.5
 KEPT_RELEASES = 3
+COMPILERS = ("numba", "llvmlite", "numpy")
+"""What compiled code depends on besides its sources."""
 STATUS_FIELDS = ("ActiveState", "SubState", "MainPID", "NRestarts", "StatusText")
 
 
@@ -90,6 +92,8 @@ class Device:
         for name in wheels:
             self._step(f"unpack {name}")
             unpack(self.wheels / name, packages)
+        self._step("carry over")
+        self._carry_over(wheels, packages)
         self._step("check")
         self._run([str(partial / "bin" / "modcube"), "doctor", "--warm"])
         (partial / "release.json").write_text(json.dumps({"release": release, "wheels": wheels, **facts}, indent=1))
@@ -112,11 +116,21 @@ class Device:
         # The release is renamed when it is whole, so nothing in it may know its own path.
         command.write_text(
             '#!/bin/sh\nhere=$(dirname "$(readlink -f "$0")")\n'
-            'export NUMBA_CACHE_DIR="${NUMBA_CACHE_DIR:-$here/../cache}"\n'
             'exec "$here/python" -I -c "import sys; from firmware_py.cli import main; sys.exit(main())" "$@"\n'
         )
         command.chmod(0o755)
         return packages
+
+    def _carry_over(self, wheels: dict[str, str], packages: Path) -> None:
+        """Compiled code of the release that runs, where all that it was made of is the same: it saves minutes."""
+        old = self.linked(self.current)
+        if old is None:
+            return
+        before = json.loads((self.releases / old / "release.json").read_text())["wheels"]
+        if all(made_by(before, name) == made_by(wheels, name) for name in COMPILERS):
+            source = next((self.releases / old / "lib").glob("python*/site-packages"))
+            if source.parent.name == packages.parent.name:
+                carry_compiled(source, packages)
 
     def activate(self, release: str) -> None:
         """Switches to `release`, restarts the service, waits for its health, goes back when it has none.
@@ -295,6 +309,11 @@ def ticks(status: dict[str, str]) -> int | None:
     """The tick that the service reported last; None before its first report."""
     words = dict(word.split("=", 1) for word in status.get("StatusText", "").split() if "=" in word)
     return int(words["tick"]) if words.get("tick", "").isdigit() else None
+
+
+def made_by(wheels: dict[str, str], name: str) -> str:
+    """The file name of a distribution's wheel; empty where there is none."""
+    return next((wheel for wheel in wheels if wheel.startswith(f"{name}-")), "")
 
 
 def unit_words(root: Path) -> dict[str, str]:

@@ -13,6 +13,12 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
+FILE_TIME_S = 315532800
+"""1980-01-01, of every file of a release: caches of compiled code know their source by time and size."""
+
+
+OWN_PACKAGES = ("firmware_py", "hil")
+
 
 class RefusedError(Exception):
     """Something cannot be done; one line."""
@@ -34,6 +40,29 @@ def unpack(wheel: Path, packages: Path) -> None:
             target.parent.mkdir(parents=True, exist_ok=True)
             with archive.open(name) as source, target.open("wb") as sink:
                 shutil.copyfileobj(source, sink)
+            os.utime(target, (FILE_TIME_S, FILE_TIME_S))
+
+
+def carry_compiled(old: Path, new: Path) -> bool:
+    """Copies numba's caches from one site-packages folder to another, if the same files there use numba.
+
+    One compiled function contains others, so that all of them have to be the same, or none is taken.
+    """
+    if numba_users(old) != numba_users(new):
+        return False
+    for package in OWN_PACKAGES:
+        for path in (old / package).rglob("__pycache__/*.nb[ic]"):
+            target = new / path.relative_to(old)
+            target.parent.mkdir(exist_ok=True)
+            shutil.copyfile(path, target)
+    return True
+
+
+def numba_users(packages: Path) -> dict[str, bytes]:
+    """Our own files that use numba, by place."""
+    files = [path for package in OWN_PACKAGES for path in (packages / package).rglob("*.py")]
+    texts = {str(path.relative_to(packages)): path.read_bytes() for path in files}
+    return {name: text for name, text in texts.items() if b"numba" in text}
 
 
 def file_digest(path: Path) -> str:

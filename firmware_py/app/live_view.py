@@ -215,8 +215,9 @@ def arrows_of(body: Body, record: BodyRecord, of_module: Sequence[Vehicle]) -> l
         if abs(force_n) < SHOWN_N:
             continue
         place, channel = int(thrusters.module[i]), int(thrusters.channel[i])
-        position = of_module[body.modules[place]].thruster[channel].position_m
-        tail = body.r_bm[place] + rotations.rotate(body.q_bm[place], position)
+        # Compiled functions take no read-only arrays, which descriptions are.
+        position = of_module[body.modules[place]].thruster[channel].position_m.copy()
+        tail = body.r_bm[place] + rotations.rotate(body.q_bm[place].copy(), position)
         direction = np.ascontiguousarray(thrusters.matrix[:3, i]) * np.sign(force_n)
         length = METRES_PER_NEWTON * abs(force_n)
         arrows.append(

@@ -41,7 +41,7 @@ class Lockstep:
     def finish_tick(
         self, tick: int, time_ns: int, requests: Sequence[Request], expected: Sequence[BusFrame]
     ) -> tuple[Outputs, list[BusFrame]]:
-        """Takes the `expected` frames that the other side sent, steps, sends the commands; returns those that went out."""
+        """Takes the `expected` frames that the other side sent, steps, sends; returns the commands that went out."""
         received = drain(self._ports, expected, self._patience_looks)
         inputs, outputs, frames = self._firmware.step(tick, time_ns, received, requests)
         sent = send(self._ports, frames)

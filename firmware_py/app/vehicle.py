@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from firmware_py.app.firmware import BusFrame, compose, vehicles_of
-from firmware_py.app.live_view import LiveView
 from firmware_py.app.ground_station import GroundSide
+from firmware_py.app.live_view import LiveView
 from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import RealTimeLoop, open_loop
 from firmware_py.app.service import reporting

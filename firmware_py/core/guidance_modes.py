@@ -264,7 +264,7 @@ class Guidance:
     def _surfacing(self, wrench: np.ndarray, estimate: Estimate, health: Health) -> np.ndarray:
         """Up by the controller, or by a constant force where depth is unknown; sideways only where the place is known."""
         if not health.ready:
-            return np.r_[0.0, 0.0, -self._lift_n, 0.0, 0.0, 0.0]
+            return np.asarray(np.r_[0.0, 0.0, -self._lift_n, 0.0, 0.0, 0.0])
         out = wrench.copy()
         force_w = np.asarray(rotate(estimate.q_wb, wrench[:3].copy()))
         if not self._placed(health):

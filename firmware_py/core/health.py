@@ -90,7 +90,7 @@ class HealthMonitor:
         self._period_ns = period_ns
         self._nominal_v = np.array([t.voltage_v[t.module == m][0] for m in range(count)])
         self._channels = [(int(m), int(c)) for m, c in zip(t.module, t.channel, strict=True)]
-        self._heard_ns: list[int | None] = [None] * count
+        self._heard_ns = [0] * count
         self._answered_ns: list[int | None] = [None] * count
         self._voltage = np.full(count, math.nan)
         self._leak = [False] * count
@@ -98,7 +98,7 @@ class HealthMonitor:
         self._cabin_pa = np.full(count, math.nan)
         self._cabin_start_pa = np.full(count, math.nan)
         self._esc_ns: dict[tuple[int, int], int] = {}
-        self._depth_ns: int | None = None
+        self._depth_ns = 0
         self._ground_ns: int | None = None
         self._pilot_ns: int | None = None
         self._stick = 0.0
@@ -118,7 +118,9 @@ class HealthMonitor:
     def step(self, inputs: Inputs, estimate: Estimate, requests: list[Request], faults: ThrusterFaults) -> Health:
         """The figures of this tick; `now` keeps them."""
         now = inputs.time_ns
-        dt_s = 0.0 if self._time_ns is None else (now - self._time_ns) * 1e-9
+        if self._time_ns is None:  # silence counts from here
+            self._heard_ns, self._depth_ns, self._time_ns = [now] * len(self._modules), now, now
+        dt_s = (now - self._time_ns) * 1e-9
         for index, module in enumerate(self._modules):
             self._listen(index, inputs.modules[module], now)
         self._people(requests, now)

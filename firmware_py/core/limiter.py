@@ -1,4 +1,4 @@
-"""Last stage of a tick, after everything else: per thruster force, slew and arm state, per module supply power and magnets; then the command.
+"""Last stage of a tick, after everything else: per thruster force, slew and arm state, per module supply and magnets; then the command.
 
 Whatever asks for a force, nothing leaves that this file has not passed.
 """

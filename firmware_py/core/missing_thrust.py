@@ -1,7 +1,8 @@
 """Finds the thruster whose force is missing in the motion, whatever its ESC says. Part of `faults`.
 
-The wrench that the motion shows, less the one that was commanded and modelled, is averaged over tenths of a second. When it changes, and one
-thruster's lost force explains the change in all six components, that thruster lies. Slow changes (current, trim, buoyancy) are not looked at.
+The wrench that the motion shows, less the one that was commanded and modelled, is averaged over tenths of a second. When it
+changes, and one thruster's lost force explains the change in all six components, that thruster lies. Slow changes (current,
+trim, buoyancy) are not looked at.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The tick, as in the paper's block diagram: measure, estimate, dock, decide, guide, control, allocate, limit. One call serves the whole fleet."""
+"""The tick, as in the paper's block diagram: measure, estimate, dock, decide, guide, control, allocate, limit.
+
+One call serves the whole fleet.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which modules form which bodies, as state: what merging and parting does to motion, estimate and forces. Swaps only; nothing is built here.
+"""Which modules form which bodies, as state: what joining and parting does to motion and estimate. Nothing is built here.
 
 The new Body comes prepared (prepare.docking). Velocities follow from momentum: what two bodies have together before, they have after.
 """

@@ -39,7 +39,8 @@ def real_time(priority: int = READER_PRIORITY) -> Iterator[list[str]]:
     try:
         yield [f"{line}: ticks may start later than they could" for line in refused]
     finally:
-        _leave()
+        use_ordinary_priority()
+        unlock_memory()
 
 
 def use_priority(priority: int) -> str:
@@ -51,6 +52,12 @@ def use_priority(priority: int) -> str:
     except AttributeError:
         return "no real-time priority (not Linux)"
     return ""
+
+
+def use_ordinary_priority() -> None:
+    """Back to an ordinary thread: for a process started from a real-time one, which would inherit its priority."""
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def use_fine_timers(slack_ns: int = 1) -> str:
@@ -84,11 +91,11 @@ def lock_memory() -> str:
         return "memory not locked (not Linux)"
 
 
-def _leave() -> None:
-    """Back to an ordinary thread with ordinary memory: a bench goes on after its flight."""
-    if hasattr(os, "sched_setscheduler"):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        ctypes.CDLL(None).munlockall()
+def unlock_memory() -> None:
+    """Ends `lock_memory`: a bench goes on after its flight."""
+    munlockall = getattr(ctypes.CDLL(None), "munlockall", None)
+    if munlockall is not None:
+        munlockall()
 
 
 @contextmanager

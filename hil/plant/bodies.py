@@ -1,6 +1,6 @@
 """Motion of rigid bodies in water: Kirchhoff's equations.
 
-A body is one or more modules docked rigidly. Its frame is that of its first module, origin O at that hull's centre. Its
+A body is one or more modules docked rigidly. Its frame has the axes of their lattice, origin O at its first hull's centre. Its
 state, (13,): position of O in the world, quaternion body to world, velocity of O and angular rate in the body frame.
 
 With the momenta of robot and entrained water (p, L) and of the water outside (h, l: added mass times velocity relative

@@ -14,7 +14,7 @@ from firmware_py.core import rotations
 from firmware_py.description.vehicle import Vehicle
 from hil.plant import shelter
 from hil.plant.bodies import Bodies, Modules
-from hil.plant.draw import ModuleDraw, carried, rigid_matrix
+from hil.plant.draw import ModuleDraw, carried
 from hil.plant.lattice import Place
 from hil.plant.spec import WorldSpec
 from hil.plant.thrusters import Thrusters
@@ -150,8 +150,7 @@ def fill_body(
     for array in bodies[1:6]:  # all but state, memory and clamp
         array[b] = 0.0
     for draw, r, turn in parts:
-        rigid = rigid_matrix(draw.dry_kg + draw.entrained_kg, draw.com, draw.inertia)
-        bodies.rigid[b] += carried(rigid, r, turn)
+        bodies.rigid[b] += carried(draw.rigid, r, turn)
         bodies.added[b] += carried(np.diag(draw.added), r, turn)
         weight = draw.dry_kg * spec.gravity
         bodies.weight[b, 0] += weight
@@ -162,6 +161,9 @@ def fill_body(
         displaced = draw.entrained_kg + draw.buoyancy_n / spec.gravity
         bodies.hull[b, 0] += displaced
         bodies.hull[b, 1:4] += displaced * r
+        for load in draw.payload:  # trimmed: it weighs what it displaces, at one point
+            bodies.hull[b, 0] += load.dry_kg + load.entrained_kg
+            bodies.hull[b, 1:4] += (load.dry_kg + load.entrained_kg) * (r + turn @ load.position_m)
     bodies.inverse[b] = np.linalg.inv(bodies.rigid[b] + bodies.added[b])
 
 

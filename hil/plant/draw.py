@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle import Payload, Vehicle
 from hil.plant.spec import WorldSpec
 
 SOURCES = (
@@ -39,6 +39,7 @@ class ModuleDraw:
         added: (6,) added mass about the hull centre.
         drag: (5,) coefficients face-on, edge-on, of rotation about x, y, z.
         gain, deadband_n: (t,) of each thruster.
+        payload: what it carries, as its vehicle file says.
     """
 
     dry_kg: float
@@ -52,6 +53,17 @@ class ModuleDraw:
     drag: np.ndarray
     gain: np.ndarray
     deadband_n: np.ndarray
+    payload: tuple[Payload, ...] = ()
+
+    @property
+    def rigid(self) -> np.ndarray:
+        """(6, 6) mass matrix of robot, payloads and the water inside them about the hull's centre, module frame."""
+        total = rigid_matrix(self.dry_kg + self.entrained_kg, self.com, self.inertia)
+        for load in self.payload:
+            mass = load.dry_kg + load.entrained_kg
+            squares = np.square(load.size_m)
+            total = total + rigid_matrix(mass, load.position_m, np.diag(mass / 12.0 * (squares.sum() - squares)))
+        return total
 
 
 def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> ModuleDraw:
@@ -84,6 +96,7 @@ def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> Mo
         drag=np.array([drag.cd_face, drag.cd_edge, *(drag.rotational_cd,) * 3]) * spread("drag", spec.drag_spread, 5),
         gain=spread("gain", spec.gain_spread, count),
         deadband_n=deadband,
+        payload=vehicle.payload,
     )
 
 

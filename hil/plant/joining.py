@@ -10,7 +10,7 @@ from firmware_py.core import rotations
 from firmware_py.description.vehicle import FACE_NORMALS
 from hil.plant.bodies import Bodies, Modules
 from hil.plant.docking import Joint
-from hil.plant.draw import ModuleDraw, carried, rigid_matrix
+from hil.plant.draw import ModuleDraw, carried
 from hil.plant.lattice import QUATERNIONS, Place, nearest
 
 
@@ -86,7 +86,7 @@ def force_needed(
     weight = np.zeros(6)
     for m in members:
         d, r, turn = draws[m], modules.position[m], modules.turn[m]
-        mass += carried(rigid_matrix(d.dry_kg + d.entrained_kg, d.com, d.inertia) + np.diag(d.added), r, turn)
+        mass += carried(d.rigid + np.diag(d.added), r, turn)
         w = d.dry_kg * gravity
         weight[:3] += (w - d.buoyancy_n) * down
         weight[3:] += np.cross(w * (r + turn @ d.weight_at) - d.buoyancy_n * (r + turn @ d.buoyancy_at), down)

@@ -5,23 +5,23 @@ Time moves only by `advance`. Modules that are docked share a body; one module e
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import FACE_NORMALS, Vehicle
+from firmware_py.description.vehicle import Vehicle
 from hil.plant import thrusters as thrusters_module
-from hil.plant.build import fill_body, make_bodies, make_modules, make_thrusters, nominal_centre, seat_thrusters
+from hil.plant.build import make_thrusters, nominal_centre
 from hil.plant.dock_spec import DockSpec, JamRule
-from hil.plant.docking import DISK_M, Docks, Joint, joints_between
+from hil.plant.docked import DockedBodies
+from hil.plant.docking import Docks, joints_between
 from hil.plant.draw import ModuleDraw, draw_module, stream
 from hil.plant.integrator import advance
 from hil.plant.jets import add_jets
-from hil.plant.joining import centre_of, force_needed, motion_of, pieces, seats_after_join
-from hil.plant.lattice import QUATERNIONS, Place, nearest
+from hil.plant.lattice import Place
 from hil.plant.spec import Tank, WorldSpec
 from hil.plant.water import Gusts, make_water
 
@@ -66,7 +66,7 @@ class BodyTruth(NamedTuple):
     p_wb: np.ndarray
     """(3,) centre of mass by the vehicle files: the point that the controller steers."""
     q_wb: np.ndarray
-    """(4,) body to world; the body frame is that of its first module."""
+    """(4,) body to world; the body frame has the axes of the lattice."""
     v_w: np.ndarray
     """(3,) velocity of that point, world."""
     w_b: np.ndarray
@@ -74,7 +74,7 @@ class BodyTruth(NamedTuple):
     """(3,) where the centre of mass, water included, really is."""
 
 
-class World:
+class World(DockedBodies):
     """Modules in a tank."""
 
     def __init__(
@@ -130,20 +130,6 @@ class World:
         self.docks.energise(joints_between(self._modules, self.docks.faces.kind))
         self._power_magnets()
         self._step(0)
-
-    def _seat(self, groups: Sequence[Sequence[int]], places: Sequence[Place]) -> None:
-        """Puts the modules into bodies; their states are the caller's business."""
-        self.bodies: list[tuple[int, ...]] = [tuple(members) for members in groups]
-        self.places = list(places)
-        self._modules = make_modules(self.vehicles, self._draws, self.bodies, places)
-        seat_thrusters(self._thrusters, self.vehicles, self._modules)
-        self._body_arrays = make_bodies(len(self.bodies))
-        for b, members in enumerate(self.bodies):
-            parts = [(self._draws[m], self._modules.position[m], self._modules.turn[m]) for m in members]
-            fill_body(self._body_arrays, b, parts, self.spec)
-        self._stage = np.zeros((6, len(self.bodies), 13))
-        self._external = np.zeros((len(self.bodies), 6))
-        self._thrust = np.zeros((len(self.bodies), 6))
 
     def set_command(self, module: int, u: Sequence[float] | np.ndarray, armed: bool) -> None:
         """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call; disarmed is zero."""
@@ -210,95 +196,6 @@ class World:
             if self._modules.body[joint.module] != self._modules.body[joint.other]:
                 self.join(joint)
 
-    def join(self, joint: Joint) -> None:
-        """Makes one body of the two that `joint` links, and closes whatever else then meets. Momentum stays as it is."""
-        a, b = sorted((int(self._modules.body[joint.module]), int(self._modules.body[joint.other])))
-        old, total = self._body_arrays, self.momentum()
-        kept = joint.module if joint.module in self.bodies[a] else joint.other
-        q_a, q_b = old.state[a, 3:7].copy(), old.state[b, 3:7].copy()
-        q_ab = rotations.multiply(rotations.conjugate(q_a), q_b)
-        seats = seats_after_join(self.places, self._modules, joint, kept, self.bodies[b], q_ab)
-        lattice = QUATERNIONS[nearest(q_ab)].copy()
-        off = rotations.log(rotations.multiply(q_ab, rotations.conjugate(lattice)))
-        masses = old.rigid[[a, b], 0, 0]
-        centre = np.average([self._to_world(k, centre_of(old, k)) for k in (a, b)], axis=0, weights=masses)
-        groups = [g for k, g in enumerate(self.bodies) if k not in (a, b)]
-        groups = sorted([*groups, tuple(sorted((*self.bodies[a], *self.bodies[b])))])
-        states = {g[0]: old.state[k].copy() for k, g in enumerate(self.bodies)}
-        leader = min(self.bodies[a][0], self.bodies[b][0])
-        self._seat(groups, seats)
-        self._restore(states)
-        new = groups.index(next(g for g in groups if g[0] == leader))
-        x = self._body_arrays.state[new]
-        x[3:7] = rotations.normalise(rotations.multiply(q_a, rotations.exp(off * masses[1] / masses.sum())))
-        x[:3] = centre - rotations.rotate(x[3:7].copy(), centre_of(self._body_arrays, new))
-        motion_of(self._body_arrays, new, total[a] + total[b], self._flow())
-        known = set(self.docks.joints)
-        for met in joints_between(self._modules, self.docks.faces.kind):
-            if met not in known:
-                self.docks.joined(met)
-        self._step(0)
-
-    def part(self, joint: Joint) -> None:
-        """Opens a joint; what no other joint holds becomes a body of its own, moving as it did."""
-        b = int(self._modules.body[joint.module])
-        self.docks.parted(joint)
-        parts = pieces(self.bodies[b], self.docks.joints)
-        if len(parts) == 1:
-            return
-        states = {g[0]: self._body_arrays.state[k].copy() for k, g in enumerate(self.bodies)}
-        places = list(self.places)
-        whole = states[self.bodies[b][0]]
-        for piece in parts:
-            shift = self.places[piece[0]].position
-            states[piece[0]] = _moved_origin(whole, shift)
-            for m in piece:
-                places[m] = Place(self.places[m].position - shift, self.places[m].quaternion)
-        groups = sorted([*(g for k, g in enumerate(self.bodies) if k != b), *parts])
-        self._seat(groups, places)
-        self._restore(states)
-        self._step(0)
-
-    def _restore(self, states: Mapping[int, np.ndarray]) -> None:
-        """Puts back the state of every body whose leader is the same."""
-        for b, members in enumerate(self.bodies):
-            self._body_arrays.state[b] = states[members[0]]
-
-    def _to_world(self, body: int, r: np.ndarray) -> np.ndarray:
-        x = self._body_arrays.state[body]
-        return np.asarray(x[:3] + rotations.rotate(x[3:7].copy(), r))
-
-    def _flow(self) -> np.ndarray:
-        return self._water.flow[0] + self._water.flow[1]
-
-    def _pull_on(self, joint: Joint) -> float:
-        """Force that pulls a joint open, N, a moment counted as a force at the disk's rim; 0 where others hold as well."""
-        b = int(self._modules.body[joint.module])
-        parts = pieces(self.bodies[b], [j for j in self.docks.joints if j != joint])
-        if len(parts) == 1:
-            return 0.0
-        far = next(piece for piece in parts if joint.other in piece)
-        need = force_needed(
-            self._draws, self._modules, far, self._body_arrays.state[b], self._stage[5, b], self.spec.gravity
-        )
-        for t in np.flatnonzero(np.isin(self._thrusters.module, far)):
-            need -= self._thrusters.column[t] * self._thrusters.force[t]
-        outward = self._modules.turn[joint.module] @ FACE_NORMALS[joint.face]
-        at = self._modules.position[joint.module] + 0.5 * self._modules.size[joint.module, joint.face // 2] * outward
-        moment = need[3:] - np.cross(at, need[:3])
-        return float(-outward @ need[:3] + np.linalg.norm(moment) / DISK_M)
-
-    def clamp(self, body: int) -> None:
-        """Holds a body where it is; `load` then says with what force."""
-        self._body_arrays.clamped[body] = 1
-        self._body_arrays.state[body, 7:13] = 0.0
-
-    def load(self, body: int) -> np.ndarray:
-        """(6,) wrench about O that the body gives to whatever clamps it, body frame; zeros for a body that swims."""
-        if not self._body_arrays.clamped[body]:
-            return np.zeros(6)
-        return self._body_arrays.wrench[body].copy()
-
     def _step(self, steps: int) -> None:
         h = 1e-9 * self._step_ns
         self._external[:] = 0.0
@@ -356,22 +253,3 @@ class World:
         x = self._body_arrays.state[body]
         x[7:10], x[10:13] = rotations.rotate_back(x[3:7].copy(), np.array(v_w, dtype=np.float64)), w_b
         self._step(0)
-
-    def momentum(self) -> np.ndarray:
-        """(b, 6) linear and angular momentum about the world's origin of each body with the water it moves, world."""
-        out = np.empty((len(self.bodies), 6))
-        for b, x in enumerate(self._body_arrays.state[: len(self.bodies)]):
-            r_wb = rotations.to_matrix(x[3:7])
-            flow = np.concatenate([r_wb.T @ (self._water.flow[0] + self._water.flow[1]), np.zeros(3)])
-            total = self._body_arrays.rigid[b] @ x[7:] + self._body_arrays.added[b] @ (x[7:] - flow)
-            p = r_wb @ total[:3]
-            out[b] = np.concatenate([p, r_wb @ total[3:] + np.cross(x[:3], p)])
-        return out
-
-
-def _moved_origin(x: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """(13,) the same motion told of the point r (3,) of the body frame in place of its origin."""
-    moved = x.copy()
-    moved[:3] += rotations.rotate(x[3:7].copy(), r.copy())
-    moved[7:10] += np.cross(x[10:13], r)
-    return moved

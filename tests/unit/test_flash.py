@@ -372,3 +372,17 @@ def test_lock_gives_every_package_that_the_vehicle_needs_and_no_bench_or_develop
 def test_offline_names_the_first_wheel_that_is_missing(tmp_path: Path) -> None:
     with pytest.raises(PayloadError, match=r"no wheel of .* run once without --offline"):
         flash_payload.make_payload("aarch64", "3.11", tmp_path, offline=True)
+
+
+def test_compiled_code_is_carried_over_only_if_all_its_sources_are_the_same(tmp_path: Path) -> None:
+    old, new = tmp_path / "old", tmp_path / "new"
+    for folder in (old, new):
+        (folder / "firmware_py" / "core").mkdir(parents=True)
+        (folder / "firmware_py" / "core" / "fast.py").write_text("import numba\n")
+    cache = old / "firmware_py" / "core" / "__pycache__"
+    cache.mkdir()
+    (cache / "fast.run-1.py311.nbi").write_text("index")
+    assert flash_files.carry_compiled(old, new)
+    assert (new / "firmware_py/core/__pycache__/fast.run-1.py311.nbi").read_text() == "index"
+    (new / "firmware_py" / "core" / "fast.py").write_text("import numba  # another\n")
+    assert not flash_files.carry_compiled(old, new)

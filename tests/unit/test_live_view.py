@@ -134,6 +134,7 @@ def test_viewer_sees_the_channels_of_the_log_and_the_scene(firmware: Firmware, v
             tick += 1
             assert tick < 20_000
             inputs, outputs = step(firmware, tick)
+            outputs.records[0] = outputs.records[0]._replace(commanded_n=np.linspace(-8.0, 8.0, 8))
             record([], [], inputs, outputs)
             draw([], [], inputs, outputs)
             if view.is_watched and tick % 5 == 0:
@@ -145,6 +146,7 @@ def test_viewer_sees_the_channels_of_the_log_and_the_scene(firmware: Firmware, v
     names = [entity.id for entity in seen["/scene"].entities]
     assert names == ["body0", "reference0"]
     assert len(seen["/scene"].entities[0].cubes) >= 1
+    assert len(seen["/scene"].entities[0].arrows) == 8
     assert {t.child_frame_id for t in seen["/tf"].transforms} == {"world", "body0", "reference0"}
     assert seen["/firmware/body0"].tick > 0
     logged = read_signals(tmp_path / "signals.mcap")

@@ -454,6 +454,15 @@ def test_end_of_one_fail_safe_does_not_wake_another() -> None:
     assert supervisor.step(False, at(GOOD._replace(leak=True), 5), []) == [] and supervisor.mode == Mode.MANUAL
 
 
+def test_sticks_alone_do_not_end_what_a_fail_safe_chose() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    supervisor.step(False, GOOD._replace(leak=True), [])
+    ask(supervisor, Action.STICKS, STICKS, at(GOOD._replace(leak=True), 1))
+    assert (supervisor.mode, supervisor.level) == (Mode.SURFACE, Level.SURFACE)
+    ask(supervisor, Action.DISARM, None, at(GOOD._replace(leak=True), 2))
+    assert supervisor.level == Level.NONE
+
+
 def test_fail_safe_may_disarm() -> None:
     supervisor = supervisor_in(mode=Mode.MANUAL, parameters=QUICK)
     (decision,) = supervisor.step(False, GOOD._replace(cabin_c=90.0), [])

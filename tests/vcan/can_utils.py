@@ -103,21 +103,22 @@ def canplayer(log: Path, interface: str, logged: str | None = None, *, as_record
     subprocess.run(["canplayer", "-I", log, *pace, f"{interface}={logged or interface}"], check=True)
 
 
-def _cangen(interface: str, gap_ms: float, *options: str) -> list[str]:
+def cangen_command(interface: str, gap_ms: float, *options: str) -> list[str]:
+    """The words of a cangen of eight-byte frames, without an end."""
     # a full buffer is waited for and the payload counts up, so that a run can be checked frame by frame
     return ["cangen", interface, "-g", str(gap_ms), "-p", "1000", "-L", "8", "-D", "i", *options]
 
 
 def cangen(interface: str, count: int, identifier: int, gap_ms: float = 0.0) -> None:
     """Sends `count` frames of eight bytes whose payload counts up, little-endian, and returns when they are out."""
-    subprocess.run(_cangen(interface, gap_ms, "-I", f"{identifier:X}", "-n", str(count)), check=True)
+    subprocess.run(cangen_command(interface, gap_ms, "-I", f"{identifier:X}", "-n", str(count)), check=True)
 
 
 @contextmanager
 def cangen_flood(interface: str, identifier: int | None = None, gap_ms: float = 0.0) -> Iterator[None]:
     """Floods the interface for as long as the block lasts: with one identifier, or with all of them in turn."""
     options = ["-I", "i" if identifier is None else f"{identifier:X}"]
-    flood = subprocess.Popen(_cangen(interface, gap_ms, *options), stderr=subprocess.DEVNULL)
+    flood = subprocess.Popen(cangen_command(interface, gap_ms, *options), stderr=subprocess.DEVNULL)
     try:
         yield
     finally:

@@ -10,7 +10,6 @@ import json
 import multiprocessing
 import os
 import shutil
-import signal
 import sys
 import threading
 import time
@@ -26,7 +25,7 @@ from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from hil.realtime import fly_in_real_time
 from hil.scenario import Scenario, load_scenario
-from tests.vcan.can_utils import cangen_flood
+from tests.vcan.can_utils import cangen_command
 from tests.vcan.link_events import break_link
 from tests.vcan.links import Interface
 
@@ -99,8 +98,8 @@ def process(target: Callable[..., None], *arguments: Any) -> Iterator[Any]:
 
 def flood(begin: Event) -> None:
     begin.wait()
-    with cangen_flood(BUS, FLOOD_ID):
-        signal.pause()
+    command = cangen_command(BUS, 0.0, "-I", f"{FLOOD_ID:X}")
+    os.execvp(command[0], command)  # in this process's place, so that it ends when this is killed
 
 
 def fly(plan: Plan, folder: Path) -> dict[str, Any]:
@@ -120,7 +119,7 @@ def fly(plan: Plan, folder: Path) -> dict[str, Any]:
         log = TickLog(spinner.kill, begin.set)
         world = hover(plan), plan.seed, Parameters(), folder, f"socketcan:{BUS}"
         flown = fly_in_real_time(*world, start_method="fork", observers=[log.observe])
-        events = history.get() if plan.link_events else []
+        events = history.get() if plan.link_events and begin.is_set() else []
     return {
         "plan": dataclasses.asdict(plan),
         **flown._asdict(),
@@ -148,9 +147,10 @@ def main() -> None:
     plans = [Plan(**plan) for plan in json.loads(sys.argv[1])]
     out = Path(os.environ["VG_OUT"])
     folders = [Path("/tmp/flights", str(number)) for number in range(len(plans))]
-    flights = [fly(plan, folder) for plan, folder in zip(plans, folders, strict=True)]
-    (out / "flights.json").write_text(json.dumps(flights, indent=2))
-    for folder in folders:
+    flights = []
+    for plan, folder in zip(plans, folders, strict=True):
+        flights.append(fly(plan, folder))
+        (out / "flights.json").write_text(json.dumps(flights, indent=2))
         shutil.copytree(folder, out / folder.name)
 
 

@@ -1,0 +1,162 @@
+"""Which modules make up which bodies in the plant, and what merging and parting do to their motion. The base of World."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from firmware_py.core import rotations
+from firmware_py.description.vehicle import FACE_NORMALS, Vehicle
+from hil.plant.bodies import Bodies, Modules
+from hil.plant.build import fill_body, make_bodies, make_modules, seat_thrusters
+from hil.plant.docking import DISK_M, Docks, Joint, joints_between
+from hil.plant.draw import ModuleDraw
+from hil.plant.joining import centre_of, force_needed, motion_of, pieces, seats_after_join
+from hil.plant.lattice import QUATERNIONS, Place, nearest
+from hil.plant.spec import WorldSpec
+from hil.plant.thrusters import Thrusters
+from hil.plant.water import Water
+
+
+class DockedBodies:
+    """Bodies of one or more modules. `World` makes the parts and moves time."""
+
+    vehicles: tuple[Vehicle, ...]
+    spec: WorldSpec
+    docks: Docks
+    bodies: list[tuple[int, ...]]
+    """Modules of each body, its leader first; in the order of the leaders."""
+    places: list[Place]
+    """Where each module sits in its body."""
+    _draws: list[ModuleDraw]
+    _thrusters: Thrusters
+    _water: Water
+    _modules: Modules
+    _body_arrays: Bodies
+    _stage: np.ndarray
+
+    def _step(self, steps: int) -> None:
+        raise NotImplementedError
+
+    def _seat(self, groups: Sequence[Sequence[int]], places: Sequence[Place]) -> None:
+        """Puts the modules into bodies; their states are the caller's business."""
+        self.bodies = [tuple(members) for members in groups]
+        self.places = list(places)
+        self._modules = make_modules(self.vehicles, self._draws, self.bodies, places)
+        seat_thrusters(self._thrusters, self.vehicles, self._modules)
+        self._body_arrays = make_bodies(len(self.bodies))
+        for b, members in enumerate(self.bodies):
+            parts = [(self._draws[m], self._modules.position[m], self._modules.turn[m]) for m in members]
+            fill_body(self._body_arrays, b, parts, self.spec)
+        self._stage = np.zeros((6, len(self.bodies), 13))
+        self._external = np.zeros((len(self.bodies), 6))
+        self._thrust = np.zeros((len(self.bodies), 6))
+
+    def join(self, joint: Joint) -> None:
+        """Makes one body of the two that `joint` links, and closes whatever else then meets. Momentum stays as it is."""
+        a, b = sorted((int(self._modules.body[joint.module]), int(self._modules.body[joint.other])))
+        old, total = self._body_arrays, self.momentum()
+        kept = joint.module if joint.module in self.bodies[a] else joint.other
+        q_a, q_b = old.state[a, 3:7].copy(), old.state[b, 3:7].copy()
+        q_ab = rotations.multiply(rotations.conjugate(q_a), q_b)
+        seats = seats_after_join(self.places, self._modules, joint, kept, self.bodies[b], q_ab)
+        lattice = QUATERNIONS[nearest(q_ab)].copy()
+        off = rotations.log(rotations.multiply(q_ab, rotations.conjugate(lattice)))
+        masses = old.rigid[[a, b], 0, 0]
+        centre = np.average([self._to_world(k, centre_of(old, k)) for k in (a, b)], axis=0, weights=masses)
+        groups = [g for k, g in enumerate(self.bodies) if k not in (a, b)]
+        groups = sorted([*groups, tuple(sorted((*self.bodies[a], *self.bodies[b])))])
+        states = {g[0]: old.state[k].copy() for k, g in enumerate(self.bodies)}
+        leader = min(self.bodies[a][0], self.bodies[b][0])
+        self._seat(groups, seats)
+        self._restore(states)
+        new = groups.index(next(g for g in groups if g[0] == leader))
+        x = self._body_arrays.state[new]
+        x[3:7] = rotations.normalise(rotations.multiply(q_a, rotations.exp(off * masses[1] / masses.sum())))
+        x[:3] = centre - rotations.rotate(x[3:7].copy(), centre_of(self._body_arrays, new))
+        motion_of(self._body_arrays, new, total[a] + total[b], self._flow())
+        known = set(self.docks.joints)
+        for met in joints_between(self._modules, self.docks.faces.kind):
+            if met not in known:
+                self.docks.joined(met)
+        self._step(0)
+
+    def part(self, joint: Joint) -> None:
+        """Opens a joint; what no other joint holds becomes a body of its own, moving as it did."""
+        b = int(self._modules.body[joint.module])
+        self.docks.parted(joint)
+        parts = pieces(self.bodies[b], self.docks.joints)
+        if len(parts) == 1:
+            return
+        states = {g[0]: self._body_arrays.state[k].copy() for k, g in enumerate(self.bodies)}
+        places = list(self.places)
+        whole = states[self.bodies[b][0]]
+        for piece in parts:
+            shift = self.places[piece[0]].position
+            states[piece[0]] = _moved_origin(whole, shift)
+            for m in piece:
+                places[m] = Place(self.places[m].position - shift, self.places[m].quaternion)
+        groups = sorted([*(g for k, g in enumerate(self.bodies) if k != b), *parts])
+        self._seat(groups, places)
+        self._restore(states)
+        self._step(0)
+
+    def _restore(self, states: Mapping[int, np.ndarray]) -> None:
+        """Puts back the state of every body whose leader is the same."""
+        for b, members in enumerate(self.bodies):
+            self._body_arrays.state[b] = states[members[0]]
+
+    def _to_world(self, body: int, r: np.ndarray) -> np.ndarray:
+        x = self._body_arrays.state[body]
+        return np.asarray(x[:3] + rotations.rotate(x[3:7].copy(), r))
+
+    def _flow(self) -> np.ndarray:
+        return self._water.flow[0] + self._water.flow[1]
+
+    def _pull_on(self, joint: Joint) -> float:
+        """Force that pulls a joint open, N, a moment counted as a force at the disk's rim; 0 where others hold as well."""
+        b = int(self._modules.body[joint.module])
+        parts = pieces(self.bodies[b], [j for j in self.docks.joints if j != joint])
+        if len(parts) == 1:
+            return 0.0
+        far = next(piece for piece in parts if joint.other in piece)
+        need = force_needed(
+            self._draws, self._modules, far, self._body_arrays.state[b], self._stage[5, b], self.spec.gravity
+        )
+        for t in np.flatnonzero(np.isin(self._thrusters.module, far)):
+            need -= self._thrusters.column[t] * self._thrusters.force[t]
+        outward = self._modules.turn[joint.module] @ FACE_NORMALS[joint.face]
+        at = self._modules.position[joint.module] + 0.5 * self._modules.size[joint.module, joint.face // 2] * outward
+        moment = need[3:] - np.cross(at, need[:3])
+        return float(-outward @ need[:3] + np.linalg.norm(moment) / DISK_M)
+
+    def clamp(self, body: int) -> None:
+        """Holds a body where it is; `load` then says with what force."""
+        self._body_arrays.clamped[body] = 1
+        self._body_arrays.state[body, 7:13] = 0.0
+
+    def load(self, body: int) -> np.ndarray:
+        """(6,) wrench about O that the body gives to whatever clamps it, body frame; zeros for a body that swims."""
+        if not self._body_arrays.clamped[body]:
+            return np.zeros(6)
+        return self._body_arrays.wrench[body].copy()
+
+    def momentum(self) -> np.ndarray:
+        """(b, 6) linear and angular momentum about the world's origin of each body with the water it moves, world."""
+        out = np.empty((len(self.bodies), 6))
+        for b, x in enumerate(self._body_arrays.state[: len(self.bodies)]):
+            r_wb = rotations.to_matrix(x[3:7])
+            flow = np.concatenate([r_wb.T @ (self._water.flow[0] + self._water.flow[1]), np.zeros(3)])
+            total = self._body_arrays.rigid[b] @ x[7:] + self._body_arrays.added[b] @ (x[7:] - flow)
+            p = r_wb @ total[:3]
+            out[b] = np.concatenate([p, r_wb @ total[3:] + np.cross(x[:3], p)])
+        return out
+
+
+def _moved_origin(x: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """(13,) the same motion told of the point r (3,) of the body frame in place of its origin."""
+    moved = x.copy()
+    moved[:3] += rotations.rotate(x[3:7].copy(), r.copy())
+    moved[7:10] += np.cross(x[10:13], r)
+    return moved

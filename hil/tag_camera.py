@@ -1,0 +1,80 @@
+"""The simulated tag computer, a node of its own on the bus: from what cameras see to TAG frames."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+
+from firmware_py.bus.codec import Codec, Frame, pack_quaternion
+from hil.plant.camera import Camera, Sighting, in_the_world
+from hil.plant.spec import SensorSpec
+from hil.plant.world import World
+
+
+class TagCamera:
+    """The tag computer, number 31: sends what its cameras saw, in the world's frame, when its delay is over.
+
+    It knows where its fixed cameras stand. What a carried camera sees it places in the world by the carrier's own tag in
+    a fixed camera's picture of the same moment; without one the sighting is of no use and is dropped.
+    """
+
+    def __init__(
+        self, codec: Codec, cameras: Sequence[Camera], numbers: Mapping[int, int], spec: SensorSpec, world: World
+    ) -> None:
+        self._position, self._attitude = codec.message("TAG_POSITION"), codec.message("TAG_ATTITUDE")
+        self._cameras, self._world = sorted(cameras, key=lambda c: c.carrier >= 0), world
+        self._number_of = {module: number for number, module in numbers.items()}
+        self._tags = [{tag.id: tag for tag in vehicle.tag} for vehicle in world.vehicles]
+        self._delay_ns = round(1e6 * spec.tag_delay_ms)
+        self._waiting: deque[tuple[Sighting, int, int]] = deque()
+        self._sync: tuple[int, int] | None = None
+        self._counters = dict.fromkeys(self._number_of, 0)
+        self.change: Callable[[Sighting], Sighting | None] = lambda sighting: sighting
+        """What a fault makes of every sighting; None: lost."""
+        self.watch()
+
+    def watch(self) -> None:
+        """Takes the pictures that have become due; each is stamped by the last SYNC heard before it."""
+        for sighting in self._see():
+            if self._sync is None or sighting.module not in self._number_of:
+                continue
+            tick, sync_ns = self._sync
+            offset_ns = sighting.capture_ns - sync_ns
+            if 0 <= offset_ns <= 25_500_000:  # what 8 bits of 0.1 ms can say
+                self._waiting.append((sighting, tick, offset_ns))
+
+    def _see(self) -> list[Sighting]:
+        """All sightings of the pictures that are due, in the world's frame, in the order of their pictures."""
+        fixed: list[Sighting] = []
+        for camera in self._cameras:
+            found = camera.watch(self._world)
+            if camera.carrier < 0:
+                fixed += [s for s in map(self.change, found) if s is not None]
+                continue
+            for relative in found:
+                own = [s for s in fixed if s.module == relative.carrier and s.capture_ns == relative.capture_ns]
+                if own:
+                    tag = self._tags[own[0].module][own[0].tag_id]
+                    seen = self.change(in_the_world(relative, own[0], tag))
+                    fixed += [] if seen is None else [seen]
+        return sorted(fixed, key=lambda s: s.capture_ns)
+
+    def sync(self, tick: int, time_ns: int) -> list[Frame]:
+        """Notes the time of SYNC and sends what is due."""
+        self._sync = (tick, time_ns)
+        frames = []
+        while self._waiting and self._waiting[0][0].capture_ns + self._delay_ns <= time_ns:
+            sighting, capture_tick, offset_ns = self._waiting.popleft()
+            counter = self._counters[sighting.module]
+            self._counters[sighting.module] = (counter + 1) & 15
+            number = self._number_of[sighting.module]
+            frames.append(self._position.encode(number, sighting.p_wt.tolist(), counter))
+            values = [
+                *pack_quaternion(sighting.q_wt.tolist()),
+                sighting.tag_id,
+                sighting.quality,
+                capture_tick & 0xFF,
+                1e-6 * offset_ns,
+            ]
+            frames.append(self._attitude.encode(number, values, counter))
+        return frames

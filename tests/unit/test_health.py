@@ -1,0 +1,167 @@
+"""Health: ages, means and worst cases of what the modules of a body say."""
+
+import math
+
+import numpy as np
+import pytest
+
+from firmware_py.core.faults import ThrusterFaults
+from firmware_py.core.health import NEVER_S, Health, HealthMonitor, is_sticks, outside
+from firmware_py.core.types import Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
+from firmware_py.description.failsafe_parameters import Fence
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+
+TICK_NS = 10_000_000
+BODY = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2, [1, 3])
+ALL_WELL = ThrusterFaults(np.ones(16, dtype=bool), (), 0, np.eye(6))
+ZERO = np.zeros(3)
+
+
+class Ear:
+    """A monitor and its ticks. Modules 1 and 3 of a fleet of four."""
+
+    def __init__(self) -> None:
+        self.monitor = HealthMonitor(BODY, Parameters(), TICK_NS)
+        self.tick = 0
+        self.time_ns = 0
+        self.dropped = 0
+
+    def hear(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: object) -> Health:
+        self.tick += 1
+        self.time_ns += TICK_NS
+        modules = [ModuleInputs(), one or ModuleInputs(), ModuleInputs(), three or ModuleInputs()]
+        estimate = Estimate(
+            np.array([1.0, -2.0, 3.0]), np.array([1.0, 0, 0, 0]), np.zeros(6), ZERO, ZERO, np.array([0.01, 0.03, 0.02]),
+            np.full(3, 0.002), 30_000_000, 6.0, 6, 0, True,
+        )  # fmt: skip
+        estimate = estimate._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
+        inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped)
+        return self.monitor.step(inputs, estimate, list(requests), ALL_WELL)
+
+    def wait(self, seconds: float, **more: object) -> Health:
+        for _ in range(round(seconds / 0.01)):
+            health = self.hear(**more)  # type: ignore[arg-type]
+        return health
+
+
+def here(**said: object) -> ModuleInputs:
+    return ModuleInputs(heard=True, answered=True, **said)  # type: ignore[arg-type]
+
+
+def test_silence_is_counted_per_module() -> None:
+    ear = Ear()
+    ear.hear(here(), here())
+    for _ in range(50):
+        health = ear.hear(here())
+    assert health.silent == (3,) and health.bus_silent_s == 0.0
+    assert health.silent_s == pytest.approx(0.5)
+    health = ear.wait(0.3)
+    assert health.silent == (1, 3) and health.bus_silent_s == pytest.approx(0.3) and health.silent_s == pytest.approx(0.8)
+    assert ear.hear(here(), here()).silent == ()
+
+
+def test_module_that_only_talks_has_not_answered() -> None:
+    ear = Ear()
+    ear.hear(here(), here())
+    for _ in range(30):
+        health = ear.hear(here(), ModuleInputs(heard=True))
+    assert health.silent == (3,) and health.silent_s == 0.0
+
+
+def test_robot_that_just_started_is_not_long_silent() -> None:
+    health = Ear().hear()
+    assert health.silent == (1, 3) and health.silent_s == 0.0 and health.depth_age_s == 0.0
+
+
+def test_weakest_supply_and_hottest_cabin_count() -> None:
+    ear = Ear()
+    assert math.isnan(ear.hear().voltage_share) and math.isnan(ear.hear().cabin_c)
+    health = ear.hear(here(voltage_v=12.0, cabin_temperature_c=31.0), here(voltage_v=10.8, cabin_temperature_c=40.0))
+    assert health.voltage_share == pytest.approx(0.9) and health.cabin_c == 40.0
+    for _ in range(40):
+        health = ear.hear(here(voltage_v=6.0), here())
+    assert health.voltage_share == pytest.approx(0.5, abs=0.01), "single readings are smoothed"
+
+
+def test_cabin_pressure_counts_from_its_first_reading() -> None:
+    ear = Ear()
+    ear.hear(here(cabin_pressure_pa=80e3), here(cabin_pressure_pa=100e3))
+    assert ear.hear(here(cabin_pressure_pa=81e3), here(cabin_pressure_pa=93e3)).cabin_change_pa == 7e3
+
+
+def test_leak_of_any_module_counts_until_it_says_dry() -> None:
+    ear = Ear()
+    assert not ear.hear(here(leak=False), here(leak=False)).leak
+    assert ear.hear(here(), here(leak=True)).leak and ear.hear(here(leak=False), here()).leak
+    assert not ear.hear(here(), here(leak=False)).leak
+
+
+def test_esc_that_fails_or_falls_silent_is_missing() -> None:
+    ear = Ear()
+    assert ear.hear().esc_missing == tuple(range(16))
+    good = [EscFeedback(i, (0.0, 0.0), (0.0, 0.0), (0, 2)) for i in range(0, 8, 2)]
+    bad = [*good[:3], EscFeedback(6, (0.0, 0.0), (0.0, 0.0), (1, 3))]
+    assert ear.hear(here(esc=good), here(esc=bad)).esc_missing == (14, 15)
+    assert ear.wait(1.0).esc_missing == (14, 15)
+    assert ear.hear().esc_missing == tuple(range(16))
+
+
+def test_ground_station_and_pilot_count_once_they_were_heard() -> None:
+    ear = Ear()
+    health = ear.wait(5.0)
+    assert math.isnan(health.ground_age_s) and math.isnan(health.pilot_age_s)
+    ear.hear(None, None, Request(Action.GROUND_ALIVE), Request(Action.STICKS, 1, Sticks((0.0, -0.4, 0.1), (0.0, 0.2, 0.0))))
+    health = ear.wait(0.5)
+    assert health.ground_age_s == health.pilot_age_s == pytest.approx(0.5) and health.stick == 0.4
+
+
+def test_sticks_are_six_numbers_within_one() -> None:
+    assert is_sticks(Sticks((1.0, -1.0, 0.0), (0.0, 0.0, 0.0)))
+    for wrong in (
+        None, (0.0,) * 6, Sticks((1.01, 0.0, 0.0), (0.0,) * 3), Sticks((0.0,) * 3, (math.nan, 0.0, 0.0)),
+        Sticks((0.0, 0.0), (0.0,) * 3),
+    ):  # type: ignore[arg-type]  # fmt: skip
+        assert not is_sticks(wrong)
+
+
+def test_bad_frames_and_missed_ticks_are_rates() -> None:
+    ear = Ear()
+    for _ in range(300):
+        ear.dropped += 1
+        health = ear.hear()
+    assert health.frame_errors_per_s == pytest.approx(100.0, rel=0.06) and health.missed_ticks_per_s == 0.0
+    for _ in range(100):
+        ear.time_ns += TICK_NS
+        health = ear.hear()
+    assert health.missed_ticks_per_s == pytest.approx(50.0, rel=0.2)
+
+
+def test_innovations_and_refusals_are_means_of_a_second() -> None:
+    ear = Ear()
+    assert ear.hear().nis_ratio == pytest.approx(1.0)
+    for _ in range(300):
+        health = ear.hear(nis=30.0)  # type: ignore[arg-type]
+    assert health.nis_ratio == pytest.approx(5.0, rel=0.02)
+    health = ear.wait(1.0, nis=math.nan, nis_dof=0)
+    assert health.nis_ratio == pytest.approx(5.0, rel=0.02), "no tag says nothing"
+    for n in range(1, 300):
+        health = ear.hear(rejected=n, nis=math.nan, nis_dof=0)  # type: ignore[arg-type]
+    assert health.rejected_share > 0.98
+
+
+def test_fence_is_a_box() -> None:
+    fence = Fence(north_m=2.0, east_m=1.0, top_m=0.5, bottom_m=3.0)
+    inside = np.array([0.0, 0.0, 1.5])
+    assert outside(inside, fence) == -1.0
+    for axis, value, beyond in ((0, 2.3, 0.3), (0, -2.3, 0.3), (1, 1.2, 0.2), (1, -1.2, 0.2), (2, 0.4, 0.1), (2, 3.4, 0.4)):
+        p = inside.copy()
+        p[axis] = value
+        assert outside(p, fence) == pytest.approx(beyond)
+
+
+def test_robot_without_a_pose_is_nowhere() -> None:
+    health = Ear().hear(ready=False, tag_age_ns=1 << 60)  # type: ignore[arg-type]
+    assert math.isnan(health.outside_m) and not health.ready and health.tag_age_s > NEVER_S
+    assert Ear().hear().sigma_m == 0.03

@@ -1,0 +1,56 @@
+"""What a process asks of the system to keep its deadlines, and that it flies without what it is refused."""
+
+import errno
+import gc
+import os
+import resource
+import threading
+
+import pytest
+
+from firmware_py.runtime import realtime
+
+
+def refuse(*_: object) -> None:
+    raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+
+def policy() -> int:
+    return os.sched_getscheduler(0)
+
+
+def test_vehicle_that_may_not_be_real_time_flies_on_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (65536, 65536))
+    assert realtime.use_priority(realtime.TICK_PRIORITY).startswith("no real-time priority (Operation not permitted")
+    assert realtime.lock_memory() == "memory not locked (limit of 64 KiB; needs memlock unlimited)"
+
+
+def test_vehicle_on_another_system_flies_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_setscheduler")
+    assert realtime.use_priority(1) == "no real-time priority (not Linux)"
+    realtime.use_ordinary_priority()
+
+
+def test_reader_threads_inherit_the_priority_and_a_bench_is_ordinary_again_afterwards() -> None:
+    before = policy()
+    seen: list[int] = []
+    with realtime.real_time() as refused:
+        thread = threading.Thread(target=lambda: seen.append(policy()))
+        thread.start()
+        thread.join()
+        allowed = not any("priority" in line for line in refused)
+    assert seen == [os.SCHED_FIFO if allowed else before]
+    assert policy() == os.SCHED_OTHER
+
+
+def test_priorities_let_the_tick_start_before_anybody_reads() -> None:
+    assert realtime.TICK_PRIORITY > realtime.READER_PRIORITY > realtime.PLANT_PRIORITY
+
+
+def test_no_garbage_is_collected_in_flight() -> None:
+    with realtime.quiet_garbage():
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0

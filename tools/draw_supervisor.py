@@ -1,0 +1,136 @@
+"""Draws docs/supervisor.md from the tables of the supervisor, so that the drawing cannot differ from what runs.
+
+    python tools/draw_supervisor.py            writes docs/supervisor.md
+    python tools/draw_supervisor.py --check    exits 1 when it is not up to date
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from firmware_py.core.arming import CHECKS
+from firmware_py.core.failsafes import ANY, PERMITTED, TABLE, Level, Row, Watch
+from firmware_py.core.supervisor import LADDER
+from firmware_py.core.transitions import MODE_TABLE, Guard, State
+from firmware_py.core.transitions import TABLE as TRANSITIONS
+from firmware_py.core.types import Mode
+from firmware_py.description.parameters import Parameters
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "supervisor.md"
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return ["| " + " | ".join(line) + " |" for line in lines] + [""]
+
+
+def words(name: str) -> str:
+    """An enum member's name for people."""
+    return name.lower().replace("_", " ")
+
+
+def diagram() -> list[str]:
+    """The state diagram, in Mermaid."""
+    arrows: dict[tuple[State, State], list[str]] = {}
+    for row in TRANSITIONS:
+        if row.state != row.next_state:
+            arrows.setdefault((row.state, row.next_state), []).append(words(row.trigger.name))
+    lines = [f"    {a.name} --> {b.name}: {', '.join(names)}" for (a, b), names in arrows.items()]
+    return ["```mermaid", "stateDiagram-v2", "    [*] --> DISARMED", *lines, "```", ""]
+
+
+def transitions() -> list[str]:
+    """Every row of the table."""
+    rows = [
+        (
+            row.state.name,
+            words(row.trigger.name),
+            "" if row.guard == Guard.ALWAYS else words(row.guard.name),
+            words(row.effect.name),
+            row.next_state.name,
+            row.mode.name if row.mode is not None else "",
+        )
+        for row in TRANSITIONS
+    ]
+    return table(("state", "trigger", "if", "then", "next state", "mode"), rows)
+
+
+def modes() -> list[str]:
+    """What each mode needs."""
+    rows = [
+        (row.mode.name, str(int(row.mode)), ", ".join(words(n.name) for n in sorted(row.needs)), "yes" if row.by_pilot else "")
+        for row in MODE_TABLE
+    ]
+    return table(("mode", "number", "needs", "a pilot may always take it"), rows)
+
+
+def arming() -> list[str]:
+    """The arming checks."""
+    return table(("check", "forced arming"), [(c.name, "skips it" if c.may_be_skipped else "checks it") for c in CHECKS])
+
+
+def counts_in(row: Row) -> str:
+    """Modes in which a fail-safe counts."""
+    if row.modes == ANY:
+        return "always"
+    if len(row.modes) > len(Mode) // 2:
+        return "all but " + ", ".join(sorted(m.name for m in ANY - row.modes))
+    forced = [f"{m.name} (by a fail-safe)" for m in sorted(row.forced_modes)]
+    return ", ".join([*sorted(m.name for m in row.modes), *forced])
+
+
+def failsafes() -> list[str]:
+    """The fail-safes with their default parameters."""
+    parameters = Parameters().failsafes
+    rows = []
+    for row in TABLE:
+        watch = Watch(row, parameters)
+        limit = f"{'<' if row.below else '>'} {watch.limit:g}" if hasattr(parameters, f"{row.name}_limit") else "yes"
+        delay = f"{getattr(parameters, f'{row.name}_delay_s'):g} s"
+        ends = "disarming" if watch.latched else f"cause gone for {parameters.clear_s:g} s"
+        says = row.words.format(float("nan")).replace("nan", "N")
+        rows.append((f"`{row.name}`", says, limit, delay, words(watch.level.name), ends, counts_in(row)))
+    return table(("fail-safe", "says", "limit", "delay", "action", "ends by", "counts in"), rows)
+
+
+def permitted() -> list[str]:
+    """What may be entered while a cause lasts, and what each action tries."""
+    rows = []
+    for level in Level:
+        allowed = PERMITTED[level]
+        names = "all" if allowed == ANY else ", ".join(sorted(m.name for m in allowed)) or "none"
+        steps = " or else ".join(words(t.name.removeprefix("FAILSAFE_")) for t in LADDER.get(level, ()))
+        rows.append((str(int(level)), words(level.name), steps, names))
+    return table(("number", "action", "does", "modes that may be entered meanwhile"), rows)
+
+
+def page() -> str:
+    """The whole page."""
+    lines = [
+        "# Supervisor", "",
+        "Drawn from the tables in `firmware_py/core` by `python tools/draw_supervisor.py`; do not edit.", "",
+        "## States", "", *diagram(), "Every transition there is; what has no row is refused in words.", "", *transitions(),
+        "## Modes", "", *modes(), "## Arming checks", "", *arming(),
+        "## Fail-safes", "", "Gravest first, with the default parameters (`failsafes.NAME_limit`, `_delay_s`, `_action`, `_latched`).", "",
+        *failsafes(), "### Actions", "", *permitted(),
+    ]  # fmt: skip
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Writes or checks the page."""
+    parser = argparse.ArgumentParser(description="draw docs/supervisor.md from the supervisor's tables")
+    parser.add_argument("--check", action="store_true", help="only say whether it is up to date")
+    if parser.parse_args(arguments).check:
+        return 0 if PAGE.exists() and PAGE.read_text(encoding="utf-8") == page() else 1
+    PAGE.parent.mkdir(exist_ok=True)
+    PAGE.write_text(page(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
