@@ -1,6 +1,6 @@
 # Every target sets up what it needs; a fresh machine needs Python 3.11 or newer, make and git.
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-clients setup-system quick lint test test-vcan hil accept bench mutants lock clean
+.PHONY: help setup setup-clients setup-system quick lint test test-vcan test-flash hil accept bench mutants lock clean
 
 BIN := .venv/bin
 PY := $(BIN)/python
@@ -8,6 +8,7 @@ STAMP := .venv/.stamp
 CLIENTS_STAMP := .venv-clients/.stamp
 PYTHONS := python3.12 python3.11 python3
 SYSTEM_PACKAGES := qemu-system-x86 busybox-static cpio kmod can-utils iproute2 gcc
+FLASH_PACKAGES := debootstrap e2fsprogs openssh-client
 PIP_INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-deps
 
 # $(call make_venv,DIR): keep DIR if its Python runs, else make it with the first Python that is new enough.
@@ -45,9 +46,9 @@ $(CLIENTS_STAMP): requirements-clients.lock
 
 setup-system: ## install the Debian packages of the virtual machine with real SocketCAN
 	@sudo=; [ "$$(id -u)" = 0 ] || sudo=sudo; set -e; \
-	echo 'setup-system: $(SYSTEM_PACKAGES)'; \
+	echo 'setup-system: $(SYSTEM_PACKAGES) $(FLASH_PACKAGES)'; \
 	$$sudo apt-get -qq update; \
-	$$sudo env DEBIAN_FRONTEND=noninteractive apt-get -qq install --no-install-recommends $(SYSTEM_PACKAGES) >/dev/null
+	$$sudo env DEBIAN_FRONTEND=noninteractive apt-get -qq install --no-install-recommends $(SYSTEM_PACKAGES) $(FLASH_PACKAGES) >/dev/null
 
 lint: setup ## ruff, mypy and the import contracts
 	@$(BIN)/ruff check --quiet .
@@ -55,13 +56,16 @@ lint: setup ## ruff, mypy and the import contracts
 	@$(BIN)/lint-imports
 
 quick: lint ## lint and the fast tests, under 60 s: for every commit
-	@$(PY) -m pytest -x -q -n 2 -m 'not slow and not vcan and not clients'
+	@$(PY) -m pytest -x -q -n 2 -m 'not slow and not vcan and not clients and not jetson'
 
 test: setup ## all tests that this machine can run; names what is left out in its last lines
 	@$(PY) tools/run_tests.py $(SYSTEM_PACKAGES)
 
 test-vcan: setup ## the tests on real SocketCAN: here, or in the virtual machine where there is none
 	@$(PY) -m pytest -rs --capture=no -m vcan tests/vcan
+
+test-flash: setup ## flash a Debian machine with systemd, break it, pull its plug: half an hour
+	@$(PY) -m pytest -rs -x -m jetson tests/jetson
 
 hil: setup ## fly the spiral on the bench and name the report
 	@$(BIN)/modcube hil run spiral --out runs/spiral

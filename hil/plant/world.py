@@ -202,7 +202,8 @@ class World(DockedBodies):
         if len(self.vehicles) > 1 and self.jet_strength > 0.0:
             jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
             add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._external)
-        arrays = (self._body_arrays, self._modules, self.docks.faces, self._thrusters, self._water)
+        faces = self.docks.faces if len(self.bodies) > 1 else None
+        arrays = (self._body_arrays, self._modules, faces, self._thrusters, self._water)
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
 
     def truth(self, module: int) -> Truth:

@@ -26,10 +26,13 @@ def missing_packages() -> list[str]:
 
 
 class Guest:
-    """One machine with a disk of its own in `folder`; a power cut loses what it has not synced."""
+    """One machine with a disk of its own in `folder`; a power cut loses what it has not synced.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    `seed` is the image of a second disk, mounted at /opt/modcube/plant: a release whose code is compiled already.
+    """
+
+    def __init__(self, folder: Path, seed: Path) -> None:
+        self.folder, self.seed = folder, seed
         self.key = folder / "key"
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", self.key], check=True)
         # The image is made for one key; a key of the cache serves every run.
@@ -66,6 +69,7 @@ class Guest:
             "-append", "console=ttyS0 quiet panic=-1 mitigations=off nokaslr random.trust_cpu=on tsc=reliable",
             "-serial", f"file:{console}",
             "-drive", f"file={self.folder}/disk,if=virtio,format=raw,cache=unsafe",
+            "-drive", f"file={self.seed},if=virtio,format=raw,cache=unsafe,readonly=on",
             "-netdev", f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-:22",
             "-device", "virtio-net-pci,netdev=net,romfile=", "-device", "virtio-rng-pci",
         ]  # fmt: skip

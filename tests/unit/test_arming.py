@@ -129,6 +129,14 @@ def test_mode_with_a_place_asks_for_a_good_pose(mode: Mode) -> None:
     assert len(reasons(GOOD._replace(tag_age_s=4.0, sigma_m=9.0, nis_ratio=50.0), mode)) == 3
 
 
+def test_limits_are_those_of_the_parameters() -> None:
+    loose = P.replace("supervision.arm_sigma_m", 0.6).replace("supervision.tag_fresh_ms", 2000.0)
+    assert reasons(GOOD._replace(sigma_m=0.6, tag_age_s=2.0), parameters=loose) == []
+    assert reasons(GOOD._replace(sigma_m=2.0, tag_age_s=2.5), parameters=loose) == [
+        "pose is 2500 ms old, 2000 permitted", "pose sigma 2000 mm, 600 permitted",
+    ]  # fmt: skip
+
+
 def test_robot_that_never_had_a_pose_hears_that_once() -> None:
     assert reasons(BLIND) == ["no pose yet"]
 

@@ -24,6 +24,7 @@ from flash_device import Device  # noqa: E402
 from flash_files import RefusedError  # noqa: E402
 from flash_payload import Payload, PayloadError  # noqa: E402
 
+DATA_SUFFIXES = (".toml", ".xml", ".service")
 GOOD, BETTER, BROKEN = "1.0-good", "1.1-better", "1.2-broken"
 
 # Takes its options away, dies where it is told to, and runs the rest here.
@@ -51,7 +52,7 @@ PYTHON = '#!/bin/sh\n[ -e "$FAKE/old_python" ] && {{ echo 3.10; exit 0; }}\nexec
 SYSTEMCTL = """#!/bin/sh
 case $* in
     *restart*) echo restarted >> "$FAKE/restarts"
-        ls -d "$FAKE"/root/current/lib/python*/site-packages/broken && exit 1;;
+        ls -d "$FAKE/root/current"/lib/python*/site-packages/broken && exit 1;;
     *show*) tick=$(($(cat "$FAKE/tick" 2>/dev/null || echo 0) + 1)); echo $tick > "$FAKE/tick"
         echo ActiveState=active; echo SubState=running; echo MainPID=7; echo NRestarts=0
         echo "StatusText=tick=$tick rate_hz=100";;
@@ -386,3 +387,11 @@ def test_compiled_code_is_carried_over_only_if_all_its_sources_are_the_same(tmp_
     assert (new / "firmware_py/core/__pycache__/fast.run-1.py311.nbi").read_text() == "index"
     (new / "firmware_py" / "core" / "fast.py").write_text("import numba  # another\n")
     assert not flash_files.carry_compiled(old, new)
+
+
+def test_wheel_carries_the_wire_the_vehicles_the_dialect_and_the_units(tmp_path: Path) -> None:
+    with zipfile.ZipFile(flash_payload.build_wheel(tmp_path)) as archive:
+        names = set(archive.namelist())
+    package = flash_payload.ROOT / "firmware_py"
+    data = {str(path.relative_to(flash_payload.ROOT)) for path in package.rglob("*.*") if path.suffix in DATA_SUFFIXES}
+    assert data | {"can_dbc/modcube.dbc", "firmware_py/deploy/modcube.service"} <= names
