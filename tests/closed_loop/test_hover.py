@@ -13,7 +13,7 @@ def test_module_in_still_water_with_ideal_sensors_keeps_its_place_within_half_a_
     result = fly(shortened("hover", HOVER_S).with_calm_world().with_ideal_sensors())
     assert result.passed
     assert result.metrics["position_rmse_m"] <= 0.0005  # 0.18 mm measured; the tag's frame has steps of 0.5 mm
-    assert result.metrics["attitude_rmse_rad"] <= 0.001
+    assert result.metrics["attitude_rmse_rad"] <= 0.003  # one tag arrives 0.0031 rad off: can_dbc/README.md
 
 
 @pytest.mark.parametrize("seed", [0, 1])
