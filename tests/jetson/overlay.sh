@@ -6,10 +6,10 @@ echo '127.0.0.1 localhost modcube-guest' > "$root/etc/hosts"
 echo '/dev/vda / ext4 defaults,noatime 0 1' > "$root/etc/fstab"
 echo '/dev/vdb /opt/modcube/plant ext4 ro,nofail 0 0' >> "$root/etc/fstab"
 chroot "$root" useradd --create-home --shell /bin/bash robot
-mkdir -p "$root/home/robot/.ssh" "$root/etc/modcube" "$root/opt/modcube/plant" "$root/etc/systemd/system/multi-user.target.wants"
-echo "$KEY" > "$root/home/robot/.ssh/authorized_keys"
+mkdir -p "${root}/home/robot/.ssh" "$root/etc/modcube" "$root/opt/modcube/plant" "$root/etc/systemd/system/multi-user.target.wants"
+echo "$KEY" > "${root}/home/robot/.ssh/authorized_keys"
 chroot "$root" sh -c 'chown -R robot:robot ~robot /opt/modcube'
-chmod 700 "$root/home/robot/.ssh"
+chmod 700 "${root}/home/robot/.ssh"
 echo 'robot ALL=(ALL) NOPASSWD: ALL' > "$root/etc/sudoers.d/robot"
 printf 'UseDNS no\nGSSAPIAuthentication no\n' > "$root/etc/ssh/sshd_config.d/guest.conf"
 # The same processor is compiled for inside and outside, so that compiled code can be brought along.
@@ -36,8 +36,8 @@ ExecStart=/usr/bin/chrt --idle 0 /bin/sh -c 'while :; do :; done'
 EOF
 unit guest-plant.service <<'EOF'
 [Unit]
-ConditionPathExists=/opt/modcube/plant/bin
-After=local-fs.target
+RequiresMountsFor=/opt/modcube/plant
+StartLimitIntervalSec=0
 [Service]
 User=robot
 EnvironmentFile=/etc/modcube/modcube.env

@@ -189,7 +189,7 @@ def test_picture_with_more_tags_weighs_more(body: Body) -> None:
     for count in (1, 4, 16):
         robot = Robot(body)
         robot.rest(101)
-        aside = tag(robot.time_ns - PERIOD, P_WB + np.array([0.004, 0.0, 0.0]))._replace(count=count)
+        aside = tag(robot.time_ns - PERIOD, P_WB + np.array([0.004, 0.0, 0.0]))._replace(tags=count)
         moved.append(robot.step(sensors(P_WB, Q_WB, aside)).p_wb[0] - P_WB[0])
     assert 0.0 < 1.3 * moved[0] < moved[1] and 1.3 * moved[1] < moved[2] < 0.004
 

@@ -52,7 +52,7 @@ PYTHON = '#!/bin/sh\n[ -e "$FAKE/old_python" ] && {{ echo 3.10; exit 0; }}\nexec
 SYSTEMCTL = """#!/bin/sh
 case $* in
     *restart*) echo restarted >> "$FAKE/restarts"
-        ls -d "$FAKE/root/current"/lib/python*/site-packages/broken && exit 1;;
+        ls -d "${FAKE}/root/current"/lib/python*/site-packages/broken && exit 1;;
     *show*) tick=$(($(cat "$FAKE/tick" 2>/dev/null || echo 0) + 1)); echo $tick > "$FAKE/tick"
         echo ActiveState=active; echo SubState=running; echo MainPID=7; echo NRestarts=0
         echo "StatusText=tick=$tick rate_hz=100";;

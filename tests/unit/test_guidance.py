@@ -70,7 +70,7 @@ class Ramp:
         inside = 0.0 < t_s < self.duration_s
         way = 0.1 * min(max(t_s, 0.0), self.duration_s)
         v = np.array([0.1 if inside else 0.0, 0.0, 0.0])
-        return Setpoint([*self.start, way, 0.0, 0.0], np.array([1.0, 0.0, 0.0, 0.0]), v, ZERO, ZERO, ZERO)
+        return Setpoint(np.add(self.start, [way, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0]), v, ZERO, ZERO, ZERO)
 
 
 def sticks(forward: float = 0.0, right: float = 0.0, down: float = 0.0, yaw: float = 0.0) -> Sticks:

@@ -19,7 +19,7 @@ def resting(tick: int, requests: list[Request]) -> Inputs:
     """What a module at rest says, every sensor answering."""
     module = ModuleInputs(answered=True, heard=True, gyro=np.zeros(3), accel=-9.80665 * to_matrix(LEVEL)[2].copy())
     module.pressure_pa = 101325.0 + 9806.65 * PLACE[2]
-    module.tags = [TagObservation(5, 7, tick * PERIOD_NS, [*PLACE, 0, 0, -0.105], LEVEL)]
+    module.tags = [TagObservation(5, 7, tick * PERIOD_NS, np.add(PLACE, [0.0, 0.0, -0.105]), LEVEL)]
     module.voltage_v, module.current_a = 12.0, 1.0
     module.leak, module.cabin_temperature_c, module.cabin_pressure_pa = False, 30.0, 101325.0
     return Inputs(tick, tick * PERIOD_NS, [module], requests)

@@ -1,16 +1,17 @@
 """The folder's tests on a machine without vcan: one boot of the guest, one pytest in it."""
 
+import os
 import shlex
 import sys
 from pathlib import Path
 
-from tests.vcan.guest import Guest
+from tests.vcan.guest import FULL_LENGTH, Guest
 
 FOLDER = str(Path(__file__).parent)
 # Plug-ins cost seconds of import in the guest.
 WITHOUT = [f"-pno:{name}" for name in ("cacheprovider", "hypothesispytest", "xdist")]
 PYTEST = [sys.executable, "-m", "pytest", FOLDER, *WITHOUT]
-TIMEOUT_S = 1200
+TIMEOUT_S = 10_800 if FULL_LENGTH in os.environ else 1200
 
 
 def test_everything_on_real_socketcan_passes_in_the_guest(guest: Guest) -> None:
