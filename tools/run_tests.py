@@ -21,8 +21,9 @@ def is_installed(package: str) -> bool:
 
 def main() -> int:
     left_out = {"jetson": "they take half an hour (make test-flash)"}
+    left_out["vcan"] = "whole flights in an emulated machine take long (make test-vcan)"
     if missing := [package for package in sys.argv[1:] if not is_installed(package)]:
-        left_out["vcan"] = f"missing Debian packages: {' '.join(missing)} (make setup-system)"
+        left_out["vcan"] = f"missing Debian packages: {' '.join(missing)} (make setup-system, then make test-vcan)"
     if not CLIENTS.exists():
         left_out["clients"] = f"missing {CLIENTS.parts[0]} (make setup-clients)"
     markers = " and ".join(f"not {marker}" for marker in left_out)
