@@ -75,14 +75,12 @@ class Limiter:
         supply = max(0.0, self._supply[module] - self.magnets[module].power_w)
         if total_power(force, forward, reverse) <= supply:
             return
-        low, high = 0.0, 1.0
+        kept, step = 0.0, 1.0
         for _ in range(POWER_HALVINGS):
-            share = 0.5 * (low + high)
-            if total_power(force * share, forward, reverse) <= supply:
-                low = share
-            else:
-                high = share
-        wanted[index] = force * low
+            step *= 0.5
+            if total_power(force * (kept + step), forward, reverse) <= supply:
+                kept += step
+        wanted[index] = force * kept
 
     def _voltage_scale(self, voltage_v: np.ndarray) -> np.ndarray:
         ratio = np.clip(voltage_v[self._t.module] / self._t.voltage_v, *VOLTAGE_RANGE)
@@ -110,4 +108,4 @@ class MagnetLimiter:
         self._left_s = np.minimum(full, self._left_s + self._dt_s * (self._p.relay_duty - on))
         self._resting = np.where(self._resting, self._left_s < 0.5 * full, self._left_s <= 0.0)
         self.power_w = float(np.sum(on)) * self._p.relay_w
-        return tuple(int(state) if lit else OFF for state, lit in zip(wanted, on, strict=True))
+        return tuple(int(wanted[face]) if on[face] else OFF for face in range(FACES))

@@ -73,13 +73,20 @@ class Guest:
             "-netdev", f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-:22",
             "-device", "virtio-net-pci,netdev=net,romfile=", "-device", "virtio-rng-pci",
         ]  # fmt: skip
-        self._machine = subprocess.Popen(machine, stdin=subprocess.DEVNULL)
+        with (self.folder / "qemu.log").open("a") as log:
+            self._machine = subprocess.Popen(machine, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         end = time.monotonic() + BOOT_S
         while time.monotonic() < end and self._machine.poll() is None:
             if self.run("true", check=False).returncode == 0:
                 return
             time.sleep(1.0)
         raise RuntimeError("the guest does not answer; its console:\n" + console.read_text(errors="replace")[-2000:])
+
+    def check_on(self) -> None:
+        """Raises RuntimeError, with qemu's last words, when the machine went off by itself."""
+        if self._machine is not None and self._machine.poll() is not None:
+            said = (self.folder / "qemu.log").read_text() + (self.folder / "console.log").read_text(errors="replace")
+            raise RuntimeError(f"the guest went off, qemu's status {self._machine.returncode}: {said[-2000:]}")
 
     def cut_power(self) -> None:
         """The plug is pulled."""
@@ -90,6 +97,7 @@ class Guest:
 
     def run(self, script: str, check: bool = True) -> subprocess.CompletedProcess[str]:
         """A shell command there."""
+        self.check_on()
         words = ["ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=20", "-p", str(self.port), *self.options]
         return subprocess.run([*words, "robot@127.0.0.1", script], capture_output=True, text=True, check=check)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,11 @@ def make_seed(folder: Path, cache: Path) -> Path:
     """The image of a disk with this checkout's release, compiled for the guest. Raises PayloadError and RefusedError."""
     os.environ["NUMBA_CPU_NAME"] = "generic"
     payload = make_payload("x86_64", "3.11", cache, offline=False)
+    image = cache.parent / f"jetson-seed-{payload.release}"
+    if image.exists():
+        return image
+    for old in cache.parent.glob("jetson-seed-*"):
+        old.unlink()
     device = Device(folder / "root", flash_files.run)
     digests = payload.digests()
     for name in device.missing_wheels(digests):
@@ -33,9 +39,10 @@ def make_seed(folder: Path, cache: Path) -> Path:
     link.unlink()
     link.symlink_to(INTERPRETER)
     (release / "pyvenv.cfg").write_text(f"home = {Path(INTERPRETER).parent}\n")
-    image = folder / "seed"
+    made = folder / "seed"
     subprocess.run(
-        ["mkfs.ext4", "-q", "-O", "^has_journal", "-d", release, image, "2G"],
+        ["mkfs.ext4", "-q", "-O", "^has_journal", "-d", release, made, "2G"],
         check=True, capture_output=True, env=os.environ | {"PATH": f"{os.environ['PATH']}:/usr/sbin:/sbin"},
     )  # fmt: skip
+    shutil.move(made, image)
     return image

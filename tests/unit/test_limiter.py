@@ -17,6 +17,7 @@ from firmware_py.core.limiter import (
     Limiter,
     MagnetLimiter,
 )  # fmt: skip
+from firmware_py.core.thruster import total_power
 from firmware_py.description import parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -189,6 +190,17 @@ def test_supply_limit_shrinks_all_forces_of_the_module_alike(body: Body, factor:
         assert power_of(body, force, module) > 0.995 * limited.supply_power_w[module]
 
 
+@pytest.mark.parametrize("share", [1.0, 0.75, 0.5, 0.125])
+def test_supply_that_is_just_enough_is_used_to_the_last_bit(body: Body, share: float) -> None:
+    """One watt-bit less is the next smaller 4096th of the forces."""
+    t, wanted = body.thrusters, np.full(16, 4.0)
+    exact = float(total_power(wanted[:8] * share, t.power_forward[:8].copy(), t.power_reverse[:8].copy()))
+    for supply, kept in ((exact, share), (np.nextafter(exact, 0.0), share - 2.0**-12)):
+        limiter = Limiter(replace(body, supply_power_w=np.array([supply, 1e6])), QUICK, 1.0)
+        force, _ = limiter.step(wanted, True, NOMINAL)
+        np.testing.assert_array_equal(force[:8], 4.0 * kept)
+
+
 def test_weak_supply_of_one_module_leaves_the_other_alone(body: Body) -> None:
     wanted = np.full(16, 5.0)
     weak = replace(body, supply_power_w=np.array([20.0, 1e6]))
@@ -271,6 +283,12 @@ def test_magnet_that_is_on_too_long_rests_until_it_is_half_cool() -> None:
     assert all(states in (ON, (0,) * 6) for states in seen)
     edges = [0, *np.flatnonzero(np.diff(lit)) + 1]
     np.testing.assert_array_equal(np.diff(edges), [11, 17, 6, 18, 6])
+
+
+def test_magnet_rests_when_its_account_is_just_empty_and_lights_when_it_is_just_half_full() -> None:
+    """At half duty and ticks of a second: 2 s, 1.5, 1, 0.5, 0; then 0.5, 1."""
+    magnets = MagnetLimiter(parameters.Limiter(relay_on_s=2.0, relay_duty=0.5), 1.0)
+    assert [magnets.step(ON) == ON for _ in range(9)] == [True] * 4 + [False] * 2 + [True] * 2 + [False]
 
 
 def test_each_magnet_has_its_own_account() -> None:
