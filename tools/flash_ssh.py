@@ -51,7 +51,8 @@ class Vehicle:
         self.host = host
         self.root = root
         self.python = "python3"
-        self._ssh = ["ssh", *(word for option in OPTIONS for word in ("-o", option)), *options, host]
+        # Of an option that is given twice ssh takes the first.
+        self._ssh = ["ssh", *options, *(word for option in OPTIONS for word in ("-o", option)), host]
 
     def shell(self, script: str, data: bytes = b"") -> str:
         """The output of a shell command there. Raises VehicleError."""

@@ -77,7 +77,7 @@ class Guest:
             self._machine = subprocess.Popen(machine, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         end = time.monotonic() + BOOT_S
         while time.monotonic() < end and self._machine.poll() is None:
-            if self.run("true", check=False).returncode == 0:
+            if self.run("systemctl is-system-running --wait >/dev/null; true", check=False).returncode == 0:
                 return
             time.sleep(1.0)
         raise RuntimeError("the guest does not answer; its console:\n" + console.read_text(errors="replace")[-2000:])
@@ -98,7 +98,7 @@ class Guest:
     def run(self, script: str, check: bool = True) -> subprocess.CompletedProcess[str]:
         """A shell command there."""
         self.check_on()
-        words = ["ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=20", "-p", str(self.port), *self.options]
+        words = ["ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=60", "-p", str(self.port), *self.options]
         return subprocess.run([*words, "robot@127.0.0.1", script], capture_output=True, text=True, check=check)
 
     def copy_in(self, folder: Path, place: str) -> None:
@@ -109,7 +109,8 @@ class Guest:
 
     def flash_words(self, python: str, checkout: Path, *more: str) -> Sequence[Any]:
         """The command line of flash.py for this machine."""
-        options = [f"--ssh-option={word}" for word in self.options[1:4:2]]
+        patience = ("ConnectTimeout=120", "ServerAliveInterval=60")
+        options = [f"--ssh-option={word}" for word in (*self.options[1:4:2], *patience)]
         return [
             python, checkout / "tools" / "flash.py", "robot@127.0.0.1", "--port", str(self.port),
             "--identity", str(self.key), *options, *more,

@@ -167,6 +167,7 @@ def calls_of_a_flash(put: Callable[..., int], fake: Path) -> int:
     return int((fake / "calls").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["before", "half", "after"])
 def test_connection_lost_at_any_call_leaves_a_release_that_runs(
     put: Callable[..., int], fake: Path, how: str, capsys: pytest.CaptureFixture[str]
