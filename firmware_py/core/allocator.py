@@ -58,7 +58,7 @@ class Allocator:
     def step(self, wrench: np.ndarray) -> Thrust:
         """The thruster forces for a wanted (6,) wrench, body frame."""
         force = self._preload + self._pinv @ wrench
-        if bool(np.all(force <= self._f_max) and np.all(force >= self._f_min)):
+        if ((force <= self._f_max) & (force >= self._f_min)).all():
             return Thrust(force, self._matrix @ force, (1.0, 1.0))
         if self._clip_only:
             force = np.clip(force, self._f_min, self._f_max)

@@ -1,4 +1,4 @@
-"""Stage 2 of a tick: an error-state Kalman filter (filterpy) of pose, velocity, sensor biases and one lumped disturbance.
+"""Stage 2 of a tick: an error-state Kalman filter of pose, velocity, sensor biases and one lumped disturbance.
 
 The filter stands at its anchor: the time of the newest tag picture, or half a second ago when none came. Everything is fused once, in the
 order in which it happened; from the anchor the state is carried to now through the stored thruster wrenches and gyro readings.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from filterpy.kalman import predict, update
 
 from firmware_py.core import observation, propagation
 from firmware_py.core.body import Body
@@ -47,7 +46,6 @@ class Estimator:
         self._x[3] = 1.0
         self._now = self._x
         self._covariance = np.eye(ERRORS)
-        self._zero = np.zeros(ERRORS)
         self.retune(parameters)
         self._anchor_ns = 0
         self._accepted = 0
@@ -61,7 +59,6 @@ class Estimator:
         """Takes other noise figures from the next tick on; the estimate stays."""
         p = self._p = parameters
         self._density = self._process_noise()
-        self._noise = np.diag(self._density)
         self._inertial_sigma = np.array([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m])
         self._tag_variance = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2
 
@@ -143,24 +140,22 @@ class Estimator:
                 index += 1
 
     def _predict(self, tau: np.ndarray, dt: float) -> None:
-        transition = propagation.transition(self._x, tau, dt, *self._plant)
-        self._x = propagation.step(self._x, tau, dt, *self._plant)
-        _, self._covariance = predict(self._zero, self._covariance, transition, self._noise * dt)
+        self._x, self._covariance = propagation.predict(self._x, self._covariance, tau, dt, self._density, *self._plant)
 
     def _fuse_inertial(self, index: int) -> None:
-        moved = propagation.inertial_acceleration(self._x, self._history.tau(index), *self._plant)
-        residual, h, noise = observation.inertial(self._x, *self._history.inertial(index), self._inertial_sigma, moved)
-        if residual.size:
-            self._correct(residual, noise, h)
+        sample = self._history.inertial(index)
+        self._x, self._covariance = observation.fuse_inertial(
+            self._x, self._covariance, self._history.tau(index), *sample, self._inertial_sigma, *self._plant
+        )
 
     def _fuse_tag(self, pose: BodyPose) -> None:
-        variance = self._tag_variance / pose.tags
-        residual, h, noise = observation.tag(self._x, pose.p_wt, pose.lever_b, pose.q_wb, variance)
-        nis = observation.normalised_square(residual, h, noise, self._covariance)
-        if not nis <= self._p.tag_gate**2:  # also when it is NaN
+        variance, gate = self._tag_variance / pose.tags, self._p.tag_gate**2
+        nis, self._x, self._covariance = observation.fuse_tag(
+            self._x, self._covariance, pose.p_wt, pose.lever_b, pose.q_wb, variance, gate
+        )
+        if not nis <= gate:  # also when it is NaN
             self._refuse(pose)
             return
-        self._correct(residual, noise, h)
         self._nis = nis if math.isnan(self._nis) else self._nis + nis
         self._nis_dof += 6
         self._accepted += 1
@@ -172,10 +167,6 @@ class Estimator:
         self._refused_in_row += 1
         if self._refused_in_row >= RESET_AFTER:
             self._start(pose)
-
-    def _correct(self, residual: np.ndarray, noise: np.ndarray, h: np.ndarray) -> None:
-        error, self._covariance = update(self._zero, self._covariance, residual, noise, h)
-        self._x = propagation.inject(self._x, error)
 
     # ------------------------------------------------------------ from the anchor to now
 

@@ -7,6 +7,7 @@ Figures that are not known yet are NaN, so that no comparison with them holds.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -88,15 +89,15 @@ class HealthMonitor:
         self._answer_s = parameters.supervision.answer_ms * 1e-3
         self._esc_fresh_s = parameters.supervision.esc_fresh_ms * 1e-3
         self._period_ns = period_ns
-        self._nominal_v = np.array([t.voltage_v[t.module == m][0] for m in range(count)])
+        self._nominal_v = [float(t.voltage_v[t.module == m][0]) for m in range(count)]
         self._channels = [(int(m), int(c)) for m, c in zip(t.module, t.channel, strict=True)]
         self._heard_ns = [0] * count
         self._answered_ns: list[int | None] = [None] * count
-        self._voltage = np.full(count, math.nan)
+        self._voltage = [math.nan] * count
         self._leak = [False] * count
-        self._cabin_c = np.full(count, math.nan)
-        self._cabin_pa = np.full(count, math.nan)
-        self._cabin_start_pa = np.full(count, math.nan)
+        self._cabin_c = [math.nan] * count
+        self._cabin_pa = [math.nan] * count
+        self._cabin_start_pa = [math.nan] * count
         self._esc_ns: dict[tuple[int, int], int] = {}
         self._depth_ns = 0
         self._ground_ns: int | None = None
@@ -132,14 +133,14 @@ class HealthMonitor:
             time_ns=now,
             ready=estimate.ready,
             tag_age_s=estimate.tag_age_ns * 1e-9,
-            sigma_m=float(np.max(estimate.sigma_p)),
+            sigma_m=max(estimate.sigma_p.tolist()),
             nis_ratio=self._nis_ratio,
             rejected_share=self._rejected_share,
             depth_age_s=_age_s(self._depth_ns, now),
-            voltage_share=_worst(-self._voltage / self._nominal_v, -1.0),
+            voltage_share=min(_known(v / nominal for v, nominal in zip(self._voltage, self._nominal_v, strict=True)), default=math.nan),
             leak=any(self._leak),
-            cabin_c=_worst(self._cabin_c),
-            cabin_change_pa=_worst(np.abs(self._cabin_pa - self._cabin_start_pa)),
+            cabin_c=max(_known(self._cabin_c), default=math.nan),
+            cabin_change_pa=max(_known(abs(a - b) for a, b in zip(self._cabin_pa, self._cabin_start_pa, strict=True)), default=math.nan),
             silent=tuple(silent),
             silent_s=max(silences),
             bus_silent_s=min(silences),
@@ -206,8 +207,8 @@ class HealthMonitor:
             self._rejected_share += TAG_SHARE * (1.0 - self._rejected_share)
 
     def _missing(self, now: int) -> tuple[int, ...]:
-        ages = [_age_s(self._esc_ns.get(channel), now) for channel in self._channels]
-        return tuple(i for i, age in enumerate(ages) if age > self._esc_fresh_s)
+        oldest = now - round(1e9 * self._esc_fresh_s)
+        return tuple(i for i, channel in enumerate(self._channels) if self._esc_ns.get(channel, -1) < oldest)
 
 
 ESC_ALIVE = (0, 2)
@@ -220,10 +221,9 @@ def _age_s(at_ns: int | None, now_ns: int, never: float = NEVER_S) -> float:
     return never if at_ns is None else (now_ns - at_ns) * 1e-9
 
 
-def _worst(values: np.ndarray, sign: float = 1.0) -> float:
-    """Largest of the values that are known, times `sign`; NaN when none is."""
-    known = values[np.isfinite(values)]
-    return sign * float(known.max()) if known.size else math.nan
+def _known(values: Iterable[float]) -> list[float]:
+    """Those that are numbers."""
+    return [value for value in values if math.isfinite(value)]
 
 
 def is_sticks(argument: object) -> bool:
@@ -235,6 +235,6 @@ def is_sticks(argument: object) -> bool:
 
 def outside(p_w: np.ndarray, fence: Fence) -> float:
     """How far a place (3,) is beyond the fence, m; negative: how far inside."""
-    north, east, down = (float(value) for value in p_w)
+    north, east, down = p_w.tolist()
     beyond = (abs(north) - fence.north_m, abs(east) - fence.east_m, fence.top_m - down, down - fence.bottom_m)
-    return max(beyond)
+    return float(max(beyond))

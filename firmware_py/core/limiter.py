@@ -56,8 +56,8 @@ class Limiter:
             self.force_n = np.zeros_like(self.force_n)
             return self.force_n, np.zeros_like(self.force_n)
         wanted = np.where(np.isfinite(wanted_n), wanted_n, 0.0)
-        wanted = np.clip(wanted, self.force_n - self._step, self.force_n + self._step)
-        wanted = np.clip(wanted, self._low, self._high)
+        wanted = np.minimum(np.maximum(wanted, self.force_n - self._step), self.force_n + self._step)
+        wanted = np.minimum(np.maximum(wanted, self._low), self._high)
         if alive is not None:
             wanted[~alive] = 0.0
         for module in range(len(self._of_module)):
@@ -83,7 +83,8 @@ class Limiter:
         wanted[index] = force * kept
 
     def _voltage_scale(self, voltage_v: np.ndarray) -> np.ndarray:
-        ratio = np.clip(voltage_v[self._t.module] / self._t.voltage_v, *VOLTAGE_RANGE)
+        low, high = VOLTAGE_RANGE
+        ratio = np.minimum(np.maximum(voltage_v[self._t.module] / self._t.voltage_v, low), high)
         return np.asarray(ratio**VOLTAGE_EXPONENT)
 
 

@@ -24,9 +24,8 @@ class Measurements:
 
     def __init__(self, body: Body) -> None:
         self._modules = body.modules
-        self._rotations = np.array([to_matrix(np.ascontiguousarray(q)) for q in body.q_bm])
+        self._rotations = [to_matrix(np.ascontiguousarray(q)) for q in body.q_bm]
         self._r_bi = body.r_bi
-        self._single = len(body.modules) == 1
         self._tags = {
             (int(m), int(i)): (np.ascontiguousarray(r), conjugate(np.ascontiguousarray(q)))
             for m, i, r, q in zip(body.tag_module, body.tag_ids, body.r_bt, body.q_bt, strict=True)
@@ -40,17 +39,19 @@ class Measurements:
             q_wb: (4,) latest attitude, for the height of each pressure sensor above the centre of mass.
         """
         mine = [modules[i] for i in self._modules]
-        gyro = self._mean(mine, "gyro")
-        accel = self._mean(mine, "accel")
+        gyro, accel = self._mean([m.gyro for m in mine]), self._mean([m.accel for m in mine])
         return Measured(gyro, accel, self._depth(mine, q_wb), self._poses(mine, q_wb))
 
-    def _mean(self, mine: list[ModuleInputs], name: str) -> np.ndarray | None:
-        heard = [(i, v) for i, v in enumerate(getattr(m, name) for m in mine) if v is not None]
-        if not heard:
-            return None
-        values = np.array([v for _, v in heard])
-        rotations = self._rotations if len(heard) == len(mine) else self._rotations[[i for i, _ in heard]]
-        return np.asarray(np.einsum("mij,mj->i", rotations, values) / len(heard))
+    def _mean(self, readings: list[np.ndarray | None]) -> np.ndarray | None:
+        """Mean over the modules that were heard, body frame."""
+        total: np.ndarray | None = None
+        heard = 0
+        for rotation, value in zip(self._rotations, readings, strict=True):
+            if value is not None:
+                turned = rotation @ value
+                total = turned if total is None else total + turned
+                heard += 1
+        return None if total is None else total / heard
 
     def _depth(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> float | None:
         heard = [(i, m.pressure_pa) for i, m in enumerate(mine) if m.pressure_pa is not None]

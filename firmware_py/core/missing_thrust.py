@@ -8,12 +8,13 @@ trim, buoyancy) are not looked at.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from firmware_py.core.body import Body
-from firmware_py.core.drag_lookup import drag_wrench
+from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.observation import GRAVITY
-from firmware_py.core.rigid_body import restoring_moment
-from firmware_py.core.rotations import cross, rotate_back
+from firmware_py.core.rigid_body import add_restoring
+from firmware_py.core.rotations import M, V, rotate_back
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 
@@ -46,6 +47,7 @@ class MissingThrust:
         t = body.thrusters
         self._body, self._p = body, parameters
         self._columns = t.matrix.T.copy()
+        self._inertia = body.mass[3:, 3:].copy()
         self._ticks = max(1, round(BLOCK_NS / period_ns))
         count = self._modules = len(body.modules)
         self._sigma = np.repeat([SIGMA_FORCE_N * np.sqrt(count), SIGMA_MOMENT * count], 3)
@@ -71,7 +73,7 @@ class MissingThrust:
         self._first = self._last = gyro
         self._first_n = self._last_n = 0
         self._sum_a, self._sum_f = np.zeros(3), np.zeros(self._columns.shape[0])
-        self._sum_model, self._sum_tau = np.zeros(6), np.zeros(6)
+        self._sum_model = np.zeros(6)
 
     def step(
         self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool
@@ -100,26 +102,21 @@ class MissingThrust:
         if measured.accel is not None:
             self._accels += 1
             self._sum_a += measured.accel + rotate_back(estimate.q_wb, DOWN)
-        tau = self._columns.T @ force_n
-        model = np.asarray(drag_wrench(b.drag.nodes, b.drag.rotational, b.drag.linear, nu))
-        model[3:] += restoring_moment(b.righting, estimate.q_wb)
-        model[3:] -= cross(nu[3:].copy(), b.mass[3:, 3:] @ nu[3:])
         self._sum_f += force_n
-        self._sum_tau += tau
-        self._sum_model += model
+        _add_model(self._inertia, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear, nu, estimate.q_wb, self._sum_model)
 
     def _close(self, estimate: Estimate) -> bool:
         """Ends the block; whether it is whole."""
         n = self._n
         span = (self._last_n - self._first_n) * self._period_s
         whole = self._accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
-        rest = np.full(6, np.nan)
+        rest, acted = np.full(6, np.nan), self._columns.T @ (self._sum_f / n)
         if whole and self._last is not None and self._first is not None:
             motion = np.r_[self._sum_a / self._accels, (self._last - self._first) / span]
-            rest = self._body.mass @ motion - (self._sum_tau + self._sum_model) / n
+            rest = self._body.mass @ motion - acted - self._sum_model / n
         down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
         for rows, new in (
-            (self._rest, rest), (self._force, self._sum_f / n), (self._acted, self._sum_tau / n), (self._down_b, down_b),
+            (self._rest, rest), (self._force, self._sum_f / n), (self._acted, acted), (self._down_b, down_b),
             (self._tilt, np.max(estimate.sigma_q)),
         ):  # fmt: skip
             rows[:-1] = rows[1:]
@@ -171,3 +168,14 @@ class MissingThrust:
 
 
 DOWN = np.array([0.0, 0.0, GRAVITY])
+
+
+@njit(f"void({M},{V},float64[:,:,:,::1],{V},{V},{V},{V},{V})", cache=True)
+def _add_model(inertia, righting, nodes, rotational, linear, nu, q_wb, out):  # type: ignore[no-untyped-def]
+    """Adds to `out` (6,) what drag, buoyancy and the (3, 3) inertia's gyroscopic moment do to the body."""
+    add_drag(nodes, rotational, linear, nu, out)
+    add_restoring(righting, q_wb, out)
+    w, h = nu[3:], inertia @ nu[3:]
+    out[3] -= w[1] * h[2] - w[2] * h[1]
+    out[4] -= w[2] * h[0] - w[0] * h[2]
+    out[5] -= w[0] * h[1] - w[1] * h[0]

@@ -11,13 +11,14 @@ import math
 import numpy as np
 from numba import float64, njit, types
 
-from firmware_py.core.propagation import ERRORS
+from firmware_py.core.propagation import ERRORS, PLANT, STATE, inertial_acceleration, inject
 from firmware_py.core.rotations import M, V, difference, skew, to_matrix
 
 GRAVITY = 9.80665
 """m/s^2, standard gravity."""
-MODEL = types.Tuple((float64[::1], float64[:, ::1], float64[:, ::1]))  # type: ignore[no-untyped-call]
-"""Residual (m,), Jacobian (m, 25), noise covariance (m, m)."""
+MODEL = types.Tuple((float64[::1], float64[:, ::1], float64[::1]))  # type: ignore[no-untyped-call]
+"""Residual (m,), Jacobian (m, 25), variance of the noise (m,)."""
+ANY_NIS = math.inf
 
 
 @njit(MODEL(float64[::1], float64[::1], float64[::1], float64, float64[::1], float64[::1]), cache=True)
@@ -50,7 +51,7 @@ def inertial(x, gyro, accel, depth, sigma, moved):  # type: ignore[no-untyped-de
         h[rows, 2] = h[rows, 24] = 1.0
         variance[rows] = sigma[2] ** 2
         rows += 1
-    return residual[:rows].copy(), h[:rows].copy(), np.diag(variance[:rows])
+    return residual[:rows].copy(), h[:rows].copy(), variance[:rows].copy()
 
 
 @njit(MODEL(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1]), cache=True)
@@ -67,14 +68,63 @@ def tag(x, p_wt, lever_b, q_wb, variance):  # type: ignore[no-untyped-def]
     residual = np.empty(6)
     residual[:3] = p_wt - x[:3] - r @ lever_b
     residual[3:] = difference(q_wb, q)
-    return residual, h, np.diag(variance)
+    return residual, h, variance
 
 
-@njit(f"float64({V},{M},{M},{M})", cache=True)
-def normalised_square(residual, h, noise, covariance):  # type: ignore[no-untyped-def]
-    """Normalised innovation squared, residual^T S^-1 residual."""
-    s = h @ covariance @ h.T + noise
-    return residual @ np.linalg.solve(s, residual)
+@njit(f"Tuple((float64,{V},{M}))({V},{M},{V},{M},{V},float64)", cache=True)
+def update(x, covariance, residual, h, variance, gate):  # type: ignore[no-untyped-def]
+    """Normalised innovation squared, and state and covariance after the measurement; as they were where `gate` is exceeded.
+
+    The Kalman filter's update, a row at a time: the noise of the rows is independent, so that no matrix is inverted, and the
+    squared innovations over their variances add up to residual^T S^-1 residual (Bierman 1977, chapter II). filterpy's
+    update gives the same (tests) in eight times the time.
+
+    Args:
+        x, covariance: (26,) and (25, 25).
+        residual, h, variance: (m,), (m, 25), (m,) of the measurement.
+        gate: largest normalised innovation squared that is believed. One that is not a number is not.
+    """
+    p = covariance.copy()
+    error = np.zeros(ERRORS)
+    ph = np.empty(ERRORS)
+    nis = 0.0
+    for row in range(residual.size):
+        ph[:] = 0.0
+        innovation = residual[row]
+        for j in range(ERRORS):
+            if h[row, j] != 0.0:
+                innovation -= h[row, j] * error[j]
+                for i in range(ERRORS):
+                    ph[i] += h[row, j] * p[j, i]
+        s = variance[row]
+        for j in range(ERRORS):
+            s += h[row, j] * ph[j]
+        nis += innovation * innovation / s
+        for i in range(ERRORS):
+            error[i] += ph[i] * innovation / s
+            for j in range(ERRORS):
+                p[i, j] -= ph[i] * ph[j] / s
+    if not nis <= gate:
+        return nis, x.copy(), covariance.copy()
+    return nis, inject(x, error), p
+
+
+@njit(f"{STATE}({V},{M},{V},{V},{V},float64,{V},{PLANT})", cache=True)
+def fuse_inertial(  # type: ignore[no-untyped-def]
+    x, covariance, tau, gyro, accel, depth, sigma, mass, mass_inv, righting, nodes, rotational, linear
+):  # fmt: skip
+    """State and covariance after one sample of gyro, accelerometer and depth, each NaN where it did not come."""
+    moved = inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, linear)
+    residual, h, variance = inertial(x, gyro, accel, depth, sigma, moved)
+    _, x_after, after = update(x, covariance, residual, h, variance, ANY_NIS)
+    return x_after, after
+
+
+@njit(f"Tuple((float64,{V},{M}))({V},{M},{V},{V},{V},{V},float64)", cache=True)
+def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, gate):  # type: ignore[no-untyped-def]
+    """`update` by a tag, of which `tag` tells."""
+    residual, h, noise = tag(x, p_wt, lever_b, q_wb, variance)
+    return update(x, covariance, residual, h, noise, gate)
 
 
 @njit(f"{V}({V},{M},{V},{M},float64,float64)", cache=True)

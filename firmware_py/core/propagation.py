@@ -11,23 +11,33 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from firmware_py.core.drag_lookup import drag_wrench
-from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
+from firmware_py.core.drag_lookup import add_drag
+from firmware_py.core.rigid_body import add_restoring, take_coriolis
 from firmware_py.core.rotations import M, V, cross, exp, multiply, normalise, rotate, rotate_back, skew, to_matrix
 
 STATES = 26
 ERRORS = 25
+MOVING = 12
+"""Errors of pose and velocity, which come first; those of biases and disturbance stand still in a prediction."""
 N = "float64[:,:,:,::1]"
 PLANT = f"{M},{M},{V},{N},{V},{V}"
 """Types of the body's arrays: mass, mass_inv, righting, drag nodes, rotational and linear damping."""
+STATE = f"Tuple(({V},{M}))"
+"""Types of a state and its covariance."""
 
 
 @njit(f"{V}({V},{V},{V},{PLANT})", cache=True)
 def acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """(6,) dnu/dt of the body under the (6,) wrench `external` (thrusters and disturbance, body frame)."""
-    total = external - coriolis_wrench(mass, nu) + drag_wrench(nodes, rotational, linear, nu)
-    total[3:] += restoring_moment(righting, q)
-    return mass_inv @ total
+    total = external.copy()
+    take_coriolis(mass, nu, total)
+    add_drag(nodes, rotational, linear, nu, total)
+    add_restoring(righting, q, total)
+    out = np.zeros(6)
+    for i in range(6):
+        for j in range(6):
+            out[i] += mass_inv[i, j] * total[j]
+    return out
 
 
 @njit(f"{V}({V},{V},{PLANT})", cache=True)
@@ -64,35 +74,57 @@ def step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # ty
 
 @njit(f"{M}({V},{V},float64,{PLANT})", cache=True)
 def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(25, 25) F = I + A dt + (A dt)^2 / 2 of the error over one step, A the Jacobian at x."""
+    """(12, 25) moving rows of F = I + A dt + (A dt)^2 / 2 of the error over one step, A the Jacobian at x.
+
+    Biases and disturbance stand still: their rows of F are those of the identity.
+    """
     q = x[3:7].copy()
     nu = x[7:13].copy()
     r = to_matrix(q)
     force_b = rotate_back(q, x[19:22].copy())
-    a = np.zeros((12, 25))  # biases and disturbance stand still: their rows are zero
+    a = np.zeros((MOVING, ERRORS))
     a[0:3, 3:6] = -r @ skew(nu[:3].copy())
     a[0:3, 6:9] = r
     a[3:6, 3:6] = -skew(nu[3:].copy())
-    a[3:6, 9:12] = np.eye(3)
     external = tau.copy()
     external[:3] += force_b
     external[3:] += x[22:25]
     base = acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear)
     step_size = 1e-4
     for i in range(6):
-        moved = nu.copy()
-        moved[i] += step_size
-        there = acceleration(moved, q, external, mass, mass_inv, righting, nodes, rotational, linear)
-        a[6:12, 6 + i] = (there - base) / step_size
+        here = nu[i]
+        nu[i] += step_size
+        there = acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear)
+        nu[i] = here
+        for j in range(6):
+            a[6 + j, 6 + i] = (there[j] - base[j]) / step_size
     linear_part = np.ascontiguousarray(mass_inv[:, :3])
     angular_part = np.ascontiguousarray(mass_inv[:, 3:])
-    down = rotate_back(q, np.array([0.0, 0.0, 1.0]))
+    down = r[2].copy()
     a[6:12, 3:6] = linear_part @ skew(force_b) - angular_part @ (skew(righting) @ skew(down))
     a[6:12, 18:21] = linear_part @ np.ascontiguousarray(r.T)
     a[6:12, 21:24] = angular_part
-    f = np.eye(25)
-    f[:12] += dt * a + (0.5 * dt * dt) * (np.ascontiguousarray(a[:, :12]) @ a)
+    for i in range(3):
+        a[3 + i, 9 + i] = 1.0
+    f = dt * a + (0.5 * dt * dt) * (np.ascontiguousarray(a[:, :MOVING]) @ a)
+    for i in range(MOVING):
+        f[i, i] += 1.0
     return f
+
+
+@njit(f"{STATE}({V},{M},{V},float64,{V},{PLANT})", cache=True)
+def predict(x, covariance, tau, dt, density, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
+    """State (26,) and covariance (25, 25) after dt seconds: F P F^T + Q dt. density: (25,) process noise, per second."""
+    f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
+    moved = f @ covariance
+    out = covariance.copy()
+    out[:MOVING, :MOVING] = moved @ np.ascontiguousarray(f.T)
+    for i in range(MOVING):
+        for j in range(MOVING, ERRORS):
+            out[i, j] = out[j, i] = moved[i, j]
+    for i in range(ERRORS):
+        out[i, i] += density[i] * dt
+    return step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear), out
 
 
 @njit(f"{V}({V},{M},{M},float64,float64,{PLANT})", cache=True)

@@ -104,8 +104,13 @@ def cross(a, b):  # type: ignore[no-untyped-def]
 @njit(f"{V}({V},{V})", cache=True)
 def rotate(q, v):  # type: ignore[no-untyped-def]
     """q v q^-1, (3,)."""
-    t = 2.0 * cross(q[1:].copy(), v)
-    return v + q[0] * t + cross(q[1:].copy(), t)
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    tx, ty, tz = 2.0 * (y * v[2] - z * v[1]), 2.0 * (z * v[0] - x * v[2]), 2.0 * (x * v[1] - y * v[0])
+    return np.array([
+        v[0] + w * tx + y * tz - z * ty,
+        v[1] + w * ty + z * tx - x * tz,
+        v[2] + w * tz + x * ty - y * tx,
+    ])
 
 
 @njit(f"{V}({V},{V})", cache=True)

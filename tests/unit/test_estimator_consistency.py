@@ -142,7 +142,7 @@ class InOrder:
     def move(self, tau: np.ndarray, to_ns: int) -> None:
         dt = (to_ns - self.time_ns) * 1e-9
         if dt > 0.0:
-            f = propagation.transition(self.x, tau, dt, *self.plant)
+            f = np.vstack([propagation.transition(self.x, tau, dt, *self.plant), np.eye(ERRORS)[propagation.MOVING :]])
             self.x = propagation.step(self.x, tau, dt, *self.plant)
             self.covariance = f @ self.covariance @ f.T + self.q * dt
         self.time_ns = to_ns
