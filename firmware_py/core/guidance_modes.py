@@ -22,7 +22,6 @@ from firmware_py.description.parameters import Parameters
 
 NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 ZERO = np.zeros(3)
-ZERO.flags.writeable = False
 NEAR_M, NEAR_RAD = 0.2, 0.35
 """A set-point no farther from the body is gone on from; otherwise the body itself is."""
 
@@ -246,12 +245,14 @@ class Guidance:
         return np.asarray(out)
 
     def _kept(self, wrench: np.ndarray, time_ns: int, estimate: Estimate, health: Health) -> np.ndarray:
-        sticks = self._read_sticks(time_ns)
-        wanted = self._full_stick * np.r_[sticks.force, sticks.moment]
         if self.mode == Mode.SURFACE:
             return self._surfacing(wrench, estimate, health)
         force, moment = STEERING[self.mode]
         out = wrench.copy()
+        if (force, moment) == (Keep.ALL, Keep.ALL):
+            return out
+        sticks = self._read_sticks(time_ns)
+        wanted = self._full_stick * np.array([*sticks.force, *sticks.moment])
         if moment == Keep.NOTHING:
             out[3:] = wanted[3:]
         if force == Keep.NOTHING:

@@ -18,6 +18,8 @@ from firmware_py.core.types import Action, Estimate, Inputs, ModuleInputs, Reque
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 
+NEVER_NS = -(1 << 60)
+"""When what never came did come."""
 NEVER_S = 1e9
 """Age of what never came."""
 MEAN_S = 1.0
@@ -208,7 +210,7 @@ class HealthMonitor:
 
     def _missing(self, now: int) -> tuple[int, ...]:
         oldest = now - round(1e9 * self._esc_fresh_s)
-        return tuple(i for i, channel in enumerate(self._channels) if self._esc_ns.get(channel, -1) < oldest)
+        return tuple(i for i, channel in enumerate(self._channels) if self._esc_ns.get(channel, NEVER_NS) < oldest)
 
 
 ESC_ALIVE = (0, 2)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.thruster import commands, total_power
+from firmware_py.core.thruster import commands, module_power, total_power
 from firmware_py.description.parameters import Limiter as LimiterParameters
 
 VOLTAGE_EXPONENT = 1.2
@@ -30,7 +30,7 @@ class Limiter:
         self._t = t
         self._low, self._high = t.f_min * parameters.force_share, t.f_max * parameters.force_share
         self._step = parameters.slew_n_per_s * dt_s
-        self._supply = body.supply_power_w
+        self._supply = [float(watts) for watts in body.supply_power_w]
         self._of_module = [np.flatnonzero(t.module == m) for m in range(len(body.modules))]
         self._power = [
             (np.ascontiguousarray(t.power_forward[i]), np.ascontiguousarray(t.power_reverse[i])) for i in self._of_module
@@ -60,21 +60,21 @@ class Limiter:
         wanted = np.minimum(np.maximum(wanted, self._low), self._high)
         if alive is not None:
             wanted[~alive] = 0.0
-        for module in range(len(self._of_module)):
-            self._limit_power(wanted, module)
+        powers = module_power(wanted, self._t.power_forward, self._t.power_reverse, self._t.module, len(self.magnets)).tolist()
+        for module, power in enumerate(powers):
+            supply = max(0.0, self._supply[module] - self.magnets[module].power_w)
+            if power > supply:
+                self._limit_power(wanted, module, supply)
         self.force_n = wanted
         out = np.empty_like(wanted)
         commands(wanted, self._voltage_scale(voltage_v), *self._curves, self._full, out)
         return wanted, out
 
-    def _limit_power(self, wanted: np.ndarray, module: int) -> None:
-        """Scales the forces of one module down until its supply can give their power besides its magnets'."""
+    def _limit_power(self, wanted: np.ndarray, module: int, supply: float) -> None:
+        """Scales the forces of one module down until its supply can give their power."""
         index = self._of_module[module]
         force = wanted[index]
         forward, reverse = self._power[module]
-        supply = max(0.0, self._supply[module] - self.magnets[module].power_w)
-        if total_power(force, forward, reverse) <= supply:
-            return
         kept, step = 0.0, 1.0
         for _ in range(POWER_HALVINGS):
             step *= 0.5

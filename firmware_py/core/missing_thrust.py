@@ -48,6 +48,8 @@ class MissingThrust:
         self._body, self._p = body, parameters
         self._columns = t.matrix.T.copy()
         self._inertia = body.mass[3:, 3:].copy()
+        self._ends = np.cumsum([6, 6, 3, t.f_max.size, 1])
+        """Of a block's columns: wrench missing, wrench that acted, down in the body, forces, doubt about the tilt."""
         self._ticks = max(1, round(BLOCK_NS / period_ns))
         count = self._modules = len(body.modules)
         self._sigma = np.repeat([SIGMA_FORCE_N * np.sqrt(count), SIGMA_MOMENT * count], 3)
@@ -60,11 +62,7 @@ class MissingThrust:
 
     def forget(self) -> None:
         """What was seen no longer counts, because the body has changed."""
-        self._rest = np.full((GAP + BASE, 6), np.nan)
-        self._force = np.zeros((GAP + BASE, self._columns.shape[0]))
-        self._acted = np.zeros((GAP + BASE, 6))
-        self._down_b = np.zeros((GAP + BASE, 3))
-        self._tilt = np.zeros((GAP + BASE, 1))
+        self._blocks = np.full((GAP + BASE, self._ends[-1]), np.nan)
         self._suspect, self._count = -1, 0
         self._start_block(None)
 
@@ -115,12 +113,8 @@ class MissingThrust:
             motion = np.r_[self._sum_a / self._accels, (self._last - self._first) / span]
             rest = self._body.mass @ motion - acted - self._sum_model / n
         down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
-        for rows, new in (
-            (self._rest, rest), (self._force, self._sum_f / n), (self._acted, acted), (self._down_b, down_b),
-            (self._tilt, np.max(estimate.sigma_q)),
-        ):  # fmt: skip
-            rows[:-1] = rows[1:]
-            rows[-1] = new
+        self._blocks[:-1] = self._blocks[1:]
+        self._blocks[-1] = np.concatenate([rest, acted, down_b, self._sum_f / n, [max(estimate.sigma_q.tolist())]])
         return whole
 
     def _decide(self, alive: np.ndarray) -> int | None:
@@ -134,19 +128,19 @@ class MissingThrust:
 
     def _explain(self, alive: np.ndarray) -> int:
         """The one thruster that explains the change, or -1."""
-        base = ~np.isnan(self._rest[:BASE, 0])
-        recent = ~np.isnan(self._rest[-RECENT:, 0])
+        known = ~np.isnan(self._blocks[:, 0])
+        base, recent = known[:BASE], known[-RECENT:]
         if base.sum() < LEAST_BASE or recent.sum() < RECENT - 1:
             return -1
-        change, now, acted, tilted = (
-            rows[-RECENT:][recent].mean(axis=0) - rows[:BASE][base].mean(axis=0)
-            for rows in (self._rest, self._force, self._acted, self._down_b)
-        )
-        before = self._force[:BASE][base].mean(axis=0)
+        old = self._blocks[:BASE][base].mean(axis=0)
+        change, acted, tilted, now, _ = np.split(self._blocks[-RECENT:][recent].mean(axis=0) - old, self._ends[:-1])
+        before, tilt_sigma = old[self._ends[2] : self._ends[3]], float(old[-1])
         now = now + before
-        sigma = self._sigmas(acted, float(np.linalg.norm(tilted)), float(self._tilt[:BASE][base].mean()))
+        sigma = self._sigmas(acted, float(np.linalg.norm(tilted)), tilt_sigma)
         y = change / sigma
         total = float(y @ y)
+        if total < SIGNIFICANT:
+            return -1
         left = np.full(alive.size, total)
         for force in (now, now - before):  # lost since, or lost all along
             phi = -(self._columns * force[:, None]) / sigma

@@ -5,11 +5,13 @@ Used by `guidance_modes`, stage 4 of a tick.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numba import njit
 
-from firmware_py.core.rotations import difference, exp, multiply, normalise, rotate
+from firmware_py.core.rotations import V, difference, exp, multiply, normalise, rotate
 from firmware_py.core.types import Estimate, Setpoint
 
 LOOP_SHARE = 4.0 / 27.0
@@ -55,6 +57,46 @@ class Wish(NamedTuple):
     """(4,) attitude, or None: rate alone."""
 
 
+UNKNOWN = np.full(4, np.nan)
+"""No place or attitude is wished for."""
+
+
+@njit(f"{V}({V},float64)", cache=True)
+def limited(vector, size):  # type: ignore[no-untyped-def]
+    """`vector` (3,), shortened to `size`."""
+    norm = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    return vector.copy() if norm <= size else vector * (size / norm)
+
+
+@njit(f"UniTuple({V}, 3)({V},{V},{V},float64,float64)", cache=True)
+def _follow(v, a, wanted, w, dt):  # type: ignore[no-untyped-def]
+    """Speed, acceleration and way after `dt`: exact answer of v'' = w^2 (wanted - v) - 2 w v' to a step."""
+    decay = math.exp(-w * dt)
+    gap = v - wanted
+    slope = a + w * gap
+    new_gap = (gap + slope * dt) * decay
+    new_a = (a - w * slope * dt) * decay
+    # integral of (gap + slope t) e^(-wt) from 0 to dt
+    way = wanted * dt + gap * ((1.0 - decay) / w) + slope * ((1.0 - decay * (1.0 + w * dt)) / w**2)
+    return wanted + new_gap, new_a, way
+
+
+@njit(f"void({V},{V},{V},{V},{V},{V},{V},{V},{V},{V},float64,float64,float64,float64,{V})", cache=True)
+def _glide(p, q, v, w, a, alpha, wish_v, wish_w, place, attitude, bandwidth, speed, rate, dt, out):  # type: ignore[no-untyped-def]
+    """Writes the set-point (p, q, v, w, a, alpha: as Setpoint) after `dt` to `out` (19,). Axes that are NaN go by speed alone."""
+    gain = bandwidth * LOOP_SHARE
+    gap, turn = np.zeros(3), np.zeros(3)
+    for i in range(3):
+        gap[i] = 0.0 if math.isnan(place[i]) else gain * (place[i] - p[i])
+    if not math.isnan(attitude[0]):
+        turn = gain * difference(attitude, q)
+    wanted_v, wanted_w = wish_v + limited(gap, speed), wish_w + limited(turn, rate)
+    out[7:10], out[13:16], way = _follow(v, a, wanted_v, bandwidth, dt)
+    out[10:13], out[16:19], turned = _follow(w, alpha, wanted_w, bandwidth, dt)
+    out[:3] = p + way
+    out[3:7] = normalise(multiply(q, exp(turned)))
+
+
 class Glider:
     """A set-point that takes up speeds smoothly: position, attitude and their first two derivatives never jump but when it is put.
 
@@ -72,36 +114,12 @@ class Glider:
 
     def step(self, wish: Wish, dt_s: float) -> Setpoint:
         """Moves on by `dt_s`."""
-        at, k = self.at, self._w * LOOP_SHARE
-        v = wish.v_w
-        if wish.p_wb is not None:
-            gap = wish.p_wb - at.p_wb
-            v = v + limited(k * np.where(np.isnan(gap), 0.0, gap), self._speed)
-        w = wish.w_b
-        if wish.q_wb is not None:
-            w = w + limited(k * np.asarray(difference(np.ascontiguousarray(wish.q_wb), at.q_wb)), self._rate)
-        v_w, a_w, way = self._follow(at.v_w, at.a_w, v, dt_s)
-        w_b, alpha_b, turn = self._follow(at.w_b, at.alpha_b, w, dt_s)
-        self.at = Setpoint(at.p_wb + way, normalise(multiply(at.q_wb, exp(turn))), v_w, w_b, a_w, alpha_b)
+        out = np.empty(19)
+        place = UNKNOWN if wish.p_wb is None else np.ascontiguousarray(wish.p_wb)
+        attitude = UNKNOWN if wish.q_wb is None else np.ascontiguousarray(wish.q_wb)
+        _glide(*self.at, wish.v_w, wish.w_b, place, attitude, self._w, self._speed, self._rate, dt_s, out)
+        self.at = Setpoint(out[0:3], out[3:7], out[7:10], out[10:13], out[13:16], out[16:19])
         return self.at
-
-    def _follow(self, v: np.ndarray, a: np.ndarray, wanted: np.ndarray, dt: float) -> tuple[np.ndarray, ...]:
-        """Speed, acceleration and way after `dt`: exact answer of v'' = w^2 (wanted - v) - 2 w v' to a step."""
-        w = self._w
-        decay = np.exp(-w * dt)
-        gap = v - wanted
-        slope = a + w * gap
-        new_gap = (gap + slope * dt) * decay
-        new_a = (a - w * slope * dt) * decay
-        # integral of (gap + slope t) e^(-wt) from 0 to dt
-        way = wanted * dt + gap * (1.0 - decay) / w + slope * (1.0 - decay * (1.0 + w * dt)) / w**2
-        return wanted + new_gap, new_a, way
-
-
-def limited(vector: np.ndarray, size: float) -> np.ndarray:
-    """`vector`, shortened to `size`."""
-    norm = float(np.linalg.norm(vector))
-    return vector if norm <= size else vector * (size / norm)
 
 
 def ahead_of(setpoint: Setpoint, lead_s: float) -> Setpoint:

@@ -79,6 +79,15 @@ def total_power(force, power_forward, power_reverse):  # type: ignore[no-untyped
     return total
 
 
+@njit("float64[::1](float64[::1],float64[:,::1],float64[:,::1],int64[::1],int64)", cache=True)
+def module_power(force, power_forward, power_reverse, module, count):  # type: ignore[no-untyped-def]
+    """(count,) electrical power of the thrusters of each module, W; `module` (n,) says whose a thruster is."""
+    out = np.zeros(count)
+    for i in range(force.shape[0]):
+        out[module[i]] += polynomial(power_forward[i] if force[i] > 0.0 else power_reverse[i], abs(force[i]))
+    return out
+
+
 class ThrusterLag:
     """The forces that the thrusters are believed to give now: commanded forces through a first-order lag.
 

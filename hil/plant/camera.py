@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import Tag, Vehicle
@@ -97,7 +98,7 @@ class Camera:
         found: list[Sighting] = []
         while self.next_ns <= world.time_ns:
             elapsed_s, span_s = 1e-9 * (self.next_ns - before_ns), 1e-9 * (world.time_ns - before_ns)
-            poses = np.array([_between(a, b, elapsed_s, span_s) for a, b in zip(before, self._before, strict=True)])
+            poses = _between(before, self._before, elapsed_s, span_s)
             found += self._picture(poses, self.next_ns)
             self.next_ns += self._period_ns
         return found
@@ -144,11 +145,17 @@ class Camera:
         if drawn.flipped:
             sight = (eye - p) / np.linalg.norm(eye - p)
             q = rotations.multiply(rotations.multiply(np.concatenate([[0.0], sight]), q), HALF_TURN_Z)
-        spec, noise = self._spec, drawn.noise
-        p = p + spec.tag_sigma_m * noise[:3] + self.bias_m
-        p = p + axis * (axis @ noise[:3]) * (spec.tag_sigma_axis_m - spec.tag_sigma_m)
-        q = rotations.multiply(q, rotations.exp(math.radians(spec.tag_sigma_deg) * noise[3:]))
-        return p, rotations.normalise(q)
+        spec = self._spec
+        sigma = (spec.tag_sigma_m, spec.tag_sigma_axis_m, math.radians(spec.tag_sigma_deg))
+        return _smear(p + self.bias_m, q, drawn.noise, axis, *sigma)
+
+
+@njit("Tuple((float64[::1],float64[::1]))(float64[::1],float64[::1],float64[::1],float64[::1],float64,float64,float64)", cache=True)
+def _smear(p, q, noise, axis, across, along, turn):
+    """A pose with six standard normal numbers on it: `across` and `along` the optical axis (m), and `turn` (rad)."""
+    depth = axis[0] * noise[0] + axis[1] * noise[1] + axis[2] * noise[2]
+    q = rotations.multiply(q, rotations.exp(turn * noise[3:]))
+    return p + across * noise[:3] + (along - across) * depth * axis, rotations.normalise(q)
 
 
 def _seen_from(pose: np.ndarray, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -182,15 +189,23 @@ def tag_pose(p_wm: np.ndarray, q_wm: np.ndarray, tag: Tag) -> tuple[np.ndarray, 
     return p_wm + rotations.rotate(q_wm, np.array(tag.position_m)), rotations.multiply(q_wm, np.array(tag.quaternion))
 
 
-def _between(a: np.ndarray, b: np.ndarray, elapsed_s: float, span_s: float) -> np.ndarray:
-    """(7,) pose `elapsed_s` after a, where b is `span_s` after a: cubic in position, constant rate of turn.
+@njit("float64[:,::1](float64[:,::1],float64[:,::1],float64,float64)", cache=True)
+def _between(before, after, elapsed_s, span_s):
+    """(m, 7) poses `elapsed_s` after `before`, where `after` is `span_s` later: cubic in position, constant rate of turn.
 
-    a, b: (16,) rows of `World.seen`.
+    before, after: (m, 16) of `World.seen`.
     """
-    if span_s <= 0.0:
-        return b[:7]
-    s = elapsed_s / span_s
+    out = np.empty((before.shape[0], 7))
+    s = elapsed_s / span_s if span_s > 0.0 else 1.0
     r = 1.0 - s
-    p = r * r * ((1 + 2 * s) * a[:3] + s * span_s * a[7:10]) + s * s * ((3 - 2 * s) * b[:3] - r * span_s * b[7:10])
-    turned = rotations.difference(b[3:7], a[3:7])
-    return np.concatenate([p, rotations.multiply(a[3:7], rotations.exp(s * turned))])
+    for m in range(out.shape[0]):
+        a, b = before[m], after[m]
+        for i in range(3):
+            start, end = (1 + 2 * s) * a[i] + s * span_s * a[7 + i], (3 - 2 * s) * b[i] - r * span_s * b[7 + i]
+            out[m, i] = r * r * start + s * s * end
+        if s >= 1.0:
+            out[m, 3:] = b[3:7]
+        else:
+            q = a[3:7].copy()
+            out[m, 3:] = rotations.multiply(q, rotations.exp(s * rotations.difference(b[3:7].copy(), q)))
+    return out

@@ -14,6 +14,7 @@ from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from hil.plant import thrusters as thrusters_module
+from hil.plant.bodies import steered
 from hil.plant.build import make_thrusters, nominal_centre
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.docked import DockedBodies
@@ -103,7 +104,7 @@ class World(DockedBodies):
         """
         if period_ns % step_ns:
             raise DescriptionError(f"plant: the sub-step of {step_ns} ns does not divide the tick of {period_ns} ns")
-        self._centres: dict[tuple[int, ...], tuple[tuple[Place, ...], np.ndarray]] = {}
+        self._centres: dict[tuple[int, ...], tuple[tuple[Place, ...], tuple[float, ...]]] = {}
         self.time_ns = 0
         self.vehicles = tuple(vehicles)
         self.spec = spec
@@ -226,20 +227,17 @@ class World(DockedBodies):
         """The truth about one body, by its index in `bodies`."""
         modules = self.bodies[body]
         x = self._body_arrays.state[body]
-        r_wb = rotations.to_matrix(x[3:7])
-        nominal = self._nominal_centre(modules)
-        rigid = self._body_arrays.rigid[body]
-        com = np.array([rigid[5, 1], rigid[3, 2], rigid[4, 0]]) / rigid[0, 0]
-        v_w = r_wb @ (x[7:10] + rotations.cross(x[10:13].copy(), nominal))
-        p = x[:3]
-        return BodyTruth(self.time_ns, modules, p + r_wb @ nominal, x[3:7].copy(), v_w, x[10:13].copy(), p + r_wb @ com)
+        seen = np.empty(9)
+        steered(x, self._nominal_centre(modules), self._body_arrays.rigid[body], seen)
+        return BodyTruth(self.time_ns, modules, seen[:3], x[3:7].copy(), seen[3:6], x[10:13].copy(), seen[6:])
 
-    def _nominal_centre(self, modules: tuple[int, ...]) -> np.ndarray:
+    def _nominal_centre(self, modules: tuple[int, ...]) -> tuple[float, ...]:
         """(3,) what the vehicle files say of a body's centre of mass; worked out again when a dock has moved its modules."""
         places = tuple(self.places[m] for m in modules)
         kept = self._centres.get(modules)
         if kept is None or any(a is not b for a, b in zip(kept[0], places, strict=True)):
-            kept = self._centres[modules] = places, nominal_centre([self.vehicles[m] for m in modules], places)
+            centre = nominal_centre([self.vehicles[m] for m in modules], places)
+            kept = self._centres[modules] = places, tuple(centre.tolist())
         return kept[1]
 
     def esc(self, module: int) -> np.ndarray:
