@@ -120,6 +120,8 @@ def predict(x, covariance, tau, dt, density, mass, mass_inv, righting, nodes, ro
     out = covariance.copy()
     out[:MOVING, :MOVING] = moved @ np.ascontiguousarray(f.T)
     for i in range(MOVING):
+        for j in range(i):  # rounding off symmetry would grow with every unstable motion, and no measurement damps it
+            out[i, j] = out[j, i] = 0.5 * (out[i, j] + out[j, i])
         for j in range(MOVING, ERRORS):
             out[i, j] = out[j, i] = moved[i, j]
     for i in range(ERRORS):

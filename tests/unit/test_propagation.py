@@ -322,4 +322,5 @@ def test_prediction_is_that_of_filterpy(body: Body, seed: int) -> None:
     _, expected = kalman.predict(np.zeros(ERRORS), covariance, f, np.diag(density) * DT)
     x, got = propagation.predict(state(seed), covariance, TAU, DT, density, *plant(body))
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(got, got.T)
     np.testing.assert_array_equal(x, propagation.step(state(seed), TAU, DT, *plant(body)))
