@@ -99,6 +99,19 @@ def doctor(
     raise typer.Exit(examine(described, out, say=lambda line: typer.echo(line)))
 
 
+@app.command()
+def replay(
+    log: Annotated[Path, typer.Argument(help="folder that a run left: can.log and signals.mcap")],
+    tolerance: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="share by which numbers may differ: for logs of another machine; 0: every byte")
+    ] = 0.0,
+) -> None:
+    """Feed a recorded flight to the same code again and compare every byte that comes out; status 1 when one differs."""
+    from firmware_py.app.replay_report import replay_and_say
+
+    raise typer.Exit(replay_and_say(log, tolerance, say=lambda line: typer.echo(line)))
+
+
 def main() -> None:
     """Runs the command line; wrong input ends in one line on stderr and status 2."""
     for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):

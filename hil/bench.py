@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from firmware_py.app.configuration import configuration_of
 from firmware_py.app.firmware import BusFrame, Firmware, compose
 from firmware_py.app.lockstep import PATIENCE_LOOKS, Lockstep, Observer, drain, send
 from firmware_py.app.vehicle import recording
@@ -129,7 +130,7 @@ def fly_scenario(
     """Flies `scenario` and leaves the logs in `out`; returns the wall time of the flight, s."""
     with ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, parameters, bus, rate_hz)
-        recorder = Recorder(out, {"scenario": scenario.name, "seed": seed, "rate_hz": rate_hz})
+        recorder = Recorder(out, configuration_of(bench.firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz))
         stack.callback(recorder.close)
         thrusters = tuple(len(v.thruster) for v in bench.nodes.world.vehicles)
         truth = stack.enter_context(TruthRecorder(out, thrusters))

@@ -12,6 +12,7 @@ from multiprocessing.synchronize import Event as ProcessEvent
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from firmware_py.app.configuration import configuration_of
 from firmware_py.app.firmware import compose
 from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import open_loop
@@ -92,7 +93,7 @@ def fly_in_real_time(
             if not plant.is_alive():
                 raise RuntimeError("the plant's process ended before it was ready")
         script = script_of(scenario, fleet)
-        recorder = Recorder(out, {"scenario": scenario.name, "seed": seed, "rate_hz": rate_hz})
+        recorder = Recorder(out, configuration_of(firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz))
         stack.callback(recorder.close)
         start_ns = 0
 

@@ -28,6 +28,7 @@ class Firmware:
 
     fleet: Fleet
     parameters: Parameters
+    codec: Codec
     collector: InputCollector
     pipeline: Pipeline
     encoder: OutputEncoder
@@ -39,6 +40,10 @@ class Firmware:
         """The SYNC frames that start tick `tick` on each bus."""
         self.collector.sync_sent(tick, time_ns)
         return self.encoder.sync(tick)
+
+    def forget_heard(self) -> None:
+        """Begins to collect anew: the first tick takes only what comes after its SYNC, as the log has it."""
+        self.collector = InputCollector(self.fleet, self.codec)
 
     def step(
         self, tick: int, time_ns: int, received: Sequence[BusFrame], requests: Sequence[Request]
@@ -78,6 +83,7 @@ def compose(
     return Firmware(
         fleet=fleet,
         parameters=parameters,
+        codec=codec,
         collector=InputCollector(fleet, codec),
         pipeline=Pipeline(bodies, parameters, fleet.period_ns),
         encoder=OutputEncoder(fleet, codec),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -29,10 +28,6 @@ class Consecutive:
     parts: tuple[tuple[float, Piecewise], ...]
     """Start, s, and trajectory; each rests at its end until the next begins."""
     duration_s: float
-
-    def describe(self) -> dict[str, Any]:
-        """What is logged of it."""
-        return {"kind": "mission", "parts": [(start, part.duration_s) for start, part in self.parts]}
 
     def sample(self, t_s: float) -> Setpoint:
         """The set-point at `t_s`; the ends are held."""

@@ -38,7 +38,7 @@ class RealTimeLoop:
     _last: Outputs | None = None
 
     def listen(self) -> None:
-        """Listens before the first SYNC. Raises PortError when somebody else sends SYNC on a bus."""
+        """Listens before the first SYNC; what was heard counts for nothing else. Raises PortError when somebody else sends SYNC."""
         end_ns = self.clock.now_ns() + LISTEN_NS
         collector = self.firmware.collector
         self.ports[0].wait(end_ns, lambda: self._take() and collector.faults["foreign_sync"] > 0)
@@ -46,6 +46,7 @@ class RealTimeLoop:
         self._received.clear()
         if collector.faults["foreign_sync"]:
             raise PortError("another SYNC producer is on the bus: stop it, or use another bus")
+        self.firmware.forget_heard()
 
     def run(self, stop: Callable[[int, Outputs], bool], first_tick: int = 1) -> None:
         """Ticks until `stop` says so of a tick's number and outputs."""

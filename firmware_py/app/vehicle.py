@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from firmware_py.app.configuration import configuration_of
 from firmware_py.app.firmware import BusFrame, compose, vehicles_of
 from firmware_py.app.ground_station import GroundSide
 from firmware_py.app.live_view import LiveView
@@ -101,7 +102,7 @@ def run_vehicle(
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
         if out is not None or live is not None:
-            recorder = Recorder(out, {"rate_hz": fleet.rate_hz}, live.context if live is not None else None)
+            recorder = Recorder(out, configuration_of(firmware, rate_hz=fleet.rate_hz), live.context if live is not None else None)
             stack.callback(recorder.close)
             observers.append(recording(recorder, fleet.rate_hz))
         if live is not None:

@@ -218,6 +218,16 @@ def _scalar(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[s
     return hint(value)
 
 
+def to_plain(value: Any) -> Any:
+    """The lists, dicts and scalars of a dataclass, as JSON takes them; `build` reads them back. A field that is None is left out."""
+    if dataclasses.is_dataclass(value):
+        items = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value) if field.init)
+        return {name: to_plain(item) for name, item in items if item is not None}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [to_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
 def to_toml(value: Any) -> str:
     """The TOML text of a dataclass of scalars, arrays and one level of tables, with units as comments."""
     head, tail = [], []

@@ -15,10 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Schema
+from mcap.records import Attachment, Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
 PACKAGE = "modcube"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of a whole log (MCAP specification)."""
 
 Columns = dict[str, np.ndarray]
 """One array per signal of a channel, (k,) or (k, n) over its k messages, and `log_time`, (k,) int64 ns."""
@@ -54,6 +56,7 @@ class Layout:
             raise ValueError(f"{name}: only doubles come in arrays")
         self.name = name
         self.signals = tuple(signals)
+        self.names = tuple(signal.name for signal in signals)
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
@@ -68,6 +71,11 @@ class Layout:
     def row(self) -> Row:
         """A fresh row to fill."""
         return Row(self)
+
+    def values(self, data: bytes) -> tuple[Any, ...]:
+        """The values of one message, in the order of `signals`. Raises ValueError where its length is that of another layout."""
+        row = np.frombuffer(data, self.dtype)[0]
+        return tuple(row[name] for name in self.names)
 
     @cached_property
     def schema(self) -> bytes:
@@ -118,7 +126,7 @@ class TextLayout:
             message.field.add(name=each, number=i, label=_FIELD.LABEL_OPTIONAL, type=kind)
         pool = descriptor_pool.DescriptorPool()
         pool.Add(self._file)
-        self._names = (*numbers, text)
+        self.names = (*numbers, text)
         self._class = message_factory.GetMessageClass(pool.FindMessageTypeByName(self.schema_name))
 
     @property
@@ -133,8 +141,42 @@ class TextLayout:
 
     def encode(self, *values: int | str) -> bytes:
         """The message of the numbers and the text."""
-        message = self._class(**dict(zip(self._names, values, strict=True)))
+        message = self._class(**dict(zip(self.names, values, strict=True)))
         return bytes(message.SerializeToString(deterministic=True))
+
+    def values(self, data: bytes) -> tuple[Any, ...]:
+        """The numbers and the text of a message."""
+        message = self._class.FromString(data)
+        return tuple(getattr(message, name) for name in self.names)
+
+
+class LogMessage(NamedTuple):
+    """One message of a log, as it stands there."""
+
+    topic: str
+    log_time_ns: int
+    data: bytes
+
+
+def read_messages(path: Path) -> Iterator[LogMessage]:
+    """All messages of an MCAP log in their order, up to its end or to where it is torn. Raises OSError."""
+    topics: dict[int, str] = {}
+    for record in _records(path.read_bytes()):
+        if isinstance(record, Message):
+            yield LogMessage(topics[record.channel_id], record.log_time, record.data)
+        elif isinstance(record, Channel):
+            topics[record.id] = record.topic
+
+
+def is_closed(path: Path) -> bool:
+    """Whether an MCAP log was written to its end. Raises OSError."""
+    return path.read_bytes().endswith(MCAP_MAGIC)
+
+
+def read_attachment(path: Path, name: str) -> bytes | None:
+    """The attachment called `name` of an MCAP log, or None. Raises OSError."""
+    attachments = (record for record in _records(path.read_bytes()) if isinstance(record, Attachment))
+    return next((bytes(attachment.data) for attachment in attachments if attachment.name == name), None)
 
 
 def read_signals(path: Path) -> dict[str, Columns]:

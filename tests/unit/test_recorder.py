@@ -1,6 +1,7 @@
 """The recorder's files: readable by the tools that others wrote, the same for the same run, whole up to a tear."""
 
 import errno
+from dataclasses import dataclass
 from pathlib import Path
 
 import can
@@ -30,16 +31,15 @@ PERIOD_NS = 10_000_000
 FRAMES = [(0x0C1, bytes.fromhex("0011223344556677")), (0x021, b"\x05\x00\x00\x00"), (0x000, b"")]
 
 
+@dataclass(frozen=True)
 class Spiral:
-    """A trajectory that can say what it is."""
+    """A trajectory."""
 
-    duration_s = 40.0
+    radius_m: float = 0.3
+    duration_s: float = 40.0
 
     def sample(self, t_s: float) -> Setpoint:
         return rest_at(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-
-    def describe(self) -> dict[str, float]:
-        return {"radius_m": 0.3, "duration_s": self.duration_s}
 
 
 def body_record(rng: np.random.Generator, thrusters: int = 8) -> BodyRecord:
@@ -120,7 +120,7 @@ def test_signals_come_back_as_columns(tmp_path: Path) -> None:
     np.testing.assert_array_equal(signals["/firmware/ticks"]["received_frames"], np.full(120, 3))
     assert signals["/events"]["text"].tolist() == ["tracking"]
     assert signals["/firmware/requests"]["request"].tolist() == [
-        '{"action":"TRACK","body":0,"argument":{"radius_m":0.3,"duration_s":40.0}}'
+        '{"action":"TRACK","body":0,"argument":{"Spiral":{"radius_m":0.3,"duration_s":40.0}}}'
     ]
 
 

@@ -1,0 +1,34 @@
+"""What a firmware was made of, as a log carries it, and the firmware made of it again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from firmware_py.app.firmware import Firmware, compose
+from firmware_py.description.fleet import Fleet
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError, Source, build, to_plain
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.runtime.worker import Worker
+
+
+def configuration_of(firmware: Firmware, **notes: Any) -> dict[str, Any]:
+    """Fleet, parameters and vehicles of `firmware`, and what else the log should say of the run."""
+    vehicles = {module.vehicle: to_plain(v) for module, v in zip(firmware.fleet.module, firmware.vehicles, strict=True)}
+    described = {"fleet": to_plain(firmware.fleet), "parameters": to_plain(firmware.parameters), "vehicles": vehicles}
+    return {**notes, **described}
+
+
+def firmware_of(configuration: Mapping[str, Any], source: str, worker: Worker | None = None) -> Firmware:
+    """The firmware that `configuration_of` described; `source` names the log in errors. Raises DescriptionError."""
+    missing = [key for key in ("fleet", "parameters", "vehicles") if key not in configuration]
+    if missing:
+        raise DescriptionError(f"{source}: its configuration has no {', '.join(missing)}; this version's logs have them")
+    text = Source(source, "")
+    fleet: Fleet = build(Fleet, configuration["fleet"], text, ("fleet",))
+    parameters: Parameters = build(Parameters, configuration["parameters"], text, ("parameters",))
+    vehicles: dict[str, Vehicle] = {
+        name: build(Vehicle, table, text, ("vehicles", name)) for name, table in configuration["vehicles"].items()
+    }
+    return compose(fleet, parameters, vehicles, worker)

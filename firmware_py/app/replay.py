@@ -1,0 +1,118 @@
+"""`modcube replay`: what a flight took goes through the same code again; every signal and every frame must come out as it did.
+
+Same machine and same lock, same bytes. Logs that another machine wrote are compared with a tolerance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from firmware_py.app.configuration import firmware_of
+from firmware_py.app.firmware import BusFrame
+from firmware_py.app.log_comparison import Comparison, Difference
+from firmware_py.app.mission_plan import Consecutive
+from firmware_py.bus.codec import Codec, Frame
+from firmware_py.prepare.paths import Harmonic, Hold
+from firmware_py.prepare.piecewise import Piecewise
+from firmware_py.runtime.flight_log import FlightLog, LogError, LoggedTick
+from firmware_py.runtime.recorder import candump_lines
+from firmware_py.runtime.request_text import CORE_TYPES, read_request
+from firmware_py.runtime.tick_messages import TickMessages
+from firmware_py.runtime.worker import InlineWorker, Job
+
+TYPES = {**CORE_TYPES, **{cls.__name__: cls for cls in (Consecutive, Harmonic, Hold, Piecewise)}}
+"""What a recorded request may hold: the trajectories, and core's own."""
+
+
+@dataclass(slots=True)
+class Outcome:
+    """How a replay went."""
+
+    ticks: int = 0
+    seconds: float = 0.0
+    """Length of what was replayed, on the vehicle's clock."""
+    first: Difference | None = None
+    torn: str = ""
+    """Where the log ends too early; empty when it is whole."""
+
+
+class DueWorker:
+    """Does each job at once and hands its result over in the tick in which the recorded flight had it."""
+
+    def __init__(self) -> None:
+        self._worker = InlineWorker()
+        self._waiting: list[Any] = []
+        self.due = 0
+        """Results that this tick takes."""
+
+    def submit(self, job: Job) -> None:
+        """Runs the job."""
+        self._worker.submit(job)
+        self._waiting += self._worker.results()
+
+    def results(self) -> list[Any]:
+        """The results that are due."""
+        results, self._waiting = self._waiting[: self.due], self._waiting[self.due :]
+        return results
+
+
+class Replay:
+    """The firmware of one log, fed with what it was fed with."""
+
+    def __init__(self, log: FlightLog, tolerance: float = 0.0) -> None:
+        """Raises LogError where the log does not say what flew, and DescriptionError where that is wrong."""
+        if log.configuration is None:
+            raise LogError(f"{log.folder}: its log does not say what flew; this version's logs do")
+        self._log, self._configuration = log, log.configuration
+        self._comparison = Comparison(Codec.load(), tolerance, bool(log.configuration.get("thinned", False)))
+        self._messages = TickMessages()
+        self._start()
+
+    def _start(self) -> None:
+        """A new process."""
+        self._worker = DueWorker()
+        self._firmware = firmware_of(self._configuration, str(self._log.folder), self._worker)
+
+    def run(self) -> Outcome:
+        """Replays up to the first difference or the end of the log. A gap in the ticks is a process that was killed: another went on."""
+        outcome, before, start_ns = Outcome(), None, 0
+        for logged in self._log.ticks():
+            if before is None:
+                start_ns = logged.time_ns
+            elif logged.tick != before + 1:
+                self._start()
+            before = logged.tick
+            outcome.first = self.step(logged)
+            outcome.ticks, outcome.seconds = outcome.ticks + 1, (logged.time_ns - start_ns) * 1e-9
+            if outcome.first is not None:
+                break
+        outcome.torn = self._log.torn
+        return outcome
+
+    def step(self, logged: LoggedTick) -> Difference | None:
+        """One tick; the first thing about it that is not as it was."""
+        tick, time_ns = logged.tick, logged.time_ns
+        self._worker.due = logged.prepared
+        sync = self._firmware.sync(tick, time_ns)
+        received = [(bus, Frame(number, data)) for bus, number, data in logged.received]
+        try:
+            requests = [read_request(text, TYPES) for text in logged.requests]
+        except (ValueError, KeyError, TypeError) as error:
+            raise LogError(f"{self._log.folder}: request of tick {tick}: {error}") from None
+        inputs, outputs, frames = self._firmware.step(tick, time_ns, received, requests)
+        messages = list(self._messages.of(len(received), inputs, outputs))
+        return self._comparison.first(logged, messages, sent_lines(time_ns, sync + frames))
+
+
+def sent_lines(time_ns: int, frames: Sequence[BusFrame]) -> list[str]:
+    """The lines of can.log for what one tick sent, bus by bus."""
+    buses = sorted({bus for bus, _ in frames})
+    return [line for bus in buses for line in candump_lines(time_ns, bus, "T", [f for b, f in frames if b == bus]).splitlines(True)]
+
+
+def replay(folder: Path, tolerance: float = 0.0) -> Outcome:
+    """Replays the log in `folder`. Raises LogError, DescriptionError and OSError."""
+    return Replay(FlightLog(folder), tolerance).run()

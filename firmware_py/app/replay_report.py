@@ -1,0 +1,27 @@
+"""What `modcube replay` prints, and its exit status."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from firmware_py.app.replay import replay
+
+SAME, DIFFERENT = 0, 1
+"""Exit statuses."""
+
+
+def replay_and_say(folder: Path, tolerance: float, say: Callable[[str], None]) -> int:
+    """Replays the log in `folder`; returns the exit status. Raises LogError, DescriptionError and OSError."""
+    began = time.perf_counter()
+    outcome = replay(folder, tolerance)
+    took_s = time.perf_counter() - began
+    if outcome.torn:
+        say(f"the log is torn: {outcome.torn}; `modcube log recover {folder}` mends it")
+    say(f"{outcome.ticks} ticks, {outcome.seconds:.2f} s, replayed in {took_s:.2f} s: {outcome.seconds / took_s:.1f} x real time")
+    if outcome.first is not None:
+        say(f"differs first in {outcome.first}")
+        return DIFFERENT
+    say("every byte is the same" if tolerance == 0.0 else f"all within {tolerance:g}")
+    return SAME

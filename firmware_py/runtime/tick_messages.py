@@ -1,0 +1,117 @@
+"""The messages of one tick: everything that it took and thought. The recorder logs them, a replay compares them.
+
+Topics, in the order in which a tick writes them:
+
+- `/firmware/ticks`: its number, its time, how many frames and prepared results it took, frames dropped so far.
+- `/firmware/requests`: per request its tick and one line of JSON (`request_text`).
+- `/firmware/bodyN`: all of one body, `body_signals`.
+- `/events`: severity (syslog) and text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from firmware_py.core.types import BodyRecord, Inputs, Outputs
+from firmware_py.description.signals import Layout, Row, Signal, TextLayout
+from firmware_py.runtime.request_text import request_text
+
+TICKS, REQUESTS, EVENTS = "/firmware/ticks", "/firmware/requests", "/events"
+
+TICK_SIGNALS = (
+    Signal("tick", kind="int"),
+    Signal("time_ns", unit="ns", kind="int"),
+    Signal("received_frames", kind="int"),
+    Signal("dropped_frames", kind="int"),
+    Signal("estop", kind="bool"),
+    Signal("prepared", kind="int"),
+)
+
+
+def body_signals(thrusters: int) -> tuple[Signal, ...]:
+    """Signals of one body with that many thrusters, in the order in which `_body_values` gives them."""
+    return (
+        Signal("tick", kind="int"),
+        Signal("time_ns", unit="ns", kind="int"),
+        Signal("state", kind="int"),
+        Signal("mode", kind="int"),
+        Signal("p_wb", 3, "m"),
+        Signal("q_wb", 4),
+        Signal("nu", 6, "m/s, rad/s"),
+        Signal("force_w", 3, "N"),
+        Signal("moment_b", 3, "N m"),
+        Signal("sigma_p", 3, "m"),
+        Signal("sigma_q", 3, "rad"),
+        Signal("tag_age_ns", unit="ns", kind="int"),
+        Signal("nis"),
+        Signal("nis_dof", kind="int"),
+        Signal("rejected", kind="int"),
+        Signal("ready", kind="bool"),
+        Signal("setpoint_p_wb", 3, "m"),
+        Signal("setpoint_q_wb", 4),
+        Signal("setpoint_v_w", 3, "m/s"),
+        Signal("setpoint_w_b", 3, "rad/s"),
+        Signal("setpoint_a_w", 3, "m/s^2"),
+        Signal("setpoint_alpha_b", 3, "rad/s^2"),
+        Signal("wrench_wanted", 6, "N, N m"),
+        Signal("wrench_achieved", 6, "N, N m"),
+        Signal("scale", 2),
+        Signal("thrust_n", thrusters, "N"),
+        Signal("commanded_n", thrusters, "N"),
+    )
+
+
+def _body_values(tick: int, time_ns: int, record: BodyRecord) -> tuple[Any, ...]:
+    thrust = record.thrust
+    return (
+        tick,
+        time_ns,
+        record.state,
+        record.mode,
+        *record.estimate,
+        *record.setpoint,
+        record.wrench,
+        thrust.achieved,
+        thrust.scale,
+        thrust.force_n,
+        record.commanded_n,
+    )
+
+
+class Message(NamedTuple):
+    """One message of a tick."""
+
+    topic: str
+    layout: Layout | TextLayout
+    data: bytes
+
+
+class TickMessages:
+    """Makes the messages of each tick. Same tick, same bytes."""
+
+    def __init__(self) -> None:
+        self.ticks = Layout("Tick", TICK_SIGNALS)
+        self.requests = TextLayout("Request", ["tick"], "request")
+        self.events = TextLayout("Event", ["tick", "severity"], "text")
+        self._tick_row = self.ticks.row()
+        self._bodies: dict[int, tuple[Layout, Row]] = {}
+
+    def of(self, received: int, inputs: Inputs, outputs: Outputs) -> Iterator[Message]:
+        """Everything about one tick that took so many frames."""
+        tick, time_ns = outputs.tick, outputs.time_ns
+        values = (tick, time_ns, received, inputs.dropped_frames, inputs.estop, len(inputs.prepared))
+        yield Message(TICKS, self.ticks, self._tick_row.encode(values))
+        for request in inputs.requests:
+            yield Message(REQUESTS, self.requests, self.requests.encode(tick, request_text(request)))
+        for record in outputs.records:
+            layout, row = self._body(len(record.commanded_n))
+            yield Message(f"/firmware/body{record.body}", layout, row.encode(_body_values(tick, time_ns, record)))
+        for event in outputs.events:
+            yield Message(EVENTS, self.events, self.events.encode(tick, event.severity, event.text))
+
+    def _body(self, thrusters: int) -> tuple[Layout, Row]:
+        if thrusters not in self._bodies:
+            layout = Layout("Body", body_signals(thrusters))
+            self._bodies[thrusters] = layout, layout.row()
+        return self._bodies[thrusters]
