@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.firmware import BusFrame, compose, vehicles_of
-from firmware_py.app.ground_station import GroundSide
 from firmware_py.app.live_view import LiveView
 from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import RealTimeLoop, open_loop
@@ -25,6 +24,9 @@ from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from firmware_py.runtime.worker import ThreadWorker
+
+if TYPE_CHECKING:
+    from firmware_py.app.ground_station import GroundSide
 
 FAREWELL_TICKS = 10
 """Ticks that go on saying `disarmed` after a stop was asked for."""
@@ -111,6 +113,8 @@ def run_vehicle(
             say(f"warning: {line}")
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
         if ground is not None:
+            from firmware_py.app.ground_station import GroundSide  # with the planner of missions: 0.2 s and 15 MB
+
             side = stack.enter_context(GroundSide(ground, firmware))
             observers.append(side.observe)
             requests = with_ground(operator, side)
