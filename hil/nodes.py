@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 from firmware_py.bus.codec import Codec, Frame, Received, Receiver
 from hil.plant.camera import Camera
-from hil.plant.draw import stream
-from hil.plant.sensors import Noise, Sensors
+from hil.plant.draw import Noise, stream
+from hil.plant.sensors import Sensors
 from hil.plant.spec import SensorSpec
 from hil.plant.world import World
 from hil.tag_camera import TagCamera

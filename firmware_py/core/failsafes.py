@@ -125,9 +125,13 @@ class Watch:
         """What is wrong, for people."""
         return self.row.words.format(self.row.value(health))
 
-    def step(self, health: Health, counts: bool, armed: bool) -> bool:
+    @property
+    def rests(self) -> bool:
+        """Whether a tick without cause changes nothing."""
+        return not self.active and self._since_ns is None
+
+    def step(self, now: int, cause: bool, armed: bool) -> bool:
         """Moves its time on; whether it has begun or ended in this tick."""
-        now, cause = health.time_ns, counts and self.beyond(health)
         if cause:
             self._gone_ns = None
             if self._since_ns is None:
@@ -156,11 +160,12 @@ class Failsafes:
         Args:
             forced: a fail-safe and no person chose `mode`.
         """
-        return [
-            Alarm(watch.row.name, watch.words(health), watch.level, watch.active)
-            for watch in self._watches
-            if watch.step(health, watch.counts(mode, forced, armed), armed)
-        ]
+        alarms = []
+        for watch in self._watches:
+            cause = watch.beyond(health) and watch.counts(mode, forced, armed)
+            if (cause or not watch.rests) and watch.step(health.time_ns, cause, armed):
+                alarms.append(Alarm(watch.row.name, watch.words(health), watch.level, watch.active))
+        return alarms
 
     @property
     def level(self) -> Level:

@@ -69,6 +69,7 @@ class BodyPipeline:
         self.allocator = Allocator(body, parameters.allocation)
         self.limiter = Limiter(body, parameters.limiter, period_ns * 1e-9)
         self.lag = ThrusterLag(body.thrusters, period_ns * 1e-9)
+        self.slots = body.thrusters.module * CHANNELS + body.thrusters.channel
         self.voltage_v = np.array([body.thrusters.voltage_v[body.thrusters.module == m][0] for m in range(len(body.modules))])
 
     def retune(self, parameters: Parameters) -> None:
@@ -281,9 +282,8 @@ class Pipeline:
 
     def _command(self, chain: BodyPipeline, command: np.ndarray, outputs: Outputs) -> None:
         """Hands each module its own thrusters, and its relays when they are due."""
-        thrusters = chain.body.thrusters
         channels = np.zeros((len(chain.body.modules), CHANNELS))
-        channels[thrusters.module, thrusters.channel] = command
+        channels.reshape(-1)[chain.slots] = command
         for i, module in enumerate(chain.body.modules):
             relays = self.docking.relays(module, outputs.time_ns)
             outputs.modules[module] = ModuleCommand(chain.supervisor.armed, channels[i], relays)

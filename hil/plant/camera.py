@@ -15,8 +15,7 @@ from numba import njit
 
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import Tag, Vehicle
-from hil.plant.draw import stream
-from hil.plant.sensors import Noise
+from hil.plant.draw import Noise, stream
 from hil.plant.sight import look, solid_boxes
 from hil.plant.spec import CameraPose, SensorSpec
 from hil.plant.world import World
@@ -77,6 +76,8 @@ class Camera:
         self.carrier = carrier
         self._pose, self._spec = pose, spec
         self._axis = pose.axis / np.linalg.norm(pose.axis)
+        self._view = math.cos(math.radians(pose.half_view_deg))
+        self._least = math.cos(math.radians(spec.tag_incidence_deg))
         self._tags = [(m, t) for m, v in enumerate(vehicles) for t in v.tag if t.id in tags]
         self._rows = _tag_rows(self._tags)
         self._boxes = solid_boxes(vehicles)
@@ -105,16 +106,15 @@ class Camera:
 
     def _picture(self, poses: np.ndarray, capture_ns: int) -> list[Sighting]:
         """The readable tags, with their errors. Draws the same numbers whatever it sees."""
-        cosines = np.empty(len(self._tags))
+        looked = np.empty(len(self._tags))
         eye, axis = self._eye(poses)
-        view = math.cos(math.radians(self._pose.half_view_deg))
-        look(tuple(eye.tolist()), tuple(axis.tolist()), view, poses, self._rows, self._boxes, cosines)
-        readable = cosines > math.cos(math.radians(self._spec.tag_incidence_deg))
+        look(tuple(eye.tolist()), tuple(axis.tolist()), self._view, poses, self._rows, self._boxes, looked)
+        cosines = looked.tolist()
         chosen = range(len(self._tags)) if self._spec.tag_all else self._best(cosines)
         found = []
         for k, errors in zip(chosen, self._tag_errors if self._spec.tag_all else self._errors, strict=True):
             drawn = errors.draw()
-            if k >= 0 and readable[k] and not drawn.lost and self._tags[k][0] != self.carrier:
+            if k >= 0 and cosines[k] > self._least and not drawn.lost and self._tags[k][0] != self.carrier:
                 m, tag = self._tags[k]
                 p, q = tag_pose(poses[m, :3], poses[m, 3:], tag)
                 p, q = self._blur(p, q, drawn, eye, axis)
@@ -123,7 +123,7 @@ class Camera:
                 found.append(Sighting(m, tag.id, capture_ns, p, q, round(7 * cosines[k]), self.carrier))
         return found
 
-    def _best(self, cosines: np.ndarray) -> list[int]:
+    def _best(self, cosines: Sequence[float]) -> list[int]:
         """Tag of each module that faces the camera most; -1 for a module without tags."""
         best = [-1] * len(self._errors)
         for k, (m, _) in enumerate(self._tags):

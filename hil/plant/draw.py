@@ -118,3 +118,22 @@ def carried(matrix: np.ndarray, position: np.ndarray, turn: np.ndarray) -> np.nd
     """
     h = np.block([[turn.T, -turn.T @ skew(position)], [np.zeros((3, 3)), turn.T]])
     return h.T @ matrix @ h
+
+
+BLOCK = 1024
+"""Random numbers drawn at a time: one call for each sample would cost more than the rest of the sensor."""
+
+
+class Noise:
+    """Standard normal numbers in groups of `width`, from blocks drawn ahead."""
+
+    def __init__(self, rng: np.random.Generator, width: int) -> None:
+        self._rng, self._width, self._next = rng, width, BLOCK
+        self._block = np.zeros((0, width))
+
+    def take(self) -> np.ndarray:
+        """(width,) fresh numbers."""
+        if self._next >= BLOCK:
+            self._block, self._next = self._rng.standard_normal((BLOCK, self._width)), 0
+        self._next += 1
+        return self._block[self._next - 1]

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
+from hil.plant.draw import Noise
 from hil.plant.spec import Tank, WorldSpec
 from hil.plant.vectors import F2, F8, V3, compiled, dot, minus, plus, times, triple
 
@@ -59,17 +60,18 @@ class Gusts:
         t1, t2 = spec.gust_time_s, spec.gust_smoothing_s
         self._sigma = spec.gust_m_s * math.sqrt((t1 + t2) / t1)
         self._keep = math.exp(-period_s / t1)
-        self._rng = rng
         self._unit = rng.standard_normal(3)
         angle = rng.uniform(0.0, 2.0 * math.pi)
         self.mean = spec.current_m_s * np.array([math.cos(angle), math.sin(angle), 0.0])
         self.start = spec.gust_m_s * (
             math.sqrt(t1 / (t1 + t2)) * self._unit + math.sqrt(t2 / (t1 + t2)) * rng.standard_normal(3)
         )
+        self._push = math.sqrt(1.0 - self._keep**2)
+        self._noise = Noise(rng, 3)
 
     def step(self) -> np.ndarray:
         """(3,) where the gust tends during the next tick, m/s."""
-        self._unit = self._keep * self._unit + math.sqrt(1.0 - self._keep**2) * self._rng.standard_normal(3)
+        self._unit = self._keep * self._unit + self._push * self._noise.take()
         return self._sigma * self._unit
 
 

@@ -70,17 +70,19 @@ class Port:
             self._thread = threading.Thread(target=self._read_for_ever, name=f"reader of {address}", daemon=True)
             self._thread.start()
 
-    def send(self, frame: Frame) -> None:
-        """Sends one frame, or counts why not. Never waits for the bus."""
+    def send(self, frame: Frame) -> bool:
+        """Sends one frame, or counts why not; whether the bus took it. Never waits for the bus."""
         bus = self._bus
         if bus is None:
             self._refuse_if_closed()
             self.faults["gone"] += 1
-            return
+            return False
         try:
             self._link.send(bus, frame)
         except Exception as error:  # python-can lets OSError, SerialException and its own through, by back end
             self._failed("send", bus, error)
+            return False
+        return True
 
     def receive(self) -> list[Frame]:
         """Every frame that is there, in order; without a reader this also reopens an interface that came back."""
