@@ -39,6 +39,8 @@ SHOWN = {
     "sigma3_share": Shown("Truth inside 3 sigma, worst of six axes", "%", 100.0, 1),
     **{f"sigma3_share_{axis}": Shown(f"Truth inside 3 sigma, {axis}", "%", 100.0, 1) for axis in AXES},
     "thrust_rms_n": Shown("Commanded force of a thruster, RMS", "N"),
+    "supply_power_w": Shown("Electrical power of all modules, mean", "W"),
+    "wrench_margin_min": Shown("Busiest thruster, worst tick: share of its range left", "%", 100.0, 1),
     "tags_rejected": Shown("Tag observations refused by the gate", digits=0),
     "docked": Shown("Together and apart as asked for (1: yes)", digits=0),
     "tries": Shown("Meetings of a probe with a funnel", digits=0),
@@ -144,6 +146,8 @@ def flight_metrics(
     return metrics | {
         "sigma3_share": float(inside.mean(axis=0).min()),
         "thrust_rms_n": float(np.sqrt(np.nanmean(np.square(firmware["commanded_n"])))),
+        "supply_power_w": float(np.nansum(flight.truth["power_w"], axis=1).mean()),
+        "wrench_margin_min": float(np.fmin.reduce(firmware["wrench_margin"])),
         "tags_rejected": float(firmware["rejected"][-1] - firmware["rejected"][0]),
         "warnings": float(warnings(flight.events["severity"], flight.events["text"])),
         "duration_s": duration_s,

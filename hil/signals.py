@@ -36,6 +36,7 @@ def module_signals(thrusters: int) -> tuple[Signal, ...]:
         Signal("w_b", 3, "rad/s"),
         Signal("force_n", thrusters, "N"),
         Signal("water_w", 3, "m/s"),
+        Signal("power_w", 1, "W"),
     )
 
 
@@ -99,7 +100,8 @@ class TruthRecorder:
         """Truth of everything at the moment of SYNC `tick`."""
         for module in range(len(world.vehicles)):
             t = world.truth(module)
-            self.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w)
+            power = t.voltage_v * t.current_a
+            self.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w, power)
         for body in range(len(world.bodies)):
             b = world.body_truth(body)
             self.record_body(tick, b.time_ns, b.modules, b.p_wb, b.q_wb, b.v_w, b.w_b, world.load(body))
@@ -148,6 +150,7 @@ class TruthRecorder:
         w_b: np.ndarray,
         force_n: np.ndarray,
         water_w: np.ndarray,
+        power_w: float = 0.0,
     ) -> None:
         """Truth of `module` at the moment of SYNC `tick`.
 
@@ -155,9 +158,10 @@ class TruthRecorder:
             p_wm, q_wm: (3,) m and (4,) module frame (hull centre) in the world.
             v_w: (3,) velocity of the module's origin, world, m/s. w_b: (3,) angular rate, module frame, rad/s.
             force_n: (n,) force that each thruster gives, N. water_w: (3,) velocity of the undisturbed water there, m/s.
+            power_w: that its supply gives, electronics and magnets included, W.
         """
         channel, row = self._modules[module]
-        self._add(channel, time_ns, row.encode((tick, time_ns, p_wm, q_wm, v_w, w_b, force_n, water_w)))
+        self._add(channel, time_ns, row.encode((tick, time_ns, p_wm, q_wm, v_w, w_b, force_n, water_w, power_w)))
 
     def _add(self, channel: int, time_ns: int, data: bytes) -> None:
         self._sequence += 1
@@ -182,7 +186,7 @@ class TruthRecorder:
 class Flight:
     """One body over the ticks that both logs hold, row by row; `unmatched` ticks of the firmware have no truth.
 
-    `truth` has the columns of the body's leading module (its `force_n` those of all its modules), and with them
+    `truth` has the columns of the body's leading module (its `force_n` and `power_w` those of all its modules), and with them
     `member`, `p_wb`, `q_wb`, `v_wb`, `w_bb` of the body where the log has them.
     """
 
@@ -258,10 +262,11 @@ def _joined(module: Columns, body: Columns | None, truths: Mapping[str, Columns]
     members = np.flatnonzero(joined["member"].any(axis=0))
     if len(members) > 1:
         others = [truths[f"/plant/module{m}"] for m in members]
-        joined["force_n"] = np.hstack([
-            np.where(joined["member"][:, [m]] > 0.0, _at(other, joined["tick"], "force_n"), np.nan)
-            for m, other in zip(members, others, strict=True)
-        ])  # fmt: skip
+        for name in ("force_n", "power_w"):
+            joined[name] = np.hstack([
+                np.where(joined["member"][:, [m]] > 0.0, _at(other, joined["tick"], name), np.nan)
+                for m, other in zip(members, others, strict=True)
+            ])  # fmt: skip
     return joined
 
 

@@ -30,6 +30,7 @@ from hil.scenario import load_scenario
 OUT = Path("accept.json")
 RUNS = Path("runs") / "accept"
 SEEDS = range(20)
+FEWER = range(8)
 JOBS = 2
 LOGS = ("can.log", "signals.mcap", "truth.mcap")
 MM, DEG = 1e3, 57.29577951308232
@@ -96,6 +97,18 @@ def flown(scenario: str, controller: str = "modcube") -> Callable[[Path], Values
         return values | {"passed": summary["succeeded"] / summary["trials"]}
 
     return measure
+
+
+def saved_by_least_power(folder: Path) -> Values:
+    """Flies the Moebius strip in both modes of allocation: share of the supply's power saved, ratio of the position errors."""
+    found = {}
+    for name in ("modcube", "least_power"):
+        with campaign_progress(f"mobius-1, {name}", len(FEWER)) as progress:
+            summary = run_campaign(load_scenario("mobius-1"), CONTROLLERS[name], FEWER, JOBS, folder / name, progress=progress)
+        found[name] = summary["metrics"]
+    both = ("supply_power_w", "position_rmse_m")
+    power, error = (found["least_power"][m]["median"] / found["modcube"][m]["median"] for m in both)
+    return {"saved": 1.0 - power, "error": error}
 
 
 def repeated(folder: Path) -> Values:
@@ -206,6 +219,14 @@ GROUPS: tuple[Group, ...] = (
     Group(
         "speed", 2, "make bench", timed,
         (Figure("spiral in lockstep with recorder and real frames, one core", "speed", low=25.0, unit="x real time"),),
+    ),
+    Group(
+        "least-power", 10, "modcube hil campaign mobius-1 --trials 8 --jobs 2 --controller least_power, and without it",
+        saved_by_least_power,
+        (
+            Figure("Moebius strip: electrical power that least_power saves, median", "saved", low=5.0, unit="%", scale=100.0),
+            Figure("Moebius strip: its position RMSE over that of least squares, medians", "error", high=1.05),
+        ),
     ),
     # Figures of later issues go here.
 )  # fmt: skip

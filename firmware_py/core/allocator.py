@@ -1,7 +1,8 @@
 """Stage 6 of a tick: from a wrench to the force of each thruster (paper, Eq. 5), within limits.
 
 Where the pseudo-inverse (plus the preload) stays within limits it is the answer. Otherwise a box-constrained
-least-squares problem (daqp) keeps the directions of force and moment and gives way in the force first.
+least-squares problem (daqp) keeps the directions of force and moment and gives way in the force first. Mode
+`least_power` moves an answer within limits to where the thrusters draw the least.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ from ctypes import c_int
 
 import daqp
 import numpy as np
+from numba import njit
 
 from firmware_py.core.body import Body
+from firmware_py.core.least_power import LeastPower
 from firmware_py.core.preload import preload
 from firmware_py.core.types import Thrust
 from firmware_py.description.parameters import Allocation
@@ -28,42 +31,56 @@ SOLVED = (1, 2)
 """daqp's exit flags for optimal, and optimal with slack."""
 
 
+@njit("float64(float64[::1],float64[::1],float64[::1])", cache=True)
+def busiest(force, f_min, f_max):  # type: ignore[no-untyped-def]
+    """Share of its range that the busiest thruster gives."""
+    most = 0.0
+    for i in range(force.shape[0]):
+        most = max(most, force[i] / (f_max[i] if force[i] > 0.0 else f_min[i]))
+    return most
+
+
 class Allocator:
     """Allocates for one body. `alive` leaves thrusters out of the problem at once."""
 
     def __init__(self, body: Body, parameters: Allocation) -> None:
         self._clip_only = parameters.mode == "pseudo_inverse"
+        self._least_power = parameters.mode == "least_power"
         self._thrusters = body.thrusters
         n = body.thrusters.f_max.size
-        self._f_min, self._f_max = body.thrusters.f_min.copy(), body.thrusters.f_max.copy()
-        self._matrix = np.ascontiguousarray(body.thrusters.matrix)
-        self._pinv = np.ascontiguousarray(body.thrusters.pinv)
-        weight = SHARE_WEIGHT * float(np.sum(self._f_max**2))
+        weight = SHARE_WEIGHT * float(np.sum(body.thrusters.f_max**2))
         self.weights = np.array([weight, weight * MOMENT_PRIORITY])
         self._h = np.diag(np.r_[np.full(n, 2.0), 2 * self.weights])
-        reach = np.maximum(self._f_max, -self._f_min)
-        self._most = np.array([np.linalg.norm(self._matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
+        reach = np.maximum(body.thrusters.f_max, -body.thrusters.f_min)
+        self._most = np.array([np.linalg.norm(body.thrusters.matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
         self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
-        self._preload = preload(body.thrusters, np.ones(n, dtype=bool), self._smallest_n)
         self._sense = np.array([0] * (n + 2) + [EQUALITY] * 6, dtype=c_int)
+        self._set(np.ones(n, dtype=bool), body.thrusters.pinv)
 
     def set_alive(self, alive: np.ndarray) -> None:
         """(n,) bool: thrusters that may be used from now on."""
+        self._set(alive, np.linalg.pinv(self._thrusters.matrix * alive))
+
+    def _set(self, alive: np.ndarray, pinv: np.ndarray) -> None:
         t = self._thrusters
         self._matrix = np.ascontiguousarray(t.matrix * alive)
-        self._pinv = np.ascontiguousarray(np.linalg.pinv(self._matrix))
+        self._pinv = np.ascontiguousarray(pinv)
         self._f_min, self._f_max = t.f_min * alive, t.f_max * alive
         self._preload = preload(t, alive, self._smallest_n)
+        self._cheaper = LeastPower(t, alive) if self._least_power else None
 
     def step(self, wrench: np.ndarray) -> Thrust:
         """The thruster forces for a wanted (6,) wrench, body frame."""
         force = self._preload + self._pinv @ wrench
         if ((force <= self._f_max) & (force >= self._f_min)).all():
-            return Thrust(force, self._matrix @ force, (1.0, 1.0))
+            return self._thrust(self._cheaper.step(force) if self._cheaper else force, (1.0, 1.0))
         if self._clip_only:
-            force = np.clip(force, self._f_min, self._f_max)
-            return Thrust(force, self._matrix @ force, (1.0, 1.0))
+            return self._thrust(np.clip(force, self._f_min, self._f_max), (1.0, 1.0))
         return self._saturated(wrench)
+
+    def _thrust(self, force: np.ndarray, kept: tuple[float, float]) -> Thrust:
+        t = self._thrusters
+        return Thrust(force, self._matrix @ force, kept, 1.0 - busiest(force, t.f_min, t.f_max))
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
         """min |f - f_preload|^2 + w_f (1 - a)^2 + w_m (1 - b)^2, J f = [a F; b M], f within limits, 0 <= a, b <= 1."""
@@ -81,10 +98,10 @@ class Allocator:
         if flag not in SOLVED:
             share = self._common_share(wrench)
             force = self._pinv @ wrench * share
-            return Thrust(force, self._matrix @ force, (share, share))
+            return self._thrust(force, (share, share))
         force = np.clip(x[:n], self._f_min, self._f_max)
         kept = np.clip(x[n:], 0.0, 1.0) * down
-        return Thrust(force, self._matrix @ force, (float(kept[0]), float(kept[1])))
+        return self._thrust(force, (float(kept[0]), float(kept[1])))
 
     def _common_share(self, wrench: np.ndarray) -> float:
         """Largest share of the pseudo-inverse's answer that is within limits."""

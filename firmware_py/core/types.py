@@ -5,6 +5,7 @@ One tick: Inputs -> (Estimate, Setpoint, Wrench, Thrust per body) -> Outputs. Wo
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -249,6 +250,8 @@ class Thrust(NamedTuple):
     """(6,) wrench that these forces give."""
     scale: tuple[float, float]
     """Share of the wanted force and moment that is kept, 0 to 1."""
+    margin: float = math.nan
+    """Share of its range that the busiest thruster has left, 0 to 1; NaN while single motors are tested."""
 
 
 # ---------------------------------------------------------------- what goes out

@@ -100,7 +100,9 @@ class Allocation:
     """From wrench to thrusters."""
 
     mode: str = quantity(
-        "least_squares", choices=("least_squares", "pseudo_inverse"), help="pseudo_inverse clips, as the paper's"
+        "least_squares",
+        choices=("least_squares", "least_power", "pseudo_inverse"),
+        help="least_power: by the thrusters' power curves; pseudo_inverse clips, as the paper's",
     )
     preload_n: float = quantity(
         0.6,
@@ -301,7 +303,7 @@ PAPER = Parameters(
 )
 """The paper's controller with the authors' gains, as accelerations: position 5 and 2, attitude 2 and 1 ."""
 
-CONTROLLERS = {"modcube": Parameters(), "paper": PAPER}
+CONTROLLERS = {"modcube": Parameters(), "least_power": Parameters(allocation=Allocation(mode="least_power")), "paper": PAPER}
 """Whole sets of parameters by name."""
 
 

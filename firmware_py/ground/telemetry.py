@@ -258,17 +258,8 @@ def named_value_float(s: Subject) -> list[Values]:
         for face, current in enumerate(m.dock_current_ma)
         if not math.isnan(current)
     ]
-    values.append(("WRENCH_MRG", wrench_margin(s)))
+    values.append(("WRENCH_MRG", s.record.thrust.margin))
     return [{"time_boot_ms": s.time_ms, "name": name, "value": value} for name, value in values]
-
-
-def wrench_margin(s: Subject) -> float:
-    """Share of its range that the busiest thruster has left, 0 to 1; NaN while the body is being swapped."""
-    body, force = s.picture.bodies.get(s.body), s.record.thrust.force_n
-    if body is None or len(force) != len(body.thrusters.f_max):
-        return _NAN
-    share = np.where(force >= 0, force / body.thrusters.f_max, force / body.thrusters.f_min)
-    return float(1.0 - share.max())
 
 
 def extended_sys_state(s: Subject) -> list[Values]:

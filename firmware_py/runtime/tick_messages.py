@@ -57,6 +57,7 @@ def body_signals(thrusters: int) -> tuple[Signal, ...]:
         Signal("wrench_wanted", 6, "N, N m"),
         Signal("wrench_achieved", 6, "N, N m"),
         Signal("scale", 2),
+        Signal("wrench_margin"),
         Signal("thrust_n", thrusters, "N"),
         Signal("commanded_n", thrusters, "N"),
     )
@@ -74,6 +75,7 @@ def _body_values(tick: int, time_ns: int, record: BodyRecord) -> tuple[Any, ...]
         record.wrench,
         thrust.achieved,
         thrust.scale,
+        thrust.margin,
         thrust.force_n,
         record.commanded_n,
     )

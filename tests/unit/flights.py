@@ -13,6 +13,8 @@ PERIOD_NS = 10_000_000
 START_NS = 4_000_000_000
 """The spiral starts after 4 s of hovering."""
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+POWER_W, MARGIN = 23.0, 0.8
+"""What the supply gives and what the busiest thruster has left, all the time."""
 
 
 def progress(t_s: float, duration_s: float) -> float:
@@ -63,7 +65,7 @@ def write_flight(
             speed = (spiral(at + 0.005, duration_s) - spiral(at - 0.005, duration_s)) / 0.01
             p_wm = wanted + np.array(offset_m) + error[tick]
             q_wm = exp(np.array(tilt_rad) + tilt[tick])
-            truth.record(tick, time_ns, 0, p_wm, q_wm, speed, np.zeros(3), thrust[tick], np.array([0.04, 0.03, 0.0]))
+            truth.record(tick, time_ns, 0, p_wm, q_wm, speed, np.zeros(3), thrust[tick], np.array([0.04, 0.03, 0.0]), POWER_W)
             zero = np.zeros(3)
             tagged = tick % 2 == 0
             estimate = Estimate(
@@ -73,7 +75,7 @@ def write_flight(
                 float(rng.chisquare(6)) if tagged else float("nan"), 6 if tagged else 0, tick // 400, True,
             )  # fmt: skip
             wrench = np.r_[0.4 * np.sin(at), 0.4 * np.cos(at), -0.4, zero]
-            result = Thrust(thrust[tick], wrench, (1.0, 1.0))
+            result = Thrust(thrust[tick], wrench, (1.0, 1.0), MARGIN)
             setpoint = Setpoint(wanted, LEVEL, speed, zero, zero, zero)
             record = BodyRecord(0, 1, 3 if at >= 0 else 16, estimate, setpoint, wrench, result, thrust[tick])
             events = [Event(6, "tracking the spiral")] if time_ns == START_NS else []

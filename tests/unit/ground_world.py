@@ -98,7 +98,7 @@ class Robot:
             self.tag_age_ns, float("nan"), 0, 0, True,
         )  # fmt: skip
         setpoint = Setpoint(self.p_wb[body], self.q_wb[body], ZERO, ZERO, ZERO, ZERO)
-        thrust = Thrust(np.zeros(8), np.zeros(6), (1.0, 1.0))
+        thrust = Thrust(np.zeros(8), np.zeros(6), (1.0, 1.0), 0.75)
         values = {
             "body": body, "state": self.state[body], "estimate": estimate, "setpoint": setpoint, "wrench": np.zeros(6),
             "thrust": thrust, "commanded_n": np.zeros(8), "mode": self.mode[body],

@@ -42,7 +42,7 @@ def refusal(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytes
         (["hil", "run", "hover", "--bus", "virtual:"], "virtual:", "virtual:NAME"),
         (["hil", "run", "hover", "--vehicle", "yacht"], "vehicle 'yacht'", "modcube, modcube_sim"),
         (["hil", "run", "hover", "--vehicle", "yacht.toml"], "yacht.toml", "cannot be read"),
-        (["hil", "run", "hover", "--controller", "fuzzy"], "controller 'fuzzy'", "modcube, paper"),
+        (["hil", "run", "hover", "--controller", "fuzzy"], "controller 'fuzzy'", "modcube, least_power, paper"),
         (["hil", "run", "hover", "--sensors", "magic"], "sensors 'magic'", "real, ideal"),
     ],
 )
@@ -119,7 +119,7 @@ def test_wrong_scenario_file_is_refused_with_line_and_permitted_range(
     [
         ("[control]\nposition_bandwith = 2.0\n", "position_bandwith: unknown key", "position_bandwidth"),
         ("[control]\nposition_bandwidth = 99.0\n", "99.0 is out of range", "0.1 to 10 rad/s"),
-        ('[allocation]\nmode = "hope"\n', "'hope' is unknown", "least_squares, pseudo_inverse"),
+        ('[allocation]\nmode = "hope"\n', "'hope' is unknown", "least_squares, least_power, pseudo_inverse"),
     ],
 )
 def test_wrong_parameter_file_is_refused_with_line_and_permitted_range(

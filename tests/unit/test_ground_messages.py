@@ -74,7 +74,7 @@ def test_every_streamed_message_arrives_with_the_robots_values(world: World, cli
     assert client.last("HOME_POSITION").latitude == 302084000
     assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_NO_MISSION
     named = {m.name: m.value for m in client.all("NAMED_VALUE_FLOAT")}
-    assert named["DOCK0+X"] == pytest.approx(0.1) and "WRENCH_MRG" in named
+    assert named["DOCK0+X"] == pytest.approx(0.1) and named["WRENCH_MRG"] == 0.75
     assert client.last("CURRENT_MODE").custom_mode == px4(4, 3)
 
 

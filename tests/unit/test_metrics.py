@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hil.checks import Limit, check_metrics, judge, write_result
 from hil.metrics import body_positions, flight_metrics, nis_mean, rotation_vectors, warnings
 from hil.signals import Flight, read_flight
-from tests.unit.flights import START_NS, write_flight
+from tests.unit.flights import MARGIN, POWER_W, START_NS, write_flight
 
 LIMITS = (Limit("position_rmse_m", high=0.005), Limit("nis_mean", 0.7, 1.4))
 
@@ -42,6 +42,7 @@ def test_every_tick_of_the_trajectory_counts(tmp_path: Path) -> None:
     assert metrics["duration_s"] == pytest.approx(5.01)
     assert metrics["real_time_factor"] == pytest.approx(50.1)
     assert metrics["deadline_misses"] == 0
+    assert (metrics["supply_power_w"], metrics["wrench_margin_min"]) == (POWER_W, MARGIN)
 
 
 def test_honest_filter_is_consistent_in_all_six_axes(tmp_path: Path) -> None:

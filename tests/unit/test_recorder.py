@@ -49,7 +49,7 @@ def body_record(rng: np.random.Generator, thrusters: int = 8) -> BodyRecord:
         np.full(3, 0.02), 40_000_000, 5.5, 6, 3, True,
     )  # fmt: skip
     setpoint = Setpoint(rng.normal(size=3), q, *rng.normal(size=(4, 3)))
-    thrust = Thrust(rng.normal(size=thrusters), rng.normal(size=6), (1.0, 0.75))
+    thrust = Thrust(rng.normal(size=thrusters), rng.normal(size=6), (1.0, 0.75), 0.4)
     return BodyRecord(0, 1, 3, estimate, setpoint, rng.normal(size=6), thrust, rng.normal(size=thrusters))
 
 
@@ -108,7 +108,7 @@ def test_body_signals_decode_to_what_the_tick_thought(tmp_path: Path) -> None:
         np.testing.assert_array_equal(message.wrench_achieved, record.thrust.achieved)
         np.testing.assert_array_equal(message.commanded_n, record.commanded_n)
         assert (message.state, message.mode, message.nis_dof, message.rejected, message.ready) == (1, 3, 6, 3, True)
-        assert list(message.scale) == [1.0, 0.75]
+        assert list(message.scale) == [1.0, 0.75] and message.wrench_margin == 0.4
 
 
 def test_signals_come_back_as_columns(tmp_path: Path) -> None:

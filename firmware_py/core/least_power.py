@@ -1,0 +1,90 @@
+"""Least power: of all forces that make a wrench, those whose thrusters draw the least electrical power.
+
+Stage 6 of a tick, after the wrench is known to be within limits. The forces may only move within the null space of the
+thruster matrix, so the wrench stays. No thruster changes the side that it pushes to, nor comes nearer to zero than its
+deadband, where what it does is not known; on one side power rises smoothly, and a few quadratic programs (daqp), each with
+the power's own slope and curvature, find the least. Work and memory of a tick are fixed; nothing is kept from tick to tick.
+"""
+
+from __future__ import annotations
+
+import daqp
+import numpy as np
+from numba import njit
+
+from firmware_py.core.body import ThrusterSet
+from firmware_py.core.thruster import total_power
+
+PASSES = 3
+"""Quadratic programs of a tick; power that is quadratic in the force needs one."""
+ITERATIONS = 200
+"""Most changes of the active set in one program; a 2x2 of modules needs about 40."""
+LEAST_BEND = 0.02
+"""Smallest curvature, W/N^2: a fitted curve may bend down somewhere, a program may not."""
+RANK_TOLERANCE = 1e-6
+"""Singular values below this share of the largest count as zero."""
+SOLVED = 1
+"""daqp's exit flag for optimal."""
+
+
+@njit("void(float64[::1],float64[:,::1],float64[:,::1],float64[::1],float64[::1])", cache=True)
+def slopes(force, power_forward, power_reverse, slope, bend):  # type: ignore[no-untyped-def]
+    """Writes d(power)/d(force), W/N, and its derivative, W/N^2, of each thruster; (n,) each, polynomials (n, 5) over |N|."""
+    for i in range(force.shape[0]):
+        c = power_forward[i] if force[i] > 0.0 else power_reverse[i]
+        x, first, second = abs(force[i]), 0.0, 0.0
+        for k in range(c.shape[0] - 1, -1, -1):
+            second = second * x + first
+            first = first * x + (k + 1) * c[k]
+        slope[i] = first if force[i] > 0.0 else -first
+        bend[i] = max(second, LEAST_BEND)
+
+
+class LeastPower:
+    """Moves the forces of one body within its null space."""
+
+    def __init__(self, thrusters: ThrusterSet, alive: np.ndarray) -> None:
+        """`alive`: (n,) bool, thrusters that may be used."""
+        self._t = thrusters
+        self._used = np.flatnonzero(alive)
+        self._free = _null_space(thrusters.matrix[:, self._used])
+        self._slope, self._bend = np.zeros(alive.size), np.zeros(alive.size)
+
+    def step(self, base: np.ndarray) -> np.ndarray:
+        """(n,) forces, N, of the same wrench and within the same limits as `base`, and of no more power."""
+        if not self._free.size:
+            return base
+        t = self._t
+        forward = base > 0.0
+        low = np.where(forward, np.minimum(base, t.deadband_n), t.f_min) - base
+        high = np.where(forward, t.f_max, np.maximum(base, -t.deadband_n)) - base
+        low, high = low[self._used], high[self._used]
+        force = base
+        for _ in range(PASSES):
+            moved, flag = self._program(force, base, low, high)
+            if flag != SOLVED:
+                break
+            force = moved
+        return force if self.power_w(force) < self.power_w(base) else base
+
+    def _program(self, force: np.ndarray, base: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, int]:
+        """min p'(f) x + 1/2 p''(f) (x - f)^2 over x = base + N z, low <= N z <= high."""
+        slopes(force, self._t.power_forward, self._t.power_reverse, self._slope, self._bend)
+        used, free = self._used, self._free
+        bend = self._bend[used]
+        linear = free.T @ (self._slope[used] + bend * (base - force)[used])
+        z, _, flag, _ = daqp.solve((free.T * bend) @ free, linear, free, high, low, iter_limit=ITERATIONS)
+        moved = base.copy()
+        moved[used] += np.clip(free @ z, low, high)
+        return moved, flag
+
+    def power_w(self, force: np.ndarray) -> float:
+        """Electrical power of all thrusters by the vehicle's curves, W."""
+        return float(total_power(force, self._t.power_forward, self._t.power_reverse))
+
+
+def _null_space(matrix: np.ndarray) -> np.ndarray:
+    """(n, n - rank) orthonormal directions that make no wrench."""
+    _, sizes, rows = np.linalg.svd(matrix)
+    rank = int(np.sum(sizes > RANK_TOLERANCE * sizes.max(initial=0.0)))
+    return np.ascontiguousarray(rows[rank:].T)
