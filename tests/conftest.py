@@ -3,3 +3,10 @@
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import pytest
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--update-golden` flies the golden logs anew."""
+    parser.addoption("--update-golden", action="store_true", help="fly the golden logs of tests/golden anew")

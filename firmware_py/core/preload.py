@@ -14,6 +14,8 @@ RANK_TOLERANCE = 1e-6
 """Singular values below this share of the largest count as zero."""
 DIRECTIONS = 720
 """Directions tried in the null space; half a degree apart where it is a plane."""
+TIE = 1e-9
+"""Directions as good as the best one but for rounding."""
 UNEVEN = 5.0
 """The largest preload force of a module is at most this many times the smallest wanted one."""
 
@@ -40,15 +42,29 @@ def _of_module(matrix: np.ndarray, smallest_n: float) -> np.ndarray:
         return np.zeros(0)
     _, values, rows = np.linalg.svd(matrix)
     rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
-    null = rows[rank:].T
+    null = _settled(rows[rank:].T)
     if null.shape[1] == 0:
         return np.zeros(matrix.shape[1])
     reachable = np.linalg.norm(null, axis=1) > RANK_TOLERANCE
     candidates = null @ _directions(null.shape[1])
     sizes = np.abs(candidates[reachable])
-    best = int(np.argmax(sizes.min(axis=0) / sizes.max(axis=0)))
+    evenness = sizes.min(axis=0) / sizes.max(axis=0)
+    best = int(np.argmax(evenness >= (1.0 - TIE) * evenness.max()))  # the first of those that are as good
     scale = min(smallest_n / max(sizes[:, best].min(), 1e-12), UNEVEN * smallest_n / sizes[:, best].max())
     return np.asarray(candidates[:, best] * scale)
+
+
+def _settled(basis: np.ndarray) -> np.ndarray:
+    """(k, d) orthonormal basis of the same space that does not depend on how the processor's LAPACK turned `basis`: Gram-Schmidt on the
+    projections of the thrusters' own axes pushing backwards, each time the first that is not much shorter than the longest.
+    """
+    left, found = -basis @ basis.T, []
+    for _ in range(basis.shape[1]):
+        lengths = np.linalg.norm(left, axis=0)
+        column = left[:, np.argmax(lengths > 0.5 * lengths.max())]
+        found.append(column / np.linalg.norm(column))
+        left = left - np.outer(found[-1], found[-1] @ left)
+    return np.array(found).reshape(-1, basis.shape[0]).T
 
 
 def _directions(dimension: int) -> np.ndarray:

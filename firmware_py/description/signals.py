@@ -161,7 +161,7 @@ class LogMessage(NamedTuple):
 def read_messages(path: Path) -> Iterator[LogMessage]:
     """All messages of an MCAP log in their order, up to its end or to where it is torn. Raises OSError."""
     topics: dict[int, str] = {}
-    for record in _records(path.read_bytes()):
+    for record in log_records(path):
         if isinstance(record, Message):
             yield LogMessage(topics[record.channel_id], record.log_time, record.data)
         elif isinstance(record, Channel):
@@ -175,7 +175,7 @@ def is_closed(path: Path) -> bool:
 
 def read_attachment(path: Path, name: str) -> bytes | None:
     """The attachment called `name` of an MCAP log, or None. Raises OSError."""
-    attachments = (record for record in _records(path.read_bytes()) if isinstance(record, Attachment))
+    attachments = (record for record in log_records(path) if isinstance(record, Attachment))
     return next((bytes(attachment.data) for attachment in attachments if attachment.name == name), None)
 
 
@@ -191,7 +191,7 @@ def read_signals(path: Path) -> dict[str, Columns]:
     channels: dict[int, Channel] = {}
     times: dict[int, list[int]] = {}
     payloads: dict[int, list[bytes]] = {}
-    for record in _records(path.read_bytes()):
+    for record in log_records(path):
         if isinstance(record, Message):
             times.setdefault(record.channel_id, []).append(record.log_time)
             payloads.setdefault(record.channel_id, []).append(record.data)
@@ -206,9 +206,10 @@ def read_signals(path: Path) -> dict[str, Columns]:
     return result
 
 
-def _records(data: bytes) -> Iterator[Any]:
+def log_records(path: Path) -> Iterator[Any]:
+    """The records of an MCAP log (mcap.records), up to its end or to where it is torn. Raises OSError."""
     try:
-        yield from StreamReader(BytesIO(data), validate_crcs=True).records
+        yield from StreamReader(BytesIO(path.read_bytes()), validate_crcs=True).records
     except (McapError, EOFError, ValueError, struct.error):
         return  # torn: what came before it stands
 

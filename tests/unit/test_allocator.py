@@ -273,3 +273,15 @@ def test_preload_is_that_of_each_module_alone(body: Body) -> None:
     for module in range(len(body.modules)):
         mine = t.module == module
         np.testing.assert_allclose(t.matrix[:, mine] @ force[mine], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [0.3, 2.0, 3.1])
+def test_preload_does_not_depend_on_how_the_processor_turns_the_null_space(
+    single: Body, turn: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alive = np.ones(8, dtype=bool)
+    force = preload(single.thrusters, alive, 0.6)
+    svd, turned = np.linalg.svd, np.eye(8)
+    turned[6:, 6:] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    monkeypatch.setattr(np.linalg, "svd", lambda matrix: (*(parts := svd(matrix))[:2], turned @ parts[2]))
+    np.testing.assert_allclose(preload(single.thrusters, alive, 0.6), force, rtol=1e-12)

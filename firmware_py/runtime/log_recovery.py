@@ -1,0 +1,78 @@
+"""Mends a log that kill -9 or a pulled plug has torn: keeps the ticks that both files hold whole, and closes both.
+
+What was torn stays beside it, as `NAME.torn`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.records import Attachment, Channel, Message, Schema
+from mcap.writer import CompressionType, Writer
+
+from firmware_py.description.signals import log_records
+from firmware_py.runtime.flight_log import FlightLog, LogError
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, candump_stamp
+
+TORN = ".torn"
+
+
+class Recovery(NamedTuple):
+    """What was done."""
+
+    ticks: int
+    """Whole ticks in the log."""
+    torn: str
+    """What was wrong; empty where nothing was and nothing was done."""
+
+
+def recover(folder: Path) -> Recovery:
+    """Mends the log in `folder`. Raises LogError where no tick of it is whole, and OSError."""
+    log = FlightLog(folder)
+    count, last_ns = 0, 0
+    for logged in log.ticks():
+        count, last_ns = count + 1, logged.time_ns
+    if not log.torn:
+        return Recovery(count, "")
+    if not count:
+        raise LogError(f"{folder}: no tick of the log is whole")
+    mended = {name: folder / f"{name}.mended" for name in (CAN_LOG, SIGNAL_LOG)}
+    _cut_frames(folder / CAN_LOG, mended[CAN_LOG], candump_stamp(last_ns))
+    rewrite(folder / SIGNAL_LOG, mended[SIGNAL_LOG], lambda topic, message: message.log_time <= last_ns)
+    for name, path in mended.items():
+        os.replace(folder / name, folder / f"{name}{TORN}")
+        os.replace(path, folder / name)
+    return Recovery(count, log.torn)
+
+
+def rewrite(source: Path, target: Path, keep: Callable[[str, Message], bool], attach: Callable[[bytes], bytes] = bytes) -> None:
+    """Writes the messages of `source` that are to be kept, and its attachments as `attach` makes them, as the whole MCAP log `target`."""
+    with target.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start(profile="", library="modcube")
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        topics: dict[int, str] = {}
+        for record in log_records(source):
+            if isinstance(record, Schema):
+                schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+            elif isinstance(record, Channel) and record.id not in channels:
+                topics[record.id] = record.topic
+                channels[record.id] = writer.register_channel(record.topic, record.message_encoding, schemas[record.schema_id])
+            elif isinstance(record, Attachment):
+                data = attach(record.data)
+                writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, data)
+            elif isinstance(record, Message) and keep(topics[record.channel_id], record):
+                number = channels[record.channel_id]
+                writer.add_message(number, record.log_time, record.data, record.publish_time, record.sequence)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _cut_frames(source: Path, target: Path, last: str) -> None:
+    """Copies whole lines up to the last one with the stamp `last`."""
+    lines = source.read_bytes().splitlines(True)
+    end = max(i for i, line in enumerate(lines) if line.startswith(last.encode() + b" "))
+    target.write_bytes(b"".join(lines[: end + 1]))

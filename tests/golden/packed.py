@@ -1,0 +1,34 @@
+"""A golden log: a flight's log, thinned and packed. `pack` makes one, `unpack` gives the folder that `modcube replay` takes.
+
+Every frame is kept, and of each body the signals of every 50th tick.
+"""
+
+import json
+import lzma
+from pathlib import Path
+
+from firmware_py.runtime.log_recovery import rewrite
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG
+
+KEEP_EVERY = 50
+BODY = "/firmware/body"
+
+
+def pack(log: Path, golden: Path, period_ns: int) -> None:
+    """Makes the folder `golden` of the log in the folder `log`."""
+    golden.mkdir(exist_ok=True)
+    thin = log / "thin.mcap"
+    rewrite(
+        log / SIGNAL_LOG,
+        thin,
+        lambda topic, message: not topic.startswith(BODY) or message.log_time // period_ns % KEEP_EVERY == 0,
+        lambda data: json.dumps(json.loads(data) | {"thinned": True}, sort_keys=True).encode(),
+    )
+    for name, path in ((CAN_LOG, log / CAN_LOG), (SIGNAL_LOG, thin)):
+        (golden / f"{name}.xz").write_bytes(lzma.compress(path.read_bytes(), preset=9))
+
+
+def unpack(golden: Path, log: Path) -> None:
+    """Writes the log of `golden` into the folder `log`."""
+    for name in (CAN_LOG, SIGNAL_LOG):
+        (log / name).write_bytes(lzma.decompress((golden / f"{name}.xz").read_bytes()))
