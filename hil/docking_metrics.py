@@ -31,7 +31,8 @@ def expected_pairs(scenario: Scenario) -> dict[tuple[int, int], bool]:
 
 def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
     """`docked`: everything is together or apart as the steps want; `tries`: meetings of a probe and a funnel; `jams`;
-    `outcome`: index into OUTCOMES; `false_declarations`: ticks in which the firmware believed in a dock that was none.
+    `outcome`: index into OUTCOMES; `false_declarations`: ticks in which the firmware believed in a dock that was none;
+    `join_jump_n`: largest step of a thruster's commanded force in a tick in which bodies were joined, N.
 
     Raises:
         OSError: a log is missing. ValueError: it holds no docks.
@@ -49,6 +50,7 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
         "jams": float(docks["jams"][-1]),
         "outcome": float(outcome),
         "false_declarations": float(_false_declarations(truths, signals)),
+        "join_jump_n": _join_jump_n(scenario, signals),
     }
 
 
@@ -96,3 +98,29 @@ def _off_attitude(signals: Mapping[str, Columns]) -> float:
             cosine = np.abs(np.sum(columns["q_wb"] * columns["setpoint_q_wb"], axis=1))
             worst = max(worst, float(2.0 * np.arccos(np.clip(cosine, 0.0, 1.0)).max()))
     return worst
+
+
+def _join_jump_n(scenario: Scenario, signals: Mapping[str, Columns]) -> float:
+    """A joined body has the target's thrusters first, then the active one's; NaN when nothing was joined."""
+    bodies = {int(name.removeprefix("/firmware/body")): c for name, c in signals.items() if name.startswith("/firmware/body")}
+    groups = {group[0]: set(group) for group in scenario.groups}
+    docks = [(scenario.index_of(step.target_module), scenario.index_of(step.module)) for step in scenario.step if step.do == "dock"]
+    worst = math.nan
+    for tick, gone in sorted((int(columns["tick"][-1]), number) for number, columns in bodies.items()):
+        after = {n: force for n, c in bodies.items() if (force := _forces(c, tick + 1)) is not None}
+        for target, active in docks:
+            pair = [next((n for n, members in groups.items() if module in members), -1) for module in (target, active)]
+            if gone not in pair or pair[0] == pair[1]:
+                continue
+            kept = pair[0] if gone == pair[1] else pair[1]
+            before = [force for n in pair if (force := _forces(bodies[n], tick)) is not None]
+            if kept in after and len(before) == len(pair):
+                worst = float(np.fmax(worst, np.abs(after[kept] - np.concatenate(before)).max()))
+                groups[kept] |= groups.pop(gone)
+    return worst
+
+
+def _forces(columns: Columns, tick: int) -> np.ndarray | None:
+    """Commanded forces (n,) of a body in a tick, N; None when it was not there."""
+    row = np.flatnonzero(columns["tick"] == tick)
+    return columns["commanded_n"][row[0]][np.isfinite(columns["commanded_n"][row[0]])] if row.size else None

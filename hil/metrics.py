@@ -47,6 +47,7 @@ SHOWN = {
     "jams": Shown("Jams", digits=0),
     "outcome": Shown("Outcome (0 docked, 1 jammed, 2 unstable, 3 refused, 4 gave up)", digits=0),
     "false_declarations": Shown("Ticks in which a dock was believed that was none", digits=0),
+    "join_jump_n": Shown("Thruster command's step when bodies join, largest", "N", digits=2),
     "warnings": Shown("Warnings of the firmware, whole flight", digits=0),
     "duration_s": Shown("Duration of the judged part", "s"),
     "real_time_factor": Shown("Faster than real time by", "times", digits=1),
