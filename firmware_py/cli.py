@@ -27,6 +27,10 @@ app = typer.Typer(
 )
 
 
+log_app = typer.Typer(help="Logs that runs left.", no_args_is_help=True)
+app.add_typer(log_app, name="log")
+
+
 @app.callback()
 def modcube() -> None:
     """Controller of a self-reconfigurable underwater robot."""
@@ -110,6 +114,20 @@ def replay(
     from firmware_py.app.replay_report import replay_and_say
 
     raise typer.Exit(replay_and_say(log, tolerance, say=lambda line: typer.echo(line)))
+
+
+@log_app.command()
+def recover(log: Annotated[Path, typer.Argument(help="folder that a run left: can.log and signals.mcap")]) -> None:
+    """Mend a log that kill -9 or a pulled plug has torn: every whole tick stays; what was torn is kept as NAME.torn."""
+    from firmware_py.runtime.log_recovery import recover as mend
+
+    ticks, torn = mend(log)
+    typer.echo(f"{log}: {torn}; mended, {ticks} ticks" if torn else f"{log}: whole, {ticks} ticks; nothing to do")
+
+
+@log_app.callback()
+def logs() -> None:
+    """Logs that runs left."""
 
 
 def main() -> None:

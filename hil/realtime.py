@@ -93,7 +93,7 @@ def fly_in_real_time(
             if not plant.is_alive():
                 raise RuntimeError("the plant's process ended before it was ready")
         script = script_of(scenario, fleet)
-        recorder = Recorder(out, configuration_of(firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz))
+        recorder = Recorder(out, configuration_of(firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz), queued=True)
         stack.callback(recorder.close)
         start_ns = 0
 

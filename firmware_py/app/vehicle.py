@@ -100,15 +100,17 @@ def run_vehicle(
     operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
     with ExitStack() as stack:
         stack.callback(worker.close)
-        observers: list[Observer] = [telling(say)]
+        observers: list[Observer] = []
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
         if out is not None or live is not None:
-            recorder = Recorder(out, configuration_of(firmware, rate_hz=fleet.rate_hz), live.context if live is not None else None)
+            configuration = configuration_of(firmware, rate_hz=fleet.rate_hz)
+            recorder = Recorder(out, configuration, live.context if live is not None else None, queued=True)
             stack.callback(recorder.close)
             observers.append(recording(recorder, fleet.rate_hz))
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
+        observers.append(telling(say))  # after the recorder, which may have something to say
         for line in stack.enter_context(real_time()):
             say(f"warning: {line}")
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests

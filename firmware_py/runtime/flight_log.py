@@ -65,21 +65,23 @@ class FlightLog:
     def ticks(self) -> Iterator[LoggedTick]:
         """Every tick that both files hold whole, in order. Raises LogError where they do not belong together.
 
-        Of a log that was not closed the last tick of can.log is left out: frames that it sent may be missing.
+        The last tick of a can.log that ends too early is left out: frames that it sent may be missing.
         """
-        groups = self._frames(keep_last=not self.torn)
-        for logged in self._thoughts():
+        groups, thoughts = self._frames(), self._thoughts()
+        for logged in thoughts:
             group = next(groups, None)
             if group is None:
                 self.torn = self.torn or f"{CAN_LOG} ends before tick {logged.tick}"
                 return
-            stamp, lines = group
-            if stamp != candump_stamp(logged.time_ns):
-                raise LogError(f"{self.folder}: {CAN_LOG} has frames of {stamp} where {SIGNAL_LOG} has tick {logged.tick}")
-            wanted = _received_frames(logged)
-            _sort_lines(lines, logged)
-            if len(logged.received) != wanted:
-                raise LogError(f"{self.folder}: {CAN_LOG} has {len(logged.received)} frames for tick {logged.tick}, which took {wanted}")
+            if group.stamp != candump_stamp(logged.time_ns):
+                raise LogError(f"{self.folder}: {CAN_LOG} has frames of {group.stamp} where {SIGNAL_LOG} has tick {logged.tick}")
+            _sort_lines(group.lines, logged)
+            wanted, came = _received_frames(logged), len(logged.received)
+            if group.is_last and (self.torn or came != wanted or next(thoughts, None) is not None):
+                self.torn = self.torn or f"{CAN_LOG} ends with tick {logged.tick}"
+                return
+            if came != wanted:
+                raise LogError(f"{self.folder}: {CAN_LOG} has {came} frames for tick {logged.tick}, which took {wanted}")
             yield logged
         if next(groups, None) is not None:
             self.torn = self.torn or f"{SIGNAL_LOG} ends before {CAN_LOG}"
@@ -101,16 +103,24 @@ class FlightLog:
         if now is not None:
             yield now
 
-    def _frames(self, keep_last: bool) -> Iterator[tuple[str, list[str]]]:
-        """Stamp and lines of every tick of can.log; half a line at the end is left out."""
+    def _frames(self) -> Iterator[_Group]:
+        """The lines of can.log tick by tick; half a line at the end is left out."""
         with (self.folder / CAN_LOG).open(encoding="ascii", errors="replace") as file:
-            before: tuple[str, list[str]] | None = None
+            before: _Group | None = None
             for stamp, lines in groupby((line for line in file if line.endswith("\n")), key=_stamp):
                 if before is not None:
                     yield before
-                before = stamp, list(lines)
-            if before is not None and keep_last:
-                yield before
+                before = _Group(stamp, list(lines), False)
+            if before is not None:
+                yield before._replace(is_last=True)
+
+
+class _Group(NamedTuple):
+    """The lines of can.log with one stamp."""
+
+    stamp: str
+    lines: list[str]
+    is_last: bool
 
 
 _TICK = Layout("Tick", TICK_SIGNALS)

@@ -25,6 +25,7 @@ from foxglove.mcap import MCAPWriteOptions
 
 from firmware_py.core.types import Event, Inputs, Outputs
 from firmware_py.description.signals import Layout, TextLayout
+from firmware_py.runtime.guarded_file import GuardedFile, QueuedFile
 from firmware_py.runtime.tick_messages import EVENTS, REQUESTS, TICKS, TickMessages
 
 CAN_LOG = "can.log"
@@ -50,56 +51,11 @@ def candump_lines(time_ns: int, bus: int, direction: str, frames: Iterable[tuple
     return "".join([start + _ID_TEXTS[frame_id] + data.hex().upper() + end for frame_id, data in frames])
 
 
-class GuardedFile:
-    """A file whose errors are kept instead of raised: after the first one it takes everything and writes nothing."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.error: OSError | None = None
-        self._position = 0
-        self._file = None
-        try:
-            self._file = path.open("wb", buffering=0)  # bytes given are with the system: kill -9 loses none
-        except OSError as error:
-            self.error = error
-
-    def write(self, data: bytes | bytearray) -> int:
-        """Append; always says that all was taken."""
-        if self.error is None:
-            try:
-                self._append(data)
-            except OSError as error:
-                self.error = error
-        self._position += len(data)
-        return len(data)
-
-    def _append(self, data: bytes | bytearray) -> None:
-        view = memoryview(data)
-        while view and self._file is not None:
-            view = view[self._file.write(view) :]
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """The position; the log is written forward only."""
-        return self._position
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def close(self) -> None:
-        """Close; a second time does nothing."""
-        if self._file is not None:
-            try:
-                self._file.close()
-            except OSError as error:
-                self.error = self.error or error
-            self._file = None
-
-
 class Recorder:
     """Writes both logs of one run into a folder. No call raises for a full disk: `flush` reports it once, as an Event.
 
-    Call `sent` and `received` as frames go and come, `record` once a tick after the step, `flush` every half second off
-    the tick (from the same thread or another), `close` at the end.
+    Call `sent` and `received` as frames go and come, `record` once a tick after the step, `flush` every half second once the tick's
+    commands are out, `close` at the end.
     """
 
     def __init__(
@@ -107,6 +63,7 @@ class Recorder:
         folder: Path | None,
         configuration: Mapping[str, Any] | None = None,
         context: foxglove.Context | None = None,
+        queued: bool = False,
     ) -> None:
         """Opens both files.
 
@@ -114,9 +71,11 @@ class Recorder:
             folder: where they go; None: nowhere, for signals that are only looked at live.
             configuration: attached to the signals.
             context: the channels' own; give one to serve them live too. Topics of LIVE_ONLY stay out of the file.
+            queued: threads of their own write the files, so that a disk that stalls holds up no tick.
         """
-        self._can = GuardedFile(folder / CAN_LOG if folder is not None else Path(os.devnull))
-        self._mcap = GuardedFile(folder / SIGNAL_LOG if folder is not None else Path(os.devnull))
+        kind = QueuedFile if queued else GuardedFile
+        self._can = kind(folder / CAN_LOG if folder is not None else Path(os.devnull))
+        self._mcap = kind(folder / SIGNAL_LOG if folder is not None else Path(os.devnull))
         self._frames: deque[tuple[int, int, str, tuple[tuple[int, bytes], ...]]] = deque()
         self._received = 0
         self._reported = False

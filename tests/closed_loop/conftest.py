@@ -3,6 +3,7 @@
 What is broken on purpose is broken on the plant's side; the firmware flies unchanged.
 """
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,11 +13,26 @@ import hil.scenario
 from firmware_py.bus.codec import Frame
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle, load_vehicle
+from hil.bench import fly_scenario
 from hil.checks import Result
 from hil.flight import fly_and_judge
 from hil.nodes import Nodes
 from hil.scenario import Scenario
-from tests.closed_loop.flights import Corrupt, Fly, Rebuild
+from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
+
+
+@pytest.fixture(scope="session")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of five seconds, 500 ticks: arms, holds, and begins to climb."""
+    folder = tmp_path_factory.mktemp("flown")
+    fly_scenario(shortened("spiral", duration_s=2.0, settle_s=3.0), 0, Parameters(), folder, "virtual:flown")
+    return folder
+
+
+@pytest.fixture
+def log(flown: Path, tmp_path: Path) -> Path:
+    """A copy of that log, to spoil."""
+    return Path(shutil.copytree(flown, tmp_path / "log"))
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """A recorded flight goes through the same code again and comes out the same, and what does not is named."""
 
 import dataclasses
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,23 +19,6 @@ from tests.closed_loop.flights import Fly, shortened
 TICKS = 500
 THRUSTER_CMD_A, GYRO = "081", "101"
 """Ids of the one module."""
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The log of five seconds: arms, holds, and begins to climb."""
-    from firmware_py.description.parameters import Parameters
-    from hil.bench import fly_scenario
-
-    folder = tmp_path_factory.mktemp("flown")
-    fly_scenario(shortened("spiral", duration_s=2.0, settle_s=3.0), 0, Parameters(), folder, "virtual:flown")
-    return folder
-
-
-@pytest.fixture
-def log(flown: Path, tmp_path: Path) -> Path:
-    """A copy to spoil."""
-    return Path(shutil.copytree(flown, tmp_path / "log"))
 
 
 def spoil(path: Path, frame_id: str, tick: int, change: int) -> None:

@@ -1,0 +1,197 @@
+"""Whatever happens to the process or its disk: the log is there up to a second before, is read up to its tear, and can be mended."""
+
+import errno
+import resource
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.app.replay import replay
+from firmware_py.app.vehicle import recording
+from firmware_py.core.types import Inputs, Outputs
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.signals import is_closed
+from firmware_py.runtime import guarded_file
+from firmware_py.runtime.flight_log import FlightLog, LogError
+from firmware_py.runtime.guarded_file import GuardedFile, QueuedFile
+from firmware_py.runtime.log_recovery import recover
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
+from hil.bench import open_bench
+from tests.closed_loop.flights import shortened
+
+TICKS, TICKS_A_SECOND = 500, 100
+KILLED_AT = 437
+KILLED = f"""
+import os, signal, sys
+from contextlib import ExitStack
+from pathlib import Path
+from firmware_py.app.configuration import configuration_of
+from firmware_py.app.vehicle import recording
+from firmware_py.description.parameters import Parameters
+from firmware_py.runtime.recorder import Recorder
+from hil.bench import open_bench
+from hil.scenario import load_scenario
+
+def kill(received, sent, inputs, outputs):
+    if outputs.tick == {KILLED_AT}:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+with ExitStack() as stack:
+    bench = open_bench(stack, load_scenario("hover"), 0, Parameters(), "virtual:killed")
+    recorder = Recorder(Path(sys.argv[1]), configuration_of(bench.firmware), queued=True)
+    bench.fly([recording(recorder, 100), kill])
+"""
+
+
+def ticks_of(folder: Path) -> list[int]:
+    return [logged.tick for logged in FlightLog(folder).ticks()]
+
+
+def tear(path: Path, share: float) -> None:
+    """Leaves only the beginning of a file."""
+    data = path.read_bytes()
+    path.write_bytes(data[: round(share * len(data))])
+
+
+def test_killed_process_leaves_a_log_that_lacks_a_second_at_the_most(tmp_path: Path) -> None:
+    process = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], capture_output=True, text=True)
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    outcome = replay(tmp_path)
+    assert outcome.first is None
+    assert outcome.torn == "signals.mcap was not closed"
+    assert KILLED_AT - TICKS_A_SECOND <= outcome.ticks <= KILLED_AT
+    assert recover(tmp_path).ticks == outcome.ticks
+    mended = replay(tmp_path)
+    assert (mended.first, mended.ticks, mended.torn) == (None, outcome.ticks, "")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_torn_log_is_read_up_to_the_tear_and_mended(log: Path, seed: int) -> None:
+    shares = np.random.default_rng(seed).uniform(0.05, 1.0, 2)
+    if seed < 4:
+        tear(log / SIGNAL_LOG, shares[0])
+    if seed > 1:
+        tear(log / CAN_LOG, shares[1])
+    torn = {name: (log / name).read_bytes() for name in (CAN_LOG, SIGNAL_LOG)}
+    ticks = ticks_of(log)
+    assert ticks == list(range(1, len(ticks) + 1))
+    assert len(ticks) >= TICKS * min(shares[0] if seed < 4 else 1.0, shares[1] if seed > 1 else 1.0) - TICKS_A_SECOND
+    assert replay(log).first is None
+    recovery = recover(log)
+    assert recovery.torn
+    assert recovery.ticks == len(ticks)
+    assert {name: (log / f"{name}.torn").read_bytes() for name in torn} == torn
+    assert is_closed(log / SIGNAL_LOG)
+    mended = replay(log)
+    assert (mended.first, mended.ticks, mended.torn) == (None, len(ticks), "")
+    assert recover(log) == (len(ticks), "")
+
+
+def test_half_a_line_of_can_log_is_left_out(log: Path) -> None:
+    tear(log / SIGNAL_LOG, 0.9)
+    (log / CAN_LOG).write_bytes((log / CAN_LOG).read_bytes()[:-20])
+    assert replay(log).first is None
+
+
+def test_whole_log_is_left_as_it_is(log: Path) -> None:
+    before = {path.name: path.read_bytes() for path in log.iterdir()}
+    assert recover(log) == (TICKS, "")
+    assert {path.name: path.read_bytes() for path in log.iterdir()} == before
+
+
+def test_log_of_which_nothing_is_whole_is_refused_and_left(log: Path) -> None:
+    tear(log / SIGNAL_LOG, 0.001)
+    with pytest.raises(LogError, match="no tick of the log is whole"):
+        recover(log)
+    assert not list(log.glob("*.torn")) + list(log.glob("*.mended"))
+
+
+# ---------------------------------------------------------------- the disk
+
+
+def fly_recorded(folder: Path, queued: bool = False) -> tuple[list[BusFrame], list[str]]:
+    """Five seconds: the frames that the firmware sent, and what was said of the log."""
+    sent_all: list[BusFrame] = []
+    said: list[str] = []
+
+    def observe(received: list[BusFrame], sent: list[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        sent_all.extend(sent)
+        said.extend(event.text for event in outputs.events if "log" in event.text)
+
+    with ExitStack() as stack:
+        bench = open_bench(stack, shortened("spiral", 2.0, 3.0), 0, Parameters(), f"virtual:{folder.name}")
+        recorder = Recorder(folder, queued=queued)
+        stack.callback(recorder.close)
+        bench.fly([recording(recorder, TICKS_A_SECOND), observe])
+    return sent_all, said
+
+
+def test_full_disk_ends_the_log_and_changes_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, said = fly_recorded(tmp_path)
+    assert said == []
+    append = GuardedFile._append
+
+    def append_to_full_disk(self: GuardedFile, data: bytes) -> None:
+        if self._position + len(data) > 100_000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        append(self, data)
+
+    monkeypatch.setattr(GuardedFile, "_append", append_to_full_disk)
+    full, said = fly_recorded(tmp_path)
+    assert full == whole
+    assert said == ["no more log: signals.mcap: No space left on device"]
+    assert 0 < len(ticks_of(tmp_path)) < TICKS
+
+
+def test_file_that_may_not_grow_ends_the_log_with_one_warning(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        _, said = fly_recorded(tmp_path, queued=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert len(said) == 1
+    assert said[0].endswith("File too large")
+    assert (tmp_path / SIGNAL_LOG).stat().st_size <= 100_000
+    assert 0 < len(ticks_of(tmp_path)) < TICKS
+
+
+def test_disk_that_stalls_holds_up_no_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, _ = fly_recorded(tmp_path)
+    monkeypatch.setattr(guarded_file, "MOST_WAITING_BYTES", 50_000)
+    stalled = threading.Event()
+    append = GuardedFile._append
+
+    def append_when_it_goes_on(self: GuardedFile, data: bytes) -> None:
+        stalled.wait()
+        append(self, data)
+
+    monkeypatch.setattr(GuardedFile, "_append", append_when_it_goes_on)
+    monkeypatch.setattr(guarded_file, "CLOSE_S", 0.0)
+    give_up = threading.Timer(60.0, stalled.set)  # should it hold up a tick after all, the test fails instead of hanging
+    give_up.start()
+    flown, said = fly_recorded(tmp_path, queued=True)
+    give_up.cancel()
+    assert not stalled.is_set()
+    stalled.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("log "):
+            thread.join()
+    assert flown == whole
+    assert said == ["no more log: can.log: the disk does not keep up"]
+
+
+def test_what_waits_is_written_at_the_end(tmp_path: Path) -> None:
+    file = QueuedFile(tmp_path / "log")
+    for i in range(1000):
+        file.write(bytes([i % 256]))
+    file.close()
+    file.close()
+    assert (tmp_path / "log").read_bytes() == bytes(i % 256 for i in range(1000))
