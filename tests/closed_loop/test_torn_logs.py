@@ -185,7 +185,7 @@ def test_disk_that_stalls_holds_up_no_tick(tmp_path: Path, monkeypatch: pytest.M
         if thread.name.startswith("log "):
             thread.join()
     assert flown == whole
-    assert said == ["no more log: can.log: the disk does not keep up"]
+    assert said == ["no more log: signals.mcap: the disk does not keep up"]
 
 
 def test_what_waits_is_written_at_the_end(tmp_path: Path) -> None:
