@@ -30,9 +30,13 @@ def expected_pairs(scenario: Scenario) -> dict[tuple[int, int], bool]:
 
 
 def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
-    """`docked`: everything is together or apart as the steps want; `tries`: meetings of a probe and a funnel; `jams`;
-    `outcome`: index into OUTCOMES; `false_declarations`: ticks in which the firmware believed in a dock that was none;
-    `join_jump_n`: largest step of a thruster's commanded force in a tick in which bodies were joined, N.
+    """What came of a run with [[step]]s.
+
+    Returns:
+        docked: everything is together or apart as the steps want; tries: meetings of a probe and a funnel; jams; outcome:
+        index into OUTCOMES; false_declarations: bodies that the firmware joined and that were not; join_jump_n: largest step
+        of a thruster's commanded force in a tick in which bodies were joined, N; docked_rmse_m: position of all joined bodies
+        against their set-points.
 
     Raises:
         OSError: a log is missing. ValueError: it holds no docks.
@@ -51,6 +55,7 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
         "outcome": float(outcome),
         "false_declarations": float(_false_declarations(truths, signals)),
         "join_jump_n": _join_jump_n(scenario, signals),
+        "docked_rmse_m": _docked_rmse_m(truths, signals),
     }
 
 
@@ -78,7 +83,8 @@ def _bodies(channels: Mapping[str, Columns], prefix: str, ticks: np.ndarray) -> 
 def _false_declarations(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> int:
     ticks = truths["/plant/docks"]["tick"]
     believed, real = _bodies(signals, "/firmware/body", ticks), _bodies(truths, "/plant/body", ticks)
-    return int(((believed > 0) & (believed < real)).sum())
+    joined = np.diff(believed, prepend=believed[:1]) < 0
+    return int((joined & (believed > 0) & (believed < real)).sum())
 
 
 def _failure(docks: Columns, signals: Mapping[str, Columns]) -> int:
@@ -106,7 +112,7 @@ def _join_jump_n(scenario: Scenario, signals: Mapping[str, Columns]) -> float:
     groups = {group[0]: set(group) for group in scenario.groups}
     docks = [(scenario.index_of(step.target_module), scenario.index_of(step.module)) for step in scenario.step if step.do == "dock"]
     worst = math.nan
-    for tick, gone in sorted((int(columns["tick"][-1]), number) for number, columns in bodies.items()):
+    for tick, gone in sorted((int(tick), number) for number, columns in bodies.items() for tick in _ends(columns["tick"])):
         after = {n: force for n, c in bodies.items() if (force := _forces(c, tick + 1)) is not None}
         for target, active in docks:
             pair = [next((n for n, members in groups.items() if module in members), -1) for module in (target, active)]
@@ -118,6 +124,28 @@ def _join_jump_n(scenario: Scenario, signals: Mapping[str, Columns]) -> float:
                 worst = float(np.fmax(worst, np.abs(after[kept] - np.concatenate(before)).max()))
                 groups[kept] |= groups.pop(gone)
     return worst
+
+
+def _ends(ticks: np.ndarray) -> np.ndarray:
+    """Last tick of each run of ticks without a gap."""
+    return ticks[np.append(np.flatnonzero(np.diff(ticks) > 1), len(ticks) - 1)]
+
+
+def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> float:
+    """Position of the truth against the set-point over the ticks in which both logs know of a joined body; NaN without any."""
+    squares, thrusters = [np.zeros(0)], truths["/plant/module0"]["force_n"].shape[1]
+    for name, true in truths.items():
+        believed = signals.get(name.replace("/plant/body", "/firmware/body"))
+        if not name.startswith("/plant/body") or believed is None:
+            continue
+        _, mine, theirs = np.intersect1d(true["tick"], believed["tick"], return_indices=True)
+        forces = np.isfinite(believed["commanded_n"][theirs]).sum(axis=1)
+        members = (true["member"][mine] > 0.0).sum(axis=1)
+        joined = (members > 1) & (forces == members * thrusters)
+        gap = true["p_wb"][mine][joined] - believed["setpoint_p_wb"][theirs][joined]
+        squares.append(np.sum(gap**2, axis=1))
+    everything = np.concatenate(squares)
+    return float(np.sqrt(everything.mean())) if everything.size else math.nan
 
 
 def _forces(columns: Columns, tick: int) -> np.ndarray | None:
