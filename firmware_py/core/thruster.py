@@ -64,12 +64,6 @@ def commands(force, scale, forward, reverse, deadband, limit_share, out):  # typ
             out[i] = -min(inverse(reverse[i], -f), limit_share[i])
 
 
-def is_monotone(coefficients: np.ndarray) -> bool:
-    """Whether a force polynomial rises over commands 0..1, so that it has an inverse."""
-    x = np.linspace(0.0, 1.0, 401)
-    return bool(np.all(np.diff([polynomial(np.array(coefficients, dtype=np.float64), v) for v in x]) > 0.0))
-
-
 @njit("float64(float64[::1],float64[:,::1],float64[:,::1])", cache=True)
 def total_power(force, power_forward, power_reverse):  # type: ignore[no-untyped-def]
     """Electrical power of all thrusters, W."""

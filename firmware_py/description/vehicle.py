@@ -47,6 +47,14 @@ class Inertial:
         0.0, unit="m", low=-0.5, high=0.5, help="centre of buoyancy above the centre of mass, times dry weight a moment"
     )
 
+    def __post_init__(self) -> None:
+        least, middle, most = np.linalg.eigvalsh(self.inertia)
+        if not np.array_equal(self.inertia, self.inertia.T) or least <= 0.0 or most > (least + middle) * (1.0 + 1e-9):
+            raise DescriptionError(
+                f"inertia {self.inertia.tolist()} is none that a body can have: "
+                "it must be symmetric and positive, no principal moment above the sum of the others"
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Payload:
@@ -94,6 +102,17 @@ class ThrusterCurve:
     deadband_n: float = quantity(0.0, unit="N", low=0.0, high=10.0, help="forces asked below this give none")
     lag_s: float = quantity(unit="s", low=0.0, high=2.0, help="first-order lag of the force")
     rpm_at_full: float = quantity(3000.0, unit="1/min", low=1.0, high=1e5, help="speed at command 1")
+
+    def __post_init__(self) -> None:
+        for name in ("forward", "reverse"):
+            if not _rises(getattr(self, name), 1.0):
+                raise DescriptionError(f"{name} {getattr(self, name).tolist()} falls somewhere in 0..1; force must rise with the command")
+
+
+def _rises(coefficients: np.ndarray, end: float) -> bool:
+    """Whether c[0] x + ... + c[4] x^5 rises all the way over 0..end."""
+    x = np.linspace(0.0, end, 401)
+    return bool(np.all(np.diff(x[:, None] ** np.arange(1, coefficients.size + 1) @ coefficients) > 0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -161,6 +180,11 @@ class Vehicle:
             raise DescriptionError(f"faces {self.faces!r} needs six letters out of P, D and -")
         if len({tag.id for tag in self.tag}) != len(self.tag):
             raise DescriptionError("two [[tag]] tables have the same id")
+        for name, side, full in (("forward", self.curve.forward, self.force_max_n), ("reverse", self.curve.reverse, -self.force_min_n)):
+            if full > float(np.sum(side)) * (1.0 + 1e-9):
+                raise DescriptionError(f"the {name} limit of {full:g} N is above the {np.sum(side):g} N of curve.{name} at full command")
+            if not _rises(getattr(self.curve, f"power_{name}"), full):
+                raise DescriptionError(f"curve.power_{name} falls somewhere in 0..{full:g} N; power must rise with the force")
 
     @property
     def positions(self) -> np.ndarray:

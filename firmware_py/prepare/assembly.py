@@ -24,6 +24,8 @@ GRAVITY = 9.80665
 """m/s^2, standard."""
 
 MOST_MODULES = 64
+CHANNELS = 8
+"""Thrusters that one module's frames carry."""
 
 PITCH_M = 0.21
 """Lattice pitch of the paper's module (its docking condition 2)."""
@@ -80,6 +82,9 @@ def assemble_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle], cache: DragCac
         chosen = [fleet.module[i] for i in members]
         cells = np.rint([m.cell for m in chosen]).astype(int)
         descriptions = [vehicles[m.vehicle] for m in chosen]
+        for vehicle in descriptions:
+            if len(vehicle.thruster) > CHANNELS:
+                raise DescriptionError(f"vehicle {vehicle.name}: {len(vehicle.thruster)} thrusters; a module's frames carry {CHANNELS}")
         bodies.append(assemble(cells, [m.rotation for m in chosen], descriptions, members, fleet.pitch_m, cache))
     return bodies
 

@@ -293,3 +293,9 @@ def test_fleet_starts_as_its_file_says(modcube: Vehicle) -> None:
     bodies = assemble_fleet(Fleet(module=modules), {"modcube": modcube})
     assert [b.modules for b in bodies] == [(0, 2), (1,)]
     np.testing.assert_allclose(bodies[0].r_bm, [[0, -PITCH / 2, 0], [0, PITCH / 2, 0]], atol=1e-12)
+
+
+def test_vehicle_with_more_thrusters_than_its_frames_carry_cannot_fly(modcube: Vehicle) -> None:
+    crowded = dataclasses.replace(modcube, name="crowded", thruster=(*modcube.thruster, modcube.thruster[0]))
+    with pytest.raises(DescriptionError, match="vehicle crowded: 9 thrusters; a module's frames carry 8"):
+        assemble_fleet(Fleet(module=(Module(number=1),)), {"modcube": crowded})
