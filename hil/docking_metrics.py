@@ -97,12 +97,13 @@ def _failure(docks: Columns, signals: Mapping[str, Columns]) -> int:
 
 
 def _off_attitude(signals: Mapping[str, Columns]) -> float:
-    """Largest angle between set-point and estimate of any body."""
+    """Largest angle between set-point and estimate of any body whose pose is known."""
     worst = 0.0
     for name, columns in signals.items():
         if name.startswith("/firmware/body"):
             cosine = np.abs(np.sum(columns["q_wb"] * columns["setpoint_q_wb"], axis=1))
-            worst = max(worst, float(2.0 * np.arccos(np.clip(cosine, 0.0, 1.0)).max()))
+            known = np.where(columns["ready"], np.clip(cosine, 0.0, 1.0), 1.0)
+            worst = max(worst, float(2.0 * np.arccos(known).max()))
     return worst
 
 

@@ -18,6 +18,11 @@ ATMOSPHERE_PA = 101_325.0
 FLIP_RAD = 0.35
 """Tags of one picture that disagree with their median by more are flipped and left out (20 deg; noise is 0.5)."""
 
+SECOND_HAND = 0
+"""Quality of a tag whose place was told through another one, by a camera that a module carries: the other's errors add to its own."""
+SECOND_HAND_WEIGHT = 1.0 / 9.0
+"""What such a tag is worth: half a degree of the carrier over half a metre is three times a tag's own noise."""
+
 
 class Measurements:
     """Fuses what the modules of one body say. Holds nothing but geometry."""
@@ -83,12 +88,17 @@ def _one_pose(capture_ns: int, seen: Seen, q_wb: np.ndarray) -> BodyPose:
         seen = _agreeing(seen, q_wb)
     if len(seen) == 1:
         tag, lever, q_wb = seen[0]
-        return BodyPose(capture_ns, tag.p_wt, lever, q_wb, 1)
+        return BodyPose(capture_ns, tag.p_wt, lever, q_wb, _weight(tag))
     reference = seen[0][2]
     mean = np.mean([difference(q, reference) for _, _, q in seen], axis=0)
     q_wb = multiply(reference, exp(mean))
     p_wt = np.mean([t.p_wt for t, _, _ in seen], axis=0)
-    return BodyPose(capture_ns, p_wt, np.mean([r for _, r, _ in seen], axis=0), q_wb, len(seen))
+    return BodyPose(capture_ns, p_wt, np.mean([r for _, r, _ in seen], axis=0), q_wb, sum(_weight(tag) for tag, _, _ in seen))
+
+
+def _weight(tag: TagObservation) -> float:
+    """How many tags of full quality an observation is worth."""
+    return SECOND_HAND_WEIGHT if tag.quality == SECOND_HAND else 1.0
 
 
 def _agreeing(seen: Seen, q_wb: np.ndarray) -> Seen:

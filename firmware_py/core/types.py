@@ -195,8 +195,8 @@ class BodyPose(NamedTuple):
     """(3,) mean of the tag centres from the centre of mass, body frame, m."""
     q_wb: Array
     """(4,) attitude of the body."""
-    tags: int
-    """Tags that went into it; the noise falls with its root."""
+    tags: float
+    """Tags of full quality that it is worth; the noise falls with the root."""
 
 
 class Estimate(NamedTuple):

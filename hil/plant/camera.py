@@ -20,6 +20,8 @@ from hil.plant.sight import look, solid_boxes
 from hil.plant.spec import CameraPose, SensorSpec
 from hil.plant.world import World
 
+SECOND_HAND = 0
+"""Quality of a tag that was placed in the world through another one."""
 ALL_TAGS = 1 << 16
 """Key of the first stream of the cameras that read every tag."""
 HALF_TURN_Z = np.array([0.0, 0.0, 0.0, 1.0])
@@ -120,7 +122,7 @@ class Camera:
                 p, q = self._blur(p, q, drawn, eye, axis)
                 if self.carrier >= 0:
                     p, q = _seen_from(poses[self.carrier], p, q)
-                found.append(Sighting(m, tag.id, capture_ns, p, q, round(7 * cosines[k]), self.carrier))
+                found.append(Sighting(m, tag.id, capture_ns, p, q, max(1, round(7 * cosines[k])), self.carrier))
         return found
 
     def _best(self, cosines: Sequence[float]) -> list[int]:
@@ -175,7 +177,7 @@ def in_the_world(relative: Sighting, carrier: Sighting, tag: Tag) -> Sighting:
     p_wc = carrier.p_wt - rotations.rotate(q_wc, np.array(tag.position_m))
     p = p_wc + rotations.rotate(q_wc, relative.p_wt)
     q = rotations.normalise(rotations.multiply(q_wc, relative.q_wt))
-    return relative._replace(p_wt=p, q_wt=q, carrier=-1)
+    return relative._replace(p_wt=p, q_wt=q, quality=SECOND_HAND, carrier=-1)
 
 
 def _tag_rows(tags: Sequence[tuple[int, Tag]]) -> np.ndarray:
