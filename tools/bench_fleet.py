@@ -2,64 +2,97 @@
 
 from __future__ import annotations
 
+from collections import deque
 from time import perf_counter_ns
 
 import numpy as np
 
+from firmware_py.core import propagation
 from firmware_py.core.body import Body
 from firmware_py.core.measurements import ATMOSPHERE_PA, WATER_DENSITY
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.pipeline import Pipeline
-from firmware_py.core.rotations import conjugate, multiply, normalise, rotate, rotate_back, to_matrix
-from firmware_py.core.types import Action, EscFeedback, Inputs, ModuleInputs, Request, TagObservation
+from firmware_py.core.propagation import STATES
+from firmware_py.core.rotations import multiply, normalise, rotate, to_matrix
+from firmware_py.core.thruster import ThrusterLag
+from firmware_py.core.types import Action, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 PERIOD_NS = 10_000_000
-SETTLE_TICKS = 300
-"""Before anything is timed: pose found, armed, holding."""
-DEPTH_M = 2.0
+PERIOD_S = 1e-9 * PERIOD_NS
+ARM_TICK, SETTLE_TICKS = 50, 300
+"""Armed when a pose is found; timed once the disturbance is learnt and the place held."""
+START_W = np.array([0.0, 0.0, 2.0])
+CURRENT_N, TRIM_NM = np.array([0.6, -0.4, 0.3]), np.array([0.02, -0.03, 0.01])
+"""Each module's share of what pushes and turns the body: world, body frame."""
 SIGMA_M, SIGMA_RAD, SIGMA_RATE, SIGMA_ACCEL = 0.002, 0.009, 0.002, 0.02
-ESC_EVERY, SLOW_EVERY, TAG_EVERY = 5, 10, 2
-"""Ticks between two feedbacks of an ESC, between two readings of the supply and cabin, and between two pictures."""
+DEPTH_EVERY, ESC_EVERY, SLOW_EVERY, TAG_EVERY, TAG_DELAY = 2, 5, 10, 2, 4
+"""Ticks between two readings of the depth, of an ESC, of supply, cabin and magnets, and between two pictures; and from a
+picture to its arrival."""
 
 
-class StillFleet:
-    """The inputs of a body of n modules that hangs still in the water, with noise; every module answers in every tick."""
+class FleetInWater:
+    """The body in water that is the controller's own model, with noise; every module answers in every tick."""
 
     def __init__(self, body: Body, seed: int) -> None:
+        drag, t, modules = body.drag, body.thrusters, range(len(body.modules))
         self._body, self._rng = body, np.random.default_rng(seed)
-        self._modules = range(len(body.modules))
+        self._plant = (body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear)
+        self._acts, self._tau = ThrusterLag(t, PERIOD_S), np.zeros(6)
+        self.x = np.zeros(STATES)
+        """(26,) true state, as core.propagation orders it."""
+        self.x[:3], self.x[3] = START_W, 1.0
+        self.x[19:22], self.x[22:25] = len(modules) * CURRENT_N, len(modules) * TRIM_NM
+        self._past: deque[np.ndarray] = deque([self.x], maxlen=TAG_DELAY + 1)
         self._turned = [to_matrix(np.ascontiguousarray(q)).T for q in body.q_bm]
-        self._tag_of = {int(m): k for k, m in enumerate(body.tag_module)}
+        self._tags = [int(np.flatnonzero(body.tag_module == m)[-1]) for m in modules]
+        self._mine = [np.flatnonzero(t.module == m) for m in modules]
+        self._full_n = t.forward.sum(axis=1), t.reverse.sum(axis=1)
+
+    def move(self, outputs: Outputs) -> None:
+        """One period with the forces that a tick commanded."""
+        self._tau = self._body.thrusters.matrix @ self._acts.step()
+        self._acts.command(outputs.records[0].commanded_n)
+        self.x = propagation.step(self.x, self._tau, PERIOD_S, *self._plant)
+        self._past.append(self.x)
 
     def inputs(self, tick: int, requests: list[Request]) -> Inputs:
         """Those of tick `tick`."""
-        return Inputs(tick, tick * PERIOD_NS, [self._module(m, tick) for m in self._modules], requests, False, 0, False)
+        down = to_matrix(self.x[3:7].copy())[2]
+        felt = propagation.inertial_acceleration(self.x, self._tau, *self._plant) - GRAVITY * down
+        force = self._acts.force_n
+        speed = self._body.thrusters.rpm_at_full * np.sqrt(np.abs(force) / np.where(force > 0.0, *self._full_n))
+        rpm = np.copysign(speed, force)
+        modules = [self._module(m, tick, felt, down, rpm[mine].tolist()) for m, mine in enumerate(self._mine)]
+        return Inputs(tick, tick * PERIOD_NS, modules, requests)
 
-    def _module(self, m: int, tick: int) -> ModuleInputs:
-        body, noise = self._body, self._rng.standard_normal(13)
-        down = np.array([0.0, 0.0, -GRAVITY])
+    def _module(self, m: int, tick: int, felt: np.ndarray, down: np.ndarray, rpm: list[float]) -> ModuleInputs:
+        body, noise = self._body, self._rng.standard_normal(6)
         found = ModuleInputs(answered=True, heard=True, mcu_state=1)
-        found.gyro = SIGMA_RATE * noise[:3]
-        found.accel = self._turned[m] @ down + SIGMA_ACCEL * noise[3:6]
-        if tick % 2 == 0:
-            found.pressure_pa = ATMOSPHERE_PA + WATER_DENSITY * GRAVITY * (DEPTH_M + float(body.r_bi[m][2]))
+        found.gyro = self._turned[m] @ self.x[10:13] + SIGMA_RATE * noise[:3]
+        found.accel = self._turned[m] @ felt + SIGMA_ACCEL * noise[3:]
+        if tick % DEPTH_EVERY == 0:
+            depth_m = float(self.x[2] + body.r_bi[m] @ down)
+            found.pressure_pa = ATMOSPHERE_PA + WATER_DENSITY * GRAVITY * depth_m
         if tick % ESC_EVERY == m % ESC_EVERY:
-            found.esc = [EscFeedback(first, (0.0, 0.0), (0.1, 0.1), (0, 0)) for first in (0, 2, 4, 6)]
+            found.esc = [EscFeedback(i, (rpm[i], rpm[i + 1]), (0.1, 0.1), (0, 0)) for i in range(0, len(rpm), 2)]
         if tick % SLOW_EVERY == m % SLOW_EVERY:
-            found.voltage_v = float(body.thrusters.voltage_v[body.thrusters.module == m][0])
+            found.voltage_v = float(body.thrusters.voltage_v[self._mine[m][0]])
             found.cabin_temperature_c, found.cabin_pressure_pa, found.leak = 25.0, 1e5, False
             found.dock_current_ma = [0.0] * 6
-        if tick % TAG_EVERY == 0 and m in self._tag_of:
-            k = self._tag_of[m]
-            q_bt = np.ascontiguousarray(body.q_bt[k])
-            place = np.array([0.0, 0.0, DEPTH_M]) + body.r_bt[k] + SIGMA_M * noise[6:9]
-            turn = normalise(np.array([1.0, *(0.5 * SIGMA_RAD * noise[9:12])]))
-            capture_ns = (tick - 4) * PERIOD_NS
-            found.tags = [TagObservation(int(body.tag_ids[k]), 7, capture_ns, place, multiply(q_bt, turn))]
+        if tick % TAG_EVERY == 0 and len(self._past) > TAG_DELAY:
+            found.tags = [self._tag(self._tags[m], (tick - TAG_DELAY) * PERIOD_NS)]
         return found
+
+    def _tag(self, k: int, capture_ns: int) -> TagObservation:
+        body, then, noise = self._body, self._past[0], self._rng.standard_normal(6)
+        q_wb = then[3:7].copy()
+        turn = normalise(np.array([1.0, *(0.5 * SIGMA_RAD * noise[:3])]))
+        q_wt = multiply(multiply(q_wb, np.ascontiguousarray(body.q_bt[k])), turn)
+        p_wt = then[:3] + rotate(q_wb, np.ascontiguousarray(body.r_bt[k])) + SIGMA_M * noise[3:]
+        return TagObservation(int(body.tag_ids[k]), 7, capture_ns, p_wt, q_wt)
 
 
 def cube_of(edge: int) -> Body:
@@ -68,18 +101,23 @@ def cube_of(edge: int) -> Body:
     return assemble(cells, [0] * len(cells), [load_vehicle("modcube")] * len(cells))
 
 
-def tick_us(body: Body, ticks: int = 300, seed: int = 0) -> float:
-    """Mean duration of pipeline.step while the body holds its pose, us. Raises RuntimeError when it does not arm."""
-    pipeline, fleet = Pipeline([body], Parameters(), PERIOD_NS), StillFleet(body, seed)
-    took_ns, armed = 0, False
-    for tick in range(1, SETTLE_TICKS + ticks + 1):
-        requests = [] if armed or tick % 50 else [Request(Action.ARM, body.index)]
-        inputs = fleet.inputs(tick, requests)
+def hold(body: Body, ticks: int = 300, seed: int = 0) -> tuple[float, float]:
+    """Mean duration of pipeline.step while the body holds its place, us, and the farthest it strays then, m.
+
+    Raises RuntimeError when it does not arm, or loses a thruster that pushes as it should.
+    """
+    pipeline, fleet = Pipeline([body], Parameters(), PERIOD_NS), FleetInWater(body, seed)
+    took_ns, strayed_m, said = 0, 0.0, []
+    for tick in range(SETTLE_TICKS + ticks):
+        inputs = fleet.inputs(tick, [Request(Action.ARM, body.index)] if tick == ARM_TICK else [])
         began = perf_counter_ns()
         outputs = pipeline.step(inputs)
-        if tick > SETTLE_TICKS:
-            took_ns += perf_counter_ns() - began
-        armed = outputs.modules[0].armed
-    if not armed:
-        raise RuntimeError(f"a body of {len(body.modules)} modules did not arm: {[e.text for e in outputs.events]}")
-    return 1e-3 * took_ns / ticks
+        elapsed_ns = perf_counter_ns() - began
+        fleet.move(outputs)
+        said += [event.text for event in outputs.events]
+        if tick >= SETTLE_TICKS:
+            took_ns += elapsed_ns
+            strayed_m = max(strayed_m, float(np.linalg.norm(fleet.x[:3] - outputs.records[0].setpoint.p_wb)))
+    if not outputs.modules[0].armed or any("left out" in words for words in said):
+        raise RuntimeError(f"a body of {len(body.modules)} modules does not hold: {'; '.join(said)}")
+    return 1e-3 * took_ns / ticks, strayed_m

@@ -5,14 +5,13 @@ Works on the estimates of this tick; the pipeline carries out the joins and part
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, PairStatus, TagTable
+from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, TagTable
 from firmware_py.core.docking_sequence import (
     RELAY_OFF,
     RELAY_PULL,
@@ -28,6 +27,7 @@ from firmware_py.description.parameters import Docking
 from firmware_py.description.vehicle import FACE_NORMALS
 
 WARNING, INFORMATION = 4, 6
+NEVER_NS = -(1 << 60)
 RELAY_PERIOD_NS = 100_000_000
 """DOCK_CMD goes out at 10 Hz, and at once when a relay changes."""
 
@@ -82,11 +82,17 @@ class _Dock(NamedTuple):
     prepared: Prepared
 
 
-class _Joint(NamedTuple):
+class Joint(NamedTuple):
     """Two faces that hold modules of one body together."""
 
-    detector: PairDetector
     request: DockRequest
+    offset: np.ndarray
+    """(3,) centre of its module in the frame of the target module, m."""
+
+    @property
+    def pair(self) -> FacePair:
+        """What the detector watches."""
+        return FacePair(self.request.target_module, self.request.target_face, self.request.module, self.request.face, self.offset)
 
 
 class _Undock:
@@ -104,12 +110,10 @@ class DockingStage:
         self._p = parameters
         self._tags = tags
         self._relays = np.zeros((modules, 6), dtype=np.int64)
-        self._sent = np.full((modules, 6), -1, dtype=np.int64)
-        self._sent_ns = [-RELAY_PERIOD_NS] * modules
+        self._due_ns = [NEVER_NS] * modules
         self._docks: list[_Dock] = []
         self._undocks: list[_Undock] = []
-        self._joints: list[_Joint] = []
-        self._ready: dict[tuple[int, int], Prepared] = {}
+        self._joints = PairBank([], parameters)
         self.events: list[Event] = []
         self.records: list[DockRecord] = []
 
@@ -117,16 +121,16 @@ class DockingStage:
         """Takes other parameters for docks that begin from now on."""
         self._p = parameters
 
-    def watch_joints(self, bodies: Sequence[Body]) -> None:
-        """Watches every joint within the given bodies; their magnets hold."""
-        kept = {(j.request.module, j.request.target_module): j for j in self._joints}
-        self._joints = []
-        for body in bodies:
-            for request, offset in joints_of(body):
-                old = kept.get((request.module, request.target_module))
-                pair = FacePair(request.target_module, request.target_face, request.module, request.face, offset)
-                self._joints.append(old or _Joint(PairDetector(pair, self._p), request))
-                self._set_relays(request, RELAY_PULL)
+    def watch_joints(self, joints: Sequence[Joint]) -> None:
+        """Watches these joints, all that there are in the fleet; their magnets hold."""
+        self._joints = PairBank([joint.pair for joint in joints], self._p, self._joints)
+        for joint in joints:
+            self._set_relays(joint.request, RELAY_PULL)
+
+    @property
+    def joints(self) -> np.ndarray:
+        """(k,) of PAIR: what is known of every joint in this tick."""
+        return self._joints.rows
 
     @property
     def busy(self) -> frozenset[int]:
@@ -146,9 +150,8 @@ class DockingStage:
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates)
-        for joint in self._joints:
-            status = joint.detector.step(inputs.time_ns, inputs.modules, poses)
-            self.records.append(_record(joint.detector, status, Stage.DOCKED, 1, math.nan, math.nan))
+        if self._joints.rows.size:
+            self._joints.step(inputs.time_ns, inputs.modules, poses)
         for dock in list(self._docks):
             self._steer(dock, inputs, estimates, poses, decisions)
         for undock in list(self._undocks):
@@ -157,11 +160,10 @@ class DockingStage:
 
     def relays(self, module: int, time_ns: int) -> tuple[int, ...] | None:
         """The relay states that a module is to be sent in this tick, or None."""
-        changed = not np.array_equal(self._relays[module], self._sent[module])
-        if not changed and time_ns - self._sent_ns[module] < RELAY_PERIOD_NS:
+        if time_ns < self._due_ns[module]:
             return None
-        self._sent[module], self._sent_ns[module] = self._relays[module], time_ns
-        return tuple(int(r) for r in self._relays[module])
+        self._due_ns[module] = time_ns + RELAY_PERIOD_NS
+        return tuple(self._relays[module].tolist())
 
     # ------------------------------------------------------------ beginnings
 
@@ -175,9 +177,7 @@ class DockingStage:
         else:
             active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
             sequence = DockingSequence(prepared.plan, estimates[active][0], estimates[target][0], self._p, time_ns)
-            pair = FacePair(
-                request.target_module, request.target_face, request.module, request.face, prepared.plan.place_t
-            )
+            pair = FacePair(request.target_module, request.target_face, request.module, request.face, prepared.plan.place_t)
             self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared))
             self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
 
@@ -197,9 +197,13 @@ class DockingStage:
         steering = dock.sequence.step(inputs.time_ns, active, target, status)
         stage = dock.sequence.stage
         self._set_relays(dock.prepared.request, steering.relay)
-        errors = dock.sequence.errors(active, target)
-        record = _record(dock.detector, status, stage, dock.sequence.tries, errors.gap_m, errors.lateral_m)
-        self.records.append(record)
+        errors, pair = dock.sequence.errors(active, target), dock.detector.pair
+        self.records.append(
+            DockRecord(
+                pair.module_a, pair.face_a, pair.module_b, pair.face_b, int(stage), dock.sequence.tries, dock.detector.currents_ma,
+                status.current, status.position, errors.gap_m, errors.lateral_m, status.position_error_m,
+            )
+        )  # fmt: skip
         if stage != before:
             reason = f": {dock.sequence.reason}" if dock.sequence.reason and stage > Stage.DOCKED else ""
             self._say(WARNING if stage > Stage.DOCKED else INFORMATION, f"dock {before.name} -> {stage.name}{reason}")
@@ -212,9 +216,7 @@ class DockingStage:
         else:
             decisions.setpoints[dock.active] = steering.active
 
-    def _release(
-        self, undock: _Undock, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions
-    ) -> None:
+    def _release(self, undock: _Undock, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions) -> None:
         plan = undock.prepared.plan
         assert isinstance(plan, UndockPlan)
         request = plan.request
@@ -232,27 +234,32 @@ class DockingStage:
         self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
 
     def _set_relays(self, request: DockRequest, relay: int) -> None:
-        self._relays[request.module, request.face] = relay
-        self._relays[request.target_module, request.target_face] = relay
+        for module, face in ((request.module, request.face), (request.target_module, request.target_face)):
+            if self._relays[module, face] != relay:
+                self._relays[module, face], self._due_ns[module] = relay, NEVER_NS
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))
 
 
-def joints_of(body: Body) -> list[tuple[DockRequest, np.ndarray]]:
-    """Every joint of a body: its faces, and the second module's centre in the frame of the first (3,), m."""
-    joints = []
-    count = len(body.modules)
-    for i in range(count):
-        for j in range(i + 1, count):
-            step = (body.cells[j] - body.cells[i]).astype(np.float64)
-            if np.abs(step).sum() == 1:
-                turn_i, turn_j = (to_matrix(np.ascontiguousarray(body.q_bm[k])) for k in (i, j))
-                near = int(np.argmax(FACE_NORMALS @ (turn_i.T @ step)))
-                far = int(np.argmax(FACE_NORMALS @ (turn_j.T @ -step)))
-                offset = rotate_back(np.ascontiguousarray(body.q_bm[i]), body.r_bm[j] - body.r_bm[i])
-                joints.append((DockRequest(body.modules[j], far, body.modules[i], near), offset))
+def joints_of(body: Body) -> list[Joint]:
+    """Every joint of a body, in the order of its modules."""
+    joints: list[Joint] = []
+    at = {tuple(cell): i for i, cell in enumerate(body.cells.tolist())}
+    for i, cell in enumerate(body.cells):
+        neighbours = (at.get(tuple(place), -1) for place in (cell + FACE_NORMALS).tolist())
+        joints += [_joint(body, i, j) for j in sorted(neighbours) if j > i]
     return joints
+
+
+def _joint(body: Body, i: int, j: int) -> Joint:
+    """Between the modules i and j of the body, which are neighbours."""
+    step = (body.cells[j] - body.cells[i]).astype(np.float64)
+    turn_i, turn_j = (to_matrix(np.ascontiguousarray(body.q_bm[k])) for k in (i, j))
+    near = int(np.argmax(FACE_NORMALS @ (turn_i.T @ step)))
+    far = int(np.argmax(FACE_NORMALS @ (turn_j.T @ -step)))
+    offset = rotate_back(np.ascontiguousarray(body.q_bm[i]), body.r_bm[j] - body.r_bm[i])
+    return Joint(DockRequest(body.modules[j], far, body.modules[i], near), offset)
 
 
 def tag_table(bodies: Sequence[Body]) -> TagTable:
@@ -270,13 +277,3 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
 
 def _body_of(module: int, estimates: Mapping[int, tuple[Body, Estimate]]) -> int:
     return next(number for number, (body, _) in estimates.items() if module in body.modules)
-
-
-def _record(
-    detector: PairDetector, status: PairStatus, stage: Stage, tries: int, gap_m: float, lateral_m: float
-) -> DockRecord:
-    pair = detector.pair
-    return DockRecord(
-        pair.module_a, pair.face_a, pair.module_b, pair.face_b, int(stage), tries, detector.currents_ma,
-        status.current, status.position, gap_m, lateral_m, status.position_error_m,
-    )  # fmt: skip

@@ -2,24 +2,26 @@
 
 Condition 1: the current of both magnets is beyond +-70 mA. Condition 2: the relative position is one lattice pitch and settled. A pose
 is taken from tags of both modules seen in one picture, never from a state that was carried on.
+
+All pairs that are watched are rows of one array, and one compiled pass a tick serves them all.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from functools import cached_property
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from firmware_py.core.rotations import V, multiply, rotate, rotate_back
+from firmware_py.core.docking_pairs import NEVER_NS, PAIR, PICTURES, Limits, module_poses, watch
 from firmware_py.core.types import ModuleInputs
 from firmware_py.description.parameters import Docking
 
-NEVER_NS = -(1 << 60)
-PICTURES = 16
-"""Relative positions kept of each pair."""
+FACES = 6
+SILENT: list[float | None] = [None] * FACES
+"""Currents of a module that reported none."""
 
 
 class FacePair(NamedTuple):
@@ -47,38 +49,61 @@ class PairStatus(NamedTuple):
     position_error_m: float
     """Distance of the mean relative position from one pitch; NaN without fresh pictures."""
     spread_m: float
-    """Largest distance of a kept relative position's half from the other half: what `settled` is judged by."""
+    """Distance between the means of the older and the newer half of the pictures: what `settled` is judged by."""
     docked: bool
     """Both hold."""
     fresh: bool
     """Both conditions rest on measurements that are young enough."""
 
 
-class _Condition:
-    """A truth that changes only after it has been seen long enough, and since when it is what it is."""
+class PairBank:
+    """Watches any number of pairs of faces. `rows`, (k,) of PAIR, is what is known of them in this tick."""
 
-    __slots__ = ("_candidate_ns", "holds", "since_ns")
+    def __init__(self, pairs: Sequence[FacePair], parameters: Docking, before: PairBank | None = None) -> None:
+        """`before`: the bank that this one replaces; what it knows of a pair that both watch is kept."""
+        p = parameters
+        self._limits = Limits(
+            p.current_threshold_ma, p.current_hysteresis_ma, p.position_tolerance_m, p.settled_m, p.hysteresis_m,
+            round(p.debounce_ms * 1e6), round(p.current_fresh_ms * 1e6), round(p.pose_fresh_ms * 1e6),
+        )  # fmt: skip
+        self.rows = np.zeros(len(pairs), PAIR)
+        self._rings = np.zeros((len(pairs), PICTURES, 3))
+        for row, pair in zip(self.rows, pairs, strict=True):
+            row["module"], row["face"] = (pair.module_a, pair.module_b), (pair.face_a, pair.face_b)
+            row["offset_a"] = pair.offset_a
+        for time in ("since_ns", "candidate_ns", "current_ns", "picture_ns"):
+            self.rows[time] = NEVER_NS
+        for figure in ("current_ma", "margin_ma", "error_m", "spread_m"):
+            self.rows[figure] = np.nan
+        self._watched = np.unique(self.rows["module"]).tolist()
+        self._heard_ma = np.full((max(self._watched, default=-1) + 1, FACES), np.nan)
+        if before is not None:
+            self._go_on(before)
 
-    def __init__(self) -> None:
-        self.holds = False
-        self.since_ns = NEVER_NS
-        self._candidate_ns: int | None = None
+    def _go_on(self, before: PairBank) -> None:
+        known = {key: i for i, key in enumerate(_keys(before.rows))}
+        for here, key in enumerate(_keys(self.rows)):
+            if key in known:
+                there = known[key]
+                self.rows[here], self._rings[here] = before.rows[there], before._rings[there]
 
-    def see(self, seen: bool, time_ns: int, after_ns: int) -> None:
-        """`seen` by a fresh measurement at `time_ns`; believed once nothing else was seen for `after_ns`."""
-        if seen == self.holds:
-            self._candidate_ns = None
-            return
-        if self._candidate_ns is None:
-            self._candidate_ns = time_ns
-        if time_ns - self._candidate_ns >= after_ns:
-            self.holds, self.since_ns, self._candidate_ns = seen, time_ns, None
+    def step(self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses) -> None:
+        """Brings the rows to the tick at `time_ns`, from its inputs alone and what they were before."""
+        heard = [m for m in self._watched if modules[m].dock_current_ma != SILENT]
+        for m in heard:
+            self._heard_ma[m] = np.array(modules[m].dock_current_ma, dtype=np.float64)  # None becomes NaN
+        watch(self.rows, self._rings, self._heard_ma, *poses.found, time_ns, self._limits)
+        if heard:
+            self._heard_ma[heard] = np.nan
 
-    def lose(self, time_ns: int) -> None:
-        """No fresh measurement supports it any longer."""
-        if self.holds:
-            self.holds, self.since_ns = False, time_ns
-        self._candidate_ns = None
+    def status(self, i: int) -> PairStatus:
+        """Of pair `i`."""
+        row = self.rows[i]
+        (current, position), (current_since, position_since) = row["holds"].tolist(), row["since_ns"].tolist()
+        return PairStatus(
+            bool(current), bool(position), current_since, position_since, float(row["margin_ma"]), float(row["error_m"]),
+            float(row["spread_m"]), bool(current and position), bool(row["fresh"]),
+        )  # fmt: skip
 
 
 class PairDetector:
@@ -86,116 +111,49 @@ class PairDetector:
 
     def __init__(self, pair: FacePair, parameters: Docking) -> None:
         self.pair = pair
-        self._p = parameters
-        self._current = _Condition()
-        self._position = _Condition()
-        self._ma = [math.nan, math.nan]
-        self._ma_ns = [NEVER_NS, NEVER_NS]
-        self._pictures = np.zeros((PICTURES, 3))
-        self._count = 0
-        self._picture_ns = NEVER_NS
-        self._error_m = math.nan
-        self._spread_m = math.nan
+        self._bank = PairBank([pair], parameters)
 
     def step(self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses) -> PairStatus:
-        """The pair's status in the tick at `time_ns`, from this tick's inputs alone and what they were before."""
-        self._take_currents(time_ns, modules)
-        self._take_pose(time_ns, poses)
-        p = self._p
-        fresh_current = time_ns - min(self._ma_ns) <= p.current_fresh_ms * 1e6
-        fresh_pose = time_ns - self._picture_ns <= p.pose_fresh_ms * 1e6
-        if not fresh_current:
-            self._current.lose(time_ns)
-        if not fresh_pose:
-            self._position.lose(time_ns)
-            self._count = 0
-        weaker = min(abs(self._ma[0]), abs(self._ma[1]))
-        return PairStatus(
-            self._current.holds, self._position.holds, self._current.since_ns, self._position.since_ns,
-            weaker - p.current_threshold_ma, self._error_m, self._spread_m,
-            self._current.holds and self._position.holds, fresh_current and fresh_pose,
-        )  # fmt: skip
+        """The pair's status in the tick at `time_ns`."""
+        self._bank.step(time_ns, modules, poses)
+        return self._bank.status(0)
 
     @property
     def currents_ma(self) -> tuple[float, float]:
         """Newest current of both faces; NaN before the first."""
-        return self._ma[0], self._ma[1]
-
-    def _take_currents(self, time_ns: int, modules: Sequence[ModuleInputs]) -> None:
-        pair = self.pair
-        fresh = False
-        for side, (module, face) in enumerate(((pair.module_a, pair.face_a), (pair.module_b, pair.face_b))):
-            value = modules[module].dock_current_ma[face]
-            if value is not None:
-                self._ma[side], self._ma_ns[side] = value, time_ns
-                fresh = True
-        if fresh:
-            p = self._p
-            threshold = p.current_threshold_ma - (p.current_hysteresis_ma if self._current.holds else 0.0)
-            beyond = abs(self._ma[0]) > threshold and abs(self._ma[1]) > threshold  # False for NaN
-            self._current.see(beyond, time_ns, round(p.debounce_ms * 1e6))
-
-    def _take_pose(self, time_ns: int, poses: ModulePoses) -> None:
-        relative = poses.relative(self.pair.module_a, self.pair.module_b)
-        if relative is None:
-            return
-        capture_ns, position = relative
-        self._pictures[self._count % PICTURES] = position
-        self._count += 1
-        self._picture_ns = capture_ns
-        if self._count < PICTURES:
-            return
-        self._error_m, self._spread_m = _statistics(self._pictures, self._count % PICTURES, self.pair.offset_a)
-        p = self._p
-        slack = p.hysteresis_m if self._position.holds else 0.0
-        near = self._error_m < p.position_tolerance_m + slack and self._spread_m < p.settled_m + slack
-        self._position.see(near, time_ns, round(p.debounce_ms * 1e6))
+        a, b = self._bank.rows[0]["current_ma"].tolist()
+        return a, b
 
 
-@njit(f"UniTuple(float64,2)(float64[:,::1],int64,{V})", cache=True)
-def _statistics(ring, oldest, wanted):  # type: ignore[no-untyped-def]
-    """Distance of the mean from `wanted` (3,), and distance between the means of the older and the newer half."""
-    n = ring.shape[0]
-    older, newer = np.zeros(3), np.zeros(3)
-    for i in range(n):
-        row = ring[(oldest + i) % n]
-        if i < n // 2:
-            older += row
-        else:
-            newer += row
-    older /= n // 2
-    newer /= n - n // 2
-    return np.linalg.norm(0.5 * (older + newer) - wanted), np.linalg.norm(newer - older)
+TagTable = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
+"""(module, tag id) -> tag centre (3,) in the module frame, and module frame to tag frame (4,)."""
+Found = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""(m + 1,) where the sightings of each module of the fleet begin; (s,) time of the picture, ns; (s, 7) the module's centre
+and attitude in the world."""
 
 
 class ModulePoses:
-    """Poses of single modules by the pictures of this tick. Made anew each tick; only pairs that ask cost anything."""
+    """Poses of single modules by the pictures of this tick. Made anew each tick; costs something only once it is asked."""
 
     def __init__(self, modules: Sequence[ModuleInputs], tags: TagTable) -> None:
         self._modules = modules
         self._tags = tags
 
-    def relative(self, a: int, b: int) -> tuple[int, np.ndarray] | None:
-        """Newest picture that shows both modules: its time, and the centre of b in the frame of a (3,), m."""
-        seen_a, seen_b = self._modules[a].tags, self._modules[b].tags
-        if not seen_a or not seen_b:
-            return None
-        for first in reversed(seen_a):
-            for second in reversed(seen_b):
-                if first.capture_ns == second.capture_ns:
-                    tag_a, tag_b = self._tags.get((a, first.tag_id)), self._tags.get((b, second.tag_id))
-                    if tag_a is None or tag_b is None:
-                        continue
-                    return first.capture_ns, _relative(first.p_wt, first.q_wt, *tag_a, second.p_wt, second.q_wt, *tag_b)
-        return None
+    @cached_property
+    def found(self) -> Found:
+        """Every tag that was seen and is known, in the order of modules, then of arrival."""
+        seen = [[t for t in m.tags if (i, t.tag_id) in self._tags] for i, m in enumerate(self._modules)]
+        first = np.array([0, *accumulate(map(len, seen))])
+        if not first[-1]:
+            return first, NO_TIMES, NO_POSES
+        parts = [(t.p_wt, t.q_wt, *self._tags[i, t.tag_id]) for i, tags in enumerate(seen) for t in tags]
+        poses = np.empty((len(parts), 7))
+        module_poses(np.concatenate([array for part in parts for array in part]).reshape(-1, 14), poses)
+        return first, np.array([t.capture_ns for tags in seen for t in tags]), poses
 
 
-TagTable = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
-"""(module, tag id) -> tag centre (3,) in the module frame, and module frame to tag frame (4,)."""
+NO_TIMES, NO_POSES = np.zeros(0, dtype=np.int64), np.zeros((0, 7))
 
 
-@njit(f"{V}({V},{V},{V},{V},{V},{V},{V},{V})", cache=True)
-def _relative(p_a, q_a, r_a, turn_a, p_b, q_b, r_b, turn_b):  # type: ignore[no-untyped-def]
-    """(3,) centre of module b in the frame of module a, from one tag of each: pose in the world, place in its module, module to tag."""
-    q_wa, q_wb = multiply(q_a, turn_a), multiply(q_b, turn_b)
-    return r_a + rotate_back(q_wa, p_b - p_a - rotate(q_wb, r_b))
+def _keys(rows: np.ndarray) -> list[tuple[int, ...]]:
+    return [tuple(pair) for pair in rows["module"].tolist()]

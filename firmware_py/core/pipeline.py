@@ -12,7 +12,7 @@ import numpy as np
 from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.controller import Controller
-from firmware_py.core.docking import Decisions, DockingStage, Join, Part, tag_table
+from firmware_py.core.docking import Decisions, DockingStage, Join, Part, joints_of, tag_table
 from firmware_py.core.estimator import Estimator
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.glide import Glide
@@ -57,6 +57,7 @@ class BodyPipeline:
 
     def __init__(self, body: Body, parameters: Parameters, period_ns: int) -> None:
         self.body = body
+        self.joints = joints_of(body)
         self.measurements = Measurements(body)
         self.estimator = ESTIMATORS[parameters.estimation.kind](body, parameters.estimation, period_ns)
         self.faults = FaultDetector(body, parameters.faults, period_ns)
@@ -190,7 +191,7 @@ class Pipeline:
         self._chains = [self.chain_of(body) for body in bodies]
         self._modules = 1 + max(module for body in bodies for module in body.modules)
         self.docking = DockingStage(parameters.docking, tag_table(bodies), self._modules)
-        self.docking.watch_joints(bodies)
+        self._watch_joints()
 
     @property
     def bodies(self) -> list[Body]:
@@ -237,6 +238,7 @@ class Pipeline:
         """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
         decisions = self.docking.step(inputs, {c.body.index: (c.body, estimates[c.body.index]) for c in self._chains})
         outputs.docks += self.docking.records
+        outputs.joints = self.docking.joints.copy()
         outputs.events += self.docking.events
         self._steer(decisions)
         for joined in decisions.joins:
@@ -275,18 +277,20 @@ class Pipeline:
             estimates[chain.body.index] = estimate
         kept = [chain for chain in self._chains if chain not in before]
         self._chains = sorted([*kept, *after], key=lambda chain: chain.body.index)
-        self.docking.watch_joints(self.bodies)
+        self._watch_joints()
+
+    def _watch_joints(self) -> None:
+        self.docking.watch_joints([joint for chain in self._chains for joint in chain.joints])
 
     def _chain(self, body: int) -> BodyPipeline:
         return next(chain for chain in self._chains if chain.body.index == body)
 
     def _command(self, chain: BodyPipeline, command: np.ndarray, outputs: Outputs) -> None:
         """Hands each module its own thrusters, and its relays when they are due."""
-        channels = np.zeros((len(chain.body.modules), CHANNELS))
+        armed, time_ns, channels = chain.supervisor.armed, outputs.time_ns, np.zeros((len(chain.body.modules), CHANNELS))
         channels.reshape(-1)[chain.slots] = command
-        for i, module in enumerate(chain.body.modules):
-            relays = self.docking.relays(module, outputs.time_ns)
-            outputs.modules[module] = ModuleCommand(chain.supervisor.armed, channels[i], relays)
+        for module, thrusters in zip(chain.body.modules, channels, strict=True):
+            outputs.modules[module] = ModuleCommand(armed, thrusters, self.docking.relays(module, time_ns))
 
 
 IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)

@@ -293,7 +293,7 @@ class BodyRecord(NamedTuple):
 
 
 class DockRecord(NamedTuple):
-    """One pair of faces in one tick."""
+    """The faces of one dock under way in one tick."""
 
     module_a: int
     face_a: int
@@ -306,7 +306,7 @@ class DockRecord(NamedTuple):
     current_holds: bool
     position_holds: bool
     gap_m: float
-    """Between the faces, by the estimates; NaN once they are one body."""
+    """Between the faces, by the estimates."""
     lateral_m: float
     position_error_m: float
     """Off one pitch, by fresh pictures."""
@@ -324,5 +324,7 @@ class Outputs:
     events: list[Event]
     records: list[BodyRecord]
     docks: list[DockRecord] = field(default_factory=list)
+    joints: Array | None = None
+    """(k,) of docking_pairs.PAIR: all faces that hold modules of one body together."""
     preparations: list[DockRequest] = field(default_factory=list)
     """Docks, and undocks of modules of one body, to be prepared beside the loop; they come back in Inputs.prepared."""

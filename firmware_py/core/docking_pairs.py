@@ -1,0 +1,178 @@
+"""The pairs of faces that the docking detector watches, as rows of one array, and the compiled pass over all of them.
+
+What a pair's two conditions are judged by, and when they are believed. Part of `docking_detector`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numba import njit
+
+from firmware_py.core.rotations import M, multiply, rotate, rotate_back
+
+NEVER_NS = -(1 << 60)
+PICTURES = 16
+"""Relative positions kept of each pair."""
+CURRENT, POSITION = 0, 1
+"""The two conditions, as columns of a pair's row."""
+
+PAIR = np.dtype(
+    [
+        ("module", np.int64, 2),  # fleet index of module a, of module b; sides a and b in `face` and the currents too
+        ("face", np.int64, 2),
+        ("offset_a", np.float64, 3),  # where the centre of b should be in the frame of a, m
+        ("holds", np.int64, 2),  # each condition, debounced
+        ("since_ns", np.int64, 2),  # since when each has been as it is
+        ("candidate_ns", np.int64, 2),  # since when the opposite has been seen; NEVER_NS: it is not
+        ("current_ma", np.float64, 2),
+        ("current_ns", np.int64, 2),
+        ("margin_ma", np.float64),
+        ("pictures", np.int64),  # relative positions since the last gap
+        ("picture_ns", np.int64),
+        ("error_m", np.float64),
+        ("spread_m", np.float64),
+        ("fresh", np.int64),
+    ],
+    align=True,
+)
+"""One pair of faces in one tick; what is not explained here, PairStatus does."""
+
+
+class Limits(NamedTuple):
+    """What the conditions are judged by, from the parameters."""
+
+    threshold_ma: float
+    current_hysteresis_ma: float
+    near_m: float
+    settled_m: float
+    position_hysteresis_m: float
+    debounce_ns: int
+    current_fresh_ns: int
+    pose_fresh_ns: int
+
+
+TABLE, TIMES = numba.float64[:, ::1], numba.int64[::1]
+ROW = numba.from_dtype(PAIR)
+LIMITS = numba.typeof(Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))  # type: ignore[no-untyped-call]
+
+
+@njit(numba.void(ROW, numba.int64, numba.boolean, numba.int64, numba.int64), cache=True)
+def _see(row, which, seen, time_ns, after_ns):  # type: ignore[no-untyped-def]
+    """A condition was `seen` by a fresh measurement; believed once nothing else was seen for `after_ns`."""
+    if seen == (row.holds[which] != 0):
+        row.candidate_ns[which] = NEVER_NS
+        return
+    if row.candidate_ns[which] == NEVER_NS:
+        row.candidate_ns[which] = time_ns
+    if time_ns - row.candidate_ns[which] >= after_ns:
+        row.holds[which], row.since_ns[which], row.candidate_ns[which] = seen, time_ns, NEVER_NS
+
+
+@njit(numba.void(ROW, numba.int64, numba.int64), cache=True)
+def _lose(row, which, time_ns):  # type: ignore[no-untyped-def]
+    """No fresh measurement supports a condition any longer."""
+    if row.holds[which]:
+        row.holds[which], row.since_ns[which] = 0, time_ns
+    row.candidate_ns[which] = NEVER_NS
+
+
+@njit(numba.boolean(ROW, TABLE, numba.int64, LIMITS), cache=True)
+def _take_currents(row, heard_ma, time_ns, limits):  # type: ignore[no-untyped-def]
+    """Condition 1 by the currents of this tick; whether those known are fresh."""
+    heard = False
+    for side in range(2):
+        value = heard_ma[row.module[side], row.face[side]]
+        if not math.isnan(value):
+            row.current_ma[side], row.current_ns[side], heard = value, time_ns, True
+    if min(row.current_ns[0], row.current_ns[1]) == NEVER_NS:
+        return False
+    weaker = min(abs(row.current_ma[0]), abs(row.current_ma[1]))
+    row.margin_ma = weaker - limits.threshold_ma
+    if heard:
+        threshold = limits.threshold_ma - (limits.current_hysteresis_ma if row.holds[CURRENT] else 0.0)
+        _see(row, CURRENT, weaker > threshold, time_ns, limits.debounce_ns)
+    fresh = time_ns - min(row.current_ns[0], row.current_ns[1]) <= limits.current_fresh_ns
+    if not fresh:
+        _lose(row, CURRENT, time_ns)
+    return fresh
+
+
+@njit("UniTuple(int64,2)(int64[::1],int64[::1],int64,int64)", cache=True)
+def _same_picture(first, capture_ns, a, b):  # type: ignore[no-untyped-def]
+    """Sightings of modules a and b in the newest picture that shows both; -1 without one."""
+    for i in range(first[a + 1] - 1, first[a] - 1, -1):
+        for j in range(first[b + 1] - 1, first[b] - 1, -1):
+            if capture_ns[i] == capture_ns[j]:
+                return i, j
+    return -1, -1
+
+
+@njit(numba.void(ROW, TABLE), cache=True)
+def _judge_ring(row, ring):  # type: ignore[no-untyped-def]
+    """Distance of the mean from the wanted position, and distance between the means of the older and the newer half."""
+    n, oldest, half = PICTURES, row.pictures, PICTURES // 2
+    off, moved = 0.0, 0.0
+    for axis in range(3):
+        older, newer = 0.0, 0.0
+        for i in range(half):
+            older += ring[(oldest + i) % n, axis]
+        for i in range(half, n):
+            newer += ring[(oldest + i) % n, axis]
+        older, newer = older / half, newer / (n - half)
+        off += (0.5 * (older + newer) - row.offset_a[axis]) ** 2
+        moved += (newer - older) ** 2
+    row.error_m, row.spread_m = math.sqrt(off), math.sqrt(moved)
+
+
+@njit(numba.boolean(ROW, TABLE, TIMES, TIMES, TABLE, numba.int64, LIMITS), cache=True)
+def _take_pose(row, ring, first, capture_ns, poses, time_ns, limits):  # type: ignore[no-untyped-def]
+    """Condition 2 by the pictures of this tick; whether those known are fresh."""
+    i, j = _same_picture(first, capture_ns, row.module[0], row.module[1])
+    if i >= 0:
+        ring[row.pictures % PICTURES] = rotate_back(poses[i, 3:], poses[j, :3] - poses[i, :3])
+        row.pictures += 1
+        row.picture_ns = capture_ns[i]
+        if row.pictures >= PICTURES:
+            _judge_ring(row, ring)
+            slack = limits.position_hysteresis_m if row.holds[POSITION] else 0.0
+            near = row.error_m < limits.near_m + slack and row.spread_m < limits.settled_m + slack
+            _see(row, POSITION, near, time_ns, limits.debounce_ns)
+    fresh = time_ns - row.picture_ns <= limits.pose_fresh_ns
+    if not fresh:
+        _lose(row, POSITION, time_ns)
+        row.pictures, row.error_m, row.spread_m = 0, math.nan, math.nan
+    return fresh
+
+
+@njit(numba.void(ROW[::1], numba.float64[:, :, ::1], TABLE, TIMES, TIMES, TABLE, numba.int64, LIMITS), cache=True)
+def watch(rows, rings, heard_ma, first, capture_ns, poses, time_ns, limits):  # type: ignore[no-untyped-def]
+    """Brings all pairs to this tick.
+
+    Args:
+        rows: (k,) PAIR; rings: (k, PICTURES, 3) relative positions, module b in the frame of a.
+        heard_ma: (m, 6) currents that came, per module and face, NaN where none did.
+        first, capture_ns, poses: sightings of single modules, as `ModulePoses.found`.
+    """
+    for k in range(rows.shape[0]):
+        row = rows[k]
+        fresh_current = _take_currents(row, heard_ma, time_ns, limits)
+        fresh_pose = _take_pose(row, rings[k], first, capture_ns, poses, time_ns, limits)
+        row.fresh = fresh_current and fresh_pose
+
+
+@njit(f"void({M},{M})", cache=True)
+def module_poses(tags, out):  # type: ignore[no-untyped-def]
+    """Writes (s, 7) centre and attitude of each module in the world.
+
+    Args:
+        tags: (s, 14) per sighting the tag's place and attitude in the world, its place in its module, and module frame to
+            tag frame.
+    """
+    for i in range(tags.shape[0]):
+        tag = tags[i]
+        out[i, 3:] = multiply(tag[3:7], tag[10:14])
+        out[i, :3] = tag[:3] - rotate(out[i, 3:], tag[7:10])

@@ -1,0 +1,174 @@
+"""The docking detector: both conditions, believed late and lost with their measurements; many pairs at once as each alone."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from firmware_py.core.docking import joints_of
+from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, PairStatus, TagTable
+from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
+from firmware_py.core.types import ModuleInputs, TagObservation
+from firmware_py.description.parameters import Docking
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+
+TICK_NS, PITCH_M = 10_000_000, 0.21
+P = Docking()
+TAG = 5
+LEVER, TURN = np.array([0.02, -0.01, -0.1]), from_euler(0.3, -0.2, 1.0)
+"""Of every module's one tag: its place in the module, and module frame to tag frame."""
+TAGS: TagTable = {(m, TAG): (LEVER, TURN) for m in range(4)}
+ROW = [FacePair(m, 0, m + 1, 1, np.array([PITCH_M, 0.0, 0.0])) for m in range(3)]
+"""Four modules in a row, the +x face of each against the -x face of the next."""
+
+
+@dataclass
+class Row:
+    """The four modules, and what they and the camera say in each tick."""
+
+    attitude: np.ndarray = field(default_factory=lambda: from_euler(0.2, -0.1, 2.0))
+    gaps_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    currents_ma: list[float] = field(default_factory=lambda: [100.0, -100.0, 100.0])
+    """Of both magnets of each joint."""
+    noise_m: float = 0.0
+    camera: bool = True
+    tick: int = 0
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+
+    def hear(self) -> tuple[int, list[ModuleInputs]]:
+        """Time and inputs of the next tick: currents at 25 Hz, pictures at 50 Hz."""
+        self.tick += 1
+        modules = [ModuleInputs() for _ in range(4)]
+        if self.tick % 4 == 0:
+            for joint, current in enumerate(self.currents_ma):
+                modules[joint].dock_current_ma[0] = modules[joint + 1].dock_current_ma[1] = current
+        if self.camera and self.tick % 2 == 0:
+            for m, x in enumerate(np.cumsum([0.0, *(PITCH_M + gap for gap in self.gaps_m)])):
+                modules[m].tags.append(self._tag(float(x)))
+        return self.tick * TICK_NS, modules
+
+    def _tag(self, x: float) -> TagObservation:
+        p_wt = np.array([1.0, 2.0, 0.5]) + rotate(self.attitude, np.array([x, 0.0, 0.0]) + LEVER)
+        p_wt = p_wt + self.noise_m * self.rng.standard_normal(3)
+        return TagObservation(TAG, 7, self.tick * TICK_NS - 40_000_000, p_wt, multiply(self.attitude, conjugate(TURN)))
+
+    def watch(self, bank: PairBank, seconds: float) -> list[PairStatus]:
+        """The status of every pair after so long."""
+        for _ in range(round(seconds / 0.01)):
+            time_ns, modules = self.hear()
+            bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        return [bank.status(i) for i in range(len(bank.rows))]
+
+
+@pytest.fixture
+def row() -> Row:
+    return Row()
+
+
+def test_pair_is_docked_once_both_conditions_were_seen_long_enough(row: Row) -> None:
+    bank = PairBank(ROW, P)
+    assert not any(status.docked for status in row.watch(bank, 0.14)), "not before the debounce is over"
+    for status in row.watch(bank, 0.6):
+        assert status.docked and status.fresh and status.current_margin_ma == pytest.approx(30.0)
+        assert status.position_error_m < 1e-9 and status.spread_m < 1e-9
+        assert 0.15e9 <= status.current_since_ns < 0.3e9 and 0.45e9 <= status.position_since_ns < 0.6e9
+
+
+def test_either_condition_alone_is_no_dock(row: Row) -> None:
+    row.gaps_m[0], row.currents_ma[1] = 0.02, 50.0
+    apart, loose, docked = row.watch(PairBank(ROW, P), 1.0)
+    assert apart.current and not apart.position and not apart.docked and apart.position_error_m == pytest.approx(0.02)
+    assert loose.position and not loose.current and not loose.docked and loose.current_margin_ma == pytest.approx(-20.0)
+    assert docked.docked
+
+
+def test_current_of_one_face_alone_does_not_count(row: Row) -> None:
+    bank = PairBank(ROW[:1], P)
+    for _ in range(100):
+        time_ns, modules = row.hear()
+        modules[1].dock_current_ma[1] = None
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+    assert not bank.status(0).current and math.isnan(bank.status(0).current_margin_ma)
+
+
+def test_dock_that_holds_is_lost_later_than_it_was_won(row: Row) -> None:
+    bank = PairBank(ROW, P)
+    row.watch(bank, 1.0)
+    row.gaps_m[0], row.currents_ma[1] = P.position_tolerance_m + 0.5 * P.hysteresis_m, -60.0
+    assert all(status.docked for status in row.watch(bank, 1.0))
+    row.gaps_m[0], row.currents_ma[1] = P.position_tolerance_m + 1.5 * P.hysteresis_m, -50.0
+    apart, loose, docked = row.watch(bank, 1.0)
+    assert not apart.position and apart.current and not loose.current and loose.position and docked.docked
+    row.gaps_m[0], row.currents_ma[1] = P.position_tolerance_m + 0.5 * P.hysteresis_m, -60.0
+    assert [status.docked for status in row.watch(bank, 1.0)] == [False, False, True]
+
+
+def test_what_is_not_seen_any_more_is_not_believed(row: Row) -> None:
+    """A coasted pose never counts, and no current is one that is old."""
+    bank = PairBank(ROW, P)
+    row.watch(bank, 1.0)
+    row.camera = False
+    assert all(status.position for status in row.watch(bank, 0.2))
+    for status in row.watch(bank, 0.2):
+        assert status.current and not status.position and not status.fresh and math.isnan(status.position_error_m)
+    row.camera, row.currents_ma = True, [math.nan] * 3
+    assert all(status.current for status in row.watch(bank, 0.2))
+    assert not any(status.current or status.fresh for status in row.watch(bank, 0.1))
+
+
+def test_pair_that_still_moves_is_not_settled(row: Row) -> None:
+    bank = PairBank(ROW[:1], P)
+    for _ in range(300):
+        row.gaps_m[0] = 0.008 * math.sin(2.0 * math.pi * 3.0 * row.tick * 0.01)
+        row.watch(bank, 0.01)
+        assert not bank.status(0).position
+
+
+def test_tag_that_the_vehicle_does_not_carry_places_nobody(row: Row) -> None:
+    bank = PairBank(ROW[:1], P)
+    for _ in range(100):
+        time_ns, modules = row.hear()
+        modules[0].tags = [tag._replace(tag_id=14) for tag in modules[0].tags]
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+    assert not bank.status(0).position and bank.status(0).current
+
+
+def test_pictures_of_different_times_place_nobody(row: Row) -> None:
+    bank = PairBank(ROW[:1], P)
+    for _ in range(100):
+        time_ns, modules = row.hear()
+        modules[0].tags = [tag._replace(capture_ns=tag.capture_ns - 1) for tag in modules[0].tags]
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+    assert not bank.status(0).position
+
+
+def test_many_pairs_are_each_as_one_alone(row: Row) -> None:
+    row.noise_m, row.gaps_m = 0.002, [0.0, 0.005, 0.01]
+    bank, alone = PairBank(ROW, P), [PairDetector(pair, P) for pair in ROW]
+    for n in range(1500):
+        row.camera = n // 100 % 3 != 2
+        row.currents_ma = [75.0 + 25.0 * math.sin(0.01 * n * k) for k in (3.0, 5.0, 7.0)]
+        time_ns, modules = row.hear()
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        for i, detector in enumerate(alone):
+            np.testing.assert_equal(detector.step(time_ns, modules, ModulePoses(modules, TAGS)), bank.status(i))
+
+
+def test_joints_go_on_when_other_joints_come_and_go(row: Row) -> None:
+    bank = PairBank(ROW[:2], P)
+    before = row.watch(bank, 1.0)
+    after = PairBank(ROW[1:], P, bank)
+    assert after.status(0) == before[1] and not after.status(1).docked
+    assert all(status.docked for status in row.watch(after, 0.6))
+
+
+def test_body_has_a_joint_between_every_two_neighbours() -> None:
+    cells = [(x, y, z) for x in range(4) for y in range(4) for z in range(4)]
+    joints = joints_of(assemble(cells, [0] * 64, [load_vehicle("modcube")] * 64))
+    assert len(joints) == 3 * 4 * 4 * 3
+    for request, offset in joints:
+        step = np.subtract(cells[request.module], cells[request.target_module])
+        np.testing.assert_allclose(offset, PITCH_M * step, atol=1e-12)
+        assert {request.target_face, request.face} in ({0, 1}, {2, 3}, {4, 5})
