@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -28,7 +29,7 @@ class Check(NamedTuple):
     """One arming check."""
 
     name: str
-    reason: Callable[[Question], str]
+    reason: Callable[[Question], str | list[str]]
     """Why it fails, in words; empty when it holds."""
     may_be_skipped: bool
     """Forced arming passes over it."""
@@ -42,27 +43,29 @@ def _answers(q: Question) -> str:
     return f"module {', '.join(str(m) for m in q.health.silent)} does not answer" if q.health.silent else ""
 
 
-def _needs(q: Question) -> str:
-    return "; ".join(missing(q.mode, q.health, q.parameters))
+def _needs(q: Question) -> list[str]:
+    return missing(q.mode, q.health, q.parameters)
+
+
+def _has_pose(q: Question) -> bool:
+    """Whether the mode asks for a pose, and there is one to judge; else `_needs` says that there is none."""
+    return Need.POSITION in MODES[q.mode].needs and not missing(q.mode, q.health, q.parameters)
 
 
 def _pose_fresh(q: Question) -> str:
     fresh_ms, age_ms = q.parameters.supervision.tag_fresh_ms, q.health.tag_age_s * 1e3
-    if Need.POSITION in MODES[q.mode].needs and q.health.ready and age_ms > fresh_ms:
-        return f"pose is {age_ms:.0f} ms old, {fresh_ms:.0f} permitted"
-    return ""
+    return f"pose is {age_ms:.0f} ms old, {fresh_ms:.0f} permitted" if _has_pose(q) and age_ms > fresh_ms else ""
 
 
 def _pose_sure(q: Question) -> str:
     permitted, sigma = q.parameters.supervision.arm_sigma_m, q.health.sigma_m
-    if Need.POSITION in MODES[q.mode].needs and q.health.ready and sigma > permitted:
-        return f"pose sigma {sigma * 1e3:.0f} mm, {permitted * 1e3:.0f} permitted"
-    return ""
+    sure = sigma <= permitted  # a NaN is not
+    return f"pose sigma {sigma * 1e3:.0f} mm, {permitted * 1e3:.0f} permitted" if _has_pose(q) and not sure else ""
 
 
 def _pose_consistent(q: Question) -> str:
     permitted, ratio = q.parameters.failsafes.estimator_limit, q.health.nis_ratio
-    if Need.POSITION in MODES[q.mode].needs and ratio > permitted:
+    if Need.POSITION in MODES[q.mode].needs and not ratio <= permitted:
         return f"sensors and model disagree: {ratio:.1f} of the expected, {permitted:.1f} permitted"
     return ""
 
@@ -82,8 +85,13 @@ def _thrusters(q: Question) -> str:
     return "the thrusters left cannot make every wrench" if q.health.lost_axes else ""
 
 
-def _failsafes(q: Question) -> str:
-    return "; ".join(q.failsafes.active(q.health))
+def _failsafes(q: Question) -> list[str]:
+    return q.failsafes.active(q.health)
+
+
+def _readings(q: Question) -> list[str]:
+    figures = {"battery": q.health.voltage_share, "cabin": q.health.cabin_c}
+    return [f"{name} was not heard of" for name, value in figures.items() if math.isnan(value)]
 
 
 def _frames(q: Question) -> str:
@@ -91,8 +99,8 @@ def _frames(q: Question) -> str:
     return f"{rate:.0f} bad frames a second, {permitted:.0f} permitted" if rate > permitted else ""
 
 
-def _parameters(q: Question) -> str:
-    return "; ".join(invalid(q.parameters))
+def _parameters(q: Question) -> list[str]:
+    return invalid(q.parameters)
 
 
 def _warm(q: Question) -> str:
@@ -113,6 +121,7 @@ CHECKS = (
     Check("pose fresh", _pose_fresh, True),
     Check("pose sure", _pose_sure, True),
     Check("pose consistent", _pose_consistent, True),
+    Check("battery and cabin known", _readings, True),
     Check("every ESC answers", _escs, True),
     Check("every axis has thrust", _thrusters, True),
     Check("no fail-safe on", _failsafes, True),
@@ -123,8 +132,11 @@ CHECKS = (
 
 def against_arming(question: Question, forced: bool) -> list[str]:
     """Why the body may not be armed, in words; empty when it may."""
-    reasons = [check.reason(question) for check in CHECKS if not (forced and check.may_be_skipped)]
-    return [reason for reason in reasons if reason]
+    reasons: list[str] = []
+    for check in CHECKS:
+        found = [] if forced and check.may_be_skipped else check.reason(question)
+        reasons += [found] if isinstance(found, str) else found
+    return [reason for reason in dict.fromkeys(reasons) if reason]
 
 
 def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:

@@ -109,6 +109,8 @@ class Watch:
         self._since_ns: int | None = None
         self._gone_ns: int | None = None
         self.active = False
+        self.began = ""
+        """Its words when it last began."""
 
     def beyond(self, health: Health) -> bool:
         """Whether its cause holds now, whatever the mode. A NaN is no cause."""
@@ -122,8 +124,12 @@ class Watch:
         return mode in self.row.modes or (forced and mode in self.row.forced_modes)
 
     def words(self, health: Health) -> str:
-        """What is wrong, for people."""
+        """How it is, for people."""
         return self.row.words.format(self.row.value(health))
+
+    def reason(self, health: Health) -> str:
+        """What is wrong, for people; what was wrong when it began, where its cause is gone."""
+        return self.words(health) if self.beyond(health) else self.began
 
     @property
     def rests(self) -> bool:
@@ -165,6 +171,7 @@ class Failsafes:
             cause = watch.beyond(health) and watch.counts(mode, forced, armed)
             if (cause or not watch.rests) and watch.step(health.time_ns, cause, armed):
                 alarms.append(Alarm(watch.row.name, watch.words(health), watch.level, watch.active))
+                watch.began = alarms[-1].words if watch.active else watch.began
         return alarms
 
     @property
@@ -174,12 +181,12 @@ class Failsafes:
 
     def active(self, health: Health) -> list[str]:
         """Those that are on and more than a warning, in words."""
-        return [watch.words(health) for watch in self._watches if watch.active and watch.level > Level.WARN]
+        return [watch.reason(health) for watch in self._watches if watch.active and watch.level > Level.WARN]
 
     def against(self, mode: Mode, health: Health) -> list[str]:
         """Why `mode` must not be entered now, in words; empty when it may."""
         return [
-            watch.words(health)
+            watch.reason(health)
             for watch in self._watches
             if mode not in PERMITTED[watch.level]
             and (watch.beyond(health) or (watch.active and watch.latched))

@@ -8,13 +8,13 @@ from __future__ import annotations
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.thruster import commands, module_power, total_power
+from firmware_py.core.thruster import commands, module_power, polynomial, total_power
 from firmware_py.description.parameters import Limiter as LimiterParameters
 
 VOLTAGE_EXPONENT = 1.2
 """Force over supply voltage at a fixed command: T200 at 16 V against 12 V, 5.25 / 3.71 kgf (t200_16v.csv, t200_12v.csv)."""
 VOLTAGE_RANGE = (0.6, 1.4)
-"""Share of the nominal voltage outside of which a reading is not believed."""
+"""Share of the nominal voltage outside of which a reading is not believed, and counts as nominal."""
 POWER_HALVINGS = 12
 """Bisections of the share that meets the supply limit."""
 OFF, FORWARD, REVERSE = 0, 1, 2
@@ -29,6 +29,8 @@ class Limiter:
         t = body.thrusters
         self._t = t
         self._low, self._high = t.f_min * parameters.force_share, t.f_max * parameters.force_share
+        self._full_high = np.array([polynomial(curve, 1.0) for curve in t.forward])
+        self._full_low = -np.array([polynomial(curve, 1.0) for curve in t.reverse])
         self._step = parameters.slew_n_per_s * dt_s
         self._supply = [float(watts) for watts in body.supply_power_w]
         self._of_module = [np.flatnonzero(t.module == m) for m in range(len(body.modules))]
@@ -57,7 +59,10 @@ class Limiter:
             return self.force_n, np.zeros_like(self.force_n)
         wanted = np.where(np.isfinite(wanted_n), wanted_n, 0.0)
         wanted = np.minimum(np.maximum(wanted, self.force_n - self._step), self.force_n + self._step)
-        wanted = np.minimum(np.maximum(wanted, self._low), self._high)
+        scale = self._voltage_scale(voltage_v)
+        # what a full command gives at this voltage: more must not be believed
+        low, high = np.maximum(self._low, self._full_low * scale), np.minimum(self._high, self._full_high * scale)
+        wanted = np.minimum(np.maximum(wanted, low), high)
         if alive is not None:
             wanted[~alive] = 0.0
         powers = module_power(wanted, self._t.power_forward, self._t.power_reverse, self._t.module, len(self.magnets)).tolist()
@@ -67,7 +72,7 @@ class Limiter:
                 self._limit_power(wanted, module, supply)
         self.force_n = wanted
         out = np.empty_like(wanted)
-        commands(wanted, self._voltage_scale(voltage_v), *self._curves, self._full, out)
+        commands(wanted, scale, *self._curves, self._full, out)
         return wanted, out
 
     def _limit_power(self, wanted: np.ndarray, module: int, supply: float) -> None:
@@ -83,9 +88,15 @@ class Limiter:
         wanted[index] = force * kept
 
     def _voltage_scale(self, voltage_v: np.ndarray) -> np.ndarray:
-        low, high = VOLTAGE_RANGE
-        ratio = np.minimum(np.maximum(voltage_v[self._t.module] / self._t.voltage_v, low), high)
-        return np.asarray(ratio**VOLTAGE_EXPONENT)
+        """(n,) force at a full command over that at the nominal voltage; 1 where the reading is not believed."""
+        ratio = voltage_v[self._t.module] / self._t.voltage_v
+        return np.asarray(np.where(is_believed(ratio), ratio, 1.0) ** VOLTAGE_EXPONENT)
+
+
+def is_believed(ratio: np.ndarray) -> np.ndarray:
+    """Whether readings of a supply may be true, given as shares of its nominal voltage. A NaN may not."""
+    low, high = VOLTAGE_RANGE
+    return np.asarray((ratio >= low) & (ratio <= high))
 
 
 class MagnetLimiter:

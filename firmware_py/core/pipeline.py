@@ -18,10 +18,11 @@ from firmware_py.core.faults import FaultDetector
 from firmware_py.core.glide import Glide
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import HealthMonitor
-from firmware_py.core.limiter import Limiter
+from firmware_py.core.limiter import Limiter, is_believed
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.motor_test import MotorTest
 from firmware_py.core.paper_estimator import TagOnlyEstimator
+from firmware_py.core.requests import FOR_ALL, sift
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.supervisor import WARNING, Decision, Supervisor
 from firmware_py.core.thruster import ThrusterLag
@@ -38,6 +39,7 @@ from firmware_py.core.types import (
     Mode,
     ModuleCommand,
     Outputs,
+    Request,
     Thrust,
 )  # fmt: skip
 from firmware_py.description.parameters import Parameters
@@ -46,8 +48,6 @@ from firmware_py.description.schema import DescriptionError
 ESTIMATORS: dict[str, type[Estimator] | type[TagOnlyEstimator]] = {"full": Estimator, "paper": TagOnlyEstimator}
 CHANNELS = 8
 """Thruster commands that one module's frames carry."""
-FOR_ALL = frozenset({Action.ESTOP, Action.CLEAR_ESTOP, Action.GROUND_ALIVE})
-"""Requests that concern every body, whichever they name: ESTOP frames stop all modules."""
 VOLTAGE_SMOOTHING = 0.5
 """Share of a new voltage reading (10 Hz) that is believed: settles in half a second."""
 
@@ -71,7 +71,8 @@ class BodyPipeline:
         self.limiter = Limiter(body, parameters.limiter, period_ns * 1e-9)
         self.lag = ThrusterLag(body.thrusters, period_ns * 1e-9)
         self.slots = body.thrusters.module * CHANNELS + body.thrusters.channel
-        self.voltage_v = np.array([body.thrusters.voltage_v[body.thrusters.module == m][0] for m in range(len(body.modules))])
+        self._nominal_v = np.array([body.thrusters.voltage_v[body.thrusters.module == m][0] for m in range(len(body.modules))])
+        self.voltage_v = self._nominal_v.copy()
 
     def retune(self, parameters: Parameters) -> None:
         """Takes other gains, noise figures and allocation from this tick on; estimate, set-point and forces stay as they are."""
@@ -95,9 +96,9 @@ class BodyPipeline:
         if self.faults.changed:
             self.allocator.set_alive(self.faults.now.alive)
 
-    def decide(self, inputs: Inputs, estimate: Estimate) -> list[DockRequest]:
-        """Requests and fail-safes -> state and mode. Returns the docks and undocks that were granted."""
-        mine = [r for r in inputs.requests if r.body == self.body.index or r.action in FOR_ALL]
+    def decide(self, inputs: Inputs, estimate: Estimate, requests: Sequence[Request]) -> list[DockRequest]:
+        """Sound requests and fail-safes -> state and mode. Returns the docks and undocks that were granted."""
+        mine = [r for r in requests if r.body == self.body.index or r.action in FOR_ALL]
         self.health.step(inputs, estimate, mine, self.faults.now)
         was_armed = self.supervisor.armed
         decisions = self.supervisor.step(inputs.estop, self.health.now, mine, self._endings())
@@ -149,7 +150,7 @@ class BodyPipeline:
     def _read_supply(self, inputs: Inputs) -> None:
         for i, module in enumerate(self.body.modules):
             voltage = inputs.modules[module].voltage_v
-            if voltage is not None and np.isfinite(voltage):
+            if voltage is not None and is_believed(voltage / self._nominal_v[i]):
                 self.voltage_v[i] += VOLTAGE_SMOOTHING * (voltage - self.voltage_v[i])
 
     def take_over(self, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
@@ -205,12 +206,14 @@ class Pipeline:
     def step(self, inputs: Inputs) -> Outputs:
         """One tick."""
         outputs = Outputs(inputs.tick, inputs.time_ns, [IDLE] * self._modules, False, [], [])
-        self._retune(inputs, outputs)
         estimates = {chain.body.index: chain.measure(inputs) for chain in self._chains}
         self._dock(inputs, estimates, outputs)
+        requests, refusals = sift(inputs.requests, {chain.body.index: chain.body for chain in self._chains})
+        outputs.events += refusals
+        self._retune(requests, outputs)
         for chain in self._chains:
             estimate = estimates[chain.body.index]
-            outputs.preparations += chain.decide(inputs, estimate)
+            outputs.preparations += chain.decide(inputs, estimate, requests)
             if chain.supervisor.mode != Mode.DOCK and chain.body.index in self.docking.busy:
                 self.docking.abort(chain.body.index, inputs.time_ns, "the mode was changed")
             record, command = chain.control(inputs.time_ns, estimate)
@@ -220,9 +223,9 @@ class Pipeline:
             self._command(chain, command, outputs)
         return outputs
 
-    def _retune(self, inputs: Inputs, outputs: Outputs) -> None:
+    def _retune(self, requests: Sequence[Request], outputs: Outputs) -> None:
         """Parameters that were set since the last tick. What a ground station's registry let through still may be refused here."""
-        wanted = dict.fromkeys(r.argument for r in inputs.requests if r.action == Action.SET_PARAMETER)
+        wanted = dict.fromkeys(r.argument for r in requests if r.action == Action.SET_PARAMETER)
         if not wanted:
             return
         for name, value in wanted:

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 from firmware_py.core.arming import Question, against_arming, missing
 from firmware_py.core.failsafes import Failsafes, Level
-from firmware_py.core.health import NEVER_S, Health, is_sticks
-from firmware_py.core.transitions import ARMED, MODES, ROWS, TRIGGERS, Effect, Guard, State, Transition, Trigger
-from firmware_py.core.types import Action, Event, Mode, Request, Setpoint
+from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.transitions import ARMED, ROWS, TRIGGERS, Effect, Guard, State, Transition, Trigger
+from firmware_py.core.types import Event, Mode, Request
 from firmware_py.description.parameters import Parameters
 
 CRITICAL, WARNING, INFORMATION = 2, 4, 6
@@ -81,9 +81,6 @@ class Supervisor:
         trigger = TRIGGERS.get(request.action)
         if trigger is None:
             return None
-        if not _is_sound(request):
-            self._say(WARNING, f"{request.action.name} refused: its argument makes no sense")
-            return None
         if trigger == Trigger.ARM and request.argument is True:
             trigger = Trigger.FORCED_ARM
         decision = self._try(trigger, request.argument, health)
@@ -118,7 +115,7 @@ class Supervisor:
         mode = row.mode if row.mode is not None else argument if trigger == Trigger.SET_MODE else self.mode
         reasons = self._reasons(row.guard, mode, health)
         if reasons:
-            self._say(WARNING, f"{trigger.name} refused: {'; '.join(reasons)}")
+            self._say(WARNING, f"{trigger.name} refused: {'; '.join(dict.fromkeys(reasons))}")
             return None
         self._go(row, mode)
         return Decision(trigger, row.effect, mode, argument)
@@ -171,19 +168,3 @@ class Supervisor:
 
 TAKES_OVER = (Effect.ENTER_MODE, Effect.HOLD_AT, Effect.FOLLOW)
 """Effects by which a person chooses how the body is steered."""
-
-
-def _is_sound(request: Request) -> bool:
-    """Whether a request's argument is what its action needs."""
-    argument = request.argument
-    if request.action == Action.SET_MODE:
-        return isinstance(argument, Mode) and MODES[argument].request
-    if request.action == Action.STICKS:
-        return is_sticks(argument)
-    if request.action == Action.SET_POINT:
-        return isinstance(argument, Setpoint)
-    if request.action == Action.HOLD:
-        return argument is None or isinstance(argument, Setpoint)
-    if request.action == Action.TRACK:
-        return hasattr(argument, "sample") and hasattr(argument, "duration_s")
-    return True

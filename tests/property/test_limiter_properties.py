@@ -14,7 +14,7 @@ from firmware_py.prepare.assembly import assemble_vehicle
 always = settings(derandomize=True, deadline=None, database=None, max_examples=60)
 anything = st.floats(allow_nan=True, allow_infinity=True)
 wanted = arrays(np.float64, 8, elements=anything | st.floats(-12.0, 12.0))
-ticks = st.lists(st.tuples(wanted, st.booleans(), st.floats(0.0, 30.0)), min_size=1, max_size=12)
+ticks = st.lists(st.tuples(wanted, st.booleans(), st.floats(0.0, 30.0) | st.floats(7.0, 17.0)), min_size=1, max_size=12)
 BODY = assemble_vehicle(load_vehicle("modcube"))
 
 
@@ -29,6 +29,10 @@ def test_no_history_of_requests_leads_beyond_the_limits(
     for asked, armed, volts in history:
         force, command = limiter.step(asked, armed, np.array([volts]))
         assert np.all(force <= t.f_max * share) and np.all(force >= t.f_min * share)
+        scale = (volts / 12.0) ** 1.2 if 7.2 < volts < 16.8 else 1.0
+        for i in np.flatnonzero(np.abs(command) >= 1.0):
+            curve = t.forward[i] if force[i] > 0.0 else t.reverse[i]
+            assert abs(force[i]) <= scale * curve.sum() * (1 + 1e-9)
         assert np.isfinite(command).all() and np.all(np.abs(command) <= 1.0)
         assert total_power(force, t.power_forward, t.power_reverse) <= BODY.supply_power_w[0] * (1 + 1e-12)
         if armed:

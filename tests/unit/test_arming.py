@@ -44,6 +44,10 @@ HARD: list[tuple[Health, str]] = [
 SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(tag_age_s=0.6), "pose is 600 ms old, 500 permitted"),
     (GOOD._replace(sigma_m=0.06), "pose sigma 60 mm, 50 permitted"),
+    (GOOD._replace(sigma_m=math.nan), "pose sigma nan mm, 50 permitted"),
+    (GOOD._replace(nis_ratio=math.nan), "sensors and model disagree: nan of the expected, 5.0 permitted"),
+    (GOOD._replace(voltage_share=math.nan), "battery was not heard of"),
+    (GOOD._replace(cabin_c=math.nan), "cabin was not heard of"),
     (GOOD._replace(nis_ratio=6.0), "sensors and model disagree: 6.0 of the expected, 5.0 permitted"),
     (GOOD._replace(esc_missing=(0, 7)), "ESC 1, 8 does not answer"),
     (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
@@ -74,18 +78,17 @@ def test_active_fail_safe_hinders_arming_and_force_passes_over_it() -> None:
     failsafes = Failsafes(replace(P.failsafes, leak_delay_s=0.0, cabin_hot_delay_s=0.0))
     wet = GOOD._replace(leak=True, cabin_c=75.0)
     failsafes.step(wet, Mode.POSHOLD, False, False)
-    assert reasons(wet, failsafes=failsafes) == ["water in a cabin; cabin at 75 degC"]
+    assert reasons(wet, failsafes=failsafes) == ["water in a cabin", "cabin at 75 degC"]
     assert reasons(wet, failsafes=failsafes, forced=True) == []
 
 
 def test_parameters_out_of_range_are_never_passed_over() -> None:
     wrong = replace(P, limiter=replace(Limiter(), force_share=1.5, slew_n_per_s=0.0))
     for forced in (False, True):
-        (words,) = reasons(parameters=wrong, forced=forced)
-        assert words == (
-            "parameter limiter.force_share: 1.5 is out of range; permitted: 0.05 to 1; "
-            "parameter limiter.slew_n_per_s: 0.0 is out of range; permitted: 1 to 10000 N/s"
-        )
+        assert reasons(parameters=wrong, forced=forced) == [
+            "parameter limiter.force_share: 1.5 is out of range; permitted: 0.05 to 1",
+            "parameter limiter.slew_n_per_s: 0.0 is out of range; permitted: 1 to 10000 N/s",
+        ]
 
 
 def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
@@ -93,22 +96,42 @@ def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
         "e-stop clear", "modules answer", "mode has what it needs", "sticks neutral", "parameters valid", "compiled code warm",
     ]  # fmt: skip
     assert [check.name for check in CHECKS if check.may_be_skipped] == [
-        "pose fresh", "pose sure", "pose consistent", "every ESC answers", "every axis has thrust", "no fail-safe on",
+        "pose fresh", "pose sure", "pose consistent", "battery and cabin known",
+        "every ESC answers", "every axis has thrust", "no fail-safe on",
         "few bad frames", "topology as configured",
     ]  # fmt: skip
     both = GOOD._replace(silent=(2,), tag_age_s=0.7)
     assert reasons(both) == ["module 2 does not answer", "pose is 700 ms old, 500 permitted"]
 
 
-BOUNDARIES = [
-    ("tag_age_s", 0.5), ("sigma_m", 0.05), ("nis_ratio", 5.0), ("frame_errors_per_s", 20.0), ("tag_age_s", 8.0),
-]  # fmt: skip
+BOUNDARIES = [("tag_age_s", 0.5), ("sigma_m", 0.05), ("nis_ratio", 5.0), ("frame_errors_per_s", 20.0)]
 
 
 @pytest.mark.parametrize(("field", "limit"), BOUNDARIES)
 def test_check_fails_just_beyond_its_limit(field: str, limit: float) -> None:
     there, beyond = GOOD._replace(**{field: limit}), GOOD._replace(**{field: above(limit)})
     assert len(reasons(beyond)) == len(reasons(there)) + 1
+
+
+def test_lost_pose_is_said_once() -> None:
+    """Not also that it is old, or unsure."""
+    assert reasons(GOOD._replace(tag_age_s=8.0)) == ["pose is 8000 ms old, 500 permitted"]
+    assert reasons(GOOD._replace(tag_age_s=above(8.0), sigma_m=9.0)) == ["no tag for 8.0 s"]
+
+
+def test_same_words_of_a_check_and_a_fail_safe_are_said_once() -> None:
+    failsafes = Failsafes(replace(P.failsafes, axis_lost_delay_s=0.0))
+    lame = GOOD._replace(lost_axes=1)
+    failsafes.step(lame, Mode.POSHOLD, False, False)
+    assert reasons(lame, failsafes=failsafes) == ["the thrusters left cannot make every wrench"]
+
+
+def test_fail_safe_whose_cause_is_gone_says_what_the_cause_was() -> None:
+    failsafes = Failsafes(replace(P.failsafes, cabin_pressure_delay_s=0.0))
+    failsafes.step(GOOD._replace(cabin_change_pa=25000.0), Mode.POSHOLD, False, True)
+    alarms = failsafes.step(GOOD._replace(cabin_change_pa=25000.0), Mode.POSHOLD, False, True)
+    assert alarms == []
+    assert reasons(GOOD, failsafes=failsafes) == ["cabin pressure off by 25000 Pa"]
 
 
 def test_sticks_count_while_they_are_fresh_and_beyond_the_dead_zone() -> None:

@@ -232,10 +232,23 @@ def test_each_module_has_its_own_voltage(rich: Body) -> None:
     assert np.all(command[8:] > command[:8])
 
 
-@pytest.mark.parametrize("volts", [0.0, -5.0, 1e6])
-def test_absurd_voltage_leaves_commands_within_bounds(rich: Body, volts: float) -> None:
-    _, command = Limiter(rich, QUICK, 1.0).step(np.full(16, 5.0), True, np.array([volts, 12.0]))
-    assert np.all(command > 0.0) and np.all(command <= 1.0)
+@pytest.mark.parametrize("volts", [0.0, -5.0, 1.0, 1e6, np.nan, np.inf])
+def test_absurd_voltage_counts_as_nominal(rich: Body, volts: float) -> None:
+    """A sensor that reads nothing must not raise the commands."""
+    force, command = Limiter(rich, QUICK, 1.0).step(np.full(16, 5.0), True, np.array([volts, 12.0]))
+    np.testing.assert_array_equal(force, 5.0)
+    np.testing.assert_array_equal(command[:8], command[8:])
+
+
+@pytest.mark.parametrize("volts", [8.0, 10.0, 11.99, 12.0, 14.0])
+@pytest.mark.parametrize("wanted", [-100.0, 100.0])
+def test_no_more_force_is_believed_than_the_supply_can_make(rich: Body, volts: float, wanted: float) -> None:
+    """A full command gives what it gives at this voltage; more than the limit is never asked for."""
+    scale = (volts / 12.0) ** 1.2
+    full = float(force_of(rich, np.full(16, np.sign(wanted)), scale)[0])
+    force, command = Limiter(rich, QUICK, 1.0).step(np.full(16, wanted), True, np.full(2, volts))
+    np.testing.assert_allclose(force, np.sign(wanted) * min(abs(full), 10.0 if wanted > 0 else 8.0), rtol=1e-12)
+    np.testing.assert_allclose(force_of(rich, command, scale), force, atol=1e-8)
 
 
 # ---------------------------------------------------------------- deadband
@@ -336,7 +349,7 @@ def test_limits_are_made_of_these_numbers() -> None:
     assert POWER_HALVINGS == 12, "replay compares bytes"
 
 
-@pytest.mark.parametrize(("volts", "believed"), [(7.2, 7.2), (7.1, 7.2), (16.8, 16.8), (17.0, 16.8)])
+@pytest.mark.parametrize(("volts", "believed"), [(7.21, 7.21), (7.19, 12.0), (16.79, 16.79), (16.81, 12.0)])
 def test_voltage_is_believed_within_its_range(rich: Body, volts: float, believed: float) -> None:
     _, command = Limiter(rich, QUICK, 1.0).step(np.full(16, 2.0), True, np.full(2, volts))
     np.testing.assert_allclose(force_of(rich, command, (believed / 12.0) ** 1.2), 2.0, atol=1e-9)

@@ -86,7 +86,7 @@ class Tank:
                 heard = modules[m]
                 heard.gyro, heard.accel = r_mb.apply(x[10:13]), r_mb.apply(felt)
                 heard.pressure_pa = 101_325.0 + 9806.65 * float((x[:3] + world(x).apply(body.r_bi[k]))[2])
-                heard.voltage_v, heard.current_a, heard.leak = 12.0, 3.0, False
+                heard.voltage_v, heard.current_a, heard.leak, heard.cabin_temperature_c = 12.0, 3.0, False, 30.0
                 if tick % 10 == 0:
                     heard.esc = self._escs(n, k)
                 if tick % 2 == 0 and tick >= TAG_DELAY_TICKS:
@@ -252,6 +252,23 @@ def test_sagging_battery_raises_the_commands(tank: Tank) -> None:
     tank._hear = sagging  # type: ignore[method-assign]
     tank.run(1.0)
     assert np.abs(tank.outputs[-1].modules[0].thrusters).mean() > 1.05 * at_12
+
+
+def test_battery_reading_of_nothing_changes_no_command(tank: Tank) -> None:
+    """Neither at once nor by way of the mean."""
+    tank.run(0.5)
+    tank.run(1.0, Request(Action.ARM))
+    before = tank.pipeline._chains[0].voltage_v.copy()
+    hear = tank._hear
+
+    def broken(tick: int) -> list[ModuleInputs]:
+        modules = hear(tick)
+        modules[0].voltage_v = 0.0 if tick % 10 else float("nan")
+        return modules
+
+    tank._hear = broken  # type: ignore[method-assign]
+    tank.run(0.3)
+    np.testing.assert_array_equal(tank.pipeline._chains[0].voltage_v, before)
 
 
 # ---------------------------------------------------------------- fleets

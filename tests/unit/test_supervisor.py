@@ -233,24 +233,11 @@ def test_request_that_is_not_the_supervisors_is_passed_over() -> None:
     assert ask(supervisor, Action.SET_PARAMETER, ("control.lead_s", 0.1)) == [] == supervisor.events
 
 
-SENSELESS = [
-    (Action.SET_MODE, 3), (Action.SET_MODE, None), (Action.SET_MODE, Mode.DOCK), (Action.STICKS, None),
-    (Action.STICKS, Sticks((1.1, 0.0, 0.0), (0.0, 0.0, 0.0))), (Action.SET_POINT, None), (Action.HOLD, PATH),
-    (Action.TRACK, None), (Action.TRACK, HERE), (Action.TRACK, 2.0),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("action", "argument"), SENSELESS)
-def test_request_without_sense_is_refused(action: Action, argument: Any) -> None:
-    supervisor = supervisor_in()
-    assert ask(supervisor, action, argument) == []
-    assert supervisor.events == [Event(WARNING, f"{action.name} refused: its argument makes no sense")]
-    assert supervisor.mode == Mode.POSHOLD
-
-
-def test_thing_that_has_only_a_duration_or_only_samples_is_no_trajectory() -> None:
-    for lacking in (type("A", (), {"duration_s": 1.0})(), type("B", (), {"sample": None})()):
-        assert ask(supervisor_in(), Action.TRACK, lacking) == []
+def test_same_reason_of_several_fail_safes_is_said_once() -> None:
+    patient = replace(P, failsafes=replace(P.failsafes, tag_lost_limit=40.0))
+    supervisor = supervisor_in(mode=Mode.ALT_HOLD, parameters=patient)
+    assert ask(supervisor, Action.SET_MODE, Mode.AUTO, GOOD._replace(tag_age_s=31.0)) == []
+    assert texts(supervisor) == ["SET_MODE refused: no tag for 31.0 s"]
 
 
 def test_force_is_the_word_true_alone() -> None:

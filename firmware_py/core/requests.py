@@ -1,0 +1,155 @@
+"""What a request must be before anybody acts on it: a table of arguments, and whom it is for. Stands before stage 3 of a tick.
+
+Whatever a client sends, what is unsound comes no farther than this file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.health import is_sticks
+from firmware_py.core.transitions import MODES
+from firmware_py.core.types import Action, DockRequest, Event, Mode, Request, Setpoint
+
+WARNING = 4
+"""syslog severity."""
+FACES, QUARTERS = 6, 4
+FARTHEST = 1e6
+"""m, m/s, rad/s and so on: nothing that is meant is larger."""
+UNIT = 1e-3
+"""A quaternion's length is 1 within this."""
+FOR_ALL = frozenset({Action.ESTOP, Action.CLEAR_ESTOP, Action.GROUND_ALIVE, Action.SET_PARAMETER})
+"""Requests that concern every body, whichever they name: ESTOP frames stop all modules."""
+
+
+def _anything(argument: Any) -> bool:
+    return True
+
+
+def _is_forced(argument: Any) -> bool:
+    return argument is None or isinstance(argument, bool)
+
+
+def _is_mode(argument: Any) -> bool:
+    return isinstance(argument, Mode) and MODES[argument].request
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= FARTHEST
+
+
+def _is_array(value: Any, size: int, may_lack: bool) -> bool:
+    """Whether it is a (size,) array as compiled functions take it, of numbers that may be meant; NaN where `may_lack`."""
+    whole = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == (size,) and value.flags.c_contiguous
+    return whole and bool(np.all((np.abs(value) <= FARTHEST) | (np.isnan(value) & may_lack)))
+
+
+def is_setpoint(argument: Any, may_lack: bool = False) -> bool:
+    """Whether it is a Setpoint that can be flown; with `may_lack`, NaN stands where nothing is asked for."""
+    if not isinstance(argument, Setpoint):
+        return False
+    p_wb, q_wb, *rest = argument
+    if not all(_is_array(value, 3, may_lack) for value in (p_wb, *rest)) or not _is_array(q_wb, 4, may_lack):
+        return False
+    return abs(math.sqrt(float(q_wb @ q_wb)) - 1.0) <= UNIT or (may_lack and bool(np.isnan(q_wb).all()))
+
+
+def _is_place(argument: Any) -> bool:
+    return argument is None or is_setpoint(argument)
+
+
+def _is_point(argument: Any) -> bool:
+    return is_setpoint(argument, may_lack=True)
+
+
+def _is_trajectory(argument: Any) -> bool:
+    """Whether it can be sampled, and starts and ends where a body can be."""
+    duration_s: Any = getattr(argument, "duration_s", None)
+    if not _is_real(duration_s) or duration_s < 0.0 or not callable(getattr(argument, "sample", None)):
+        return False
+    return is_setpoint(argument.sample(0.0)) and is_setpoint(argument.sample(duration_s))
+
+
+def _is_parameter(argument: Any) -> bool:
+    if not isinstance(argument, tuple) or len(argument) != 2:
+        return False
+    name, value = argument
+    return isinstance(name, str) and isinstance(value, int | float | str)
+
+
+def _is_dock(argument: Any) -> bool:
+    if not isinstance(argument, DockRequest):
+        return False
+    *numbers, both_approach = argument
+    if not all(type(number) is int and number >= 0 for number in numbers) or not isinstance(both_approach, bool):
+        return False
+    return argument.face < FACES and argument.target_face < FACES and argument.quarter_turns < QUARTERS
+
+
+def _is_motor_test(argument: Any) -> bool:
+    if not isinstance(argument, tuple) or len(argument) != 3:
+        return False
+    index, share, seconds = argument
+    return type(index) is int and index >= 0 and _is_real(share) and _is_real(seconds)
+
+
+SOUND: Mapping[Action, Callable[[Any], bool]] = {
+    Action.ARM: _is_forced,
+    Action.DISARM: _anything,
+    Action.HOLD: _is_place,
+    Action.TRACK: _is_trajectory,
+    Action.ESTOP: _anything,
+    Action.CLEAR_ESTOP: _anything,
+    Action.SET_MODE: _is_mode,
+    Action.STICKS: is_sticks,
+    Action.SET_POINT: _is_point,
+    Action.SET_PARAMETER: _is_parameter,
+    Action.DOCK: _is_dock,
+    Action.UNDOCK: _is_dock,
+    Action.MOTOR_TEST: _is_motor_test,
+    Action.GROUND_ALIVE: _anything,
+}
+"""What the argument of each action must be. What stops a robot is never refused for its argument."""
+
+
+def sift(requests: Sequence[Request], bodies: Mapping[int, Body]) -> tuple[list[Request], list[Event]]:
+    """The requests that make sense and reach a body, and for each of the others why not."""
+    reasons = [against_request(request, bodies) for request in requests]
+    sound = [request for request, why in zip(requests, reasons, strict=True) if not why]
+    return sound, [Event(WARNING, f"{r.action.name} refused: {why}") for r, why in zip(requests, reasons, strict=True) if why]
+
+
+def against_request(request: Request, bodies: Mapping[int, Body]) -> str:
+    """Why a request reaches nobody, in words; empty when it does. `bodies` by number."""
+    if not SOUND[request.action](request.argument):
+        return "its argument makes no sense"
+    if request.action in FOR_ALL:
+        return ""
+    if request.body not in bodies:
+        return f"there is no body {request.body}; there are {_listed(bodies)}"
+    if request.action in (Action.DOCK, Action.UNDOCK):
+        return _against_faces(request.action, request.argument, request.body, bodies)
+    return ""
+
+
+def _against_faces(action: Action, dock: DockRequest, body: int, bodies: Mapping[int, Body]) -> str:
+    """Why two modules can neither meet nor part, whatever their faces are like."""
+    modules = {module for each in bodies.values() for module in each.modules}
+    unknown = {dock.module, dock.target_module} - modules
+    if unknown:
+        return f"there is no module {min(unknown)}; there are {_listed(modules)}"
+    if dock.module not in bodies[body].modules:
+        return f"module {dock.module} is not of body {body}"
+    together = dock.target_module in bodies[body].modules
+    if together == (action == Action.DOCK):
+        return f"modules {dock.module} and {dock.target_module} are {'already' if together else 'not'} of one body"
+    return ""
+
+
+def _listed(numbers: Iterable[int]) -> str:
+    return ", ".join(str(number) for number in sorted(numbers))

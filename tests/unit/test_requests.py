@@ -1,0 +1,160 @@
+"""Whatever is asked for: what makes no sense or reaches nobody is refused in words, and the robot flies on as it did."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_py.core.requests import SOUND, against_request, sift
+from firmware_py.core.rotations import from_euler
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Action, DockRequest, Event, Mode, Request, Setpoint, Sticks
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+from firmware_py.prepare.paths import hold
+from tests.unit.test_pipeline import DT, Tank, single
+
+NAN, LEVEL, ZERO = math.nan, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+HERE = rest_at(np.array([1.0, 0.0, 0.8]), from_euler(0.1, -0.15, 0.4))
+STICKS = Sticks((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+
+
+class Path:
+    """A trajectory that may be spoilt."""
+
+    def __init__(self, point: Any = HERE, duration_s: Any = 2.0) -> None:
+        self.point, self.duration_s = point, duration_s
+
+    def sample(self, t_s: float) -> Any:
+        return self.point
+
+
+def spoilt(**parts: Any) -> Setpoint:
+    return HERE._replace(**parts)
+
+
+UNPLACED = [
+    spoilt(p_wb=np.array([NAN, 0.0, 0.0])), spoilt(p_wb=np.array([0.0, math.inf, 0.0])), spoilt(p_wb=np.array([0.0, 0.0, 1.1e6])),
+    spoilt(v_w=np.array([NAN, 0.0, 0.0])), spoilt(q_wb=np.zeros(4)), spoilt(q_wb=2.0 * LEVEL), spoilt(q_wb=LEVEL * NAN),
+]  # fmt: skip
+MALFORMED = [
+    spoilt(p_wb=[1.0, 0.0, 0.0]), spoilt(q_wb=(1.0, 0.0, 0.0, 0.0)), spoilt(p_wb=np.zeros(2)), spoilt(p_wb=np.zeros((3, 1))),
+    spoilt(p_wb=np.zeros(3, np.float32)), spoilt(a_w=np.zeros(6)[::2]), spoilt(alpha_b=None), spoilt(w_b=np.array(["a", "b", "c"])),
+    tuple(HERE), [1.0, 2.0, 3.0], "here", 1,
+]  # fmt: skip
+DOCK = DockRequest(1, 1, 0, 0)
+UNSOUND: list[tuple[Action, Any]] = [
+    *[(Action.ARM, x) for x in (1, "yes", NAN)],
+    *[(Action.HOLD, x) for x in (*UNPLACED, *MALFORMED, Path())],
+    *[(Action.SET_POINT, x) for x in (None, *UNPLACED[1:3], *UNPLACED[4:6], *MALFORMED, spoilt(q_wb=np.array([1.0, 0.0, NAN, 0.0])))],
+    *[(Action.TRACK, x) for x in (None, HERE, 2.0, Path(duration_s=NAN), Path(duration_s=-1.0), Path(duration_s="long"))],
+    *[(Action.TRACK, Path(x)) for x in (None, *UNPLACED, *MALFORMED)],
+    (Action.TRACK, type("Sampleless", (), {"duration_s": 1.0})()),
+    (Action.TRACK, type("Endless", (), {"sample": lambda self, t: HERE})()),
+    *[(Action.SET_MODE, x) for x in (3, None, "AUTO", Mode.DOCK)],
+    *[(Action.STICKS, x) for x in (None, STICKS._replace(force=(1.1, 0, 0)), STICKS._replace(moment=(NAN, 0, 0)), (1, 2))],
+    *[(Action.SET_PARAMETER, x) for x in (None, "control.lead_s", ("control.lead_s",), (1, 2), ("control.lead_s", None), (["a"], 1.0))],
+    *[(action, x) for action in (Action.DOCK, Action.UNDOCK) for x in (
+        None, (1, 1, 0, 0), DOCK._replace(module=None), DOCK._replace(module=-1), DOCK._replace(face=6), DOCK._replace(face=0.5),
+        DOCK._replace(target_face=6), DOCK._replace(target_module="one"), DOCK._replace(quarter_turns=4), DOCK._replace(both_approach=2),
+    )],
+    *[(Action.MOTOR_TEST, x) for x in (None, (0, 0.1), (0.0, 0.1, 1.0), (-1, 0.1, 1.0), (0, NAN, 1.0), (0, "a", "b"), (0, 0.1, math.inf))],
+]  # fmt: skip
+SOUND_ONES: list[tuple[Action, Any]] = [
+    (Action.ARM, None), (Action.ARM, True), (Action.ARM, False), (Action.DISARM, object()), (Action.ESTOP, NAN), (Action.CLEAR_ESTOP, 1),
+    (Action.GROUND_ALIVE, "?"), (Action.HOLD, None), (Action.HOLD, HERE), (Action.TRACK, Path()), (Action.TRACK, hold(HERE, 3.0)),
+    (Action.SET_MODE, Mode.AUTO), (Action.STICKS, STICKS), (Action.SET_POINT, HERE), (Action.SET_POINT, spoilt(p_wb=ZERO * NAN)),
+    (Action.SET_POINT, spoilt(q_wb=LEVEL * NAN, v_w=np.array([NAN, 0.0, 0.1]))), (Action.SET_PARAMETER, ("control.lead_s", 0.1)),
+    (Action.MOTOR_TEST, (7, -0.1, 2)), (Action.HOLD, spoilt(q_wb=LEVEL * 1.0009)), (Action.HOLD, spoilt(p_wb=np.full(3, 1e6))),
+]  # fmt: skip
+PAIR = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2, [0, 1])
+APART = {0: single(0), 1: single(1)}
+
+
+def name(value: Any) -> str:
+    return value.name if isinstance(value, Action) else type(value).__name__
+
+
+def test_table_knows_every_action() -> None:
+    assert set(SOUND) == set(Action)
+
+
+@pytest.mark.parametrize(("action", "argument"), UNSOUND, ids=name)
+def test_argument_without_sense_is_refused(action: Action, argument: Any) -> None:
+    assert against_request(Request(action, 0, argument), {0: PAIR}) == "its argument makes no sense"
+
+
+@pytest.mark.parametrize(("action", "argument"), SOUND_ONES, ids=name)
+def test_argument_with_sense_passes(action: Action, argument: Any) -> None:
+    assert against_request(Request(action, 0, argument), APART) == ""
+
+
+@pytest.mark.parametrize("action", [Action.ESTOP, Action.CLEAR_ESTOP, Action.GROUND_ALIVE, Action.SET_PARAMETER], ids=name)
+def test_what_concerns_everybody_may_name_anybody(action: Action) -> None:
+    assert against_request(Request(action, 99, ("control.lead_s", 0.1)), APART) == ""
+
+
+def test_body_that_is_not_there_is_named_with_those_that_are() -> None:
+    assert against_request(Request(Action.ARM, 7), APART) == "there is no body 7; there are 0, 1"
+    assert against_request(Request(Action.DISARM, 1), {0: PAIR}) == "there is no body 1; there are 0"
+
+
+@pytest.mark.parametrize(
+    ("action", "body", "dock", "words"),
+    [
+        (Action.DOCK, 1, DOCK, ""),
+        (Action.DOCK, 1, DOCK._replace(target_module=9), "there is no module 9; there are 0, 1"),
+        (Action.DOCK, 1, DOCK._replace(module=5), "there is no module 5; there are 0, 1"),
+        (Action.DOCK, 0, DOCK, "module 1 is not of body 0"),
+        (Action.DOCK, 1, DOCK._replace(target_module=1), "modules 1 and 1 are already of one body"),
+        (Action.UNDOCK, 1, DOCK, "modules 1 and 0 are not of one body"),
+    ],
+)
+def test_dock_or_undock_of_what_is_not_there_is_refused(action: Action, body: int, dock: DockRequest, words: str) -> None:
+    assert against_request(Request(action, body, dock), APART) == words
+
+
+def test_docked_modules_part_and_do_not_dock_again() -> None:
+    assert against_request(Request(Action.UNDOCK, 0, DOCK), {0: PAIR}) == ""
+    assert against_request(Request(Action.DOCK, 0, DOCK), {0: PAIR}) == "modules 1 and 0 are already of one body"
+
+
+def test_sound_requests_keep_their_order_and_the_others_are_answered() -> None:
+    requests = [Request(Action.ARM), Request(Action.HOLD, 0, 1), Request(Action.DISARM), Request(Action.ARM, 3)]
+    sound, events = sift(requests, APART)
+    assert sound == [requests[0], requests[2]]
+    assert events == [
+        Event(4, "HOLD refused: its argument makes no sense"), Event(4, "ARM refused: there is no body 3; there are 0, 1"),
+    ]  # fmt: skip
+
+
+# ---------------------------------------------------------------- in flight
+
+
+def test_robot_flies_on_through_every_request_without_sense() -> None:
+    """All of them at once, in every tick of a second: nothing raises, nothing moves, every one is answered."""
+    tank = Tank([single()])
+    tank.run(0.5)
+    tank.run(3.0, Request(Action.ARM))
+    for _ in range(10):
+        outputs = tank.run(DT, *(Request(action, 0, argument) for action, argument in UNSOUND))
+        assert len([event for event in outputs.events if "refused" in event.text]) == len(UNSOUND)
+        tank.run(0.1)
+    record = tank.outputs[-1].records[0]
+    assert (record.state, record.mode) == (State.ARMED, Mode.POSHOLD)
+    np.testing.assert_allclose(record.setpoint.p_wb, tank.states[0][:3], atol=2e-3)
+    assert np.isfinite(record.commanded_n).all()
+
+
+def test_place_with_a_hole_in_it_does_not_poison_the_set_point() -> None:
+    """Once a NaN is in the glider, it stays there."""
+    tank = Tank([single()])
+    tank.run(0.5)
+    tank.run(1.0, Request(Action.ARM))
+    for argument in UNPLACED + MALFORMED:
+        tank.run(DT, Request(Action.HOLD, 0, argument), Request(Action.SET_POINT, 0, argument))
+    outputs = tank.run(1.0, Request(Action.SET_MODE, 0, Mode.GUIDED))
+    assert all(np.isfinite(part).all() for part in outputs.records[0].setpoint)
+    assert outputs.modules[0].thrusters.any()
