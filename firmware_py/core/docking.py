@@ -149,7 +149,7 @@ class DockingStage:
         decisions = Decisions({}, [], [], [])
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:
-            self._begin(prepared, inputs.time_ns, estimates)
+            self._begin(prepared, inputs.time_ns, estimates, decisions)
         if self._joints.rows.size:
             self._joints.step(inputs.time_ns, inputs.modules, poses)
         for dock in list(self._docks):
@@ -167,10 +167,13 @@ class DockingStage:
 
     # ------------------------------------------------------------ beginnings
 
-    def _begin(self, prepared: Prepared, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]]) -> None:
+    def _begin(
+        self, prepared: Prepared, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions
+    ) -> None:
         request = prepared.request
         if prepared.plan is None:
             self._say(WARNING, f"dock refused: {prepared.refusal}")
+            decisions.ended.append(_body_of(request.module, estimates))
         elif isinstance(prepared.plan, UndockPlan):
             self._undocks.append(_Undock(prepared, time_ns))
             self._say(INFORMATION, f"undocking module {request.module} from {request.target_module}")

@@ -158,3 +158,26 @@ def test_place_with_a_hole_in_it_does_not_poison_the_set_point() -> None:
     outputs = tank.run(1.0, Request(Action.SET_MODE, 0, Mode.GUIDED))
     assert all(np.isfinite(part).all() for part in outputs.records[0].setpoint)
     assert outputs.modules[0].thrusters.any()
+
+
+def test_dock_that_cannot_be_prepared_leaves_the_body_holding_its_place() -> None:
+    """Probe against probe: known only when it is prepared, after the mode was taken."""
+    from firmware_py.core.docking import Prepared
+
+    tank = Tank([single(0), single(1)])
+    tank.run(0.5)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
+    outputs = tank.run(DT, Request(Action.DOCK, 1, DOCK))
+    assert outputs.preparations == [DOCK]
+    assert outputs.records[1].mode == Mode.DOCK
+    step = tank.pipeline.step
+
+    def refuse_once(inputs: Any) -> Any:
+        tank.pipeline.step = step  # type: ignore[method-assign]
+        inputs.prepared = [Prepared(DOCK, None, (), "a probe would meet no drogue")]
+        return step(inputs)
+
+    tank.pipeline.step = refuse_once  # type: ignore[method-assign]
+    outputs = tank.run(2 * DT)
+    assert any(event.text == "dock refused: a probe would meet no drogue" for o in tank.outputs[-2:] for event in o.events)
+    assert outputs.records[1].mode == Mode.POSHOLD
