@@ -29,7 +29,8 @@ class History:
         """Appends the sample of the tick at `time_ns`; ticks that were skipped are filled with the same wrench and no
         sensors.
         """
-        missed = min((time_ns - self.newest_ns) // self.period_ns - 1, self.length) if self.newest >= 0 else 0
+        periods = (time_ns - self.newest_ns + self.period_ns // 2) // self.period_ns  # the nearest: a tick may come off its time
+        missed = min(periods - 1, self.length) if self.newest >= 0 else 0
         for _ in range(missed):
             self._write(self.newest_ns + self.period_ns, tau, None, None, None)
         self._write(time_ns, tau, gyro, accel, depth_m)
