@@ -19,6 +19,9 @@ from typing import Any
 
 import numpy as np
 
+SHOWN_CHARACTERS = 60
+"""A value that is longer is cut in an error's line."""
+
 
 class DescriptionError(ValueError):
     """A description is wrong; the message is one line: where, what, and what would be right."""
@@ -116,7 +119,7 @@ class Source:
     def error(self, keys: Sequence[str | int], what: str) -> DescriptionError:
         """The error for `keys`: `file:line: a.b: what`."""
         name = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
-        return DescriptionError(f"{self.path}:{self.line_of(keys)}: {name}: {what}")
+        return DescriptionError(f"{self.path}:{self.line_of(keys)}: {name}{': ' if name else ''}{what}")
 
 
 def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
@@ -127,9 +130,9 @@ def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
         raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     try:
         return tomllib.loads(text), Source(str(path), text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, and what Python itself refuses to read
         match = re.search(r"line (\d+)", str(error))
-        raise DescriptionError(f"{path}:{match.group(1) if match else 1}: not valid TOML: {error}") from None
+        raise DescriptionError(f"{path}:{match.group(1) if match else 1}: not valid TOML: {str(error).splitlines()[0]}") from None
 
 
 def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str | int, ...] = ()) -> Any:
@@ -161,8 +164,10 @@ def describe(limits: Limits) -> str:
     if limits.choices:
         return "one of " + ", ".join(limits.choices)
     unit = f" {limits.unit}" if limits.unit else ""
-    if math.isfinite(limits.low) or math.isfinite(limits.high):
+    if math.isfinite(limits.low) and math.isfinite(limits.high):
         return f"{limits.low:g} to {limits.high:g}{unit}"
+    if math.isfinite(limits.low) or math.isfinite(limits.high):
+        return f"at least {limits.low:g}{unit}" if math.isfinite(limits.low) else f"at most {limits.high:g}{unit}"
     return f"a value{f' in{unit}' if unit else ''}"
 
 
@@ -187,35 +192,55 @@ def _value(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[st
 
 def _array(limits: Limits, value: Any, source: Source, keys: tuple[str | int, ...]) -> np.ndarray:
     try:
+        if not _is_numeric(value):
+            raise TypeError
         array = frozen_array(value)
     except (TypeError, ValueError):
         raise source.error(keys, "must be numbers only, in rows of equal length") from None
+    except OverflowError:
+        array = frozen_array(math.inf)
     shape = limits.shape
-    if shape and (array.ndim != len(shape) or any(s not in (-1, n) for s, n in zip(shape, array.shape, strict=True))):
-        raise source.error(keys, f"has shape {array.shape}; needs {shape} (-1: any)")
     if not np.all(np.isfinite(array)):
         raise source.error(keys, "must be finite numbers, not NaN or infinity")
+    if shape and (array.ndim != len(shape) or any(s not in (-1, n) for s, n in zip(shape, array.shape, strict=True))):
+        raise source.error(keys, f"has shape {array.shape}; needs {shape} (-1: any)")
     if array.size and (array.min() < limits.low or array.max() > limits.high):
-        raise source.error(keys, f"{value} is out of range; permitted: {describe(limits)}")
+        raise source.error(keys, f"{_shown(value)} is out of range; permitted: {describe(limits)}")
     return array
+
+
+def _is_numeric(value: Any) -> bool:
+    """Whether a list, or lists in it, hold numbers alone; neither truth nor text."""
+    if isinstance(value, list):
+        return all(_is_numeric(item) for item in value)
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _shown(value: Any) -> str:
+    """The value as it stands in a line of words."""
+    text = repr(value)
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."
 
 
 def _scalar(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[str | int, ...]) -> Any:
     if hint is bool or isinstance(value, bool):
         if hint is not bool or not isinstance(value, bool):
-            raise source.error(keys, f"{value!r} is not {'true or false' if hint is bool else describe(limits)}")
+            raise source.error(keys, f"{_shown(value)} is not {'true or false' if hint is bool else describe(limits)}")
         return value
     if hint is str:
         if not isinstance(value, str):
-            raise source.error(keys, f"{value!r} is not text")
+            raise source.error(keys, f"{_shown(value)} is not text")
         if limits.choices and value not in limits.choices:
-            raise source.error(keys, f"{value!r} is unknown; permitted: {describe(limits)}")
+            raise source.error(keys, f"{_shown(value)} is unknown; permitted: {describe(limits)}")
         return value
     if not isinstance(value, int | float) or (hint is int and not isinstance(value, int)):
-        raise source.error(keys, f"{value!r} is not {'a whole number' if hint is int else 'a number'}")
-    if not math.isfinite(value) or not limits.low <= value <= limits.high:
-        raise source.error(keys, f"{value!r} is out of range; permitted: {describe(limits)}")
-    return hint(value)
+        raise source.error(keys, f"{_shown(value)} is not {'a whole number' if hint is int else 'a number'}")
+    try:
+        if limits.low <= value <= limits.high and math.isfinite(float(value)):
+            return hint(value)
+    except OverflowError:
+        pass
+    raise source.error(keys, f"{_shown(value)} is out of range; permitted: {describe(limits)}")
 
 
 def to_plain(value: Any) -> Any:

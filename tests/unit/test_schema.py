@@ -43,6 +43,11 @@ class Boat:
     fin: tuple[Fin, ...] = quantity((), help="the others")
     flags: tuple[str, ...] = quantity((), choices=("red", "green"), help="shown")
     mate: str | None = quantity(None, help="may be absent")
+    heel: float = quantity(0.0, help="any number")
+
+    def __post_init__(self) -> None:
+        if self.mate == self.name:
+            raise DescriptionError("mate must not be the captain")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,7 +106,7 @@ def test_what_is_written_comes_through_and_the_rest_is_default(tmp_path: Path) -
 
 NAME = 'name = "Ann"\n'
 TOP = NAME + "length_m = 7.5\n"
-KNOWN = "crew, depths, fin, flags, inertia, keel, length_m, mate, name, rig, sails"
+KNOWN = "crew, depths, fin, flags, heel, inertia, keel, length_m, mate, name, rig, sails"
 
 WRONG = {
     "unknown key": (TOP + "colour = 3\n", f"3: colour: unknown key; permitted here: {KNOWN}"),
@@ -149,6 +154,14 @@ WRONG = {
     "NaN in an array": (TOP + "depths = [1, nan]\n", "3: depths: must be finite numbers, not NaN or infinity"),
     "array out of range": (TOP + "depths = [1, 51]\n", "3: depths: [1, 51] is out of range; permitted: 0 to 50 m"),
     "number for an array": (TOP + "depths = 3\n", "3: depths: has shape (); needs (-1,) (-1: any)"),
+    "text in an array": (TOP + 'depths = [1, "2"]\n', "3: depths: must be numbers only, in rows of equal length"),
+    "truth in an array": (TOP + "inertia = [[1, 0], [true, 1]]\n", "3: inertia: must be numbers only, in rows of equal length"),
+    "huge number": (NAME + f"length_m = 1{'0' * 400}\n", f"2: length_m: 1{'0' * 56}... is out of range; permitted: 0.1 to 100 m"),
+    "huge number in an array": (TOP + f"depths = [1{'0' * 400}]\n", "3: depths: must be finite numbers, not NaN or infinity"),
+    "number that no computer can read": (NAME + f"length_m = 1{'0' * 5000}\n", "1: not valid TOML: Exceeds the limit"),
+    "brackets without end": (NAME + "length_m = " + "[" * 5000 + "\n", "1: not valid TOML: "),
+    "long array out of range": (TOP + f"depths = {[51] * 99}\n", f"3: depths: {str([51] * 99)[:57]}... is out of range"),
+    "its own rule at the top": (TOP + 'mate = "Ann"\n', "1: mate must not be the captain"),
     "its own rule": (TOP + "[keel]\nangle = 0.5\n", "3: keel: angle must not be one half"),
     "its own rule in a row": (TOP + "[[fin]]\nangle = 0\n\n[[fin]]\nangle = 0.5\n", "6: fin[1]: angle must not"),
 }
@@ -158,6 +171,11 @@ WRONG = {
 def test_what_is_wrong_is_refused_with_line_and_remedy(tmp_path: Path, case: str) -> None:
     text, words = WRONG[case]
     assert refusal(tmp_path, text).startswith(f"boat.toml:{words}")
+
+
+def test_number_beyond_every_float_is_refused_where_any_number_is_permitted(tmp_path: Path) -> None:
+    assert refusal(tmp_path, TOP + f"heel = -1{'0' * 400}\n").endswith("is out of range; permitted: a value")
+    assert refusal(tmp_path, TOP + "heel = inf\n").endswith("inf is out of range; permitted: a value")
 
 
 def test_line_is_that_of_an_inline_table(tmp_path: Path) -> None:
@@ -211,6 +229,8 @@ def test_frozen_array_is_a_copy() -> None:
     [
         ({"low": 0.0, "high": 2.0, "unit": "m"}, "0 to 2 m"),
         ({"low": 0.0, "high": 2.0}, "0 to 2"),
+        ({"low": 0.0, "unit": "m"}, "at least 0 m"),
+        ({"high": 5.0}, "at most 5"),
         ({"unit": "m"}, "a value in m"),
         ({}, "a value"),
         ({"choices": ("a", "b")}, "one of a, b"),
