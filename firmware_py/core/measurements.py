@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.observation import GRAVITY
-from firmware_py.core.rotations import conjugate, difference, exp, multiply, to_matrix
+from firmware_py.core.rotations import M, V, conjugate, difference, exp, multiply, to_matrix
 from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservation
 
 WATER_DENSITY = 1000.0
@@ -24,17 +26,21 @@ SECOND_HAND_WEIGHT = 1.0 / 9.0
 """What such a tag is worth: half a degree of the carrier over half a metre is three times a tag's own noise."""
 
 
+Seen = list[tuple[TagObservation, int]]
+"""Tags of one picture, and which of the body's tags each is."""
+
+
 class Measurements:
     """Fuses what the modules of one body say. Holds nothing but geometry."""
 
     def __init__(self, body: Body) -> None:
         self._modules = body.modules
-        self._rotations = [to_matrix(np.ascontiguousarray(q)) for q in body.q_bm]
-        self._r_bi = body.r_bi
-        self._tags = {
-            (int(m), int(i)): (np.ascontiguousarray(r), conjugate(np.ascontiguousarray(q)))
-            for m, i, r, q in zip(body.tag_module, body.tag_ids, body.r_bt, body.q_bt, strict=True)
-        }
+        self._rotations = np.stack([to_matrix(np.ascontiguousarray(q)) for q in body.q_bm], axis=1)
+        self._mean_of_all = self._rotations.reshape(3, -1) / len(body.modules)
+        self._r_bi, self._mean_r_bi = body.r_bi, body.r_bi.mean(axis=0)
+        self._tags = {(int(m), int(i)): k for k, (m, i) in enumerate(zip(body.tag_module, body.tag_ids, strict=True))}
+        self._levers = np.ascontiguousarray(body.r_bt)
+        self._q_tb = np.array([conjugate(np.ascontiguousarray(q)) for q in body.q_bt]).reshape(-1, 4)
 
     def fuse(self, modules: Sequence[ModuleInputs], q_wb: np.ndarray) -> Measured:
         """One measurement of each kind.
@@ -49,51 +55,44 @@ class Measurements:
 
     def _mean(self, readings: list[np.ndarray | None]) -> np.ndarray | None:
         """Mean over the modules that were heard, body frame."""
-        total: np.ndarray | None = None
-        heard = 0
-        for rotation, value in zip(self._rotations, readings, strict=True):
-            if value is not None:
-                turned = rotation @ value
-                total = turned if total is None else total + turned
-                heard += 1
-        return None if total is None else total / heard
-
-    def _depth(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> float | None:
-        heard = [(i, m.pressure_pa) for i, m in enumerate(mine) if m.pressure_pa is not None]
+        heard = [value for value in readings if value is not None]
         if not heard:
             return None
-        down_b = to_matrix(q_wb)[2]
-        below = sum(float(self._r_bi[i] @ down_b) for i, _ in heard) / len(heard)
-        pressure = sum(p for _, p in heard) / len(heard)
+        mean = self._mean_of_all
+        if len(heard) < len(readings):
+            mean = self._rotations[:, [value is not None for value in readings]].reshape(3, -1) / len(heard)
+        return np.asarray(mean @ np.concatenate(heard))
+
+    def _depth(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> float | None:
+        heard = [m.pressure_pa for m in mine if m.pressure_pa is not None]
+        if not heard:
+            return None
+        lever = self._mean_r_bi
+        if len(heard) < len(mine):
+            lever = self._r_bi[[m.pressure_pa is not None for m in mine]].mean(axis=0)
+        pressure, below = sum(heard) / len(heard), float(lever @ to_matrix(q_wb)[2])
         return (pressure - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - below
 
     def _poses(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> list[BodyPose]:
         """One pose for each picture, oldest first."""
-        pictures: dict[int, list[tuple[TagObservation, np.ndarray, np.ndarray]]] = {}
+        pictures: dict[int, Seen] = {}
         for index, module in enumerate(mine):
             for tag in module.tags:
                 known = self._tags.get((index, tag.tag_id))
                 if known is not None:
-                    pictures.setdefault(tag.capture_ns, []).append((tag, known[0], multiply(tag.q_wt, known[1])))
-        return [_one_pose(capture, seen, q_wb) for capture, seen in sorted(pictures.items())]
+                    pictures.setdefault(tag.capture_ns, []).append((tag, known))
+        return [self._one_pose(capture, seen, q_wb) for capture, seen in sorted(pictures.items())]
 
-
-Seen = list[tuple[TagObservation, np.ndarray, np.ndarray]]
-"""Tag, its place in the body (3,), and the body's attitude by it (4,)."""
-
-
-def _one_pose(capture_ns: int, seen: Seen, q_wb: np.ndarray) -> BodyPose:
-    """Mean of the tags of one picture; those that stand alone against the others are left out as flipped."""
-    if len(seen) > 1:
-        seen = _agreeing(seen, q_wb)
-    if len(seen) == 1:
-        tag, lever, q_wb = seen[0]
-        return BodyPose(capture_ns, tag.p_wt, lever, q_wb, _weight(tag))
-    reference = seen[0][2]
-    mean = np.mean([difference(q, reference) for _, _, q in seen], axis=0)
-    q_wb = multiply(reference, exp(mean))
-    p_wt = np.mean([t.p_wt for t, _, _ in seen], axis=0)
-    return BodyPose(capture_ns, p_wt, np.mean([r for _, r, _ in seen], axis=0), q_wb, sum(_weight(tag) for tag, _, _ in seen))
+    def _one_pose(self, capture_ns: int, seen: Seen, q_wb: np.ndarray) -> BodyPose:
+        """Mean of the tags of one picture; those that stand alone against the others are left out as flipped."""
+        if len(seen) == 1:
+            tag, k = seen[0]
+            return BodyPose(capture_ns, tag.p_wt, self._levers[k], multiply(tag.q_wt, self._q_tb[k]), _weight(tag))
+        p_wt, q_wt = (np.concatenate(parts).reshape(len(seen), -1) for parts in ([t.p_wt for t, _ in seen], [t.q_wt for t, _ in seen]))
+        known, weights = np.array([k for _, k in seen]), np.array([_weight(tag) for tag, _ in seen])
+        mean_p_wt, lever, attitude = np.zeros(3), np.zeros(3), np.zeros(4)
+        weight = fuse_picture(p_wt, q_wt, self._levers[known], self._q_tb[known], weights, q_wb, mean_p_wt, lever, attitude)
+        return BodyPose(capture_ns, mean_p_wt, lever, attitude, weight)
 
 
 def _weight(tag: TagObservation) -> float:
@@ -101,9 +100,29 @@ def _weight(tag: TagObservation) -> float:
     return SECOND_HAND_WEIGHT if tag.quality == SECOND_HAND else 1.0
 
 
-def _agreeing(seen: Seen, q_wb: np.ndarray) -> Seen:
-    """The largest group of tags that agree on the attitude; of equal groups the one nearest to the estimate `q_wb`."""
-    attitudes = np.array([q for _, _, q in seen])
-    agreement = np.abs(attitudes @ attitudes.T) > np.cos(0.5 * FLIP_RAD)
-    votes = agreement.sum(axis=1) + 0.5 * np.abs(attitudes @ q_wb)
-    return [s for s, ok in zip(seen, agreement[int(np.argmax(votes))], strict=True) if ok]
+@njit(f"float64({M},{M},{M},{M},{V},{V},{V},{V},{V})", cache=True)
+def fuse_picture(p_wt, q_wt, levers, q_tb, weights, q_near, mean_p_wt, mean_lever, mean_q_wb):  # type: ignore[no-untyped-def]
+    """Writes the means of the largest group of tags that agree on the attitude; of equal groups of the one nearest to `q_near`.
+
+    Args:
+        p_wt, q_wt: (k, 3), (k, 4) poses of the tags in the world; levers, q_tb: their places in the body, body frame to
+            tag frame; weights: (k,).
+        mean_p_wt, mean_lever, mean_q_wb: are written, (3,), (3,), (4,).
+
+    Returns the weight of the group.
+    """
+    count = p_wt.shape[0]
+    q_wb = np.empty((count, 4))
+    for i in range(count):
+        q_wb[i] = multiply(q_wt[i], q_tb[i])
+    agreement = np.abs(q_wb @ q_wb.T) > math.cos(0.5 * FLIP_RAD)
+    group = agreement[np.argmax(agreement.sum(axis=1) + 0.5 * np.abs(q_wb @ q_near))]
+    reference, size, weight, turn = q_wb[np.argmax(group)], np.sum(group), 0.0, np.zeros(3)
+    for i in range(count):
+        if group[i]:
+            turn += difference(q_wb[i], reference) / size
+            mean_p_wt += p_wt[i] / size
+            mean_lever += levers[i] / size
+            weight += weights[i]
+    mean_q_wb[:] = multiply(reference, exp(turn))
+    return weight
