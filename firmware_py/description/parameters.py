@@ -307,23 +307,28 @@ CONTROLLERS = {"modcube": Parameters(), "least_power": Parameters(allocation=All
 """Whole sets of parameters by name."""
 
 
+_TUNABLES = tuple(
+    (group.name, field.name, limits_of(type(group.default), field.name))
+    for group in dataclasses.fields(Parameters)
+    for field in dataclasses.fields(type(group.default))  # type: ignore[arg-type]
+)
+"""Group, field and limits of every tunable: worked out once, they are checked in the tick that arms."""
+
+
 def registry() -> Iterator[tuple[str, Limits]]:
     """Every tunable as `group.field` with its limits, in a fixed order."""
-    for group in dataclasses.fields(Parameters):
-        cls = type(group.default)
-        for field in dataclasses.fields(cls):  # type: ignore[arg-type]
-            yield f"{group.name}.{field.name}", limits_of(cls, field.name)
+    for group, name, limits in _TUNABLES:
+        yield f"{group}.{name}", limits
 
 
 def invalid(parameters: Parameters) -> list[str]:
     """What is out of range in a set of parameters, in words; empty when nothing is."""
     reasons = []
-    for dotted, limits in registry():
-        group, _, name = dotted.partition(".")
+    for group, name, limits in _TUNABLES:
         value = getattr(getattr(parameters, group), name)
         ok = value in limits.choices if limits.choices else limits.low <= value <= limits.high
         if not ok:
-            reasons.append(f"parameter {dotted}: {value!r} is out of range; permitted: {describe(limits)}")
+            reasons.append(f"parameter {group}.{name}: {value!r} is out of range; permitted: {describe(limits)}")
     return reasons
 
 

@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +75,7 @@ class Recorder:
         kind = QueuedFile if queued else GuardedFile
         self._can = kind(folder / CAN_LOG if folder is not None else Path(os.devnull))
         self._mcap = kind(folder / SIGNAL_LOG if folder is not None else Path(os.devnull))
-        self._frames: deque[tuple[int, int, str, tuple[tuple[int, bytes], ...]]] = deque()
+        self._lines: list[str] = []
         self._received = 0
         self._reported = False
         self._closed = False
@@ -108,13 +107,12 @@ class Recorder:
 
     def sent(self, time_ns: int, bus: int, frames: Iterable[tuple[int, bytes]]) -> None:
         """Frames (id, data) that the tick at `time_ns` put on bus number `bus`."""
-        self._frames.append((time_ns, bus, "T", tuple(frames)))
+        self._lines.append(candump_lines(time_ns, bus, "T", frames))
 
-    def received(self, time_ns: int, bus: int, frames: Iterable[tuple[int, bytes]]) -> None:
+    def received(self, time_ns: int, bus: int, frames: Collection[tuple[int, bytes]]) -> None:
         """Frames (id, data) that the tick at `time_ns` took from bus number `bus`."""
-        taken = tuple(frames)
-        self._received += len(taken)
-        self._frames.append((time_ns, bus, "R", taken))
+        self._received += len(frames)
+        self._lines.append(candump_lines(time_ns, bus, "R", frames))
 
     def record(self, inputs: Inputs, outputs: Outputs) -> None:
         """One tick: what it took and everything that it thought."""
@@ -124,10 +122,8 @@ class Recorder:
 
     def flush(self) -> list[Event]:
         """Hand everything so far to the operating system; a warning, once, where that fails."""
-        lines = []
-        while self._frames:
-            lines.append(candump_lines(*self._frames.popleft()))
-        self._can.write("".join(lines).encode())
+        self._can.write("".join(self._lines).encode())
+        self._lines.clear()
         self._writer.flush()
         failed = next((file for file in (self._can, self._mcap) if file.error is not None), None)
         if failed is None or self._reported:
