@@ -8,34 +8,23 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import median
 from typing import Annotated, Any
 
 import typer
+from accept_measures import Values, flown, repeated, saved_by_least_power, timed
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from firmware_py.description.parameters import CONTROLLERS
-from hil.campaign import run_campaign
 from hil.checks import UNBOUNDED, limit_text
-from hil.console import campaign_progress
-from hil.scenario import load_scenario
 
 OUT = Path("accept.json")
 RUNS = Path("runs") / "accept"
-SEEDS = range(20)
-FEWER = range(8)
-JOBS = 2
-LOGS = ("can.log", "signals.mcap", "truth.mcap")
 MM, DEG = 1e3, 57.29577951308232
-
-Values = Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -84,55 +73,6 @@ def outcomes(group: Group, values: Values) -> list[Outcome]:
         limit = limit_text(figure.low, figure.high)
         found.append(Outcome(figure.name, value, limit, passed, group.command, figure.unit, group.name, group.issue))
     return found
-
-
-def flown(scenario: str, controller: str = "modcube") -> Callable[[Path], Values]:
-    """Flies all seeds; keys are `metric.quantile`, and `passed` is the share that passed every check."""
-
-    def measure(folder: Path) -> Values:
-        chosen, parameters = load_scenario(scenario), CONTROLLERS[controller]
-        with campaign_progress(f"{scenario}, {controller}", len(SEEDS)) as progress:
-            summary = run_campaign(chosen, parameters, SEEDS, JOBS, folder, progress=progress)
-        values = {f"{m}.{q}": v for m, each in summary["metrics"].items() for q, v in each.items() if v is not None}
-        return values | {"passed": summary["succeeded"] / summary["trials"]}
-
-    return measure
-
-
-def saved_by_least_power(folder: Path) -> Values:
-    """Flies the Moebius strip in both modes of allocation: share of the supply's power saved, ratio of the position errors."""
-    found = {}
-    for name in ("modcube", "least_power"):
-        with campaign_progress(f"mobius-1, {name}", len(FEWER)) as progress:
-            summary = run_campaign(load_scenario("mobius-1"), CONTROLLERS[name], FEWER, JOBS, folder / name, progress=progress)
-        found[name] = summary["metrics"]
-    both = ("supply_power_w", "position_rmse_m")
-    power, error = (found["least_power"][m]["median"] / found["modcube"][m]["median"] for m in both)
-    return {"saved": 1.0 - power, "error": error}
-
-
-def repeated(folder: Path) -> Values:
-    """Flies one seed twice and another once: logs of the twin that differ, logs of the other that are the same."""
-    for name, seed in (("first", 0), ("second", 0), ("other", 1)):
-        command = [Path(sys.executable).with_name("modcube"), "hil", "run", "spiral", "--no-plots"]
-        subprocess.run([*command, "--seed", str(seed), "--out", folder / name], capture_output=True)
-    logs = {run: [(folder / run / log).read_bytes() for log in LOGS] for run in ("first", "second", "other")}
-    pairs = [zip(logs["first"], logs[run], strict=True) for run in ("second", "other")]
-    different, same = (sum(a != b for a, b in pairs[0]), sum(a == b for a, b in pairs[1]))
-    return {"different": different, "same": same}
-
-
-def timed(folder: Path) -> Values:
-    """Lockstep's speed on one core, out of `make bench`'s own measurement."""
-    code = "from bench_flight import measure_flight; print(*(measure_flight(0).speed for _ in range(5)))"
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-    core = min(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
-    pinned = f"import os; os.sched_setaffinity(0, {{{core}}}); " if core is not None else ""
-    done = subprocess.run(
-        [sys.executable, "-c", pinned + code], check=True, capture_output=True, text=True, env=environment,
-        cwd=Path(__file__).parent,
-    )  # fmt: skip
-    return {"speed": median(float(word) for word in done.stdout.split())}
 
 
 def read_outcomes(path: Path) -> list[dict[str, Any]]:
@@ -184,6 +124,16 @@ def main(
     raise typer.Exit(0 if all(outcome.passed for outcome in measured) else 1)
 
 
+def strip(modules: int, sensors: str, worst_mm: float, *more: Figure) -> tuple[Figure, ...]:
+    """Figures of the Moebius strip."""
+    name = f"Moebius strip, {modules} module{'s' if modules > 1 else ''}, {sensors} sensors, 10 seeds"
+    return (
+        *more,
+        Figure(f"{name}: position RMSE, worst", "position_rmse_m.max", high=worst_mm, unit="mm", scale=MM),
+        Figure(f"{name}: attitude RMSE, worst", "attitude_rmse_rad.max", high=2.5, unit="deg", scale=DEG),
+    )
+
+
 GROUPS: tuple[Group, ...] = (
     Group(
         "hover", 2, "modcube hil campaign hover --trials 20 --jobs 2", flown("hover"),
@@ -226,6 +176,74 @@ GROUPS: tuple[Group, ...] = (
         (
             Figure("Moebius strip: electrical power that least_power saves, median", "saved", low=5.0, unit="%", scale=100.0),
             Figure("Moebius strip: its position RMSE over that of least squares, medians", "error", high=1.05),
+        ),
+    ),
+    Group(
+        "mobius-1-ideal", 4, "modcube hil campaign mobius-1 --trials 10 --jobs 2 --sensors ideal",
+        flown("mobius-1", trials=10, sensors="ideal"), strip(1, "ideal", 5.5, Figure(
+            "Moebius strip, 1 module, ideal sensors, 10 seeds: position RMSE, median", "position_rmse_m.median",
+            high=4.4, unit="mm", scale=MM,
+        )),
+    ),
+    Group(
+        "mobius-1", 4, "modcube hil campaign mobius-1 --trials 10 --jobs 2", flown("mobius-1", trials=10), strip(1, "real", 7.0),
+    ),
+    Group(
+        "mobius-2-ideal", 4, "modcube hil campaign mobius-2 --trials 10 --jobs 2 --sensors ideal",
+        flown("mobius-2", trials=10, sensors="ideal"), strip(2, "ideal", 5.5, Figure(
+            "Moebius strip, 2 modules, ideal sensors, 10 seeds: position RMSE, median", "position_rmse_m.median",
+            high=4.4, unit="mm", scale=MM,
+        )),
+    ),
+    Group(
+        "mobius-2", 4, "modcube hil campaign mobius-2 --trials 10 --jobs 2", flown("mobius-2", trials=10), strip(2, "real", 7.0),
+    ),
+    Group(
+        "mobius-4-ideal", 4, "modcube hil campaign mobius-4 --trials 10 --jobs 2 --sensors ideal",
+        flown("mobius-4", trials=10, sensors="ideal"), strip(4, "ideal", 5.5, Figure(
+            "Moebius strip, 4 modules, ideal sensors, 10 seeds: position RMSE, median", "position_rmse_m.median",
+            high=4.4, unit="mm", scale=MM,
+        )),
+    ),
+    Group(
+        "mobius-4", 4, "modcube hil campaign mobius-4 --trials 10 --jobs 2", flown("mobius-4", trials=10), strip(4, "real", 7.0),
+    ),
+    Group(
+        "polycube", 4, "modcube hil campaign polycube --trials 20 --jobs 2", flown("polycube"),
+        (
+            Figure(
+                "random polycubes of 2 to 8 modules, 20: position RMSE, worst", "position_rmse_m.max", high=15.0, unit="mm", scale=MM
+            ),
+        ),
+    ),
+    Group(
+        "dock", 5, "modcube hil campaign dock --trials 1000 --jobs 2", flown("dock", trials=1000),
+        (
+            Figure("dock, 1000 trials: lower 95 % bound of success", "passed.low", low=98.0, unit="%", scale=100.0),
+            Figure("dock: step of a thruster's command when bodies join, worst", "join_jump_n.max", high=1.0, unit="N"),
+        ),
+    ),
+    Group(
+        "dock-paper", 5, "modcube hil campaign dock --trials 200 --jobs 2 --controller paper", flown("dock", "paper", 200),
+        (Figure("dock, the paper's sequence, 200 trials: docked", "passed", low=60.0, high=97.0, unit="%", scale=100.0),),
+    ),
+    Group(
+        "dock-near-miss", 5, "modcube hil campaign dock-near-miss --trials 300 --jobs 2", flown("dock-near-miss", trials=300),
+        (Figure("near miss, 300 flown: docks declared that were none", "false_declarations.max", high=0.0),),
+    ),
+    Group(
+        "dock-third", 5, "modcube hil campaign dock-third --trials 100 --jobs 2", flown("dock-third", trials=100),
+        (Figure("a third module joins a pair, 100 trials: docked", "passed", low=95.0, unit="%", scale=100.0),),
+    ),
+    Group(
+        "dock-vertical", 5, "modcube hil campaign dock-vertical --trials 100 --jobs 2", flown("dock-vertical", trials=100),
+        (Figure("one above the other, second tag source, 100 trials: docked", "passed", low=95.0, unit="%", scale=100.0),),
+    ),
+    Group(
+        "dock-mobius", 5, "modcube hil campaign dock-mobius --trials 10 --jobs 2", flown("dock-mobius", trials=10),
+        (
+            Figure("dock, Moebius strip as one, undock, 10 trials: passed", "passed", low=1.0),
+            Figure("joined pair on the strip: position RMSE, worst", "docked_rmse_m.max", high=7.0, unit="mm", scale=MM),
         ),
     ),
     # Figures of later issues go here.

@@ -1,0 +1,29 @@
+"""Bodies of several modules fly their paths with the same gains as one; all seeds belong to `make accept`."""
+
+import pytest
+
+from hil.scenario import load_scenario
+from tests.closed_loop.flights import Fly
+
+ATTITUDE_LIMIT_RAD = 0.0436332
+"""2.5 deg."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "ideal", "limit_m"), [("mobius-1", True, 0.0055), ("mobius-2", False, 0.007), ("mobius-4", False, 0.007)])
+def test_moebius_strip_is_flown_by_one_two_and_four_modules(fly: Fly, name: str, ideal: bool, limit_m: float) -> None:
+    scenario = load_scenario(name)
+    metrics = fly(scenario.with_ideal_sensors() if ideal else scenario, 0).metrics
+    assert 0.001 <= metrics["position_rmse_m"] <= limit_m
+    assert metrics["attitude_rmse_rad"] <= ATTITUDE_LIMIT_RAD
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_random_shape_of_modules_flies_a_closed_curve(fly: Fly, seed: int) -> None:
+    assert 0.001 <= fly(load_scenario("polycube"), seed).metrics["position_rmse_m"] <= 0.015
+
+
+@pytest.mark.slow
+def test_force_of_two_docked_modules_is_tracked_as_well_as_that_of_one_without_interference(fly: Fly) -> None:
+    assert fly(load_scenario("force-tracking"), 0).passed

@@ -1,0 +1,72 @@
+"""What `make accept` measures: each function takes a folder and returns figures by name. The bars stand in accept.py."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from statistics import median
+
+from firmware_py.description.parameters import CONTROLLERS
+from hil.campaign import run_campaign
+from hil.console import campaign_progress
+from hil.scenario import load_scenario
+
+FEWER = range(8)
+JOBS = 2
+LOGS = ("can.log", "signals.mcap", "truth.mcap")
+
+Values = Mapping[str, float]
+
+
+def flown(scenario: str, controller: str = "modcube", trials: int = 20, sensors: str = "real") -> Callable[[Path], Values]:
+    """Flies so many seeds; keys are `metric.quantile`, the share `passed` that passed every check, and its lower 95 % bound."""
+
+    def measure(folder: Path) -> Values:
+        chosen, parameters = load_scenario(scenario), CONTROLLERS[controller]
+        if sensors == "ideal":
+            chosen = chosen.with_ideal_sensors()
+        with campaign_progress(f"{scenario}, {controller}, {sensors} sensors", trials) as progress:
+            summary = run_campaign(chosen, parameters, range(trials), JOBS, folder, progress=progress)
+        values = {f"{m}.{q}": v for m, each in summary["metrics"].items() for q, v in each.items() if v is not None}
+        return values | {"passed": summary["succeeded"] / trials, "passed.low": summary["confidence_interval"][0]}
+
+    return measure
+
+
+def saved_by_least_power(folder: Path) -> Values:
+    """Flies the Moebius strip in both modes of allocation: share of the supply's power saved, ratio of the position errors."""
+    found = {}
+    for name in ("modcube", "least_power"):
+        with campaign_progress(f"mobius-1, {name}", len(FEWER)) as progress:
+            summary = run_campaign(load_scenario("mobius-1"), CONTROLLERS[name], FEWER, JOBS, folder / name, progress=progress)
+        found[name] = summary["metrics"]
+    both = ("supply_power_w", "position_rmse_m")
+    power, error = (found["least_power"][m]["median"] / found["modcube"][m]["median"] for m in both)
+    return {"saved": 1.0 - power, "error": error}
+
+
+def repeated(folder: Path) -> Values:
+    """Flies one seed twice and another once: logs of the twin that differ, logs of the other that are the same."""
+    for name, seed in (("first", 0), ("second", 0), ("other", 1)):
+        command = [Path(sys.executable).with_name("modcube"), "hil", "run", "spiral", "--no-plots"]
+        subprocess.run([*command, "--seed", str(seed), "--out", folder / name], capture_output=True)
+    logs = {run: [(folder / run / log).read_bytes() for log in LOGS] for run in ("first", "second", "other")}
+    pairs = [zip(logs["first"], logs[run], strict=True) for run in ("second", "other")]
+    different, same = (sum(a != b for a, b in pairs[0]), sum(a == b for a, b in pairs[1]))
+    return {"different": different, "same": same}
+
+
+def timed(folder: Path) -> Values:
+    """Lockstep's speed on one core, out of `make bench`'s own measurement."""
+    code = "from bench_flight import measure_flight; print(*(measure_flight(0).speed for _ in range(5)))"
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    core = min(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+    pinned = f"import os; os.sched_setaffinity(0, {{{core}}}); " if core is not None else ""
+    done = subprocess.run(
+        [sys.executable, "-c", pinned + code], check=True, capture_output=True, text=True, env=environment,
+        cwd=Path(__file__).parent,
+    )  # fmt: skip
+    return {"speed": median(float(word) for word in done.stdout.split())}
