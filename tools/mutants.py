@@ -88,13 +88,13 @@ def _at(tree: ast.Module, index: int) -> ast.AST:
 
 
 def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
-    """Nodes whose change means nothing at run time: annotations and text alone on a line."""
+    """Nodes whose change means nothing at run time: annotations, how a function is compiled, and text alone on a line."""
     for node in ast.walk(tree):
         roots: list[ast.AST | None] = []
         if isinstance(node, (ast.AnnAssign, ast.arg)):
             roots.append(node.annotation)
         elif isinstance(node, ast.FunctionDef):
-            roots.append(node.returns)
+            roots += [node.returns, *(each for each in node.decorator_list if isinstance(each, ast.Call))]
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             roots.append(node)
         for root in roots:

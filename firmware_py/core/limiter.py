@@ -5,7 +5,10 @@ Whatever asks for a force, nothing leaves that this file has not passed.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.thruster import commands, module_power, polynomial, total_power
@@ -28,17 +31,17 @@ class Limiter:
     def __init__(self, body: Body, parameters: LimiterParameters, dt_s: float) -> None:
         t = body.thrusters
         self._t = t
-        self._low, self._high = t.f_min * parameters.force_share, t.f_max * parameters.force_share
-        self._full_high = np.array([polynomial(curve, 1.0) for curve in t.forward])
-        self._full_low = -np.array([polynomial(curve, 1.0) for curve in t.reverse])
-        self._step = parameters.slew_n_per_s * dt_s
+        self._limits = (
+            t.f_min * parameters.force_share, t.f_max * parameters.force_share,
+            -np.array([polynomial(curve, 1.0) for curve in t.reverse]), np.array([polynomial(curve, 1.0) for curve in t.forward]),
+            parameters.slew_n_per_s * dt_s,
+        )  # fmt: skip
         self._supply = [float(watts) for watts in body.supply_power_w]
         self._of_module = [np.flatnonzero(t.module == m) for m in range(len(body.modules))]
-        self._power = [
-            (np.ascontiguousarray(t.power_forward[i]), np.ascontiguousarray(t.power_reverse[i])) for i in self._of_module
-        ]
+        self._power = [(np.ascontiguousarray(t.power_forward[i]), np.ascontiguousarray(t.power_reverse[i])) for i in self._of_module]
         self._curves = (t.forward, t.reverse, t.deadband_n)
-        self._full = np.ones(t.f_max.size)
+        self._full, self._all = np.ones(t.f_max.size), np.ones(t.f_max.size, dtype=bool)
+        self._nominal_v = np.array([t.voltage_v[i[0]] for i in self._of_module])
         self.magnets = [MagnetLimiter(parameters, dt_s) for _ in body.modules]
         """One for each module."""
         self.force_n = np.zeros(t.f_max.size)
@@ -57,14 +60,8 @@ class Limiter:
         if not armed:
             self.force_n = np.zeros_like(self.force_n)
             return self.force_n, np.zeros_like(self.force_n)
-        wanted = np.where(np.isfinite(wanted_n), wanted_n, 0.0)
-        wanted = np.minimum(np.maximum(wanted, self.force_n - self._step), self.force_n + self._step)
-        scale = self._voltage_scale(voltage_v)
-        # what a full command gives at this voltage: more must not be believed
-        low, high = np.maximum(self._low, self._full_low * scale), np.minimum(self._high, self._full_high * scale)
-        wanted = np.minimum(np.maximum(wanted, low), high)
-        if alive is not None:
-            wanted[~alive] = 0.0
+        scale, wanted = self._voltage_scale(voltage_v), np.empty_like(self.force_n)
+        limit_forces(wanted_n, self.force_n, self._all if alive is None else alive, scale, *self._limits, wanted)
         powers = module_power(wanted, self._t.power_forward, self._t.power_reverse, self._t.module, len(self.magnets)).tolist()
         for module, power in enumerate(powers):
             supply = max(0.0, self._supply[module] - self.magnets[module].power_w)
@@ -89,8 +86,29 @@ class Limiter:
 
     def _voltage_scale(self, voltage_v: np.ndarray) -> np.ndarray:
         """(n,) force at a full command over that at the nominal voltage; 1 where the reading is not believed."""
-        ratio = voltage_v[self._t.module] / self._t.voltage_v
-        return np.asarray(np.where(is_believed(ratio), ratio, 1.0) ** VOLTAGE_EXPONENT)
+        ratio = voltage_v / self._nominal_v
+        return np.asarray((np.where(is_believed(ratio), ratio, 1.0) ** VOLTAGE_EXPONENT)[self._t.module])
+
+
+@njit(
+    "void(float64[::1],float64[::1],boolean[::1],float64[::1],float64[::1],float64[::1],float64[::1],float64[::1],float64,float64[::1])",
+    cache=True,
+)
+def limit_forces(wanted, last, alive, scale, low, high, full_low, full_high, step, out):  # type: ignore[no-untyped-def]
+    """Writes the limited force of each thruster, N; all but `step` are (n,).
+
+    Args:
+        wanted, last: force asked for, and of the tick before. alive: may turn.
+        scale: force at a full command over that at the nominal voltage.
+        low, high: limits by the parameters. full_low, full_high: what full commands give at the nominal voltage.
+        step: largest change in a tick, N.
+    """
+    for i in range(out.shape[0]):
+        force = wanted[i] if math.isfinite(wanted[i]) else 0.0
+        force = min(max(force, last[i] - step), last[i] + step)
+        # what a full command gives at this voltage: more must not be believed
+        force = min(max(force, low[i], full_low[i] * scale[i]), high[i], full_high[i] * scale[i])
+        out[i] = force if alive[i] else 0.0
 
 
 def is_believed(ratio: np.ndarray) -> np.ndarray:

@@ -13,8 +13,10 @@ from numba import njit
 
 from firmware_py.core.body import ThrusterSet
 
-BISECTIONS = 40
-"""Halvings of the command interval: 2^-40, far below the bus's 1/2048."""
+RESOLUTION = 2.0**-40
+"""Of a command found by `inverse`: far below the bus's 1/2048."""
+MOST_STEPS = 60
+"""Of its search; six are usual."""
 
 
 @njit("float64(float64[::1],float64)", cache=True)
@@ -28,19 +30,31 @@ def polynomial(c, x):  # type: ignore[no-untyped-def]
 
 @njit("float64(float64[::1],float64)", cache=True)
 def inverse(c, value):  # type: ignore[no-untyped-def]
-    """The x in 0..1 with polynomial(c, x) = value; 0 below and 1 above the range. c must rise over 0..1."""
+    """The x in 0..1 with polynomial(c, x) = value; 0 below and 1 above the range. c must rise over 0..1.
+
+    Newton's steps from where a square law would have it, halving the interval instead wherever one would leave it.
+    """
+    full = polynomial(c, 1.0)
     if value <= 0.0:
         return 0.0
-    if value >= polynomial(c, 1.0):
+    if value >= full:
         return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        if polynomial(c, middle) < value:
-            low = middle
+    low, high, x = 0.0, 1.0, math.sqrt(value / full)
+    for _ in range(MOST_STEPS):
+        here, slope = 0.0, 0.0
+        for i in range(c.shape[0] - 1, -1, -1):
+            slope = slope * x + here + c[i]
+            here = (here + c[i]) * x
+        if here < value:
+            low = x
         else:
-            high = middle
-    return 0.5 * (low + high)
+            high = x
+        before, x = x, 0.5 * (low + high)
+        if slope > 0.0 and low <= before + (value - here) / slope <= high:
+            x = before + (value - here) / slope
+        if abs(x - before) <= RESOLUTION:
+            break
+    return x
 
 
 @njit(
