@@ -14,7 +14,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults
-from firmware_py.core.types import Action, Estimate, Inputs, ModuleInputs, Request, Sticks
+from firmware_py.core.types import Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 
@@ -26,6 +26,10 @@ MEAN_S = 1.0
 """Time over which rates and shares are averaged."""
 VOLTAGE_SHARE = 0.2
 """Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
+
+
+UNKNOWN = (None,) * 4
+"""Supply, leak, temperature and pressure of a cabin that nothing came of."""
 
 
 class Health(NamedTuple):
@@ -80,6 +84,15 @@ class Health(NamedTuple):
     """What about the topology is not as configured, in words; empty when all is."""
 
 
+class Cabins(NamedTuple):
+    """The worst of all modules' supplies and cabins, as in Health."""
+
+    voltage_share: float
+    leak: bool
+    hottest_c: float
+    change_pa: float
+
+
 class HealthMonitor:
     """Keeps the ages and means of one body."""
 
@@ -88,19 +101,22 @@ class HealthMonitor:
         t = body.thrusters
         self._modules = body.modules
         self._fence = parameters.fence
-        self._answer_s = parameters.supervision.answer_ms * 1e-3
-        self._esc_fresh_s = parameters.supervision.esc_fresh_ms * 1e-3
+        self._answer_ns = round(parameters.supervision.answer_ms * 1e6)
+        self._esc_fresh_ns = round(parameters.supervision.esc_fresh_ms * 1e6)
         self._period_ns = period_ns
         self._nominal_v = [float(t.voltage_v[t.module == m][0]) for m in range(count)]
-        self._channels = [(int(m), int(c)) for m, c in zip(t.module, t.channel, strict=True)]
+        self._thruster_at: list[dict[int, int]] = [{} for _ in range(count)]
+        for i, (m, channel) in enumerate(zip(t.module.tolist(), t.channel.tolist(), strict=True)):
+            self._thruster_at[m][channel] = i
+        self._esc_ns = [NEVER_NS] * t.module.size
         self._heard_ns = [0] * count
-        self._answered_ns: list[int | None] = [None] * count
+        self._answered_ns = [NEVER_NS] * count
         self._voltage = [math.nan] * count
         self._leak = [False] * count
         self._cabin_c = [math.nan] * count
         self._cabin_pa = [math.nan] * count
         self._cabin_start_pa = [math.nan] * count
-        self._esc_ns: dict[tuple[int, int], int] = {}
+        self._cabins = Cabins(math.nan, False, math.nan, math.nan)
         self._depth_ns = 0
         self._ground_ns: int | None = None
         self._pilot_ns: int | None = None
@@ -124,13 +140,11 @@ class HealthMonitor:
         if self._time_ns is None:  # silence counts from here
             self._heard_ns, self._depth_ns, self._time_ns = [now] * len(self._modules), now, now
         dt_s = (now - self._time_ns) * 1e-9
-        for index, module in enumerate(self._modules):
-            self._listen(index, inputs.modules[module], now)
+        self._listen([inputs.modules[m] for m in self._modules], now)
         self._people(requests, now)
         self._rates(inputs, estimate, dt_s)
         self._time_ns = now
-        silences = [_age_s(heard, now) for heard in self._heard_ns]
-        silent = [m for m, at in zip(self._modules, self._answered_ns, strict=True) if _age_s(at, now) > self._answer_s]
+        cabins = self._cabins
         self.now = Health(
             time_ns=now,
             ready=estimate.ready,
@@ -139,14 +153,14 @@ class HealthMonitor:
             nis_ratio=self._nis_ratio,
             rejected_share=self._rejected_share,
             depth_age_s=_age_s(self._depth_ns, now),
-            voltage_share=min(_known(v / nominal for v, nominal in zip(self._voltage, self._nominal_v, strict=True)), default=math.nan),
-            leak=any(self._leak),
-            cabin_c=max(_known(self._cabin_c), default=math.nan),
-            cabin_change_pa=max(_known(abs(a - b) for a, b in zip(self._cabin_pa, self._cabin_start_pa, strict=True)), default=math.nan),
-            silent=tuple(silent),
-            silent_s=max(silences),
-            bus_silent_s=min(silences),
-            esc_missing=self._missing(now),
+            voltage_share=cabins.voltage_share,
+            leak=cabins.leak,
+            cabin_c=cabins.hottest_c,
+            cabin_change_pa=cabins.change_pa,
+            silent=tuple(self._modules[i] for i in _older(self._answered_ns, now - self._answer_ns)),
+            silent_s=_age_s(min(self._heard_ns), now),
+            bus_silent_s=_age_s(max(self._heard_ns), now),
+            esc_missing=_older(self._esc_ns, now - self._esc_fresh_ns),
             frame_errors_per_s=self._error_rate,
             missed_ticks_per_s=self._missed_rate,
             foreign_sync=inputs.foreign_sync,
@@ -162,29 +176,51 @@ class HealthMonitor:
         )
         return self.now
 
-    def _listen(self, index: int, module: ModuleInputs, now: int) -> None:
-        if module.heard or module.answered:
-            self._heard_ns[index] = now
-        if module.answered:
-            self._answered_ns[index] = now
-        if module.pressure_pa is not None:
-            self._depth_ns = now
-        if module.voltage_v is not None:
+    def _listen(self, modules: list[ModuleInputs], now: int) -> None:
+        news = False
+        for index, module in enumerate(modules):
+            if module.heard or module.answered:
+                self._heard_ns[index] = now
+            if module.answered:
+                self._answered_ns[index] = now
+            if module.pressure_pa is not None:
+                self._depth_ns = now
+            inside = (module.voltage_v, module.leak, module.cabin_temperature_c, module.cabin_pressure_pa)
+            if inside != UNKNOWN:
+                self._look_in(index, *inside)
+                news = True
+            if module.esc:
+                self._hear_escs(self._thruster_at[index], module.esc, now)
+        if news:
+            self._cabins = self._worst()
+
+    def _look_in(self, index: int, voltage_v: float | None, leak: bool | None, cabin_c: float | None, cabin_pa: float | None) -> None:
+        """Takes what is known of supply and cabin of one module."""
+        if voltage_v is not None:
             before = self._voltage[index]
-            change = module.voltage_v - before
-            self._voltage[index] = module.voltage_v if math.isnan(before) else before + VOLTAGE_SHARE * change
-        if module.leak is not None:
-            self._leak[index] = module.leak
-        if module.cabin_temperature_c is not None:
-            self._cabin_c[index] = module.cabin_temperature_c
-        if module.cabin_pressure_pa is not None:
-            self._cabin_pa[index] = module.cabin_pressure_pa
+            self._voltage[index] = voltage_v if math.isnan(before) else before + VOLTAGE_SHARE * (voltage_v - before)
+        if leak is not None:
+            self._leak[index] = leak
+        if cabin_c is not None:
+            self._cabin_c[index] = cabin_c
+        if cabin_pa is not None:
+            self._cabin_pa[index] = cabin_pa
             if math.isnan(self._cabin_start_pa[index]):
-                self._cabin_start_pa[index] = module.cabin_pressure_pa
-        for esc in module.esc:
-            for offset, status in enumerate(esc.status):
-                if status in ESC_ALIVE:
-                    self._esc_ns[index, esc.first + offset] = now
+                self._cabin_start_pa[index] = cabin_pa
+
+    def _worst(self) -> Cabins:
+        shares = [v / nominal for v, nominal in zip(self._voltage, self._nominal_v, strict=True)]
+        changes = [abs(a - b) for a, b in zip(self._cabin_pa, self._cabin_start_pa, strict=True)]
+        return Cabins(
+            min(_known(shares), default=math.nan), any(self._leak), max(_known(self._cabin_c), default=math.nan),
+            max(_known(changes), default=math.nan),
+        )  # fmt: skip
+
+    def _hear_escs(self, thruster_at: dict[int, int], escs: list[EscFeedback], now: int) -> None:
+        for esc in escs:
+            for channel, status in enumerate(esc.status, esc.first):
+                if status in ESC_ALIVE and channel in thruster_at:
+                    self._esc_ns[thruster_at[channel]] = now
 
     def _people(self, requests: list[Request], now: int) -> None:
         for request in requests:
@@ -208,10 +244,6 @@ class HealthMonitor:
         if refused > 0:
             self._rejected_share += TAG_SHARE * (1.0 - self._rejected_share)
 
-    def _missing(self, now: int) -> tuple[int, ...]:
-        oldest = now - round(1e9 * self._esc_fresh_s)
-        return tuple(i for i, channel in enumerate(self._channels) if self._esc_ns.get(channel, NEVER_NS) < oldest)
-
 
 ESC_ALIVE = (0, 2)
 """EscStatus OK and OVERTEMPERATURE."""
@@ -221,6 +253,13 @@ TAG_SHARE = 1.0 / 60.0
 
 def _age_s(at_ns: int | None, now_ns: int, never: float = NEVER_S) -> float:
     return never if at_ns is None else (now_ns - at_ns) * 1e-9
+
+
+def _older(times_ns: list[int], oldest_ns: int) -> tuple[int, ...]:
+    """Indices of the times before `oldest_ns`."""
+    if min(times_ns) >= oldest_ns:
+        return ()
+    return tuple(i for i, time_ns in enumerate(times_ns) if time_ns < oldest_ns)
 
 
 def _known(values: Iterable[float]) -> list[float]:
