@@ -64,8 +64,8 @@ else:
             assert one.faults["down"] >= 3
             ip("link", "set", "vcan2", "up")
             # The first call after a flap may still report it.
-            assert poll(lambda: one.send(FRAMES[1]) or other.receive())
-            assert poll(lambda: other.send(FRAMES[2]) or one.receive())
+            assert poll(lambda: one.send(FRAMES[1]) and other.receive())
+            assert poll(lambda: other.send(FRAMES[2]) and one.receive())
             assert one.faults["gone"] == one.faults["send"] == 0
 
     @pytest.mark.parametrize("reader", [False, True])
@@ -104,7 +104,7 @@ else:
                     one.send(Frame(0x100, bytes((n & 0xFF,))))
                 assert one.faults["full"] > 0
                 assert receive(other, 1)[0] == Frame(0x100, b"\x00")
-                assert poll(lambda: other.receive() == [] and one.send(FRAMES[1]) is None and receive(other, 1))
+                assert poll(lambda: other.receive() == [] and one.send(FRAMES[1]) and receive(other, 1))
         finally:
             subprocess.run(["tc", "qdisc", "del", "dev", "vcan1", "root"], check=True)
 

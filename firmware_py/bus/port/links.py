@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import ipaddress
 import os
+import select
 import socket
+import struct
 import uuid
 from abc import ABC, abstractmethod
 from queue import Empty, SimpleQueue
@@ -23,6 +25,12 @@ WAITING_FRAMES = 4096
 """Most frames that wait unread in a virtual bus or behind a reader; half a second of a full bus."""
 SOCKET_BUFFER_BYTES = 1 << 20
 """Asked for; the kernel's default keeps 256 to 278 unread frames (measured), and gives twice that at most."""
+
+_CAN_FRAME = struct.Struct("=IB3x8s")
+"""struct can_frame of linux/can.h: id and flags, length, payload."""
+_EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
+"""CAN_EFF_FLAG, CAN_RTR_FLAG and CAN_ERR_FLAG, in the word of the id."""
+_FLAGS = _EXTENDED | _REMOTE | _ERROR
 
 
 class PortError(Exception):
@@ -161,7 +169,11 @@ class UdpLink(Link):
 
 
 class SocketcanLink(Link):
-    """socketcan:INTERFACE, the kernel's. A controller that went bus-off comes back by itself with `restart-ms` set."""
+    """socketcan:INTERFACE, the kernel's. A controller that went bus-off comes back by itself with `restart-ms` set.
+
+    Frames pass through python-can's socket without its messages. Thousands of instructions a frame, measured in
+    hil/guest: sent 9 in place of python-can's 46, received 9 in place of 55.
+    """
 
     def __init__(self, address: str) -> None:
         super().__init__(address)
@@ -184,6 +196,23 @@ class SocketcanLink(Link):
             raise PortError(f"socketcan:{self.address}: {hint}; it takes can0, vcan0 or the like") from None
         _enlarge_buffer(bus)
         return bus
+
+    def send(self, bus: Any, frame: Frame) -> None:
+        bus.socket.send(_CAN_FRAME.pack(frame[0], len(frame[1]), frame[1]), socket.MSG_DONTWAIT)
+
+    def read(self, bus: Any, timeout_s: float) -> Frame | can.Message | None:
+        if timeout_s > 0.0 and not select.select((bus.socket,), (), (), timeout_s)[0]:
+            return None
+        try:
+            word, length, payload = _CAN_FRAME.unpack(bus.socket.recv(_CAN_FRAME.size, socket.MSG_DONTWAIT))
+        except BlockingIOError:
+            return None
+        if word & _FLAGS:
+            return can.Message(
+                arbitration_id=word & ~_FLAGS, data=payload[:length], is_extended_id=bool(word & _EXTENDED),
+                is_remote_frame=bool(word & _REMOTE), is_error_frame=bool(word & _ERROR),
+            )  # fmt: skip
+        return Frame(word, payload[:length])
 
     def is_present(self) -> bool:
         return self._current_index() != 0
