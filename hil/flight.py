@@ -11,6 +11,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.bench import DEFAULT_BUS, fly_scenario
 from hil.checks import Result, judge, write_result
+from hil.dock_plot import write_dock_plot
 from hil.docking_metrics import docking_metrics
 from hil.force_metrics import force_metrics
 from hil.metrics import PAPER_SPIRAL_RMSE_MM, flight_metrics
@@ -77,6 +78,7 @@ def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
     vehicle = load_vehicle(scenario.module[0].vehicle)
     scene = _scene(scenario, vehicle, flight)
     plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm)
+    plots += write_dock_plot(folder, start_of(flight))
     return write_report(folder, result, flight, scene, plots)
 
 

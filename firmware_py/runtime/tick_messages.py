@@ -5,6 +5,7 @@ Topics, in the order in which a tick writes them:
 - `/firmware/ticks`: its number, its time, how many frames and prepared results it took, frames dropped so far.
 - `/firmware/requests`: per request its tick and one line of JSON (`request_text`).
 - `/firmware/bodyN`: all of one body, `body_signals`.
+- `/firmware/docks`: per dock under way its faces, stage and tries, both currents and both conditions.
 - `/events`: severity (syslog) and text.
 """
 
@@ -17,7 +18,7 @@ from firmware_py.core.types import BodyRecord, Inputs, Outputs
 from firmware_py.description.signals import Layout, Row, Signal, TextLayout
 from firmware_py.runtime.request_text import request_text
 
-TICKS, REQUESTS, EVENTS = "/firmware/ticks", "/firmware/requests", "/events"
+TICKS, REQUESTS, DOCKS, EVENTS = "/firmware/ticks", "/firmware/requests", "/firmware/docks", "/events"
 
 TICK_SIGNALS = (
     Signal("tick", kind="int"),
@@ -81,6 +82,25 @@ def _body_values(tick: int, time_ns: int, record: BodyRecord) -> tuple[Any, ...]
     )
 
 
+DOCK_SIGNALS = (
+    Signal("tick", kind="int"),
+    Signal("time_ns", unit="ns", kind="int"),
+    Signal("module_a", kind="int"),
+    Signal("face_a", kind="int"),
+    Signal("module_b", kind="int"),
+    Signal("face_b", kind="int"),
+    Signal("stage", kind="int"),
+    Signal("tries", kind="int"),
+    Signal("current_ma", 2, "mA"),
+    Signal("current_holds", kind="bool"),
+    Signal("position_holds", kind="bool"),
+    Signal("gap_m", unit="m"),
+    Signal("lateral_m", unit="m"),
+    Signal("position_error_m", unit="m"),
+)
+"""After tick and time the fields of a DockRecord, in their order."""
+
+
 class Message(NamedTuple):
     """One message of a tick."""
 
@@ -96,7 +116,8 @@ class TickMessages:
         self.ticks = Layout("Tick", TICK_SIGNALS)
         self.requests = TextLayout("Request", ["tick"], "request")
         self.events = TextLayout("Event", ["tick", "severity"], "text")
-        self._tick_row = self.ticks.row()
+        self.docks = Layout("Dock", DOCK_SIGNALS)
+        self._tick_row, self._dock_row = self.ticks.row(), self.docks.row()
         self._bodies: dict[int, tuple[Layout, Row]] = {}
 
     def of(self, received: int, inputs: Inputs, outputs: Outputs) -> Iterator[Message]:
@@ -109,6 +130,8 @@ class TickMessages:
         for record in outputs.records:
             layout, row = self._body(len(record.commanded_n))
             yield Message(f"/firmware/body{record.body}", layout, row.encode(_body_values(tick, time_ns, record)))
+        for dock in outputs.docks:
+            yield Message(DOCKS, self.docks, self._dock_row.encode((tick, time_ns, *dock)))
         for event in outputs.events:
             yield Message(EVENTS, self.events, self.events.encode(tick, event.severity, event.text))
 

@@ -1,0 +1,96 @@
+"""One dock over time, like the paper's figure: both currents, the gap, the two conditions and the tries."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_py.core.docking_sequence import Stage
+from firmware_py.description.signals import Columns, read_signals
+from hil.plots import STYLE
+from hil.signals import SIGNAL_LOG, TRUTH_LOG
+
+THRESHOLD_MA = 70.0
+"""The paper's; what a flight used may differ."""
+FACES = ("#0b63b0", "#c0392b")
+HOLDS = "#2e8b57"
+MARK = "#555f6b"
+LAST_S = 0.3
+"""How long the last tick of a dock is drawn."""
+
+
+def write_dock_plot(folder: Path, start_ns: int) -> list[Path]:
+    """Draws the dock of the run in `folder`; nothing where none was begun."""
+    docks = read_signals(folder / SIGNAL_LOG).get("/firmware/docks")
+    truth = read_signals(folder / TRUTH_LOG).get("/plant/docks")
+    if docks is None or truth is None:
+        return []
+    import matplotlib
+
+    matplotlib.use("Agg")
+    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+        from matplotlib import pyplot
+
+        figure = docking(docks, truth, start_ns)
+        path = folder / "docking.png"
+        figure.savefig(path, metadata={"Software": None})
+        pyplot.close(figure)
+    return [path]
+
+
+def docking(docks: Columns, truth: Columns, start_ns: int) -> Any:
+    """The figure of the first dock of a run.
+
+    Args:
+        docks: /firmware/docks. truth: /plant/docks. start_ns: time of the first tick of the run.
+    """
+    from matplotlib import pyplot
+
+    first = (docks["module_b"] == docks["module_b"][0]) & (docks["module_a"] == docks["module_a"][0])
+    rows = {name: column[first] for name, column in docks.items()}
+    time_s = 1e-9 * (rows["time_ns"] - start_ns)
+    figure, (currents, gap, conditions) = pyplot.subplots(
+        3, 1, figsize=(9.0, 7.0), sharex=True, layout="constrained", height_ratios=(2, 2, 1.2)
+    )
+    _currents(currents, time_s, rows["current_ma"])
+    _gap(gap, time_s, rows, truth, start_ns)
+    _conditions(conditions, time_s, rows)
+    for axes in (currents, gap, conditions):
+        for at_s in time_s[1:][np.diff(rows["stage"]) != 0]:
+            axes.axvline(at_s, color=MARK, linewidth=0.6, alpha=0.5)
+    return figure
+
+
+def _currents(axes: Any, time_s: np.ndarray, current_ma: np.ndarray) -> None:
+    for face, colour in enumerate(FACES):
+        axes.plot(time_s, current_ma[:, face], color=colour, linewidth=1.1, label=("target's face", "active face")[face])
+    for sign in (1.0, -1.0):
+        axes.axhline(sign * THRESHOLD_MA, color=MARK, linestyle="--", linewidth=0.9, label="threshold" if sign > 0 else None)
+    axes.set(ylabel="mA", title="Relay current of both faces")
+    axes.legend(loc="upper left", ncols=3, fontsize=9)
+
+
+def _gap(axes: Any, time_s: np.ndarray, rows: Columns, truth: Columns, start_ns: int) -> None:
+    axes.plot(time_s, 1e3 * rows["gap_m"], color=FACES[0], linewidth=1.1, label="gap by the estimates")
+    axes.plot(time_s, 1e3 * rows["lateral_m"], color=FACES[1], linewidth=1.0, label="beside the axis, by the estimates")
+    true_s = 1e-9 * (truth["time_ns"] - start_ns)
+    under_way = (true_s >= time_s[0]) & (true_s <= time_s[-1])
+    axes.plot(true_s[under_way], 1e3 * truth["gap_m"][under_way], color="black", linestyle=":", linewidth=1.2, label="true gap")
+    axes.set(ylabel="mm", title="Between the faces")
+    axes.legend(loc="upper right", ncols=3, fontsize=9)
+
+
+def _conditions(axes: Any, time_s: np.ndarray, rows: Columns) -> None:
+    for level, name in enumerate(("current_holds", "position_holds")):
+        holds = np.append(rows[name], rows[name][-1]).astype(float)
+        axes.fill_between(np.append(time_s, time_s[-1] + LAST_S), level, level + 0.8 * holds, step="post", color=HOLDS, linewidth=0)
+    axes.set_yticks([0.4, 1.4], ["current", "position"])
+    axes.set(ylim=(-0.1, 2.6), xlabel="time (s)", title="Condition holds (green); stages")
+    starts = np.flatnonzero(np.diff(rows["stage"], prepend=-1))
+    for k, (start, end) in enumerate(zip(starts, [*starts[1:], len(time_s) - 1], strict=True)):
+        middle = 0.5 * (time_s[start] + time_s[end])
+        name = Stage(int(rows["stage"][start])).name.replace("_", " ").lower()
+        if time_s[end] - time_s[start] > 0.04 * (time_s[-1] - time_s[0]):
+            axes.text(middle, 2.05 + 0.25 * (k % 2), f"{name}, try {rows['tries'][start]}", ha="center", va="center", fontsize=8)
