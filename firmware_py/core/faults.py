@@ -9,15 +9,21 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.missing_thrust import MissingThrust
+from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
-from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
+from firmware_py.core.types import Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 
 ESC_DOWN = (1, 3)
 """EscStatus FAULT and SILENT."""
+WHY = ("has an ESC that failed", "stands still", "does not obey")
+DOWN, STANDS, DISOBEYS = range(len(WHY))
+"""What the feedback of an ESC may show often enough in a row, the gravest first."""
+HEALTHY = -1
 RANK_TOLERANCE = 1e-6
 """Singular values below this share of the largest count as zero."""
 FAST_SHARE = 2.0
@@ -50,20 +56,30 @@ def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:
     return np.asarray(made @ made.T @ give_up)
 
 
+def by_channel(body: Body) -> list[dict[int, int]]:
+    """Per module: number of a thruster in the module -> its index in the body."""
+    t = body.thrusters
+    found: list[dict[int, int]] = [{} for _ in body.modules]
+    for i, (module, channel) in enumerate(zip(t.module.tolist(), t.channel.tolist(), strict=True)):
+        found[module][channel] = i
+    return found
+
+
 class FaultDetector:
     """Watches the thrusters of one body."""
 
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
-        self._p, self._t = parameters, t
-        self._index = {(int(m), int(c)): i for i, (m, c) in enumerate(zip(t.module, t.channel, strict=True))}
+        self._t = t
+        self._thruster_at = by_channel(body)
         self._modules = body.modules
-        full = [(polynomial(f, 1.0), polynomial(r, 1.0)) for f, r in zip(t.forward, t.reverse, strict=True)]
-        self._full = np.array(full)
+        full_n = np.array([(polynomial(f, 1.0), polynomial(r, 1.0)) for f, r in zip(t.forward, t.reverse, strict=True)])
+        self._believed = (full_n, t.rpm_at_full)
+        self._limits = (parameters.force_n, parameters.dead_share, parameters.dead_count)
         self._motion = MissingThrust(body, parameters, period_ns)
         n = t.f_max.size
         self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
-        self._stands, self._disobeys, self._down = (np.zeros(n, dtype=np.int64) for _ in range(3))
+        self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
         self.words: list[str] = []
         """What was found in this tick, for people."""
         self.changed = False
@@ -72,8 +88,7 @@ class FaultDetector:
 
     def reset(self) -> None:
         """All thrusters are trusted again."""
-        for count in (self._stands, self._disobeys, self._down):
-            count[:] = 0
+        self._counts[:] = 0
         self._motion.reset()
         self.changed = not self.now.alive.all()
         self.now = self._judge(np.ones(self.now.alive.size, dtype=bool))
@@ -94,40 +109,31 @@ class FaultDetector:
         if found is not None:
             self._lose(found, "does not push as it says")
         if armed:
-            for index, module in enumerate(self._modules):
-                for esc in modules[module].esc:
-                    self._hear(index, esc, force_n)
+            self._hear([modules[m] for m in self._modules], force_n)
         return self.now
 
-    def _hear(self, module: int, esc: EscFeedback, force_n: np.ndarray) -> None:
-        for offset in (0, 1):
-            i = self._index.get((module, esc.first + offset))
-            if i is not None and self.now.alive[i]:
-                self._compare(i, esc.rpm[offset], esc.status[offset], float(force_n[i]))
-
-    def _compare(self, i: int, rpm: float, status: int, force_n: float) -> None:
-        """One ESC's feedback against what its thruster is believed to give."""
-        believed = self.believed_rpm(i, force_n)
-        self._down[i] = self._down[i] + 1 if status in ESC_DOWN else 0
-        if self._down[i] >= self._p.dead_count:
-            self._lose(i, "has an ESC that failed")
+    def _hear(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
+        """Every ESC's feedback against what its thruster is believed to give."""
+        heard = [
+            (thruster_at[channel], rpm, status)
+            for module, thruster_at in zip(modules, self._thruster_at, strict=True)
+            for esc in module.esc
+            for channel, rpm, status in zip((esc.first, esc.first + 1), esc.rpm, esc.status, strict=True)
+            if channel in thruster_at
+        ]
+        if not heard:
             return
-        if abs(force_n) >= self._p.force_n:
-            stands = abs(rpm) < self._p.dead_share * abs(believed)
-            self._stands[i] = self._stands[i] + 1 if stands else 0
-        margin = FAST_MARGIN * float(self._t.rpm_at_full[i])
-        wrong_way = rpm * believed < 0.0
-        fast = abs(rpm) > FAST_SHARE * abs(believed) + margin or (wrong_way and abs(rpm - believed) > margin)
-        self._disobeys[i] = self._disobeys[i] + 1 if fast else 0
-        if self._stands[i] >= self._p.dead_count:
-            self._lose(i, "stands still")
-        elif self._disobeys[i] >= self._p.dead_count:
-            self._lose(i, "does not obey")
+        verdicts = np.empty(len(heard), dtype=np.int64)
+        judge(np.array(heard), force_n, self.now.alive, *self._believed, *self._limits, self._counts, verdicts)
+        if verdicts.max() != HEALTHY:
+            for (i, _, _), verdict in zip(heard, verdicts.tolist(), strict=True):
+                if verdict != HEALTHY and self.now.alive[i]:
+                    self._lose(i, WHY[verdict])
 
     def believed_rpm(self, i: int, force_n: float) -> float:
-        """Speed of thruster `i` at a force, 1/min: thrust goes with the square of the speed."""
-        full = float(self._full[i, 0 if force_n > 0.0 else 1])
-        return math.copysign(float(self._t.rpm_at_full[i]) * math.sqrt(abs(force_n) / full), force_n)
+        """Speed of thruster `i` at a force, 1/min."""
+        full_n, rpm_at_full = self._believed
+        return float(believed_rpm(force_n, full_n[i], rpm_at_full[i]))
 
     def _lose(self, i: int, why: str) -> None:
         alive = self.now.alive.copy()
@@ -141,3 +147,36 @@ class FaultDetector:
         rank = int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1e-12)))
         dead = tuple(int(i) for i in np.flatnonzero(~alive))
         return ThrusterFaults(alive, dead, self._rank - rank, _keep(u[:, :rank], u[:, rank:]))
+
+
+@njit(f"float64(float64,{V},float64)", cache=True)
+def believed_rpm(force_n, full_n, rpm_at_full):  # type: ignore[no-untyped-def]
+    """Speed of a thruster at a force, 1/min: thrust goes with the square of the speed. full_n: (2,) full force forward, reverse."""
+    return math.copysign(rpm_at_full * math.sqrt(abs(force_n) / full_n[0 if force_n > 0.0 else 1]), force_n)
+
+
+@njit(f"void({M},{V},boolean[::1],{M},{V},float64,float64,int64,int64[:,::1],int64[::1])", cache=True)
+def judge(heard, force_n, alive, full_n, rpm_at_full, least_n, dead_share, dead_count, counts, verdicts):  # type: ignore[no-untyped-def]
+    """Counts what each feedback shows, and writes what was shown often enough.
+
+    Args:
+        heard: (k, 3) thruster, speed 1/min and EscStatus of each feedback.
+        force_n, alive, full_n, rpm_at_full: of all thrusters; force believed, may be used, full forces (n, 2), full speed.
+        least_n: force from which a speed is judged, N; dead_share, dead_count: as the parameters.
+        counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS; verdicts: (k,), HEALTHY or one of them.
+    """
+    for k in range(heard.shape[0]):
+        i, rpm, status = int(heard[k, 0]), heard[k, 1], int(heard[k, 2])
+        verdicts[k] = HEALTHY
+        if not alive[i]:
+            continue
+        believed = believed_rpm(force_n[i], full_n[i], rpm_at_full[i])
+        count, margin = counts[i], FAST_MARGIN * rpm_at_full[i]
+        wrong_way = rpm * believed < 0.0 and abs(rpm - believed) > margin
+        count[DOWN] = count[DOWN] + 1 if status in ESC_DOWN else 0
+        if abs(force_n[i]) >= least_n:
+            count[STANDS] = count[STANDS] + 1 if abs(rpm) < dead_share * abs(believed) else 0
+        count[DISOBEYS] = count[DISOBEYS] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
+        for kind in (DISOBEYS, STANDS, DOWN):
+            if count[kind] >= dead_count:
+                verdicts[k] = kind

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.faults import ThrusterFaults
+from firmware_py.core.faults import ThrusterFaults, by_channel
 from firmware_py.core.types import Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
@@ -105,9 +105,7 @@ class HealthMonitor:
         self._esc_fresh_ns = round(parameters.supervision.esc_fresh_ms * 1e6)
         self._period_ns = period_ns
         self._nominal_v = [float(t.voltage_v[t.module == m][0]) for m in range(count)]
-        self._thruster_at: list[dict[int, int]] = [{} for _ in range(count)]
-        for i, (m, channel) in enumerate(zip(t.module.tolist(), t.channel.tolist(), strict=True)):
-            self._thruster_at[m][channel] = i
+        self._thruster_at = by_channel(body)
         self._esc_ns = [NEVER_NS] * t.module.size
         self._heard_ns = [0] * count
         self._answered_ns = [NEVER_NS] * count
