@@ -5,7 +5,8 @@ One call serves the whole fleet.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -107,7 +108,8 @@ class BodyPipeline:
         self.supervisor.events[:0] = [Event(WARNING, words) for words in self.faults.words]
         if self.supervisor.armed and not was_armed:
             self.faults.reset()
-            self.allocator.set_alive(self.faults.now.alive)
+            if self.faults.changed:
+                self.allocator.set_alive(self.faults.now.alive)
         if not self.supervisor.armed:
             self.guidance.rest(estimate)
             self.motor_test.stop()
@@ -220,7 +222,7 @@ class Pipeline:
             outputs.records.append(record)
             outputs.events += chain.supervisor.events
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
-            self._command(chain, command, outputs)
+            _command(chain, command, relays, outputs)
         return outputs
 
     def _retune(self, requests: Sequence[Request], outputs: Outputs) -> None:
@@ -288,13 +290,14 @@ class Pipeline:
     def _chain(self, body: int) -> BodyPipeline:
         return next(chain for chain in self._chains if chain.body.index == body)
 
-    def _command(self, chain: BodyPipeline, command: np.ndarray, outputs: Outputs) -> None:
-        """Hands each module its own thrusters, and its relays when they are due."""
-        armed, time_ns, channels = chain.supervisor.armed, outputs.time_ns, np.zeros((len(chain.body.modules), CHANNELS))
-        channels.reshape(-1)[chain.slots] = command
-        for module, thrusters in zip(chain.body.modules, channels, strict=True):
-            outputs.modules[module] = ModuleCommand(armed, thrusters, self.docking.relays(module, time_ns))
-
 
 IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)
 """What a module is told that belongs to no body."""
+
+
+def _command(chain: BodyPipeline, command: np.ndarray, relays: Mapping[int, tuple[int, ...]], outputs: Outputs) -> None:
+    """Hands each module its own thrusters, and its relays when they are due."""
+    armed, channels = chain.supervisor.armed, np.zeros((len(chain.body.modules), CHANNELS))
+    channels.reshape(-1)[chain.slots] = command
+    for module, thrusters in zip(chain.body.modules, channels, strict=True):
+        outputs.modules[module] = ModuleCommand(armed, thrusters, relays.get(module))
