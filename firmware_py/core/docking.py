@@ -158,18 +158,18 @@ class DockingStage:
             self._release(undock, inputs.time_ns, estimates, decisions)
         return decisions
 
-    def relays(self, module: int, time_ns: int) -> tuple[int, ...] | None:
-        """The relay states that a module is to be sent in this tick, or None."""
-        if time_ns < self._due_ns[module]:
-            return None
-        self._due_ns[module] = time_ns + RELAY_PERIOD_NS
-        return tuple(self._relays[module].tolist())
+    def relays(self, time_ns: int) -> dict[int, tuple[int, ...]]:
+        """By module: the relay states that it is to be sent in this tick."""
+        if min(self._due_ns) > time_ns:
+            return {}
+        due = [module for module, at_ns in enumerate(self._due_ns) if at_ns <= time_ns]
+        for module in due:
+            self._due_ns[module] = time_ns + RELAY_PERIOD_NS
+        return {module: tuple(self._relays[module].tolist()) for module in due}
 
     # ------------------------------------------------------------ beginnings
 
-    def _begin(
-        self, prepared: Prepared, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions
-    ) -> None:
+    def _begin(self, prepared: Prepared, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions) -> None:
         request = prepared.request
         if prepared.plan is None:
             self._say(WARNING, f"dock refused: {prepared.refusal}")

@@ -5,7 +5,6 @@ One call serves the whole fleet.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -213,6 +212,7 @@ class Pipeline:
         requests, refusals = sift(inputs.requests, {chain.body.index: chain.body for chain in self._chains})
         outputs.events += refusals
         self._retune(requests, outputs)
+        relays = self.docking.relays(inputs.time_ns)
         for chain in self._chains:
             estimate = estimates[chain.body.index]
             outputs.preparations += chain.decide(inputs, estimate, requests)
