@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -90,8 +89,8 @@ class PairBank:
     def step(self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses) -> None:
         """Brings the rows to the tick at `time_ns`, from its inputs alone and what they were before."""
         heard = [m for m in self._watched if modules[m].dock_current_ma != SILENT]
-        for m in heard:
-            self._heard_ma[m] = np.array(modules[m].dock_current_ma, dtype=np.float64)  # None becomes NaN
+        if heard:
+            self._heard_ma[heard] = np.array([modules[m].dock_current_ma for m in heard], dtype=np.float64)  # None becomes NaN
         watch(self.rows, self._rings, self._heard_ma, *poses.found, time_ns, self._limits)
         if heard:
             self._heard_ma[heard] = np.nan
@@ -142,14 +141,15 @@ class ModulePoses:
     @cached_property
     def found(self) -> Found:
         """Every tag that was seen and is known, in the order of modules, then of arrival."""
-        seen = [[t for t in m.tags if (i, t.tag_id) in self._tags] for i, m in enumerate(self._modules)]
-        first = np.array([0, *accumulate(map(len, seen))])
-        if not first[-1]:
-            return first, NO_TIMES, NO_POSES
-        parts = [(t.p_wt, t.q_wt, *self._tags[i, t.tag_id]) for i, tags in enumerate(seen) for t in tags]
-        poses = np.empty((len(parts), 7))
-        module_poses(np.concatenate([array for part in parts for array in part]).reshape(-1, 14), poses)
-        return first, np.array([t.capture_ns for tags in seen for t in tags]), poses
+        tags = self._tags
+        seen = [(i, t) for i, module in enumerate(self._modules) if module.tags for t in module.tags if (i, t.tag_id) in tags]
+        if not seen:
+            return np.zeros(len(self._modules) + 1, dtype=np.int64), NO_TIMES, NO_POSES
+        parts = [array for i, t in seen for array in (t.p_wt, t.q_wt, *tags[i, t.tag_id])]
+        poses = np.empty((len(seen), 7))
+        module_poses(np.concatenate(parts).reshape(-1, 14), poses)
+        first = np.searchsorted([i for i, _ in seen], np.arange(len(self._modules) + 1))
+        return first, np.array([t.capture_ns for _, t in seen]), poses
 
 
 NO_TIMES, NO_POSES = np.zeros(0, dtype=np.int64), np.zeros((0, 7))

@@ -23,7 +23,8 @@ ESC_DOWN = (1, 3)
 WHY = ("has an ESC that failed", "stands still", "does not obey")
 DOWN, STANDS, DISOBEYS = range(len(WHY))
 """What the feedback of an ESC may show often enough in a row, the gravest first."""
-HEALTHY = -1
+NEITHER = (-1, -1)
+"""Thrusters of a feedback that the vehicle does not have."""
 RANK_TOLERANCE = 1e-6
 """Singular values below this share of the largest count as zero."""
 FAST_SHARE = 2.0
@@ -71,11 +72,11 @@ class FaultDetector:
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
         self._t = t
-        self._thruster_at = by_channel(body)
+        self._pairs = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in by_channel(body)]
         self._modules = body.modules
         full_n = np.array([(polynomial(f, 1.0), polynomial(r, 1.0)) for f, r in zip(t.forward, t.reverse, strict=True)])
         self._believed = (full_n, t.rpm_at_full)
-        self._limits = (parameters.force_n, parameters.dead_share, parameters.dead_count)
+        self._limits, self._dead_count = (parameters.force_n, parameters.dead_share), parameters.dead_count
         self._motion = MissingThrust(body, parameters, period_ns)
         n = t.f_max.size
         self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
@@ -114,21 +115,19 @@ class FaultDetector:
 
     def _hear(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
         """Every ESC's feedback against what its thruster is believed to give."""
-        heard = [
-            (thruster_at[channel], rpm, status)
-            for module, thruster_at in zip(modules, self._thruster_at, strict=True)
-            for esc in module.esc
-            for channel, rpm, status in zip((esc.first, esc.first + 1), esc.rpm, esc.status, strict=True)
-            if channel in thruster_at
-        ]
+        heard: list[float] = []
+        for module, pairs in zip(modules, self._pairs, strict=True):
+            for esc in module.esc:
+                heard += pairs.get(esc.first, NEITHER)
+                heard += esc.rpm
+                heard += esc.status
         if not heard:
             return
-        verdicts = np.empty(len(heard), dtype=np.int64)
-        judge(np.array(heard), force_n, self.now.alive, *self._believed, *self._limits, self._counts, verdicts)
-        if verdicts.max() != HEALTHY:
-            for (i, _, _), verdict in zip(heard, verdicts.tolist(), strict=True):
-                if verdict != HEALTHY and self.now.alive[i]:
-                    self._lose(i, WHY[verdict])
+        feedback = np.array(heard, dtype=np.float64).reshape(-1, 3, 2)
+        if judge(feedback, force_n, self.now.alive, *self._believed, *self._limits, self._dead_count, self._counts):
+            for i, kind in np.argwhere(self._counts >= self._dead_count).tolist():
+                if self.now.alive[i]:
+                    self._lose(i, WHY[kind])
 
     def believed_rpm(self, i: int, force_n: float) -> float:
         """Speed of thruster `i` at a force, 1/min."""
@@ -155,28 +154,28 @@ def believed_rpm(force_n, full_n, rpm_at_full):  # type: ignore[no-untyped-def]
     return math.copysign(rpm_at_full * math.sqrt(abs(force_n) / full_n[0 if force_n > 0.0 else 1]), force_n)
 
 
-@njit(f"void({M},{V},boolean[::1],{M},{V},float64,float64,int64,int64[:,::1],int64[::1])", cache=True)
-def judge(heard, force_n, alive, full_n, rpm_at_full, least_n, dead_share, dead_count, counts, verdicts):  # type: ignore[no-untyped-def]
-    """Counts what each feedback shows, and writes what was shown often enough.
+@njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},float64,float64,int64,int64[:,::1])", cache=True)
+def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, dead_count, counts):  # type: ignore[no-untyped-def]
+    """Counts what each feedback shows; whether it was shown often enough by a thruster.
 
     Args:
-        heard: (k, 3) thruster, speed 1/min and EscStatus of each feedback.
+        feedback: (k, 3, 2) of two thrusters each their indices (-1: there is none), speeds 1/min and EscStatus.
         force_n, alive, full_n, rpm_at_full: of all thrusters; force believed, may be used, full forces (n, 2), full speed.
         least_n: force from which a speed is judged, N; dead_share, dead_count: as the parameters.
-        counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS; verdicts: (k,), HEALTHY or one of them.
+        counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS.
     """
-    for k in range(heard.shape[0]):
-        i, rpm, status = int(heard[k, 0]), heard[k, 1], int(heard[k, 2])
-        verdicts[k] = HEALTHY
-        if not alive[i]:
-            continue
-        believed = believed_rpm(force_n[i], full_n[i], rpm_at_full[i])
-        count, margin = counts[i], FAST_MARGIN * rpm_at_full[i]
-        wrong_way = rpm * believed < 0.0 and abs(rpm - believed) > margin
-        count[DOWN] = count[DOWN] + 1 if status in ESC_DOWN else 0
-        if abs(force_n[i]) >= least_n:
-            count[STANDS] = count[STANDS] + 1 if abs(rpm) < dead_share * abs(believed) else 0
-        count[DISOBEYS] = count[DISOBEYS] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
-        for kind in (DISOBEYS, STANDS, DOWN):
-            if count[kind] >= dead_count:
-                verdicts[k] = kind
+    found = False
+    for k in range(feedback.shape[0]):
+        for side in range(2):
+            i, rpm, status = int(feedback[k, 0, side]), feedback[k, 1, side], int(feedback[k, 2, side])
+            if i < 0 or not alive[i]:
+                continue
+            believed = believed_rpm(force_n[i], full_n[i], rpm_at_full[i])
+            count, margin = counts[i], FAST_MARGIN * rpm_at_full[i]
+            wrong_way = rpm * believed < 0.0 and abs(rpm - believed) > margin
+            count[DOWN] = count[DOWN] + 1 if status in ESC_DOWN else 0
+            if abs(force_n[i]) >= least_n:
+                count[STANDS] = count[STANDS] + 1 if abs(rpm) < dead_share * abs(believed) else 0
+            count[DISOBEYS] = count[DISOBEYS] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
+            found = found or count.max() >= dead_count
+    return found

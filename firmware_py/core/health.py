@@ -7,8 +7,7 @@ Figures that are not known yet are NaN, so that no comparison with them holds.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -26,10 +25,6 @@ MEAN_S = 1.0
 """Time over which rates and shares are averaged."""
 VOLTAGE_SHARE = 0.2
 """Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
-
-
-UNKNOWN = (None,) * 4
-"""Supply, leak, temperature and pressure of a cabin that nothing came of."""
 
 
 class Health(NamedTuple):
@@ -84,15 +79,6 @@ class Health(NamedTuple):
     """What about the topology is not as configured, in words; empty when all is."""
 
 
-class Cabins(NamedTuple):
-    """The worst of all modules' supplies and cabins, as in Health."""
-
-    voltage_share: float
-    leak: bool
-    hottest_c: float
-    change_pa: float
-
-
 class HealthMonitor:
     """Keeps the ages and means of one body."""
 
@@ -109,12 +95,11 @@ class HealthMonitor:
         self._esc_ns = [NEVER_NS] * t.module.size
         self._heard_ns = [0] * count
         self._answered_ns = [NEVER_NS] * count
-        self._voltage = [math.nan] * count
         self._leak = [False] * count
-        self._cabin_c = [math.nan] * count
-        self._cabin_pa = [math.nan] * count
-        self._cabin_start_pa = [math.nan] * count
-        self._cabins = Cabins(math.nan, False, math.nan, math.nan)
+        self._voltage_share: dict[int, float] = {}
+        self._cabin_c: dict[int, float] = {}
+        self._cabin_start_pa: dict[int, float] = {}
+        self._cabin_change_pa: dict[int, float] = {}
         self._depth_ns = 0
         self._ground_ns: int | None = None
         self._pilot_ns: int | None = None
@@ -142,7 +127,6 @@ class HealthMonitor:
         self._people(requests, now)
         self._rates(inputs, estimate, dt_s)
         self._time_ns = now
-        cabins = self._cabins
         self.now = Health(
             time_ns=now,
             ready=estimate.ready,
@@ -151,10 +135,10 @@ class HealthMonitor:
             nis_ratio=self._nis_ratio,
             rejected_share=self._rejected_share,
             depth_age_s=_age_s(self._depth_ns, now),
-            voltage_share=cabins.voltage_share,
-            leak=cabins.leak,
-            cabin_c=cabins.hottest_c,
-            cabin_change_pa=cabins.change_pa,
+            voltage_share=min(self._voltage_share.values(), default=math.nan),
+            leak=any(self._leak),
+            cabin_c=max(self._cabin_c.values(), default=math.nan),
+            cabin_change_pa=max(self._cabin_change_pa.values(), default=math.nan),
             silent=tuple(self._modules[i] for i in _older(self._answered_ns, now - self._answer_ns)),
             silent_s=_age_s(min(self._heard_ns), now),
             bus_silent_s=_age_s(max(self._heard_ns), now),
@@ -175,7 +159,6 @@ class HealthMonitor:
         return self.now
 
     def _listen(self, modules: list[ModuleInputs], now: int) -> None:
-        news = False
         for index, module in enumerate(modules):
             if module.heard or module.answered:
                 self._heard_ns[index] = now
@@ -183,36 +166,19 @@ class HealthMonitor:
                 self._answered_ns[index] = now
             if module.pressure_pa is not None:
                 self._depth_ns = now
-            inside = (module.voltage_v, module.leak, module.cabin_temperature_c, module.cabin_pressure_pa)
-            if inside != UNKNOWN:
-                self._look_in(index, *inside)
-                news = True
+            if module.leak is not None:
+                self._leak[index] = module.leak
+            if is_known(module.voltage_v):
+                share = module.voltage_v / self._nominal_v[index]
+                before = self._voltage_share.get(index, share)
+                self._voltage_share[index] = before + VOLTAGE_SHARE * (share - before)
+            if is_known(module.cabin_temperature_c):
+                self._cabin_c[index] = module.cabin_temperature_c
+            if is_known(module.cabin_pressure_pa):
+                start = self._cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
+                self._cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
             if module.esc:
                 self._hear_escs(self._thruster_at[index], module.esc, now)
-        if news:
-            self._cabins = self._worst()
-
-    def _look_in(self, index: int, voltage_v: float | None, leak: bool | None, cabin_c: float | None, cabin_pa: float | None) -> None:
-        """Takes what is known of supply and cabin of one module."""
-        if voltage_v is not None:
-            before = self._voltage[index]
-            self._voltage[index] = voltage_v if math.isnan(before) else before + VOLTAGE_SHARE * (voltage_v - before)
-        if leak is not None:
-            self._leak[index] = leak
-        if cabin_c is not None:
-            self._cabin_c[index] = cabin_c
-        if cabin_pa is not None:
-            self._cabin_pa[index] = cabin_pa
-            if math.isnan(self._cabin_start_pa[index]):
-                self._cabin_start_pa[index] = cabin_pa
-
-    def _worst(self) -> Cabins:
-        shares = [v / nominal for v, nominal in zip(self._voltage, self._nominal_v, strict=True)]
-        changes = [abs(a - b) for a, b in zip(self._cabin_pa, self._cabin_start_pa, strict=True)]
-        return Cabins(
-            min(_known(shares), default=math.nan), any(self._leak), max(_known(self._cabin_c), default=math.nan),
-            max(_known(changes), default=math.nan),
-        )  # fmt: skip
 
     def _hear_escs(self, thruster_at: dict[int, int], escs: list[EscFeedback], now: int) -> None:
         for esc in escs:
@@ -260,9 +226,9 @@ def _older(times_ns: list[int], oldest_ns: int) -> tuple[int, ...]:
     return tuple(i for i, time_ns in enumerate(times_ns) if time_ns < oldest_ns)
 
 
-def _known(values: Iterable[float]) -> list[float]:
-    """Those that are numbers."""
-    return [value for value in values if math.isfinite(value)]
+def is_known(value: float | None) -> TypeGuard[float]:
+    """Whether a reading came and is a number."""
+    return value is not None and math.isfinite(value)
 
 
 def is_sticks(argument: object) -> bool:

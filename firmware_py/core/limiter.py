@@ -63,10 +63,9 @@ class Limiter:
         scale, wanted = self._voltage_scale(voltage_v), np.empty_like(self.force_n)
         limit_forces(wanted_n, self.force_n, self._all if alive is None else alive, scale, *self._limits, wanted)
         powers = module_power(wanted, self._t.power_forward, self._t.power_reverse, self._t.module, len(self.magnets)).tolist()
-        for module, power in enumerate(powers):
-            supply = max(0.0, self._supply[module] - self.magnets[module].power_w)
-            if power > supply:
-                self._limit_power(wanted, module, supply)
+        for module, (power, supply_w, magnets) in enumerate(zip(powers, self._supply, self.magnets, strict=True)):
+            if power > supply_w - magnets.power_w:
+                self._limit_power(wanted, module, supply_w - magnets.power_w)
         self.force_n = wanted
         out = np.empty_like(wanted)
         commands(wanted, scale, *self._curves, self._full, out)
