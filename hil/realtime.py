@@ -95,6 +95,8 @@ def fly_in_real_time(
         script = script_of(scenario, fleet)
         recorder = Recorder(out, configuration_of(firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz), queued=True)
         stack.callback(recorder.close)
+        for body in firmware.pipeline.bodies:
+            recorder.expect(body.index, body.thrusters.f_max.size)
         start_ns = 0
 
         def requests(time_ns: int, last: Outputs | None) -> Sequence[Request]:

@@ -107,6 +107,8 @@ def run_vehicle(
             configuration = configuration_of(firmware, rate_hz=fleet.rate_hz)
             recorder = Recorder(out, configuration, live.context if live is not None else None, queued=True)
             stack.callback(recorder.close)
+            for body in firmware.pipeline.bodies:
+                recorder.expect(body.index, body.thrusters.f_max.size)
             observers.append(recording(recorder, fleet.rate_hz))
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))

@@ -20,6 +20,12 @@ from firmware_py.runtime.request_text import request_text
 
 TICKS, REQUESTS, DOCKS, EVENTS = "/firmware/ticks", "/firmware/requests", "/firmware/docks", "/events"
 
+
+def body_topic(index: int) -> str:
+    """Of the body of that index."""
+    return f"/firmware/body{index}"
+
+
 TICK_SIGNALS = (
     Signal("tick", kind="int"),
     Signal("time_ns", unit="ns", kind="int"),
@@ -128,14 +134,15 @@ class TickMessages:
         for request in inputs.requests:
             yield Message(REQUESTS, self.requests, self.requests.encode(tick, request_text(request)))
         for record in outputs.records:
-            layout, row = self._body(len(record.commanded_n))
-            yield Message(f"/firmware/body{record.body}", layout, row.encode(_body_values(tick, time_ns, record)))
+            layout, row = self.body(len(record.commanded_n))
+            yield Message(body_topic(record.body), layout, row.encode(_body_values(tick, time_ns, record)))
         for dock in outputs.docks:
             yield Message(DOCKS, self.docks, self._dock_row.encode((tick, time_ns, *dock)))
         for event in outputs.events:
             yield Message(EVENTS, self.events, self.events.encode(tick, event.severity, event.text))
 
-    def _body(self, thrusters: int) -> tuple[Layout, Row]:
+    def body(self, thrusters: int) -> tuple[Layout, Row]:
+        """Layout of a body with so many thrusters, and a row to fill."""
         if thrusters not in self._bodies:
             layout = Layout("Body", body_signals(thrusters))
             self._bodies[thrusters] = layout, layout.row()
