@@ -22,13 +22,18 @@ from firmware_py.runtime.recorder import Recorder
 from hil.dock_script import DockScript
 from hil.faults import Faults
 from hil.force_script import ForceScript
+from hil.mode_script import ModeScript
 from hil.nodes import Nodes, make_nodes
 from hil.scenario import Scenario, make_world
 from hil.script import Script
 from hil.signals import TruthRecorder
 
 DEFAULT_BUS = "virtual:modcube"
-Orders = Script | DockScript | ForceScript
+Orders = Script | DockScript | ForceScript | ModeScript
+
+
+SCRIPTS: dict[str, type[Orders]] = {"dock": DockScript, "force": ForceScript, "mode": ModeScript}
+"""By kind of task; a trajectory's is Script."""
 
 
 @dataclass(slots=True)
@@ -103,9 +108,7 @@ def fleet_of(scenario: Scenario, bus: str, rate_hz: int) -> Fleet:
 
 def script_of(scenario: Scenario, fleet: Fleet) -> Orders:
     """Whoever gives the orders in a scenario."""
-    if scenario.task.kind == "force":
-        return ForceScript(scenario, fleet)
-    return DockScript(scenario, fleet) if scenario.task.kind == "dock" else Script(scenario, fleet)
+    return SCRIPTS.get(scenario.task.kind, Script)(scenario, fleet)
 
 
 def open_bench(

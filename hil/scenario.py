@@ -82,15 +82,21 @@ class Step:
     also: bool = quantity(False, help="begins together with the step before")
 
 
+MODES = ("MANUAL", "STABILIZE", "ALT_HOLD", "POSHOLD", "AUTO", "GUIDED", "SURFACE", "MOTOR_DETECT")
+"""Modes that a person may take with one body."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Task:
     """What the robot is to do."""
 
     kind: str = quantity(
-        choices=("hover", "spiral", "moebius", "lissajous", "dock", "force"),
+        choices=("hover", "spiral", "moebius", "lissajous", "dock", "force", "mode"),
         help="hover: hold the place; spiral: climb on a cylinder; moebius: along the rim of a Moebius strip; "
-        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns; dock: the [[step]]s; force: a stick on a load cell",
+        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns; dock: the [[step]]s; force: a stick on a load cell; "
+        "mode: stays in `mode`",
     )
+    mode: str = quantity("POSHOLD", choices=MODES, help="mode: which one")
     settle_s: float = quantity(15.0, unit="s", low=0, high=600, help="held at the start before the task begins")
     duration_s: float = quantity(unit="s", low=0.1, high=7200, help="of the task itself, rest to rest")
     radius_m: float = quantity(0.30, unit="m", low=0.01, high=100, help="spiral: radius; moebius: of the centre circle")

@@ -77,6 +77,7 @@ TABLE = (
     Row("tag_lost", "no tag for {:.1f} s", lambda h: h.tag_age_s, modes=PLACED),
     Row("tag_late", "no tag for {:.1f} s", lambda h: h.tag_age_s, modes=MOVING),
     Row("depth_lost", "no pressure for {:.1f} s", lambda h: h.depth_age_s),
+    Row("imu_lost", "no IMU for {:.1f} s", lambda h: h.imu_age_s),
     Row("module_silent", "a module is silent for {:.1f} s", lambda h: h.silent_s),
     Row("ticks_missed", "{:.0f} ticks missed in a second", lambda h: h.missed_ticks_per_s),
     Row("fence", "{:.2f} m outside the fence", lambda h: h.outside_m, modes=MOVING),

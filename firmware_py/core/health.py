@@ -41,6 +41,8 @@ class Health(NamedTuple):
     rejected_share: float
     """Share of tag observations that the gate refused, mean of a second."""
     depth_age_s: float
+    imu_age_s: float
+    """Since the last sample of any module's IMU that is to be believed."""
     voltage_share: float
     """Lowest supply of a module over its nominal one; NaN before the first reading."""
     leak: bool
@@ -100,7 +102,7 @@ class HealthMonitor:
         self._cabin_c: dict[int, float] = {}
         self._cabin_start_pa: dict[int, float] = {}
         self._cabin_change_pa: dict[int, float] = {}
-        self._depth_ns = 0
+        self._depth_ns = self._imu_ns = 0
         self._ground_ns: int | None = None
         self._pilot_ns: int | None = None
         self._stick = 0.0
@@ -110,6 +112,8 @@ class HealthMonitor:
         self._time_ns: int | None = None
         self._missed_rate = 0.0
         self.now: Health
+        self.imu_heard = True
+        """Whether an IMU that is to be believed was heard in this tick; set by whoever watches them."""
         self.partner_lost = False
         """Set by whoever watches the docked faces."""
         self.topology = ""
@@ -121,9 +125,11 @@ class HealthMonitor:
         """The figures of this tick; `now` keeps them."""
         now = inputs.time_ns
         if self._time_ns is None:  # silence counts from here
-            self._heard_ns, self._depth_ns, self._time_ns = [now] * len(self._modules), now, now
+            self._heard_ns, self._depth_ns, self._imu_ns, self._time_ns = [now] * len(self._modules), now, now, now
         dt_s = (now - self._time_ns) * 1e-9
         self._listen([inputs.modules[m] for m in self._modules], now)
+        if self.imu_heard:
+            self._imu_ns = now
         self._people(requests, now)
         self._rates(inputs, estimate, dt_s)
         self._time_ns = now
@@ -135,6 +141,7 @@ class HealthMonitor:
             nis_ratio=self._nis_ratio,
             rejected_share=self._rejected_share,
             depth_age_s=_age_s(self._depth_ns, now),
+            imu_age_s=_age_s(self._imu_ns, now),
             voltage_share=min(self._voltage_share.values(), default=math.nan),
             leak=any(self._leak),
             cabin_c=max(self._cabin_c.values(), default=math.nan),

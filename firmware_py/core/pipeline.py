@@ -18,13 +18,15 @@ from firmware_py.core.faults import FaultDetector
 from firmware_py.core.glide import Glide
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import HealthMonitor
-from firmware_py.core.limiter import Limiter, is_believed
+from firmware_py.core.imu_watch import ImuWatch
+from firmware_py.core.limiter import Limiter
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.motor_test import MotorTest
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.requests import FOR_ALL, sift
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.supervisor import WARNING, Decision, Supervisor
+from firmware_py.core.supply import SupplyMeter
 from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.topology import join, part_of
 from firmware_py.core.transitions import DOCKING, Effect, Trigger
@@ -48,8 +50,6 @@ from firmware_py.description.schema import DescriptionError
 ESTIMATORS: dict[str, type[Estimator] | type[TagOnlyEstimator]] = {"full": Estimator, "paper": TagOnlyEstimator}
 CHANNELS = 8
 """Thruster commands that one module's frames carry."""
-VOLTAGE_SMOOTHING = 0.5
-"""Share of a new voltage reading (10 Hz) that is believed: settles in half a second."""
 
 
 class BodyPipeline:
@@ -59,6 +59,7 @@ class BodyPipeline:
         self.body = body
         self.joints = joints_of(body)
         self.measurements = Measurements(body)
+        self.imus = ImuWatch(body.modules)
         self.estimator = ESTIMATORS[parameters.estimation.kind](body, parameters.estimation, period_ns)
         self.faults = FaultDetector(body, parameters.faults, period_ns)
         self.health = HealthMonitor(body, parameters, period_ns)
@@ -71,8 +72,7 @@ class BodyPipeline:
         self.limiter = Limiter(body, parameters.limiter, period_ns * 1e-9)
         self.lag = ThrusterLag(body.thrusters, period_ns * 1e-9)
         self.slots = body.thrusters.module * CHANNELS + body.thrusters.channel
-        self._nominal_v = np.array([body.thrusters.voltage_v[body.thrusters.module == m][0] for m in range(len(body.modules))])
-        self.voltage_v = self._nominal_v.copy()
+        self.supply = SupplyMeter(body)
 
     def retune(self, parameters: Parameters) -> None:
         """Takes other gains, noise figures and allocation from this tick on; estimate, set-point and forces stay as they are."""
@@ -83,9 +83,10 @@ class BodyPipeline:
 
     def measure(self, inputs: Inputs) -> Estimate:
         """Sensors -> estimate."""
-        self._read_supply(inputs)
+        self.supply.step(inputs.modules)
         mean_n = self.lag.step()
-        measured = self.measurements.fuse(inputs.modules, self.estimator.q_wb)
+        self.health.imu_heard = self.imus.step(inputs.modules)
+        measured = self.measurements.fuse(inputs.modules, self.estimator.q_wb, self.imus.frozen)
         estimate = self.estimator.step(inputs.time_ns, measured, self.body.thrusters.matrix @ mean_n)
         self._find_faults(inputs, measured, estimate, mean_n)
         return estimate
@@ -135,7 +136,7 @@ class BodyPipeline:
         wrench = self.guidance.mix(wrench, time_ns, estimate, health)
         thrust = self._allocate(wrench, time_ns)
         armed, alive = self.supervisor.armed, self.faults.now.alive
-        force, command = self.limiter.step(thrust.force_n, armed, self.voltage_v, alive)
+        force, command = self.limiter.step(thrust.force_n, armed, self.supply.voltage_v, alive)
         self.lag.command(force)
         state, mode = self.supervisor.state, self.supervisor.mode
         record = BodyRecord(self.body.index, state, mode, estimate, setpoint, wrench, thrust, force)
@@ -147,12 +148,6 @@ class BodyPipeline:
             force = self.motor_test.step(time_ns)
             return Thrust(force, self.body.thrusters.matrix @ force, (1.0, 1.0))
         return self.allocator.step(self.faults.now.keep @ wrench if self.faults.now.lost_axes else wrench)
-
-    def _read_supply(self, inputs: Inputs) -> None:
-        for i, module in enumerate(self.body.modules):
-            voltage = inputs.modules[module].voltage_v
-            if voltage is not None and is_believed(voltage / self._nominal_v[i]):
-                self.voltage_v[i] += VOLTAGE_SMOOTHING * (voltage - self.voltage_v[i])
 
     def take_over(self, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
         """Goes on from the bodies that this one is made of, or was part of: motion, forces, supplies, arm state. Returns its estimate."""
@@ -179,7 +174,7 @@ class BodyPipeline:
                 for array, source in zip(forces, other.lag.forces, strict=True):
                     array[here] = source[there]
                 limited[here] = other.limiter.force_n[there]
-                self.voltage_v[i] = other.voltage_v[j]
+                self.supply.voltage_v[i] = other.supply.voltage_v[j]
         self.lag.restart(*forces)
         self.limiter.force_n = limited
 

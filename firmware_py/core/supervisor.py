@@ -23,6 +23,10 @@ LADDER = {
 """What a fail-safe tries, one after the other until one is possible."""
 
 
+MODE_LEVEL = {Mode.SURFACE: Level.SURFACE}
+"""What a mode is worth as a fail-safe, whoever chose it: a milder one does not end it."""
+
+
 class Decision(NamedTuple):
     """A transition that was made: its trigger, what guidance is to do, the mode after it, and the request's argument."""
 
@@ -97,7 +101,7 @@ class Supervisor:
             self._say(severity, f"fail-safe {'on' if alarm.begins else 'over'}: {alarm.words}")
         begun = [alarm.level for alarm in alarms if alarm.begins and alarm.level > Level.WARN]
         level = self._failsafes.level
-        if self.armed and begun and level > self.level:
+        if self.armed and begun and level > max(self.level, MODE_LEVEL.get(self.mode, Level.NONE)):
             for trigger in LADDER[level]:
                 decision = self._try(trigger, None, health)
                 if decision is not None:

@@ -109,6 +109,13 @@ class Failsafes:
     depth_lost_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_DEPL_S")
     depth_lost_action: int = quantity(1, low=0, high=5, help=ACTION, mavlink="FS_DEPL_ACT")
     depth_lost_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_DEPL_LAT")
+    # the IMU is silent, at fault or frozen
+    imu_lost_limit: float = quantity(
+        0.5, unit="s", low=0.1, high=60, help="no IMU of the body gave a sample to believe for longer", mavlink="FS_IMU_LIM"
+    )
+    imu_lost_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_IMU_S")
+    imu_lost_action: int = quantity(2, low=0, high=5, help=ACTION, mavlink="FS_IMU_ACT")
+    imu_lost_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_IMU_LAT")
     # a CAN node is silent
     module_silent_limit: float = quantity(
         0.5, unit="s", low=0.1, high=60, help="a module was not heard for longer", mavlink="FS_MOD_LIM"

@@ -20,7 +20,7 @@ FIELDS: dict[str, str] = {
     "leak": "leak", "bus_silent": "bus_silent_s", "foreign_sync": "foreign_sync", "battery_critical": "voltage_share",
     "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
     "tag_gone": "tag_age_s", "partner_lost": "partner_lost", "estimator": "nis_ratio", "rejected": "rejected_share",
-    "tag_lost": "tag_age_s", "tag_late": "tag_age_s", "depth_lost": "depth_age_s", "module_silent": "silent_s",
+    "tag_lost": "tag_age_s", "tag_late": "tag_age_s", "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
     "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
     "thruster_lost": "dead", "battery_low": "voltage_share",
 }  # fmt: skip
@@ -222,6 +222,7 @@ WORDS = {
     "tag_lost": "no tag for 8.0 s",
     "tag_late": "no tag for 1.0 s",
     "depth_lost": "no pressure for 1.0 s",
+    "imu_lost": "no IMU for 0.5 s",
     "module_silent": "a module is silent for 0.5 s",
     "ticks_missed": "5 ticks missed in a second",
     "fence": "0.00 m outside the fence",

@@ -546,3 +546,15 @@ def test_joined_robot_keeps_e_stop_and_fail_safe() -> None:
     calm = Supervisor(P)
     calm.take_over([supervisor_in(), supervisor_in()])
     assert not calm.raises_estop
+
+
+def test_milder_fail_safe_does_not_end_surfacing() -> None:
+    """Whoever chose it: a robot on its way up is not made to hold its place."""
+    health = GOOD._replace(silent_s=0.6)
+    supervisor = supervisor_in(mode=Mode.SURFACE)
+    supervisor.step(False, health, [])
+    assert (supervisor.mode, supervisor.level) == (Mode.SURFACE, Level.NONE)
+    assert texts(supervisor) == ["fail-safe on: a module is silent for 0.6 s"]
+    supervisor = supervisor_in(mode=Mode.SURFACE)
+    supervisor.step(False, GOOD._replace(bus_silent_s=2.1), [])
+    assert supervisor.state == State.DISARMED

@@ -1,0 +1,41 @@
+"""Notices an inertial sensor that repeats its last sample: noise never does that for long. Stands before stage 1 of a tick.
+
+What it finds frozen is not measured with; the body flies on by tags, depth and its model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from firmware_py.core.types import ModuleInputs
+
+REPEATS = 10
+"""Samples in a row that are the same in all six numbers. A quiet sensor of one count of noise does that once in a day of 100 Hz."""
+
+
+class ImuWatch:
+    """Watches the IMUs of one body.
+
+    Attributes:
+        frozen: of each module, whether its IMU is not to be believed now.
+    """
+
+    def __init__(self, modules: Sequence[int]) -> None:
+        self._modules = tuple(modules)
+        self._last: list[bytes] = [b""] * len(self._modules)
+        self._repeats = [0] * len(self._modules)
+        self.frozen = [False] * len(self._modules)
+
+    def step(self, modules: Sequence[ModuleInputs]) -> bool:
+        """Whether any IMU that is to be believed gave a sample in this tick. `modules`: by fleet index."""
+        heard = False
+        for i, index in enumerate(self._modules):
+            gyro, accel = modules[index].gyro, modules[index].accel
+            if gyro is None or accel is None:
+                continue
+            sample = gyro.tobytes() + accel.tobytes()
+            self._repeats[i] = self._repeats[i] + 1 if sample == self._last[i] else 0
+            self._last[i] = sample
+            self.frozen[i] = self._repeats[i] >= REPEATS
+            heard = heard or not self.frozen[i]
+        return heard

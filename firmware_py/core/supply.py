@@ -1,0 +1,35 @@
+"""The supply voltage of each module, smoothed. Read before stage 1 of a tick; the limiter asks for more command where it sags."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.limiter import is_believed
+from firmware_py.core.types import ModuleInputs
+
+SMOOTHING = 0.5
+"""Share of a new reading (10 Hz) that is believed: settles in half a second."""
+
+
+class SupplyMeter:
+    """The supplies of one body.
+
+    Attributes:
+        voltage_v: (m,) of each module; nominal before the first reading that can be true.
+    """
+
+    def __init__(self, body: Body) -> None:
+        t = body.thrusters
+        self._modules = body.modules
+        self._nominal_v = np.array([t.voltage_v[t.module == m][0] for m in range(len(body.modules))])
+        self.voltage_v = self._nominal_v.copy()
+
+    def step(self, modules: Sequence[ModuleInputs]) -> None:
+        """Takes the readings of this tick. `modules`: by fleet index."""
+        for i, module in enumerate(self._modules):
+            voltage = modules[module].voltage_v
+            if voltage is not None and is_believed(voltage / self._nominal_v[i]):
+                self.voltage_v[i] += SMOOTHING * (voltage - self.voltage_v[i])

@@ -1,0 +1,74 @@
+"""What the person at the bench does to fly one mode: arms, takes the mode, and goes on steering in it: sticks, set-points, a path."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.transitions import ARMED
+from firmware_py.core.types import Action, Mode, Outputs, Request, Setpoint, Sticks
+from firmware_py.description.fleet import Fleet
+from firmware_py.prepare import paths
+from hil.scenario import Scenario
+
+ARM_FROM_S, ARM_EVERY_S = 1.0, 0.5
+STREAM_EVERY_S = 0.1
+"""Sticks and set-points."""
+PILOTED = (Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD)
+STICKS = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+RADIUS_M, TURN_S = 0.25, 15.0
+"""Circle of AUTO and of GUIDED's set-points, and the time of one round."""
+
+
+class ModeScript:
+    """The requests of one run. Once armed it never arms again: what a fault has disarmed stays so."""
+
+    def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
+        self._fleet, self._task = fleet, scenario.task
+        self._mode = Mode[scenario.task.mode]
+        self.begin_ns = round(scenario.task.settle_s * 1e9)
+        self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
+        self.ticks = self.end_ns // fleet.period_ns
+        self._armed = self._begun = False
+
+    def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
+        """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
+        if last is None or time_ns < ARM_FROM_S * 1e9:
+            return []
+        tick, rate = time_ns // self._fleet.period_ns, self._fleet.rate_hz
+        self._armed = self._armed or last.records[0].state in ARMED
+        if not self._armed:
+            return [Request(Action.ARM)] if tick % round(ARM_EVERY_S * rate) == 0 else []
+        if time_ns < self.begin_ns:
+            return []
+        asked = [] if self._begun else self._begin()
+        self._begun = True
+        if tick % max(1, round(STREAM_EVERY_S * rate)) == 0:
+            asked += self._stream(1e-9 * (time_ns - self.begin_ns))
+        return asked
+
+    def is_over(self, time_ns: int) -> bool:
+        """The time is flown to its end."""
+        return False
+
+    def _begin(self) -> list[Request]:
+        if self._mode == Mode.AUTO:
+            turns = self._task.duration_s / TURN_S
+            centre = self._task.centre_m - np.array([RADIUS_M, 0.0, 0.0])
+            return [Request(Action.TRACK, 0, paths.circle(centre, RADIUS_M, turns, self._task.duration_s))]
+        return [Request(Action.SET_MODE, 0, self._mode)]
+
+    def _stream(self, t_s: float) -> list[Request]:
+        if self._mode in PILOTED:
+            return [Request(Action.STICKS, 0, STICKS)]
+        return [Request(Action.SET_POINT, 0, self._point(t_s))] if self._mode == Mode.GUIDED else []
+
+    def _point(self, t_s: float) -> Setpoint:
+        """On a circle through the start, (3,) m of the place; at an even speed."""
+        angle, rate = 2.0 * math.pi * t_s / TURN_S, 2.0 * math.pi / TURN_S
+        out, along = np.array([math.cos(angle) - 1.0, math.sin(angle), 0.0]), np.array([-math.sin(angle), math.cos(angle), 0.0])
+        place = rest_at(self._task.centre_m + RADIUS_M * out, np.array([1.0, 0.0, 0.0, 0.0]))
+        return place._replace(v_w=RADIUS_M * rate * along)
