@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from accept_measures import Values, flown, repeated, saved_by_least_power, timed
+from accept_measures import Values, flown, loop_margins, repeated, saved_by_least_power, timed
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -244,6 +244,15 @@ GROUPS: tuple[Group, ...] = (
         (
             Figure("dock, Moebius strip as one, undock, 10 trials: passed", "passed", low=1.0),
             Figure("joined pair on the strip: position RMSE, worst", "docked_rmse_m.max", high=7.0, unit="mm", scale=MM),
+        ),
+    ),
+    Group(
+        "margins", 9, "python tools/margins.py", loop_margins,
+        (
+            Figure("loop broken at the plant's input, least gain margin of 18", "nominal.gain_db", low=8.0, unit="dB"),
+            Figure("loop broken at the plant's input, least phase margin of 18", "nominal.phase_deg", low=40.0, unit="deg"),
+            Figure("the same, worst over mass, inertia and lag +-15 %: gain", "worst.gain_db", low=6.0, unit="dB"),
+            Figure("the same, worst over mass, inertia and lag +-15 %: phase", "worst.phase_deg", low=35.0, unit="deg"),
         ),
     ),
     # Figures of later issues go here.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -46,6 +47,15 @@ def saved_by_least_power(folder: Path) -> Values:
     both = ("supply_power_w", "position_rmse_m")
     power, error = (found["least_power"][m]["median"] / found["modcube"][m]["median"] for m in both)
     return {"saved": 1.0 - power, "error": error}
+
+
+def loop_margins(folder: Path) -> Values:
+    """Least margins of all axes of bodies of 1, 2 and 4 modules, nominal and in the worst corner; keys `nominal.gain_db`."""
+    command = [sys.executable, Path(__file__).with_name("margins.py"), "--jobs", str(JOBS), "--out", folder]
+    subprocess.run(command, stdout=subprocess.DEVNULL)
+    found = json.loads((folder / "margins.json").read_text(encoding="utf-8"))
+    kinds, keys = ("nominal", "worst"), ("gain_db", "phase_deg")
+    return {f"{kind}.{key}": min(row[key] for row in found if row["kind"] == kind) for kind in kinds for key in keys}
 
 
 def repeated(folder: Path) -> Values:

@@ -1,0 +1,61 @@
+"""The measured open loop against what it says of the closed one, and margins of loops that are known."""
+
+import numpy as np
+import pytest
+
+from firmware_py.description.parameters import Parameters
+from tools.loop_response import AXES, LINES, Loop, Response, Scale, corners, lines, margins, measure
+
+SURGE = 0
+
+
+def ideal(gain: float, delay_s: float) -> Response:
+    """gain exp(-j w delay) / (j w): phase margin 90 deg - gain delay, gain margin pi / (2 gain delay)."""
+    w = np.geomspace(0.1, 100.0, 400)
+    return Response(w, gain * np.exp(-1j * w * delay_s) / (1j * w))
+
+
+def test_margins_of_an_integrator_with_delay_are_the_known_ones() -> None:
+    found = margins(ideal(2.0, 0.2))
+    assert found.crossover_rad_s == pytest.approx(2.0, rel=1e-3)
+    assert found.phase_deg == pytest.approx(90.0 - np.degrees(0.4), abs=0.05)
+    assert found.gain_db == pytest.approx(20.0 * np.log10(np.pi / 0.8), abs=0.02)
+
+
+def test_loop_that_may_also_lose_gain_shows_the_nearer_margin() -> None:
+    """PID on a double integrator: unstable where the gain falls, too."""
+    w = np.geomspace(0.1, 100.0, 400)
+    s = 1j * w
+    loop = 4.0 * (s + 1.0) ** 2 / s**3
+    found = margins(Response(w, loop))
+    assert found.gain_db == pytest.approx(20.0 * np.log10(8.0), abs=0.05)  # Routh: stable above a gain of 1/2
+
+
+def test_every_sine_is_one_of_its_own() -> None:
+    chosen = lines()
+    assert chosen.shape == (len(AXES), LINES)
+    assert len(set(chosen.ravel().tolist())) == chosen.size
+
+
+def test_corners_are_all_eight() -> None:
+    assert len(set(corners(0.15))) == 8
+    assert Scale(0.85, 1.15, 0.85) in corners(0.15)
+
+
+def swing(gain: float) -> float:
+    """Growth of the surge force of a loop of so much more gain, over ten seconds after a push."""
+    loop, given = Loop(1, Parameters()), np.zeros(6)
+    swings = []
+    for tick in range(3600):
+        shake = np.zeros(6)
+        shake[SURGE] = (gain - 1.0) * given[SURGE] + (0.5 if 2000 <= tick < 2010 else 0.0)
+        given = loop.step(shake)
+        swings.append(abs(float(given[SURGE])))
+    return max(swings[3200:]) / max(swings[2200:2600])
+
+
+@pytest.mark.slow
+def test_loop_swings_up_just_beyond_its_measured_gain_margin_and_dies_out_just_below() -> None:
+    gain = 10.0 ** (margins(measure(1, Parameters())[SURGE]).gain_db / 20.0)
+    assert swing(0.93 * gain) < 0.7
+    assert swing(1.07 * gain) > 1.3

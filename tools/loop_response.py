@@ -1,0 +1,214 @@
+"""Open-loop response of the attitude and position loops at the plant's input, measured on the code that flies.
+
+The stages of a tick (measure, estimate, control, allocate, limit) run against the bench's plant, with its thruster lag, the bus's
+tick of delay and tags at 60 Hz that are 40 ms late; noise, current, deadband and quantisation are off, so what is left is linear
+in small motions. Sines are added to the forces behind the controller's back, each axis at frequencies of its own, all at once. With u
+what the controller gives and p = u + sines what reaches the plant, the loop broken at that axis, all others closed, is
+L(jw) = -U(jw) / P(jw), exact at every frequency of the record's grid.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.pipeline import BodyPipeline
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.thruster import commands
+from firmware_py.core.types import Inputs, ModuleInputs, TagObservation
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.prepare.assembly import PITCH_M, assemble
+from hil.plant.camera import Camera
+from hil.plant.lattice import place
+from hil.plant.sensors import Sensors
+from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
+from hil.plant.world import Start, World
+
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+BODIES: dict[int, list[tuple[int, int, int]]] = {
+    1: [(0, 0, 0)],
+    2: [(0, 0, 0), (1, 0, 0)],
+    4: [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)],
+}
+"""Cells of the bodies that are examined, by their number of modules: one, a line, two by two."""
+PERIOD_NS = 10_000_000
+PRESSURE_EVERY = 2
+"""Ticks from one pressure reading to the next."""
+SETTLE_TICKS, RECORD_TICKS = 4000, 5000
+"""Until the filter's gains stand still; and of the record, whose frequencies are multiples of 2 pi / 50 s."""
+LOWEST_RAD_S, HIGHEST_RAD_S, LINES = 0.3, 30.0, 20
+"""Frequencies at which each axis is shaken."""
+SHAKE = np.repeat([0.01, 0.02], 3)
+"""Acceleration of one sine, m/s^2 and rad/s^2: all together stay far from the thrusters' limits."""
+HEIGHT_M = 1.5
+
+
+class Scale(NamedTuple):
+    """How the plant differs from what the controller believes: factors of mass, inertia (water's included) and thruster lag."""
+
+    mass: float = 1.0
+    inertia: float = 1.0
+    lag: float = 1.0
+
+
+NOMINAL = Scale()
+
+
+def corners(spread: float) -> list[Scale]:
+    """The eight corners of mass, inertia and lag, each up or down by the share `spread`."""
+    sides = (1.0 - spread, 1.0 + spread)
+    return [Scale(m, i, t) for m in sides for i in sides for t in sides]
+
+
+class Response(NamedTuple):
+    """L of one axis: (k,) frequencies, rad/s, and (k,) complex values."""
+
+    frequency: np.ndarray
+    loop: np.ndarray
+
+
+class Loop:
+    """One body of docked modules that holds its place: firmware and plant, tick by tick."""
+
+    def __init__(self, modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicle: str = "modcube") -> None:
+        described = load_vehicle(vehicle)
+        cells = BODIES[modules]
+        self.body = assemble(cells, [0] * modules, [described] * modules)
+        self._chain = BodyPipeline(self.body, parameters, PERIOD_NS)
+        self._hold = rest_at(np.array([0.0, 0.0, HEIGHT_M]), np.array([1.0, 0.0, 0.0, 0.0]))
+        self._sensors_spec = dataclasses.replace(SensorSpec(), **{**IDEAL, "tag_delay_ms": SensorSpec().tag_delay_ms})
+        self._world = _world(self.body, [_scaled(described, scale)] * modules, described.curve.lag_s * scale.lag)
+        self._sensors = [Sensors(self._sensors_spec, self._world.spec, 0, m) for m in range(modules)]
+        self._camera = Camera(CameraPose(), self._sensors_spec, self._world.vehicles, (0, 1, 2, 3, 4, 5), 0)
+        self._seen = self._camera.watch(self._world)
+        self._commanded = np.zeros(self.body.thrusters.f_max.size)
+        self._tick = 0
+        self.position_m = np.zeros(3)
+
+    def step(self, shake: np.ndarray) -> np.ndarray:
+        """(6,) wrench that the controller gives in this tick; `shake` (6,) N, N m goes to the thrusters with that of the tick before."""
+        tick, self._tick = self._tick, self._tick + 1
+        self._push(self._commanded + self.body.thrusters.pinv @ shake)
+        inputs = self._sample(tick)
+        chain = self._chain
+        estimate = chain.measure(inputs)
+        thrust = chain.allocator.step(chain.controller.step(self._hold, self._hold, estimate))
+        self._commanded, _ = chain.limiter.step(thrust.force_n, estimate.ready, chain.voltage_v)
+        chain.lag.command(self._commanded)
+        self._world.advance(PERIOD_NS)
+        self._seen += self._camera.watch(self._world)
+        self.position_m = estimate.p_wb
+        return np.asarray(self.body.thrusters.matrix @ self._commanded)
+
+    def _push(self, force_n: np.ndarray) -> None:
+        """At SYNC the plant takes the forces that were commanded in the tick before."""
+        t, u = self.body.thrusters, np.zeros(force_n.size)
+        nothing, full = np.zeros(force_n.size), np.ones(force_n.size)
+        commands(np.ascontiguousarray(force_n), full, t.forward, t.reverse, nothing, full, u)
+        for module in range(len(self.body.modules)):
+            self._world.set_command(module, u[t.module == module].tolist(), True)
+
+    def _sample(self, tick: int) -> Inputs:
+        """What the sensors say at SYNC, and the tags that have arrived."""
+        time_ns = self._world.time_ns
+        delay_ns = round(1e6 * self._sensors_spec.tag_delay_ms)
+        modules = []
+        for index, sensors in enumerate(self._sensors):
+            truth = self._world.truth(index)
+            pressure = sensors.pressure_pa(truth) if tick % PRESSURE_EVERY == 0 else None
+            due = [s for s in self._seen if s.module == index and s.capture_ns + delay_ns <= time_ns]
+            tags = [TagObservation(s.tag_id, s.quality, s.capture_ns, s.p_wt, s.q_wt) for s in due]
+            modules.append(ModuleInputs(sensors.gyro(truth), sensors.accel(truth), pressure, tags, answered=True, heard=True))
+        self._seen = [s for s in self._seen if s.capture_ns + delay_ns > time_ns]
+        return Inputs(tick, time_ns, modules)
+
+
+def _scaled(vehicle: Vehicle, scale: Scale) -> Vehicle:
+    i = vehicle.inertial
+    return dataclasses.replace(
+        vehicle,
+        inertial=dataclasses.replace(
+            i,
+            dry_kg=i.dry_kg * scale.mass,
+            entrained_kg=i.entrained_kg * scale.mass,
+            inertia=i.inertia * scale.inertia,
+            added=i.added * np.repeat([scale.mass, scale.inertia], 3),
+            righting_arm_m=i.righting_arm_m / scale.mass,  # the moment stays as it is
+        ),
+    )
+
+
+def _world(body: Body, vehicles: Sequence[Vehicle], lag_s: float) -> World:
+    spec = dataclasses.replace(WorldSpec(), **{**CALM, "thruster_lag_s": lag_s, "supply_limit": False})
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    origin = body.cells[0].astype(float)
+    places = [place(cell, 0, PITCH_M, origin) for cell in body.cells]
+    start = Start(np.array([0.0, 0.0, HEIGHT_M]) + body.r_bm[0], level)
+    return World(
+        spec, Tank(kind="cylinder"), vehicles, [start] * len(vehicles), 0, PERIOD_NS,
+        groups=[tuple(range(len(vehicles)))], places=places,
+    )  # fmt: skip
+
+
+def lines() -> np.ndarray:
+    """(6, LINES) whole numbers of periods in the record, all different: the sines of each axis."""
+    span_s = RECORD_TICKS * PERIOD_NS * 1e-9
+    wanted = np.geomspace(LOWEST_RAD_S, HIGHEST_RAD_S, LINES * 6) * span_s / (2.0 * math.pi)
+    taken: list[int] = []
+    for each in wanted:
+        taken.append(max(math.ceil(each - 0.5), taken[-1] + 1 if taken else 1))
+    return np.array(taken).reshape(LINES, 6).T
+
+
+def measure(modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicle: str = "modcube") -> list[Response]:
+    """The open-loop response of each axis of a body of so many modules."""
+    loop, chosen = Loop(modules, parameters, scale, vehicle), lines()
+    phase = 2.0 * math.pi * np.random.default_rng(0).uniform(size=chosen.shape)
+    time = np.arange(SETTLE_TICKS + RECORD_TICKS) / RECORD_TICKS
+    size = SHAKE * np.diag(loop.body.mass)
+    shake = np.array([s * np.sin(2.0 * math.pi * np.outer(time, n) + p).sum(axis=1) for s, n, p in zip(size, chosen, phase, strict=True)]).T
+    given = np.array([loop.step(each) for each in shake])
+    # What was commanded in one tick is pushed in the next: the sine of a tick meets the wrench of the tick before.
+    u = np.fft.rfft(given[SETTLE_TICKS - 1 : -1], axis=0)
+    p = u + np.fft.rfft(shake[SETTLE_TICKS:], axis=0)
+    base = 2.0 * math.pi / (RECORD_TICKS * PERIOD_NS * 1e-9)
+    return [Response(base * n, -u[n, axis] / p[n, axis]) for axis, n in enumerate(chosen)]
+
+
+class Margins(NamedTuple):
+    """Smallest distances of a loop from instability."""
+
+    gain_db: float
+    """By how much the gain may change, up or down."""
+    phase_deg: float
+    crossover_rad_s: float
+    """Highest frequency at which the gain is one."""
+
+
+def margins(response: Response) -> Margins:
+    """Margins of one loop, interpolated over the logarithm of the frequency; infinite where nothing is crossed."""
+    x = np.log(response.frequency)
+    gain_db = 20.0 * np.log10(np.abs(response.loop))
+    phase = np.unwrap(np.angle(response.loop))
+    phase += -2.0 * math.pi * round((phase[int(np.argmin(np.abs(gain_db)))] + math.pi) / (2.0 * math.pi))  # near -180 at crossover
+    turns = math.pi * np.array([-3.0, -1.0, 1.0])
+    gains = [np.interp(c, x, gain_db) for turn in turns for c in _crossings(x, phase - turn)]
+    crossovers = _crossings(x, gain_db)
+    phases = [abs((math.degrees(np.interp(c, x, phase)) + 360.0) % 360.0 - 180.0) for c in crossovers]
+    return Margins(
+        min((abs(g) for g in gains), default=math.inf),
+        min(phases, default=math.inf),
+        math.exp(max(crossovers)) if crossovers else math.nan,
+    )
+
+
+def _crossings(x: np.ndarray, y: np.ndarray) -> list[float]:
+    """Where y, taken as straight between its points, is zero."""
+    at = np.flatnonzero(np.signbit(y[1:]) != np.signbit(y[:-1]))
+    return [float(x[i] + (x[i + 1] - x[i]) * y[i] / (y[i] - y[i + 1])) for i in at]

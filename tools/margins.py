@@ -1,0 +1,151 @@
+#!/usr/bin/env python3
+"""Gain and phase margins of the loops broken at the plant's input, and how far they shrink where the plant is not as believed.
+
+margins.py                                     # the shipped gains, bodies of 1, 2 and 4 modules
+margins.py --controller runs/tune/parameters.toml --modules 1
+margins.py --vehicle bluerov2_heavy --modules 1 --out runs/margins
+
+Status 1 where a margin is under its bar. In DIR: margins.json and margins.png, the Bode plot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import load_vehicle
+
+BARS = {"nominal": (8.0, 40.0), "worst": (6.0, 35.0)}
+"""Least gain margin, dB, and phase margin, deg."""
+SPREAD = 0.15
+COLOURS = ("#d55e00", "#0072b2", "#009e73")
+"""Of the three axes of a panel (Okabe and Ito's palette)."""
+
+Found = dict[int, dict[Scale, list[Response]]]
+
+
+def measured(modules: Sequence[int], parameters: Parameters, vehicle: str, jobs: int) -> Found:
+    """The responses of every body in the nominal world and in the eight corners."""
+    cases = [(n, scale) for n in modules for scale in (NOMINAL, *corners(SPREAD))]
+    found: Found = {n: {} for n in modules}
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        futures = [pool.submit(measure, n, parameters, scale, vehicle) for n, scale in cases]
+        for done, ((n, scale), future) in enumerate(zip(cases, futures, strict=True), 1):
+            found[n][scale] = future.result()
+            print(f"margins: {done} of {len(cases)}", file=sys.stderr, flush=True)
+    return found
+
+
+def rows(found: Found) -> list[dict[str, Any]]:
+    """One row for each body, axis and bar: margins, and in which corner the worst are."""
+    result = []
+    for modules, responses in found.items():
+        for axis, name in enumerate(AXES):
+            each = {scale: margins(r[axis]) for scale, r in responses.items()}
+            for kind, worlds in (("nominal", [NOMINAL]), ("worst", list(each))):
+                by_gain, by_phase = (min(worlds, key=lambda s, k=k: each[s][k]) for k in (0, 1))  # type: ignore[misc]
+                found_margins = Margins(each[by_gain].gain_db, each[by_phase].phase_deg, each[by_phase].crossover_rad_s)
+                passed = all(value >= bar for value, bar in zip(found_margins[:2], BARS[kind], strict=True))
+                result.append({"modules": modules, "axis": name, "kind": kind, **found_margins._asdict(), "passed": passed, "at": by_phase})
+    return result
+
+
+def print_table(table_rows: Sequence[dict[str, Any]]) -> None:
+    """One line for each body and axis."""
+    table = Table(box=box.SIMPLE_HEAD, title=f"margins at the plant's input; worst over mass, inertia and lag +-{SPREAD:.0%}")
+    for column in ("modules", "axis", "crossover", "gain", "phase", "gain, worst", "phase, worst", "worst at mass, inertia, lag", ""):
+        table.add_column(column, justify="left" if column in ("axis", "") else "right")
+    for nominal, worst in zip(table_rows[::2], table_rows[1::2], strict=True):
+        verdict = "" if nominal["passed"] and worst["passed"] else "FAILED"
+        table.add_row(
+            str(nominal["modules"]), nominal["axis"], f"{nominal['crossover_rad_s']:.1f} rad/s",
+            *(f"{row[key]:.1f} {unit}" for row in (nominal, worst) for key, unit in (("gain_db", "dB"), ("phase_deg", "deg"))),
+            ", ".join(f"{v:g}" for v in worst["at"]), verdict,
+        )  # fmt: skip
+    bars = [f"{kind} >= {gain:g} dB and {phase:g} deg" for kind, (gain, phase) in BARS.items()]
+    table.caption = "bars: " + "; ".join(bars)
+    Console(width=None if sys.stdout.isatty() else 130).print(table)
+
+
+def draw(path: Path, found: Found) -> None:
+    """Bode plot: a column for each body and kind of axis, bands over all corners."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    columns = [(n, first) for n in found for first in (0, 3)]
+    figure, panels = plt.subplots(2, len(columns), figsize=(4.1 * len(columns), 6.4), sharex=True, sharey="row", squeeze=False)
+    for (modules, first), (gain, phase) in zip(columns, panels.T, strict=True):
+        for axis, colour in zip(range(first, first + 3), COLOURS, strict=True):
+            curves = [_bode(r[axis]) for r in found[modules].values()]
+            w = found[modules][NOMINAL][axis].frequency
+            for panel, part in ((gain, 0), (phase, 1)):
+                values = np.array([c[part] for c in curves])
+                panel.fill_between(w, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.15, linewidth=0)
+                panel.plot(w, values[0], color=colour, label=AXES[axis])
+        gain.axhline(0.0, color="#30363d", linewidth=0.8)
+        phase.axhline(-180.0, color="#30363d", linewidth=0.8)
+        gain.set_title(f"{modules} module{'s' if modules > 1 else ''}")
+        gain.legend(frameon=False, loc="upper right")
+        phase.set_xlabel("frequency, rad/s")
+    panels[0, 0].set(xscale="log", ylabel="loop gain, dB", ylim=(-40, 45))
+    panels[1, 0].set(ylabel="phase, deg", ylim=(-400, -80), yticks=range(-360, -80, 45))
+    for panel in panels.flat:
+        panel.grid(color="#d8dee4", linewidth=0.6)
+    figure.suptitle(f"Loops broken at the plant's input; bands: mass, inertia and thruster lag +-{SPREAD:.0%}")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _bode(response: Response) -> tuple[np.ndarray, np.ndarray]:
+    """Gain, dB, and phase, deg, nearest to -180 at crossover."""
+    gain = 20.0 * np.log10(np.abs(response.loop))
+    phase = np.degrees(np.unwrap(np.angle(response.loop)))
+    return gain, phase - 360.0 * round((phase[int(np.argmin(np.abs(gain)))] + 180.0) / 360.0)
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--modules", type=int, nargs="+", choices=list(BODIES), default=list(BODIES), help="sizes of body")
+    parser.add_argument("--controller", default="modcube", help=f"{', '.join(CONTROLLERS)}, or a file of parameters")
+    parser.add_argument("--vehicle", default="modcube", help="vehicle of every module")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/margins"), help="for margins.json and margins.png")
+    given = parser.parse_args()
+    try:
+        load_vehicle(given.vehicle)
+        chosen = CONTROLLERS.get(given.controller) or load_parameters(Path(given.controller))
+        given.out.mkdir(parents=True, exist_ok=True)
+        found = measured(given.modules, chosen, given.vehicle, given.jobs)
+    except (DescriptionError, OSError) as error:
+        print(f"margins: {error}", file=sys.stderr)
+        return 2
+    table_rows = rows(found)
+    print_table(table_rows)
+    finite = [{k: v if not isinstance(v, float) or math.isfinite(v) else None for k, v in row.items()} for row in table_rows]
+    (given.out / "margins.json").write_text(json.dumps(finite, indent=2) + "\n", encoding="utf-8")
+    draw(given.out / "margins.png", found)
+    print(given.out / "margins.png")
+    return 0 if all(row["passed"] for row in table_rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
