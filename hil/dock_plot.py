@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.core.docking_sequence import Stage
 from firmware_py.description.signals import Columns, read_signals
 from hil.plots import STYLE
 from hil.signals import SIGNAL_LOG, TRUTH_LOG
@@ -17,6 +16,8 @@ THRESHOLD_MA = 70.0
 FACES = ("#0b63b0", "#c0392b")
 HOLDS = "#2e8b57"
 MARK = "#555f6b"
+STAGES = ("pre-approach", "align", "approach", "push", "verify", "docked", "release", "back off", "aborted", "failed")
+"""By the number that the log has."""
 LAST_S = 0.3
 """How long the last tick of a dock is drawn."""
 
@@ -91,6 +92,6 @@ def _conditions(axes: Any, time_s: np.ndarray, rows: Columns) -> None:
     starts = np.flatnonzero(np.diff(rows["stage"], prepend=-1))
     for k, (start, end) in enumerate(zip(starts, [*starts[1:], len(time_s) - 1], strict=True)):
         middle = 0.5 * (time_s[start] + time_s[end])
-        name = Stage(int(rows["stage"][start])).name.replace("_", " ").lower()
+        name = STAGES[int(rows["stage"][start])]
         if time_s[end] - time_s[start] > 0.04 * (time_s[-1] - time_s[0]):
             axes.text(middle, 2.05 + 0.25 * (k % 2), f"{name}, try {rows['tries'][start]}", ha="center", va="center", fontsize=8)

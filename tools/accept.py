@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from accept_measures import Values, flown, loop_margins, repeated, saved_by_least_power, timed
+from accept_measures import Values, flown, loop_margins, passed_by, repeated, saved_by_least_power, timed
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -230,6 +230,14 @@ GROUPS: tuple[Group, ...] = (
     Group(
         "dock-near-miss", 5, "modcube hil campaign dock-near-miss --trials 300 --jobs 2", flown("dock-near-miss", trials=300),
         (Figure("near miss, 300 flown: docks declared that were none", "false_declarations.max", high=0.0),),
+    ),
+    Group(
+        "near-miss-passes", 5, "make accept ONLY=near-miss-passes", passed_by,
+        (
+            Figure("near miss, 10,000 passes through real frames: docks declared", "declared", high=0.0),
+            Figure("the same, by the current alone", "current", low=1.0),
+            Figure("the same, by the position alone", "position", low=1.0),
+        ),
     ),
     Group(
         "dock-third", 5, "modcube hil campaign dock-third --trials 100 --jobs 2", flown("dock-third", trials=100),

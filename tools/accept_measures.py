@@ -7,8 +7,12 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
+
+import near_miss
 
 from firmware_py.description.parameters import CONTROLLERS
 from hil.campaign import run_campaign
@@ -17,6 +21,8 @@ from hil.scenario import load_scenario
 
 FEWER = range(8)
 JOBS = 2
+PASSES, CHUNK = 10_000, 250
+"""Near misses in all, and those that a process counts at a time."""
 LOGS = ("can.log", "signals.mcap", "truth.mcap")
 
 Values = Mapping[str, float]
@@ -56,6 +62,17 @@ def loop_margins(folder: Path) -> Values:
     found = json.loads((folder / "margins.json").read_text(encoding="utf-8"))
     kinds, keys = ("nominal", "worst"), ("gain_db", "phase_deg")
     return {f"{kind}.{key}": min(row[key] for row in found if row["kind"] == kind) for kind in kinds for key in keys}
+
+
+def passed_by(folder: Path) -> Values:
+    """Ten thousand near misses seen by the docking detector through real frames."""
+    chunks = [range(first, first + CHUNK) for first in range(0, PASSES, CHUNK)]
+    total: dict[str, int] = {}
+    with ProcessPoolExecutor(JOBS, mp_context=get_context("spawn")) as pool:
+        for found in pool.map(near_miss.count, chunks):
+            total = {key: total.get(key, 0) + value for key, value in found.items()}
+    (folder / "passes.json").write_text(json.dumps(total, indent=2) + "\n", encoding="utf-8")
+    return total
 
 
 def repeated(folder: Path) -> Values:

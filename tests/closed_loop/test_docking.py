@@ -7,6 +7,7 @@ import pytest
 from firmware_py.description.parameters import CONTROLLERS
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly
+from tools import near_miss
 
 LARGEST_JUMP_N = 1.0
 """Of a thruster's command in the tick in which two bodies become one."""
@@ -47,3 +48,13 @@ def test_module_that_passes_close_by_with_magnets_on_is_not_believed_docked(fly:
 def test_paper_sequence_is_flown_by_its_controller(fly: Fly) -> None:
     """One straight line at constant speed, no second try."""
     assert fly(load_scenario("dock"), 0, CONTROLLERS["paper"]).metrics["tries"] <= 1.0
+
+
+@pytest.mark.slow
+def test_detector_needs_both_conditions() -> None:
+    """Through real frames: each condition alone would have believed in docks that were none; together they believe in none."""
+    found = near_miss.count(range(150))
+    assert found["misses"] > 100
+    assert found["current"] >= 5
+    assert found["position"] >= 5
+    assert found["declared"] == 0
