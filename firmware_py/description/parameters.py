@@ -79,6 +79,9 @@ class Estimation:
     force_walk: float = quantity(
         0.015, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass", mavlink="DIST_F_WALK"
     )
+    current_walk: float = quantity(
+        0.02, unit="m/s/sqrt(s)", low=0, high=1, help="water's speed, felt as drag; counts where above force_walk", mavlink="DIST_C_WALK"
+    )
     moment_walk: float = quantity(
         0.15, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia", mavlink="DIST_M_WALK"
     )

@@ -30,6 +30,14 @@ def test_paper_controller_on_the_same_spiral_errs_about_as_much_as_the_paper_mea
     assert PAPER_BAND_M[0] <= metrics["position_rmse_m"] <= PAPER_BAND_M[1]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_heavy_bluerov_flies_the_same_spiral_a_hand_from_the_walls(fly: Fly, seed: int) -> None:
+    """Its drag is ten times the module's per kilogram, so that the current disturbs it ten times as much."""
+    result = fly(load_scenario("spiral").with_vehicle("bluerov2_heavy"), seed)
+    assert result.passed
+
+
 def test_scenario_says_what_the_issue_asks_of_the_spiral() -> None:
     scenario = load_scenario("spiral")
     limits = {check.metric: check.high for check in scenario.checks}

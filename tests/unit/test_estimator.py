@@ -1,6 +1,7 @@
 """What the estimator makes of a robot at rest or in steady motion: outliers, silence, late tags, biases, trim."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -294,3 +295,18 @@ def test_robot_on_its_head_is_estimated_like_any_other(body: Body) -> None:
     np.testing.assert_allclose(difference(estimate.q_wb, upside), 0.0, atol=1e-3)
     np.testing.assert_allclose(estimate.p_wb, P_WB, atol=1e-3)
     assert estimate.rejected == 0
+
+
+def disturbance_doubt(vehicle: str, current_walk: float) -> float:
+    """Standard deviation of the disturbance force after ten seconds without a tag, per mass, m/s^2."""
+    robot = Robot(assemble_vehicle(load_vehicle(vehicle)), replace(P, current_walk=current_walk))
+    robot.rest(100)
+    for _ in range(1000):
+        robot.step(Measured(np.zeros(3), None, None, []))
+    body = assemble_vehicle(load_vehicle(vehicle))
+    return float(np.sqrt(robot.estimator.motion.covariance[18, 18]) / body.mass[0, 0])
+
+
+def test_robot_of_much_drag_doubts_the_current_and_the_module_does_not() -> None:
+    assert disturbance_doubt("bluerov2_heavy", 0.02) > 2.0 * disturbance_doubt("bluerov2_heavy", 0.0)
+    assert disturbance_doubt("modcube", 0.02) == disturbance_doubt("modcube", 0.0)
