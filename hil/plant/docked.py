@@ -115,7 +115,10 @@ class DockedBodies:
         return self._water.flow[0] + self._water.flow[1]
 
     def _pull_on(self, joint: Joint) -> float:
-        """Force that pulls a joint open, N, a moment counted as a force at the disk's rim; 0 where others hold as well."""
+        """Force that pulls a joint open, N; 0 where others hold as well.
+
+        A moment that bends the joint counts as a force at the disk's rim; one about the face's normal is borne by the pins.
+        """
         b = int(self._modules.body[joint.module])
         parts = pieces(self.bodies[b], [j for j in self.docks.joints if j != joint])
         if len(parts) == 1:
@@ -128,8 +131,8 @@ class DockedBodies:
             need -= self._thrusters.column[t] * self._thrusters.force[t]
         outward = self._modules.turn[joint.module] @ FACE_NORMALS[joint.face]
         at = self._modules.position[joint.module] + 0.5 * self._modules.size[joint.module, joint.face // 2] * outward
-        moment = need[3:] - np.cross(at, need[:3])
-        return float(-outward @ need[:3] + np.linalg.norm(moment) / DISK_M)
+        bending = np.cross(outward, need[3:] - np.cross(at, need[:3]))
+        return float(-outward @ need[:3] + np.linalg.norm(bending) / DISK_M)
 
     def clamp(self, body: int) -> None:
         """Holds a body where it is; `load` then says with what force."""

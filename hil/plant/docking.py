@@ -27,7 +27,7 @@ LEAST_HOLD = 0.05
 OPENING_M_S = 0.001
 """Faces that part faster than this do not lock: they were just pulled open."""
 DISK_M = 0.07
-"""Radius of a docking disk: a moment on a joint is borne by a pull at its rim (synthetic)."""
+"""Radius of a docking disk: a moment that bends a joint is borne by a pull at its rim (synthetic)."""
 
 
 class Joint(NamedTuple):

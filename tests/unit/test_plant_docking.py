@@ -132,6 +132,18 @@ def test_a_stronger_pull_than_the_magnets_opens_the_joint() -> None:
     assert weak.bodies == [(0,), (1,)]
 
 
+def test_pins_bear_a_turn_about_the_joint_and_magnets_a_bending() -> None:
+    columns = np.vstack([VEHICLE.directions.T, np.cross(VEHICLE.positions, VEHICLE.directions).T])
+    pulls = []
+    for axis in (3, 4):  # about the joint's normal, and across it
+        world, turn = docked_pair(), np.linalg.pinv(columns)[:, axis]
+        for module, sign in ((0, -0.5), (1, 0.5)):
+            world.set_command(module, sign * turn / np.abs(turn).max(), True)
+        run(world, 0.3)
+        pulls.append(world._pull_on(world.docks.joints[0]))
+    assert abs(pulls[0]) < 0.2 * pulls[1]
+
+
 def test_jam_holds_the_faces_apart_until_they_let_go() -> None:
     world = two(0.03, jam=ALWAYS)
     relays(world, PULL)
