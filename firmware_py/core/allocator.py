@@ -1,19 +1,17 @@
 """Stage 6 of a tick: from a wrench to the force of each thruster (paper, Eq. 5), within limits.
 
 Where the pseudo-inverse (plus the preload) stays within limits it is the answer. Otherwise a box-constrained
-least-squares problem (daqp) keeps the directions of force and moment and gives way in the force first. Mode
+least-squares problem (box_program) keeps the directions of force and moment and gives way in the force first. Mode
 `least_power` moves an answer within limits to where the thrusters draw the least.
 """
 
 from __future__ import annotations
 
-from ctypes import c_int
-
-import daqp
 import numpy as np
 from numba import njit
 
 from firmware_py.core.body import Body
+from firmware_py.core.box_program import nearest
 from firmware_py.core.least_power import LeastPower
 from firmware_py.core.preload import preload
 from firmware_py.core.types import Thrust
@@ -25,10 +23,8 @@ SHARE_WEIGHT = 1e3
 """Cost of losing the whole force against all thrusters at their limits: high enough that feasible force is not given away."""
 BEYOND = 2.0
 """A wrench above this many times what all thrusters together could give is scaled down first, so that the problem stays well scaled."""
-EQUALITY = 5
-"""daqp's mark of an equality row."""
-SOLVED = (1, 2)
-"""daqp's exit flags for optimal, and optimal with slack."""
+LEFT = 1e-3
+"""Largest difference from the directions of force and moment, N and N m, that is taken; a hundred thousand times what is usual."""
 
 
 @njit("float64(float64[::1],float64[::1],float64[::1])", cache=True)
@@ -44,17 +40,17 @@ class Allocator:
     """Allocates for one body. `alive` leaves thrusters out of the problem at once."""
 
     def __init__(self, body: Body, parameters: Allocation) -> None:
+        self.parameters = parameters
         self._clip_only = parameters.mode == "pseudo_inverse"
         self._least_power = parameters.mode == "least_power"
         self._thrusters = body.thrusters
         n = body.thrusters.f_max.size
         weight = SHARE_WEIGHT * float(np.sum(body.thrusters.f_max**2))
-        self.weights = np.array([weight, weight * MOMENT_PRIORITY])
-        self._h = np.diag(np.r_[np.full(n, 2.0), 2 * self.weights])
+        self._weights = np.r_[np.ones(n), weight, weight * MOMENT_PRIORITY]
         reach = np.maximum(body.thrusters.f_max, -body.thrusters.f_min)
         self._most = np.array([np.linalg.norm(body.thrusters.matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
         self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
-        self._sense = np.array([0] * (n + 2) + [EQUALITY] * 6, dtype=c_int)
+        self._preloaded: tuple[np.ndarray, np.ndarray] | None = None
         self._set(np.ones(n, dtype=bool), body.thrusters.pinv)
 
     def set_alive(self, alive: np.ndarray) -> None:
@@ -66,7 +62,11 @@ class Allocator:
         self._matrix = np.ascontiguousarray(t.matrix * alive)
         self._pinv = np.ascontiguousarray(pinv)
         self._f_min, self._f_max = t.f_min * alive, t.f_max * alive
-        self._preload = preload(t, alive, self._smallest_n)
+        self._preload = preload(t, alive, self._smallest_n, self._preloaded)
+        self._preloaded = (alive.copy(), self._preload)
+        self._rows = np.vstack([self._matrix.T, np.zeros((2, 6))])
+        self._goal = np.r_[self._preload, 1.0, 1.0]
+        self._low, self._high = np.r_[self._f_min, 0.0, 0.0], np.r_[self._f_max, 1.0, 1.0]
         self._cheaper = LeastPower(t, alive) if self._least_power else None
 
     def step(self, wrench: np.ndarray) -> Thrust:
@@ -84,24 +84,15 @@ class Allocator:
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
         """min |f - f_preload|^2 + w_f (1 - a)^2 + w_m (1 - b)^2, J f = [a F; b M], f within limits, 0 <= a, b <= 1."""
-        n = self._f_max.size
         sizes = np.array([np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])])
         down = np.minimum(1.0, BEYOND * self._most / np.maximum(sizes, 1e-9))
-        rows = np.zeros((6, n + 2))
-        rows[:, :n] = self._matrix
-        rows[:3, n] = -wrench[:3] * down[0]
-        rows[3:, n + 1] = -wrench[3:] * down[1]
-        upper = np.r_[self._f_max, 1.0, 1.0, np.zeros(6)]
-        lower = np.r_[self._f_min, 0.0, 0.0, np.zeros(6)]
-        linear = np.r_[-2 * self._preload, -2 * self.weights]
-        x, _, flag, _ = daqp.solve(self._h, linear, rows, upper, lower, self._sense)
-        if flag not in SOLVED:
+        self._rows[-2, :3], self._rows[-1, 3:] = -wrench[:3] * down[0], -wrench[3:] * down[1]
+        x = np.empty_like(self._goal)
+        if not nearest(self._rows, self._weights, self._goal, self._low, self._high, x) <= LEFT:
             share = self._common_share(wrench)
-            force = self._pinv @ wrench * share
-            return self._thrust(force, (share, share))
-        force = np.clip(x[:n], self._f_min, self._f_max)
-        kept = np.clip(x[n:], 0.0, 1.0) * down
-        return self._thrust(force, (float(kept[0]), float(kept[1])))
+            return self._thrust(self._pinv @ wrench * share, (share, share))
+        kept = x[-2:] * down
+        return self._thrust(x[:-2].copy(), (float(kept[0]), float(kept[1])))
 
     def _common_share(self, wrench: np.ndarray) -> float:
         """Largest share of the pseudo-inverse's answer that is within limits."""

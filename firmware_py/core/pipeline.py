@@ -78,8 +78,9 @@ class BodyPipeline:
         """Takes other gains, noise figures and allocation from this tick on; estimate, set-point and forces stay as they are."""
         self.estimator.retune(parameters.estimation)
         self.controller = Controller(self.body, parameters.control)
-        self.allocator = Allocator(self.body, parameters.allocation)
-        self.allocator.set_alive(self.faults.now.alive)
+        if parameters.allocation != self.allocator.parameters:
+            self.allocator = Allocator(self.body, parameters.allocation)
+            self.allocator.set_alive(self.faults.now.alive)
 
     def measure(self, inputs: Inputs) -> Estimate:
         """Sensors -> estimate."""

@@ -20,18 +20,26 @@ UNEVEN = 5.0
 """The largest preload force of a module is at most this many times the smallest wanted one."""
 
 
-def preload(thrusters: ThrusterSet, alive: np.ndarray, smallest_n: float) -> np.ndarray:
+def preload(
+    thrusters: ThrusterSet, alive: np.ndarray, smallest_n: float, before: tuple[np.ndarray, np.ndarray] | None = None
+) -> np.ndarray:
     """(n,) forces without wrench, N: every thruster that can be is at least `smallest_n` from zero, and no more than
     needed.
 
     Args:
         alive: (n,) bool, thrusters that may be used.
         smallest_n: wanted distance from zero; 0 gives no preload.
+        before: `alive` and answer of an earlier call; modules that have the same thrusters as then keep their forces.
     """
     forces = np.zeros(thrusters.f_max.size)
+    changed = np.unique(thrusters.module)
+    if before is not None:
+        forces, changed = before[1].copy(), np.unique(thrusters.module[alive != before[0]])
     if smallest_n > 0.0:
-        for module in np.unique(thrusters.module):
-            index = np.flatnonzero((thrusters.module == module) & alive)
+        for module in changed:
+            mine = thrusters.module == module
+            forces[mine] = 0.0
+            index = np.flatnonzero(mine & alive)
             forces[index] = _of_module(thrusters.matrix[:, index], smallest_n)
     return forces
 

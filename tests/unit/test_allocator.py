@@ -170,6 +170,28 @@ def test_clipping_bends_the_wrench_and_least_squares_does_not(single: Body) -> N
     assert bend(Allocation()) < 1e-6
 
 
+def test_sixty_four_modules_saturate_as_few_do() -> None:
+    """512 thrusters: directions kept, attitude first, and the answer is stationary to the last thruster."""
+    cells = list(itertools.product(range(4), repeat=3))
+    whole = assemble(cells, [0] * 64, [load_vehicle("modcube")] * 64)
+    allocator, limits = Allocator(whole, PLAIN), (whole.thrusters.f_min, whole.thrusters.f_max)
+    for size in (4.0, 10.0, 100.0):
+        for wrench in wrenches(whole, 4, size, seed=9):
+            thrust = allocator.step(wrench)
+            assert_within_limits(whole, thrust)
+            np.testing.assert_allclose(thrust.achieved, np.repeat(thrust.scale, 3) * wrench, atol=1e-5)
+            free = ~np.isin(thrust.force_n, limits)
+            assert thrust.scale[1] > 0.9 * thrust.scale[0] and 4 <= free.sum() < 512
+            # least effort: forces of the thrusters that are not at a limit are one wrench's, f = J^T y
+            y = np.linalg.lstsq(whole.thrusters.matrix[:, free].T, thrust.force_n[free], rcond=1e-9)[0]
+            np.testing.assert_allclose(whole.thrusters.matrix[:, free].T @ y, thrust.force_n[free], atol=1e-4)
+
+
+def test_wrench_that_is_no_number_gives_no_force_beyond_the_limits(single: Body) -> None:
+    thrust = Allocator(single, Allocation()).step(np.array([np.nan, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert not np.isfinite(thrust.force_n).any(), "and the limiter takes what is not finite for nothing"
+
+
 # ---------------------------------------------------------------- dead thrusters
 
 
