@@ -9,12 +9,11 @@ All pairs that are watched are rows of one array, and one compiled pass a tick s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.core.docking_pairs import NEVER_NS, PAIR, PICTURES, Limits, module_poses, watch
+from firmware_py.core.docking_pairs import NEVER_NS, PAIR, PICTURES, Limits, place_modules, watch
 from firmware_py.core.types import ModuleInputs
 from firmware_py.description.parameters import Docking
 
@@ -91,7 +90,7 @@ class PairBank:
         heard = [m for m in self._watched if modules[m].dock_current_ma != SILENT]
         if heard:
             self._heard_ma[heard] = np.array([modules[m].dock_current_ma for m in heard], dtype=np.float64)  # None becomes NaN
-        watch(self.rows, self._rings, self._heard_ma, *poses.found, time_ns, self._limits)
+        watch(self.rows, self._rings, self._heard_ma, *poses.sightings, time_ns, self._limits)
         if heard:
             self._heard_ma[heard] = np.nan
 
@@ -126,9 +125,17 @@ class PairDetector:
 
 TagTable = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
 """(module, tag id) -> tag centre (3,) in the module frame, and module frame to tag frame (4,)."""
-Found = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""(m + 1,) where the sightings of each module of the fleet begin; (s,) time of the picture, ns; (s, 7) the module's centre
-and attitude in the world."""
+
+
+class Sightings(NamedTuple):
+    """Single modules as the pictures of one tick show them, in the order of modules, then of arrival."""
+
+    first: np.ndarray
+    """(m + 1,) where the sightings of each module of the fleet begin."""
+    seen: np.ndarray
+    """(s, 2) module, and time of the picture, ns."""
+    poses: np.ndarray
+    """(s, 7) the module's centre and attitude in the world."""
 
 
 class ModulePoses:
@@ -137,22 +144,33 @@ class ModulePoses:
     def __init__(self, modules: Sequence[ModuleInputs], tags: TagTable) -> None:
         self._modules = modules
         self._tags = tags
+        self._sightings: Sightings | None = None
 
-    @cached_property
-    def found(self) -> Found:
-        """Every tag that was seen and is known, in the order of modules, then of arrival."""
-        tags = self._tags
-        seen = [(i, t) for i, module in enumerate(self._modules) if module.tags for t in module.tags if (i, t.tag_id) in tags]
-        if not seen:
-            return np.zeros(len(self._modules) + 1, dtype=np.int64), NO_TIMES, NO_POSES
-        parts = [array for i, t in seen for array in (t.p_wt, t.q_wt, *tags[i, t.tag_id])]
-        poses = np.empty((len(seen), 7))
-        module_poses(np.concatenate(parts).reshape(-1, 14), poses)
-        first = np.searchsorted([i for i, _ in seen], np.arange(len(self._modules) + 1))
-        return first, np.array([t.capture_ns for _, t in seen]), poses
+    @property
+    def sightings(self) -> Sightings:
+        """All tags that were seen and are known."""
+        if self._sightings is None:
+            self._sightings = self._gather()
+        return self._sightings
+
+    def _gather(self) -> Sightings:
+        times: list[int] = []
+        parts: list[np.ndarray] = []
+        for i, module in enumerate(self._modules):
+            for tag in module.tags:
+                known = self._tags.get((i, tag.tag_id))
+                if known is not None:
+                    times += i, tag.capture_ns
+                    parts += tag.p_wt, tag.q_wt, *known
+        if not parts:
+            return Sightings(np.zeros(len(self._modules) + 1, dtype=np.int64), *NOTHING)
+        seen = np.array(times, dtype=np.int64).reshape(-1, 2)
+        found = Sightings(np.empty(len(self._modules) + 1, dtype=np.int64), seen, np.empty((len(seen), 7)))
+        place_modules(np.concatenate(parts).reshape(-1, 14), *found)
+        return found
 
 
-NO_TIMES, NO_POSES = np.zeros(0, dtype=np.int64), np.zeros((0, 7))
+NOTHING = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 7))
 
 
 def _keys(rows: np.ndarray) -> list[tuple[int, ...]]:

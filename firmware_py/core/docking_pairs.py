@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numba import njit
 
-from firmware_py.core.rotations import M, multiply, rotate, rotate_back
+from firmware_py.core.rotations import multiply, rotate, rotate_back
 
 NEVER_NS = -(1 << 60)
 PICTURES = 16
@@ -55,7 +55,7 @@ class Limits(NamedTuple):
     pose_fresh_ns: int
 
 
-TABLE, TIMES = numba.float64[:, ::1], numba.int64[::1]
+TABLE, FIRST, SEEN = numba.float64[:, ::1], numba.int64[::1], numba.int64[:, ::1]
 ROW = numba.from_dtype(PAIR)
 LIMITS = numba.typeof(Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))  # type: ignore[no-untyped-call]
 
@@ -101,12 +101,12 @@ def _take_currents(row, heard_ma, time_ns, limits):  # type: ignore[no-untyped-d
     return fresh
 
 
-@njit("UniTuple(int64,2)(int64[::1],int64[::1],int64,int64)", cache=True)
-def _same_picture(first, capture_ns, a, b):  # type: ignore[no-untyped-def]
+@njit("UniTuple(int64,2)(int64[::1],int64[:,::1],int64,int64)", cache=True)
+def _same_picture(first, seen, a, b):  # type: ignore[no-untyped-def]
     """Sightings of modules a and b in the newest picture that shows both; -1 without one."""
     for i in range(first[a + 1] - 1, first[a] - 1, -1):
         for j in range(first[b + 1] - 1, first[b] - 1, -1):
-            if capture_ns[i] == capture_ns[j]:
+            if seen[i, 1] == seen[j, 1]:
                 return i, j
     return -1, -1
 
@@ -128,14 +128,14 @@ def _judge_ring(row, ring):  # type: ignore[no-untyped-def]
     row.error_m, row.spread_m = math.sqrt(off), math.sqrt(moved)
 
 
-@njit(numba.boolean(ROW, TABLE, TIMES, TIMES, TABLE, numba.int64, LIMITS), cache=True)
-def _take_pose(row, ring, first, capture_ns, poses, time_ns, limits):  # type: ignore[no-untyped-def]
+@njit(numba.boolean(ROW, TABLE, FIRST, SEEN, TABLE, numba.int64, LIMITS), cache=True)
+def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[no-untyped-def]
     """Condition 2 by the pictures of this tick; whether those known are fresh."""
-    i, j = _same_picture(first, capture_ns, row.module[0], row.module[1])
+    i, j = _same_picture(first, seen, row.module[0], row.module[1])
     if i >= 0:
         ring[row.pictures % PICTURES] = rotate_back(poses[i, 3:], poses[j, :3] - poses[i, :3])
         row.pictures += 1
-        row.picture_ns = capture_ns[i]
+        row.picture_ns = seen[i, 1]
         if row.pictures >= PICTURES:
             _judge_ring(row, ring)
             slack = limits.position_hysteresis_m if row.holds[POSITION] else 0.0
@@ -148,31 +148,35 @@ def _take_pose(row, ring, first, capture_ns, poses, time_ns, limits):  # type: i
     return fresh
 
 
-@njit(numba.void(ROW[::1], numba.float64[:, :, ::1], TABLE, TIMES, TIMES, TABLE, numba.int64, LIMITS), cache=True)
-def watch(rows, rings, heard_ma, first, capture_ns, poses, time_ns, limits):  # type: ignore[no-untyped-def]
+@njit(numba.void(ROW[::1], numba.float64[:, :, ::1], TABLE, FIRST, SEEN, TABLE, numba.int64, LIMITS), cache=True)
+def watch(rows, rings, heard_ma, first, seen, poses, time_ns, limits):  # type: ignore[no-untyped-def]
     """Brings all pairs to this tick.
 
     Args:
         rows: (k,) PAIR; rings: (k, PICTURES, 3) relative positions, module b in the frame of a.
         heard_ma: (m, 6) currents that came, per module and face, NaN where none did.
-        first, capture_ns, poses: sightings of single modules, as `ModulePoses.found`.
+        first, seen, poses: docking_detector.Sightings.
     """
     for k in range(rows.shape[0]):
         row = rows[k]
         fresh_current = _take_currents(row, heard_ma, time_ns, limits)
-        fresh_pose = _take_pose(row, rings[k], first, capture_ns, poses, time_ns, limits)
+        fresh_pose = _take_pose(row, rings[k], first, seen, poses, time_ns, limits)
         row.fresh = fresh_current and fresh_pose
 
 
-@njit(f"void({M},{M})", cache=True)
-def module_poses(tags, out):  # type: ignore[no-untyped-def]
-    """Writes (s, 7) centre and attitude of each module in the world.
+@njit(numba.void(TABLE, FIRST, SEEN, TABLE), cache=True)
+def place_modules(tags, first, seen, poses):  # type: ignore[no-untyped-def]
+    """Writes `first` and `poses` of docking_detector.Sightings.
 
     Args:
         tags: (s, 14) per sighting the tag's place and attitude in the world, its place in its module, and module frame to
             tag frame.
     """
-    for i in range(tags.shape[0]):
-        tag = tags[i]
-        out[i, 3:] = multiply(tag[3:7], tag[10:14])
-        out[i, :3] = tag[:3] - rotate(out[i, 3:], tag[7:10])
+    i = 0
+    for module in range(first.shape[0]):
+        first[module] = i
+        while i < seen.shape[0] and seen[i, 0] == module:
+            tag = tags[i]
+            poses[i, 3:] = multiply(tag[3:7], tag[10:14])
+            poses[i, :3] = tag[:3] - rotate(poses[i, 3:], tag[7:10])
+            i += 1
