@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from accept_measures import Values, flown, loop_margins, passed_by, repeated, saved_by_least_power, timed
+from accept_measures import Values, flown, loop_margins, passed_by, repeated, said_by_tests, saved_by_least_power, timed
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -25,6 +25,7 @@ from hil.checks import UNBOUNDED, limit_text
 OUT = Path("accept.json")
 RUNS = Path("runs") / "accept"
 MM, DEG = 1e3, 57.29577951308232
+ON_TIME = ("alone", "beside four busy loops", "200 Hz", "200 Hz beside four busy loops")
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,11 @@ def strip(modules: int, sensors: str, worst_mm: float, *more: Figure) -> tuple[F
         Figure(f"{name}: position RMSE, worst", "position_rmse_m.max", high=worst_mm, unit="mm", scale=MM),
         Figure(f"{name}: attitude RMSE, worst", "attitude_rmse_rad.max", high=2.5, unit="deg", scale=DEG),
     )
+
+
+def said(name: str, low: float = -UNBOUNDED, high: float = UNBOUNDED, unit: str = "") -> Figure:
+    """A figure that a test says by name."""
+    return Figure(name, name, low, high, unit)
 
 
 GROUPS: tuple[Group, ...] = (
@@ -261,6 +267,29 @@ GROUPS: tuple[Group, ...] = (
             Figure("loop broken at the plant's input, least phase margin of 18", "nominal.phase_deg", low=40.0, unit="deg"),
             Figure("the same, worst over mass, inertia and lag +-15 %: gain", "worst.gain_db", low=6.0, unit="dB"),
             Figure("the same, worst over mass, inertia and lag +-15 %: phase", "worst.phase_deg", low=35.0, unit="deg"),
+        ),
+    ),
+    Group(
+        "vcan", 3, "MODCUBE_FULL=1 pytest -s tests/vcan/test_in_guest.py", said_by_tests("tests/vcan/test_in_guest.py"),
+        (
+            said("spiral in lockstep over vcan0: lines of can.log that differ from virtual", high=0.0),
+            said("log played back by canplayer: frames that decode to the same messages", low=50_000.0),
+            said("lockstep over vcan, link events, sum", low=1000.0),
+            said("lockstep over vcan, link events: resumed within", high=0.5, unit="s"),
+            Figure("tests on vcan0 in lockstep that failed", "failed", high=0.0),
+        ),
+    ),
+    Group(
+        "vcan-real-time", 3, "MODCUBE_FULL=1 pytest -s tests/vcan/test_realtime_in_guest.py",
+        said_by_tests("tests/vcan/test_realtime_in_guest.py"),
+        (
+            *(said(f"real time on vcan0, {name}: p99 lateness", high=100.0, unit="us") for name in ON_TIME),
+            *(said(f"real time on vcan0, {name}: overruns", high=0.0) for name in ON_TIME),
+            said("real time on vcan0, in a flood of cangen: position RMSE", high=8.0, unit="mm"),
+            said("real time on vcan0, link events, sum", low=1000.0),
+            said("real time on vcan0, link events: resumed within", high=0.5, unit="s"),
+            said("real time on vcan0, C node: position RMSE", high=8.0, unit="mm"),
+            Figure("tests on vcan0 in real time that failed", "failed", high=0.0),
         ),
     ),
     # Figures of later issues go here.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -24,6 +25,9 @@ JOBS = 2
 PASSES, CHUNK = 10_000, 250
 """Near misses in all, and those that a process counts at a time."""
 LOGS = ("can.log", "signals.mcap", "truth.mcap")
+
+FIGURE = re.compile(r"^figure: (?P<name>.+) = (?P<value>\S+)", re.MULTILINE)
+"""A line of tests/vcan/figures.py."""
 
 Values = Mapping[str, float]
 
@@ -73,6 +77,24 @@ def passed_by(folder: Path) -> Values:
             total = {key: total.get(key, 0) + value for key, value in found.items()}
     (folder / "passes.json").write_text(json.dumps(total, indent=2) + "\n", encoding="utf-8")
     return total
+
+
+def said_by_tests(*paths: str) -> Callable[[Path], Values]:
+    """Runs tests at full length: of each figure that they say the largest, and as `NAME, sum` the sum; `failed` is pytest's status."""
+
+    def measure(folder: Path) -> Values:
+        command = [sys.executable, "-m", "pytest", "--capture=no", "-rs", *paths]
+        environment = {**os.environ, "MODCUBE_FULL": "1"}
+        with (folder / "pytest.log").open("w+", encoding="utf-8") as log:
+            status = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment).returncode
+            log.seek(0)
+            said: dict[str, list[float]] = {}
+            for line in FIGURE.finditer(log.read()):
+                said.setdefault(line["name"], []).append(float(line["value"]))
+        sums = {f"{name}, sum": sum(values) for name, values in said.items()}
+        return {name: max(values) for name, values in said.items()} | sums | {"failed": status}
+
+    return measure
 
 
 def repeated(folder: Path) -> Values:

@@ -23,8 +23,6 @@ PATIENCE_LOOKS = 100
 """On vcan a frame is there when send returns; what is not by now is lost."""
 
 
-
-
 def short(name: str, duration_s: float, settle_s: float = SETTLE_S) -> Scenario:
     """Scenario `name` as far as `duration_s`; a spiral as steep as the whole one."""
     scenario = load_scenario(name)

@@ -1,8 +1,8 @@
 """Run inside the guest: hovers in real time, plant and firmware as two processes, in the company that the plan asks
 for.
 
-Argument: JSON, a list of plans (fields of Plan). Leaves in $VG_OUT `flights.json`, how late ticks were and how soon the
-flight went on after link events, and the logs of flight N in folder N.
+Arguments: JSON, a list of plans (fields of Plan); the C reference node's program. Leaves in $VG_OUT `flights.json`, how
+late ticks were and how soon the flight went on after link events, and the logs of flight N in folder N.
 """
 
 import dataclasses
@@ -10,6 +10,8 @@ import json
 import multiprocessing
 import os
 import shutil
+import signal
+import subprocess
 import sys
 import threading
 import time
@@ -18,12 +20,17 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 from firmware_py.app.firmware import BusFrame
+from firmware_py.bus.port import open_port
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
-from hil.realtime import fly_in_real_time
+from firmware_py.runtime.clock import MonotonicClock
+from firmware_py.runtime.realtime import PLANT_PRIORITY, READER_PRIORITY, real_time, use_priority
+from hil.realtime import fly_in_real_time, serve_plant
+from hil.reference_node import SocketPlant
 from hil.scenario import Scenario, load_scenario
 from tests.vcan.can_utils import cangen_command
 from tests.vcan.link_events import break_link
@@ -34,6 +41,9 @@ FLOOD_ID = 0x71E
 """HEARTBEAT of number 30, with a wrong length: stops nobody and commands nothing."""
 MCU_ARMED = 2
 """State in MCU_STATUS."""
+NODE_PRIORITY = READER_PRIORITY - 1
+"""Of the C node's process: it stands for hardware, which no plant keeps waiting."""
+NODE_ENDS_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +55,9 @@ class Plan:
     busy_loops: int = 0
     flood: bool = False
     link_events: int = 0
+    node: bool = False
+    """The C reference node in place of the plant's own."""
+    rate_hz: int = 100
     seed: int = 0
 
 
@@ -102,6 +115,27 @@ def flood(begin: Event) -> None:
     os.execvp(command[0], command)  # in this process's place, so that it ends when this is killed
 
 
+def serve_socket_plant(
+    scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, ready: Event, stop: Event
+) -> None:
+    """The plant's process, and the C node as its child."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    path, arrival = Path(mkdtemp(), "board.socket"), threading.Event()
+    plant = SocketPlant(scenario, seed, rate_hz, out, path)
+    clock = MonotonicClock.started_now()
+    with (
+        real_time(PLANT_PRIORITY - 1),
+        open_port(bus, reader=True, now_ns=clock.now_ns, arrival=arrival) as port,
+        plant.open_board(arrival),
+    ):
+        use_priority(PLANT_PRIORITY)
+        node = subprocess.Popen([sys.argv[2], BUS, "1", str(rate_hz), str(path)])
+        os.sched_setscheduler(node.pid, os.SCHED_FIFO, os.sched_param(NODE_PRIORITY))
+        ready.set()
+        plant.serve(port, clock.now_ns, stop.is_set)
+    assert node.wait(NODE_ENDS_S) == 0, "the node ends when its board does"
+
+
 def fly(plan: Plan, folder: Path) -> dict[str, Any]:
     """One flight and its figures; its logs are in `folder`."""
     folder.mkdir(parents=True)
@@ -117,8 +151,9 @@ def fly(plan: Plan, folder: Path) -> dict[str, Any]:
         if plan.link_events:
             stack.enter_context(process(break_link, Interface(BUS), plan.seed, plan.link_events, begin, history))
         log = TickLog(spinner.kill, begin.set)
-        world = hover(plan), plan.seed, Parameters(), folder, f"socketcan:{BUS}"
-        flown = fly_in_real_time(*world, start_method="fork", observers=[log.observe])
+        world = hover(plan), plan.seed, Parameters(), folder, f"socketcan:{BUS}", plan.rate_hz
+        serve = serve_socket_plant if plan.node else serve_plant
+        flown = fly_in_real_time(*world, start_method="fork", observers=[log.observe], serve=serve)
         events = history.get() if plan.link_events and begin.is_set() else []
     return {
         "plan": dataclasses.asdict(plan),

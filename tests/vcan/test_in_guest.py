@@ -9,7 +9,7 @@ from tests.vcan.guest import FULL_LENGTH, Guest
 
 FOLDER = str(Path(__file__).parent)
 # Plug-ins cost seconds of import in the guest.
-WITHOUT = [f"-pno:{name}" for name in ("cacheprovider", "hypothesispytest", "xdist")]
+WITHOUT = [f"-pno:{name}" for name in ("cacheprovider", "hypothesispytest", "xdist", "xdist.looponfail")]
 PYTEST = [sys.executable, "-m", "pytest", FOLDER, *WITHOUT]
 TIMEOUT_S = 10_800 if FULL_LENGTH in os.environ else 1200
 
@@ -17,6 +17,6 @@ TIMEOUT_S = 10_800 if FULL_LENGTH in os.environ else 1200
 def test_everything_on_real_socketcan_passes_in_the_guest(guest: Guest) -> None:
     # Collecting imports what the tests import: compiled code of both kinds is then in the caches that the guest reads.
     warm_up = shlex.join([*PYTEST, "--collect-only", "-qq"]) + " >/dev/null"
-    inner = [*PYTEST, "-m", "vcan", "-rs", "--durations=5"]
+    inner = [*PYTEST, "--capture=no", "-m", "vcan", "-rs", "--durations=5"]
     result = guest.run(inner, warm_up=warm_up, timeout_s=TIMEOUT_S, capture=False)
     assert result.returncode == 0, "in the guest (its report is above, or under captured output)"
