@@ -20,10 +20,11 @@ from firmware_py.app.mission_plan import plan_mission
 from firmware_py.core.types import Inputs, Outputs, Request
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.link import LinkError, Links
+from firmware_py.ground.link import Links
 from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.signing import Signing, load_signing
 from firmware_py.ground.station import GroundStation
+from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import unix_ns
 
 _WAIT_S = 0.005

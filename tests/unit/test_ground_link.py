@@ -15,7 +15,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from firmware_py.app.ground_station import GroundSide
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.link import Channel, LinkError, Links, open_link
+from firmware_py.ground.link import Channel, Links
+from firmware_py.ground.transport import LinkError, open_link
 from tests.unit.ground_world import Robot, World, fleet_of
 from tests.unit.test_ground_walk import free_port
 
@@ -127,6 +128,41 @@ def test_serial_link_carries_frames_both_ways() -> None:
         assert os.read(ours, 100) == b"answer"
     os.close(ours)
     os.close(theirs)
+
+
+class Radio:
+    """A serial device behind a link, as udev names one: plugged in until it is pulled."""
+
+    def __init__(self, name: Path) -> None:
+        self.ours, self._theirs = pty.openpty()
+        self._name = name
+        name.symlink_to(os.ttyname(self._theirs))
+
+    def pull(self) -> None:
+        self._name.unlink()
+        os.close(self.ours)
+        os.close(self._theirs)
+
+
+def test_radio_that_is_pulled_and_plugged_in_again_is_taken_up_again(tmp_path: Path) -> None:
+    name = tmp_path / "radio"
+    radio = Radio(name)
+    with closing(Links([f"{name},115200"])) as links:
+        radio.pull()
+        for _ in range(3):  # the first finds out
+            links.send(None, b"to nobody")
+            links.flush()
+            links.wait(0.0)
+            assert links.receive() == []
+        assert links.counts["send"] + links.counts["receive"] == 1
+        radio = Radio(name)
+        links.wait(0.0)
+        os.write(radio.ours, heartbeat())
+        assert b"".join(r.data for r in received(links, 1)) == heartbeat()
+        links.send(None, b"answer")
+        links.flush()
+        assert os.read(radio.ours, 100) == b"answer"
+    radio.pull()
 
 
 @pytest.mark.parametrize(
