@@ -7,7 +7,8 @@ Figures that are not known yet are NaN, so that no comparison with them holds.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeGuard
+from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 
@@ -167,21 +168,21 @@ class HealthMonitor:
 
     def _listen(self, modules: list[ModuleInputs], now: int) -> None:
         for index, module in enumerate(modules):
-            if module.heard or module.answered:
-                self._heard_ns[index] = now
             if module.answered:
-                self._answered_ns[index] = now
+                self._heard_ns[index] = self._answered_ns[index] = now
+            elif module.heard:
+                self._heard_ns[index] = now
             if module.pressure_pa is not None:
                 self._depth_ns = now
             if module.leak is not None:
                 self._leak[index] = module.leak
-            if is_known(module.voltage_v):
+            if module.voltage_v is not None and isfinite(module.voltage_v):
                 share = module.voltage_v / self._nominal_v[index]
                 before = self._voltage_share.get(index, share)
                 self._voltage_share[index] = before + VOLTAGE_SHARE * (share - before)
-            if is_known(module.cabin_temperature_c):
+            if module.cabin_temperature_c is not None and isfinite(module.cabin_temperature_c):
                 self._cabin_c[index] = module.cabin_temperature_c
-            if is_known(module.cabin_pressure_pa):
+            if module.cabin_pressure_pa is not None and isfinite(module.cabin_pressure_pa):
                 start = self._cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
                 self._cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
             if module.esc:
@@ -231,11 +232,6 @@ def _older(times_ns: list[int], oldest_ns: int) -> tuple[int, ...]:
     if min(times_ns) >= oldest_ns:
         return ()
     return tuple(i for i, time_ns in enumerate(times_ns) if time_ns < oldest_ns)
-
-
-def is_known(value: float | None) -> TypeGuard[float]:
-    """Whether a reading came and is a number."""
-    return value is not None and math.isfinite(value)
 
 
 def is_sticks(argument: object) -> bool:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from firmware_py.core.types import ModuleInputs
 
 REPEATS = 10
@@ -22,7 +24,7 @@ class ImuWatch:
 
     def __init__(self, modules: Sequence[int]) -> None:
         self._modules = tuple(modules)
-        self._last: list[bytes] = [b""] * len(self._modules)
+        self._last: list[tuple[bytes, np.ndarray]] = [(b"", np.zeros(0))] * len(self._modules)
         self._repeats = [0] * len(self._modules)
         self.frozen = [False] * len(self._modules)
 
@@ -33,9 +35,10 @@ class ImuWatch:
             gyro, accel = modules[index].gyro, modules[index].accel
             if gyro is None or accel is None:
                 continue
-            sample = gyro.tobytes() + accel.tobytes()
-            self._repeats[i] = self._repeats[i] + 1 if sample == self._last[i] else 0
-            self._last[i] = sample
+            rate, (last_rate, last_accel) = gyro.tobytes(), self._last[i]
+            repeats = rate == last_rate and accel.tobytes() == last_accel.tobytes()
+            self._repeats[i] = self._repeats[i] + 1 if repeats else 0
+            self._last[i] = rate, accel
             self.frozen[i] = self._repeats[i] >= REPEATS
             heard = heard or not self.frozen[i]
         return heard
