@@ -1,84 +1,189 @@
-"""Many seeds of one scenario, in processes of their own; campaign.json says what came of them."""
+"""Many seeds of one scenario on any concurrent.futures executor: processes here, or a dask cluster.
+
+Every trial goes to trials.jsonl the moment it is flown. Started again in the same folder, a campaign flies what is missing; since a seed
+always gives the same flight, it ends in the same bytes as one that was never interrupted. campaign.json and trials.csv say what came of it.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
+import math
+import os
+import re
+import socket
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from contextlib import suppress
+from functools import cache
+from importlib import resources
 from multiprocessing import get_context
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
-import numpy as np
-from scipy.stats import binomtest
-
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import load_vehicle
+from hil.campaign_summary import Trial, summarise, table_of
 from hil.flight import fly_and_judge
+from hil.plant.world_parameters import world_parameters
 from hil.scenario import Scenario
 
-SUMMARY_FILE = "campaign.json"
-CONFIDENCE = 0.95
-WORST = 5
-"""Seeds named as the worst."""
-QUANTILES = {"min": 0.0, "q05": 0.05, "median": 0.5, "q95": 0.95, "max": 1.0}
+SUMMARY_FILE, TABLE_FILE, TRIALS_FILE = "campaign.json", "trials.csv", "trials.jsonl"
+WALL_CLOCK = ("real_time_factor", "deadline_misses")
+"""Metrics of the machine and not of the flight: no two campaigns would agree on them."""
+PACKAGES = ("firmware_py", "hil", "can_dbc")
+SOURCES = (".py", ".toml", ".dbc")
 
-Trial = dict[str, Any]
+Pool = Callable[[], Executor]
 
 
-def fly_trial(scenario: Scenario, parameters: Parameters, seed: int, bus: str) -> Trial:
-    """One trial, logs thrown away: its seed, whether it passed, and its metrics."""
+@cache
+def code_digest() -> str:
+    """What all code and data of the robot and the bench come to."""
+    digest = hashlib.sha256()
+    for package in PACKAGES:
+        root = Path(str(resources.files(package)))
+        for path in sorted(p for p in root.rglob("*") if p.suffix in SOURCES):
+            digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def identity(scenario: Scenario, parameters: Parameters) -> str:
+    """Same identity and same seed, same trial."""
+    vehicles = [dataclasses.asdict(load_vehicle(m.vehicle)) for m in scenario.module]
+    parts = (code_digest(), dataclasses.asdict(scenario), vehicles, dataclasses.asdict(parameters))
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def fly_trial(scenario: Scenario, parameters: Parameters, seed: int, bus: str, code: str) -> Trial:
+    """One trial, logs thrown away. Raises DescriptionError where this machine's code is not `code`."""
+    if code_digest() != code:
+        raise DescriptionError("a worker runs other code than this machine; install the same version there")
     with tempfile.TemporaryDirectory() as folder:
         result = fly_and_judge(scenario, seed, parameters, Path(folder), bus)
     failed = [check.name for check in result.checks if not check.passed]
-    outcome = "passed" if result.passed else failed[0] if failed else "not checked"
-    return {"seed": seed, "passed": result.passed, "outcome": outcome, "metrics": result.metrics}
+    flown = scenario.for_seed(seed)
+    return {
+        "seed": seed,
+        "passed": result.passed,
+        "outcome": "passed" if result.passed else failed[0] if failed else "not checked",
+        "metrics": _numbers({name: value for name, value in result.metrics.items() if name not in WALL_CLOCK}),
+        "world": _numbers(world_parameters([load_vehicle(m.vehicle) for m in flown.module], flown.world, seed)),
+    }
+
+
+def _numbers(values: dict[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+class TrialFile:
+    """trials.jsonl: who it belongs to, then a line for each trial, with the disk before the next one is waited for."""
+
+    def __init__(self, path: Path, owner: str) -> None:
+        """Goes on in `path` if it is `owner`'s, else begins it anew. A line that was torn is flown again."""
+        self.trials: dict[int, Trial] = {}
+        kept = self._read(path, owner) if path.exists() else 0
+        self._file = path.open("r+b" if kept else "wb")
+        self._file.truncate(kept)
+        self._file.seek(kept)
+        if not kept:
+            self._write({"campaign": owner})
+
+    def _read(self, path: Path, owner: str) -> int:
+        """Bytes that stand."""
+        kept = 0
+        for line in path.read_bytes().splitlines(keepends=True):
+            try:
+                entry = json.loads(line) if line.endswith(b"\n") else None
+            except ValueError:
+                entry = None
+            if not isinstance(entry, dict) or (kept == 0 and entry != {"campaign": owner}):
+                break
+            if kept:
+                self.trials[int(entry["seed"])] = entry
+            kept += len(line)
+        return kept
+
+    def add(self, trial: Trial) -> None:
+        """One more trial, on the disk when this returns."""
+        self.trials[int(trial["seed"])] = trial
+        self._write(trial)
+
+    def _write(self, entry: Trial) -> None:
+        self._file.write(json.dumps(entry).encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def __enter__(self) -> TrialFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._file.close()
+
+
+def processes(jobs: int) -> Pool:
+    """So many processes of this machine."""
+    return lambda: ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
+
+
+def dask_cluster(address: str) -> Pool:
+    """The workers of the dask scheduler at `address`, such as tcp://host:8786. Raises DescriptionError when none answers."""
+    found = re.fullmatch(r"t(?:cp|ls)://(.+):(\d+)", address)
+    if not found:
+        raise DescriptionError(f"--dask {address!r} is no address; it needs tcp://HOST:PORT, as `dask scheduler` prints it")
+    try:
+        socket.create_connection((found[1], int(found[2])), timeout=10).close()
+    except (OSError, OverflowError) as error:
+        raise DescriptionError(f"no dask scheduler at {address}: {error}; start one with `dask scheduler`") from None
+    from distributed import Client
+
+    client = Client(address, timeout=10, set_as_default=False)
+    return lambda: client.get_executor(pure=False)
 
 
 def run_campaign(
     scenario: Scenario,
     parameters: Parameters,
     seeds: Sequence[int],
-    jobs: int,
+    pool: Pool,
     out: Path,
-    executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Flies every seed and writes campaign.json into `out`; returns its content. `executor` replaces the processes."""
+    """Flies every seed that `out` does not hold yet; writes campaign.json and trials.csv there; returns what the first holds."""
     out.mkdir(parents=True, exist_ok=True)
-    pool = executor or ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
-    trials: list[Trial] = []
-    with pool:
-        futures = [pool.submit(fly_trial, scenario, parameters, seed, f"virtual:trial{seed}") for seed in seeds]
-        for future in as_completed(futures):
-            trials.append(future.result())
+    with TrialFile(out / TRIALS_FILE, identity(scenario, parameters)) as file:
+        missing = [seed for seed in seeds if seed not in file.trials]
+        for trial in _flown(scenario, parameters, missing, pool):
+            file.add(trial)
             if progress is not None:
-                progress(len(trials), len(futures))
-    summary = summarise(scenario.name, sorted(trials, key=lambda trial: int(trial["seed"])))
+                progress(sum(seed in file.trials for seed in seeds), len(seeds))
+        trials = [file.trials[seed] for seed in sorted(seeds)]
+    summary = summarise(scenario.name, trials)
     (out / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    (out / TABLE_FILE).write_text(table_of(trials), encoding="utf-8")
     return summary
 
 
-def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
-    """The content of campaign.json. The interval is Wilson's."""
-    succeeded = sum(bool(trial["passed"]) for trial in trials)
-    interval = binomtest(succeeded, len(trials)).proportion_ci(CONFIDENCE, method="wilson")
-    outcomes: dict[str, int] = {}
-    for trial in trials:
-        outcomes[trial["outcome"]] = outcomes.get(trial["outcome"], 0) + 1
-    worst = sorted(trials, key=lambda trial: -trial["metrics"].get("position_rmse_m", 0.0))[:WORST]
-    return {
-        "scenario": scenario,
-        "trials": len(trials),
-        "succeeded": succeeded,
-        "outcomes": outcomes,
-        "confidence_interval": [interval.low, interval.high],
-        "metrics": {name: _quantiles(trial["metrics"].get(name) for trial in trials) for name in trials[0]["metrics"]},
-        "worst_seeds": [trial["seed"] for trial in worst],
-        "seeds": [trial["seed"] for trial in trials],
-    }
-
-
-def _quantiles(values: Iterable[float | None]) -> Mapping[str, float | None]:
-    known = np.array([v for v in values if v is not None and np.isfinite(v)])
-    return {name: float(np.quantile(known, q)) if known.size else None for name, q in QUANTILES.items()}
+def _flown(scenario: Scenario, parameters: Parameters, seeds: Sequence[int], pool: Pool) -> Iterator[Trial]:
+    """Trials as they come. A worker that dies costs the trials under way; without any trial between two deaths it is given up."""
+    left, code, in_vain = set(seeds), code_digest(), 0
+    while left:
+        before = len(left)
+        with suppress(BrokenExecutor), pool() as executor:
+            futures = [executor.submit(fly_trial, scenario, parameters, s, f"virtual:trial{s}", code) for s in sorted(left)]
+            try:
+                for future in as_completed(futures):
+                    if not isinstance(future.exception(), BrokenExecutor):
+                        trial = future.result()
+                        left.discard(int(trial["seed"]))
+                        yield trial
+            finally:
+                for future in futures:
+                    future.cancel()
+        in_vain = in_vain + 1 if len(left) == before else 0
+        if in_vain == 2:
+            raise DescriptionError(f"workers die before they finish a trial; {len(left)} seeds are left, {min(left)} the first")

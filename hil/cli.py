@@ -79,21 +79,23 @@ def campaign(
     scenario: ScenarioName,
     trials: Annotated[int, typer.Option(min=1, help="number of seeds")] = 20,
     jobs: Annotated[int, typer.Option(min=1, help="processes")] = 2,
+    dask: Annotated[str, typer.Option(metavar="ADDRESS", help="scheduler of a dask cluster, tcp://HOST:PORT, in place of processes")] = "",
     seed: Annotated[int, typer.Option(min=0, help="first seed")] = 0,
-    out: Annotated[Path | None, typer.Option(help="folder for campaign.json")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for trials.jsonl, trials.csv, campaign.json; a campaign in it goes on")] = None,
     controller: Controller = "modcube",
     vehicle: Vehicle = "",
     sensors: Sensors = "real",
 ) -> None:
-    """Fly many seeds of a scenario; prints a table and leaves campaign.json."""
-    from hil.campaign import run_campaign
+    """Fly many seeds of a scenario; prints a table and leaves every trial. Interrupted and started again, it goes on."""
+    from hil.campaign import dask_cluster, processes, run_campaign
     from hil.console import campaign_progress, print_campaign
 
     chosen = scenario_of(scenario, vehicle, sensors)
     folder = out if out is not None else Path("runs") / f"{chosen.name}-campaign"
     parameters, seeds = parameters_of(controller), range(seed, seed + trials)
     with campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
-        summary = run_campaign(chosen, parameters, seeds, jobs, folder, progress=progress)
+        pool = dask_cluster(dask) if dask else processes(jobs)
+        summary = run_campaign(chosen, parameters, seeds, pool, folder, progress)
     print_campaign(summary)
     raise typer.Exit(0 if summary["succeeded"] == summary["trials"] else FAILED)
 

@@ -16,7 +16,7 @@ from statistics import median
 import near_miss
 
 from firmware_py.description.parameters import CONTROLLERS
-from hil.campaign import run_campaign
+from hil.campaign import processes, run_campaign
 from hil.console import campaign_progress
 from hil.scenario import load_scenario
 
@@ -40,7 +40,7 @@ def flown(scenario: str, controller: str = "modcube", trials: int = 20, sensors:
         if sensors == "ideal":
             chosen = chosen.with_ideal_sensors()
         with campaign_progress(f"{scenario}, {controller}, {sensors} sensors", trials) as progress:
-            summary = run_campaign(chosen, parameters, range(trials), JOBS, folder, progress=progress)
+            summary = run_campaign(chosen, parameters, range(trials), processes(JOBS), folder, progress)
         values = {f"{m}.{q}": v for m, each in summary["metrics"].items() for q, v in each.items() if v is not None}
         return values | {"passed": summary["succeeded"] / trials, "passed.low": summary["confidence_interval"][0]}
 
@@ -52,7 +52,7 @@ def saved_by_least_power(folder: Path) -> Values:
     found = {}
     for name in ("modcube", "least_power"):
         with campaign_progress(f"mobius-1, {name}", len(FEWER)) as progress:
-            summary = run_campaign(load_scenario("mobius-1"), CONTROLLERS[name], FEWER, JOBS, folder / name, progress=progress)
+            summary = run_campaign(load_scenario("mobius-1"), CONTROLLERS[name], FEWER, processes(JOBS), folder / name, progress)
         found[name] = summary["metrics"]
     both = ("supply_power_w", "position_rmse_m")
     power, error = (found["least_power"][m]["median"] / found["modcube"][m]["median"] for m in both)

@@ -2,18 +2,25 @@
 
 import io
 import json
+import math
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 import hil.campaign
 from firmware_py.description.parameters import Parameters
-from hil.campaign import Trial, run_campaign, summarise
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import load_vehicle
+from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, Pool, dask_cluster, fly_trial, run_campaign
+from hil.campaign_summary import Trial, median_interval, summarise
 from hil.console import campaign_progress, print_campaign
+from hil.plant.world_parameters import world_parameters
 from hil.scenario import Scenario, load_scenario
 
 
@@ -27,7 +34,7 @@ class Inline(Executor):
 
 
 def trial(seed: int, rmse_m: float, outcome: str = "passed") -> Trial:
-    metrics = {"position_rmse_m": rmse_m, "nis_mean": float("nan"), "duration_s": 40.0}
+    metrics = {"position_rmse_m": rmse_m, "nis_mean": None, "duration_s": 40.0}
     return {"seed": seed, "passed": outcome == "passed", "outcome": outcome, "metrics": metrics}
 
 
@@ -56,27 +63,179 @@ def test_confidence_interval_is_wilsons() -> None:
     assert summarise("dock", trials)["confidence_interval"] == pytest.approx([0.6396, 0.9476], abs=1e-4)
 
 
-def test_campaign_flies_every_seed_and_writes_what_it_returns(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def flying(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, str]]:
+    """Every flight takes no time; returns the (seed, bus) of those that will be flown."""
     flown: list[tuple[int, str]] = []
 
-    def fly(scenario: Scenario, parameters: Parameters, seed: int, bus: str) -> Trial:
+    def fly(scenario: Scenario, parameters: Parameters, seed: int, bus: str, code: str) -> Trial:
         flown.append((seed, bus))
-        return trial(seed, 0.001 * seed)
+        return {**trial(seed, 0.001 * seed), "world": {"mass_factor": 1.0 + 0.01 * seed}}
 
     monkeypatch.setattr(hil.campaign, "fly_trial", fly)
+    return flown
+
+
+def fly(out: Path, seeds: range, pool: Pool = Inline, **progress: Any) -> dict[str, Any]:
+    return run_campaign(load_scenario("spiral"), Parameters(), seeds, pool, out, **progress)
+
+
+def content(out: Path) -> list[bytes]:
+    return [(out / name).read_bytes() for name in (SUMMARY_FILE, TABLE_FILE)]
+
+
+def test_campaign_flies_every_seed_and_writes_what_it_returns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown = flying(monkeypatch)
     counted: list[tuple[int, int]] = []
 
     def count(done: int, total: int) -> None:
         counted.append((done, total))
 
-    summary = run_campaign(load_scenario("spiral"), Parameters(), range(5, 8), 1, tmp_path, Inline(), count)
+    summary = fly(tmp_path, range(5, 8), progress=count)
     assert sorted(seed for seed, _ in flown) == [5, 6, 7]
     assert len({bus for _, bus in flown}) == 3  # trials in one process must not hear each other
     assert counted == [(1, 3), (2, 3), (3, 3)]
-    assert summary == json.loads((tmp_path / "campaign.json").read_text())
+    assert summary == json.loads((tmp_path / SUMMARY_FILE).read_text())
     assert summary["seeds"] == [5, 6, 7]
+    rows = (tmp_path / TABLE_FILE).read_text().splitlines()
+    assert rows[0] == "seed,passed,outcome,position_rmse_m,nis_mean,duration_s,world.mass_factor"
+    assert rows[1] == "5,1,passed,0.005,,40.0,1.05"
+
+
+class PlugError(Exception):
+    """Somebody pulled the plug."""
+
+
+def test_interrupted_campaign_flies_what_is_missing_and_ends_in_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown = flying(monkeypatch)
+    fly(tmp_path / "whole", range(6))
+
+    def stop(done: int, total: int) -> None:
+        if done == 4:
+            raise PlugError
+
+    with pytest.raises(PlugError):
+        fly(tmp_path / "torn", range(6), progress=stop)
+    assert len((tmp_path / "torn" / TRIALS_FILE).read_text().splitlines()) == 1 + 4
+    flown.clear()
+    fly(tmp_path / "torn", range(6))
+    assert len(flown) == 2
+    assert content(tmp_path / "torn") == content(tmp_path / "whole")
+
+
+def test_line_that_was_torn_off_is_flown_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown = flying(monkeypatch)
+    fly(tmp_path, range(3))
+    before = content(tmp_path)
+    path = tmp_path / TRIALS_FILE
+    path.write_bytes(path.read_bytes()[:-20])
+    flown.clear()
+    fly(tmp_path, range(3))
+    assert len(flown) == 1
+    assert content(tmp_path) == before
+    flown.clear()
+    fly(tmp_path, range(5))
+    assert [seed for seed, _ in flown] == [3, 4]
+
+
+def test_other_gains_begin_a_campaign_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown = flying(monkeypatch)
+    fly(tmp_path, range(2))
+    other = Parameters().replace("control.position_bandwidth", 2.0)
+    run_campaign(load_scenario("spiral"), other, range(2), Inline, tmp_path)
+    assert [seed for seed, _ in flown] == [0, 1, 0, 1]
+
+
+def test_order_in_which_trials_end_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flying(monkeypatch)
+    fly(tmp_path / "forwards", range(6))
+    for last in (range(3, 6), range(6)):
+        fly(tmp_path / "backwards", last)
+    assert content(tmp_path / "backwards") == content(tmp_path / "forwards")
+
+
+def dying(after: int) -> Pool:
+    """Executors whose worker dies after so many trials."""
+
+    class Dying(Inline):
+        left = after
+
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            if self.left > 0:
+                self.left -= 1
+                return super().submit(fn, *args, **kwargs)
+            future: Future[Any] = Future()
+            future.set_exception(BrokenProcessPool("a worker died"))
+            return future
+
+    return Dying
+
+
+def test_worker_that_dies_costs_the_trials_under_way_and_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown = flying(monkeypatch)
+    fly(tmp_path / "whole", range(5))
+    flown.clear()
+    fly(tmp_path / "dying", range(5), dying(after=2))
+    assert content(tmp_path / "dying") == content(tmp_path / "whole")
+    assert len(flown) <= 2 * 5
+
+
+def test_workers_that_die_at_once_are_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flying(monkeypatch)
+    with pytest.raises(DescriptionError, match="workers die before they finish a trial; 5 seeds are left, 0 the first"):
+        fly(tmp_path, range(5), dying(after=0))
+
+
+@pytest.mark.parametrize(
+    ("address", "words"), [("nonsense", "is no address; it needs tcp://HOST:PORT"), ("tcp://127.0.0.1:1", "no dask scheduler at tcp")]
+)
+def test_cluster_that_is_not_there_is_said_in_one_line(address: str, words: str) -> None:
+    with pytest.raises(DescriptionError, match=words):
+        dask_cluster(address)
+
+
+def test_worker_with_other_code_is_refused() -> None:
+    with pytest.raises(DescriptionError, match="other code than this machine"):
+        fly_trial(load_scenario("hover"), Parameters(), 0, "virtual:other", "not this code")
+
+
+def test_median_lies_between_the_sixth_and_the_fifteenth_of_twenty() -> None:
+    # Table of David and Nagaraja: 95.9 % for the 6th and 15th order statistics of 20; no interval of 5 values has 95 %
+    assert median_interval(np.arange(1.0, 21.0)) == (6.0, 15.0)
+    assert median_interval(np.arange(5.0)) == (None, None)
+    assert median_interval(np.arange(6.0)) == (0.0, 5.0)
+
+
+def worlds(count: int) -> list[Trial]:
+    made = [{"mass_factor": i / count, "trim_m": (17 * i) % count / count, "still": 0.0} for i in range(count)]
+    return [{**trial(i, 0.001 * math.exp(3.0 * world["mass_factor"])), "world": world} for i, world in enumerate(made)]
+
+
+def test_metric_that_follows_a_parameter_of_the_world_shows_it_and_one_that_does_not_shows_none() -> None:
+    found = summarise("spiral", worlds(40))["sensitivities"]["position_rmse_m"]
+    assert found["mass_factor"]["rho"] == pytest.approx(1.0) and found["mass_factor"]["low"] > 0.99
+    assert found["trim_m"]["low"] < 0.0 < found["trim_m"]["high"]
+    assert "still" not in found
+    assert not summarise("spiral", worlds(9))["sensitivities"]
+
+
+def test_people_read_what_a_metric_goes_with() -> None:
+    console = Console(file=io.StringIO(), width=160)
+    print_campaign(summarise("spiral", worlds(40)), console)
+    assert "Position RMSE, truth against reference goes with: mass_factor 1.00 (" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_world_of_a_seed_is_named_in_numbers_and_a_calm_one_is_what_the_file_says() -> None:
+    scenario = load_scenario("hover")
+    vehicles = [load_vehicle("modcube")] * 2
+    windy, calm = scenario.world, scenario.with_calm_world().world
+    assert world_parameters(vehicles, windy, 1) != world_parameters(vehicles, windy, 2)
+    assert 0.85 <= world_parameters(vehicles, windy, 1)["mass_factor"] <= 1.15
+    quiet = world_parameters(vehicles, calm, 1)
+    assert {name: value for name, value in quiet.items() if name.endswith("_factor")} == dict.fromkeys(
+        ("mass_factor", "added_mass_factor", "inertia_factor", "drag_face_factor", "drag_edge_factor"), pytest.approx(1.0)
+    )
+    assert quiet["trim_m"] == quiet["current_north_m_s"] == quiet["net_buoyancy_n"] == 0.0
+    assert quiet["righting_arm_m"] == pytest.approx(0.005)
 
 
 def test_table_of_a_campaign_shows_units_failures_and_worst_seeds() -> None:

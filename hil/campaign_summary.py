@@ -1,0 +1,109 @@
+"""What many trials say: success and metrics with confidence intervals, worst seeds, and what each metric depends on."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom, binomtest, norm, spearmanr
+
+CONFIDENCE = 0.95
+WORST = 5
+"""Seeds named as the worst."""
+QUANTILES = {"min": 0.0, "q05": 0.05, "median": 0.5, "q95": 0.95, "max": 1.0}
+LEAST_TRIALS = 10
+"""Fewer say nothing of what a metric depends on."""
+
+Trial = Mapping[str, Any]
+"""`seed`, `passed`, `outcome`, `metrics` and `world`: names to numbers, None where there was none."""
+
+
+def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
+    """The content of campaign.json. Success has Wilson's interval, a median that of its order statistics."""
+    succeeded = sum(bool(trial["passed"]) for trial in trials)
+    interval = binomtest(succeeded, len(trials)).proportion_ci(CONFIDENCE, method="wilson")
+    outcomes: dict[str, int] = {}
+    for trial in trials:
+        outcomes[trial["outcome"]] = outcomes.get(trial["outcome"], 0) + 1
+    worst = sorted(trials, key=lambda trial: -(trial["metrics"].get("position_rmse_m") or 0.0))[:WORST]
+    return {
+        "scenario": scenario,
+        "trials": len(trials),
+        "succeeded": succeeded,
+        "outcomes": outcomes,
+        "confidence_interval": [interval.low, interval.high],
+        "metrics": {name: _spread(_known(trials, "metrics", name)) for name in _names(trials, "metrics")},
+        "sensitivities": sensitivities(trials),
+        "worst_seeds": [trial["seed"] for trial in worst],
+        "seeds": [trial["seed"] for trial in trials],
+    }
+
+
+def _names(trials: Sequence[Trial], part: str) -> list[str]:
+    return list(dict.fromkeys(name for trial in trials for name in trial.get(part, {})))
+
+
+def _known(trials: Sequence[Trial], part: str, name: str) -> np.ndarray:
+    """(k,) the finite values."""
+    values = np.array([trial.get(part, {}).get(name) for trial in trials], dtype=float)
+    return values[np.isfinite(values)]
+
+
+def _spread(known: np.ndarray) -> dict[str, float | None]:
+    low, high = median_interval(known)
+    found = {name: float(np.quantile(known, q)) if known.size else None for name, q in QUANTILES.items()}
+    return {**found, "median_low": low, "median_high": high}
+
+
+def median_interval(values: np.ndarray) -> tuple[float | None, float | None]:
+    """The order statistics between which the median of the distribution lies in at least 95 % of cases, whatever it is.
+
+    None where there are too few values (David and Nagaraja, Order Statistics, 2003, section 7.1).
+    """
+    n, ordered = values.size, np.sort(values)
+    below = int(binom.ppf(0.5 * (1.0 - CONFIDENCE), n, 0.5)) - 1 if n else -1
+    while below + 1 < n / 2 and binom.cdf(below + 1, n, 0.5) <= 0.5 * (1.0 - CONFIDENCE):
+        below += 1
+    if below < 0:
+        return None, None
+    return float(ordered[below]), float(ordered[n - 1 - below])
+
+
+def sensitivities(trials: Sequence[Trial]) -> dict[str, dict[str, dict[str, float]]]:
+    """Spearman's rank correlation of each metric with each parameter of the world, with its 95 % interval.
+
+    The interval is Fisher's, with Bonett and Wright's variance (Psychometrika 65, 2000). Where either never changes there is none.
+    """
+    if len(trials) < LEAST_TRIALS:
+        return {}
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for metric in _names(trials, "metrics"):
+        for parameter in _names(trials, "world"):
+            pairs = np.array([(t["metrics"].get(metric), t["world"].get(parameter)) for t in trials], dtype=float)
+            pairs = pairs[np.isfinite(pairs).all(axis=1)]
+            if len(pairs) >= LEAST_TRIALS and np.all(np.ptp(pairs, axis=0) > 0.0):
+                found.setdefault(metric, {})[parameter] = _rank_correlation(pairs)
+    return found
+
+
+def _rank_correlation(pairs: np.ndarray) -> dict[str, float]:
+    rho = float(spearmanr(pairs[:, 0], pairs[:, 1]).statistic)
+    half = float(norm.ppf(0.5 + 0.5 * CONFIDENCE)) * math.sqrt((1.0 + 0.5 * rho * rho) / (len(pairs) - 3))
+    z = math.atanh(max(-1.0 + 1e-12, min(1.0 - 1e-12, rho)))
+    return {"rho": rho, "low": math.tanh(z - half), "high": math.tanh(z + half)}
+
+
+def table_of(trials: Sequence[Trial]) -> str:
+    """trials.csv: a row for each seed; metrics, then the world that the seed made."""
+    metrics, world = _names(trials, "metrics"), _names(trials, "world")
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["seed", "passed", "outcome", *metrics, *(f"world.{name}" for name in world)])
+    for t in trials:
+        values = [*(t["metrics"].get(m) for m in metrics), *(t.get("world", {}).get(w) for w in world)]
+        writer.writerow([t["seed"], int(t["passed"]), t["outcome"], *("" if v is None else repr(float(v)) for v in values)])
+    return text.getvalue()

@@ -1,0 +1,43 @@
+"""What one seed made of the world, as named numbers: against these a campaign holds its metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from firmware_py.description.vehicle import Vehicle
+from hil.plant.draw import draw_module, stream
+from hil.plant.spec import WorldSpec
+from hil.plant.water import Gusts
+
+
+def world_parameters(vehicles: Sequence[Vehicle], spec: WorldSpec, seed: int) -> dict[str, float]:
+    """Means over the modules of what was drawn for each; factors are of the vehicle file's value."""
+    modules = [_module_parameters(vehicle, spec, seed, m) for m, vehicle in enumerate(vehicles)]
+    current = Gusts(spec, stream(seed, "gusts"), 1.0).mean
+    means = {name: float(np.mean([module[name] for module in modules])) for name in modules[0]}
+    return {**means, "current_north_m_s": float(current[0]), "current_east_m_s": float(current[1])}
+
+
+def _module_parameters(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> dict[str, float]:
+    draw, nominal = draw_module(vehicle, spec, seed, module), vehicle.inertial
+    drag = vehicle.drag
+    return {
+        "mass_factor": draw.dry_kg / nominal.dry_kg,
+        "added_mass_factor": _factor(draw.added[:3], nominal.added[:3]),
+        "inertia_factor": _factor(np.diag(draw.inertia), np.diag(nominal.inertia)),
+        "drag_face_factor": _factor(draw.drag[:1], np.array([drag.cd_face])),
+        "drag_edge_factor": _factor(draw.drag[1:2], np.array([drag.cd_edge])),
+        "thruster_gain_mean": float(draw.gain.mean()),
+        "thruster_gain_spread": float(draw.gain.std()),
+        "deadband_n": float(draw.deadband_n.mean()),
+        "net_buoyancy_n": draw.buoyancy_n - draw.dry_kg * spec.gravity,
+        "righting_arm_m": float(draw.weight_at[2] - draw.buoyancy_at[2]),
+        "trim_m": float(np.hypot(*(draw.weight_at - nominal.com_m)[:2])),
+    }
+
+
+def _factor(drawn: np.ndarray, nominal: np.ndarray) -> float:
+    """Mean of drawn over nominal values; 1 where there is nothing to draw from."""
+    return float(np.mean(drawn[nominal != 0.0] / nominal[nominal != 0.0])) if np.any(nominal) else 1.0
