@@ -6,23 +6,25 @@ how many times better than the peer; what has no peer has none.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import struct
+import subprocess
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 
 import can
 import cantools.database
 import numpy as np
+from bench_docking import DetectorBench
+from bench_drag import drag_entries
+from bench_entry import REPETITIONS, Entry, compare, each_us
+from bench_fleet import TIMED_TICKS, Hold, cube_of
 from bench_flight import FlightTimes, measure_flight
-from numba import njit
 from rich import box as box_style
 from rich.console import Console
 from rich.table import Table
@@ -32,58 +34,17 @@ from can_dbc import __path__ as dbc_path
 from firmware_py.bus.codec import Codec, crc8
 from firmware_py.bus.port import open_port
 from firmware_py.core.allocator import Allocator
-from firmware_py.core.drag_lookup import add_drag
 from firmware_py.description.parameters import Allocation
-from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare import alpha, drag_table
-from firmware_py.prepare.assembly import assemble_vehicle
-from firmware_py.prepare.joints import Placement
-from firmware_py.prepare.projected_area import Solid, areas_and_centroids, box, plane_basis
 
 OUT = Path("bench.json")
-REPETITIONS = 7
+FLEET_PROGRAM = Path(__file__).with_name("bench_fleet.py")
 FLIGHTS = 3
-DIRECTIONS = 1000
-"""Directions of the paper's drag table, and look-ups in one repetition."""
 REQUIRED_SPEED = 25.0
 """Times real time that lockstep must reach (issue 2)."""
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One line of bench.json."""
-
-    name: str
-    value: float
-    unit: str
-    peer: str | None = None
-    peer_value: float | None = None
-    ratio: float | None = None
-
-
-def compare(name: str, unit: str, ours: Callable[[], float], peers: dict[str, Callable[[], float]]) -> list[Entry]:
-    """Medians of alternating repetitions of functions that return a duration in `unit`; one entry per peer."""
-    everyone = {"": ours, **peers}
-    times: dict[str, list[float]] = {key: [] for key in everyone}
-    for _ in range(REPETITIONS):
-        for key, function in everyone.items():
-            times[key].append(function())
-    value = median(times.pop(""))
-    if not peers:
-        return [Entry(name, value, unit)]
-    return [Entry(name, value, unit, peer, median(each), median(each) / value) for peer, each in times.items()]
-
-
-def each_us(function: Callable[[], object], times: int) -> Callable[[], float]:
-    """Runs `function` so many times; the duration of one, us."""
-
-    def run() -> float:
-        began = time.perf_counter()
-        for _ in range(times):
-            function()
-        return 1e6 * (time.perf_counter() - began) / times
-
-    return run
+PERMITTED_MB = 300.0
+"""Memory of a process with 64 modules (issue 4)."""
+PERMITTED_DETECTION_US = 20.0
+"""Docking detection of eight modules (issue 5)."""
 
 
 def flight_entries() -> list[Entry]:
@@ -164,105 +125,33 @@ def port_entries() -> list[Entry]:
         )
 
 
-@njit(cache=False)
-def _look_up_all(nodes, rotational, linear, velocities, out):  # type: ignore[no-untyped-def]
-    for i in range(velocities.shape[0]):
-        out[i] = 0.0
-        add_drag(nodes, rotational, linear, velocities[i], out[i])
-
-
-@njit(cache=False)
-def _nearest_all(directions, coefficients, velocities, out):  # type: ignore[no-untyped-def]
-    for i in range(velocities.shape[0]):
-        v = velocities[i]
-        best, where = -2.0, 0
-        for k in range(directions.shape[0]):
-            cosine = directions[k, 0] * v[0] + directions[k, 1] * v[1] + directions[k, 2] * v[2]
-            if cosine > best:
-                best, where = cosine, k
-        out[i, :3] = -coefficients[where] * np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2) * v[:3]
-
-
-def fibonacci(n: int) -> np.ndarray:
-    """(n, 3) unit vectors: the paper's Algorithm 1 with the errata's phi."""
-    i = np.arange(n)
-    z, phi = 1.0 - (2.0 * i + 1.0) / n, np.pi * (1.0 + np.sqrt(5.0)) * i
-    return np.column_stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z])
-
-
-def drag_entries() -> list[Entry]:
-    """Looking drag up, its error, and building its table."""
-    vehicle = load_vehicle("modcube")
-    placements = [Placement(vehicle, (0, 0, 0), 0)]
-    solids = [box(np.array(vehicle.hull.size_m))]
-    pitch_m = float(vehicle.hull.size_m[0])
-
-    def exact(directions: np.ndarray) -> np.ndarray:
-        """Drag per squared speed along (n, 3) directions, N s^2/m^2."""
-        area = areas_and_centroids(solids, directions)[0]
-        return np.asarray(0.5 * drag_table.WATER_DENSITY * drag_table.coefficient(placements, directions) * area)
-
-    def build(method: drag_table.Outlines) -> Callable[[], float]:
-        return lambda: each_us(lambda: drag_table.build(placements, np.zeros(3), pitch_m, method=method), 1)() * 1e-6
-
-    table = drag_table.build(placements, np.zeros(3), pitch_m)
-    drawn = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
-    velocities = np.hstack([drawn / np.linalg.norm(drawn, axis=1, keepdims=True), np.zeros((DIRECTIONS, 3))])
-    grid = fibonacci(DIRECTIONS)
-    ours, theirs = np.zeros((DIRECTIONS, 6)), np.zeros((DIRECTIONS, 6))
-    look_up = (table.nodes, table.rotational, np.zeros(6), velocities, ours)
-    nearest = (grid, exact(grid), velocities, theirs)
-    _look_up_all(*look_up)
-    _nearest_all(*nearest)
-    truth = exact(velocities[:, :3])
-    errors = [100.0 * _rms(np.linalg.norm(each[:, :3], axis=1) / truth - 1.0) for each in (ours, theirs)]
-    peer = "nearest of 1000 directions"
-    builders: dict[str, Callable[[], float]] = {"alpha shapes of 1000 points": build(alpha.lattice_method())}
-    if importlib.util.find_spec("alphashape") is not None:
-        builders["the alphashape package"] = build(_alphashape_package)
-    return [
-        *compare(
-            "drag look-up, compiled", "us", _per_direction(lambda: _look_up_all(*look_up)),
-            {peer: _per_direction(lambda: _nearest_all(*nearest))},
-        ),
-        Entry("drag look-up, error", errors[0], "% rms", peer, errors[1], errors[1] / errors[0]),
-        *compare("drag table of one module", "s", build(areas_and_centroids), builders),
-    ]  # fmt: skip
-
-
-def _per_direction(function: Callable[[], object]) -> Callable[[], float]:
-    run = each_us(function, 5)
-    return lambda: run() / DIRECTIONS
-
-
-def _alphashape_package(solids: Sequence[Solid], directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a user of the alphashape package would write; seconds per direction, so it is not in the lock."""
-    import alphashape
-
-    cloud = alpha.lattice_points(solids)
-    shapes = [
-        (alphashape.alphashape(cloud.points @ basis.T, 1.0 / cloud.radius), basis) for basis in plane_basis(directions)
-    ]
-    centroids = [np.array([shape.centroid.x, shape.centroid.y]) @ basis for shape, basis in shapes]
-    return np.array([shape.area for shape, _ in shapes]), np.array(centroids)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def allocator_entries() -> list[Entry]:
-    """Thruster forces for a wrench that saturates, and one that does not."""
-    vehicle = load_vehicle("modcube")
-    body = assemble_vehicle(vehicle)
-    allocator = Allocator(body, Allocation())
-    t = body.thrusters
+    """Thruster forces for a wrench that saturates, and one that does not; of one module, and of 64."""
     entries = []
-    for name, force_n in (("within limits", 5.0), ("saturated", 60.0)):
-        wrench = np.array([force_n, 0.3 * force_n, -0.2 * force_n, 0.2, -0.1, 0.1])
-        peer = each_us(lambda w=wrench: lsq_linear(t.matrix, w, (t.f_min, t.f_max)), 20)  # type: ignore[misc]
-        ours = each_us(lambda w=wrench: allocator.step(w), 500)  # type: ignore[misc]
+    for name, edge, force_n in (("within limits", 1, 5.0), ("saturated", 1, 60.0), ("saturated, 64 modules", 4, 4000.0)):
+        body = cube_of(edge)
+        allocator, t = Allocator(body, Allocation()), body.thrusters
+        wrench = np.r_[force_n * np.array([1.0, 0.3, -0.2]), len(body.modules) * np.array([0.2, -0.1, 0.1])]
+        peer = each_us(lambda w=wrench, t=t: lsq_linear(t.matrix, w, (t.f_min, t.f_max)), 20 // edge)  # type: ignore[misc]
+        ours = each_us(lambda w=wrench, a=allocator: a.step(w), 500 // edge)  # type: ignore[misc]
         entries += compare(f"allocation, {name}", "us", ours, {"scipy lsq_linear": peer})
+    return entries
+
+
+def fleet_entries() -> list[Entry]:
+    """A tick of 64 docked modules beside that of one, its memory, and the docking detector."""
+    one, many = Hold(cube_of(1)), Hold(cube_of(4))
+    entries = compare(
+        "pipeline.step, 64 modules docked", "us", lambda: many.run(TIMED_TICKS), {"one module": lambda: one.run(TIMED_TICKS)}
+    )
+    alone = subprocess.run([sys.executable, str(FLEET_PROGRAM), "4"], check=True, capture_output=True, text=True)
+    memory_mb = float(json.loads(alone.stdout)["memory_mb"])
+    entries.append(Entry("memory, 64 modules docked", memory_mb, "MB", "permitted", PERMITTED_MB, PERMITTED_MB / memory_mb))
+    docking = DetectorBench()
+    detect_us, decode_us = (median(each() for _ in range(REPETITIONS)) for each in (docking.detect_us, docking.decode_us))
+    name = "docking detection, 8 modules"
+    entries.append(Entry(name, detect_us, "us", "permitted", PERMITTED_DETECTION_US, PERMITTED_DETECTION_US / detect_us))
+    entries.append(Entry(f"{name}: decoding its {docking.frames:.1f} frames", decode_us, "us"))
     return entries
 
 
@@ -285,7 +174,7 @@ def main() -> None:
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     entries: list[Entry] = []
-    for measure in (flight_entries, codec_entries, port_entries, drag_entries, allocator_entries):
+    for measure in (flight_entries, fleet_entries, codec_entries, port_entries, drag_entries, allocator_entries):
         print(f"bench: {(measure.__doc__ or '').splitlines()[0]}", file=sys.stderr, flush=True)
         entries += measure()
     OUT.write_text(json.dumps([asdict(e) for e in entries], indent=2) + "\n", encoding="utf-8")

@@ -1,8 +1,16 @@
-"""For tools/bench.py: what a tick of many docked modules costs beside that of one, with every module's sensors arriving."""
+"""For tools/bench.py: what a tick of many docked modules costs beside that of one, with every module's sensors arriving.
+
+    python tools/bench_fleet.py EDGE
+
+holds a cube of EDGE^3 modules and prints the duration of a tick, how far it strayed, and the memory of the process.
+"""
 
 from __future__ import annotations
 
+import json
+import sys
 from collections import deque
+from pathlib import Path
 from time import perf_counter_ns
 
 import numpy as np
@@ -11,7 +19,7 @@ from firmware_py.core import propagation
 from firmware_py.core.body import Body
 from firmware_py.core.measurements import ATMOSPHERE_PA, WATER_DENSITY
 from firmware_py.core.observation import GRAVITY
-from firmware_py.core.pipeline import Pipeline
+from firmware_py.core.pipeline import CHANNELS, Pipeline
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import multiply, normalise, rotate, to_matrix
 from firmware_py.core.thruster import ThrusterLag
@@ -24,6 +32,8 @@ PERIOD_NS = 10_000_000
 PERIOD_S = 1e-9 * PERIOD_NS
 ARM_TICK, SETTLE_TICKS = 50, 300
 """Armed when a pose is found; timed once the disturbance is learnt and the place held."""
+TIMED_TICKS = 100
+"""Ten rounds of everything that comes at its own rate."""
 START_W = np.array([0.0, 0.0, 2.0])
 CURRENT_N, TRIM_NM = np.array([0.6, -0.4, 0.3]), np.array([0.02, -0.03, 0.01])
 """Each module's share of what pushes and turns the body: world, body frame."""
@@ -49,12 +59,16 @@ class FleetInWater:
         self._turned = [to_matrix(np.ascontiguousarray(q)).T for q in body.q_bm]
         self._tags = [int(np.flatnonzero(body.tag_module == m)[-1]) for m in modules]
         self._mine = [np.flatnonzero(t.module == m) for m in modules]
+        self._channels = t.module * CHANNELS + t.channel
         self._full_n = t.forward.sum(axis=1), t.reverse.sum(axis=1)
 
     def move(self, outputs: Outputs) -> None:
-        """One period with the forces that a tick commanded."""
-        self._tau = self._body.thrusters.matrix @ self._acts.step()
-        self._acts.command(outputs.records[0].commanded_n)
+        """One period with what a tick commanded."""
+        t, powers = self._body.thrusters, np.arange(1, 6)
+        self._tau = t.matrix @ self._acts.step()
+        share = np.concatenate([outputs.modules[m].thrusters for m in self._body.modules])[self._channels, None]
+        curves = np.where(share > 0.0, t.forward, t.reverse)
+        self._acts.command(np.sum(np.sign(share) * curves * np.abs(share) ** powers, axis=1))
         self.x = propagation.step(self.x, self._tau, PERIOD_S, *self._plant)
         self._past.append(self.x)
 
@@ -101,23 +115,50 @@ def cube_of(edge: int) -> Body:
     return assemble(cells, [0] * len(cells), [load_vehicle("modcube")] * len(cells))
 
 
-def hold(body: Body, ticks: int = 300, seed: int = 0) -> tuple[float, float]:
-    """Mean duration of pipeline.step while the body holds its place, us, and the farthest it strays then, m.
+class Hold:
+    """The pipeline of one body that is armed and holds its place in the water."""
 
-    Raises RuntimeError when it does not arm, or loses a thruster that pushes as it should.
-    """
-    pipeline, fleet = Pipeline([body], Parameters(), PERIOD_NS), FleetInWater(body, seed)
-    took_ns, strayed_m, said = 0, 0.0, []
-    for tick in range(SETTLE_TICKS + ticks):
-        inputs = fleet.inputs(tick, [Request(Action.ARM, body.index)] if tick == ARM_TICK else [])
-        began = perf_counter_ns()
-        outputs = pipeline.step(inputs)
-        elapsed_ns = perf_counter_ns() - began
-        fleet.move(outputs)
-        said += [event.text for event in outputs.events]
-        if tick >= SETTLE_TICKS:
-            took_ns += elapsed_ns
-            strayed_m = max(strayed_m, float(np.linalg.norm(fleet.x[:3] - outputs.records[0].setpoint.p_wb)))
-    if not outputs.modules[0].armed or any("left out" in words for words in said):
-        raise RuntimeError(f"a body of {len(body.modules)} modules does not hold: {'; '.join(said)}")
-    return 1e-3 * took_ns / ticks, strayed_m
+    def __init__(self, body: Body, seed: int = 0) -> None:
+        """Raises RuntimeError when it does not arm."""
+        self._body, self._fleet, self._tick = body, FleetInWater(body, seed), 0
+        self._pipeline, self._said = Pipeline([body], Parameters(), PERIOD_NS), list[str]()
+        self.strayed_m = 0.0
+        """The farthest that it was from its set-point."""
+        self.run(SETTLE_TICKS)
+        self.strayed_m = 0.0
+
+    def run(self, ticks: int) -> float:
+        """Mean duration of pipeline.step, us. Raises RuntimeError when the body disarms, or leaves a healthy thruster out."""
+        took_ns = 0
+        for _ in range(ticks):
+            inputs = self._fleet.inputs(self._tick, [Request(Action.ARM, self._body.index)] if self._tick == ARM_TICK else [])
+            began = perf_counter_ns()
+            outputs = self._pipeline.step(inputs)
+            took_ns += perf_counter_ns() - began
+            self._take(outputs)
+        if not outputs.modules[0].armed or any("left out" in words for words in self._said):
+            raise RuntimeError(f"a body of {len(self._body.modules)} modules does not hold: {'; '.join(self._said)}")
+        return 1e-3 * took_ns / ticks
+
+    def _take(self, outputs: Outputs) -> None:
+        self._tick += 1
+        self._fleet.move(outputs)
+        self._said += [event.text for event in outputs.events]
+        self.strayed_m = max(self.strayed_m, float(np.linalg.norm(self._fleet.x[:3] - outputs.records[0].setpoint.p_wb)))
+
+
+def peak_memory_mb() -> float:
+    """The most memory that this process ever held, MB. getrusage's figure begins with that of the process that started it."""
+    status = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+    return float(status["VmHWM"].split()[0]) / 1024.0
+
+
+def main() -> None:
+    """Holds a cube of `sys.argv[1]`^3 modules in a process of its own; prints what came of it."""
+    flight = Hold(cube_of(int(sys.argv[1])))
+    tick_us = flight.run(TIMED_TICKS)
+    print(json.dumps({"tick_us": tick_us, "strayed_m": flight.strayed_m, "memory_mb": peak_memory_mb()}))
+
+
+if __name__ == "__main__":
+    main()

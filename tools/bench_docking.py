@@ -1,0 +1,82 @@
+"""For tools/bench.py: what detecting docks costs for eight docked modules, from the frames that it needs."""
+
+from __future__ import annotations
+
+from time import perf_counter_ns
+
+import numpy as np
+from bench_fleet import PERIOD_NS, cube_of
+
+from firmware_py.bus.codec import Codec, Frame, pack_quaternion
+from firmware_py.bus.mapping import InputCollector
+from firmware_py.core.docking import joints_of, tag_table
+from firmware_py.core.docking_detector import ModulePoses, PairBank
+from firmware_py.core.types import Inputs
+from firmware_py.description.fleet import Fleet, Module
+from firmware_py.description.parameters import Docking
+
+TICKS = 480
+MODULES_OF_A_BUS = 4
+CURRENT_MA = 100
+CURRENT_EVERY, PICTURES_PER_TICK, DELAY_TICKS = 4, 0.6, 4
+"""Currents at 25 Hz, pictures at 60 Hz that arrive 40 ms late."""
+
+
+class DetectorBench:
+    """A 2x2x2 of docked modules on two buses: their magnets' currents and top tags."""
+
+    def __init__(self) -> None:
+        self._codec, self._body = Codec.load(), cube_of(2)
+        self._addresses = [(m // MODULES_OF_A_BUS, 1 + m % MODULES_OF_A_BUS) for m in self._body.modules]
+        self._fleet = Fleet(module=tuple(Module(number=number, bus=bus) for bus, number in self._addresses), buses=("a", "b"))
+        self._frames = [self._frames_of(tick) for tick in range(TICKS)]
+        self._table = tag_table([self._body])
+        self.frames = sum(map(len, self._frames)) / TICKS
+        """Of a tick, on the mean."""
+        self._inputs, _ = self._decode()
+
+    def decode_us(self) -> float:
+        """Frames to Inputs, a tick."""
+        return self._decode()[1]
+
+    def detect_us(self) -> float:
+        """Inputs to the state of the twelve joints, a tick. Raises RuntimeError when one is not found docked."""
+        bank = PairBank([joint.pair for joint in joints_of(self._body)], Docking())
+        began = perf_counter_ns()
+        for inputs in self._inputs:
+            bank.step(inputs.time_ns, inputs.modules, ModulePoses(inputs.modules, self._table))
+        took_ns = perf_counter_ns() - began
+        if not bank.rows["holds"].all():
+            raise RuntimeError(f"not all of {len(bank.rows)} joints were found docked")
+        return 1e-3 * took_ns / TICKS
+
+    def _decode(self) -> tuple[list[Inputs], float]:
+        collector, found, took_ns = InputCollector(self._fleet, self._codec), [], 0
+        for tick, frames in enumerate(self._frames):
+            collector.sync_sent(tick, tick * PERIOD_NS)
+            began = perf_counter_ns()
+            for bus, frame in frames:
+                collector.take(bus, frame)
+            found.append(collector.collect(tick, tick * PERIOD_NS))
+            took_ns += perf_counter_ns() - began
+        return found, 1e-3 * took_ns / TICKS
+
+    def _frames_of(self, tick: int) -> list[tuple[int, Frame]]:
+        frames = []
+        picture = int(PICTURES_PER_TICK * tick)
+        for m, (bus, number) in enumerate(self._addresses):
+            for offset, name in enumerate(("DOCK_CURRENT_ABC", "DOCK_CURRENT_DEF")):
+                if (tick + m + 2 * offset) % CURRENT_EVERY == 0:
+                    values = (CURRENT_MA,) * 3 + (1,) * 3
+                    frames.append((bus, self._codec.message(name).encode(number, values, tick // CURRENT_EVERY & 15)))
+            if tick >= DELAY_TICKS and picture > int(PICTURES_PER_TICK * (tick - 1)):
+                frames += [(bus, frame) for frame in self._see(m, number, tick, picture & 15)]
+        return frames
+
+    def _see(self, m: int, number: int, tick: int, counter: int) -> list[Frame]:
+        body = self._body
+        k = int(np.flatnonzero(body.tag_module == m)[-1])
+        place, quaternion = tuple(body.r_bt[k].tolist()), pack_quaternion(body.q_bt[k].tolist())
+        attitude = (*quaternion, int(body.tag_ids[k]), 7, tick - DELAY_TICKS & 0xFF, 2.0)
+        values = (("TAG_POSITION", place), ("TAG_ATTITUDE", attitude))
+        return [self._codec.message(name).encode(number, of, counter) for name, of in values]

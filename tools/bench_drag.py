@@ -1,0 +1,106 @@
+"""For tools/bench.py: looking drag up, and building its table, beside what else would do the same."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from bench_entry import Entry, compare, each_us
+from numba import njit
+
+from firmware_py.core.drag_lookup import add_drag
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare import alpha, drag_table
+from firmware_py.prepare.joints import Placement
+from firmware_py.prepare.projected_area import Solid, areas_and_centroids, box, plane_basis
+
+DIRECTIONS = 1000
+"""Directions of the paper's drag table, and look-ups in one repetition."""
+
+
+@njit(cache=False)
+def _look_up_all(nodes, rotational, linear, velocities, out):  # type: ignore[no-untyped-def]
+    for i in range(velocities.shape[0]):
+        out[i] = 0.0
+        add_drag(nodes, rotational, linear, velocities[i], out[i])
+
+
+@njit(cache=False)
+def _nearest_all(directions, coefficients, velocities, out):  # type: ignore[no-untyped-def]
+    for i in range(velocities.shape[0]):
+        v = velocities[i]
+        best, where = -2.0, 0
+        for k in range(directions.shape[0]):
+            cosine = directions[k, 0] * v[0] + directions[k, 1] * v[1] + directions[k, 2] * v[2]
+            if cosine > best:
+                best, where = cosine, k
+        out[i, :3] = -coefficients[where] * np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2) * v[:3]
+
+
+def fibonacci(n: int) -> np.ndarray:
+    """(n, 3) unit vectors: the paper's Algorithm 1 with the errata's phi."""
+    i = np.arange(n)
+    z, phi = 1.0 - (2.0 * i + 1.0) / n, np.pi * (1.0 + np.sqrt(5.0)) * i
+    return np.column_stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z])
+
+
+def drag_entries() -> list[Entry]:
+    """Looking drag up, its error, and building its table."""
+    vehicle = load_vehicle("modcube")
+    placements = [Placement(vehicle, (0, 0, 0), 0)]
+    solids = [box(np.array(vehicle.hull.size_m))]
+    pitch_m = float(vehicle.hull.size_m[0])
+
+    def exact(directions: np.ndarray) -> np.ndarray:
+        """Drag per squared speed along (n, 3) directions, N s^2/m^2."""
+        area = areas_and_centroids(solids, directions)[0]
+        return np.asarray(0.5 * drag_table.WATER_DENSITY * drag_table.coefficient(placements, directions) * area)
+
+    def build(method: drag_table.Outlines) -> Callable[[], float]:
+        return lambda: each_us(lambda: drag_table.build(placements, np.zeros(3), pitch_m, method=method), 1)() * 1e-6
+
+    table = drag_table.build(placements, np.zeros(3), pitch_m)
+    drawn = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    velocities = np.hstack([drawn / np.linalg.norm(drawn, axis=1, keepdims=True), np.zeros((DIRECTIONS, 3))])
+    grid = fibonacci(DIRECTIONS)
+    ours, theirs = np.zeros((DIRECTIONS, 6)), np.zeros((DIRECTIONS, 6))
+    look_up = (table.nodes, table.rotational, np.zeros(6), velocities, ours)
+    nearest = (grid, exact(grid), velocities, theirs)
+    _look_up_all(*look_up)
+    _nearest_all(*nearest)
+    truth = exact(velocities[:, :3])
+    errors = [100.0 * _rms(np.linalg.norm(each[:, :3], axis=1) / truth - 1.0) for each in (ours, theirs)]
+    peer = "nearest of 1000 directions"
+    builders: dict[str, Callable[[], float]] = {"alpha shapes of 1000 points": build(alpha.lattice_method())}
+    if importlib.util.find_spec("alphashape") is not None:
+        builders["the alphashape package"] = build(_alphashape_package)
+    return [
+        *compare(
+            "drag look-up, compiled", "us", _per_direction(lambda: _look_up_all(*look_up)),
+            {peer: _per_direction(lambda: _nearest_all(*nearest))},
+        ),
+        Entry("drag look-up, error", errors[0], "% rms", peer, errors[1], errors[1] / errors[0]),
+        *compare("drag table of one module", "s", build(areas_and_centroids), builders),
+    ]  # fmt: skip
+
+
+def _per_direction(function: Callable[[], object]) -> Callable[[], float]:
+    run = each_us(function, 5)
+    return lambda: run() / DIRECTIONS
+
+
+def _alphashape_package(solids: Sequence[Solid], directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a user of the alphashape package would write; seconds per direction, so it is not in the lock."""
+    import alphashape
+
+    cloud = alpha.lattice_points(solids)
+    shapes = [
+        (alphashape.alphashape(cloud.points @ basis.T, 1.0 / cloud.radius), basis) for basis in plane_basis(directions)
+    ]
+    centroids = [np.array([shape.centroid.x, shape.centroid.y]) @ basis for shape, basis in shapes]
+    return np.array([shape.area for shape, _ in shapes]), np.array(centroids)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
