@@ -15,8 +15,8 @@ from hil.signals import SIGNAL_LOG, TRUTH_LOG
 OUTCOMES = ("docked", "jammed", "unstable control", "refused", "gave up")
 """What the metric `outcome` counts."""
 DOCKED, JAMMED, UNSTABLE, REFUSED, GAVE_UP = range(len(OUTCOMES))
-UNSTABLE_RAD = math.radians(30.0)
-"""A module that ever tilts or turns so far from where it was bound is out of control."""
+UNSTABLE_RAD, KEPT_UP_TICKS = math.radians(30.0), 200
+"""A module that stays so far from the attitude that it was bound for is out of control."""
 
 
 def expected_pairs(scenario: Scenario) -> dict[tuple[int, int], bool]:
@@ -97,13 +97,13 @@ def _failure(docks: Columns, signals: Mapping[str, Columns]) -> int:
 
 
 def _off_attitude(signals: Mapping[str, Columns]) -> float:
-    """Largest angle between set-point and estimate of any body whose pose is known."""
+    """Largest angle between set-point and estimate that any body, its pose known, keeps up for a while, rad."""
     worst = 0.0
     for name, columns in signals.items():
-        if name.startswith("/firmware/body"):
+        if name.startswith("/firmware/body") and len(columns["tick"]) >= KEPT_UP_TICKS:
             cosine = np.abs(np.sum(columns["q_wb"] * columns["setpoint_q_wb"], axis=1))
-            known = np.where(columns["ready"], np.clip(cosine, 0.0, 1.0), 1.0)
-            worst = max(worst, float(2.0 * np.arccos(known).max()))
+            angle = np.where(columns["ready"], 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0)), 0.0)
+            worst = max(worst, float(np.lib.stride_tricks.sliding_window_view(angle, KEPT_UP_TICKS).min(axis=1).max()))
     return worst
 
 

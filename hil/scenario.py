@@ -20,7 +20,7 @@ from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
 from hil.plant.lattice import is_connected, place
 from hil.plant.polycube import grow
-from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
+from hil.plant.spec import CALM, HALF_A_COUNT, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
 
 
@@ -211,8 +211,8 @@ class Scenario:
         return dataclasses.replace(self, module=modules, polycube=None)
 
     def with_ideal_sensors(self) -> Scenario:
-        """The same with perfect sensors; quantisation by the frames stays."""
-        return dataclasses.replace(self, sensors=dataclasses.replace(self.sensors, **IDEAL))  # type: ignore[arg-type]
+        """The same with perfect sensors; quantisation by the frames stays, and half a count of noise on the inertial ones."""
+        return dataclasses.replace(self, sensors=dataclasses.replace(self.sensors, **(IDEAL | HALF_A_COUNT)))  # type: ignore[arg-type]
 
     def with_vehicle(self, vehicle: str) -> Scenario:
         """The same with every module of the kind `vehicle`, a name or a file."""

@@ -121,6 +121,8 @@ IDEAL: dict[str, float] = dict.fromkeys(
     0,
 )  # fmt: skip
 """Overrides for perfect sensors: no noise, no bias, no delay."""
+HALF_A_COUNT = {"gyro_sigma": 0.00025, "accel_sigma": 0.001}
+"""Noise of inertial sensors at half a step of their frames: one that repeats itself to the last bit counts as frozen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -4,7 +4,6 @@ import dataclasses
 
 import pytest
 
-from firmware_py.description.parameters import CONTROLLERS
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly
 from tools import near_miss
@@ -33,7 +32,8 @@ def test_docked_pair_flies_the_moebius_strip_as_one_and_parts_again(fly: Fly) ->
 @pytest.mark.slow
 def test_lower_module_that_nobody_sees_is_refused_and_nothing_moves(fly: Fly) -> None:
     scenario = load_scenario("dock-vertical")
-    metrics = fly(dataclasses.replace(scenario, camera=scenario.camera[:1]), 0).metrics
+    task = dataclasses.replace(scenario.task, duration_s=40.0)
+    metrics = fly(dataclasses.replace(scenario, camera=scenario.camera[:1], task=task), 0).metrics
     assert (metrics["docked"], metrics["tries"], metrics["outcome"]) == (0.0, 0.0, 3.0)
 
 
@@ -45,16 +45,10 @@ def test_module_that_passes_close_by_with_magnets_on_is_not_believed_docked(fly:
 
 
 @pytest.mark.slow
-def test_paper_sequence_is_flown_by_its_controller(fly: Fly) -> None:
-    """One straight line at constant speed, no second try."""
-    assert fly(load_scenario("dock"), 0, CONTROLLERS["paper"]).metrics["tries"] <= 1.0
-
-
-@pytest.mark.slow
 def test_detector_needs_both_conditions() -> None:
     """Through real frames: each condition alone would have believed in docks that were none; together they believe in none."""
-    found = near_miss.count(range(150))
-    assert found["misses"] > 100
-    assert found["current"] >= 5
-    assert found["position"] >= 5
+    found = near_miss.count(range(70))
+    assert found["misses"] > 40
+    assert found["current"] >= 3
+    assert found["position"] >= 3
     assert found["declared"] == 0
