@@ -99,7 +99,7 @@ class Loop:
         chain = self._chain
         estimate = chain.measure(inputs)
         thrust = chain.allocator.step(chain.controller.step(self._hold, self._hold, estimate))
-        self._commanded, _ = chain.limiter.step(thrust.force_n, estimate.ready, chain.voltage_v)
+        self._commanded, _ = chain.limiter.step(thrust.force_n, estimate.ready, chain.supply.voltage_v)
         chain.lag.command(self._commanded)
         self._world.advance(PERIOD_NS)
         self._seen += self._camera.watch(self._world)

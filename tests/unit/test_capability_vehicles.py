@@ -65,7 +65,7 @@ def test_heavy_has_its_published_dynamics() -> None:
     body = assemble_vehicle(load_vehicle("bluerov2_heavy"))
     assert np.diag(body.mass) == pytest.approx([19.86, 20.62, 32.18, 0.449, 0.365, 0.592])
     assert body.drag.linear == pytest.approx([13.7, 0.0, 33.0, 0.0, 0.8, 0.0])
-    assert body.drag.rotational == pytest.approx([1.19, 0.47, 1.5])
+    assert body.drag.rotational == pytest.approx([1.192, 0.47, 1.5])
     ahead, right, down = body.drag.nodes[0, 6, 6, 0], body.drag.nodes[2, 6, 6, 0], body.drag.nodes[4, 6, 6, 0]
     assert (ahead, right, down) == pytest.approx((141.0, 217.0, 190.0))
 
