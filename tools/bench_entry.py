@@ -22,11 +22,13 @@ class Entry:
     ratio: float | None = None
 
 
-def compare(name: str, unit: str, ours: Callable[[], float], peers: dict[str, Callable[[], float]]) -> list[Entry]:
+def compare(
+    name: str, unit: str, ours: Callable[[], float], peers: dict[str, Callable[[], float]], repetitions: int = REPETITIONS
+) -> list[Entry]:
     """Medians of alternating repetitions of functions that return a duration in `unit`; one entry per peer."""
     everyone = {"": ours, **peers}
     times: dict[str, list[float]] = {key: [] for key in everyone}
-    for _ in range(REPETITIONS):
+    for _ in range(repetitions):
         for key, function in everyone.items():
             times[key].append(function())
     value = median(times.pop(""))

@@ -7,6 +7,7 @@ holds a cube of EDGE^3 modules and prints the duration of a tick, how far it str
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 from collections import deque
@@ -126,6 +127,8 @@ class Hold:
         """The farthest that it was from its set-point."""
         self.run(SETTLE_TICKS)
         self.strayed_m = 0.0
+        gc.collect()
+        gc.freeze()  # as the vehicle's process does before its first tick
 
     def run(self, ticks: int) -> float:
         """Mean duration of pipeline.step, us. Raises RuntimeError when the body disarms, or leaves a healthy thruster out."""
