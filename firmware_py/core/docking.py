@@ -266,7 +266,7 @@ def _joint(body: Body, i: int, j: int) -> Joint:
 
 
 def tag_table(bodies: Sequence[Body]) -> TagTable:
-    """Tags of every module in its own frame: centre (3,), and module frame to tag frame (4,)."""
+    """Tags of every module in its own frame."""
     table: TagTable = {}
     for body in bodies:
         for k, tag in enumerate(body.tag_ids):
@@ -274,7 +274,7 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
             q_bm = np.ascontiguousarray(body.q_bm[i])
             r_mt = rotate_back(q_bm, body.r_bt[k] - body.r_bm[i])
             q_tm = multiply(conjugate(np.ascontiguousarray(body.q_bt[k])), q_bm)
-            table[body.modules[i], int(tag)] = (r_mt, q_tm)
+            table[body.modules[i], int(tag)] = np.concatenate([r_mt, q_tm])
     return table
 
 

@@ -123,8 +123,8 @@ class PairDetector:
         return a, b
 
 
-TagTable = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
-"""(module, tag id) -> tag centre (3,) in the module frame, and module frame to tag frame (4,)."""
+TagTable = dict[tuple[int, int], np.ndarray]
+"""(module, tag id) -> (7,) tag centre in the module frame, m, and module frame to tag frame."""
 
 
 class Sightings(NamedTuple):
@@ -135,7 +135,7 @@ class Sightings(NamedTuple):
     seen: np.ndarray
     """(s, 2) module, and time of the picture, ns."""
     poses: np.ndarray
-    """(s, 7) the module's centre and attitude in the world."""
+    """(s, 12) the module's centre in the world, and its rotation matrix row by row."""
 
 
 class ModulePoses:
@@ -161,16 +161,16 @@ class ModulePoses:
                 known = self._tags.get((i, tag.tag_id))
                 if known is not None:
                     times += i, tag.capture_ns
-                    parts += tag.p_wt, tag.q_wt, *known
+                    parts += tag.p_wt, tag.q_wt, known
         if not parts:
             return Sightings(np.zeros(len(self._modules) + 1, dtype=np.int64), *NOTHING)
         seen = np.array(times, dtype=np.int64).reshape(-1, 2)
-        found = Sightings(np.empty(len(self._modules) + 1, dtype=np.int64), seen, np.empty((len(seen), 7)))
+        found = Sightings(np.empty(len(self._modules) + 1, dtype=np.int64), seen, np.empty((len(seen), 12)))
         place_modules(np.concatenate(parts).reshape(-1, 14), *found)
         return found
 
 
-NOTHING = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 7))
+NOTHING = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 12))
 
 
 def _keys(rows: np.ndarray) -> list[tuple[int, ...]]:

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numba import njit
 
-from firmware_py.core.rotations import multiply, rotate, rotate_back
+from firmware_py.core.rotations import multiply, to_matrix
 
 NEVER_NS = -(1 << 60)
 PICTURES = 16
@@ -133,7 +133,11 @@ def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[
     """Condition 2 by the pictures of this tick; whether those known are fresh."""
     i, j = _same_picture(first, seen, row.module[0], row.module[1])
     if i >= 0:
-        ring[row.pictures % PICTURES] = rotate_back(poses[i, 3:], poses[j, :3] - poses[i, :3])
+        here = ring[row.pictures % PICTURES]
+        for axis in range(3):
+            here[axis] = 0.0
+            for k in range(3):
+                here[axis] += poses[i, 3 + 3 * k + axis] * (poses[j, k] - poses[i, k])
         row.pictures += 1
         row.picture_ns = seen[i, 1]
         if row.pictures >= PICTURES:
@@ -177,6 +181,8 @@ def place_modules(tags, first, seen, poses):  # type: ignore[no-untyped-def]
         first[module] = i
         while i < seen.shape[0] and seen[i, 0] == module:
             tag = tags[i]
-            poses[i, 3:] = multiply(tag[3:7], tag[10:14])
-            poses[i, :3] = tag[:3] - rotate(poses[i, 3:], tag[7:10])
+            turn = to_matrix(multiply(tag[3:7], tag[10:14]))
+            for k in range(3):
+                poses[i, k] = tag[k] - turn[k, 0] * tag[7] - turn[k, 1] * tag[8] - turn[k, 2] * tag[9]
+                poses[i, 3 + 3 * k : 6 + 3 * k] = turn[k]
             i += 1

@@ -19,7 +19,7 @@ P = Docking()
 TAG = 5
 LEVER, TURN = np.array([0.02, -0.01, -0.1]), from_euler(0.3, -0.2, 1.0)
 """Of every module's one tag: its place in the module, and module frame to tag frame."""
-TAGS: TagTable = {(m, TAG): (LEVER, TURN) for m in range(4)}
+TAGS: TagTable = {(m, TAG): np.r_[LEVER, TURN] for m in range(4)}
 ROW = [FacePair(m, 0, m + 1, 1, np.array([PITCH_M, 0.0, 0.0])) for m in range(3)]
 """Four modules in a row, the +x face of each against the -x face of the next."""
 
