@@ -86,7 +86,12 @@ def campaign(
     vehicle: Vehicle = "",
     sensors: Sensors = "real",
 ) -> None:
-    """Fly many seeds of a scenario; prints a table and leaves every trial. Interrupted and started again, it goes on."""
+    """Fly many seeds of a scenario; prints a table and leaves every trial. Interrupted and started again, it goes on.
+
+    `faults`: everything that can break, in every mode.
+    """
+    if scenario == "faults":
+        raise typer.Exit(_fly_faults(jobs, seed, out))
     from hil.campaign import dask_cluster, processes, run_campaign
     from hil.console import campaign_progress, print_campaign
 
@@ -98,6 +103,20 @@ def campaign(
         summary = run_campaign(chosen, parameters, seeds, pool, folder, progress)
     print_campaign(summary)
     raise typer.Exit(0 if summary["succeeded"] == summary["trials"] else FAILED)
+
+
+def _fly_faults(jobs: int, seed: int, out: Path | None) -> int:
+    """The matrix of faults; returns the exit status."""
+    from hil.console import campaign_progress
+    from hil.fault_campaign import run_fault_campaign
+    from hil.fault_matrix import print_faults
+    from hil.fault_table import ROWS
+    from hil.scenario import MODES
+
+    with campaign_progress("every fault in every mode", len(ROWS) * len(MODES)) as progress:
+        cells = run_fault_campaign(jobs, out if out is not None else Path("runs") / "faults-campaign", seed, progress=progress)
+    print_faults(cells)
+    return FAILED if any(cell.broken for cell in cells) else 0
 
 
 @app.command()

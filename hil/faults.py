@@ -22,6 +22,11 @@ from hil.plant.fault_spec import ALL, DIRECTIONS, FRAME_KINDS, THRUSTER_KINDS, F
 
 LOWEST_BABBLE_ID = 0x040
 """A babbling node takes no id of ESTOP or SYNC: those are faults of another kind."""
+ESTOP, SYNC = Frame(0x01E, b""), Frame(0x020, bytes(4))
+"""Of the e-stop box, and of somebody else who means to lead the bus."""
+ESTOP_PERIOD_NS = 50_000_000
+
+
 class Wire:
     """What happens to the frames of one direction of one link."""
 
@@ -84,6 +89,7 @@ class Faults:
         axis = self._tags.standard_normal(3)
         self._bias_axis = axis / np.linalg.norm(axis)
         self._began: dict[Fault, Callable[[], None]] = {}
+        self._estop_due_ns = 0
         for camera in nodes.cameras:
             camera.change = self._change_tag
 
@@ -118,8 +124,20 @@ class Faults:
         return self._to_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
 
     def outgoing(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
-        """Frames from the plant, as they leave."""
-        return self._from_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
+        """Frames from the plant, as they leave, and those of nodes that should not be there."""
+        others = self._others(time_ns) if self._on else []
+        return self._from_plant.pass_on([*frames, *others], [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
+
+    def _others(self, time_ns: int) -> list[Frame]:
+        """What an e-stop box or another SYNC producer sends, and what the nodes answer to it."""
+        frames = []
+        for kind in {f.kind for f in self._on}:
+            if kind == "foreign_sync":
+                frames.append(SYNC)
+            elif kind == "estop" and time_ns >= self._estop_due_ns:
+                self._estop_due_ns = time_ns + ESTOP_PERIOD_NS
+                frames.append(ESTOP)
+        return frames + [answer for frame in frames for answer in self._nodes.take(frame, time_ns)]
 
     # ------------------------------------------------------------ in the plant
 

@@ -47,7 +47,8 @@ class ModeScript:
         asked = [] if self._begun else self._begin()
         self._begun = True
         if tick % max(1, round(STREAM_EVERY_S * rate)) == 0:
-            asked += self._stream(1e-9 * (time_ns - self.begin_ns))
+            asked += self._stream(1e-9 * (time_ns - self.begin_ns)) if time_ns < self._task.pilot_until_s * 1e9 else []
+            asked += [Request(Action.GROUND_ALIVE)] if time_ns < self._task.ground_until_s * 1e9 else []
         return asked
 
     def is_over(self, time_ns: int) -> bool:

@@ -97,6 +97,8 @@ class Task:
         "mode: stays in `mode`",
     )
     mode: str = quantity("POSHOLD", choices=MODES, help="mode: which one")
+    pilot_until_s: float = quantity(1e6, unit="s", low=0, high=1e6, help="mode: sticks and set-points stream so long")
+    ground_until_s: float = quantity(0.0, unit="s", low=0, high=1e6, help="mode: a ground station is heard so long; 0: never")
     settle_s: float = quantity(15.0, unit="s", low=0, high=600, help="held at the start before the task begins")
     duration_s: float = quantity(unit="s", low=0.1, high=7200, help="of the task itself, rest to rest")
     radius_m: float = quantity(0.30, unit="m", low=0.01, high=100, help="spiral: radius; moebius: of the centre circle")

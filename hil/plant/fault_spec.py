@@ -9,7 +9,8 @@ from firmware_py.description.schema import quantity
 THRUSTER_KINDS = ("thruster_dead", "thruster_weak", "thruster_reversed", "thruster_stuck", "thruster_fake_rpm")
 FRAME_KINDS = ("frame_loss", "frame_delay", "frame_duplicate", "frame_corrupt", "babble")
 OTHER_KINDS = (
-    "imu_frozen", "tag_flip", "tag_jump", "tag_absent", "camera_bias", "battery_sag", "leak", "magnet", "jets", "process_killed",
+    "estop", "foreign_sync", "imu_frozen", "tag_flip", "tag_jump", "tag_absent", "camera_bias", "battery_sag", "leak", "magnet", "jets",
+    "process_killed",
 )  # fmt: skip
 ALL = -1
 """Index of a fault that means every thruster, or every face."""

@@ -1,0 +1,135 @@
+"""`modcube hil campaign faults`: every fault in every mode; what happened beside what is promised."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from firmware_py.core.transitions import ARMED, State
+from firmware_py.core.types import Mode
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
+from hil.bench import fly_scenario
+from hil.fault_table import AT_S, NUMBER, PLACED, ROWS, Row
+from hil.metrics import rotation_vectors
+from hil.scenario import MODES, Scenario, load_scenario
+from hil.signals import Flight, read_flight
+
+SCENARIO = "faults"
+RESULT_FILE = "faults.json"
+BEFORE_S = 0.015
+"""The tick before the fault is looked at too, so that what changes at once is seen to change."""
+BLAMED = re.compile(r"thruster (\d+) ")
+"""Words with which a thruster is left out."""
+
+
+class Cell(NamedTuple):
+    """One fault in one mode."""
+
+    fault: str
+    mode: str
+    happened: str
+    """In words."""
+    broken: tuple[str, ...]
+    """Promises that were not kept; empty: all were."""
+
+
+def scenario_of(row: Row, mode: str) -> Scenario:
+    """The flight of one cell."""
+    base = load_scenario(SCENARIO)
+    task = dataclasses.replace(base.task, mode=mode, **row.task)
+    return dataclasses.replace(base, task=task, fault=(row.fault,) if row.fault is not None else ())
+
+
+def fly_cell(row: Row, mode: str, seed: int, parameters: Parameters | None = None) -> Cell:
+    """Flies one cell and judges it by its logs."""
+    scenario = scenario_of(row, mode)
+    with tempfile.TemporaryDirectory() as folder:
+        fly_scenario(scenario, seed, parameters or Parameters(), Path(folder), f"virtual:{row.name}-{mode}-{seed}")
+        flight = read_flight(Path(folder))
+    return judge(row, mode, flight, load_vehicle(scenario.module[0].vehicle))
+
+
+def judge(row: Row, mode: str, flight: Flight, vehicle: Any) -> Cell:
+    """What happened after the fault, and which promises it broke."""
+    after = flight.between(round((AT_S - BEFORE_S) * 1e9), 1 << 62)
+    time_s = after.firmware["time_ns"] * 1e-9 - AT_S
+    names = [_name(int(state), int(now)) for state, now in zip(after.firmware["state"], after.firmware["mode"], strict=True)]
+    wanted = row.ends.get(mode, mode)
+    changes = [i for i in range(1, len(names)) if names[i] != names[i - 1]]
+    reached_s = float(time_s[changes[-1]]) if changes else 0.0
+    told = [str(t) for t, at in zip(flight.events["text"], flight.events["log_time"], strict=True) if at >= round(AT_S * 1e9)]
+    error_m, angle_deg = errors(after, names)
+    commanded = after.firmware["commanded_n"]
+    still = np.array([name in ("DISARMED", "ESTOP") for name in names])
+    blamed = {found[1] for text in told for found in BLAMED.finditer(text)} - {NUMBER.split()[1]}
+    broken = {
+        f"ended in {names[-1]}, not {wanted}": names[-1] != wanted,
+        f"took {reached_s:.2f} s": wanted != mode and reached_s > row.within_s,
+        f"{error_m * 1e3:.0f} mm off": error_m > row.error_m,
+        f"{angle_deg:.0f} deg off": angle_deg > row.angle_deg,
+        f"did not say {row.says!r}": bool(row.says) and mode in row.says_in and not any(row.says in text for text in told),
+        f"blamed thruster {', '.join(sorted(blamed))}": bool(blamed) or (not row.name.startswith("thruster") and _blames(told)),
+        "a command was no number": not np.isfinite(commanded).all(),
+        "a command was beyond its limits": bool((commanded > vehicle.force_max_n).any() or (commanded < vehicle.force_min_n).any()),
+        "a thruster turned while stopped": bool(commanded[still].any()),
+    }
+    happened = f"{wanted if names[-1] == wanted else names[-1]} {reached_s:.2f} s" if changes else "as before"
+    happened += f", {error_m * 1e3:.0f} mm" if np.isfinite(error_m) else ""
+    return Cell(row.name, mode, happened, tuple(words for words, is_so in broken.items() if is_so))
+
+
+def errors(flight: Flight, names: Sequence[str]) -> tuple[float, float]:
+    """Largest distance from the set-point, m, and angle, deg, in modes with a place; NaN without one.
+
+    After a mode without a place the body has SETTLE_TICKS to come to rest, and without tags nobody knows the place.
+    """
+    placed, ticks = np.array([name in PLACED for name in names]), np.arange(len(names))
+    lost = np.maximum.accumulate(np.where(placed, -SETTLE_TICKS, ticks))
+    held = (ticks - lost >= SETTLE_TICKS) & (flight.firmware["tag_age_ns"] < KNOWN_NS)
+    if not held.any():
+        return float("nan"), float("nan")
+    off = np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
+    turn = np.linalg.norm(rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"]), axis=1)
+    return float(off[held].max()), float(np.degrees(turn[held].max()))
+
+
+SETTLE_TICKS = 300
+"""After a mode without a place: the body comes to rest."""
+KNOWN_NS = 1_000_000_000
+"""Age of the last tag until which a place is known."""
+
+
+def _name(state: int, mode: int) -> str:
+    return Mode(mode).name if state in ARMED else State(state).name
+
+
+def _blames(told: Sequence[str]) -> bool:
+    return any("left out" in text for text in told)
+
+
+def run_fault_campaign(
+    jobs: int, out: Path, seed: int = 0, executor: Executor | None = None, progress: Callable[[int, int], None] | None = None
+) -> list[Cell]:
+    """Flies every cell and writes faults.json into `out`; returns the cells, row by row. `executor` replaces the processes."""
+    out.mkdir(parents=True, exist_ok=True)
+    cells: list[Cell] = []
+    with executor or ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        futures = [pool.submit(fly_cell, row, mode, seed) for row in ROWS for mode in MODES]
+        for future in futures:
+            cells.append(future.result())
+            if progress is not None:
+                progress(len(cells), len(futures))
+    promises = {row.name: row.promise for row in ROWS}
+    entries = [{**cell._asdict(), "promise": promises[cell.fault], "passed": not cell.broken} for cell in cells]
+    (out / RESULT_FILE).write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
+    return cells

@@ -1,0 +1,32 @@
+"""How the matrix of `modcube hil campaign faults` looks in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from hil.fault_campaign import Cell
+from hil.fault_table import ROWS
+
+
+def print_faults(cells: Sequence[Cell], console: Console | None = None) -> None:
+    """The matrix of faults and modes: what happened, and what was promised; then every promise that was broken."""
+    console = console or Console()
+    modes = list(dict.fromkeys(cell.mode for cell in cells))
+    promises = {row.name: row.promise for row in ROWS}
+    table = Table(title="faults: what happened in each mode", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in ("fault", "promised", *modes):
+        table.add_column(column)
+    for name in dict.fromkeys(cell.fault for cell in cells):
+        row = [Text(cell.happened, style="bold red" if cell.broken else "green") for cell in cells if cell.fault == name]
+        table.add_row(name, promises[name], *row)
+    console.print(table)
+    broken = [cell for cell in cells if cell.broken]
+    for cell in broken:
+        console.print(f"FAILED: {cell.fault}, {cell.mode}: {'; '.join(cell.broken)}", style="bold red", highlight=False, soft_wrap=True)
+    verdict = f"{len(cells) - len(broken)} of {len(cells)} cells kept their promise"
+    console.print(verdict, style="bold red" if broken else "green", highlight=False)

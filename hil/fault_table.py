@@ -1,0 +1,123 @@
+"""What is broken in `modcube hil campaign faults`, and what the robot then promises in each mode: one row per fault.
+
+The promises are those of the fail-safe table (docs/supervisor.md) with its default parameters, and figures of our own where it has none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from hil.plant.fault_spec import Fault
+from hil.scenario import MODES
+
+AT_S = 8.0
+"""When it breaks."""
+THRUSTER = 5
+"""The one that breaks; MOTOR_DETECT turns it after that."""
+PILOTED = ("MANUAL", "STABILIZE", "ALT_HOLD")
+PLACED = ("POSHOLD", "AUTO", "GUIDED")
+"""Modes in which the place is held or followed."""
+NUMBER = f"thruster {THRUSTER + 1}"
+
+
+def _all_but(*modes: str) -> tuple[str, ...]:
+    return tuple(mode for mode in MODES if mode not in modes)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fault and its promise."""
+
+    name: str
+    promise: str
+    """In words."""
+    fault: Fault | None = None
+    ends: Mapping[str, str] = field(default_factory=dict)
+    """Where it ends, by mode: a mode, DISARMED or ESTOP; the mode itself where it is not named."""
+    within_s: float = math.inf
+    """At most so long after the fault it is there."""
+    error_m: float = math.inf
+    """Largest distance from the set-point in modes with a place, while the place is known."""
+    angle_deg: float = math.inf
+    """Largest angle off the wanted attitude in modes with a place."""
+    says: str = ""
+    """What must be said ..."""
+    says_in: tuple[str, ...] = MODES
+    """... in these modes."""
+    task: Mapping[str, Any] = field(default_factory=dict)
+    """What else about the task changes: who falls silent."""
+
+
+def _fault(kind: str, value: float = 0.0, **more: float | str) -> Fault:
+    return Fault(kind=kind, at_s=AT_S, value=value, **more)  # type: ignore[arg-type]
+
+
+def _to(mode: str, *modes: str) -> dict[str, str]:
+    return dict.fromkeys(modes, mode)
+
+
+ROWS = (
+    Row(
+        "thruster dead", "left out; 60 mm, 15 deg", _fault("thruster_dead", index=THRUSTER),
+        error_m=0.060, angle_deg=15.0, says=f"{NUMBER} stands still",
+    ),
+    Row("thruster at half force", "flown with; 60 mm, 15 deg", _fault("thruster_weak", 0.5, index=THRUSTER), error_m=0.060, angle_deg=15.0),
+    Row(
+        "thruster reversed", "left out; 60 mm, 15 deg", _fault("thruster_reversed", index=THRUSTER),
+        error_m=0.060, angle_deg=15.0, says=f"{NUMBER} does not",
+    ),
+    Row(
+        "thruster stuck at half", "left out; 100 mm, 20 deg", _fault("thruster_stuck", 0.5, index=THRUSTER),
+        error_m=0.100, angle_deg=20.0, says=f"{NUMBER} does not obey", says_in=_all_but("MANUAL"),
+    ),
+    Row(
+        "thruster fakes its rpm", "left out; 60 mm, 15 deg", _fault("thruster_fake_rpm", 0.0, index=THRUSTER),
+        error_m=0.060, angle_deg=15.0, says=f"{NUMBER} does not push as it says", says_in=_all_but("MANUAL", "MOTOR_DETECT"),
+    ),
+    Row("30 % of the frames lost", "as before; 30 mm", _fault("frame_loss", 0.3), error_m=0.030),
+    Row("frames 20 ms late", "as before; 30 mm", _fault("frame_delay", 20.0), error_m=0.030),
+    Row("30 % of the frames twice", "as before; 20 mm", _fault("frame_duplicate", 0.3), error_m=0.020),
+    Row("10 % of the frames corrupt", "as before; 30 mm", _fault("frame_corrupt", 0.1), error_m=0.030),
+    Row("node babbles", "as before; 20 mm", _fault("babble", 5.0), error_m=0.020),
+    Row(
+        "all frames lost", "MCU stops; disarms after 2 s", _fault("frame_loss", 1.0), ends=_to("DISARMED", *MODES), within_s=2.2,
+        says="bus silent for",
+    ),
+    Row(
+        "another SYNC producer", "surfaces", _fault("foreign_sync"), ends=_to("SURFACE", *MODES), within_s=0.1,
+        says="somebody else sends SYNC",
+    ),
+    Row("e-stop on the bus", "stops, latched", _fault("estop", until_s=AT_S + 1.0), ends=_to("ESTOP", *MODES), within_s=0.02),
+    Row(
+        "IMU frozen", "holds the place; 30 mm", _fault("imu_frozen"), ends=_to("POSHOLD", *_all_but("SURFACE")), within_s=1.0,
+        error_m=0.030, says="no IMU for",
+    ),
+    Row("half of the tags flipped", "as before; 20 mm", _fault("tag_flip", 0.5), error_m=0.020),
+    Row("tags jump by 100 mm", "follows the tags; 130 mm", _fault("tag_jump", 0.1), error_m=0.130),
+    Row(
+        "tags absent", "holds after 1 s, depth after 8 s", _fault("tag_absent"), ends=_to("ALT_HOLD", *PLACED), within_s=8.1,
+        says="no tag for", says_in=PLACED,
+    ),
+    Row("camera off by 5 mm", "as before; 20 mm", _fault("camera_bias", 0.005), error_m=0.020),
+    Row("battery low", "warns; 30 mm", _fault("battery_sag", 1.8), error_m=0.030, says="battery low"),
+    Row(
+        "battery critical", "surfaces after 5 s", _fault("battery_sag", 3.0), ends=_to("SURFACE", *MODES), within_s=6.5, error_m=0.100,
+        says="battery critical",
+    ),
+    Row("leak", "surfaces after 0.5 s", _fault("leak"), ends=_to("SURFACE", *MODES), within_s=0.8, error_m=0.100, says="water in a cabin"),
+    Row(
+        "firmware killed for 0.5 s", "comes back disarmed", _fault("process_killed", until_s=AT_S + 0.5), ends=_to("DISARMED", *MODES),
+        within_s=0.52,
+    ),
+    Row(
+        "pilot silent", "holds the place after 1 s", ends=_to("POSHOLD", *PILOTED), within_s=1.2, error_m=0.030,
+        says="pilot silent", says_in=PILOTED, task={"pilot_until_s": AT_S},
+    ),
+    Row(
+        "ground station silent", "holds the place after 5 s", ends=_to("POSHOLD", *_all_but("AUTO", "SURFACE")), within_s=5.2,
+        error_m=0.030, says="ground station silent", says_in=_all_but("AUTO", "SURFACE"), task={"ground_until_s": AT_S},
+    ),
+)  # fmt: skip

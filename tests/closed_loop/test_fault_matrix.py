@@ -1,0 +1,70 @@
+"""Every fault in one mode, and the judge of the matrix on flights that broke their promise. All modes: `modcube hil campaign faults`."""
+
+import dataclasses
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+import hil.fault_campaign
+from firmware_py.description.parameters import Parameters
+from hil.fault_campaign import Cell, fly_cell, run_fault_campaign
+from hil.fault_matrix import print_faults
+from hil.fault_table import ROWS, Row
+from hil.plant.fault_spec import FRAME_KINDS, OTHER_KINDS, THRUSTER_KINDS
+from hil.scenario import MODES
+
+BY_NAME = {row.name: row for row in ROWS}
+ELSEWHERE = {"magnet", "jets"}
+"""Faults of docking bodies."""
+
+
+def test_table_breaks_everything_that_can_break() -> None:
+    assert {row.fault.kind for row in ROWS if row.fault} == {*THRUSTER_KINDS, *FRAME_KINDS, *OTHER_KINDS} - ELSEWHERE
+    assert len({row.name for row in ROWS}) == len(ROWS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+def test_robot_that_holds_its_place_keeps_its_promise(row: Row) -> None:
+    assert fly_cell(row, "POSHOLD", 0).broken == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "POSHOLD"])
+def test_leak_brings_the_robot_up_from_every_mode(mode: str) -> None:
+    cell = fly_cell(BY_NAME["leak"], mode, 0)
+    assert cell.broken == ()
+    assert cell.happened.startswith("as before" if mode == "SURFACE" else "SURFACE 0.6")
+
+
+def test_fail_safe_that_was_switched_off_breaks_the_promise() -> None:
+    deaf = Parameters().replace("failsafes.leak_action", 0)
+    assert fly_cell(BY_NAME["leak"], "POSHOLD", 0, deaf).broken == (
+        "ended in POSHOLD, not SURFACE", "did not say 'water in a cabin'",
+    )  # fmt: skip
+
+
+def test_promise_of_less_error_than_there_is_is_broken() -> None:
+    strict = dataclasses.replace(BY_NAME["pilot silent"], error_m=1e-4)
+    (words,) = fly_cell(strict, "POSHOLD", 0).broken
+    assert words.endswith("mm off")
+
+
+def test_campaign_writes_every_cell_with_its_promise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hil.fault_campaign, "fly_cell", lambda row, mode, seed: Cell(row.name, mode, "as before", ()))
+    cells = run_fault_campaign(1, tmp_path, executor=ThreadPoolExecutor(1))
+    entries = json.loads((tmp_path / "faults.json").read_text())
+    assert len(cells) == len(entries) == len(ROWS) * len(MODES)
+    assert entries[0] == {
+        "fault": "thruster dead", "mode": "MANUAL", "happened": "as before", "broken": [], "promise": "left out; 60 mm, 15 deg",
+        "passed": True,
+    }  # fmt: skip
+
+
+def test_matrix_names_what_was_broken(capsys: pytest.CaptureFixture[str]) -> None:
+    print_faults([Cell("leak", "AUTO", "as before", ()), Cell("leak", "POSHOLD", "AUTO 1.00 s", ("ended in AUTO, not SURFACE",))])
+    said = capsys.readouterr().out
+    assert "FAILED: leak, POSHOLD: ended in AUTO, not SURFACE" in said
+    assert "1 of 2 cells kept their promise" in said
