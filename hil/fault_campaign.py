@@ -67,23 +67,26 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Any) -> Cell:
     wanted = row.ends.get(mode, mode)
     changes = [i for i in range(1, len(names)) if names[i] != names[i - 1]]
     reached_s = float(time_s[changes[-1]]) if changes else 0.0
-    told = [str(t) for t, at in zip(flight.events["text"], flight.events["log_time"], strict=True) if at >= round(AT_S * 1e9)]
+    events = zip(flight.events["text"], flight.events["log_time"] * 1e-9 - AT_S, strict=True)
+    told = [(str(text), float(at_s)) for text, at_s in events if at_s >= 0.0]
+    said_s = [at_s for text, at_s in told if row.says and row.says in text]
     error_m, angle_deg = errors(after, names)
     commanded = after.firmware["commanded_n"]
     still = np.array([name in ("DISARMED", "ESTOP") for name in names])
-    blamed = {found[1] for text in told for found in BLAMED.finditer(text)} - {NUMBER.split()[1]}
+    blamed = {found[1] for text, _ in told for found in BLAMED.finditer(text)} - {NUMBER.split()[1]}
     broken = {
         f"ended in {names[-1]}, not {wanted}": names[-1] != wanted,
         f"took {reached_s:.2f} s": wanted != mode and reached_s > row.within_s,
         f"{error_m * 1e3:.0f} mm off": error_m > row.error_m,
         f"{angle_deg:.0f} deg off": angle_deg > row.angle_deg,
-        f"did not say {row.says!r}": bool(row.says) and mode in row.says_in and not any(row.says in text for text in told),
+        f"did not say {row.says!r}": bool(row.says) and mode in row.says_in and not said_s,
         f"blamed thruster {', '.join(sorted(blamed))}": bool(blamed) or (not row.name.startswith("thruster") and _blames(told)),
         "a command was no number": not np.isfinite(commanded).all(),
         "a command was beyond its limits": bool((commanded > vehicle.force_max_n).any() or (commanded < vehicle.force_min_n).any()),
         "a thruster turned while stopped": bool(commanded[still].any()),
     }
     happened = f"{wanted if names[-1] == wanted else names[-1]} {reached_s:.2f} s" if changes else "as before"
+    happened += f", said {said_s[0]:.1f} s" if said_s and not changes else ""
     happened += f", {error_m * 1e3:.0f} mm" if np.isfinite(error_m) else ""
     return Cell(row.name, mode, happened, tuple(words for words, is_so in broken.items() if is_so))
 
@@ -113,8 +116,8 @@ def _name(state: int, mode: int) -> str:
     return Mode(mode).name if state in ARMED else State(state).name
 
 
-def _blames(told: Sequence[str]) -> bool:
-    return any("left out" in text for text in told)
+def _blames(told: Sequence[tuple[str, float]]) -> bool:
+    return any("left out" in text for text, _ in told)
 
 
 def run_fault_campaign(
