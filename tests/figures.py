@@ -1,4 +1,4 @@
-"""Figures that tests measure: a line each, which `make test-vcan` shows and tools/accept_measures.py reads."""
+"""Figures that tests measure: a line each, which `pytest -s` shows and tools/accept_measures.py reads."""
 
 
 def figure(name: str, value: float, unit: str = "") -> None:

@@ -27,7 +27,7 @@ PASSES, CHUNK = 10_000, 250
 LOGS = ("can.log", "signals.mcap", "truth.mcap")
 
 FIGURE = re.compile(r"^figure: (?P<name>.+) = (?P<value>\S+)", re.MULTILINE)
-"""A line of tests/vcan/figures.py."""
+"""A line of tests/figures.py."""
 
 Values = Mapping[str, float]
 

@@ -19,8 +19,8 @@ from firmware_py.bus.port import open_port
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Inputs, Outputs
 from hil.scenario import Scenario, load_scenario
+from tests.figures import figure
 from tests.vcan.can_utils import LoggedFrame, candump, cangen_flood, canplayer, cansend
-from tests.vcan.figures import figure
 from tests.vcan.flight_bench import FULL, bench_on, between, frame_of, record, sent, short
 from tests.vcan.link_events import BadDay
 from tests.vcan.links import Interface

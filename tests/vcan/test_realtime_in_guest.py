@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from hil.flight import judge_logs
-from tests.vcan.figures import figure
+from tests.figures import figure
 from tests.vcan.flight_bench import FULL
 from tests.vcan.guest import ROOT, Guest
 from tests.vcan.realtime_program import Plan, hover
