@@ -45,7 +45,8 @@ def kill(received, sent, inputs, outputs):
 
 with ExitStack() as stack:
     bench = open_bench(stack, load_scenario("hover"), 0, Parameters(), "virtual:killed")
-    recorder = Recorder(Path(sys.argv[1]), configuration_of(bench.firmware), queued=True)
+    # written at once: in lockstep a second of flight passes before a writer of its own has had a turn
+    recorder = Recorder(Path(sys.argv[1]), configuration_of(bench.firmware))
     bench.fly([recording(recorder, 100), kill])
 """
 
