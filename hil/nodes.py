@@ -64,6 +64,16 @@ class Mcu:
         self._motion: tuple[list[float], list[float]] | None = None
         self._counters = dict.fromkeys(SLOW, 0)
 
+    @property
+    def applied(self) -> tuple[float, ...]:
+        """Shares of full command that the thrusters have now."""
+        return tuple(self._applied)
+
+    @property
+    def accepted_ns(self) -> tuple[int | None, ...]:
+        """When each half of THRUSTER_CMD was last accepted, on the plant's clock."""
+        return tuple(self._accepted_ns)
+
     def heard(self, received: Received, time_ns: int) -> None:
         """A checked frame for this module."""
         name, values = received.message.name, received.values

@@ -310,3 +310,19 @@ def disturbance_doubt(vehicle: str, current_walk: float) -> float:
 def test_robot_of_much_drag_doubts_the_current_and_the_module_does_not() -> None:
     assert disturbance_doubt("bluerov2_heavy", 0.02) > 2.0 * disturbance_doubt("bluerov2_heavy", 0.0)
     assert disturbance_doubt("modcube", 0.02) == disturbance_doubt("modcube", 0.0)
+
+
+@pytest.mark.parametrize("spoil", ["state", "covariance", "negative variance"])
+def test_estimate_that_is_no_number_any_longer_is_given_up_and_found_again(body: Body, spoil: str) -> None:
+    """Whatever sensors had to say for that: a NaN in the filter would stay there for ever."""
+    robot = Robot(body)
+    robot.rest(200)
+    if spoil == "state":
+        robot.estimator._x[7] = math.nan
+    else:
+        robot.estimator._covariance[:3, :3] = np.eye(3) * (math.nan if spoil == "covariance" else -1e3)
+    lost = robot.step(sensors())
+    assert not lost.ready
+    assert all(np.isfinite(part).all() for part in lost[:7])
+    assert robot.rest(200).ready
+    assert_rests(robot.rest(100), tolerance_m=2e-3)

@@ -1,0 +1,133 @@
+"""Frames that nobody should send, fed to a robot in flight: bits turned, lengths wrong, ids unknown, old frames again, and whole lies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from firmware_py.app.firmware import compose
+from firmware_py.bus.codec import Codec, Frame, MessageCodec, Receiver
+from firmware_py.core.transitions import ARMED
+from firmware_py.core.types import Action, Mode, Outputs, Request
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import Vehicle
+from hil.bench import fleet_of
+from hil.nodes import make_nodes
+from hil.plant.draw import stream
+from hil.scenario import MODES, load_scenario, make_world
+
+STOPPING = 0.0002
+"""Share of the frames with ids of ESTOP and SYNC: they stop the robot, so they are few."""
+LOWEST_OTHER_ID = 0x040
+ARM_EVERY, CLEAR_EVERY = 20, 30
+"""Ticks: somebody takes another mode, arms it by force and clears the e-stop again and again."""
+
+
+class Fuzzer:
+    """Makes frames of all kinds; seeded."""
+
+    def __init__(self, codec: Codec, seed: int) -> None:
+        self._rng = stream(seed, "fuzz")
+        self._messages = [message for message in codec.messages if message.function << 5 >= LOWEST_OTHER_ID]
+        self._stopping = [message for message in codec.messages if message.function << 5 < LOWEST_OTHER_ID]
+        self._old: list[Frame] = [Frame(0x101, bytes(8))]
+        self._kinds = (self._noise, self._turned, self._cut, self._again, self._lie)
+
+    def frames(self, count: int, real: Sequence[Frame]) -> list[Frame]:
+        """So many frames; `real` are those of this tick, to be spoilt now and repeated later."""
+        self._old = [*self._old[-200:], *real]
+        return [self._one() for _ in range(count)]
+
+    def _one(self) -> Frame:
+        if self._rng.random() < STOPPING:
+            return self._random_of(self._stopping[int(self._rng.integers(len(self._stopping)))])
+        return self._kinds[int(self._rng.integers(len(self._kinds)))]()
+
+    def _noise(self) -> Frame:
+        return Frame(int(self._rng.integers(LOWEST_OTHER_ID, 0x800)), self._rng.bytes(int(self._rng.integers(0, 9))))
+
+    def _turned(self) -> Frame:
+        frame = self._again()
+        if not frame.data:
+            return frame
+        data = bytearray(frame.data)
+        data[int(self._rng.integers(len(data)))] ^= 1 << int(self._rng.integers(8))
+        return Frame(frame.id, bytes(data))
+
+    def _cut(self) -> Frame:
+        frame = self._again()
+        length = int(self._rng.integers(0, 9))
+        return Frame(frame.id, (frame.data + self._rng.bytes(8))[:length])
+
+    def _again(self) -> Frame:
+        return self._old[int(self._rng.integers(len(self._old)))]
+
+    def _lie(self) -> Frame:
+        """Whole in every check, and nothing in it is true."""
+        return self._random_of(self._messages[int(self._rng.integers(len(self._messages)))])
+
+    def _random_of(self, message: MessageCodec) -> Frame:
+        number = 1 if 1 in message.numbers and self._rng.random() < 0.8 else int(self._rng.choice(sorted(message.numbers)))
+        raws = [int(self._rng.integers(low, high, endpoint=True)) for low, high in (f.raw_range for f in message.field_details)]
+        return message.encode_raw(number, raws, int(self._rng.integers(16)))
+
+
+@dataclass(slots=True)
+class Fuzzed:
+    """What came of it."""
+
+    frames: int = 0
+    """Fuzzed and real ones, all that the firmware took."""
+    accepted: int = 0
+    """By a receiver that listens in; `frames` less all that the firmware dropped."""
+    dropped: dict[str, int] = field(default_factory=dict)
+    """By kind."""
+    beyond: int = 0
+    """Commands that were no number or beyond their limits."""
+    armed_ticks: int = 0
+    ticks: int = 0
+
+
+def fuzz_flight(frames: int, seed: int = 0, a_tick: int = 100) -> Fuzzed:
+    """Flies a hover into which so many fuzzed frames come, `a_tick` in every tick. What the firmware raises comes through."""
+    scenario = load_scenario("hover")
+    fleet = fleet_of(scenario, "virtual:fuzz", 100)
+    codec = Codec.load()
+    firmware = compose(fleet, Parameters())
+    world = make_world(scenario, seed, fleet.period_ns)
+    nodes = make_nodes(world, codec, {1: 0}, scenario)
+    fuzzer, result, listener = Fuzzer(codec, seed), Fuzzed(), Receiver(codec)
+    halves = {codec.message(name).id_of(1): codec.message(name) for name in ("THRUSTER_CMD_A", "THRUSTER_CMD_B")}
+    sent: list[Frame] = []
+    while result.frames < frames:
+        result.ticks += 1
+        tick, time_ns = result.ticks, result.ticks * fleet.period_ns
+        sync = [frame for _, frame in firmware.sync(tick, time_ns)]
+        real = nodes.step([*sent, *sync])
+        taken = [*real, *fuzzer.frames(a_tick, real)]
+        _, outputs, out = firmware.step(tick, time_ns, [(0, frame) for frame in taken], _asked(tick))
+        sent = [frame for _, frame in out]
+        result.frames += len(taken)
+        result.accepted += sum(listener.accept(frame) is not None for frame in taken)
+        result.beyond += _beyond(outputs, sent, halves, world.vehicles[0])
+        result.armed_ticks += outputs.records[0].state in ARMED
+    result.dropped = firmware.collector.dropped
+    return result
+
+
+def _asked(tick: int) -> list[Request]:
+    asked = [Request(Action.CLEAR_ESTOP)] if tick % CLEAR_EVERY == 0 else []
+    if tick % ARM_EVERY == 0:
+        asked += [Request(Action.SET_MODE, 0, Mode[MODES[tick // ARM_EVERY % len(MODES)]]), Request(Action.ARM, 0, True)]
+    return asked
+
+
+def _beyond(outputs: Outputs, sent: Sequence[Frame], halves: dict[int, MessageCodec], vehicle: Vehicle) -> int:
+    """Commands of one tick that should not be: forces, shares and frames."""
+    force, command = outputs.records[0].commanded_n, outputs.modules[0].thrusters
+    wrong = int(np.sum(~np.isfinite(force) | (force > vehicle.force_max_n) | (force < vehicle.force_min_n)))
+    wrong += int(np.sum(~np.isfinite(command) | (np.abs(command) > 1.0)))
+    shares = [value for frame in sent if frame.id in halves for value in halves[frame.id].decode(frame.data)[:4]]
+    return wrong + sum(not -1.0 <= share <= 1.0 for share in shares) + (len(shares) != 8)

@@ -1,0 +1,218 @@
+"""Flights in which something breaks, and their figures: thrusters that die or lie, tags that stay away, frames that are lost, e-stops.
+
+Used by the tests and, over all seeds, by `make accept`. Every figure comes from the logs, or from the frames themselves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.bus.codec import Codec
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.types import Action, Inputs, Mode, Outputs, Request, Sticks
+from firmware_py.description.parameters import Parameters
+from hil.bench import fly_scenario, open_bench
+from hil.fault_table import ROWS
+from hil.metrics import rotation_vectors
+from hil.plant.draw import stream
+from hil.plant.fault_spec import Fault
+from hil.scenario import MODES, Scenario, load_scenario
+from hil.signals import Flight, read_flight
+
+BREAKS_AFTER_S = 10.0
+"""Into the spiral."""
+COMMANDED_N = 0.3
+"""A thruster is watched from the moment it is first commanded more."""
+LEFT_OUT = re.compile(r"thruster (\d+) .*: left out")
+
+
+def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None) -> Flight:
+    """The flight of a scenario, its logs thrown away."""
+    with tempfile.TemporaryDirectory() as folder:
+        fly_scenario(scenario, seed, parameters or Parameters(), Path(folder), f"virtual:{Path(folder).name}")
+        return read_flight(Path(folder))
+
+
+def timed(name: str, settle_s: float, duration_s: float, *faults: Fault) -> Scenario:
+    """A scenario with other times, in which something breaks."""
+    scenario = load_scenario(name)
+    task = dataclasses.replace(scenario.task, settle_s=settle_s, duration_s=duration_s)
+    return dataclasses.replace(scenario, task=task, fault=faults)
+
+
+# ---------------------------------------------------------------- thrusters
+
+
+class ThrusterFlight(NamedTuple):
+    """A spiral in which thrusters broke."""
+
+    rmse_m: float
+    """Truth against reference, from the spiral's start to its end or to the mode that a fail-safe took."""
+    peak_m: float
+    angle_peak_deg: float
+    found_s: tuple[float, ...]
+    """Of each broken thruster: from its first command of COMMANDED_N after it broke until it was left out; infinite: never."""
+    blamed: tuple[int, ...]
+    """Healthy ones that were left out."""
+    ends_in: str
+
+
+def spiral_with(broken: Sequence[int], kind: str = "thruster_dead", value: float = 0.0, seed: int = 0) -> ThrusterFlight:
+    """Flies the spiral; `broken` thrusters break at once in the middle of it."""
+    base = load_scenario("spiral")
+    at_s = base.task.settle_s + BREAKS_AFTER_S
+    faults = tuple(Fault(kind=kind, at_s=at_s, index=index, value=value) for index in broken)
+    whole = flown(dataclasses.replace(base, fault=faults), seed)
+    task_ns = (round(base.task.settle_s * 1e9), round(base.duration_s * 1e9))
+    flight = whole.between(*task_ns)
+    off = np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
+    turn = np.degrees(np.linalg.norm(rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"]), axis=1))
+    kept = np.logical_and.accumulate(flight.firmware["mode"] == Mode.AUTO)
+    left_out = {
+        int(found[1]) - 1: float(at) * 1e-9
+        for text, at in zip(whole.events["text"], whole.events["log_time"], strict=True)
+        if (found := LEFT_OUT.search(str(text)))
+    }
+    after = whole.between(round(at_s * 1e9), task_ns[1])
+    return ThrusterFlight(
+        float(np.sqrt(np.mean(off[kept] ** 2))), float(off[kept].max()), float(turn[kept].max()),
+        tuple(_found_after(after, index, left_out) for index in broken), tuple(sorted(set(left_out) - set(broken))),
+        Mode(int(flight.firmware["mode"][-1])).name,
+    )  # fmt: skip
+
+
+def _found_after(flight: Flight, index: int, left_out: dict[int, float]) -> float:
+    used = np.flatnonzero(np.abs(flight.firmware["commanded_n"][:, index]) > COMMANDED_N)
+    if not used.size or index not in left_out:
+        return float("inf")
+    return left_out[index] - float(flight.firmware["time_ns"][used[0]]) * 1e-9
+
+
+# ---------------------------------------------------------------- tags
+
+
+class BlindFlight(NamedTuple):
+    """A hover without tags for a while."""
+
+    error_m: float
+    """Largest horizontal distance of the truth from the place."""
+    normalised: tuple[float, float]
+    """North and east error of the estimate at the end, over its own sigma."""
+
+
+def hover_blind(seed: int, blind_s: float = 5.0, settle_s: float = 12.0) -> BlindFlight:
+    """Hovers, and loses the tags for `blind_s`."""
+    absent = Fault(kind="tag_absent", at_s=settle_s, until_s=settle_s + blind_s)
+    flight = flown(timed("hover", settle_s, blind_s, absent), seed).between(round(settle_s * 1e9), round((settle_s + blind_s) * 1e9))
+    off = np.linalg.norm((flight.p_wb - flight.firmware["setpoint_p_wb"])[:, :2], axis=1)
+    wrong = (flight.firmware["p_wb"] - flight.p_wb)[-1, :2] / flight.firmware["sigma_p"][-1, :2]
+    return BlindFlight(float(off.max()), (float(wrong[0]), float(wrong[1])))
+
+
+# ---------------------------------------------------------------- frames
+
+
+def command_outlives_frames_ms(seed: int = 0) -> float:
+    """How long an MCU's command outlives the last frame that it accepted, when all frames are lost in flight, ms."""
+    scenario = timed("hover", 4.0, 2.0, Fault(kind="frame_loss", at_s=5.0, value=1.0))
+    longest = 0.0
+    with ExitStack() as stack:
+        bench = open_bench(stack, scenario, seed, Parameters(), "virtual:lost")
+        mcu = next(iter(bench.nodes.mcus.values()))
+
+        class Watch:
+            """Looks at the MCU where the truth is recorded: once a tick."""
+
+            def record_world(self, tick: int, world: Any) -> None:
+                nonlocal longest
+                accepted = [at_ns for at_ns in mcu.accepted_ns if at_ns is not None]
+                if accepted and any(mcu.applied):
+                    longest = max(longest, (world.time_ns - max(accepted)) * 1e-6)
+
+        bench.fly(truth=Watch())  # type: ignore[arg-type]
+        return float("inf") if any(mcu.applied) else longest
+
+
+# ---------------------------------------------------------------- e-stop
+
+
+class StoppedFlight(NamedTuple):
+    """A flight with an e-stop."""
+
+    ticks: int
+    """After the one that took the e-stop."""
+    violations: int
+    """Of those, the ones in which a thruster was commanded, or was not told that it is disarmed."""
+    was_armed: bool
+
+
+def fly_to_estop(seed: int) -> StoppedFlight:
+    """A short flight in a mode and with a fault of the seed's; an e-stop at any tick, and people who go on asking for everything."""
+    rng = stream(seed, "estop")
+    faults = [row.fault for row in ROWS if row.fault is not None and row.fault.kind not in OWN_FIGURES and row.name != "all frames lost"]
+    fault = dataclasses.replace(faults[int(rng.integers(len(faults)))], at_s=float(rng.uniform(1.5, 4.5)), until_s=1e6)
+    at_s, by_frame = float(rng.uniform(1.5, 4.5)), bool(rng.random() < 0.5)
+    box = (Fault(kind="estop", at_s=at_s, until_s=at_s + float(rng.uniform(0.1, 1.0))),) if by_frame else ()
+    base = load_scenario("faults")
+    task = dataclasses.replace(base.task, mode=str(rng.choice(MODES)), settle_s=2.0, duration_s=3.0)
+    scenario = dataclasses.replace(base, task=task, fault=(fault, *box))
+    codec = Codec.load()
+    halves = {codec.message(name).id_of(1): codec.message(name) for name in ("THRUSTER_CMD_A", "THRUSTER_CMD_B")}
+    state = {"stopped": False, "ticks": 0, "violations": 0, "was_armed": False}
+
+    def watch(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        if state["stopped"]:
+            commands = [halves[frame.id].decode(frame.data) for _, frame in sent if frame.id in halves]
+            state["ticks"] += 1
+            state["violations"] += len(commands) != len(halves) or any(any(values) for values in commands)
+        elif inputs.estop or any(request.action == Action.ESTOP for request in inputs.requests):
+            state["stopped"] = True
+        else:
+            state["was_armed"] = outputs.modules[0].armed
+
+    with ExitStack() as stack:
+        bench = open_bench(stack, scenario, seed, Parameters(), f"virtual:estop{seed}")
+        bench.script = _Nagging(bench.script, rng, at_s, by_frame)  # type: ignore[assignment]
+        bench.fly([watch])
+    return StoppedFlight(int(state["ticks"]), int(state["violations"]), bool(state["was_armed"]))
+
+
+OWN_FIGURES = ("process_killed", "estop")
+"""Faults that are no company for an e-stop: the one ends the firmware, the other is one."""
+
+
+class _Nagging:
+    """A script, and somebody who from the e-stop on asks for everything but its release; and at `estop_s` for it, unless it is pressed."""
+
+    def __init__(self, script: Any, rng: np.random.Generator, estop_s: float, is_pressed: bool) -> None:
+        self._script, self._rng, self._estop_s, self._is_asked = script, rng, estop_s, is_pressed
+        self.ticks, self.is_over = script.ticks, script.is_over
+
+    def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
+        """The script's, and from the e-stop on one more in every third tick."""
+        asked = list(self._script.requests(time_ns, last))
+        if time_ns < self._estop_s * 1e9:
+            return asked
+        if not self._is_asked:
+            self._is_asked = True
+            return [*asked, Request(Action.ESTOP)]
+        return [*asked, ASKED[int(self._rng.integers(len(ASKED)))]] if self._rng.random() < 0.33 else asked
+
+
+_HERE = rest_at(np.array([0.0, 0.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]))
+ASKED = (
+    Request(Action.ARM), Request(Action.ARM, 0, True), Request(Action.DISARM), Request(Action.HOLD, 0, _HERE),
+    Request(Action.SET_POINT, 0, _HERE),
+    Request(Action.MOTOR_TEST, 0, (1, 0.3, 2.0)), Request(Action.STICKS, 0, Sticks((0.5, 0.0, 0.0), (0.0, 0.3, 0.0))),
+    *(Request(Action.SET_MODE, 0, Mode[mode]) for mode in MODES),
+)  # fmt: skip
+"""What people ask for who do not know that the robot is stopped."""

@@ -1,0 +1,89 @@
+"""People put their hands near these thrusters: the figures of `make accept`, on a few seeds.
+
+Thrusters that die or lie on the spiral, lost frames, e-stops at any tick, tags that stay away, a million frames that nobody should send.
+"""
+
+import numpy as np
+import pytest
+
+from hil.fuzz import fuzz_flight
+from hil.metrics import flight_metrics
+from hil.plant.fault_spec import Fault
+from hil.safety import command_outlives_frames_ms, flown, fly_to_estop, hover_blind, spiral_with, timed
+
+TICK_MS = 10.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("thruster", [0, 5])
+def test_dead_thruster_on_the_spiral_is_found_at_once_and_hardly_felt(thruster: int) -> None:
+    flight = spiral_with([thruster])
+    assert flight.found_s[0] <= 0.5
+    assert (flight.blamed, flight.ends_in) == ((), "AUTO")
+    assert 0.001 <= flight.rmse_m <= 0.012
+    assert flight.peak_m <= 0.060
+    assert flight.angle_peak_deg <= 15.0
+
+
+@pytest.mark.slow
+def test_lying_thruster_is_found_by_the_motion_alone() -> None:
+    flight = spiral_with([3], "thruster_fake_rpm")
+    assert flight.found_s[0] <= 2.0
+    assert flight.blamed == ()
+
+
+@pytest.mark.slow
+def test_two_dead_thrusters_that_leave_every_axis_are_flown_with() -> None:
+    flight = spiral_with([0, 1])
+    assert (flight.blamed, flight.ends_in) == ((), "AUTO")
+    assert flight.rmse_m <= 0.025
+    assert flight.angle_peak_deg <= 30.0
+
+
+@pytest.mark.slow
+def test_pair_without_which_yaw_is_lost_keeps_the_place_and_surfaces() -> None:
+    flight = spiral_with([4, 7])
+    assert flight.ends_in == "SURFACE"
+    assert flight.rmse_m <= 0.025
+    assert flight.peak_m <= 0.060
+
+
+@pytest.mark.slow
+def test_healthy_spiral_blames_no_thruster() -> None:
+    flight = spiral_with([], seed=7)
+    assert (flight.blamed, flight.ends_in) == ((), "AUTO")
+
+
+@pytest.mark.slow
+def test_spiral_is_flown_through_thirty_percent_of_lost_frames() -> None:
+    scenario = timed("spiral", 15.0, 40.0, Fault(kind="frame_loss", value=0.3))
+    flight = flown(scenario, 0).between(15_000_000_000, 55_000_000_000)
+    assert flight_metrics(flight)["position_rmse_m"] <= 0.008
+
+
+def test_command_ends_a_tenth_of_a_second_after_the_last_frame() -> None:
+    assert 50.0 <= command_outlives_frames_ms() <= 100.0 + TICK_MS
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_after_an_e_stop_nothing_turns_whatever_else_happens(seed: int) -> None:
+    flight = fly_to_estop(seed)
+    assert flight.violations == 0
+    assert flight.ticks > 10
+    assert flight.was_armed
+
+
+@pytest.mark.slow
+def test_hover_survives_five_seconds_without_tags() -> None:
+    flights = [hover_blind(seed) for seed in range(8)]
+    assert np.median([flight.error_m for flight in flights]) <= 0.045
+    normalised = np.array([flight.normalised for flight in flights])
+    assert 0.2 <= float(np.mean(normalised**2)) <= 2.5
+
+
+def test_fuzzed_frames_raise_nothing_and_command_nothing_beyond_the_limits() -> None:
+    result = fuzz_flight(40_000, seed=3)
+    assert result.beyond == 0
+    assert result.accepted + sum(result.dropped.values()) == result.frames
+    assert result.armed_ticks > 0.1 * result.ticks, "the fuzz is to reach a robot that is armed"
+    assert all(count > 50 for count in result.dropped.values())
