@@ -11,7 +11,10 @@ from functools import cached_property
 
 import numpy as np
 import shapely
-from scipy.spatial import ConvexHull
+
+_BOX_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+"""Corners of each face of a box, right-handed about its outward normal; corner 4 x + 2 y + z, each 0 or 1."""
+_BOX_TRIANGLES = np.array([each for a, b, c, d in _BOX_FACES for each in ((a, b, c), (a, c, d))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +44,8 @@ class Solid:
 
 def box(size: np.ndarray) -> Solid:
     """A box centred on the origin with edges of `size` (3,) m."""
-    return convex_solid(np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size)
-
-
-def convex_solid(points: np.ndarray) -> Solid:
-    """The convex hull of (k, 3) points."""
-    hull = ConvexHull(points)
-    triangles = hull.simplices.copy()
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
-    triangles[inward] = triangles[inward][:, ::-1]
-    return Solid(np.asarray(points, dtype=float), triangles, True)
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    return Solid(corners * size, _BOX_TRIANGLES, True)
 
 
 def plane_basis(directions: np.ndarray) -> np.ndarray:
