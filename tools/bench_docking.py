@@ -11,9 +11,9 @@ from firmware_py.bus.codec import Codec, Frame, pack_quaternion
 from firmware_py.bus.mapping import InputCollector
 from firmware_py.core.docking import joints_of, tag_table
 from firmware_py.core.docking_detector import ModulePoses, PairBank
-from firmware_py.core.types import Inputs
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Docking
+from firmware_py.runtime.realtime import quiet_garbage
 
 TICKS = 480
 MODULES_OF_A_BUS = 4
@@ -25,48 +25,42 @@ CURRENT_EVERY, PICTURES_PER_TICK, DELAY_TICKS = 4, 0.6, 4
 class DetectorBench:
     """A 2x2x2 of docked modules on two buses: their magnets' currents and top tags."""
 
-    def __init__(self) -> None:
+    def __init__(self, detects: bool = True) -> None:
+        """`detects`: with currents and detector; or the tags alone, which the estimator needs anyway."""
+        self._detects = detects
         self._codec, self._body = Codec.load(), cube_of(2)
         self._addresses = [(m // MODULES_OF_A_BUS, 1 + m % MODULES_OF_A_BUS) for m in self._body.modules]
         self._fleet = Fleet(module=tuple(Module(number=number, bus=bus) for bus, number in self._addresses), buses=("a", "b"))
-        self._frames = [self._frames_of(tick) for tick in range(TICKS)]
+        self._ticks = [[[f for at, f in frames if at == bus] for bus in range(2)] for frames in map(self._frames_of, range(TICKS))]
         self._table = tag_table([self._body])
-        self.frames = sum(map(len, self._frames)) / TICKS
+        self.frames = sum(len(frames) for tick in self._ticks for frames in tick) / TICKS
         """Of a tick, on the mean."""
-        self._inputs, _ = self._decode()
 
-    def decode_us(self) -> float:
-        """Frames to Inputs, a tick."""
-        return self._decode()[1]
-
-    def detect_us(self) -> float:
-        """Inputs to the state of the twelve joints, a tick. Raises RuntimeError when one is not found docked."""
+    def tick_us(self) -> float:
+        """Raw frames to Inputs, and on to the state of the twelve joints, a tick. Raises RuntimeError when one is not found docked."""
+        collector = InputCollector(self._fleet, self._codec)
         bank = PairBank([joint.pair for joint in joints_of(self._body)], Docking())
-        began = perf_counter_ns()
-        for inputs in self._inputs:
-            bank.step(inputs.time_ns, inputs.modules, ModulePoses(inputs.modules, self._table))
-        took_ns = perf_counter_ns() - began
-        if not bank.rows["holds"].all():
+        with quiet_garbage():
+            began = perf_counter_ns()
+            for tick, frames in enumerate(self._ticks):
+                time_ns = tick * PERIOD_NS
+                collector.sync_sent(tick, time_ns)
+                for bus in range(2):
+                    collector.take(bus, frames[bus])
+                inputs = collector.collect(tick, time_ns)
+                if self._detects:
+                    bank.step(time_ns, inputs.modules, ModulePoses(inputs.modules, self._table))
+            took_ns = perf_counter_ns() - began
+        if self._detects and not bank.rows["holds"].all():
             raise RuntimeError(f"not all of {len(bank.rows)} joints were found docked")
         return 1e-3 * took_ns / TICKS
-
-    def _decode(self) -> tuple[list[Inputs], float]:
-        collector, found, took_ns = InputCollector(self._fleet, self._codec), [], 0
-        for tick, frames in enumerate(self._frames):
-            collector.sync_sent(tick, tick * PERIOD_NS)
-            began = perf_counter_ns()
-            for bus in range(len(self._fleet.buses)):
-                collector.take(bus, [frame for at, frame in frames if at == bus])
-            found.append(collector.collect(tick, tick * PERIOD_NS))
-            took_ns += perf_counter_ns() - began
-        return found, 1e-3 * took_ns / TICKS
 
     def _frames_of(self, tick: int) -> list[tuple[int, Frame]]:
         frames = []
         picture = int(PICTURES_PER_TICK * tick)
         for m, (bus, number) in enumerate(self._addresses):
             for offset, name in enumerate(("DOCK_CURRENT_ABC", "DOCK_CURRENT_DEF")):
-                if (tick + m + 2 * offset) % CURRENT_EVERY == 0:
+                if self._detects and (tick + m + 2 * offset) % CURRENT_EVERY == 0:
                     values = (CURRENT_MA,) * 3 + (1,) * 3
                     frames.append((bus, self._codec.message(name).encode(number, values, tick // CURRENT_EVERY & 15)))
             if tick >= DELAY_TICKS and picture > int(PICTURES_PER_TICK * (tick - 1)):

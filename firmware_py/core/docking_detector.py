@@ -8,6 +8,7 @@ All pairs that are watched are rows of one array, and one compiled pass a tick s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from firmware_py.core.types import ModuleInputs
 from firmware_py.description.parameters import Docking
 
 FACES = 6
-SILENT: list[float | None] = [None] * FACES
+SILENT = [math.nan] * FACES
 """Currents of a module that reported none."""
 
 
@@ -89,10 +90,8 @@ class PairBank:
         """Brings the rows to the tick at `time_ns`, from its inputs alone and what they were before."""
         heard = [m for m in self._watched if modules[m].dock_current_ma != SILENT]
         if heard:
-            self._heard_ma[heard] = np.array([modules[m].dock_current_ma for m in heard], dtype=np.float64)  # None becomes NaN
+            self._heard_ma[heard] = [modules[m].dock_current_ma for m in heard]
         watch(self.rows, self._rings, self._heard_ma, *poses.sightings, time_ns, self._limits)
-        if heard:
-            self._heard_ma[heard] = np.nan
 
     def status(self, i: int) -> PairStatus:
         """Of pair `i`."""

@@ -158,7 +158,7 @@ def watch(rows, rings, heard_ma, first, seen, poses, time_ns, limits):  # type: 
 
     Args:
         rows: (k,) PAIR; rings: (k, PICTURES, 3) relative positions, module b in the frame of a.
-        heard_ma: (m, 6) currents that came, per module and face, NaN where none did.
+        heard_ma: (m, 6) currents that came, per module and face, NaN where none did; forgotten afterwards.
         first, seen, poses: docking_detector.Sightings.
     """
     for k in range(rows.shape[0]):
@@ -166,6 +166,7 @@ def watch(rows, rings, heard_ma, first, seen, poses, time_ns, limits):  # type: 
         fresh_current = _take_currents(row, heard_ma, time_ns, limits)
         fresh_pose = _take_pose(row, rings[k], first, seen, poses, time_ns, limits)
         row.fresh = fresh_current and fresh_pose
+    heard_ma[:] = math.nan
 
 
 @njit(numba.void(TABLE, FIRST, SEEN, TABLE), cache=True)

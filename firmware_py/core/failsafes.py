@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
+from operator import attrgetter
 from typing import NamedTuple
 
 from firmware_py.core.health import Health
@@ -60,31 +61,29 @@ class Row(NamedTuple):
 
 
 TABLE = (
-    Row("leak", "water in a cabin", lambda h: h.leak),
-    Row("bus_silent", "bus silent for {:.1f} s", lambda h: h.bus_silent_s),
-    Row("foreign_sync", "somebody else sends SYNC", lambda h: h.foreign_sync),
-    Row("battery_critical", "battery critical: {:.0%} of its voltage", lambda h: h.voltage_share, below=True),
-    Row("cabin_hot", "cabin at {:.0f} degC", lambda h: h.cabin_c),
-    Row("cabin_pressure", "cabin pressure off by {:.0f} Pa", lambda h: h.cabin_change_pa),
+    Row("leak", "water in a cabin", attrgetter("leak")),
+    Row("bus_silent", "bus silent for {:.1f} s", attrgetter("bus_silent_s")),
+    Row("foreign_sync", "somebody else sends SYNC", attrgetter("foreign_sync")),
+    Row("battery_critical", "battery critical: {:.0%} of its voltage", attrgetter("voltage_share"), below=True),
+    Row("cabin_hot", "cabin at {:.0f} degC", attrgetter("cabin_c")),
+    Row("cabin_pressure", "cabin pressure off by {:.0f} Pa", attrgetter("cabin_change_pa")),
     Row("axis_lost", "the thrusters left cannot make every wrench", lambda h: h.lost_axes > 0),
-    Row(
-        "depth_unknown", "depth unknown for {:.1f} s", lambda h: min(h.depth_age_s, h.tag_age_s), modes=PLACED | {Mode.ALT_HOLD}
-    ),
-    Row("tag_gone", "no tag for {:.1f} s", lambda h: h.tag_age_s, modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
-    Row("partner_lost", "a docked partner is lost", lambda h: h.partner_lost),
-    Row("estimator", "sensors and model disagree: {:.1f} of the expected", lambda h: h.nis_ratio, modes=PLACED),
-    Row("rejected", "{:.0%} of the tags refused", lambda h: h.rejected_share, modes=PLACED),
-    Row("tag_lost", "no tag for {:.1f} s", lambda h: h.tag_age_s, modes=PLACED),
-    Row("tag_late", "no tag for {:.1f} s", lambda h: h.tag_age_s, modes=MOVING),
-    Row("depth_lost", "no pressure for {:.1f} s", lambda h: h.depth_age_s),
-    Row("imu_lost", "no IMU for {:.1f} s", lambda h: h.imu_age_s),
-    Row("module_silent", "a module is silent for {:.1f} s", lambda h: h.silent_s),
-    Row("ticks_missed", "{:.0f} ticks missed in a second", lambda h: h.missed_ticks_per_s),
-    Row("fence", "{:.2f} m outside the fence", lambda h: h.outside_m, modes=MOVING),
-    Row("ground_lost", "ground station silent for {:.1f} s", lambda h: h.ground_age_s, modes=ANY - {Mode.AUTO, Mode.SURFACE}),
-    Row("pilot_lost", "pilot silent for {:.1f} s", lambda h: h.pilot_age_s, modes=PILOTED),
+    Row("depth_unknown", "depth unknown for {:.1f} s", lambda h: min(h.depth_age_s, h.tag_age_s), modes=PLACED | {Mode.ALT_HOLD}),
+    Row("tag_gone", "no tag for {:.1f} s", attrgetter("tag_age_s"), modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
+    Row("partner_lost", "a docked partner is lost", attrgetter("partner_lost")),
+    Row("estimator", "sensors and model disagree: {:.1f} of the expected", attrgetter("nis_ratio"), modes=PLACED),
+    Row("rejected", "{:.0%} of the tags refused", attrgetter("rejected_share"), modes=PLACED),
+    Row("tag_lost", "no tag for {:.1f} s", attrgetter("tag_age_s"), modes=PLACED),
+    Row("tag_late", "no tag for {:.1f} s", attrgetter("tag_age_s"), modes=MOVING),
+    Row("depth_lost", "no pressure for {:.1f} s", attrgetter("depth_age_s")),
+    Row("imu_lost", "no IMU for {:.1f} s", attrgetter("imu_age_s")),
+    Row("module_silent", "a module is silent for {:.1f} s", attrgetter("silent_s")),
+    Row("ticks_missed", "{:.0f} ticks missed in a second", attrgetter("missed_ticks_per_s")),
+    Row("fence", "{:.2f} m outside the fence", attrgetter("outside_m"), modes=MOVING),
+    Row("ground_lost", "ground station silent for {:.1f} s", attrgetter("ground_age_s"), modes=ANY - {Mode.AUTO, Mode.SURFACE}),
+    Row("pilot_lost", "pilot silent for {:.1f} s", attrgetter("pilot_age_s"), modes=PILOTED),
     Row("thruster_lost", "a thruster is out", lambda h: len(h.dead) > 0),
-    Row("battery_low", "battery low: {:.0%} of its voltage", lambda h: h.voltage_share, below=True),
+    Row("battery_low", "battery low: {:.0%} of its voltage", attrgetter("voltage_share"), below=True),
 )
 
 
@@ -102,6 +101,7 @@ class Watch:
 
     def __init__(self, row: Row, parameters: FailsafeParameters) -> None:
         self.row = row
+        self._sign = -1.0 if row.below else 1.0
         self.limit: float = getattr(parameters, f"{row.name}_limit", 0.0)
         self.level = Level(getattr(parameters, f"{row.name}_action"))
         self.latched = bool(getattr(parameters, f"{row.name}_latched"))
@@ -115,8 +115,12 @@ class Watch:
 
     def beyond(self, health: Health) -> bool:
         """Whether its cause holds now, whatever the mode. A NaN is no cause."""
-        value = self.row.value(health)
-        return value < self.limit if self.row.below else value > self.limit
+        return self._sign * self.row.value(health) > self._sign * self.limit
+
+    @property
+    def criterion(self) -> tuple[Callable[[Health], float], float, float]:
+        """What `beyond` compares: value, sign and signed limit."""
+        return self.row.value, self._sign, self._sign * self.limit
 
     def counts(self, mode: Mode, forced: bool, armed: bool) -> bool:
         """Whether it counts now."""
@@ -160,6 +164,7 @@ class Failsafes:
 
     def __init__(self, parameters: FailsafeParameters) -> None:
         self._watches = [watch for watch in (Watch(row, parameters) for row in TABLE) if watch.level != Level.NONE]
+        self._rows = [(watch, *watch.criterion) for watch in self._watches]
 
     def step(self, health: Health, mode: Mode, forced: bool, armed: bool) -> list[Alarm]:
         """Those that begin or end in this tick, gravest row first.
@@ -168,8 +173,8 @@ class Failsafes:
             forced: a fail-safe and no person chose `mode`.
         """
         alarms = []
-        for watch in self._watches:
-            cause = watch.beyond(health) and watch.counts(mode, forced, armed)
+        for watch, value, sign, limit in self._rows:
+            cause = sign * value(health) > limit and watch.counts(mode, forced, armed)
             if (cause or not watch.rests) and watch.step(health.time_ns, cause, armed):
                 alarms.append(Alarm(watch.row.name, watch.words(health), watch.level, watch.active))
                 watch.began = alarms[-1].words if watch.active else watch.began

@@ -51,7 +51,8 @@ class ModuleInputs:
     """(3,) specific force, module frame, m/s^2."""
     pressure_pa: float | None = None
     tags: list[TagObservation] = field(default_factory=list)
-    dock_current_ma: list[float | None] = field(default_factory=lambda: [None] * 6)
+    dock_current_ma: list[float] = field(default_factory=lambda: [math.nan] * 6)
+    """Of each face; NaN where nothing fresh came."""
     relay_echo: list[int | None] = field(default_factory=lambda: [None] * 6)
     esc: list[EscFeedback] = field(default_factory=list)
     voltage_v: float | None = None

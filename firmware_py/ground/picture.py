@@ -62,7 +62,7 @@ class ModulePicture:
         if inputs.leak is not None:
             self.leak = inputs.leak
         for i, current in enumerate(inputs.dock_current_ma):
-            if current is not None:
+            if not math.isnan(current):
                 self.dock_current_ma[i] = current
         for esc in inputs.esc:
             self.esc_frames += 1

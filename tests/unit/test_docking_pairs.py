@@ -88,7 +88,7 @@ def test_current_of_one_face_alone_does_not_count(row: Row) -> None:
     bank = PairBank(ROW[:1], P)
     for _ in range(100):
         time_ns, modules = row.hear()
-        modules[1].dock_current_ma[1] = None
+        modules[1].dock_current_ma[1] = math.nan
         bank.step(time_ns, modules, ModulePoses(modules, TAGS))
     assert not bank.status(0).current and math.isnan(bank.status(0).current_margin_ma)
 
