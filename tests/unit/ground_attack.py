@@ -105,7 +105,7 @@ class Attack:
         self.world.station.jobs()
         inputs, outputs = self.world.robot.step(requests)
         self.world.robot.asked.clear()
-        self.world.station.observe(inputs, outputs, [])
+        self.world.station.observe(inputs, outputs, self.world.robot.bodies)
         self.world.station.frames(outputs.time_ns)
 
     def _noise(self) -> bytes:

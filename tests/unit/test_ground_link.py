@@ -56,6 +56,13 @@ def test_udpin_answers_each_client_on_its_own_channel() -> None:
             client.close()
 
 
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+def test_an_address_without_a_host_is_this_machines_alone(kind: str) -> None:
+    link: Any = open_link(f"{kind}::0")
+    with closing(link):
+        assert (link._socket if kind == "udpin" else link._server).getsockname()[0] == "127.0.0.1"
+
+
 def test_udpout_speaks_first_and_survives_that_nobody_listens() -> None:
     port = free_port()
     links = Links([f"udpout:127.0.0.1:{port}"])
