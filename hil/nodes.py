@@ -217,7 +217,6 @@ class Nodes:
         self.receiver = Receiver(codec)
         self.mcus = {number: Mcu(codec, number, module, world, sensors, tick_ns) for number, module in numbers.items()}
         self.cameras = [TagCamera(codec, cameras, numbers, sensors, world)] if cameras else []
-        self._dropped = dict(self.receiver.dropped)
         self.faults: WireFaults = NoFaults()
 
     def step(self, frames: Iterable[Frame]) -> list[Frame]:
@@ -229,8 +228,9 @@ class Nodes:
     def answer(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
         """Takes frames off the wire at `time_ns` and puts the answers on it, through whatever is wrong with the wire."""
         answers: list[Frame] = []
-        for frame in self.faults.incoming(frames, time_ns):
-            answers += self.take(frame, time_ns)
+        arrived = self.faults.incoming(frames, time_ns)
+        for frame, received in zip(arrived, self.receiver.judge(arrived), strict=True):
+            answers += self._hear(frame, received, time_ns)
         return self.faults.outgoing(answers, time_ns)
 
     def watch(self) -> None:
@@ -243,9 +243,11 @@ class Nodes:
 
     def take(self, frame: Frame, time_ns: int) -> list[Frame]:
         """One frame from the bus at `time_ns` on the plant's clock; returns the answers. Bad frames count and drop."""
-        received = self.receiver.accept(frame)
-        if received is None:
-            self._blame(frame)
+        return self._hear(frame, self.receiver.judge((frame,))[0], time_ns)
+
+    def _hear(self, frame: Frame, received: Received | str, time_ns: int) -> list[Frame]:
+        if isinstance(received, str):
+            self._blame(frame, received)
             return []
         name = received.message.name
         if name == "ESTOP":
@@ -262,14 +264,11 @@ class Nodes:
             self.mcus[received.number].heard(received, time_ns)
         return []
 
-    def _blame(self, frame: Frame) -> None:
+    def _blame(self, frame: Frame, kind: str) -> None:
         """The MCU that a dropped frame was meant for reports the kind of error."""
-        dropped, self._dropped = self._dropped, dict(self.receiver.dropped)
         mcu = self.mcus.get(frame.id & 0x1F)
         if mcu is not None:
-            for kind, bit in ERROR_BITS.items():
-                if self._dropped[kind] != dropped[kind]:
-                    mcu.errors |= bit
+            mcu.errors |= ERROR_BITS.get(kind, 0)
 
 
 def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[Any, int, int]]:

@@ -228,6 +228,11 @@ GROUPS: tuple[Group, ...] = (
         (Figure("one above the other, second tag source, 100 trials: docked", "passed", low=95.0, unit="%", scale=100.0),),
     ),
     Group(
+        "dock-vertical-blind", 5, "modcube hil campaign dock-vertical-blind --trials 100 --jobs 2",
+        flown("dock-vertical-blind", trials=100),
+        (Figure("the same without the second tag source, 100 trials: refused, nothing touched", "passed", low=1.0),),
+    ),
+    Group(
         "dock-mobius", 5, "modcube hil campaign dock-mobius --trials 10 --jobs 2", flown("dock-mobius", trials=10),
         (
             Figure("dock, Moebius strip as one, undock, 10 trials: passed", "passed", low=1.0),

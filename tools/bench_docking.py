@@ -55,8 +55,8 @@ class DetectorBench:
         for tick, frames in enumerate(self._frames):
             collector.sync_sent(tick, tick * PERIOD_NS)
             began = perf_counter_ns()
-            for bus, frame in frames:
-                collector.take(bus, frame)
+            for bus in range(len(self._fleet.buses)):
+                collector.take(bus, [frame for at, frame in frames if at == bus])
             found.append(collector.collect(tick, tick * PERIOD_NS))
             took_ns += perf_counter_ns() - began
         return found, 1e-3 * took_ns / TICKS

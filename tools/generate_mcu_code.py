@@ -64,7 +64,7 @@ def wire_parts(codec: Codec) -> dict[str, Any]:
         "enumeration": "\n".join(f"    MODCUBE_{m.name} = {i}," for i, m in enumerate(messages)),
         "conversions": "\n".join(f"{conversion(m, f)};" for m, f in scaled),
         "definitions": "\n\n".join(definition(m, f) for m, f in scaled),
-        "ranges": "\n\n".join(range_check(m) for m in messages if m.in_range is not None),
+        "ranges": "\n\n".join(range_check(m) for m in messages if m.is_limited),
         "table": "\n".join(table_row(m) for m in messages),
         "functions": rows(functions.get(function, 0) for function in range(64)),
         "crc_table": rows(TABLE),
@@ -88,7 +88,7 @@ def rows(values: Iterable[int]) -> str:
 def table_row(message: MessageCodec) -> str:
     """The message's entry in MODCUBE_MESSAGES."""
     numbers = sum(1 << number for number in message.numbers)
-    check = f"{snake(message.name)}_is_in_range" if message.in_range is not None else "NULL"
+    check = f"{snake(message.name)}_is_in_range" if message.is_limited else "NULL"
     flags = f"{'true' if message.protected else 'false'}, {'true' if message.per_tick else 'false'}"
     frame_id = message.function << 5
     return f"    {{0x{frame_id:03x}u, {message.length}u, {flags}, {message.cycle_ms}u, 0x{numbers:08x}u, {check}}},"

@@ -67,8 +67,7 @@ def fly_by(seed: int) -> Pass:
         commands = [ModuleCommand(False, np.zeros(8), wanted) for wanted in relays]
         sent = [*encoder.sync(tick), *encoder.frames(Outputs(tick, time_ns, commands, False, [], []))]
         collector.sync_sent(tick, time_ns)
-        for frame in nodes.step([frame for _, frame in sent]):
-            collector.take(0, frame)
+        collector.take(0, nodes.step([frame for _, frame in sent]))
         if len(world.bodies) == 1:
             return Pass(*seen, joined=True)
         inputs = collector.collect(tick, time_ns)

@@ -49,8 +49,8 @@ class Firmware:
         self, tick: int, time_ns: int, received: Sequence[BusFrame], requests: Sequence[Request]
     ) -> tuple[Inputs, Outputs, list[BusFrame]]:
         """Steps the fleet with the frames that came since the last tick; returns inputs, outputs and the frames to send."""
-        for bus, frame in received:
-            self.collector.take(bus, frame)
+        for bus in range(len(self.fleet.buses)):
+            self.collector.take(bus, [frame for at, frame in received if at == bus])
         inputs = self.collector.collect(tick, time_ns, requests)
         outputs = self.tick(inputs)
         return inputs, outputs, self.encoder.frames(outputs)

@@ -79,9 +79,9 @@ class RealTimeLoop:
     def _take(self) -> bool:
         """Hands every frame that is there to the collector."""
         for bus, port in enumerate(self.ports):
-            for frame in port.receive():
-                self.firmware.collector.take(bus, frame)
-                self._received.append((bus, frame))
+            frames = port.receive()
+            self.firmware.collector.take(bus, frames)
+            self._received += [(bus, frame) for frame in frames]
         return True
 
     def _send(self, frames: Sequence[BusFrame]) -> None:

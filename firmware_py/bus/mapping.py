@@ -6,11 +6,11 @@ Stands at both ends of a tick, between the ports and the pipeline. No clock: the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from firmware_py.bus.codec import Codec, Frame, Received, Receiver, unpack_quaternion
+from firmware_py.bus.codec import Codec, Frame, Receiver, unpack_quaternion
+from firmware_py.bus.codec.receiver import COUNTER, MESSAGE, NUMBER, VALUES
 from firmware_py.core.types import EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.fleet import Fleet
 
@@ -29,7 +29,8 @@ CHANNELS = 8
 ESTOP_PERIOD_NS = 50_000_000
 """ESTOP goes out at 20 Hz while it is raised."""
 
-Values = tuple[Any, ...]
+Row = list[float]
+"""A checked frame: message, number, counter, values (bus.codec.receiver)."""
 
 
 class InputCollector:
@@ -48,13 +49,16 @@ class InputCollector:
         self._modules = [ModuleInputs() for _ in fleet.module]
         self._status_ticks: list[int | None] = [None] * len(fleet.module)
         self._sync_ns: list[int | None] = [None] * REMEMBERED_TICKS
-        self._halves: dict[tuple[int, int], tuple[str, Values, int]] = {}
+        self._halves: dict[tuple[int, float], tuple[Row, int]] = {}
         self._collections = 0
         self._estop = False
         kinds = ("module", "tag_unpaired", "tag_stale", "tag_future", "sensor", "foreign_sync", "foreign_command")
         self.faults: dict[str, int] = dict.fromkeys(kinds, 0)
         self.heartbeats: dict[tuple[int, int], int] = {}
-        self._handlers = self._make_handlers()
+        named = self._make_handlers()
+        self._handlers = [named.get(message.name) for message in codec.messages]
+        self._names = [message.name for message in codec.messages]
+        self._tag_position = float(self._names.index("TAG_POSITION"))
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -66,24 +70,23 @@ class InputCollector:
         """SYNC `tick` went out at `time_ns`: what the capture times of tags count from."""
         self._sync_ns[tick % REMEMBERED_TICKS] = time_ns
 
-    def take(self, bus: int, frame: Frame) -> None:
-        """Takes one frame that came on bus `bus`, whatever it holds."""
-        received = self._receivers[bus].accept(frame)
-        if received is None:
+    def take(self, bus: int, frames: Sequence[Frame]) -> None:
+        """Takes the frames that came on bus `bus`, whatever they hold."""
+        if not frames:
             return
-        name = received.message.name
-        handler = self._handlers.get(name)
-        if handler is None:
-            self._take_other(bus, received)
-            return
-        index = self._index.get((bus, received.number))
-        if index is None:
-            self.faults["module"] += 1
-            return
-        # TAG frames come from the camera, so they are no sign of life of the module whose number they carry.
-        if name not in ("TAG_POSITION", "TAG_ATTITUDE"):
-            self._modules[index].heard = True
-        handler(index, self._modules[index], received)
+        for row in self._receivers[bus].rows(frames).tolist():
+            which = int(row[MESSAGE])
+            if which < 0:
+                continue
+            handler = self._handlers[which]
+            if handler is None:
+                self._take_other(bus, self._names[which], row)
+                continue
+            index = self._index.get((bus, row[NUMBER]))
+            if index is None:
+                self.faults["module"] += 1
+            else:
+                handler(index, self._modules[index], row)
 
     def all_answered(self, tick: int) -> bool:
         """Whether MCU_STATUS of `tick` of every module is in: the inputs of the tick may close."""
@@ -100,19 +103,19 @@ class InputCollector:
                 module.tags = [tag for tag in module.tags if self._is_timely(tag, time_ns)]
         self._expire_halves()
         estop, self._estop = self._estop, False
-        dropped = sum(sum(receiver.dropped.values()) for receiver in self._receivers)
+        dropped = sum([receiver.dropped_in_all for receiver in self._receivers])
         foreign = self.faults["foreign_sync"] > 0
         return Inputs(tick, time_ns, modules, list(requests), estop, dropped, foreign)
 
-    def _make_handlers(self) -> dict[str, Callable[[int, ModuleInputs, Received], None]]:
-        handlers: dict[str, Callable[[int, ModuleInputs, Received], None]] = {
+    def _make_handlers(self) -> dict[str, Callable[[int, ModuleInputs, Row], None]]:
+        handlers: dict[str, Callable[[int, ModuleInputs, Row], None]] = {
             "TAG_POSITION": self._take_tag,
             "TAG_ATTITUDE": self._take_tag,
             "GYRO": self._take_gyro,
             "ACCEL": self._take_accel,
             "DEPTH": self._take_depth,
-            "DOCK_CURRENT_ABC": self._take_dock_abc,
-            "DOCK_CURRENT_DEF": self._take_dock_def,
+            "DOCK_CURRENT_ABC": _dock_handler(0),
+            "DOCK_CURRENT_DEF": _dock_handler(3),
             "POWER": self._take_power,
             "ENVIRONMENT": self._take_environment,
             "MCU_STATUS": self._take_status,
@@ -121,69 +124,66 @@ class InputCollector:
             handlers[f"ESC_FEEDBACK_{pair + 1}"] = _esc_handler(2 * pair)
         return handlers
 
-    def _take_other(self, bus: int, received: Received) -> None:
-        name = received.message.name
+    def _take_other(self, bus: int, name: str, row: Row) -> None:
         if name == "ESTOP":
             self._estop = True
         elif name == "HEARTBEAT":
-            self.heartbeats[bus, received.number] = received.values[0]
+            self.heartbeats[bus, int(row[NUMBER])] = int(row[VALUES])
         else:
             self.faults["foreign_sync" if name == "SYNC" else "foreign_command"] += 1
 
-    def _take_gyro(self, index: int, module: ModuleInputs, received: Received) -> None:
-        x, y, z, status = received.values
-        if self._is_usable(status):
-            module.gyro = np.array((x, y, z))
+    def _take_gyro(self, index: int, module: ModuleInputs, row: Row) -> None:
+        module.heard = True
+        if self._is_usable(row[VALUES + 3]):
+            module.gyro = np.array(row[VALUES : VALUES + 3])
 
-    def _take_accel(self, index: int, module: ModuleInputs, received: Received) -> None:
-        x, y, z, status = received.values
-        if self._is_usable(status):
-            module.accel = np.array((x, y, z))
+    def _take_accel(self, index: int, module: ModuleInputs, row: Row) -> None:
+        module.heard = True
+        if self._is_usable(row[VALUES + 3]):
+            module.accel = np.array(row[VALUES : VALUES + 3])
 
-    def _take_depth(self, index: int, module: ModuleInputs, received: Received) -> None:
-        pressure, _, status = received.values
-        if self._is_usable(status):
-            module.pressure_pa = float(pressure)
+    def _take_depth(self, index: int, module: ModuleInputs, row: Row) -> None:
+        module.heard = True
+        if self._is_usable(row[VALUES + 2]):
+            module.pressure_pa = row[VALUES]
 
-    def _take_dock_abc(self, index: int, module: ModuleInputs, received: Received) -> None:
-        module.dock_current_ma[:3] = [float(current) for current in received.values[:3]]
-        module.relay_echo[:3] = received.values[3:]
-
-    def _take_dock_def(self, index: int, module: ModuleInputs, received: Received) -> None:
-        module.dock_current_ma[3:] = [float(current) for current in received.values[:3]]
-        module.relay_echo[3:] = received.values[3:]
-
-    def _take_power(self, index: int, module: ModuleInputs, received: Received) -> None:
-        voltage, current, status = received.values
+    def _take_power(self, index: int, module: ModuleInputs, row: Row) -> None:
+        module.heard = True
+        voltage, current, status = row[VALUES : VALUES + 3]
         if status == SENSOR_FAULT:
             self.faults["sensor"] += 1
             return
         module.voltage_v, module.current_a = voltage, current
 
-    def _take_environment(self, index: int, module: ModuleInputs, received: Received) -> None:
-        temperature, pressure, leak = received.values
-        module.cabin_temperature_c, module.cabin_pressure_pa, module.leak = temperature, float(pressure), bool(leak)
+    def _take_environment(self, index: int, module: ModuleInputs, row: Row) -> None:
+        module.heard = True
+        module.cabin_temperature_c, module.cabin_pressure_pa, leak = row[VALUES : VALUES + 3]
+        module.leak = bool(leak)
 
-    def _take_status(self, index: int, module: ModuleInputs, received: Received) -> None:
-        tick, _, errors, state = received.values
-        self._status_ticks[index] = tick
-        module.mcu_errors |= errors
-        module.mcu_state = state
+    def _take_status(self, index: int, module: ModuleInputs, row: Row) -> None:
+        module.heard = True
+        tick, _, errors, state = row[VALUES : VALUES + 4]
+        self._status_ticks[index] = int(tick)
+        module.mcu_errors |= int(errors)
+        module.mcu_state = int(state)
 
-    def _take_tag(self, index: int, module: ModuleInputs, received: Received) -> None:
-        """Halves of one observation share the counter, and nothing else says that they belong together."""
-        key = (index, received.counter)
-        name, values = received.message.name, received.values
+    def _take_tag(self, index: int, module: ModuleInputs, row: Row) -> None:
+        """Halves of one observation share the counter, and nothing else says that they belong together.
+
+        They come from the camera, so they are no sign of life of the module whose number they carry.
+        """
+        key = (index, row[COUNTER])
         other = self._halves.pop(key, None)
-        if other is None or other[0] == name:
+        if other is None or other[0][MESSAGE] == row[MESSAGE]:
             self.faults["tag_unpaired"] += other is not None
-            self._halves[key] = (name, values, self._collections)
+            self._halves[key] = (row, self._collections)
             return
-        position, attitude = (values, other[1]) if name == "TAG_POSITION" else (other[1], values)
-        self._take_observation(module, position, attitude)
+        position, attitude = (row, other[0]) if row[MESSAGE] == self._tag_position else (other[0], row)
+        self._take_observation(module, position[VALUES : VALUES + 3], attitude[VALUES:])
 
-    def _take_observation(self, module: ModuleInputs, position: Values, attitude: Values) -> None:
-        largest, a, b, c, tag_id, quality, capture_tick, offset_ms = attitude
+    def _take_observation(self, module: ModuleInputs, position: Row, attitude: Row) -> None:
+        offset_ms = attitude[-1]
+        largest, a, b, c, tag_id, quality, capture_tick = map(int, attitude[:-1])
         sync_ns = self._sync_ns[capture_tick]
         if sync_ns is None or offset_ms >= OFFSET_SATURATED_MS:
             self.faults["tag_stale"] += 1
@@ -199,7 +199,7 @@ class InputCollector:
         self.faults["tag_stale" if age_ns > 0 else "tag_future"] += 1
         return False
 
-    def _is_usable(self, status: int) -> bool:
+    def _is_usable(self, status: float) -> bool:
         if status in USABLE_STATUS:
             return True
         self.faults["sensor"] += 1
@@ -208,18 +208,27 @@ class InputCollector:
     def _expire_halves(self) -> None:
         """The halves of an observation may fall to either side of one tick's end; a half older than that is alone."""
         if self._halves:
-            old = [key for key, half in self._halves.items() if half[2] < self._collections]
+            old = [key for key, half in self._halves.items() if half[1] < self._collections]
             for key in old:
                 del self._halves[key]
             self.faults["tag_unpaired"] += len(old)
         self._collections += 1
 
 
-def _esc_handler(first: int) -> Callable[[int, ModuleInputs, Received], None]:
-    def take(index: int, module: ModuleInputs, received: Received) -> None:
-        rpm1, current1, status1, rpm2, current2, status2 = received.values
-        feedback = EscFeedback(first, (float(rpm1), float(rpm2)), (current1, current2), (status1, status2))
-        module.esc.append(feedback)
+def _dock_handler(first: int) -> Callable[[int, ModuleInputs, Row], None]:
+    def take(index: int, module: ModuleInputs, row: Row) -> None:
+        module.heard = True
+        module.dock_current_ma[first : first + 3] = row[VALUES : VALUES + 3]
+        module.relay_echo[first : first + 3] = map(int, row[VALUES + 3 : VALUES + 6])
+
+    return take
+
+
+def _esc_handler(first: int) -> Callable[[int, ModuleInputs, Row], None]:
+    def take(index: int, module: ModuleInputs, row: Row) -> None:
+        module.heard = True
+        rpm1, current1, status1, rpm2, current2, status2 = row[VALUES : VALUES + 6]
+        module.esc.append(EscFeedback(first, (rpm1, rpm2), (current1, current2), (int(status1), int(status2))))
 
     return take
 

@@ -24,7 +24,7 @@ class Robot:
     def say(self, name, values, number=1, bus=0, counter=None):
         count = self.counters.get((name, number, bus), -1) + 1 if counter is None else counter
         self.counters[name, number, bus] = count
-        self.collector.take(bus, CODEC.message(name).encode(number, values, count))
+        self.collector.take(bus, [CODEC.message(name).encode(number, values, count)])
 
     def see_tag(self, tag=4, counter=0, tick=0, offset_ms=0.0, halves="PA", number=1, p=(1.0, 2.0, 3.0)):
         for half in halves:
@@ -294,7 +294,7 @@ def test_tag_is_no_sign_of_life_of_the_module_that_wears_it():
 @pytest.mark.parametrize("frame", [Frame(0, b""), Frame(30, b""), Frame(31, b"\x01\x02"), Frame(5, bytes(8))])
 def test_estop_of_anybody_in_any_length_enters_the_tick(frame):
     robot = Robot(TWO_BUSES)
-    robot.collector.take(1, frame)
+    robot.collector.take(1, [frame])
     assert robot.tick(0).estop
 
 
@@ -323,7 +323,7 @@ def test_dropped_frames_of_all_buses_are_counted_from_the_start():
     robot = Robot(TWO_BUSES)
     gyro = CODEC.message("GYRO").encode(1, (0.0, 0.0, 0.0, 0), 3)
     for bus, frame in ((0, gyro), (0, gyro), (1, gyro), (1, Frame(gyro.id, b"short"))):
-        robot.collector.take(bus, frame)
+        robot.collector.take(bus, [frame])
     assert robot.tick(0).dropped_frames == 2
     assert robot.tick(1).dropped_frames == 2
     assert {kind: count for kind, count in robot.collector.dropped.items() if count} == {"counter": 1, "length": 1}

@@ -48,6 +48,12 @@ class Field:
         return self.factor == 1 and self.offset == 0
 
     @property
+    def is_limited(self) -> bool:
+        """The DBC's limits leave out some of what its bits can hold."""
+        low, high = self.raw_range
+        return self.raw_low > low or self.raw_high < high
+
+    @property
     def raw_range(self) -> tuple[int, int]:
         """What its bits can hold; the DBC's limits may be narrower."""
         return (-(1 << self.bits - 1), (1 << self.bits - 1) - 1) if self.signed else (0, (1 << self.bits) - 1)
@@ -79,9 +85,13 @@ class MessageCodec:
         self._crc_start = tuple(crc.register_of_id(can_id) for can_id in ids)
         self._unpack: Callable[[int], tuple[Any, ...]] = _compile(_decode_source(self.field_details))
         self._pack: Callable[[Sequence[Any]], int] = _compile(_encode_source(self.field_details))
-        source = _range_source(self.field_details)
-        self.in_range: Callable[[tuple[Any, ...]], bool] | None = _compile(source) if source else None
-        """Whether physical values keep the DBC's limits; None where the bits cannot hold anything beyond them."""
+        self.typed: Callable[[Sequence[float]], tuple[Any, ...]] = _compile(_type_source(self.field_details))
+        """Physical values out of floats: int where the factor is 1."""
+
+    @property
+    def is_limited(self) -> bool:
+        """The DBC's limits leave out values that the bits of a field can hold."""
+        return any(field.is_limited for field in self.field_details)
 
     def id_of(self, number: int) -> int:
         """The id of this message for node `number`. Raises ValueError where the number is not valid for it."""
@@ -133,13 +143,6 @@ class MessageCodec:
     def counter_of(self, data: bytes) -> int:
         """The counter that a frame of the right length carries; NO_COUNTER where the message has none."""
         return data[-2] >> 4 if self.protected else NO_COUNTER
-
-    def crc_ok(self, number: int, data: bytes) -> bool:
-        """Whether the last byte of a protected frame is the CRC of its id and payload. Needs the right length."""
-        table, register = crc.TABLE, self._crc_start[number]
-        for byte in data:
-            register = table[register ^ byte]
-        return register == crc.RESIDUE
 
     def _frame(self, number: int, packed: int, counter: int) -> Frame:
         if number not in self.numbers:
@@ -212,21 +215,15 @@ def _encode_source(fields: Sequence[Field]) -> str:
     return "\n".join(lines)
 
 
-def _range_source(fields: Sequence[Field]) -> str:
-    checks = []
-    for index, field in enumerate(fields):
-        low, high = field.raw_range
-        if field.raw_low > low:
-            checks.append(f"v[{index}] >= {field.raw_low * field.factor + field.offset!r}")
-        if field.raw_high < high:
-            checks.append(f"v[{index}] <= {field.raw_high * field.factor + field.offset!r}")
-    return f"lambda v: {' and '.join(checks)}" if checks else ""
+def _type_source(fields: Sequence[Field]) -> str:
+    items = [f"int(v[{index}])" if field.is_integer else f"v[{index}]" for index, field in enumerate(fields)]
+    return f"lambda v: ({' '.join(item + ',' for item in items)})"
 
 
 def _compile(source: str) -> Any:
     """The function that `source` defines: a lambda, or a def called pack."""
     if source.startswith("lambda"):
-        return eval(source, {"__builtins__": {}})
+        return eval(source, {"__builtins__": {"int": int}})
     namespace: dict[str, Any] = {"__builtins__": {"round": round}}
     exec(source, namespace)
     return namespace["pack"]
