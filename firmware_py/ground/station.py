@@ -15,6 +15,7 @@ from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.geodesy import Origin
 from firmware_py.ground.logs import LogService
+from firmware_py.ground.message_requests import MessageRequests
 from firmware_py.ground.mission_flight import MissionFlight, Plan, PlanJob
 from firmware_py.ground.missions import MissionService
 from firmware_py.ground.outbox import Outbox, Outgoing
@@ -47,7 +48,7 @@ class Services:
             "AUTOPILOT_VERSION": self.presence.autopilot_version,
             "AVAILABLE_MODES": self.presence.available_modes,
         }
-        self.commands = CommandService(system, self.flight, self.steering, extra)
+        self.commands = CommandService(system, self.flight, self.steering, MessageRequests(system, extra))
         parts = (self.commands, self.parameters, self.missions, self.steering, self.presence, self.logs)
         self.handlers = {name: handler for part in parts for name, handler in part.handlers().items()}
 
