@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import ExitStack
+from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +17,7 @@ from firmware_py.bus.port import PortError
 from firmware_py.description.fleet import load_fleet, single
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.config import GroundConfig, load_ground
 from firmware_py.ground.identity import IDENTITIES
 
 CANNOT_RUN = 2
@@ -52,6 +53,9 @@ def run(
     ] = None,
     identity: Annotated[str, typer.Option(help="generic (PX4's modes) or ardusub")] = "generic",
     store: Annotated[str, typer.Option(help="folder for parameters and signing key of ground stations")] = "",
+    ground_file: Annotated[
+        Path | None, typer.Option(help="file of the ground side: links, identity, store, whom it watches, dock buttons")
+    ] = None,
     stats: Annotated[bool, typer.Option("--stats", help="print how the ticks kept their deadlines")] = False,
     live: Annotated[bool, typer.Option("--live", help="serve a live view for Foxglove")] = False,
     live_host: Annotated[str, typer.Option(help="address that the live view listens on")] = "127.0.0.1",
@@ -64,7 +68,7 @@ def run(
 
     described = load_fleet(fleet) if fleet is not None else single(vehicle, bus, rate_hz)
     chosen = load_parameters(parameters) if parameters is not None else Parameters()
-    links = ground_config(ground or [], identity, store, out)
+    links = ground_config(ground_file, ground or [], identity, store, out)
     notifier = Notifier.of(os.environ)
     with ExitStack() as stack:
         # Its threads start before this process takes its real-time priority, which they would inherit.
@@ -75,13 +79,14 @@ def run(
             typer.echo(f"{name:20s} {value}")
 
 
-def ground_config(links: list[str], identity: str, store: str, logs: Path | None) -> GroundConfig | None:
-    """What the command line says of ground stations; None without a link. Raises DescriptionError."""
-    if not links:
+def ground_config(file: Path | None, links: list[str], identity: str, store: str, logs: Path | None) -> GroundConfig | None:
+    """What `file`, or else the command line, says of ground stations; None without either. Raises DescriptionError."""
+    if file is None and not links:
         return None
     if identity not in IDENTITIES:
         raise DescriptionError(f"identity {identity!r} is unknown; there are {', '.join(IDENTITIES)}")
-    return GroundConfig(links=tuple(links), identity=identity, store=store, logs=str(logs) if logs is not None else "")
+    config = load_ground(file) if file is not None else GroundConfig(identity=identity, store=store)
+    return replace(config, links=tuple(links) or config.links, logs=config.logs or str(logs or ""))
 
 
 @app.command()

@@ -93,11 +93,25 @@ def passed_by(folder: Path) -> Values:
     return total
 
 
-def said_by_tests(*paths: str) -> Callable[[Path], Values]:
-    """Runs tests at full length: of each figure that they say the largest, and as `NAME, sum` the sum; `failed` is pytest's status."""
+def printed_by(program: str) -> Callable[[Path], Values]:
+    """Runs one of the programs of `make bench` that print JSON: its figures by name."""
 
     def measure(folder: Path) -> Values:
-        command = [sys.executable, "-m", "pytest", "--capture=no", "-rs", *paths]
+        command = [sys.executable, Path(__file__).with_name(program)]
+        printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        (folder / "bench.json").write_text(printed, encoding="utf-8")
+        return {entry["name"]: entry["value"] for entry in json.loads(printed)}
+
+    return measure
+
+
+def said_by_tests(*arguments: str) -> Callable[[Path], Values]:
+    """Runs tests at full length, as pytest's `arguments` name them: of each figure that they say the largest, and as `NAME, sum` the sum;
+    `failed` is pytest's status.
+    """
+
+    def measure(folder: Path) -> Values:
+        command = [sys.executable, "-m", "pytest", "--capture=no", "-rs", *arguments]
         environment = {**os.environ, "MODCUBE_FULL": "1"}
         with (folder / "pytest.log").open("w+", encoding="utf-8") as log:
             status = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment).returncode

@@ -9,7 +9,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-CLIENTS = Path(".venv-clients/bin/python")
+CLIENTS = Path(".venv-clients/.stamp")
+"""There once every client is installed."""
 PYTEST = [sys.executable, "-m", "pytest"]
 VCAN = [*PYTEST, "--capture=no", "-rs", "-m", "vcan", "tests/vcan"]
 
@@ -28,11 +29,11 @@ def main() -> int:
     if missing := [package for package in sys.argv[1:] if not is_installed(package)]:
         left_out["vcan"] = f"missing Debian packages: {' '.join(missing)} (make setup-system)"
     if not CLIENTS.exists():
-        left_out["clients"] = f"missing {CLIENTS.parts[0]} (make setup-clients)"
+        left_out["clients"] = f"{CLIENTS.parent} is not complete (make setup-clients)"
     markers = " and ".join(f"not {marker}" for marker in sorted({"vcan", *left_out}))
     with tempfile.TemporaryFile("w+") as report:
         beside = None if missing else subprocess.Popen(VCAN, stdout=report, stderr=subprocess.STDOUT)
-        status = subprocess.run([*PYTEST, "-n", "2", "-m", markers]).returncode
+        status = subprocess.run([*PYTEST, "-n", "2", "--dist", "loadgroup", "-m", markers]).returncode
         if beside is not None:
             print("tests marked vcan, in the virtual machine:", flush=True)
             status = max(status, beside.wait())

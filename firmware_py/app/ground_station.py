@@ -1,5 +1,6 @@
 """The ground side beside the loop: links and GroundStation in a thread of their own. A tick only hands results over.
 
+The thread works once a tick is over, while the loop waits for the next: both want the one interpreter.
 Missions are planned in a process of their own, so that planning takes nothing from the tick.
 """
 
@@ -27,8 +28,8 @@ from firmware_py.ground.station import GroundStation
 from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import unix_ns
 
-_WAIT_S = 0.005
-"""How long the thread sleeps when nothing comes: telemetry is late by so much at most."""
+_WAIT_S = 0.1
+"""A loop that stands still is served this often."""
 _SWITCH_S = 50e-6
 """A tick that wakes up waits this long at most for the interpreter, where Python's own 5 ms would make it late."""
 _MOST_TICKS = 200
@@ -48,7 +49,6 @@ class GroundSide:
     Args of the constructor:
         executor: plans missions; None starts a process for it.
         unix_now_ns: the time of day, for signing.
-        threaded: work in a thread; False: after each tick, in the loop's own time.
     """
 
     def __init__(
@@ -57,7 +57,6 @@ class GroundSide:
         firmware: Firmware,
         executor: Executor | None = None,
         unix_now_ns: Callable[[], int] = unix_ns,
-        threaded: bool = True,
     ) -> None:
         """Opens the links. Raises DescriptionError for a link, key file or parameter file that is wrong."""
         self._config, self._pipeline, self._unix_now_ns = config, firmware.pipeline, unix_now_ns
@@ -71,9 +70,9 @@ class GroundSide:
         self._ticks: deque[tuple[Inputs, Outputs]] = deque(maxlen=_MOST_TICKS)
         self._requests: deque[Request] = deque(maxlen=_MOST_REQUESTS)
         self._thread: threading.Thread | None = None
+        self._ticked = threading.Event()
         self._stopping = False
         self._saved_ns = 0
-        self._threaded = threaded
         self._switch_s = 0.0
         self.error: Exception | None = None
         """What ended the thread; the vehicle goes on without it."""
@@ -81,17 +80,14 @@ class GroundSide:
     def observe(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
         """Observer of the loop: hands the tick over, once its commands are out."""
         self._ticks.append((inputs, outputs))
-        if not self._threaded and self.error is None:
-            self._guarded_pump(0.0)
+        self._ticked.set()
 
     def requests(self) -> list[Request]:
         """What ground stations ask of this tick."""
         return [self._requests.popleft() for _ in range(len(self._requests))]
 
-    def pump(self, wait_s: float = 0.0) -> None:
+    def pump(self) -> None:
         """One round: take ticks and bytes, answer, stream."""
-        if wait_s:
-            self.links.wait(wait_s)
         station = self.station
         while self._ticks:
             inputs, outputs = self._ticks.popleft()
@@ -121,8 +117,6 @@ class GroundSide:
         if self._executor is None:
             self._executor = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
             self._executor.submit(plan_mission, _NOTHING, None)
-        if not self._threaded:
-            return self
         self._switch_s = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
         self._thread = threading.Thread(target=self._run, name="ground", daemon=True)
@@ -146,12 +140,11 @@ class GroundSide:
             self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _run(self) -> None:
-        while not self._stopping and self.error is None:
-            self._guarded_pump(_WAIT_S)
-
-    def _guarded_pump(self, wait_s: float) -> None:
         try:
-            self.pump(wait_s)
+            while not self._stopping:
+                self._ticked.wait(_WAIT_S)
+                self._ticked.clear()
+                self.pump()
         except Exception as error:  # the flight is worth more than its telemetry
             self.error = error
 

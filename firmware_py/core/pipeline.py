@@ -216,7 +216,7 @@ class Pipeline:
                 self.docking.abort(chain.body.index, inputs.time_ns, "the mode was changed")
             record, command = chain.control(inputs.time_ns, estimate)
             outputs.records.append(record)
-            outputs.events += chain.supervisor.events
+            outputs.events += [event._replace(body=chain.body.index) for event in chain.supervisor.events]
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
             _command(chain, command, relays, outputs)
         return outputs

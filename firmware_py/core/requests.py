@@ -121,7 +121,8 @@ def sift(requests: Sequence[Request], bodies: Mapping[int, Body]) -> tuple[list[
     """The requests that make sense and reach a body, and for each of the others why not."""
     reasons = [against_request(request, bodies) for request in requests]
     sound = [request for request, why in zip(requests, reasons, strict=True) if not why]
-    return sound, [Event(WARNING, f"{r.action.name} refused: {why}") for r, why in zip(requests, reasons, strict=True) if why]
+    refused = [(request, why) for request, why in zip(requests, reasons, strict=True) if why]
+    return sound, [Event(WARNING, f"{request.action.name} refused: {why}", request.body) for request, why in refused]
 
 
 def against_request(request: Request, bodies: Mapping[int, Body]) -> str:

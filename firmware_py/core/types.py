@@ -274,6 +274,8 @@ class Event(NamedTuple):
     severity: int
     """syslog: 2 critical, 4 warning, 6 information."""
     text: str
+    body: int | None = None
+    """Number of the body that it is about; None: all of them, or none that there is."""
 
 
 class BodyRecord(NamedTuple):

@@ -3,42 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 from firmware_py.core.types import Action, DockRequest, Event, Mode
+from firmware_py.ground.command import ACCEPTED, DENIED, FAILED, TEMPORARILY_REJECTED, UNSUPPORTED, Answer, Command
 from firmware_py.ground.identity import SETTABLE
+from firmware_py.ground.message_requests import MessageRequests
 from firmware_py.ground.mission_flight import MissionFlight
 from firmware_py.ground.steering import Steering
-from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
-from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS
+from firmware_py.ground.system import Arrival, Handler, System
 
-ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
 DECISION_NS = 400_000_000
 """The supervisor decides within a tick or two; clients ask again after 0.5 s."""
 _FORCED = (21196, 2989)
 """Second parameter of a forced arm or disarm: MAVLink's, and ArduPilot's for arming."""
-_MODULES, _FACES = 64, 6
+_FACES = 6
 
 DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
 """User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
 
 _WARNING = 4
-
-
-class Command(NamedTuple):
-    """One command, however it came."""
-
-    number: int
-    parameters: tuple[float, ...]
-    """Seven; those that are not used may be NaN."""
-    arrival: Arrival
-
-    def get(self, index: int, default: float = 0.0) -> float:
-        """Parameter `index` (1 to 7), or `default` where it is NaN or infinite."""
-        value = self.parameters[index - 1]
-        return value if math.isfinite(value) else default
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,22 +37,11 @@ class Pending:
     deadline_ns: int
 
 
-Answer = int | None
-"""A MAV_RESULT, or None when it comes later."""
-
-
 class CommandService:
     """The commands of one system."""
 
-    def __init__(
-        self,
-        system: System,
-        missions: MissionFlight,
-        steering: Steering,
-        extra: Mapping[str, Callable[[Arrival], bool]],
-    ) -> None:
-        """`extra` answers REQUEST_MESSAGE for messages that are not streamed; False means it cannot."""
-        self._system, self._missions, self._steering, self._extra = system, missions, steering, extra
+    def __init__(self, system: System, missions: MissionFlight, steering: Steering, messages: MessageRequests) -> None:
+        self._system, self._missions, self._steering = system, missions, steering
         self._pending: list[Pending] = []
         self.reboot_asked = False
         self._table: dict[int, Callable[[Command], Answer]] = {
@@ -82,15 +57,11 @@ class CommandService:
             246: self._reboot,
             300: lambda c: self._start_mission(c, max(0, int(c.get(1)))),
             400: self._arm,
-            410: lambda c: self._request(c, "HOME_POSITION"),
-            510: self._get_interval,
-            511: self._set_interval,
-            512: self._request_message,
-            520: lambda c: self._request(c, "AUTOPILOT_VERSION"),
             DOCK: lambda c: self._dock(c, Action.DOCK),
             UNDOCK: lambda c: self._dock(c, Action.UNDOCK),
             ESTOP: self._estop,
             CLEAR_ESTOP: self._clear_estop,
+            **messages.table(),
         }
 
     def handlers(self) -> dict[str, Handler]:
@@ -261,47 +232,3 @@ class CommandService:
         s = self._system.subject
         is_turning = lambda: s.picture.mode(s.body) == Mode.MOTOR_DETECT and s.armed  # noqa: E731
         return self._ask(command, Action.MOTOR_TEST, (thruster, share, seconds), is_turning)
-
-    # ------------------------------------------------------------ messages and their rates
-
-    def _set_interval(self, command: Command) -> Answer:
-        name = self._name(command.get(1))
-        if name not in STREAMS:
-            return UNSUPPORTED
-        interval_us = command.get(2)
-        rates = self._system.channels[command.arrival.channel]
-        if interval_us == 0:
-            hz = DEFAULT_HZ.get(name, 0.0)
-            interval_ns = round(NS_PER_S / hz) if hz else 0
-        else:
-            interval_ns = max(round(interval_us * 1e3), 0)
-        if name == "HEARTBEAT" and not 0 < interval_ns <= NS_PER_S:
-            return DENIED  # without it clients lose the vehicle
-        rates.set(name, interval_ns, command.arrival.time_ns)
-        return ACCEPTED
-
-    def _get_interval(self, command: Command) -> Answer:
-        name = self._name(command.get(1))
-        if name not in STREAMS:
-            return UNSUPPORTED
-        interval_ns = self._system.channels[command.arrival.channel].intervals_ns.get(name, 0)
-        interval_us = interval_ns // 1000 if interval_ns else -1
-        values = {"message_id": int(command.get(1)), "interval_us": interval_us}
-        self._system.send(command.arrival.channel, "MESSAGE_INTERVAL", values)
-        return ACCEPTED
-
-    def _request_message(self, command: Command) -> Answer:
-        return self._request(command, self._name(command.get(1)), command.get(2))
-
-    def _request(self, command: Command, name: str, index: float = 0.0) -> Answer:
-        if name in self._extra:
-            message = replace(command.arrival.message, values={"index": int(index)})
-            return ACCEPTED if self._extra[name](command.arrival._replace(message=message)) else DENIED
-        if name not in STREAMS or self._system.body not in self._system.subject.picture.records:
-            return UNSUPPORTED
-        for values in STREAMS[name](self._system.subject):
-            self._system.send(command.arrival.channel, name, values)
-        return ACCEPTED
-
-    def _name(self, number: float) -> str:
-        return self._system.name_of(int(number))

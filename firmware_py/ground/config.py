@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_py.description.schema import DescriptionError, quantity
+from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
 from firmware_py.ground.identity import IDENTITIES, Identity
 
 
@@ -49,3 +49,10 @@ class GroundConfig:
     def key_file(self) -> Path | None:
         """Where key and time stamp are kept."""
         return Path(self.store) / "signing.json" if self.store else None
+
+
+def load_ground(path: Path) -> GroundConfig:
+    """The ground side in `path`; what it leaves out keeps its default. Raises DescriptionError, one line."""
+    table, source = read_toml(path)
+    config: GroundConfig = build(GroundConfig, table, source)
+    return config

@@ -102,3 +102,9 @@ SETTABLE = (
     Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.SURFACE, Mode.MOTOR_DETECT,
 )  # fmt: skip
 """Modes that a person may choose; DOCK is entered by asking for it."""
+
+NAMES: Mapping[Mode, str] = {
+    Mode.MANUAL: "Manual", Mode.STABILIZE: "Stabilize", Mode.ALT_HOLD: "Depth Hold", Mode.POSHOLD: "Position Hold",
+    Mode.AUTO: "Auto", Mode.GUIDED: "Guided", Mode.SURFACE: "Surface", Mode.MOTOR_DETECT: "Motor Detection",
+}  # fmt: skip
+"""What people read in a menu. QGroundControl pauses, and starts missions, by these names of a submarine's modes."""

@@ -5,7 +5,6 @@ Everyone at the other end is a channel with a number of its own. Runs beside the
 
 from __future__ import annotations
 
-import selectors
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -68,14 +67,6 @@ class Links:
         for index, link in enumerate(self.links):
             for peer in link.peers():
                 self._channel(index, peer)
-
-    def wait(self, timeout_s: float) -> None:
-        """Until something came, or the time is over."""
-        with selectors.DefaultSelector() as selector:
-            for link in self.links:
-                for each in link.sockets():
-                    selector.register(each, selectors.EVENT_READ)
-            selector.select(timeout_s)
 
     def receive(self) -> list[Received]:
         """What came on all links, without waiting."""

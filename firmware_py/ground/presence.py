@@ -7,7 +7,7 @@ from collections.abc import Callable
 from firmware_py.core.types import Action
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.identity import SETTABLE
+from firmware_py.ground.identity import NAMES, SETTABLE
 from firmware_py.ground.signing import KEY_BYTES, Signing
 from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
 
@@ -112,7 +112,7 @@ class Presence:
             values = {
                 "number_modes": count, "mode_index": number, "standard_mode": 0,
                 "custom_mode": self._system.subject.identity.custom_mode(mode), "properties": 0,
-                "mode_name": mode.name.replace("_", " ").title(),
+                "mode_name": NAMES[mode],
             }  # fmt: skip
             self._system.send(arrival.channel, "AVAILABLE_MODES", values)
         return True

@@ -15,6 +15,7 @@ from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.geodesy import Origin
 from firmware_py.ground.logs import LogService
+from firmware_py.ground.message_requests import MessageRequests
 from firmware_py.ground.mission_flight import MissionFlight, Plan, PlanJob
 from firmware_py.ground.missions import MissionService
 from firmware_py.ground.outbox import Outbox, Outgoing
@@ -47,7 +48,7 @@ class Services:
             "AUTOPILOT_VERSION": self.presence.autopilot_version,
             "AVAILABLE_MODES": self.presence.available_modes,
         }
-        self.commands = CommandService(system, self.flight, self.steering, extra)
+        self.commands = CommandService(system, self.flight, self.steering, MessageRequests(system, extra))
         parts = (self.commands, self.parameters, self.missions, self.steering, self.presence, self.logs)
         self.handlers = {name: handler for part in parts for name, handler in part.handlers().items()}
 
@@ -91,16 +92,21 @@ class GroundStation:
         self.picture.observe(inputs, outputs, bodies)
         for event in outputs.events:
             for services in self.services.values():
-                services.commands.hear(event)
-                services.flight.hear(event)
-        present = self.present()
-        if present:
-            while self.picture.events:
-                event = self.picture.events.popleft()
-                present[0].say(event.severity, event.text)
+                if event.body in (None, services.system.body):
+                    services.commands.hear(event)
+                    services.flight.hear(event)
+        self._tell()
         for services in self.services.values():
             if services.system.body_is_known:
                 services.step(outputs.time_ns)
+
+    def _tell(self) -> None:
+        """Events as texts of the body that they are about; the first one tells what is about no body."""
+        present: dict[int | None, System] = {system.body: system for system in self.present()}
+        while present and self.picture.events:
+            event = self.picture.events.popleft()
+            speaker = present.get(event.body, next(iter(present.values())))
+            speaker.say(event.severity, event.text)
 
     def join(self, channel: int, time_ns: int) -> None:
         """A channel is there; it gets the default telemetry."""

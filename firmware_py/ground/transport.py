@@ -26,10 +26,6 @@ class Link(Protocol):
 
     datagram: bool
 
-    def sockets(self) -> Sequence[Any]:
-        """What to wait for."""
-        ...
-
     def receive(self) -> list[tuple[Any, bytes]]:
         """What came, with the peer it came from. An empty text ends a peer."""
         ...
@@ -69,9 +65,6 @@ class UdpLink:
     def port(self) -> int:
         """The local port."""
         return int(self._socket.getsockname()[1])
-
-    def sockets(self) -> Sequence[Any]:
-        return [self._socket]
 
     def receive(self) -> list[tuple[Any, bytes]]:
         got: list[tuple[Any, bytes]] = []
@@ -113,9 +106,6 @@ class TcpLink:
     def port(self) -> int:
         """The local port."""
         return int(self._server.getsockname()[1])
-
-    def sockets(self) -> Sequence[Any]:
-        return [self._server, *self._left]
 
     def receive(self) -> list[tuple[Any, bytes]]:
         with contextlib.suppress(BlockingIOError, ConnectionError):
@@ -178,9 +168,6 @@ class SerialLink:
 
     def _open(self) -> Any:
         return serial.Serial(self._device, self._baud, timeout=0, write_timeout=0)
-
-    def sockets(self) -> Sequence[Any]:
-        return [self._serial] if self._is_plugged() else []
 
     def _is_plugged(self) -> bool:
         """Whether the device is open; opens it when it is there again."""

@@ -115,9 +115,7 @@ _REFUSED = Packet(Message("", {}), b"")
 
 def checksum(covered: bytes, crc_extra: int) -> int:
     """X.25 checksum of a frame without its magic byte, and of the message's own byte."""
-    crc = x25crc(covered)
-    crc.accumulate(bytes([crc_extra]))
-    return int(crc.crc)
+    return int(x25crc(covered + bytes((crc_extra,))).crc)
 
 
 class Encoder:

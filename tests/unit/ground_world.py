@@ -3,6 +3,7 @@ firmware_py.ground.
 """
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import (
     Action,
     BodyRecord,
+    EscFeedback,
     Estimate,
     Event,
     Inputs,
@@ -52,14 +54,22 @@ class Robot:
         self.refuse: dict[Action, str] = {}
         """Reason for each action that is refused."""
         self.asked: list[Request] = []
+        self.events: list[Event] = []
+        """What the next tick says."""
+        self.bodies: list[Any] = [SimpleNamespace(index=n, modules=(n,)) for n in range(modules)]
+
+    def dock(self) -> None:
+        """All modules are one body from now on."""
+        self.bodies = [SimpleNamespace(index=0, modules=tuple(range(len(self.state))))]
 
     def step(self, requests: list[Request]) -> tuple[Inputs, Outputs]:
         self.tick += 1
         time_ns = self.tick * PERIOD_NS
         modules = [self._inputs() for _ in self.state]
-        events = [event for request in requests for event in self._take(request)]
+        events = [*self.events, *(event for request in requests for event in self._take(request))]
+        self.events = []
         commands = [ModuleCommand(s == State.ARMED, np.linspace(-1, 1, 8), None) for s in self.state]
-        records = [self._record(body) for body in range(len(self.state))]
+        records = [self._record(body.index) for body in self.bodies]
         return Inputs(self.tick, time_ns, modules, requests), Outputs(
             self.tick, time_ns, commands, False, events, records
         )
@@ -68,13 +78,14 @@ class Robot:
         return ModuleInputs(
             gyro=ZERO, accel=ZERO, pressure_pa=106_000.0, dock_current_ma=[100.0, *[0.0] * 5], voltage_v=12.1,
             current_a=2.5, cabin_temperature_c=25.5, cabin_pressure_pa=101_300.0, leak=False, answered=True, heard=True,
+            esc=[EscFeedback(2, (900.0, -450.0), (1.5, 0.5), (0, 4))],
         )  # fmt: skip
 
     def _take(self, request: Request) -> list[Event]:
         self.asked.append(request)
         action, body = request.action, request.body
         if action in self.refuse:
-            return [Event(4, f"{action.name} refused: {self.refuse[action]}")]
+            return [Event(4, f"{action.name} refused: {self.refuse[action]}", body)]
         armed = self.state[body] == State.ARMED
         if action == Action.ARM and self.state[body] == State.DISARMED:
             self.state[body] = State.ARMED
@@ -184,7 +195,7 @@ class World:
     def run(self, ticks: int) -> None:
         for _ in range(ticks):
             inputs, outputs = self.robot.step(self.station.requests())
-            self.station.observe(inputs, outputs, [])
+            self.station.observe(inputs, outputs, self.robot.bodies)
             for channel, frame in self.station.frames(outputs.time_ns):
                 client = self.clients[channel]
                 client.inbox += client.mav.parse_buffer(frame) or []

@@ -1,6 +1,7 @@
 """What a client hears and may ask, message by message, through pymavlink's own encoder and parser."""
 
 import math
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from firmware_py.core.types import Action, DockRequest, Mode
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.identity import px4
+from firmware_py.ground.telemetry import STREAMS
 from firmware_py.ground.wire import checksum
 from tests.unit.ground_world import Client, World
 
@@ -108,14 +110,17 @@ def test_esc_messages_decode_with_a_dialect_that_mavgen_made(world: World, clien
     assert ours.by_name["ESC_STATUS"].crc_extra == status.crc_extra
     raw = status.unpacker.unpack(payload.ljust(status.unpacker.size, b"\0"))
     assert set(raw) == {4, 7, 1, -2, 3, -4, 12.5, 0.5, 1.5, 2.0}
-    frames: list[bytes] = []
     world.station.frames(world.time_ns)
+    client.command(512, 290)
     client.command(512, 291)
-    frames += [frame for _, frame in world.station.frames(world.time_ns)]
     parser = dialect.MAVLink(None)
     parser.robust_parsing = True
-    names = [m.get_type() for frame in frames for m in parser.parse_buffer(frame) or []]
-    assert names.count("ESC_STATUS") == 2, "eight ESCs, four in a message"
+    sent = [m for _, frame in world.station.frames(world.time_ns) for m in parser.parse_buffer(frame) or []]
+    info, statuses = ([m for m in sent if m.get_type() == name] for name in ("ESC_INFO", "ESC_STATUS"))
+    assert [m.index for m in statuses] == [m.index for m in info] == [0, 4], "eight ESCs, four in a message"
+    assert (statuses[0].rpm, statuses[0].current) == ([0, 0, 900, -450], [0.0, 0.0, 1.5, 0.5])
+    assert statuses[0].voltage == pytest.approx([12.1] * 4)
+    assert (info[0].count, info[0].info, info[0].connection_type, info[0].failure_flags) == (8, 15, 5, [0, 0, 0, 4])
 
 
 def test_frames_carry_the_checksum_that_pymavlink_computes(client: Client) -> None:
@@ -143,6 +148,28 @@ def test_refusals_and_failsafes_reach_the_client_as_text(world: World, client: C
 
 
 # ---------------------------------------------------------------- rates and requests
+
+
+def sent(world: World, ticks: int = 1) -> Counter[int]:
+    """How many frames of each message number went out."""
+    counts: Counter[int] = Counter()
+    for _ in range(ticks):
+        inputs, outputs = world.robot.step(world.station.requests())
+        world.station.observe(inputs, outputs, world.robot.bodies)
+        counts.update(int.from_bytes(frame[7:10], "little") for _, frame in world.station.frames(outputs.time_ns))
+    return counts
+
+
+@pytest.mark.parametrize("name", sorted(STREAMS.keys() - {"HEARTBEAT"}))
+def test_every_message_stops_comes_once_and_streams_as_it_is_asked_to(world: World, client: Client, name: str) -> None:
+    number = load_dialect().by_name[name].number
+    client.command(511, number, -1)
+    assert not sent(world, 210)[number]
+    client.command(512, number)
+    once = sent(world)[number]
+    assert once > 0
+    client.command(511, number, 250_000)
+    assert sent(world, 100)[number] == 5 * once, "at once, and every 250 ms"
 
 
 def test_message_interval_sets_the_rate_of_this_link_alone(world: World, client: Client) -> None:
@@ -178,7 +205,8 @@ def test_available_modes_are_told_one_by_one(world: World, client: Client) -> No
     modes = client.all("AVAILABLE_MODES")
     assert len(modes) == modes[0].number_modes and modes[0].mode_name == "Manual"
     ask(world, client, 512, mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, 4)
-    assert client.last("AVAILABLE_MODES").custom_mode == px4(4, 3)
+    assert (client.last("AVAILABLE_MODES").custom_mode, client.last("AVAILABLE_MODES").mode_name) == (px4(4, 3), "Position Hold")
+    assert ask(world, client, 512, mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, 9) == mavlink.MAV_RESULT_DENIED
 
 
 def test_home_position_can_be_asked_for(world: World, client: Client) -> None:
@@ -205,6 +233,20 @@ def test_unknown_command_is_unsupported_at_once(world: World, client: Client) ->
     client.command(2000, *[NAN] * 7)
     world.run(1)
     assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_UNSUPPORTED
+
+
+def test_every_command_is_acknowledged_when_all_its_parameters_are_left_out() -> None:
+    for number in World().station.services[1].commands._table:
+        world = World()
+        client = world.client()
+        client.command(number, *[NAN] * 7)
+        assert acknowledged(world, client, number) <= mavlink.MAV_RESULT_FAILED
+
+
+@pytest.mark.parametrize("number", [20, 21])
+def test_return_and_land_both_surface(world: World, client: Client, number: int) -> None:
+    assert ask(world, client, number) == mavlink.MAV_RESULT_ACCEPTED
+    assert world.robot.mode[0] == Mode.SURFACE
 
 
 def test_component_zero_and_system_zero_are_accepted(world: World, client: Client) -> None:

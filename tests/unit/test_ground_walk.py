@@ -46,7 +46,7 @@ def test_client_sees_heartbeat_and_attitude(ours: str, theirs: str) -> None:
                 client.mav.heartbeat_send(6, 8, 0, 0, 4)
             inputs, outputs = robot.step(side.requests())
             side.observe([], [], inputs, outputs)
-            side.pump(0.001)
+            side.pump()
             while (message := client.recv_match(blocking=False)) is not None:
                 seen[message.get_type()] = message
             if "HEARTBEAT" in seen and "ATTITUDE" in seen:

@@ -285,6 +285,12 @@ def test_each_body_obeys_its_own_requests() -> None:
     np.testing.assert_allclose(tank.states[1][:3], tank.past[50][1][:3], atol=5e-3)
 
 
+def test_what_is_said_names_the_body_that_it_is_about() -> None:
+    tank = Tank([single(0), single(1)])
+    refused = tank.run(DT, Request(Action.ARM, 1), Request(Action.SET_MODE, 0, 19.5))
+    assert {(event.text.split(":")[0], event.body) for event in refused.events} >= {("ARM refused", 1), ("SET_MODE refused", 0)}
+
+
 @pytest.mark.parametrize("modules", [[0, 1, 2], [2, 0, 1]])
 def test_docked_shape_holds_its_place_however_its_modules_sit_and_count(modules: list[int]) -> None:
     """An L of three whose modules all sit differently: a mix-up of frames, levers or commands would throw it about."""

@@ -1,0 +1,28 @@
+"""One command of a client, and how it may be answered."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from firmware_py.ground.system import Arrival
+
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
+"""MAV_RESULT."""
+
+Answer = int | None
+"""A MAV_RESULT, or None when it comes later."""
+
+
+class Command(NamedTuple):
+    """One command, however it came."""
+
+    number: int
+    parameters: tuple[float, ...]
+    """Seven; those that are not used may be NaN."""
+    arrival: Arrival
+
+    def get(self, index: int, default: float = 0.0) -> float:
+        """Parameter `index` (1 to 7), or `default` where it is NaN or infinite."""
+        value = self.parameters[index - 1]
+        return value if math.isfinite(value) else default

@@ -1,0 +1,70 @@
+"""Commands about messages: which are streamed how often, and which are wanted once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from firmware_py.ground.command import ACCEPTED, DENIED, UNSUPPORTED, Answer, Command
+from firmware_py.ground.system import NS_PER_S, Arrival, System
+from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS
+
+
+class MessageRequests:
+    """What one system is asked to send."""
+
+    def __init__(self, system: System, extra: Mapping[str, Callable[[Arrival], bool]]) -> None:
+        """`extra` answers REQUEST_MESSAGE for messages that are not streamed; False means it cannot."""
+        self._system, self._extra = system, extra
+
+    def table(self) -> dict[int, Callable[[Command], Answer]]:
+        """By the command's number."""
+        return {
+            410: lambda c: self._request(c, "HOME_POSITION"),
+            510: self._get_interval,
+            511: self._set_interval,
+            512: self._request_message,
+            520: lambda c: self._request(c, "AUTOPILOT_VERSION"),
+        }
+
+    def _set_interval(self, command: Command) -> Answer:
+        name = self._name(command.get(1))
+        if name not in STREAMS:
+            return UNSUPPORTED
+        interval_us = command.get(2)
+        rates = self._system.channels[command.arrival.channel]
+        if interval_us == 0:
+            hz = DEFAULT_HZ.get(name, 0.0)
+            interval_ns = round(NS_PER_S / hz) if hz else 0
+        else:
+            interval_ns = max(round(interval_us * 1e3), 0)
+        if name == "HEARTBEAT" and not 0 < interval_ns <= NS_PER_S:
+            return DENIED  # without it clients lose the vehicle
+        rates.set(name, interval_ns, command.arrival.time_ns)
+        return ACCEPTED
+
+    def _get_interval(self, command: Command) -> Answer:
+        name = self._name(command.get(1))
+        if name not in STREAMS:
+            return UNSUPPORTED
+        interval_ns = self._system.channels[command.arrival.channel].intervals_ns.get(name, 0)
+        interval_us = interval_ns // 1000 if interval_ns else -1
+        values = {"message_id": int(command.get(1)), "interval_us": interval_us}
+        self._system.send(command.arrival.channel, "MESSAGE_INTERVAL", values)
+        return ACCEPTED
+
+    def _request_message(self, command: Command) -> Answer:
+        return self._request(command, self._name(command.get(1)), command.get(2))
+
+    def _request(self, command: Command, name: str, index: float = 0.0) -> Answer:
+        if name in self._extra:
+            message = replace(command.arrival.message, values={"index": int(index)})
+            return ACCEPTED if self._extra[name](command.arrival._replace(message=message)) else DENIED
+        if name not in STREAMS or self._system.body not in self._system.subject.picture.records:
+            return UNSUPPORTED
+        for values in STREAMS[name](self._system.subject):
+            self._system.send(command.arrival.channel, name, values)
+        return ACCEPTED
+
+    def _name(self, number: float) -> str:
+        return self._system.name_of(int(number))
