@@ -132,8 +132,10 @@ def logs() -> None:
 
 def main() -> None:
     """Runs the command line; wrong input ends in one line on stderr and status 2."""
-    for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):
-        app.add_typer(entry.load(), name=entry.name)
+    own = {command.callback.__name__ for command in app.registered_commands if command.callback is not None}
+    if own.isdisjoint(sys.argv[1:2]):  # the vehicle's process has no room for the bench
+        for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):
+            app.add_typer(entry.load(), name=entry.name)
     try:
         status = app(prog_name="modcube", standalone_mode=False)
     except TyperException as error:

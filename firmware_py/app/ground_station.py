@@ -6,6 +6,7 @@ Missions are planned in a process of their own, so that planning takes nothing f
 from __future__ import annotations
 
 import multiprocessing
+import os
 import sys
 import threading
 from collections import deque
@@ -16,7 +17,7 @@ from types import TracebackType
 import numpy as np
 
 from firmware_py.app.firmware import BusFrame, Firmware
-from firmware_py.app.mission_plan import plan_mission
+from firmware_py.core.body import Body
 from firmware_py.core.types import Inputs, Outputs, Request
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
@@ -26,6 +27,7 @@ from firmware_py.ground.signing import Signing, load_signing
 from firmware_py.ground.station import GroundStation
 from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import unix_ns
+from firmware_py.runtime.realtime import die_with
 
 _WAIT_S = 0.005
 """How long the thread sleeps when nothing comes: telemetry is late by so much at most."""
@@ -40,6 +42,17 @@ _SAVE_EVERY_NS = 1_000_000_000
 
 _NOTHING = PlanJob(0, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), 0.1, 1.0)
 """A plan of no legs: makes the planning process load what it needs."""
+
+
+def _plan_mission(job: PlanJob, body: Body | None) -> Plan:
+    """In the planning process alone: its solvers take 20 MB that the vehicle's process has no need of."""
+    from firmware_py.app.mission_plan import plan_mission
+
+    return plan_mission(job, body)
+
+
+def _planner() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=die_with, initargs=(os.getpid(),))
 
 
 class GroundSide:
@@ -119,8 +132,8 @@ class GroundSide:
     def __enter__(self) -> GroundSide:
         """Start the thread, and the process that plans: it takes seconds to be ready."""
         if self._executor is None:
-            self._executor = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-            self._executor.submit(plan_mission, _NOTHING, None)
+            self._executor = _planner()
+            self._executor.submit(_plan_mission, _NOTHING, None)
         if not self._threaded:
             return self
         self._switch_s = sys.getswitchinterval()
@@ -160,8 +173,8 @@ class GroundSide:
         bodies = {body.index: body for body in self._pipeline.bodies}
         for job in self.station.jobs():
             if self._executor is None:
-                self._executor = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-            self._plans.append((job, self._executor.submit(plan_mission, job, bodies.get(job.body))))
+                self._executor = _planner()
+            self._plans.append((job, self._executor.submit(_plan_mission, job, bodies.get(job.body))))
         for job, future in list(self._plans):
             if not future.done():
                 continue

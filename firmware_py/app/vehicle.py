@@ -21,7 +21,7 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.runtime.notify import Notifier
-from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time, use_priority
+from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time, release_compiler, use_priority
 from firmware_py.runtime.recorder import Recorder
 from firmware_py.runtime.worker import ThreadWorker
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 FAREWELL_TICKS = 10
 """Ticks that go on saying `disarmed` after a stop was asked for."""
 ARM_EVERY_S = 1.0
-"""How often arming is tried again with `--hold`."""
+"""How often arming is tried again with `--hold`, once the pose is known."""
 FLUSH_EVERY_S = 0.5
 
 
@@ -57,6 +57,7 @@ class Operator:
     stopping: bool = False
     farewell: int = 0
     _ticks: int = 0
+    _next_try: int = 0
 
     def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
         """The requests of this tick."""
@@ -64,9 +65,12 @@ class Operator:
         if self.stopping:
             self.farewell += 1
             return [Request(Action.DISARM, body) for body in self.bodies] if self.farewell == 1 else []
-        if not self.hold or last is None or self._ticks % round(ARM_EVERY_S * self.rate_hz):
+        if not self.hold or last is None or self._ticks < self._next_try:
             return []
-        return [Request(Action.ARM, record.body) for record in last.records if record.state not in ARMED]
+        ready = [record.body for record in last.records if record.state not in ARMED and record.estimate.ready]
+        if ready:
+            self._next_try = self._ticks + round(ARM_EVERY_S * self.rate_hz)
+        return [Request(Action.ARM, body) for body in ready]
 
     def is_done(self, tick: int, outputs: Outputs) -> bool:
         """Whether every module has been told for long enough."""
@@ -95,6 +99,7 @@ def run_vehicle(
     """
     if ground is not None and ground.parameter_file is not None and ground.parameter_file.exists():
         parameters = load_parameters(ground.parameter_file)
+    release_compiler()
     worker = ThreadWorker()
     firmware = compose(fleet, parameters, worker=worker)
     operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
@@ -113,15 +118,16 @@ def run_vehicle(
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
         observers.append(telling(say))  # after the recorder, which may have something to say
-        for line in stack.enter_context(real_time()):
-            say(f"warning: {line}")
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
         if ground is not None:
-            from firmware_py.app.ground_station import GroundSide  # with the planner of missions: 0.2 s and 15 MB
+            from firmware_py.app.ground_station import GroundSide  # a tenth of a second, and 6 MB of messages
 
+            # Like the recorder's and the live view's, its threads start before this one takes its priority, which they would inherit.
             side = stack.enter_context(GroundSide(ground, firmware))
             observers.append(side.observe)
             requests = with_ground(operator, side)
+        for line in stack.enter_context(real_time()):
+            say(f"warning: {line}")
         loop = open_loop(stack, firmware, requests, observers)
         if notifier is not None and notifier.is_heard:
             loop.observers = [*observers, reporting(notifier, loop.rate_keeper, fleet.rate_hz)]

@@ -4,8 +4,12 @@ import errno
 import gc
 import os
 import resource
+import signal
+import subprocess
+import sys
 import threading
 
+import numba
 import pytest
 
 from firmware_py.runtime import realtime
@@ -54,3 +58,15 @@ def test_no_garbage_is_collected_in_flight() -> None:
         assert not gc.isenabled()
     assert gc.isenabled()
     assert gc.get_freeze_count() == 0
+
+
+def test_compiler_whose_pages_were_given_back_still_compiles() -> None:
+    realtime.release_compiler()
+    twice = numba.njit("i8(i8)")(lambda number: 2 * number)
+    realtime.release_compiler()
+    assert twice(21) == 42
+
+
+def test_helper_whose_vehicle_has_ended_already_ends_too() -> None:
+    code = "import os; from firmware_py.runtime.realtime import die_with; die_with(os.getpid())"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
