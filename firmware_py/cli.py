@@ -58,6 +58,7 @@ def run(
     live_port: Annotated[int, typer.Option(min=1, max=65535, help="and its port")] = 8765,
 ) -> None:
     """Run the vehicle until SIGINT or SIGTERM."""
+    from firmware_py.app.deadlines import stats_lines
     from firmware_py.app.live_view import LiveView
     from firmware_py.app.vehicle import run_vehicle
     from firmware_py.runtime.notify import Notifier
@@ -70,9 +71,8 @@ def run(
         # Its threads start before this process takes its real-time priority, which they would inherit.
         view = stack.enter_context(LiveView(live_host, live_port)) if live else None
         summary = run_vehicle(described, chosen, hold, out, lambda line: typer.echo(line), notifier, links, view)
-    if stats:
-        for name, value in summary._asdict().items():
-            typer.echo(f"{name:20s} {value}")
+    for line in stats_lines(summary) if stats else ():
+        typer.echo(line)
 
 
 def ground_config(links: list[str], identity: str, store: str, logs: Path | None) -> GroundConfig | None:

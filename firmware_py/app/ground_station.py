@@ -16,6 +16,7 @@ from types import TracebackType
 
 import numpy as np
 
+from firmware_py.app.deadlines import times_of
 from firmware_py.app.firmware import BusFrame, Firmware
 from firmware_py.core.body import Body
 from firmware_py.core.types import Inputs, Outputs, Request
@@ -27,6 +28,7 @@ from firmware_py.ground.signing import Signing, load_signing
 from firmware_py.ground.station import GroundStation
 from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import unix_ns
+from firmware_py.runtime.rate_keeper import RateKeeper
 from firmware_py.runtime.realtime import die_with
 
 _WAIT_S = 0.005
@@ -88,6 +90,8 @@ class GroundSide:
         self._saved_ns = 0
         self._threaded = threaded
         self._switch_s = 0.0
+        self.keeper: RateKeeper | None = None
+        """Of a loop on a clock; telemetry tells how its ticks keep their deadlines."""
         self.error: Exception | None = None
         """What ended the thread; the vehicle goes on without it."""
 
@@ -106,6 +110,8 @@ class GroundSide:
         if wait_s:
             self.links.wait(wait_s)
         station = self.station
+        if self.keeper is not None:
+            station.picture.times = times_of(self.keeper)
         while self._ticks:
             inputs, outputs = self._ticks.popleft()
             station.observe(inputs, outputs, self._pipeline.bodies)

@@ -1,4 +1,4 @@
-"""Commands of `modcube` as processes of their own, which end by a deadline however a test goes."""
+"""Commands of `modcube` as processes of their own, which end by a deadline, and with the test, however it goes."""
 
 import os
 import signal
@@ -9,8 +9,9 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-MODCUBE = [sys.executable, "-c", "from firmware_py.cli import main; main()"]
-DEADLINE_S = 120.0
+DIE_WITH_TEST = f"from firmware_py.runtime.realtime import die_with; die_with({os.getpid()})"
+MODCUBE = [sys.executable, "-c", f"{DIE_WITH_TEST}; from firmware_py.cli import main; main()"]
+DEADLINE_S = 300.0
 """Longest that a process may take on a machine that is busy with other tests."""
 
 

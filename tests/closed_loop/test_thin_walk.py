@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_py.app.replay import replay
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.signals import read_signals
 from hil.flight import fly_and_judge
 from hil.scenario import load_scenario
 from hil.signals import read_flight
@@ -26,6 +28,12 @@ def test_vehicle_process_arms_holds_and_disarms_when_it_is_asked_to_stop(tmp_pat
         plant.end()
     assert "-> DISARMED" in rest
     assert "lateness_p99_ns" in rest
+    assert "compute, ticks\n" in rest
+    outcome = replay(tmp_path / "log")
+    assert (outcome.first, outcome.torn) == (None, "")
+    times = read_signals(tmp_path / "log" / "signals.mcap")["/firmware/times"]
+    for name in ("lateness_ticks", "compute_ticks"):
+        assert np.sum(times[name][-1]) == times["tick"][-1] == outcome.ticks
     assert (tmp_path / "log" / "can.log").stat().st_size > 0
 
 
