@@ -25,6 +25,7 @@ from bench_drag import drag_entries
 from bench_entry import REPETITIONS, Entry, compare, each_us
 from bench_fleet import TIMED_TICKS, Hold, cube_of
 from bench_flight import FlightTimes, measure_flight
+from bench_lateness import lateness_entries
 from rich import box as box_style
 from rich.console import Console
 from rich.table import Table
@@ -174,7 +175,7 @@ def main() -> None:
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     entries: list[Entry] = []
-    for measure in (flight_entries, fleet_entries, codec_entries, port_entries, drag_entries, allocator_entries):
+    for measure in (flight_entries, fleet_entries, codec_entries, port_entries, drag_entries, allocator_entries, lateness_entries):
         print(f"bench: {(measure.__doc__ or '').splitlines()[0]}", file=sys.stderr, flush=True)
         entries += measure()
     OUT.write_text(json.dumps([asdict(e) for e in entries], indent=2) + "\n", encoding="utf-8")
