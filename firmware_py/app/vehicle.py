@@ -23,7 +23,7 @@ from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.rate_keeper import RateKeeper
-from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time, release_compiler, use_priority
+from firmware_py.runtime.realtime import TICK_PRIORITY, beside_the_tick, quiet_garbage, real_time, release_compiler, use_priority
 from firmware_py.runtime.recorder import Recorder
 from firmware_py.runtime.worker import ThreadWorker
 
@@ -90,11 +90,12 @@ def run_vehicle(
     if ground is not None and ground.parameter_file is not None and ground.parameter_file.exists():
         parameters = load_parameters(ground.parameter_file)
     release_compiler()
-    worker = ThreadWorker()
-    firmware = compose(fleet, parameters, worker=worker)
-    operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
     with ExitStack() as stack:
+        move_to_own_processor = stack.enter_context(beside_the_tick())
+        worker = ThreadWorker()
         stack.callback(worker.close)
+        firmware = compose(fleet, parameters, worker=worker)
+        operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
         observers: list[Observer] = []
         recorder = _open_recorder(stack, firmware, out, live)
         if recorder is not None:
@@ -116,6 +117,7 @@ def run_vehicle(
         loop = open_loop(stack, firmware, requests)
         loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier)]
         use_priority(TICK_PRIORITY)
+        move_to_own_processor()
         loop.listen()
         stack.enter_context(_stopping_by_signal(operator))
         stack.enter_context(quiet_garbage())
