@@ -62,6 +62,7 @@ def run(
     live_port: Annotated[int, typer.Option(min=1, max=65535, help="and its port")] = 8765,
 ) -> None:
     """Run the vehicle until SIGINT or SIGTERM."""
+    from firmware_py.app.deadlines import stats_lines
     from firmware_py.app.live_view import LiveView
     from firmware_py.app.vehicle import run_vehicle
     from firmware_py.runtime.notify import Notifier
@@ -74,9 +75,8 @@ def run(
         # Its threads start before this process takes its real-time priority, which they would inherit.
         view = stack.enter_context(LiveView(live_host, live_port)) if live else None
         summary = run_vehicle(described, chosen, hold, out, lambda line: typer.echo(line), notifier, links, view)
-    if stats:
-        for name, value in summary._asdict().items():
-            typer.echo(f"{name:20s} {value}")
+    for line in stats_lines(summary) if stats else ():
+        typer.echo(line)
 
 
 def ground_config(file: Path | None, links: list[str], identity: str, store: str, logs: Path | None) -> GroundConfig | None:
@@ -137,8 +137,10 @@ def logs() -> None:
 
 def main() -> None:
     """Runs the command line; wrong input ends in one line on stderr and status 2."""
-    for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):
-        app.add_typer(entry.load(), name=entry.name)
+    own = {command.callback.__name__ for command in app.registered_commands if command.callback is not None}
+    if own.isdisjoint(sys.argv[1:2]):  # the vehicle's process has no room for the bench
+        for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):
+            app.add_typer(entry.load(), name=entry.name)
     try:
         status = app(prog_name="modcube", standalone_mode=False)
     except TyperException as error:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from firmware_py.app.configuration import configuration_of
+from firmware_py.app.deadlines import recording_times
 from firmware_py.app.firmware import compose
 from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import open_loop
@@ -108,7 +109,8 @@ def fly_in_real_time(
             return tick >= script.ticks
 
         refused = stack.enter_context(real_time())
-        loop = open_loop(stack, firmware, requests, [recording(recorder, rate_hz), *observers])
+        loop = open_loop(stack, firmware, requests)
+        loop.observers = [recording(recorder, rate_hz), recording_times(recorder, loop.rate_keeper, rate_hz), *observers]
         use_priority(TICK_PRIORITY)
         loop.listen()
         stack.enter_context(quiet_garbage())

@@ -279,6 +279,25 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     *GROUND,
+    Group(
+        "vehicle-process", 8, "MODCUBE_FULL=1 pytest -s tests/closed_loop/test_vehicle_process.py",
+        said_by_tests("tests/closed_loop/test_vehicle_process.py"),
+        (
+            said("vehicle's process, warm cache: armed and holding after", high=3.0, unit="s"),
+            said("vehicle's process, killed: armed and holding again after", high=4.0, unit="s"),
+            said("vehicle's process: peak of memory", high=250.0, unit="MB"),
+            Figure("tests on the vehicle's process that failed", "failed", high=0.0),
+        ),
+    ),
+    Group(
+        "flash", 8, "make test-flash", said_by_tests("tests/jetson"),
+        (
+            said("flashed Debian machine: modules that answer its service", low=1.0, high=1.0),
+            said("flashed Debian machine: releases rolled back by itself", low=1.0, high=1.0),
+            said("flashed Debian machine: power cuts survived", low=1.0, high=1.0),
+            Figure("tests on a flashed Debian machine that failed", "failed", high=0.0),
+        ),
+    ),
     # Figures of later issues go here.
 )  # fmt: skip
 

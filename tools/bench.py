@@ -26,6 +26,7 @@ from bench_entry import REPETITIONS, Entry, compare, each_us
 from bench_fleet import TIMED_TICKS, Hold, cube_of
 from bench_flight import FlightTimes, measure_flight
 from bench_ground import ground_entries
+from bench_lateness import lateness_entries
 from rich import box as box_style
 from rich.console import Console
 from rich.table import Table
@@ -172,6 +173,7 @@ MEASURES = (
     drag_entries,
     allocator_entries,
     ground_entries,
+    lateness_entries,
 )
 """In the order of the table."""
 

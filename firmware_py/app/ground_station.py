@@ -7,6 +7,7 @@ Missions are planned in a process of their own, so that planning takes nothing f
 from __future__ import annotations
 
 import multiprocessing
+import os
 import sys
 import threading
 from collections import deque
@@ -16,8 +17,9 @@ from types import TracebackType
 
 import numpy as np
 
+from firmware_py.app.deadlines import times_of
 from firmware_py.app.firmware import BusFrame, Firmware
-from firmware_py.app.mission_plan import plan_mission
+from firmware_py.core.body import Body
 from firmware_py.core.types import Inputs, Outputs, Request
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
@@ -27,6 +29,8 @@ from firmware_py.ground.signing import Signing, load_signing
 from firmware_py.ground.station import GroundStation
 from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import unix_ns
+from firmware_py.runtime.rate_keeper import RateKeeper
+from firmware_py.runtime.realtime import die_with
 
 _WAIT_S = 0.1
 """A loop that stands still is served this often."""
@@ -41,6 +45,17 @@ _SAVE_EVERY_NS = 1_000_000_000
 
 _NOTHING = PlanJob(0, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), 0.1, 1.0)
 """A plan of no legs: makes the planning process load what it needs."""
+
+
+def _plan_mission(job: PlanJob, body: Body | None) -> Plan:
+    """In the planning process alone: its solvers take 20 MB that the vehicle's process has no need of."""
+    from firmware_py.app.mission_plan import plan_mission
+
+    return plan_mission(job, body)
+
+
+def _planner() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=die_with, initargs=(os.getpid(),))
 
 
 class GroundSide:
@@ -74,6 +89,8 @@ class GroundSide:
         self._stopping = False
         self._saved_ns = 0
         self._switch_s = 0.0
+        self.keeper: RateKeeper | None = None
+        """Of a loop on a clock; telemetry tells how its ticks keep their deadlines."""
         self.error: Exception | None = None
         """What ended the thread; the vehicle goes on without it."""
 
@@ -89,6 +106,8 @@ class GroundSide:
     def pump(self) -> None:
         """One round: take ticks and bytes, answer, stream."""
         station = self.station
+        if self.keeper is not None:
+            station.picture.times = times_of(self.keeper)
         while self._ticks:
             inputs, outputs = self._ticks.popleft()
             station.observe(inputs, outputs, self._pipeline.bodies)
@@ -115,8 +134,8 @@ class GroundSide:
     def __enter__(self) -> GroundSide:
         """Start the thread, and the process that plans: it takes seconds to be ready."""
         if self._executor is None:
-            self._executor = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-            self._executor.submit(plan_mission, _NOTHING, None)
+            self._executor = _planner()
+            self._executor.submit(_plan_mission, _NOTHING, None)
         self._switch_s = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
         self._thread = threading.Thread(target=self._run, name="ground", daemon=True)
@@ -153,8 +172,8 @@ class GroundSide:
         bodies = {body.index: body for body in self._pipeline.bodies}
         for job in self.station.jobs():
             if self._executor is None:
-                self._executor = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-            self._plans.append((job, self._executor.submit(plan_mission, job, bodies.get(job.body))))
+                self._executor = _planner()
+            self._plans.append((job, self._executor.submit(_plan_mission, job, bodies.get(job.body))))
         for job, future in list(self._plans):
             if not future.done():
                 continue

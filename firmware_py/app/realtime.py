@@ -25,6 +25,7 @@ class RealTimeLoop:
     Attributes:
         requests: hands over what people asked for since the last tick, given its outputs and the time of this one.
         unanswered: ticks that closed at half time because a module had not answered.
+        last: outputs of the last tick.
     """
 
     firmware: Firmware
@@ -34,8 +35,8 @@ class RealTimeLoop:
     requests: Callable[[int, Outputs | None], Sequence[Request]]
     observers: Sequence[Observer] = ()
     unanswered: int = 0
+    last: Outputs | None = None
     _received: list[BusFrame] = field(default_factory=list)
-    _last: Outputs | None = None
 
     def listen(self) -> None:
         """Listens before the first SYNC; what was heard counts for nothing else. Raises PortError when somebody else sends SYNC."""
@@ -67,13 +68,13 @@ class RealTimeLoop:
         in_time = self.ports[0].wait(close_ns, lambda: self._take() and collector.all_answered(tick))
         self.unanswered += not in_time
         received, self._received = self._received, []
-        inputs = collector.collect(tick, time_ns, list(self.requests(time_ns, self._last)))
+        inputs = collector.collect(tick, time_ns, list(self.requests(time_ns, self.last)))
         outputs = self.firmware.tick(inputs)
         frames = self.firmware.encoder.frames(outputs)
         self._send(frames)
         for observer in self.observers:
             observer(received, sync + frames, inputs, outputs)
-        self._last = outputs
+        self.last = outputs
         return outputs
 
     def _take(self) -> bool:

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from firmware_py.app.configuration import configuration_of
-from firmware_py.app.firmware import BusFrame, compose, vehicles_of
+from firmware_py.app.deadlines import Summary, recording_times, summary_of
+from firmware_py.app.firmware import BusFrame, Firmware, compose, vehicles_of
 from firmware_py.app.live_view import LiveView
 from firmware_py.app.lockstep import Observer
-from firmware_py.app.realtime import RealTimeLoop, open_loop
+from firmware_py.app.realtime import open_loop
 from firmware_py.app.service import reporting
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
@@ -21,7 +22,8 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.runtime.notify import Notifier
-from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time, use_priority
+from firmware_py.runtime.rate_keeper import RateKeeper
+from firmware_py.runtime.realtime import TICK_PRIORITY, beside_the_tick, quiet_garbage, real_time, release_compiler, use_priority
 from firmware_py.runtime.recorder import Recorder
 from firmware_py.runtime.worker import ThreadWorker
 
@@ -31,20 +33,8 @@ if TYPE_CHECKING:
 FAREWELL_TICKS = 10
 """Ticks that go on saying `disarmed` after a stop was asked for."""
 ARM_EVERY_S = 1.0
-"""How often arming is tried again with `--hold`."""
+"""How often arming is tried again with `--hold`, once the pose is known."""
 FLUSH_EVERY_S = 0.5
-
-
-class Summary(NamedTuple):
-    """How a run went."""
-
-    ticks: int
-    overruns: int
-    skipped: int
-    unanswered: int
-    lateness_p50_ns: int
-    lateness_p99_ns: int
-    lateness_worst_ns: int
 
 
 @dataclass(slots=True)
@@ -57,6 +47,7 @@ class Operator:
     stopping: bool = False
     farewell: int = 0
     _ticks: int = 0
+    _next_try: int = 0
 
     def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
         """The requests of this tick."""
@@ -64,9 +55,12 @@ class Operator:
         if self.stopping:
             self.farewell += 1
             return [Request(Action.DISARM, body) for body in self.bodies] if self.farewell == 1 else []
-        if not self.hold or last is None or self._ticks % round(ARM_EVERY_S * self.rate_hz):
+        if not self.hold or last is None or self._ticks < self._next_try:
             return []
-        return [Request(Action.ARM, record.body) for record in last.records if record.state not in ARMED]
+        ready = [record.body for record in last.records if record.state not in ARMED and record.estimate.ready]
+        if ready:
+            self._next_try = self._ticks + round(ARM_EVERY_S * self.rate_hz)
+        return [Request(Action.ARM, body) for body in ready]
 
     def is_done(self, tick: int, outputs: Outputs) -> bool:
         """Whether every module has been told for long enough."""
@@ -95,43 +89,69 @@ def run_vehicle(
     """
     if ground is not None and ground.parameter_file is not None and ground.parameter_file.exists():
         parameters = load_parameters(ground.parameter_file)
-    worker = ThreadWorker()
-    firmware = compose(fleet, parameters, worker=worker)
-    operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
+    release_compiler()
     with ExitStack() as stack:
+        move_to_own_processor = stack.enter_context(beside_the_tick())
+        worker = ThreadWorker()
         stack.callback(worker.close)
+        firmware = compose(fleet, parameters, worker=worker)
+        operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
         observers: list[Observer] = []
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-        if out is not None or live is not None:
-            configuration = configuration_of(firmware, rate_hz=fleet.rate_hz)
-            recorder = Recorder(out, configuration, live.context if live is not None else None, queued=True)
-            stack.callback(recorder.close)
-            for body in firmware.pipeline.bodies:
-                recorder.expect(body.index, body.thrusters.f_max.size)
+        recorder = _open_recorder(stack, firmware, out, live)
+        if recorder is not None:
             observers.append(recording(recorder, fleet.rate_hz))
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
         observers.append(telling(say))  # after the recorder, which may have something to say
-        for line in stack.enter_context(real_time()):
-            say(f"warning: {line}")
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
+        side: GroundSide | None = None
         if ground is not None:
-            from firmware_py.app.ground_station import GroundSide  # with the planner of missions: 0.2 s and 15 MB
+            from firmware_py.app.ground_station import GroundSide  # a tenth of a second, and 6 MB of messages
 
+            # Like the recorder's and the live view's, its threads start before this one takes its priority, which they would inherit.
             side = stack.enter_context(GroundSide(ground, firmware))
             observers.append(side.observe)
             requests = with_ground(operator, side)
-        loop = open_loop(stack, firmware, requests, observers)
-        if notifier is not None and notifier.is_heard:
-            loop.observers = [*observers, reporting(notifier, loop.rate_keeper, fleet.rate_hz)]
+        for line in stack.enter_context(real_time()):
+            say(f"warning: {line}")
+        loop = open_loop(stack, firmware, requests)
+        loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier)]
         use_priority(TICK_PRIORITY)
+        move_to_own_processor()
         loop.listen()
         stack.enter_context(_stopping_by_signal(operator))
         stack.enter_context(quiet_garbage())
         say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
         loop.run(operator.is_done)
-        return _summary(loop)
+        if recorder is not None and loop.last is not None:
+            recorder.record_times(loop.last.tick, loop.last.time_ns, loop.rate_keeper)
+        return summary_of(loop)
+
+
+def _open_recorder(stack: ExitStack, firmware: Firmware, out: Path | None, live: LiveView | None) -> Recorder | None:
+    """The recorder for a folder, for viewers, or for both."""
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    elif live is None:
+        return None
+    configuration = configuration_of(firmware, rate_hz=firmware.fleet.rate_hz)
+    recorder = Recorder(out, configuration, live.context if live is not None else None, queued=True)
+    stack.callback(recorder.close)
+    for body in firmware.pipeline.bodies:
+        recorder.expect(body.index, body.thrusters.f_max.size)
+    return recorder
+
+
+def _watching(
+    keeper: RateKeeper, rate_hz: int, recorder: Recorder | None, side: GroundSide | None, notifier: Notifier | None
+) -> Iterator[Observer]:
+    """How ticks keep their deadlines, for the log, ground stations and the service manager."""
+    if side is not None:
+        side.keeper = keeper
+    if recorder is not None:
+        yield recording_times(recorder, keeper, rate_hz)
+    if notifier is not None and notifier.is_heard:
+        yield reporting(notifier, keeper, rate_hz)
 
 
 def with_ground(operator: Operator, side: GroundSide) -> Callable[[int, Outputs | None], list[Request]]:
@@ -190,12 +210,3 @@ def _stopping_by_signal(operator: Operator) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _summary(loop: RealTimeLoop) -> Summary:
-    keeper = loop.rate_keeper
-    late = keeper.lateness
-    return Summary(
-        late.total, keeper.overruns, keeper.skipped, loop.unanswered,
-        late.quantile_ns(0.5), late.quantile_ns(0.99), late.worst_ns,
-    )  # fmt: skip

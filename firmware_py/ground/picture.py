@@ -13,6 +13,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.transitions import ARMED, State
 from firmware_py.core.types import BodyRecord, Event, Inputs, Mode, ModuleInputs, Outputs
 from firmware_py.description.parameters import Supervision
+from firmware_py.ground.times import Times
 
 _THRUSTERS = 8
 _MOST_EVENTS = 64
@@ -82,6 +83,8 @@ class Picture:
         self.ticks = 0
         self.estop = False
         self.dropped_frames = 0
+        self.times: Times | None = None
+        """None in lockstep."""
         self.events: deque[Event] = deque(maxlen=_MOST_EVENTS)
         """Not yet told to anybody."""
 

@@ -15,6 +15,7 @@ from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.ground.geodesy import Origin
 from firmware_py.ground.identity import TYPE_SUBMARINE, Identity, base_mode
 from firmware_py.ground.picture import ModulePicture, Picture
+from firmware_py.ground.times import histograms, load_permille
 
 Values = Mapping[str, Any]
 _NAN = math.nan
@@ -22,7 +23,6 @@ _UNKNOWN_16, _UNKNOWN_BATTERY = 0xFFFF, -1
 _STATE_STANDBY, _STATE_ACTIVE, _STATE_EMERGENCY = 3, 4, 6
 _FRAME_LOCAL_NED, _FRAME_BODY_FRD = 1, 12
 _PWM_CENTRE, _PWM_HALF = 1500, 400
-_G = 9.80665
 
 
 @dataclass(slots=True)
@@ -132,7 +132,7 @@ def sys_status(s: Subject) -> list[Values]:
         "onboard_control_sensors_health": sum(SENSORS[name] for name, ok in healthy.items() if ok),
         "voltage_battery": _scaled(modules[0].voltage_v, 1e3, _UNKNOWN_16),
         "current_battery": _scaled(sum(m.current_a for m in modules), 1e2, -1), "battery_remaining": _UNKNOWN_BATTERY,
-        "errors_comm": s.picture.dropped_frames & 0xFFFF,
+        "errors_comm": s.picture.dropped_frames & 0xFFFF, "load": load_permille(s.picture.times),
     }]  # fmt: skip
 
 
@@ -322,6 +322,7 @@ STREAMS: Mapping[str, Callable[[Subject], list[Values]]] = {
     "SCALED_PRESSURE": scaled_pressure,
     "SCALED_PRESSURE2": scaled_pressure2,
     "NAMED_VALUE_FLOAT": named_value_float,
+    "DEBUG_FLOAT_ARRAY": lambda s: histograms(s.picture.times, s.time_us),
     "EXTENDED_SYS_STATE": extended_sys_state,
     "HOME_POSITION": home_position,
     "GPS_GLOBAL_ORIGIN": gps_global_origin,
@@ -334,7 +335,7 @@ STREAMS: Mapping[str, Callable[[Subject], list[Values]]] = {
 DEFAULT_HZ: Mapping[str, float] = {
     "HEARTBEAT": 1, "SYS_STATUS": 2, "ATTITUDE": 10, "ATTITUDE_QUATERNION": 10, "LOCAL_POSITION_NED": 10,
     "ODOMETRY": 5, "GLOBAL_POSITION_INT": 5, "VFR_HUD": 4, "BATTERY_STATUS": 1, "SERVO_OUTPUT_RAW": 2,
-    "ESC_STATUS": 1, "ESC_INFO": 0.5, "SCALED_PRESSURE": 1, "SCALED_PRESSURE2": 1, "NAMED_VALUE_FLOAT": 2,
+    "ESC_STATUS": 1, "ESC_INFO": 0.5, "SCALED_PRESSURE": 1, "SCALED_PRESSURE2": 1, "NAMED_VALUE_FLOAT": 2, "DEBUG_FLOAT_ARRAY": 0.2,
     "EXTENDED_SYS_STATE": 1, "HOME_POSITION": 0.5, "MISSION_CURRENT": 1, "CURRENT_MODE": 0.5, "SYSTEM_TIME": 0.5,
 }  # fmt: skip
 """Before anybody asks for other rates."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import Layout, TextLayout, is_closed, read_attachment, read_messages
 from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG, candump_stamp
-from firmware_py.runtime.tick_messages import REQUESTS, TICK_SIGNALS, TICKS
+from firmware_py.runtime.tick_messages import REQUESTS, TICK_SIGNALS, TICKS, TIMES
 
 
 class LogError(DescriptionError):
@@ -95,7 +95,7 @@ class FlightLog:
                     yield now
                 tick, time_ns, *_, prepared = _TICK.values(message.data)
                 now = LoggedTick(int(tick), int(time_ns), int(prepared))
-            if now is None:
+            if now is None or message.topic == TIMES:
                 continue
             now.messages.append((message.topic, message.data))
             if message.topic == REQUESTS:

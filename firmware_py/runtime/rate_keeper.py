@@ -16,6 +16,10 @@ from firmware_py.runtime.clock import Clock
 NS_PER_S = 1_000_000_000
 LATENESS_EDGES_NS = tuple(int(10 ** (3 + i / 10)) for i in range(61))
 """Upper edges of the histogram's bins: 1 us to 1 s, ten to a decade (26 % wide)."""
+_COARSE = tuple(i for i in range(len(LATENESS_EDGES_NS)) if i % 10 in (0, 3, 7))
+COARSE_EDGES_NS = tuple(LATENESS_EDGES_NS[i] for i in _COARSE)
+"""Those of the bins that are shown to people: 1, 2, 5, 10 us and so on to 1 s."""
+_COARSE_STARTS = (0, *(i + 1 for i in _COARSE))
 _TIMER_ABSTIME = 1  # <time.h>
 
 
@@ -113,6 +117,10 @@ class Histogram:
         self.counts[bisect_left(LATENESS_EDGES_NS, duration_ns)] += 1
         self.worst_ns = max(self.worst_ns, duration_ns)
         self.total += 1
+
+    def coarse(self) -> np.ndarray:
+        """(20,) counts by COARSE_EDGES_NS; the last of what is longer than a second."""
+        return np.asarray(np.add.reduceat(self.counts, _COARSE_STARTS))
 
     def quantile_ns(self, share: float) -> int:
         """Upper edge of the bin that `share` of the durations reach: at most 26 % above the true one. 0 when empty."""

@@ -10,9 +10,11 @@ import ctypes
 import gc
 import os
 import resource
+import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 TICK_PRIORITY = 50
 """SCHED_FIFO priority of the thread that ticks: where Linux puts its own interrupt threads, above ordinary threads."""
@@ -25,8 +27,11 @@ SWITCH_INTERVAL_S = 1e-4
 """Longest time that another Python thread keeps the tick waiting. Python's own 5 ms were the 99th percentile of lateness
 (5.0 ms) while a reader worked through a flood of frames."""
 
-_PR_SET_TIMERSLACK = 29  # linux/prctl.h
+_PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29  # linux/prctl.h
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # sys/mman.h
+_MADV_DONTNEED = 4  # sys/mman.h
+_MAPS = Path("/proc/self/maps")
+_COMPILER = "libllvmlite"
 
 
 @contextmanager
@@ -41,7 +46,7 @@ def real_time(priority: int = READER_PRIORITY) -> Iterator[list[str]]:
         One line for each thing that the system refused; empty when all is well.
     """
     switch_interval_s = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    sys.setswitchinterval(min(switch_interval_s, SWITCH_INTERVAL_S))
     refused = [line for line in (use_fine_timers(), lock_memory(), use_priority(priority)) if line]
     try:
         yield [f"{line}: ticks may start later than they could" for line in refused]
@@ -62,6 +67,30 @@ def use_priority(priority: int) -> str:
     return ""
 
 
+@contextmanager
+def beside_the_tick() -> Iterator[Callable[[], None]]:
+    """The threads of this process, and those that are started inside, leave its last processor to the tick.
+
+    Yields:
+        A function that moves the calling thread there. Both do nothing where there is but one processor.
+    """
+    allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    if len(allowed) < 2:
+        yield lambda: None
+        return
+    _place_threads(allowed[:-1])
+    try:
+        yield lambda: os.sched_setaffinity(0, allowed[-1:])
+    finally:
+        _place_threads(allowed)
+
+
+def _place_threads(processors: Sequence[int]) -> None:
+    for thread in os.listdir("/proc/self/task"):
+        with suppress(ProcessLookupError):
+            os.sched_setaffinity(int(thread), processors)
+
+
 def use_ordinary_priority() -> None:
     """Back to an ordinary thread: for a process started from a real-time one, which would inherit its priority."""
     if hasattr(os, "sched_setscheduler"):
@@ -80,6 +109,31 @@ def use_fine_timers(slack_ns: int = 1) -> str:
         return f"no fine timers ({os.strerror(ctypes.get_errno())})"
     except AttributeError:
         return "no fine timers (not Linux)"
+
+
+def die_with(parent: int) -> None:
+    """This process is killed when the thread of the process `parent` that started it ends, however that ends."""
+    prctl = getattr(ctypes.CDLL(None), "prctl", None)
+    if prctl is not None:
+        prctl(_PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGKILL), 0, 0, 0)
+    if os.getppid() != parent:  # it ended before it was asked
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def release_compiler() -> None:
+    """Gives the pages of the compiler's own instructions back: 50 MB that no tick needs, for every function is compiled by now.
+
+    They are a file's, never written: who compiles again after all reads them again. Its constants stay: some hold addresses
+    that were written when it was loaded.
+    """
+    if not _MAPS.exists():
+        return
+    madvise = ctypes.CDLL(None).madvise
+    for line in _MAPS.read_text().splitlines():
+        span, rights = line.split()[:2]
+        if _COMPILER in line and rights == "r-xp":
+            begin, end = (int(word, 16) for word in span.split("-"))
+            madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _MADV_DONTNEED)
 
 
 def lock_memory() -> str:

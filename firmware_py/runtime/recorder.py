@@ -25,7 +25,17 @@ from foxglove.mcap import MCAPWriteOptions
 from firmware_py.core.types import Event, Inputs, Outputs
 from firmware_py.description.signals import Layout, TextLayout
 from firmware_py.runtime.guarded_file import GuardedFile, QueuedFile
-from firmware_py.runtime.tick_messages import EVENTS, REQUESTS, TICKS, TickMessages, body_topic
+from firmware_py.runtime.rate_keeper import RateKeeper
+from firmware_py.runtime.tick_messages import (
+    EVENTS,
+    REQUESTS,
+    TICKS,
+    TIMES,
+    TIMES_SIGNALS,
+    TickMessages,
+    body_topic,
+    times_values,
+)
 
 CAN_LOG = "can.log"
 SIGNAL_LOG = "signals.mcap"
@@ -93,6 +103,7 @@ class Recorder:
                 log_time=0, create_time=0, name=CONFIGURATION, media_type="application/json", data=data
             )
         self._messages = messages = TickMessages()
+        self._times = Layout("Times", TIMES_SIGNALS)
         self._channels: dict[str, foxglove.Channel] = {}
         for topic, layout in ((TICKS, messages.ticks), (REQUESTS, messages.requests), (EVENTS, messages.events)):
             self._channel(topic, layout)
@@ -109,6 +120,10 @@ class Recorder:
         """Opens the channel of a body: 1.8 million instructions that the first tick then is spared."""
         self._channel(body_topic(body), self._messages.body(thrusters)[0])
 
+    def expect_times(self) -> None:
+        """Opens the channel of `record_times`."""
+        self._channel(TIMES, self._times)
+
     def sent(self, time_ns: int, bus: int, frames: Iterable[tuple[int, bytes]]) -> None:
         """Frames (id, data) that the tick at `time_ns` put on bus number `bus`."""
         self._lines.append(candump_lines(time_ns, bus, "T", frames))
@@ -123,6 +138,11 @@ class Recorder:
         for topic, layout, data in self._messages.of(self._received, inputs, outputs):
             self._channel(topic, layout).log(data, log_time=outputs.time_ns)
         self._received = 0
+
+    def record_times(self, tick: int, time_ns: int, keeper: RateKeeper) -> None:
+        """How the ticks that are done kept their deadlines. Real time only: another run is never the same."""
+        data = self._times.row().encode(times_values(tick, time_ns, keeper))
+        self._channel(TIMES, self._times).log(data, log_time=time_ns)
 
     def flush(self) -> list[Event]:
         """Hand everything so far to the operating system; a warning, once, where that fails."""

@@ -7,6 +7,8 @@ Topics, in the order in which a tick writes them:
 - `/firmware/bodyN`: all of one body, `body_signals`.
 - `/firmware/docks`: per dock under way its faces, stage and tries, both currents and both conditions.
 - `/events`: severity (syslog) and text.
+
+In real time `/firmware/times` says every half second how ticks kept their deadlines so far; no replay compares it.
 """
 
 from __future__ import annotations
@@ -16,9 +18,11 @@ from typing import Any, NamedTuple
 
 from firmware_py.core.types import BodyRecord, Inputs, Outputs
 from firmware_py.description.signals import Layout, Row, Signal, TextLayout
+from firmware_py.runtime.rate_keeper import LATENESS_EDGES_NS, RateKeeper
 from firmware_py.runtime.request_text import request_text
 
 TICKS, REQUESTS, DOCKS, EVENTS = "/firmware/ticks", "/firmware/requests", "/firmware/docks", "/events"
+TIMES = "/firmware/times"
 
 
 def body_topic(index: int) -> str:
@@ -105,6 +109,25 @@ DOCK_SIGNALS = (
     Signal("position_error_m", unit="m"),
 )
 """After tick and time the fields of a DockRecord, in their order."""
+
+
+BINS = len(LATENESS_EDGES_NS) + 1
+TIMES_SIGNALS = (
+    Signal("tick", kind="int"),
+    Signal("time_ns", unit="ns", kind="int"),
+    Signal("overruns", kind="int"),
+    Signal("skipped", kind="int"),
+    Signal("lateness_worst_ns", unit="ns", kind="int"),
+    Signal("compute_worst_ns", unit="ns", kind="int"),
+    Signal("lateness_ticks", BINS, "ticks by how late they began: up to 1 us, 1.26 us, ... 1 s (ten bins to a decade), longer"),
+    Signal("compute_ticks", BINS, "ticks by how long they ran, in the same bins"),
+)
+
+
+def times_values(tick: int, time_ns: int, keeper: RateKeeper) -> tuple[Any, ...]:
+    """Of the ticks that are done, in the order of TIMES_SIGNALS."""
+    late, ran = keeper.lateness, keeper.compute
+    return tick, time_ns, keeper.overruns, keeper.skipped, late.worst_ns, ran.worst_ns, late.counts, ran.counts
 
 
 class Message(NamedTuple):

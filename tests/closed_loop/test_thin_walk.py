@@ -1,8 +1,6 @@
 """Each of the four uses once, end to end: the vehicle's process, a tuning script, and a dock seen through the bus."""
 
 import json
-import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -10,52 +8,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_py.app.replay import replay
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.signals import read_signals
 from hil.flight import fly_and_judge
 from hil.scenario import load_scenario
 from hil.signals import read_flight
-
-MODCUBE = [sys.executable, "-c", "from firmware_py.cli import main; main()"]
-DEADLINE_S = 120.0
-"""Longest that a process may take on a machine that is busy with other tests."""
-
-
-def free_group() -> str:
-    """A multicast address that nobody else on this machine uses now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"udp:239.74.163.9:{probe.getsockname()[1]}"
+from tests.closed_loop.processes import free_group, running
 
 
 @pytest.mark.slow
 def test_vehicle_process_arms_holds_and_disarms_when_it_is_asked_to_stop(tmp_path: Path) -> None:
     bus = free_group()
-    plant = subprocess.Popen(
-        [*MODCUBE, "hil", "plant", "hover", "--bus", bus], stdout=subprocess.PIPE, text=True, cwd=tmp_path
-    )
-    try:
-        assert plant.stdout is not None
-        assert plant.stdout.readline().startswith("plant of hover")
-        vehicle = subprocess.Popen(
-            [*MODCUBE, "run", "--bus", bus, "--hold", "--stats", "--out", str(tmp_path / "log")],
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert vehicle.stdout is not None
-        said = []
-        for line in vehicle.stdout:
-            said.append(line)
-            if "DISARMED" in line and "ARMED POSHOLD" in line:
-                break
-        vehicle.send_signal(signal.SIGINT)
-        rest, _ = vehicle.communicate(timeout=DEADLINE_S)
-        assert vehicle.returncode == 0, said
-        assert "-> DISARMED" in rest
-        assert "lateness_p99_ns" in rest
-    finally:
-        plant.send_signal(signal.SIGTERM)
-        plant.communicate(timeout=DEADLINE_S)
-    assert plant.returncode == 0
+    with running("hil", "plant", "hover", "--bus", bus) as plant:
+        plant.wait_for("plant of hover")
+        with running("run", "--bus", bus, "--hold", "--stats", "--out", str(tmp_path / "log")) as vehicle:
+            vehicle.wait_for("DISARMED", "ARMED POSHOLD")
+            rest = vehicle.end()
+        plant.end()
+    assert "-> DISARMED" in rest
+    assert "lateness_p99_ns" in rest
+    assert "compute, ticks\n" in rest
+    outcome = replay(tmp_path / "log")
+    assert (outcome.first, outcome.torn) == (None, "")
+    times = read_signals(tmp_path / "log" / "signals.mcap")["/firmware/times"]
+    for name in ("lateness_ticks", "compute_ticks"):
+        assert np.sum(times[name][-1]) == times["tick"][-1] == outcome.ticks
     assert (tmp_path / "log" / "can.log").stat().st_size > 0
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.figures import figure
 from tests.jetson.guest import ROOT, Guest, missing_packages
 from tests.jetson.seed import make_seed
 
@@ -82,6 +83,7 @@ def test_release_is_flashed_and_the_service_flies_the_hover_on_vcan0(guest: Gues
     done = flash(guest, ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "answered=1/1" in wait_for(guest, "answered=1/1")
+    figure("flashed Debian machine: modules that answer its service", 1)
     journal = guest.run("sudo journalctl -u modcube --no-pager").stdout
     assert "-> ARMED" in journal, journal[-2000:]
     assert guest.run("ps -o user= -C python | sort -u").stdout.split() == ["robot"]
@@ -96,6 +98,7 @@ def test_broken_release_is_rolled_back_by_the_machine_itself(guest: Guest, tmp_p
     assert len(done.stderr.splitlines()) == 1
     assert current(guest) == before
     assert "active" in report(guest)
+    figure("flashed Debian machine: releases rolled back by itself", 1)
 
 
 def test_power_cut_half_way_through_a_flash_brings_the_old_release_up(guest: Guest, tmp_path: Path) -> None:
@@ -116,3 +119,4 @@ def test_power_cut_half_way_through_a_flash_brings_the_old_release_up(guest: Gue
     assert current(guest) == before
     assert guest.run("ls /opt/modcube/trial.json", check=False).returncode != 0
     assert "on trial" not in flash(guest, ROOT, "--status").stdout
+    figure("flashed Debian machine: power cuts survived", 1)

@@ -9,6 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 from pymavlink.generator import mavgen
 
+from firmware_py.app.deadlines import times_of
 from firmware_py.core.rotations import rotate
 from firmware_py.core.types import Action, DockRequest, Mode
 from firmware_py.ground.config import GroundConfig
@@ -16,6 +17,8 @@ from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.identity import px4
 from firmware_py.ground.telemetry import STREAMS
 from firmware_py.ground.wire import checksum
+from firmware_py.runtime.clock import ManualClock
+from firmware_py.runtime.rate_keeper import RateKeeper
 from tests.unit.ground_world import Client, World
 
 NAN = float("nan")
@@ -78,6 +81,20 @@ def test_every_streamed_message_arrives_with_the_robots_values(world: World, cli
     named = {m.name: m.value for m in client.all("NAMED_VALUE_FLOAT")}
     assert named["DOCK0+X"] == pytest.approx(0.1) and named["WRENCH_MRG"] == 0.75
     assert client.last("CURRENT_MODE").custom_mode == px4(4, 3)
+    assert client.all("DEBUG_FLOAT_ARRAY") == [] and client.last("SYS_STATUS").load == 0  # nobody is late in lockstep
+
+
+def test_robot_on_a_clock_tells_how_its_ticks_keep_their_deadlines(world: World, client: Client) -> None:
+    keeper = RateKeeper(10_000_000, ManualClock(), lambda deadline_ns: None)
+    for duration_ns in (4_000, 150_000, 160_000):
+        keeper.lateness.add(duration_ns)
+        keeper.compute.add(10 * duration_ns)
+    world.station.picture.times = times_of(keeper)
+    world.run(550)
+    told = {message.name: message.data for message in client.all("DEBUG_FLOAT_ARRAY")}
+    assert told["LATENESS"] == [0, 0, 1, 0, 0, 0, 0, 2, *[0] * 50]
+    assert told["COMPUTE"] == [0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 2, *[0] * 47]
+    assert client.last("SYS_STATUS").load == 160
 
 
 def test_system_status_tells_of_health_and_of_readiness_to_arm(world: World, client: Client) -> None:

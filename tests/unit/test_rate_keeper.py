@@ -2,8 +2,9 @@
 
 import pytest
 
+from firmware_py.app.deadlines import histogram_lines
 from firmware_py.runtime.clock import ManualClock, MonotonicClock
-from firmware_py.runtime.rate_keeper import Histogram, RateKeeper, absolute_sleeper
+from firmware_py.runtime.rate_keeper import COARSE_EDGES_NS, Histogram, RateKeeper, absolute_sleeper
 
 PERIOD_NS = 10_000_000
 
@@ -79,6 +80,26 @@ def test_durations_beyond_every_bin_are_kept() -> None:
     histogram.add(-3)
     assert histogram.counts[0] == histogram.counts[-1] == 1
     assert histogram.quantile_ns(1.0) == 5_000_000_000
+
+
+def test_coarse_bins_end_at_one_two_and_five_and_hold_every_tick() -> None:
+    histogram = Histogram()
+    for duration_ns in (900, 1_900, 2_100, 4_900, 80_000, 999_000_000, 2_000_000_000):
+        histogram.add(duration_ns)
+    assert [round(edge * 1e-3) for edge in COARSE_EDGES_NS[:7]] == [1, 2, 5, 10, 20, 50, 100]
+    assert histogram.coarse().tolist() == [1, 1, 2, 0, 0, 0, 1, *[0] * 11, 1, 1]
+
+
+def test_histogram_is_told_in_lines_from_its_first_to_its_last_tick() -> None:
+    histogram = Histogram()
+    for duration_ns in (4_000, 4_000, 15_000):
+        histogram.add(duration_ns)
+    assert list(histogram_lines(histogram)) == [
+        f"         to 5 us         2 {'#' * 40}",
+        "        to 10 us         0",
+        f"        to 20 us         1 {'#' * 20}",
+    ]
+    assert list(histogram_lines(Histogram())) == []
 
 
 def test_machine_sleeps_to_the_deadline_and_returns_at_once_after_it() -> None:

@@ -4,8 +4,12 @@ import errno
 import gc
 import os
 import resource
+import signal
+import subprocess
+import sys
 import threading
 
+import numba
 import pytest
 
 from firmware_py.runtime import realtime
@@ -45,6 +49,24 @@ def test_reader_threads_inherit_the_priority_and_a_bench_is_ordinary_again_after
     assert policy() == os.SCHED_OTHER
 
 
+def test_tick_has_a_processor_to_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    places: dict[int, list[int]] = {}
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 1, 2})
+    monkeypatch.setattr(os, "sched_setaffinity", lambda thread, processors: places.update({thread: list(processors)}))
+    with realtime.beside_the_tick() as move:
+        assert places[threading.get_native_id()] == [1, 2]
+        move()
+        assert places[0] == [3]  # the calling thread
+    assert places[threading.get_native_id()] == [1, 2, 3]
+
+
+def test_machine_with_one_processor_shares_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    with realtime.beside_the_tick() as move:
+        move()
+
+
 def test_priorities_let_the_tick_start_before_anybody_reads() -> None:
     assert realtime.TICK_PRIORITY > realtime.READER_PRIORITY > realtime.PLANT_PRIORITY
 
@@ -54,3 +76,15 @@ def test_no_garbage_is_collected_in_flight() -> None:
         assert not gc.isenabled()
     assert gc.isenabled()
     assert gc.get_freeze_count() == 0
+
+
+def test_compiler_whose_pages_were_given_back_still_compiles() -> None:
+    realtime.release_compiler()
+    twice = numba.njit("i8(i8)")(lambda number: 2 * number)
+    realtime.release_compiler()
+    assert twice(21) == 42
+
+
+def test_helper_whose_vehicle_has_ended_already_ends_too() -> None:
+    code = "import os; from firmware_py.runtime.realtime import die_with; die_with(os.getpid())"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL

@@ -1,0 +1,71 @@
+"""The vehicle's process from outside: how soon it flies, how soon again when it was killed, how much memory it takes.
+
+The clock counts with MODCUBE_FULL=1 (`make accept`). Beside other tests it says nothing: there the processor time that the
+process needs until its first tick is held to twice the limit, which compiling anew, 20 s, would break.
+"""
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.closed_loop.processes import free_group, running
+from tests.figures import figure
+
+READY_S = 3.0
+BACK_S = 4.0
+MEMORY_MB = 250.0
+RESTART_S = 0.2
+"""RestartSec of modcube.service."""
+FULL = "MODCUBE_FULL" in os.environ
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+class Flight(NamedTuple):
+    """How one went."""
+
+    armed_s: float
+    """On the clock, until it was armed and held its place."""
+    started_s: float
+    """Of processor time, until its first tick."""
+    memory_mb: float
+    """Peak."""
+
+
+def fly(bus: str, out: Path, how: signal.Signals) -> Flight:
+    """Starts the vehicle, whose compiled code the plant has cached, and ends it once it holds its place."""
+    began = time.monotonic()
+    with running("run", "--bus", bus, "--hold", "--out", str(out), "--ground", "udpin:127.0.0.1:0") as vehicle:
+        proc = Path(f"/proc/{vehicle.pid}")
+        vehicle.wait_for("running at")
+        times = proc.joinpath("stat").read_text().rpartition(")")[2].split()
+        vehicle.wait_for("-> ARMED POSHOLD")
+        armed_s = time.monotonic() - began
+        peak_kb = proc.joinpath("status").read_text().partition("VmHWM:")[2].split()[0]
+        vehicle.end(how)
+    return Flight(armed_s, (int(times[11]) + int(times[12])) / TICKS_PER_S, int(peak_kb) / 1024)
+
+
+@pytest.mark.slow
+def test_vehicle_is_soon_armed_and_soon_back_when_killed_and_stays_small(tmp_path: Path) -> None:
+    bus = free_group()
+    with running("hil", "plant", "hover", "--bus", bus) as plant:
+        plant.wait_for("plant of hover")
+        first = fly(bus, tmp_path / "first", signal.SIGKILL)
+        again = fly(bus, tmp_path / "again", signal.SIGINT)
+        plant.end()
+    back_s = RESTART_S + again.armed_s
+    memory_mb = max(first.memory_mb, again.memory_mb)
+    figure("vehicle's process, warm cache: armed and holding after", first.armed_s, "s")
+    figure("vehicle's process, killed: armed and holding again after", back_s, "s")
+    figure("vehicle's process: processor time until its first tick", first.started_s, "s")
+    figure("vehicle's process: peak of memory", memory_mb, "MB")
+    assert memory_mb < MEMORY_MB
+    if FULL:
+        assert first.armed_s <= READY_S
+        assert back_s <= BACK_S
+    else:
+        assert max(first.started_s, again.started_s) <= 2.0 * READY_S

@@ -1,0 +1,101 @@
+"""For tools/bench.py: how late ticks start on this machine, beside a loop that does nothing but wake up at the same rate.
+
+Run as a program, bench_lateness.py RATE SECONDS flies the hover in real time over udp, firmware and plant each in a
+process, and prints JSON. The idle loop is a third process of the same priority: what it is late by is the machine's own.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_entry import Entry
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.core.types import Inputs, Outputs
+from firmware_py.description.parameters import Parameters
+from firmware_py.runtime.clock import MonotonicClock
+from firmware_py.runtime.rate_keeper import RateKeeper, absolute_sleeper
+from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time
+from hil.realtime import fly_in_real_time
+from hil.scenario import load_scenario
+
+RATES_HZ = (100, 200, 400)
+FLIGHT_S = 60.0
+SETTLE_S = 3.0
+BUS = "udp:239.74.163.11:43711"
+NS_PER_S = 1_000_000_000
+ENDS = 0.1
+"""Share of the flying ticks at either end: by how much the median end of a tick moves against its deadline is the drift."""
+
+
+def idle_loop(rate_hz: int, duration_s: float, begin: Event, result: Connection) -> None:
+    """Says that it is there; from `begin` on wakes up as the tick does, then sends how late it was: p50, p99 and worst, ns."""
+    result.send("ready")
+    begin.wait()
+    clock = MonotonicClock()
+    keeper = RateKeeper(NS_PER_S // rate_hz, clock, absolute_sleeper(clock))
+    with real_time(TICK_PRIORITY), quiet_garbage():
+        for _ in range(round(duration_s * rate_hz)):
+            keeper.wait()
+            keeper.finish()
+    late = keeper.lateness
+    result.send({"p50": late.quantile_ns(0.5), "p99": late.quantile_ns(0.99), "worst": late.worst_ns})
+
+
+def fly(rate_hz: int, duration_s: float) -> dict[str, Any]:
+    """One flight and the idle loop beside it."""
+    scenario = load_scenario("hover")
+    scenario = replace(scenario, task=replace(scenario.task, settle_s=SETTLE_S, duration_s=duration_s - SETTLE_S))
+    period_ns = NS_PER_S // rate_hz
+    offsets_ns = np.zeros(round(duration_s * rate_hz), dtype=np.int64)
+    context = multiprocessing.get_context("spawn")
+    begin = context.Event()
+    ours, theirs = context.Pipe()
+    context.Process(target=idle_loop, args=(rate_hz, duration_s, begin, theirs), daemon=True).start()
+    ours.recv()
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        offsets_ns[outputs.tick - 1] = time.monotonic_ns() - outputs.time_ns // period_ns * period_ns
+        if outputs.tick == 1:
+            begin.set()
+
+    with tempfile.TemporaryDirectory() as folder:
+        flown = fly_in_real_time(scenario, 0, Parameters(), Path(folder), BUS, rate_hz, observers=[observe])
+    flying_ns = offsets_ns[round(SETTLE_S * rate_hz) :]
+    some = round(ENDS * len(flying_ns))
+    drift_ns = float(np.median(flying_ns[-some:]) - np.median(flying_ns[:some]))
+    return {**flown._asdict(), "idle_ns": ours.recv(), "drift_us": drift_ns * 1e-3}
+
+
+def lateness_entries() -> list[Entry]:
+    """How late ticks start in real time, a minute at each rate, beside the machine's own hiccups."""
+    entries = []
+    for rate_hz in RATES_HZ:
+        command = [sys.executable, __file__, str(rate_hz), str(FLIGHT_S)]
+        flown = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        name, peer = f"real time at {rate_hz} Hz", "a loop that only wakes up"
+        for key in ("p50", "p99", "worst"):
+            late, idle = flown["lateness_ns"][key] * 1e-3, flown["idle_ns"][key] * 1e-3
+            entries.append(Entry(f"{name}: tick starts late by, {key}", late, "us", peer, idle, idle / late))
+        entries.append(Entry(f"{name}: overruns and deadlines passed over in {FLIGHT_S:.0f} s", flown["deadline_misses"], ""))
+        entries.append(Entry(f"{name}: drift over {FLIGHT_S:.0f} s", flown["drift_us"], "us"))
+    return entries
+
+
+if __name__ == "__main__":
+    if hasattr(os, "sched_setaffinity"):  # the bench keeps to one processor, a vehicle does not
+        os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    print(json.dumps(fly(int(sys.argv[1]), float(sys.argv[2]))))
