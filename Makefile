@@ -6,9 +6,11 @@ BIN := .venv/bin
 PY := $(BIN)/python
 STAMP := .venv/.stamp
 CLIENTS_STAMP := .venv-clients/.stamp
-PYTHONS := python3.12 python3.11 python3
+# The distribution's Python first: it is built with profile-guided optimisation and runs a tick a fifth faster than a plain build.
+PYTHONS := /usr/bin/python3.12 /usr/bin/python3.11 python3.12 python3.11 python3
 SYSTEM_PACKAGES := qemu-system-x86 busybox-static cpio kmod can-utils iproute2 gcc
 FLASH_PACKAGES := debootstrap e2fsprogs openssh-client
+PYTHON_PACKAGES := python3-venv
 PIP_INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-deps
 
 # $(call make_venv,DIR): keep DIR if its Python runs, else make it with the first Python that is new enough.
@@ -46,9 +48,9 @@ $(CLIENTS_STAMP): requirements-clients.lock
 
 setup-system: ## install the Debian packages of the virtual machine with real SocketCAN
 	@sudo=; [ "$$(id -u)" = 0 ] || sudo=sudo; set -e; \
-	echo 'setup-system: $(SYSTEM_PACKAGES) $(FLASH_PACKAGES)'; \
+	echo 'setup-system: $(SYSTEM_PACKAGES) $(FLASH_PACKAGES) $(PYTHON_PACKAGES)'; \
 	$$sudo apt-get -qq update; \
-	$$sudo env DEBIAN_FRONTEND=noninteractive apt-get -qq install --no-install-recommends $(SYSTEM_PACKAGES) $(FLASH_PACKAGES) >/dev/null
+	$$sudo env DEBIAN_FRONTEND=noninteractive apt-get -qq install --no-install-recommends $(SYSTEM_PACKAGES) $(FLASH_PACKAGES) $(PYTHON_PACKAGES) >/dev/null
 
 lint: setup ## ruff, mypy and the import contracts
 	@$(BIN)/ruff check --quiet .

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from accept_measures import Values, flown, loop_margins, passed_by, repeated, said_by_tests, saved_by_least_power, timed
+from accept_measures import Values, characterised, flown, loop_margins, passed_by, repeated, said_by_tests, saved_by_least_power, timed
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -254,6 +254,11 @@ GROUPS: tuple[Group, ...] = (
         (Figure("one above the other, second tag source, 100 trials: docked", "passed", low=95.0, unit="%", scale=100.0),),
     ),
     Group(
+        "dock-vertical-blind", 5, "modcube hil campaign dock-vertical-blind --trials 100 --jobs 2",
+        flown("dock-vertical-blind", trials=100),
+        (Figure("the same without the second tag source, 100 trials: refused, nothing touched", "passed", low=1.0),),
+    ),
+    Group(
         "dock-mobius", 5, "modcube hil campaign dock-mobius --trials 10 --jobs 2", flown("dock-mobius", trials=10),
         (
             Figure("dock, Moebius strip as one, undock, 10 trials: passed", "passed", low=1.0),
@@ -290,6 +295,13 @@ GROUPS: tuple[Group, ...] = (
             said("real time on vcan0, link events: resumed within", high=0.5, unit="s"),
             said("real time on vcan0, C node: position RMSE", high=8.0, unit="mm"),
             Figure("tests on vcan0 in real time that failed", "failed", high=0.0),
+        ),
+    ),
+    Group(
+        "capability", 10, "python tools/characterise.py modcube, and --table1 --out DIR", characterised,
+        (
+            Figure("capability of one module: the whole command, median of 3", "module", high=2.0, unit="s"),
+            Figure("Table I, seven vehicles: the whole command with figure and report, median of 3", "table1", high=60.0, unit="s"),
         ),
     ),
     # Figures of later issues go here.

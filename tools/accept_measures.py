@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -66,6 +67,19 @@ def loop_margins(folder: Path) -> Values:
     found = json.loads((folder / "margins.json").read_text(encoding="utf-8"))
     kinds, keys = ("nominal", "worst"), ("gain_db", "phase_deg")
     return {f"{kind}.{key}": min(row[key] for row in found if row["kind"] == kind) for kind in kinds for key in keys}
+
+
+def characterised(folder: Path) -> Values:
+    """Wall time of tools/characterise.py for one module and for Table I with figure and report, each a process with all its imports, s."""
+    program, took = Path(__file__).with_name("characterise.py"), {}
+    for name, words in (("module", ["modcube"]), ("table1", ["--table1", "--out", folder])):
+        runs = []
+        for _ in range(3):
+            began = time.perf_counter()
+            subprocess.run([sys.executable, program, *words], check=True, capture_output=True)
+            runs.append(time.perf_counter() - began)
+        took[name] = median(runs)
+    return took
 
 
 def passed_by(folder: Path) -> Values:
