@@ -9,46 +9,25 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from accept_figures import Figure, Group, said
 from accept_measures import Values, characterised, flown, loop_margins, passed_by, repeated, said_by_tests, saved_by_least_power, timed
+from accept_tuning import TUNING
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from hil.checks import UNBOUNDED, limit_text
+from hil.checks import limit_text
 
 OUT = Path("accept.json")
 RUNS = Path("runs") / "accept"
 MM, DEG = 1e3, 57.29577951308232
 ON_TIME = ("alone", "beside four busy loops", "200 Hz", "200 Hz beside four busy loops")
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One number that must be within low..high, both in `unit`, after `scale` was applied to what was measured."""
-
-    name: str
-    key: str
-    low: float = -UNBOUNDED
-    high: float = UNBOUNDED
-    unit: str = ""
-    scale: float = 1.0
-
-
-@dataclass(frozen=True)
-class Group:
-    """Figures that one measurement gives."""
-
-    name: str
-    issue: int
-    command: str
-    measure: Callable[[Path], Values]
-    figures: tuple[Figure, ...]
 
 
 @dataclass(frozen=True)
@@ -133,11 +112,6 @@ def strip(modules: int, sensors: str, worst_mm: float, *more: Figure) -> tuple[F
         Figure(f"{name}: position RMSE, worst", "position_rmse_m.max", high=worst_mm, unit="mm", scale=MM),
         Figure(f"{name}: attitude RMSE, worst", "attitude_rmse_rad.max", high=2.5, unit="deg", scale=DEG),
     )
-
-
-def said(name: str, low: float = -UNBOUNDED, high: float = UNBOUNDED, unit: str = "") -> Figure:
-    """A figure that a test says by name."""
-    return Figure(name, name, low, high, unit)
 
 
 GROUPS: tuple[Group, ...] = (
@@ -304,6 +278,7 @@ GROUPS: tuple[Group, ...] = (
             Figure("Table I, seven vehicles: the whole command with figure and report, median of 3", "table1", high=60.0, unit="s"),
         ),
     ),
+    *TUNING,
     # Figures of later issues go here.
 )  # fmt: skip
 

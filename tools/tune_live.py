@@ -30,7 +30,7 @@ BETTER = 0.97
 """Share of the best cost that counts as better: two looks at one hover differ by a per cent or two."""
 SETTLE_S = 3.0
 """After a change, before it is looked at; by the vehicle's clock."""
-SILENT_S, ANSWER_S, ANSWERS = 3.0, 1.0, 5
+SILENT_S, ANSWER_S, ANSWERS = 5.0, 1.0, 5
 """Without a heartbeat the vehicle is lost; a parameter is sent again after so long, so often."""
 STATE_ACTIVE, ARMED, ERROR = 4, 0x80, 3
 """MAV_STATE_ACTIVE; MAV_MODE_FLAG_SAFETY_ARMED; worst severity that is only said."""

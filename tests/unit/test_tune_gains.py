@@ -132,7 +132,7 @@ def test_folder_of_another_search_is_not_thrown_away(tools: tuple[Any, Any], tmp
         ('scenario = "hover"', 'scenario = "hoover"', "scenario 'hoover' is unknown"),
     ],
 )
-def test_objective_that_makes_no_sense_is_refused_in_one_line(tools: tuple[Any, Any], tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_objective_that_makes_no_sense_is_refused(tools: tuple[Any, Any], tmp_path: Path, old: str, new: str, words: str) -> None:
     with pytest.raises(DescriptionError, match=words) as refusal:
         objective_of(tools, tmp_path, OBJECTIVE.replace(old, new))
     assert "\n" not in str(refusal.value)
