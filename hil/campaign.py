@@ -83,9 +83,10 @@ def _numbers(values: dict[str, float]) -> dict[str, float | None]:
 class TrialFile:
     """trials.jsonl: who it belongs to, then a line for each trial, with the disk before the next one is waited for."""
 
-    def __init__(self, path: Path, owner: str) -> None:
-        """Goes on in `path` if it is `owner`'s, else begins it anew. A line that was torn is flown again."""
+    def __init__(self, path: Path, owner: str, key: str = "seed") -> None:
+        """Goes on in `path` if it is `owner`'s, else begins it anew. A line that was torn is flown again; `key` tells trials apart."""
         self.trials: dict[int, Trial] = {}
+        self._key = key
         kept = self._read(path, owner) if path.exists() else 0
         self._file = path.open("r+b" if kept else "wb")
         self._file.truncate(kept)
@@ -104,13 +105,13 @@ class TrialFile:
             if not isinstance(entry, dict) or (kept == 0 and entry != {"campaign": owner}):
                 break
             if kept:
-                self.trials[int(entry["seed"])] = entry
+                self.trials[int(entry[self._key])] = entry
             kept += len(line)
         return kept
 
     def add(self, trial: Trial) -> None:
         """One more trial, on the disk when this returns."""
-        self.trials[int(trial["seed"])] = trial
+        self.trials[int(trial[self._key])] = trial
         self._write(trial)
 
     def _write(self, entry: Trial) -> None:

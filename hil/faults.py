@@ -25,6 +25,8 @@ LOWEST_BABBLE_ID = 0x040
 ESTOP, SYNC = Frame(0x01E, b""), Frame(0x020, bytes(4))
 """Of the e-stop box, and of somebody else who means to lead the bus."""
 ESTOP_PERIOD_NS = 50_000_000
+PUSH_LEVER_M = 0.03
+"""From the hull's centre to the point that is pushed."""
 
 
 class Wire:
@@ -88,6 +90,8 @@ class Faults:
         self._tags = stream(seed, "faults", 1024 + link)
         axis = self._tags.standard_normal(3)
         self._bias_axis = axis / np.linalg.norm(axis)
+        hand = stream(seed, "push", link).standard_normal((2, 3))
+        self._hand, self._grip = hand / np.linalg.norm(hand, axis=1, keepdims=True)
         self._began: dict[Fault, Callable[[], None]] = {}
         self._estop_due_ns = 0
         for camera in nodes.cameras:
@@ -167,6 +171,8 @@ class Faults:
         if fault.kind == "jets":
             before, self._world.jet_strength = self._world.jet_strength, fault.value
             return lambda: setattr(self._world, "jet_strength", before)
+        if fault.kind == "push":
+            return self._push(fault, modules)
         return None
 
     def _break_thrusters(self, fault: Fault, modules: Sequence[int]) -> Callable[[], None]:
@@ -181,6 +187,18 @@ class Faults:
                 self._world.mend_thruster(m, t)
 
         return mend
+
+    def _push(self, fault: Fault, modules: Sequence[int]) -> Callable[[], None]:
+        """A hand on the rim of a side's disk: it shoves and turns."""
+        wrench = fault.value * np.concatenate([self._hand, PUSH_LEVER_M * np.cross(self._grip, self._hand)])
+        for m in modules:
+            self._world.push[m] += wrench
+
+        def let_go() -> None:
+            for m in modules:
+                self._world.push[m] -= wrench
+
+        return let_go
 
     def _hang_magnets(self, fault: Fault, modules: Sequence[int]) -> Callable[[], None]:
         docks, relay = self._world.docks, {1: 1, -1: 2}.get(int(fault.value), 0)

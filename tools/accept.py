@@ -18,6 +18,7 @@ import typer
 from accept_figures import Figure, Group, said
 from accept_ground import GROUND
 from accept_measures import Values, characterised, flown, loop_margins, passed_by, repeated, said_by_tests, saved_by_least_power, timed
+from accept_tuning import TUNING
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -298,6 +299,7 @@ GROUPS: tuple[Group, ...] = (
             Figure("tests on a flashed Debian machine that failed", "failed", high=0.0),
         ),
     ),
+    *TUNING,
     # Figures of later issues go here.
 )  # fmt: skip
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.pipeline import BodyPipeline
+from firmware_py.core.rotations import exp, log
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.thruster import commands
 from firmware_py.core.types import Inputs, ModuleInputs, TagObservation
@@ -47,6 +48,10 @@ LOWEST_RAD_S, HIGHEST_RAD_S, LINES = 0.3, 30.0, 20
 SHAKE = np.repeat([0.01, 0.02], 3)
 """Acceleration of one sine, m/s^2 and rad/s^2: all together stay far from the thrusters' limits."""
 HEIGHT_M = 1.5
+HOME = rest_at(np.array([0.0, 0.0, HEIGHT_M]), np.array([1.0, 0.0, 0.0, 0.0]))
+STEP = np.repeat([0.05, math.radians(5.0)], 3)
+"""Of the set-point: small enough for no thruster to reach its limit."""
+STEP_SETTLE_TICKS, STEP_TICKS = 2000, 500
 
 
 class Scale(NamedTuple):
@@ -81,7 +86,7 @@ class Loop:
         cells = BODIES[modules]
         self.body = assemble(cells, [0] * modules, [described] * modules)
         self._chain = BodyPipeline(self.body, parameters, PERIOD_NS)
-        self._hold = rest_at(np.array([0.0, 0.0, HEIGHT_M]), np.array([1.0, 0.0, 0.0, 0.0]))
+        self.aim = HOME
         self._sensors_spec = dataclasses.replace(SensorSpec(), **{**IDEAL, "tag_delay_ms": SensorSpec().tag_delay_ms})
         self._world = _world(self.body, [_scaled(described, scale)] * modules, described.curve.lag_s * scale.lag)
         self._sensors = [Sensors(self._sensors_spec, self._world.spec, 0, m) for m in range(modules)]
@@ -89,7 +94,8 @@ class Loop:
         self._seen = self._camera.watch(self._world)
         self._commanded = np.zeros(self.body.thrusters.f_max.size)
         self._tick = 0
-        self.position_m = np.zeros(3)
+        self.pose = np.zeros(6)
+        """Estimated place, m, and rotation vector, rad."""
 
     def step(self, shake: np.ndarray) -> np.ndarray:
         """(6,) wrench that the controller gives in this tick; `shake` (6,) N, N m goes to the thrusters with that of the tick before."""
@@ -98,12 +104,12 @@ class Loop:
         inputs = self._sample(tick)
         chain = self._chain
         estimate = chain.measure(inputs)
-        thrust = chain.allocator.step(chain.controller.step(self._hold, self._hold, estimate))
+        thrust = chain.allocator.step(chain.controller.step(self.aim, self.aim, estimate))
         self._commanded, _ = chain.limiter.step(thrust.force_n, estimate.ready, chain.supply.voltage_v)
         chain.lag.command(self._commanded)
         self._world.advance(PERIOD_NS)
         self._seen += self._camera.watch(self._world)
-        self.position_m = estimate.p_wb
+        self.pose = np.concatenate([estimate.p_wb, log(estimate.q_wb)])
         return np.asarray(self.body.thrusters.matrix @ self._commanded)
 
     def _push(self, force_n: np.ndarray) -> None:
@@ -179,6 +185,26 @@ def measure(modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicl
     p = u + np.fft.rfft(shake[SETTLE_TICKS:], axis=0)
     base = 2.0 * math.pi / (RECORD_TICKS * PERIOD_NS * 1e-9)
     return [Response(base * n, -u[n, axis] / p[n, axis]) for axis, n in enumerate(chosen)]
+
+
+def step_responses(parameters: Parameters, axes: Sequence[int], vehicle: str = "modcube") -> np.ndarray:
+    """(k, STEP_TICKS) share of a step of the set-point that a lone module has made, tick by tick, one of `axes` after the other."""
+    loop, found, still = Loop(1, parameters, vehicle=vehicle), [], np.zeros(6)
+    for _ in range(STEP_SETTLE_TICKS):
+        loop.step(still)
+    for axis in axes:
+        step = STEP[axis] * np.eye(6)[axis]
+        before = loop.pose[axis]
+        loop.aim = rest_at(HOME.p_wb + step[:3], exp(step[3:]))
+        moved = []
+        for _ in range(STEP_TICKS):
+            loop.step(still)
+            moved.append((loop.pose[axis] - before) / STEP[axis])
+        found.append(moved)
+        loop.aim = HOME
+        for _ in range(STEP_TICKS):
+            loop.step(still)
+    return np.array(found)
 
 
 class Margins(NamedTuple):

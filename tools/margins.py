@@ -93,7 +93,7 @@ def draw(path: Path, found: Found) -> None:
     figure, panels = plt.subplots(2, len(columns), figsize=(4.1 * len(columns), 6.4), sharex=True, sharey="row", squeeze=False)
     for (modules, first), (gain, phase) in zip(columns, panels.T, strict=True):
         for axis, colour in zip(range(first, first + 3), COLOURS, strict=True):
-            curves = [_bode(r[axis]) for r in found[modules].values()]
+            curves = [bode(r[axis]) for r in found[modules].values()]
             w = found[modules][NOMINAL][axis].frequency
             for panel, part in ((gain, 0), (phase, 1)):
                 values = np.array([c[part] for c in curves])
@@ -114,7 +114,7 @@ def draw(path: Path, found: Found) -> None:
     plt.close(figure)
 
 
-def _bode(response: Response) -> tuple[np.ndarray, np.ndarray]:
+def bode(response: Response) -> tuple[np.ndarray, np.ndarray]:
     """Gain, dB, and phase, deg, nearest to -180 at crossover."""
     gain = 20.0 * np.log10(np.abs(response.loop))
     phase = np.degrees(np.unwrap(np.angle(response.loop)))

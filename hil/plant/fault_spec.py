@@ -10,7 +10,7 @@ THRUSTER_KINDS = ("thruster_dead", "thruster_weak", "thruster_reversed", "thrust
 FRAME_KINDS = ("frame_loss", "frame_delay", "frame_duplicate", "frame_corrupt", "babble")
 OTHER_KINDS = (
     "estop", "foreign_sync", "imu_frozen", "tag_flip", "tag_jump", "tag_absent", "camera_bias", "battery_sag", "leak", "magnet", "jets",
-    "process_killed",
+    "process_killed", "push",
 )  # fmt: skip
 ALL = -1
 """Index of a fault that means every thruster, or every face."""
@@ -30,7 +30,8 @@ class Fault:
     value: float = quantity(
         0.0, low=-1e6, high=1e6,
         help="weak, fake_rpm: share of the force that is left; stuck: command; loss, duplicate, corrupt, flip: share; "
-        "delay: ms; babble: frames a tick; jump, camera_bias: m; battery_sag: V less; magnet: -1, 0, 1; jets: strength",
+        "delay: ms; babble: frames a tick; jump, camera_bias: m; battery_sag: V less; magnet: -1, 0, 1; jets: strength; "
+        "push: N, from a side of its own in each seed",
     )  # fmt: skip
     direction: str = quantity("both", choices=DIRECTIONS, help="frames: which way")
 

@@ -121,6 +121,8 @@ class World(DockedBodies):
         self.docks = Docks(vehicles, dock or DockSpec(), jam or JamRule(), seed)
         self.jet_strength = spec.jet_strength
         self._broken: dict[tuple[int, int], tuple[str, float]] = {}
+        self.push = np.zeros((len(vehicles), 6))
+        """Wrench of somebody's hand on each module about its hull's centre, module frame, N and N m."""
         alone = [Place(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) for _ in vehicles]
         self._seat(groups or [(m,) for m in range(len(vehicles))], places or alone)
         for b, members in enumerate(self.bodies):
@@ -204,6 +206,10 @@ class World(DockedBodies):
         if len(self.vehicles) > 1 and self.jet_strength > 0.0:
             jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
             add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._external)
+        for m in np.flatnonzero(self.push.any(axis=1)):
+            force, moment = (self._modules.turn[m] @ part for part in np.split(self.push[m], 2))
+            moment += np.cross(self._modules.position[m], force)
+            self._external[self._modules.body[m]] += np.concatenate([force, moment])
         faces = self.docks.faces if len(self.bodies) > 1 else None
         arrays = (self._body_arrays, self._modules, faces, self._thrusters, self._water)
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)

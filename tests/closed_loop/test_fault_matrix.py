@@ -16,8 +16,8 @@ from hil.plant.fault_spec import FRAME_KINDS, OTHER_KINDS, THRUSTER_KINDS
 from hil.scenario import MODES
 
 BY_NAME = {row.name: row for row in ROWS}
-ELSEWHERE = {"magnet", "jets"}
-"""Faults of docking bodies."""
+ELSEWHERE = {"magnet", "jets", "push"}
+"""Faults of docking bodies, and somebody's hand."""
 
 
 def test_table_breaks_everything_that_can_break() -> None:

@@ -74,6 +74,23 @@ def test_fault_lasts_as_long_as_it_says() -> None:
     assert before > 2.0 and during == pytest.approx(0.0, abs=0.05) and after == pytest.approx(before, rel=0.05)
 
 
+def test_hand_pushes_with_its_force_for_its_time_from_a_side_of_the_seed_s_own() -> None:
+    """From rest in still water: the hull gains F t over its mass, water included, and a turn; another seed's hand pushes elsewhere."""
+    calm = load_scenario("hover").with_calm_world()
+    gained = []
+    for seed in (0, 1):
+        nodes = make_nodes(make_world(calm, seed, PERIOD_NS), CODEC, {1: 0}, calm)
+        nodes.faults = Faults(nodes, [Fault(kind="push", value=2.0, at_s=0.1, until_s=0.2)])
+        fly(nodes, 9, u=0.0)
+        assert np.abs(nodes.world.truth(0).v_w).max() == 0.0
+        fly(nodes, 14, u=0.0, first=10)
+        gained.append(nodes.world.truth(0).v_w)
+        assert np.linalg.norm(gained[-1]) == pytest.approx(2.0 * 0.1 / 15.5, rel=0.05)
+        assert np.linalg.norm(nodes.world.truth(0).w_b) > 0.005
+        assert not nodes.world.push.any()
+    assert np.linalg.norm(gained[0] - gained[1]) > 0.1 * np.linalg.norm(gained[0])
+
+
 def test_frozen_imu_repeats_itself() -> None:
     rates = values(fly(nodes_with(Fault(kind="imu_frozen")), 20), "GYRO")
     assert len(rates) == 20 and all(r[:3] == rates[0][:3] for r in rates)

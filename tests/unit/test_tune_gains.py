@@ -1,0 +1,155 @@
+"""The search for gains: what a trial costs, that it stops early what is worse, that it goes on where it was killed, and when it refuses."""
+
+import json
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
+from hil.scenario import Scenario
+from tests.unit.test_campaign import Inline
+
+ROOT = Path(__file__).resolve().parents[2]
+BANDWIDTH, DAMPING = "control.position_bandwidth", "control.position_damping"
+OBJECTIVE = """
+help = "a valley"
+seeds = [0, 1]
+unseen_seeds = [7]
+worst_share = 0.5
+flight = [{ scenario = "hover", weight = 0.5 }, { scenario = "spiral" }]
+search = [
+    { parameter = "control.position_bandwidth", low = 0.5, high = 8.0, logarithmic = true },
+    { parameter = "control.position_damping", low = 0.3, high = 3.0 },
+]
+term = [{ metric = "position_rmse_m", per = 0.001 }, { metric = "thrust_rms_n", per = 1.0, weight = 0.5 }]
+"""
+START = Parameters().replace(BANDWIDTH, 7.5)
+
+
+@pytest.fixture
+def tools(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
+    """The modules tune_objective and tune_search; a flight takes no time and knows the best gains: 2 rad/s and 1."""
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    import tune_objective
+    import tune_search
+
+    def fly(scenario: Scenario, parameters: Parameters, seed: int, bus: str, code: str) -> dict[str, Any]:
+        c = parameters.control
+        off = (c.position_bandwidth - 2.0) ** 2 + (c.position_damping - 1.0) ** 2
+        return {"seed": seed, "metrics": {"position_rmse_m": 0.001 * (1.0 + 0.1 * seed + off), "thrust_rms_n": 1.0}}
+
+    monkeypatch.setattr(tune_search, "fly_trial", fly)
+    yield tune_objective, tune_search
+
+
+def objective_of(tools: tuple[Any, Any], folder: Path, text: str = OBJECTIVE) -> Any:
+    path = folder / "objective.toml"
+    path.write_text(text)
+    return tools[0].load_objective(path)
+
+
+class PlugError(Exception):
+    """Somebody pulled the plug."""
+
+
+class Dying(Inline):
+    """Loses its power after so many flights."""
+
+    def __init__(self, flights: int) -> None:
+        self.left = flights
+
+    def submit(self, *args: Any, **kwargs: Any) -> Any:
+        if self.left == 0:
+            raise PlugError
+        self.left -= 1
+        return super().submit(*args, **kwargs)
+
+
+def search(tools: tuple[Any, Any], out: Path, trials: int, pool: Executor, seed: int = 0) -> Any:
+    out.mkdir(exist_ok=True)
+    return tools[1].search(objective_of(tools, out), START, trials, out, pool, seed, lambda progress: None)
+
+
+def test_cost_is_the_mean_of_all_flights_and_the_worst_one_s_share(tools: tuple[Any, Any], tmp_path: Path) -> None:
+    objective = objective_of(tools, tmp_path)
+    costs = [objective.cost(spec, {"position_rmse_m": 0.003, "thrust_rms_n": 2.0}) for spec in objective.flight]
+    assert costs == pytest.approx([0.5 * (3.0 + 1.0), 3.0 + 1.0])
+    assert objective.total(costs) == pytest.approx(0.5 * 3.0 + 0.5 * 4.0)
+
+
+@pytest.mark.parametrize("metrics", [{}, {"position_rmse_m": 0.003, "thrust_rms_n": None}, {"position_rmse_m": 1e9, "thrust_rms_n": 1.0}])
+def test_flight_that_cannot_be_judged_costs_the_most(tools: tuple[Any, Any], tmp_path: Path, metrics: dict[str, float | None]) -> None:
+    objective = objective_of(tools, tmp_path)
+    assert objective.cost(objective.flight[1], metrics) == tools[0].FAILED_COST
+
+
+def test_search_finds_the_valley_and_ends_early_what_lies_above_it(tools: tuple[Any, Any], tmp_path: Path) -> None:
+    study = search(tools, tmp_path, 60, Inline())
+    assert study.trials[0].params == {BANDWIDTH: 7.5, DAMPING: 1.0}
+    assert study.best_params[BANDWIDTH] == pytest.approx(2.0, abs=0.4)
+    pruned = [t for t in study.trials if len(t.intermediate_values) == 1]
+    assert 10 < len(pruned) < 50
+    assert min(t.intermediate_values[0] for t in pruned) > study.best_trial.intermediate_values[0]
+
+
+@pytest.mark.parametrize("flights", [1, 17, 50])
+def test_search_that_was_killed_loses_no_trial_and_ends_in_the_same_bytes(tools: tuple[Any, Any], tmp_path: Path, flights: int) -> None:
+    search(tools, tmp_path / "whole", 20, Inline())
+    with pytest.raises(PlugError):
+        search(tools, tmp_path / "torn", 20, Dying(flights))
+    path = tmp_path / "torn" / "search.jsonl"
+    kept = path.read_bytes()
+    path.write_bytes(kept + b'{"number": 1, "param')  # the line that was being written
+    search(tools, tmp_path / "torn", 20, Inline())
+    assert path.read_bytes().startswith(kept)
+    assert path.read_bytes() == (tmp_path / "whole" / "search.jsonl").read_bytes()
+
+
+def test_other_seed_searches_elsewhere(tools: tuple[Any, Any], tmp_path: Path) -> None:
+    first, second = (search(tools, tmp_path / str(seed), 5, Inline(), seed) for seed in (0, 1))
+    assert first.trials[0].params == second.trials[0].params and first.trials[1].params != second.trials[1].params
+
+
+def test_folder_of_another_search_is_not_thrown_away(tools: tuple[Any, Any], tmp_path: Path) -> None:
+    search(tools, tmp_path, 2, Inline())
+    objective = objective_of(tools, tmp_path)
+    tools[1].check_folder(tmp_path, objective, START, 0)
+    with pytest.raises(DescriptionError, match=r"search.jsonl holds trials of another objective.*give another --out"):
+        tools[1].check_folder(tmp_path, objective, Parameters(), 0)
+    assert json.loads((tmp_path / "search.jsonl").read_text().splitlines()[-1])["number"] == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("unseen_seeds = [7]", "unseen_seeds = [1]", "a seed is both in seeds and in unseen_seeds"),
+        ("high = 8.0", "high = 80.0", "position_bandwidth: 80.0 is out of range"),
+        ("high = 8.0", "high = 0.4", "low 0.5 is not below high 0.4"),
+        ('scenario = "hover"', 'scenario = "hoover"', "scenario 'hoover' is unknown"),
+    ],
+)
+def test_objective_that_makes_no_sense_is_refused(tools: tuple[Any, Any], tmp_path: Path, old: str, new: str, words: str) -> None:
+    with pytest.raises(DescriptionError, match=words) as refusal:
+        objective_of(tools, tmp_path, OBJECTIVE.replace(old, new))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["hover", "spiral", "spiral-and-push"])
+def test_objectives_that_are_shipped_can_be_flown(tools: tuple[Any, Any], name: str) -> None:
+    objective = tools[0].load_objective(ROOT / "tools" / "objectives" / f"{name}.toml")
+    assert set(objective.start(Parameters())) == {s.parameter for s in objective.search}
+
+
+def test_detuned_gains_are_off_by_up_to_three_and_within_the_bounds(tools: tuple[Any, Any]) -> None:
+    objective = tools[0].load_objective(ROOT / "tools" / "objectives" / "spiral-and-push.toml")
+    factors = []
+    for seed in range(50):
+        wrong = tools[0].detuned(objective, Parameters(), 3.0, seed)
+        values = {s.parameter: tools[0].value_of(wrong, s.parameter) for s in objective.search}
+        assert objective.start(wrong) == values
+        factors += [value / tools[0].value_of(Parameters(), name) for name, value in values.items()]
+    assert 1 / 3 <= min(factors) < 0.4 and 2.5 < max(factors) <= 3.0

@@ -1,0 +1,72 @@
+"""For tools/accept.py: the figures of tuning and of campaigns on several workers."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from accept_figures import Figure, Group
+from accept_measures import Values, said_by_tests
+
+from firmware_py.description.parameters import Parameters
+from hil.campaign import SUMMARY_FILE, TABLE_FILE, processes, run_campaign
+from hil.scenario import load_scenario
+
+TRIALS = range(16)
+"""Of the campaign that is timed: enough for a start of its processes not to count."""
+WORKERS_TEST = "tests/closed_loop/test_campaign_workers.py"
+TUNE = ["tools/objectives/spiral-and-push.toml", "--detune", "1", "--trials", "1000", "--minutes", "10"]
+
+
+def speedup(folder: Path) -> Values:
+    """How many times as fast two processes fly a campaign as one does, and tables of theirs that differ, of two."""
+    took_s, tables = [], []
+    for jobs in (1, 2):
+        out = folder / f"jobs-{jobs}"
+        shutil.rmtree(out, ignore_errors=True)
+        began_s = time.monotonic()
+        run_campaign(load_scenario("spiral"), Parameters(), TRIALS, processes(jobs), out)
+        took_s.append(time.monotonic() - began_s)
+        tables.append([(out / name).read_bytes() for name in (SUMMARY_FILE, TABLE_FILE)])
+    return {"speedup": took_s[0] / took_s[1], "different": sum(one != two for one, two in zip(*tables, strict=True))}
+
+
+def tuned(folder: Path) -> Values:
+    """One search from detuned gains: its objective on unseen seeds over the shipped gains', and what the whole command took, min."""
+    out = folder / "tune"
+    shutil.rmtree(out, ignore_errors=True)
+    began_s = time.monotonic()
+    script = Path(__file__).with_name("tune_gains.py")
+    subprocess.run([sys.executable, script, *TUNE, "--no-plots", "--out", out], check=True)
+    minutes = (time.monotonic() - began_s) / 60.0
+    found = json.loads((out / "tuning.json").read_text(encoding="utf-8"))
+    unseen = found["unseen"]
+    ratio = unseen["tuned"]["objective"] / unseen["shipped"]["objective"]
+    return {"ratio": ratio, "minutes": minutes, "start": found["start_value"] / found["best_value"]}
+
+
+TUNING: tuple[Group, ...] = (
+    Group(
+        "workers", 9, "modcube hil campaign spiral --trials 16 --jobs 1, and --jobs 2", speedup,
+        (
+            Figure("campaign, 16 spirals: two workers faster than one by", "speedup", low=1.8, unit="times"),
+            Figure("campaign, 16 spirals: tables of one and of two workers that differ, of two", "different", high=0.0),
+        ),
+    ),
+    Group(
+        "lost-workers", 9, f"pytest {WORKERS_TEST}", said_by_tests(WORKERS_TEST),
+        (Figure("tests of a lost dask worker and of a campaign killed half-way that failed", "failed", high=0.0),),
+    ),
+    Group(
+        "tuning", 9, f"python tools/tune_gains.py {' '.join(TUNE)}", tuned,
+        (
+            Figure("tuned from gains off by up to 3: objective on 20 unseen seeds over the shipped gains'", "ratio", high=1.05),
+            Figure("the same: search and comparison, two cores", "minutes", high=15.0, unit="min"),
+            Figure("the same: objective of the detuned gains over that of the best", "start", low=1.0),
+        ),
+    ),
+)  # fmt: skip

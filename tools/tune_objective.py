@@ -1,0 +1,121 @@
+"""What tune_gains makes small: which flights in which worlds, which parameters within which bounds, and what each metric costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from hil.scenario import Scenario, load_scenario
+
+FAILED_COST = 1e6
+"""Cost of a flight that could not be judged."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightSpec:
+    """One flight of the objective."""
+
+    scenario: str = quantity(help="name of a scenario")
+    vehicle: str = quantity("", help="vehicle in place of the scenario's")
+    settle_s: float = quantity(0.0, unit="s", low=0, high=60, help="held before the task; 0: as the scenario has it")
+    duration_s: float = quantity(0.0, unit="s", low=0, high=600, help="of the task; 0: as the scenario has it")
+    weight: float = quantity(1.0, low=0, high=1e3, help="share in the sum")
+
+    def flown(self) -> Scenario:
+        """The scenario with what changes of it. Raises DescriptionError."""
+        scenario = load_scenario(self.scenario)
+        times = {name: value for name in ("settle_s", "duration_s") if (value := getattr(self, name)) > 0.0}
+        scenario = dataclasses.replace(scenario, task=dataclasses.replace(scenario.task, **times))
+        return scenario.with_vehicle(self.vehicle) if self.vehicle else scenario
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search:
+    """One parameter and its bounds."""
+
+    parameter: str = quantity(help="as group.field")
+    low: float = quantity(help="lowest tried")
+    high: float = quantity(help="highest tried")
+    logarithmic: bool = quantity(False, help="search on a logarithmic scale")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Term:
+    """What a metric costs."""
+
+    metric: str = quantity(help="name in result.json")
+    per: float = quantity(low=1e-12, high=1e12, help="this much of the metric costs `weight`")
+    weight: float = quantity(1.0, low=0, high=1e3, help="cost of `per`")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Objective:
+    """What is to be made small."""
+
+    help: str = quantity(help="one line")
+    flight: tuple[FlightSpec, ...] = quantity(help="flights of each seed, the cheapest to fly first: a bad trial ends early")
+    search: tuple[Search, ...] = quantity(help="what may change")
+    term: tuple[Term, ...] = quantity(help="what costs")
+    seeds: tuple[int, ...] = quantity(low=0, high=2**31, help="worlds of the search")
+    unseen_seeds: tuple[int, ...] = quantity(low=0, high=2**31, help="worlds of the comparison")
+    worst_share: float = quantity(0.0, low=0, high=1, help="share of the worst flight in the objective")
+
+    def __post_init__(self) -> None:
+        if set(self.seeds) & set(self.unseen_seeds):
+            raise DescriptionError("a seed is both in seeds and in unseen_seeds; the comparison needs worlds of its own")
+        for search in self.search:
+            if not search.low < search.high:
+                raise DescriptionError(f"parameter {search.parameter}: low {search.low:g} is not below high {search.high:g}")
+            Parameters().replace(search.parameter, search.low)
+            Parameters().replace(search.parameter, search.high)
+
+    def cost(self, spec: FlightSpec, metrics: Mapping[str, float | None]) -> float:
+        """Of one flight. A metric that is missing costs the most."""
+        values = [metrics.get(term.metric) for term in self.term]
+        costs = [term.weight * value / term.per for term, value in zip(self.term, values, strict=True) if value is not None]
+        total = spec.weight * math.fsum(costs)
+        return min(total, FAILED_COST) if len(costs) == len(self.term) and math.isfinite(total) else FAILED_COST
+
+    def total(self, costs: Sequence[float]) -> float:
+        """The objective, out of the costs of all flights: their mean, and of the worst one its share."""
+        return (1.0 - self.worst_share) * float(np.mean(costs)) + self.worst_share * max(costs)
+
+    def start(self, parameters: Parameters) -> dict[str, float]:
+        """Where the search begins: the values in `parameters`, moved within the bounds."""
+        return {s.parameter: min(max(value_of(parameters, s.parameter), s.low), s.high) for s in self.search}
+
+
+def value_of(parameters: Parameters, dotted: str) -> float:
+    """The value of `group.field`."""
+    group, _, name = dotted.partition(".")
+    return float(getattr(getattr(parameters, group), name))
+
+
+def with_values(parameters: Parameters, values: Mapping[str, float]) -> Parameters:
+    """A copy with these values of `group.field`. Raises DescriptionError."""
+    for dotted, value in values.items():
+        parameters = parameters.replace(dotted, value)
+    return parameters
+
+
+def detuned(objective: Objective, parameters: Parameters, factor: float, seed: int) -> Parameters:
+    """A copy in which everything that is searched is off by a random factor, log-uniform from 1/factor to factor."""
+    factors = factor ** np.random.default_rng(seed).uniform(-1.0, 1.0, len(objective.search))
+    wrong = {s.parameter: value_of(parameters, s.parameter) * float(f) for s, f in zip(objective.search, factors, strict=True)}
+    return with_values(parameters, wrong)
+
+
+def load_objective(path: Path) -> Objective:
+    """The objective in a file, its scenarios checked. Raises DescriptionError, one line."""
+    table, source = read_toml(path)
+    objective: Objective = build(Objective, table, source)
+    for spec in objective.flight:
+        spec.flown()
+    return objective

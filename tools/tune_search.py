@@ -1,0 +1,114 @@
+"""The search of tune_gains: Optuna's estimator proposes, the bench flies, every trial is on the disk before the next one begins.
+
+A trial's proposal depends on the seed, its number and the trials before it, and on nothing else. So a search that was killed and is
+started again proposes what it would have proposed, and ends in the same bytes as one that never was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import optuna
+from optuna.distributions import FloatDistribution
+from optuna.trial import TrialState, create_trial
+from tune_objective import Objective, with_values
+
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
+from hil.campaign import TrialFile, code_digest, fly_trial
+
+TRIALS_FILE = "search.jsonl"
+FIRST_AT_RANDOM = 10
+"""Trials before the estimator has something to go by."""
+
+
+class Progress(NamedTuple):
+    """What is shown after every trial."""
+
+    number: int
+    value: float
+    pruned: bool
+    best: float
+
+
+def identity(objective: Objective, start: Parameters, seed: int) -> str:
+    """Same identity and same number, same trial."""
+    parts = (code_digest(), asdict(objective), asdict(start), seed)
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def check_folder(out: Path, objective: Objective, start: Parameters, seed: int) -> None:
+    """Raises DescriptionError where `out` holds the trials of another search: nobody's hours are thrown away."""
+    path = out / TRIALS_FILE
+    if not path.exists():
+        return
+    head, newline, _ = path.read_bytes().partition(b"\n")
+    if newline and json.loads(head) != {"campaign": identity(objective, start, seed)}:
+        raise DescriptionError(f"{path} holds trials of another objective, start, seed or code; give another --out")
+
+
+def running_totals(objective: Objective, parameters: Parameters, pool: Executor) -> Iterator[float]:
+    """The objective over the search's seeds, after each flight of it that was flown in all worlds."""
+    costs: list[float] = []
+    code = code_digest()
+    for spec in objective.flight:
+        jobs = [pool.submit(fly_trial, spec.flown(), parameters, seed, f"virtual:tune{seed}", code) for seed in objective.seeds]
+        costs += [objective.cost(spec, job.result()["metrics"]) for job in jobs]
+        yield objective.total(costs)
+
+
+def search(
+    objective: Objective,
+    start: Parameters,
+    trials: int,
+    out: Path,
+    pool: Executor,
+    seed: int,
+    tell: Callable[[Progress], None],
+    end_s: float = float("inf"),
+) -> optuna.Study:
+    """Goes on in `out` until `trials` trials are done, or no more is begun after `end_s` of time.monotonic(); returns the study."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    bounds = {s.parameter: FloatDistribution(s.low, s.high, log=s.logarithmic) for s in objective.search}
+    study = optuna.create_study(pruner=optuna.pruners.MedianPruner(n_startup_trials=4))
+    with TrialFile(out / TRIALS_FILE, identity(objective, start, seed), key="number") as file:
+        for number in sorted(file.trials):
+            study.add_trial(_restored(file.trials[number], bounds))
+        while len(file.trials) < trials and time.monotonic() < end_s:
+            number = len(file.trials)
+            study.sampler = optuna.samplers.TPESampler(seed=[seed, number], multivariate=True, n_startup_trials=FIRST_AT_RANDOM)
+            if number == 0:
+                study.enqueue_trial(objective.start(start))
+            file.add(_flown(study, study.ask(bounds), objective, start, pool))
+            last = study.trials[-1]
+            tell(Progress(number, float(last.value), last.state == TrialState.PRUNED, study.best_value))
+    return study
+
+
+def _flown(study: optuna.Study, trial: optuna.Trial, objective: Objective, start: Parameters, pool: Executor) -> dict[str, Any]:
+    """Flies one trial, as far as it is worth it; returns its line."""
+    parameters, seen = with_values(start, trial.params), []
+    pruned = False
+    for step, value in enumerate(running_totals(objective, parameters, pool)):
+        seen.append(value)
+        trial.report(value, step)
+        pruned = step + 1 < len(objective.flight) and bool(trial.should_prune())
+        if pruned:
+            break
+    study.tell(trial, state=TrialState.PRUNED) if pruned else study.tell(trial, seen[-1])
+    return {"number": trial.number, "parameters": trial.params, "totals": seen, "pruned": pruned}
+
+
+def _restored(line: dict[str, Any], bounds: dict[str, FloatDistribution]) -> optuna.trial.FrozenTrial:
+    totals, pruned = line["totals"], line["pruned"]
+    return create_trial(
+        state=TrialState.PRUNED if pruned else TrialState.COMPLETE, value=totals[-1], params=line["parameters"],
+        distributions=bounds, intermediate_values=dict(enumerate(totals)),
+    )  # fmt: skip
