@@ -254,12 +254,14 @@ def to_plain(value: Any) -> Any:
 
 
 def to_toml(value: Any) -> str:
-    """The TOML text of a dataclass of scalars, arrays and one level of tables, with units as comments."""
+    """The TOML text of a dataclass of scalars, arrays, tables and lists of tables, with units as comments."""
     head, tail = [], []
     for field in dataclasses.fields(value):
         item = getattr(value, field.name)
         if dataclasses.is_dataclass(item):
             tail.append(f"\n[{field.name}]\n{to_toml(item)}")
+        elif isinstance(item, tuple) and item and dataclasses.is_dataclass(item[0]):
+            tail += [f"\n[[{field.name}]]\n{to_toml(each)}" for each in item]
         else:
             unit = limits_of(type(value), field.name).unit
             head.append(f"{field.name} = {_literal(item)}{f'  # {unit}' if unit else ''}\n")
@@ -273,4 +275,6 @@ def _literal(item: Any) -> str:
         return repr(item.tolist())
     if isinstance(item, str):
         return '"' + item.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(item, tuple):
+        return f"[{', '.join(_literal(each) for each in item)}]"
     return repr(item)

@@ -137,3 +137,14 @@ class Noise:
             self._block, self._next = self._rng.standard_normal((BLOCK, self._width)), 0
         self._next += 1
         return self._block[self._next - 1]
+
+    def take_many(self, count: int) -> np.ndarray:
+        """(count, width) of them: what so many calls of `take` give."""
+        parts = []
+        while count > 0:
+            parts.append(self.take()[None])
+            more = self._block[self._next : self._next + count - 1]
+            parts.append(more)
+            self._next += len(more)
+            count -= 1 + len(more)
+        return np.concatenate(parts)

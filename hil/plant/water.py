@@ -14,7 +14,7 @@ from numba import types
 
 from hil.plant.draw import Noise
 from hil.plant.spec import Tank, WorldSpec
-from hil.plant.vectors import F2, F8, V3, compiled, dot, minus, plus, times, triple
+from hil.plant.vectors import F1, F2, F8, V3, compiled, dot, minus, plus, times, triple
 
 FRICTION = 0.3
 """Largest friction at a wall, share of the normal force (synthetic)."""
@@ -73,6 +73,22 @@ class Gusts:
         """(3,) where the gust tends during the next tick, m/s."""
         self._unit = self._keep * self._unit + self._push * self._noise.take()
         return self._sigma * self._unit
+
+    def steps(self, count: int) -> np.ndarray:
+        """(count, 3) what so many calls of `step` give, at once."""
+        out = self._noise.take_many(count)
+        _lag(self._unit, self._keep, self._push, out)
+        self._unit = out[-1].copy()
+        return self._sigma * out
+
+
+@compiled(types.void(F1, F8, F8, F2))
+def _lag(start, keep, push, out):
+    """Puts white noise (k, 3), in place, through the first lag."""
+    for k in range(out.shape[0]):
+        for i in range(3):
+            before = start[i] if k == 0 else out[k - 1, i]
+            out[k, i] = keep * before + push * out[k, i]
 
 
 @compiled(types.Tuple((V3, V3))(WATER, F8))

@@ -14,7 +14,7 @@ from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from hil.plant import thrusters as thrusters_module
-from hil.plant.bodies import steered
+from hil.plant.bodies import Bodies, Modules, steered
 from hil.plant.build import make_thrusters, nominal_centre
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.docked import DockedBodies
@@ -24,7 +24,8 @@ from hil.plant.integrator import advance
 from hil.plant.jets import add_jets
 from hil.plant.lattice import Place
 from hil.plant.spec import Tank, WorldSpec
-from hil.plant.water import Gusts, make_water
+from hil.plant.thrusters import Thrusters
+from hil.plant.water import Gusts, Water, make_water
 
 STEP_NS = 2_500_000
 """Sub-step of the integration."""
@@ -73,6 +74,25 @@ class BodyTruth(NamedTuple):
     w_b: np.ndarray
     com_w: np.ndarray
     """(3,) where the centre of mass, water included, really is."""
+
+
+class Arrays(NamedTuple):
+    """A world's own arrays, as `integrator.advance` takes them."""
+
+    bodies: Bodies
+    modules: Modules
+    thrusters: Thrusters
+    water: Water
+    gusts: np.ndarray
+    """(k, 3) where the gust tends in each tick to come."""
+    external: np.ndarray
+    steps: int
+    """Sub-steps of a tick."""
+    step_s: float
+    stage: np.ndarray
+    thrust: np.ndarray
+    seen: np.ndarray
+    """(m, 16)."""
 
 
 class World(DockedBodies):
@@ -213,6 +233,21 @@ class World(DockedBodies):
         faces = self.docks.faces if len(self.bodies) > 1 else None
         arrays = (self._body_arrays, self._modules, faces, self._thrusters, self._water)
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
+
+    def lend(self, ticks: int) -> Arrays:
+        """The arrays of a lone module for `hil.batch`, which moves them on by so many ticks; the clock already stands at their end.
+
+        Raises DescriptionError for more than one module, or a thruster that is broken: these need Python between the ticks.
+        """
+        if len(self.vehicles) > 1 or self._broken:
+            raise DescriptionError(
+                f"plant: a batch is of lone modules that are whole; here are {len(self.vehicles)} modules, {len(self._broken)} faults"
+            )
+        self.time_ns += ticks * self.period_ns
+        return Arrays(
+            self._body_arrays, self._modules, self._thrusters, self._water, self._gusts.steps(ticks), self._external,
+            self.period_ns // self._step_ns, 1e-9 * self._step_ns, self._stage, self._thrust, self._seen,
+        )  # fmt: skip
 
     def truth(self, module: int) -> Truth:
         """The truth about one module; its arrays are copies."""

@@ -1,0 +1,73 @@
+"""Many worlds in one call are what they would have been one by one."""
+
+import numpy as np
+import pytest
+
+from firmware_py.description.schema import DescriptionError
+from hil.batch import fly
+from hil.plant.draw import Noise, stream
+from hil.plant.world import World
+from hil.scenario import load_scenario, make_world
+
+TICKS = 1500
+"""Beyond the 1024 numbers that gusts are drawn ahead."""
+PERIOD_NS = 10_000_000
+
+
+def worlds(count: int) -> list[World]:
+    return [make_world(load_scenario("spiral"), seed, PERIOD_NS) for seed in range(count)]
+
+
+def pushes(count: int, ticks: int = TICKS) -> np.ndarray:
+    """(count, ticks, 8) commands that drive the module about, and into the walls."""
+    return np.clip(0.4 * np.cumsum(np.random.default_rng(1).standard_normal((count, ticks, 8)), axis=1) / 10.0, -1.0, 1.0)
+
+
+def one_by_one(world: World, commands: np.ndarray) -> np.ndarray:
+    rows = []
+    for u in commands:
+        world.set_command(0, u, True)
+        world.advance(PERIOD_NS)
+        rows.append(world.seen()[0])
+    return np.array(rows)
+
+
+def test_batch_is_the_single_plant_to_the_last_bit() -> None:
+    commands = pushes(3)
+    together = fly(worlds(3), commands, threads=2)
+    for each, world, u in zip(together, worlds(3), commands, strict=True):
+        assert np.array_equal(each, one_by_one(world, u))
+    assert not np.array_equal(together[0], together[1])
+
+
+def test_world_goes_on_where_the_batch_has_put_it() -> None:
+    commands = pushes(1, 60)
+    world, alone = worlds(1)[0], worlds(1)[0]
+    fly([world], commands[:, :20])
+    one_by_one(world, commands[0, 20:40])
+    last = fly([world], commands[:, 40:])
+    assert np.array_equal(last[0], one_by_one(alone, commands[0])[40:])
+    assert world.time_ns == alone.time_ns
+    assert np.array_equal(world.truth(0).force_n, alone.truth(0).force_n)
+
+
+def test_numbers_taken_together_are_those_taken_singly() -> None:
+    single, many = (Noise(stream(0, "gusts"), 3) for _ in range(2))
+    wanted = np.array([single.take() for _ in range(2500)])
+    assert np.array_equal(np.concatenate([many.take_many(n) for n in (1, 700, 1500, 299)]), wanted)
+
+
+def test_same_commands_for_all_need_be_given_once() -> None:
+    commands = pushes(1, 30)[0]
+    assert np.array_equal(fly(worlds(2), commands), fly(worlds(2), np.stack([commands, commands])))
+
+
+@pytest.mark.parametrize("shape", [(30, 7), (3, 30, 8), (8,)])
+def test_commands_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(DescriptionError, match=r"batch: commands have the shape"):
+        fly(worlds(2), np.zeros(shape))
+
+
+def test_docked_modules_are_refused() -> None:
+    with pytest.raises(DescriptionError, match="lone modules"):
+        fly([make_world(load_scenario("mobius-2"), 0, PERIOD_NS)], np.zeros((10, 8)))

@@ -1,0 +1,92 @@
+"""A thruster's load-cell measurement becomes a curve that a vehicle file takes."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.description.schema import DescriptionError, build, read_toml
+from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
+tool = importlib.import_module("fit_thruster")
+LIKE = load_vehicle("modcube").curve
+POWERS = np.arange(1, 6)
+
+
+def measured(noise_n: float = 0.0, voltage_v: float = 12.0) -> dict[str, np.ndarray]:
+    """41 points of the vehicle's own curve, measured at another voltage."""
+    u = np.linspace(-1.0, 1.0, 41)
+    force = np.where(u > 0.0, np.abs(u)[:, None] ** POWERS @ LIKE.forward, -(np.abs(u)[:, None] ** POWERS @ LIKE.reverse))
+    force[np.abs(force) < LIKE.deadband_n] = 0.0
+    force += noise_n * np.random.default_rng(0).standard_normal(len(u)) * (force != 0.0)
+    side = np.where((force > 0.0)[:, None], LIKE.power_forward, LIKE.power_reverse)
+    power = np.sum(np.abs(force)[:, None] ** POWERS * side, axis=1)
+    return {"command": u, "force_n": force * (voltage_v / 12.0) ** 2, "voltage_v": np.full(len(u), voltage_v), "power_w": power}
+
+
+def write_csv(path: Path, points: dict[str, np.ndarray]) -> Path:
+    rows = [",".join(points), *(",".join(f"{value:.9g}" for value in row) for row in np.column_stack(list(points.values())))]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("voltage_v", [12.0, 10.5])
+def test_curve_that_was_measured_is_found_whatever_the_voltage(voltage_v: float) -> None:
+    curve, left_n = tool.fit_curve(measured(voltage_v=voltage_v), LIKE, 12.0, 0.05)
+    assert left_n < 1e-6
+    for name in ("forward", "reverse"):
+        assert getattr(curve, name) == pytest.approx(getattr(LIKE, name), abs=1e-4)
+    assert curve.deadband_n == pytest.approx(LIKE.deadband_n, abs=0.1)  # the points are 0.05 of full command apart
+    f = np.linspace(0.5, 7.0, 9)[:, None] ** POWERS
+    assert f @ curve.power_forward == pytest.approx(f @ LIKE.power_forward, rel=1e-3)
+
+
+def test_noise_does_not_make_the_curve_fall() -> None:
+    """The schema refuses a curve that falls; so wild points must not give one."""
+    for seed in range(5):
+        points = measured()
+        wild = 1.5 * np.random.default_rng(seed).standard_normal(41)
+        points["force_n"] = np.sign(points["force_n"]) * np.abs(points["force_n"] + wild * (np.abs(points["force_n"]) > 2.0))
+        curve, left_n = tool.fit_curve(points, LIKE, 12.0, 0.05)
+        assert 0.3 < left_n < 3.0
+        assert np.all(np.diff(np.linspace(0.0, 1.0, 500)[:, None] ** POWERS @ curve.forward) > 0.0)
+
+
+def test_file_that_is_written_is_a_vehicle_files_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, out = write_csv(tmp_path / "bench.csv", measured(0.02)), tmp_path / "curve.toml"
+    monkeypatch.setattr(sys, "argv", ["fit_thruster", str(source), "--out", str(out)])
+    assert tool.main() == 0
+    table, where = read_toml(out)
+    curve = build(ThrusterCurve, table, where)
+    assert np.sum(curve.forward) == pytest.approx(np.sum(LIKE.forward), rel=0.01)
+    assert curve.lag_s == LIKE.lag_s
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("command,newton\n0,0\n", "no column force_n"),
+        ("command,force_n\n0,zero\n", "2: 'zero' is not a number"),
+        ("command,force_n\n0,0\n1.5,3\n", "3: command 1.5 is out of range"),
+        ("command,force_n\n1,5\n", "forward: 1 points"),
+    ],
+)
+def test_measurement_that_will_not_do_is_refused_in_one_line(
+    text: str, complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bench.csv").write_text(text)
+    monkeypatch.setattr(sys, "argv", ["fit_thruster", str(tmp_path / "bench.csv"), "--out", str(tmp_path / "curve.toml")])
+    assert tool.main() == 2
+    said = capsys.readouterr().err
+    assert complaint in said and said.count("\n") == 1
+    assert not (tmp_path / "curve.toml").exists()
+
+
+def test_thruster_that_pushes_against_its_command_is_refused() -> None:
+    points = measured()
+    points["force_n"] = -points["force_n"]
+    with pytest.raises(DescriptionError, match="against it"):
+        tool.fit_curve(points, LIKE, 12.0, 0.05)

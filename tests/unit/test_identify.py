@@ -1,0 +1,103 @@
+"""Parts of tools/identify.py on made-up data: no flight."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.description.schema import DescriptionError, build, read_toml, to_toml
+from firmware_py.description.vehicle import Vehicle, load_vehicle, vehicle_names
+from hil.scenario import load_scenario
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
+excitation, fit, model, motion, tool = (
+    importlib.import_module(name) for name in ("identify_excitation", "identify_fit", "identify_model", "identify_motion", "identify")
+)
+
+
+def test_noise_of_a_sensor_is_found_beside_its_motion() -> None:
+    t = np.arange(2000)[:, None] * 0.01
+    moved = np.sin(2.0 * t + np.arange(3)) + 0.002 * np.random.default_rng(0).standard_normal((2000, 3))
+    assert motion.noise_of(moved) == pytest.approx(0.002, rel=0.05)
+
+
+def test_window_sees_a_rate_as_the_slope_of_its_integral() -> None:
+    """Both sides of the equations go through the same window: a jump of the moment shows alike in both."""
+    h, dt = model.HALF_WINDOW, 0.01
+    jump = (np.arange(60) >= 30).astype(float)
+    rate = np.concatenate([[0.0], np.cumsum(0.5 * (jump[1:] + jump[:-1]))])[:, None] * dt
+    assert model._slope(rate, dt)[:, 0] == pytest.approx(np.convolve(jump, model._window(h), "valid"), abs=1e-12)
+
+
+def test_interval_is_as_wide_as_kiefer_and_vogelsang_say() -> None:
+    """Their table 1, 97.5 %, Bartlett: 1.96 at b = 0, 4.771 at b = 1."""
+    assert fit.critical_value(0.0) == pytest.approx(1.96)
+    assert fit.critical_value(1.0) == pytest.approx(4.771, abs=0.06)
+
+
+def test_reference_within_two_percent_has_the_spread_of_even_odds() -> None:
+    assert fit.Reference(0, 0.02).sigma == pytest.approx(0.02 / np.sqrt(3.0))
+
+
+def test_whole_excitation_is_a_scenario_that_stays_in_its_tank(tmp_path: Path) -> None:
+    file = tmp_path / "shake.toml"
+    file.write_text(excitation.excitation(list(excitation.MOTIONS), "modcube"))
+    scenario = load_scenario(str(file))
+    task = scenario.task
+    assert task.settle_s + task.duration_s == pytest.approx(180.0)  # the log of three minutes
+    assert np.linalg.norm(task.amplitude_m[:2]) < scenario.tank.radius_m - 0.2
+    assert task.centre_m[2] + task.amplitude_m[2] < scenario.tank.depth_m - 0.2
+    assert task.yaw_turns and task.roll_turns
+
+
+@pytest.mark.parametrize(
+    ("motions", "axes", "turns"),
+    [(["along y"], [1], False), (["turning"], [], True), (["fast edge-on", "turning"], [0, 1], True), (["along z"], [2], False)],
+)
+def test_excitation_makes_only_the_motion_that_is_missing(motions: list[str], axes: list[int], turns: bool, tmp_path: Path) -> None:
+    file = tmp_path / "shake.toml"
+    file.write_text(excitation.excitation(motions, "modcube"))
+    task = load_scenario(str(file)).task
+    assert np.flatnonzero(task.amplitude_m).tolist() == axes
+    assert (task.yaw_turns != 0.0) is turns and (task.roll_turns != 0.0) is turns
+
+
+def test_smaller_room_is_kept_and_shaken_faster() -> None:
+    text = excitation.excitation(["along x"], "modcube", (0.15, 0.5, 0.3))
+    assert "amplitude_m = [0.15, 0.0, 0.0]" in text
+    assert "turns = 18.00" in text  # a quarter of the way, twice as often: the same acceleration
+
+
+def test_no_room_is_refused() -> None:
+    with pytest.raises(DescriptionError, match="leaves no room"):
+        excitation.excitation(["along x"], "modcube", (0.0, 0.5, 0.3))
+
+
+@pytest.mark.parametrize("text", ["2.0", "2.0:0.2:60", "a:b:c:d", "0:0.2:60:120", "2:0.2:120:60"])
+def test_weight_that_makes_no_sense_is_refused(text: str) -> None:
+    with pytest.raises(DescriptionError, match="--weight"):
+        tool.parse_weight(text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [([], "no LOG was given"), (["nowhere"], "no can.log"), (["a", "b", "--weight", "2:0.2:1:2"], "give one LOG")],
+)
+def test_what_cannot_run_says_so_in_one_line(
+    arguments: list[str], complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["identify", *arguments])
+    assert tool.main() == 2
+    said = capsys.readouterr().err
+    assert complaint in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", vehicle_names())
+def test_vehicle_that_is_written_is_the_vehicle(name: str, tmp_path: Path) -> None:
+    vehicle, file = load_vehicle(name), tmp_path / "again.toml"
+    file.write_text(to_toml(vehicle))
+    table, source = read_toml(file)
+    again: Vehicle = build(Vehicle, table, source)
+    assert to_toml(again) == to_toml(vehicle)

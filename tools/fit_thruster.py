@@ -1,0 +1,134 @@
+#!/usr/bin/env python3
+"""Fit the paper's fifth-order polynomials to a thruster's load-cell measurement, rising all the way as the vehicle file asks.
+
+    .venv/bin/python tools/fit_thruster.py bench.csv --voltage 12 --out curve.toml
+
+The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w. The force is brought to one voltage by its
+square. Written are the fields of a vehicle file's [curve], for it or for tools/identify.py --curve; what was not measured (power, lag,
+speed) is --vehicle's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import nnls
+
+from firmware_py.description.schema import DescriptionError, frozen_array, to_toml
+from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
+
+DEGREE = 5
+LEAST_SLOPE = 1e-3
+"""Of the force, share of its mean slope: no curve stands still."""
+LEAST_POINTS = 6
+"""On either side, beyond the deadband."""
+COLUMNS = ("command", "force_n")
+
+
+def rising_polynomial(x: np.ndarray, y: np.ndarray, end: float) -> np.ndarray:
+    """(5,) c of c[0] x + ... + c[4] x^5, the least-squares fit to (k,) points that rises all over 0..end.
+
+    Its slope is a sum of Bernstein polynomials of degree 4 with coefficients above zero, found by non-negative least squares
+    (Lawson and Hanson 1974); a slope that needs a negative coefficient though it never falls is approximated.
+    """
+    basis = np.zeros((DEGREE, DEGREE))
+    for i in range(DEGREE):  # slope binom(4, i) t^i (1-t)^(4-i), t = x / end, integrated
+        for k in range(DEGREE - i):
+            basis[i, i + k] = math.comb(4, i) * math.comb(4 - i, k) * (-1.0) ** k / (i + k + 1)
+    powers = (x[:, None] / end) ** np.arange(1, DEGREE + 1)
+    floor = LEAST_SLOPE * float(np.max(y))
+    shares, _ = nnls(powers @ basis.T, y - floor * powers @ basis.sum(axis=0))
+    return np.asarray((shares + floor) @ basis / end ** np.arange(1, DEGREE + 1))
+
+
+def read_points(path: Path) -> dict[str, np.ndarray]:
+    """The columns of the CSV. Raises DescriptionError and OSError."""
+    with path.open(encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file)
+        lacking = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
+        if lacking:
+            raise DescriptionError(f"{path}:1: no column {', '.join(lacking)}; the header needs command,force_n (and voltage_v, power_w)")
+        rows = list(reader)
+    points = {}
+    for name in (*COLUMNS, "voltage_v", "power_w"):
+        if rows and name in rows[0]:
+            points[name] = np.array([_number(row[name], path, line) for line, row in enumerate(rows, 2)])
+    if rows and np.max(np.abs(points["command"])) > 1.0:
+        line = 2 + int(np.argmax(np.abs(points["command"]) > 1.0))
+        raise DescriptionError(f"{path}:{line}: command {points['command'][line - 2]:g} is out of range; it runs from -1 to 1")
+    return points
+
+
+def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: float, zero_n: float) -> tuple[ThrusterCurve, float]:
+    """The curve, and the root mean square of what is left of the forces beyond the deadband, N. Raises DescriptionError.
+
+    Args:
+        points: columns of `read_points`. like: what was not measured. voltage_v: to which forces are brought.
+        zero_n: size of a force that counts as none.
+    """
+    u, force = points["command"], points["force_n"].copy()
+    if "voltage_v" in points:
+        force *= np.square(voltage_v / points["voltage_v"])
+    changed: dict[str, np.ndarray] = {}
+    edges, left = [], []
+    for side, sign in (("forward", 1.0), ("reverse", -1.0)):
+        works = (sign * u > 0.0) & (np.abs(force) > zero_n)
+        if works.sum() < LEAST_POINTS or np.any(sign * force[works] < 0.0):
+            raise DescriptionError(
+                f"{side}: {works.sum()} points with a force of the command's sign beyond {zero_n:g} N; at least {LEAST_POINTS} are "
+                "needed, and none against it"
+            )
+        x, y = np.abs(u[works]), np.abs(force[works])
+        changed[side] = rising_polynomial(x, y, 1.0)
+        powers = np.arange(1, DEGREE + 1)
+        left.append(x[:, None] ** powers @ changed[side] - y)
+        idle = np.abs(u[(sign * u >= 0.0) & ~works])
+        between = 0.5 * (float(x.min()) + float(idle.max())) if idle.size else 0.0
+        edges.append(float(between**powers @ changed[side]) if idle.size else 0.0)
+        if "power_w" in points:
+            changed[f"power_{side}"] = rising_polynomial(y, points["power_w"][works], float(np.sum(changed[side])))
+    curve = dataclasses.replace(
+        like, voltage_v=voltage_v, deadband_n=float(np.mean(edges)), **{name: frozen_array(c) for name, c in changed.items()}
+    )
+    return curve, float(np.sqrt(np.mean(np.square(np.concatenate(left)))))
+
+
+def _number(text: str | None, path: Path, line: int) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise DescriptionError(f"{path}:{line}: {text!r} is not a number")
+    return value
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("csv", type=Path, help="the measurement")
+    parser.add_argument("--voltage", type=float, help="V of the curve; else the vehicle's")
+    parser.add_argument("--zero", type=float, default=0.05, metavar="N", help="size of a force that counts as none")
+    parser.add_argument("--vehicle", default="modcube", help="whose curve is taken for what was not measured")
+    parser.add_argument("--out", type=Path, default=Path("curve.toml"), help="the file to write")
+    given = parser.parse_args()
+    try:
+        like = load_vehicle(given.vehicle).curve
+        curve, left_n = fit_curve(read_points(given.csv), like, given.voltage or like.voltage_v, given.zero)
+        given.out.write_text(to_toml(curve), encoding="utf-8")
+    except (DescriptionError, OSError) as error:
+        print(f"fit_thruster: {error}", file=sys.stderr)
+        return 2
+    print(f"{given.out}: {np.sum(curve.forward):.3g} N forward, {np.sum(curve.reverse):.3g} N reverse at {curve.voltage_v:g} V;", end=" ")
+    print(f"deadband {curve.deadband_n:.2g} N; residual {left_n:.2g} N RMS")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,139 @@
+#!/usr/bin/env python3
+"""Fit a vehicle file to recorded flights of one module, with 95 % intervals; the bench's logs or a real vehicle's.
+
+    .venv/bin/python tools/identify.py runs/shaken                                  # no reference: ratios only
+    .venv/bin/python tools/identify.py runs/shaken --curve curve.toml --thruster 1 --accuracy 2
+    .venv/bin/python tools/identify.py runs/shaken --weight 2.0:0.22:60:120
+    .venv/bin/python tools/identify.py --excitation shake.toml                      # the flight to begin with
+
+A log is the folder that `modcube run --out` or `modcube hil run --out` left; can.log and signals.mcap are read, truth.mcap is not.
+Left in --out: identified.json, vehicle.toml (with a reference), excite.toml (where some motion is missing).
+Exit status 0: everything within 10 %; 1: a motion is missing; 2: cannot run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from identify_excitation import MOTIONS, SPACE_M, excitation
+from identify_fit import Reference, fit
+from identify_log import Recording, read_recording
+from identify_model import Equations, Weight
+from identify_motion import smooth
+from identify_quantities import NO_SCALE, Finding, findings, fitted_vehicle, missing
+from rich import box as box_style
+from rich.console import Console
+from rich.table import Table
+
+from firmware_py.description.schema import DescriptionError, build, read_toml, to_toml
+from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
+
+
+def read_curve(path: Path) -> ThrusterCurve:
+    """A curve that tools/fit_thruster.py wrote. Raises DescriptionError."""
+    table, source = read_toml(path)
+    curve: ThrusterCurve = build(ThrusterCurve, table, source)
+    return curve
+
+
+def parse_weight(text: str) -> Weight:
+    """NEWTON:KG:FROM:UNTIL. Raises DescriptionError."""
+    try:
+        weight = Weight(*(float(word) for word in text.split(":")))
+    except (ValueError, TypeError):
+        raise DescriptionError(
+            f"--weight {text!r} is not NEWTON:KG:FROM:UNTIL, such as 2.0:0.22:60:120 (weight in water, mass in air, seconds of the log)"
+        ) from None
+    if weight.newton == 0.0 or weight.kg < 0.0 or not 0.0 <= weight.from_s < weight.until_s:
+        raise DescriptionError(f"--weight {text!r}: a weight other than 0, a mass of 0 or more, and a beginning before its end are needed")
+    return weight
+
+
+def reference_of(recording: Recording, thruster: int, accuracy_percent: float) -> Reference:
+    """The load-cell curve as a reference. Raises DescriptionError."""
+    count = len(recording.vehicle.thruster)
+    if not 1 <= thruster <= count:
+        raise DescriptionError(f"--thruster {thruster}: the vehicle has thrusters 1 to {count}")
+    if not 0.0 < accuracy_percent <= 50.0:
+        raise DescriptionError(f"--accuracy {accuracy_percent:g}: a percentage above 0 and up to 50 is needed")
+    return Reference(thruster - 1, 0.01 * accuracy_percent)
+
+
+def print_findings(found: Sequence[Finding]) -> None:
+    """The table."""
+    table = Table(box=box_style.SIMPLE_HEAD)
+    for column in ("what", "value", "95 % interval", "", "unit"):
+        table.add_column(column, justify="left" if column in ("what", "unit") else "right")
+    for each in found:
+        table.add_row(each.name, f"{each.value:.4g}", f"+-{each.half_width:.2g}", f"{min(each.share, 9.99):.1%}", each.unit)
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+
+
+def identify(given: argparse.Namespace) -> int:
+    """Fits, prints and writes; the exit status. Raises DescriptionError and OSError."""
+    if not given.logs:
+        if given.excitation is None:
+            raise DescriptionError("no LOG was given; give the folder of a flight, or --excitation FILE for the flight to begin with")
+        load_vehicle(given.vehicle)
+        given.excitation.write_text(excitation(list(MOTIONS), given.vehicle, given.space), encoding="utf-8")
+        print(f"fly it: modcube hil run {given.excitation}")
+        return 0
+    weight = parse_weight(given.weight) if given.weight else None
+    if weight is not None and len(given.logs) > 1:
+        raise DescriptionError("--weight says when the weight hung in one log; give one LOG with it")
+    recordings = [read_recording(Path(log)) for log in given.logs]
+    if len({to_toml(r.vehicle) for r in recordings}) > 1:
+        raise DescriptionError(f"{given.logs[0]} and the others were flown by different vehicles; give logs of one")
+    vehicle = recordings[0].vehicle
+    if vehicle.drag.quadratic.size:
+        raise DescriptionError(f"vehicle {vehicle.name}: its drag is published damping; only cd_face and cd_edge can be fitted")
+    curve = read_curve(given.curve) if given.curve else vehicle.curve
+    reference = reference_of(recordings[0], given.thruster, given.accuracy) if given.curve else None
+    flights = [Equations(recording, smooth(recording), curve, weight) for recording in recordings]
+    result = fit(flights, reference, weight is not None)
+    found, logs = findings(result, vehicle), ", ".join(given.logs)
+    print_findings(found)
+    wanted = missing(found)
+    given.out.mkdir(parents=True, exist_ok=True)
+    report = {"logs": given.logs, "has_reference": result.has_scale, "residual": result.residual.tolist(), "missing": wanted}
+    report["found"] = [each._asdict() for each in found]
+    (given.out / "identified.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    if result.has_scale:
+        (given.out / "vehicle.toml").write_text(to_toml(fitted_vehicle(result, vehicle, curve, logs)), encoding="utf-8")
+        print(given.out / "vehicle.toml")
+    else:
+        print(f"refused: {NO_SCALE}")
+    for motion, needing in wanted.items():
+        print(f"missing excitation: {motion}, for {', '.join(needing)}")
+    if wanted:
+        chosen = given.excitation or given.out / "excite.toml"
+        chosen.write_text(excitation(list(wanted), recordings[0].vehicle_name, given.space), encoding="utf-8")
+        print(f"fly it: modcube hil run {chosen}")
+    return 1 if wanted else 0
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("logs", nargs="*", metavar="LOG", help="folders of flights of one vehicle, one module alone")
+    parser.add_argument("--curve", type=Path, metavar="FILE", help="curve of one thruster, from tools/fit_thruster.py")
+    parser.add_argument("--thruster", type=int, default=1, help="which thruster that was, 1 the first")
+    parser.add_argument("--accuracy", type=float, default=2.0, metavar="PERCENT", help="bounds of the load cell's scale")
+    parser.add_argument("--weight", metavar="NEWTON:KG:FROM:UNTIL", default="", help="a known weight hung below the middle so long")
+    parser.add_argument("--excitation", type=Path, metavar="FILE", help="where the scenario of the missing motions goes")
+    parser.add_argument("--space", type=float, nargs=3, metavar="M", default=list(SPACE_M), help="room to either side, world x y z")
+    parser.add_argument("--vehicle", default="modcube", help="of the flight to begin with")
+    parser.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/identify"), help="for what is found")
+    try:
+        return identify(parser.parse_args())
+    except (DescriptionError, OSError) as error:
+        print(f"identify: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

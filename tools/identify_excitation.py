@@ -1,0 +1,85 @@
+"""For tools/identify.py: the flight that shows what a log did not: a scenario for `modcube hil run FILE`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from firmware_py.description.schema import DescriptionError
+
+SPACE_M = (0.6, 0.5, 0.3)
+"""How far it moves to either side of the middle when nothing else is said: keeps the peak below 0.45 m/s and 0.35 m/s^2."""
+RATE_HZ = 9.0 / 170.0
+"""Rounds a second at that size; at another, as many as keep the acceleration."""
+FREQUENCY = (1.0, 1.3, 1.7)
+"""Of the axes, in rounds: never in step, so that axes, diagonals and all speeds between come by."""
+YAW_TURNS, ROLL_TURNS = 0.61, 0.43
+"""Turns a round."""
+MOTIONS: Mapping[str, tuple[tuple[int, ...], bool]] = {
+    "along x": ((0,), False),
+    "along y": ((1,), False),
+    "along z": ((2,), False),
+    "fast face-on": ((0, 1, 2), False),
+    "fast edge-on": ((0, 1), False),
+    "turning": ((), True),
+}
+"""Axes along which each goes to and fro, and whether it turns."""
+
+TEMPLATE = """\
+# Written by tools/identify.py: {why}.
+name = "excite"
+help = "for tools/identify.py: {why}"
+tags = [0, 1, 2, 3, 4, 5]
+
+[tank]                  # yours in its place
+kind = "cylinder"
+radius_m = 3.5
+depth_m = 3.0
+
+[[module]]
+number = 1
+vehicle = "{vehicle}"
+position_m = [0.0, 0.0, 1.5]
+
+[[camera]]              # above the tank, looking down
+position_m = [0.0, 0.0, -1.2]
+axis = [0.0, 0.0, 1.0]
+
+[task]
+kind = "lissajous"
+settle_s = 10.0
+duration_s = {duration:.1f}
+centre_m = [0.0, 0.0, 1.5]
+amplitude_m = {amplitude}
+frequency = {frequency}
+turns = {turns:.2f}
+yaw_turns = {yaw}
+roll_turns = {roll}
+"""
+
+
+def excitation(motions: Collection[str], vehicle: str, space_m: Sequence[float] = SPACE_M, duration_s: float = 170.0) -> str:
+    """The TOML text of a scenario that makes the `motions` (keys of MOTIONS). Raises DescriptionError where nothing can move.
+
+    Args:
+        vehicle: name or file. space_m: (3,) how far the vehicle may go to either side of the middle, along each world axis.
+    """
+    axes = {axis for motion in motions for axis in MOTIONS[motion][0]}
+    turns = any(MOTIONS[motion][1] for motion in motions)
+    amplitude = [min(most, free) if i in axes else 0.0 for i, (most, free) in enumerate(zip(SPACE_M, space_m, strict=True))]
+    if axes and max(amplitude) <= 0.0:
+        raise DescriptionError(f"--space {' '.join(f'{s:g}' for s in space_m)} leaves no room to move; give what is free to either side, m")
+    reach = np.array([a / full for a, full in zip(amplitude, SPACE_M, strict=True) if a > 0.0])
+    rounds = RATE_HZ * duration_s / math.sqrt(reach.max() if reach.size else 1.0)
+    return TEMPLATE.format(
+        why=", ".join(motion for motion in MOTIONS if motion in motions),
+        vehicle=vehicle,
+        duration=duration_s,
+        amplitude=[round(a, 3) for a in amplitude],
+        frequency=list(FREQUENCY),
+        turns=rounds,
+        yaw=YAW_TURNS if turns else 0.0,
+        roll=ROLL_TURNS if turns else 0.0,
+    )

@@ -1,0 +1,141 @@
+"""For tools/identify.py: the unknowns that explain recorded flights best, and how well they are known.
+
+Gauss-Newton on the rows of all flights. What the model leaves out, gusts above all, is no white noise: it lasts for seconds. So the
+covariance is the sandwich of Newey and West (1987) over a window of 10 s, and an interval is as much wider than the normal one
+as that window's share of the record asks for (Kiefer and Vogelsang 2005, table 1).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from identify_model import NUISANCES, Equations, beginning, places, unknowns
+
+MEMORY_S = 10.0
+"""How far apart in time errors still know of one another; gusts last 5 s."""
+MOST_STEPS = 15
+STILL = 0.05
+"""Of a standard error, the largest step after which the search ends."""
+CERTAIN = 1e-6
+"""Standard deviation that fixes a scale which nothing measures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What one thruster's gain is known to be: 1, for the curve that was measured on it, to within `accuracy` of it."""
+
+    thruster: int
+    accuracy: float
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of bounds within which everything is as likely (GUM 4.3.7)."""
+        return self.accuracy / math.sqrt(3.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What was found.
+
+    Attributes:
+        x: (p,) unknowns, those of the vehicle first. places: where each stands, by name.
+        covariance: (p, p). critical: half-width of a 95 % interval in standard errors.
+        residual: (6,) root mean square of what is left, m/s^2 and rad/s^2.
+        has_scale: whether anything absolute was known: else gains are such that their mean is 1.
+    """
+
+    x: np.ndarray
+    places: dict[str, slice]
+    covariance: np.ndarray
+    critical: float
+    residual: np.ndarray
+    has_scale: bool
+
+    def value(self, name: str) -> np.ndarray:
+        """One unknown."""
+        return self.x[self.places[name]]
+
+    def interval(self, function: Callable[[np.ndarray], float]) -> tuple[float, float]:
+        """A function of the unknowns, and the half-width of its 95 % interval, to first order."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        slope = np.zeros(len(self.x))
+        for i in np.flatnonzero(sigma):
+            ahead, behind = self.x.copy(), self.x.copy()
+            ahead[i] += 1e-5
+            behind[i] -= 1e-5
+            slope[i] = (function(ahead) - function(behind)) / 2e-5
+        return function(self.x), self.critical * math.sqrt(max(0.0, slope @ self.covariance @ slope))
+
+
+def fit(flights: Sequence[Equations], reference: Reference | None = None, has_weight: bool = False) -> Fit:
+    """Fits all flights of one vehicle at once; without `reference` and weight the mean gain is 1 by decree."""
+    vehicle = flights[0].vehicle
+    mine = unknowns(len(vehicle.thruster))
+    shared = places(mine)
+    count = sum(u.count for u in mine)
+    own = [places(NUISANCES, count + k * sum(u.count for u in NUISANCES)) for k in range(len(flights))]
+    first = np.concatenate([*beginning(vehicle).values(), np.zeros(sum(n.count for n in NUISANCES) * len(flights))])
+    parts = [*mine, *(NUISANCES * len(flights))]
+    width = np.concatenate([np.full(u.count, u.width) for u in parts])
+    step = np.concatenate([np.full(u.count, u.step) for u in parts])
+    scale, pull = _scale_row(shared["gain"], len(first), reference, has_weight)
+    prior = np.diag(width**-2.0) + pull * np.outer(scale, scale)
+    x, sigma = first.copy(), np.ones(6)
+    for _ in range(MOST_STEPS):
+        rows = [_rows(flight, x, step, shared | nuisances) for flight, nuisances in zip(flights, own, strict=True)]
+        sigma = np.sqrt(np.mean(np.concatenate([residual for residual, _ in rows]) ** 2, axis=0))
+        flat = [(slopes / sigma[:, None]).reshape(-1, len(x)) for _, slopes in rows]
+        information = prior + sum(each.T @ each for each in flat)
+        score = sum(each.T @ (residual / sigma).ravel() for each, (residual, _) in zip(flat, rows, strict=True))
+        score = score - (x - first) / width**2 + pull * scale * (1.0 - scale @ x)
+        move = np.linalg.solve(information, score)
+        x = x + move
+        if np.all(np.abs(move) < STILL / np.sqrt(np.diag(information))):
+            break
+    inverse = np.linalg.inv(information)
+    share, meat = 0.0, prior.copy()
+    for flight, (residual, slopes) in zip(flights, rows, strict=True):
+        lags = max(1, round(MEMORY_S / float(np.median(np.diff(flight.time_s)))))
+        meat += _long_run(np.einsum("nki,nk->ni", slopes, residual / sigma**2), lags)
+        share = max(share, lags / len(residual) / len(flights))
+    covariance = inverse @ meat @ inverse
+    return Fit(x, shared, covariance, critical_value(min(share, 1.0)), sigma, reference is not None or has_weight)
+
+
+def critical_value(share: float) -> float:
+    """Half-width of a 95 % interval in standard errors whose window is this share of the record; 1.96 for none."""
+    return 1.96 + 2.9694 * share + 0.4160 * share**2 - 0.5324 * share**3
+
+
+def _scale_row(gains: slice, count: int, reference: Reference | None, has_weight: bool) -> tuple[np.ndarray, float]:
+    """(p,) row that is to be 1, and how strongly: the reference's thruster, or else the mean gain."""
+    row = np.zeros(count)
+    if reference is not None:
+        row[gains.start + reference.thruster] = 1.0
+        return row, reference.sigma**-2.0
+    row[gains] = 1.0 / (gains.stop - gains.start)
+    return row, 0.0 if has_weight else CERTAIN**-2.0
+
+
+def _rows(flight: Equations, x: np.ndarray, step: np.ndarray, where: dict[str, slice]) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 6) what was measured less what was expected, and (n, 6, p) slopes of the expectation."""
+    expected = flight.predict({name: x[at] for name, at in where.items()})
+    slopes = np.zeros((*expected.shape, len(x)))
+    for at in where.values():
+        for i in range(at.start, at.stop):
+            ahead = x.copy()
+            ahead[i] += step[i]
+            slopes[:, :, i] = (flight.predict({name: ahead[k] for name, k in where.items()}) - expected) / step[i]
+    return flight.measured - expected, slopes
+
+
+def _long_run(scores: np.ndarray, lags: int) -> np.ndarray:
+    """(p, p) covariance of the sum of (n, p) scores that know of one another over `lags` rows: Bartlett's weights."""
+    total = scores.T @ scores
+    for lag in range(1, min(lags, len(scores) - 1) + 1):
+        between = scores[:-lag].T @ scores[lag:]
+        total += (1.0 - lag / (lags + 1.0)) * (between + between.T)
+    return np.asarray(total)

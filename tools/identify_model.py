@@ -1,0 +1,222 @@
+"""For tools/identify.py: the equations of motion of one module, with what is to be found in them.
+
+Newton and Euler about the centre of mass, body frame, motion relative to the water (Fossen 2011, ch. 6 and 8):
+
+    M a  =  sum k_i F_i d_i + D(v) + n down                                 - w' x s - w x (w x s)  + M (w x v) - w x (M v)
+    I w' =  sum k_i F_i r_i x d_i - (rot |w| + cross c(v)) w - arm x down   - s x a                 - w x (I w) - v x (M v)
+
+a is what the accelerometer feels plus gravity, w' the derivative of the gyro; F_i is the thruster's curve over the commands that went
+out, behind a first-order lag, at the measured voltage; v the velocity less the current's; s the first moment of mass about where the
+file has the centre. M, I, s, D, n, arm and k have one factor in common that no motion shows. Both sides are seen through one window
+of 0.11 s: that of a straight line's slope through the gyro.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from identify_log import Recording
+from identify_motion import Motion, filled
+from scipy.signal import lfilter
+
+from firmware_py.core.drag_lookup import look_up
+from firmware_py.core.observation import GRAVITY
+from firmware_py.description.vehicle import ThrusterCurve, Vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+
+HALF_WINDOW = 5
+"""Ticks to either side of a row; rows follow every so many twice, so that hardly a sample is in two."""
+DEADBAND_EDGE_N = 0.01
+"""Over which a thruster's deadband ends, so that its place can be searched by slopes."""
+SHORTEST_LAG_S = 0.005
+DOWN = np.array([0.0, 0.0, 1.0])
+
+
+class Unknown(NamedTuple):
+    """So many numbers that are searched, with the width of what is thinkable around where the vehicle file has them."""
+
+    name: str
+    count: int
+    width: float
+    step: float = 1e-4
+    """For slopes."""
+
+
+def unknowns(thrusters: int) -> tuple[Unknown, ...]:
+    """What belongs to the vehicle. mass, inertia: logarithms of the totals; SI units."""
+    return (
+        Unknown("mass", 3, 1.0),
+        Unknown("inertia", 3, 1.0),
+        Unknown("gain", thrusters, 0.5),
+        Unknown("deadband", thrusters, 0.1, 0.003),
+        Unknown("lag", 1, 0.1),
+        Unknown("drag", 2, 1.0),
+        Unknown("rotational", 3, 0.05),
+        Unknown("crossflow", 3, 0.5),
+        Unknown("arm", 3, 0.5),
+        Unknown("weight", 1, 5.0),
+        Unknown("offset", 3, 0.1),
+    )
+
+
+NUISANCES = (Unknown("current", 3, 0.3), Unknown("bias", 3, 0.3))
+"""What belongs to one flight: the water's velocity, m/s, and the accelerometer's bias, m/s^2."""
+
+
+def places(parts: Sequence[Unknown], first: int = 0) -> dict[str, slice]:
+    """Where each stands in the vector of all."""
+    ends = first + np.cumsum([p.count for p in parts])
+    return {p.name: slice(int(end) - p.count, int(end)) for p, end in zip(parts, ends, strict=True)}
+
+
+class Weight(NamedTuple):
+    """A known weight that hung at the vehicle for part of a flight."""
+
+    newton: float
+    """In water."""
+    kg: float
+    """In air."""
+    from_s: float
+    until_s: float
+
+
+def beginning(vehicle: Vehicle) -> dict[str, np.ndarray]:
+    """The unknowns as the vehicle file has them."""
+    body, count = assemble_vehicle(vehicle), len(vehicle.thruster)
+    total = np.diag(body.mass)
+    return {
+        "mass": np.log(total[:3]),
+        "inertia": np.log(total[3:]),
+        "gain": np.ones(count),
+        "deadband": np.full(count, vehicle.curve.deadband_n),
+        "lag": np.array([max(vehicle.curve.lag_s, SHORTEST_LAG_S)]),
+        "drag": np.array([vehicle.drag.cd_face, vehicle.drag.cd_edge]),
+        "rotational": body.drag.rotational,
+        "crossflow": np.zeros(3),
+        "arm": body.righting,
+        "weight": np.zeros(1),
+        "offset": np.zeros(3),
+    }
+
+
+class Equations:
+    """The equations over one flight: what was measured, and what it should have been for given unknowns."""
+
+    def __init__(self, recording: Recording, motion: Motion, curve: ThrusterCurve, weight: Weight | None = None) -> None:
+        """`curve` is the thrusters' in place of the recording's."""
+        vehicle, window = recording.vehicle, _window(HALF_WINDOW)
+        inner = np.arange(HALF_WINDOW, len(recording.time_ns) - HALF_WINDOW, 2 * HALF_WINDOW)
+        steady = np.convolve(recording.armed, np.ones(len(window)), "valid") > len(window) - 0.5
+        self._rows = inner[steady[inner - HALF_WINDOW]]
+        self._window, self._period_s = window, recording.period_s
+        self._matrix = recording.body.thrusters.matrix
+        self.time_s = 1e-9 * (recording.time_ns[self._rows] - recording.time_ns[0])
+        self.vehicle, self.name = vehicle, recording.name
+        self._w, self._v_w, self._q = motion.w_b[self._rows], motion.v_w[self._rows], motion.q_wb[self._rows]
+        down = _each(motion.q_wb, np.broadcast_to(DOWN, motion.v_w.shape))
+        self._down = down[self._rows]
+        lever, slope = recording.body.r_bi[0], np.gradient(motion.w_b, recording.period_s, axis=0)
+        moved = _cross(slope, lever) + _cross(motion.w_b, _cross(motion.w_b, lever)) if lever.any() else 0.0
+        felt = self._seen(filled(recording.accel) + GRAVITY * down - moved)
+        self.measured = np.hstack([felt, _slope(motion.w_b, recording.period_s)[self._rows - HALF_WINDOW]])
+        self._static = np.column_stack([_force(curve, u) for u in recording.command.T])
+        self._scale = np.square(recording.voltage_v / curve.voltage_v)
+        self._nodes = _drag_nodes(vehicle)
+        self._loaded = _share(self.time_s, weight)
+        self._load = weight or Weight(0.0, 0.0, 0.0, 0.0)
+        self._kept: dict[object, tuple[bytes, object]] = {}
+
+    def predict(self, x: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(n, 6) acceleration of the centre of mass and derivative of the rate; `x` holds the unknowns and nuisances by name."""
+        thrust = np.column_stack([
+            self._once(i, np.array([x["lag"][0], x["deadband"][i]]), self._thrust) for i in range(len(x["gain"]))
+        ])  # fmt: skip
+        v, drags = self._once("drag", x["current"], self._drag)
+        w, mass, inertia = self._w, np.exp(x["mass"]), np.exp(x["inertia"])
+        tau = (thrust * x["gain"]) @ self._matrix.T
+        force = tau[:, :3] + x["drag"][0] * drags[0] + x["drag"][1] * drags[1]
+        force = force + (x["weight"] + self._load.newton * self._loaded)[:, None] * self._down
+        a, turned, s = self.measured[:, :3] - x["bias"], self.measured[:, 3:], x["offset"]
+        force = force - _cross(turned, s) - _cross(w, _cross(w, s)) + mass * _cross(w, v) - _cross(w, mass * v)
+        speed = np.abs(v)
+        damping = x["rotational"] * np.linalg.norm(w, axis=1, keepdims=True) + x["crossflow"] * (speed.sum(axis=1, keepdims=True) - speed)
+        moment = tau[:, 3:] - damping * w - _cross(x["arm"], self._down) - _cross(s, a) - _cross(w, inertia * w)
+        moment = moment - _cross(v, mass * v)
+        return np.hstack([force / (mass + self._load.kg * self._loaded[:, None]) + x["bias"], moment / inertia])
+
+    def _once(self, key: object, at: np.ndarray, compute):  # type: ignore[no-untyped-def]
+        """What `compute(key, at)` gave the last time, where `at` has not changed."""
+        kept = self._kept.get(key)
+        if kept is None or kept[0] != at.tobytes():
+            kept = self._kept[key] = at.tobytes(), compute(key, at)
+        return kept[1]
+
+    def _thrust(self, thruster: int, at: np.ndarray) -> np.ndarray:
+        """(n,) force of one thruster of gain 1, for a lag and a deadband."""
+        lag_s, deadband_n = max(float(at[0]), SHORTEST_LAG_S), at[1]
+        static = self._static[:, thruster]
+        working = 0.5 + 0.5 * np.tanh((np.abs(static) - deadband_n) / (2.0 * DEADBAND_EDGE_N))
+        keep = np.exp(-self._period_s / lag_s)
+        return self._seen(lfilter([1.0 - keep], [1.0, -keep], static * working) * self._scale)
+
+    def _drag(self, key: str, current: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """(n, 3) velocity through the water, and the (n, 3) force for coefficients (face, edge) of (1, 0) and (0, 1)."""
+        v = _each(self._q, self._v_w - current)
+        speed = np.linalg.norm(v, axis=1, keepdims=True)
+        return v, [-np.array([look_up(nodes, row)[:1] for row in np.ascontiguousarray(v)]) * speed * v for nodes in self._nodes]
+
+    def _seen(self, series: np.ndarray) -> np.ndarray:
+        """A series of all ticks, through the window, at the rows."""
+        columns = series.reshape(len(series), -1).T
+        seen = np.column_stack([np.convolve(c, self._window, "valid") for c in columns])[self._rows - HALF_WINDOW]
+        return seen if series.ndim > 1 else seen[:, 0]
+
+
+def _each(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """(n, 3) world vectors, each seen in the body of its attitude."""
+    axis = -q[:, 1:]
+    twice = 2.0 * _cross(axis, vectors)
+    return np.asarray(vectors + q[:, :1] * twice + _cross(axis, twice))
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n, 3) a x b, of (n, 3) or (3,): numpy's own takes five times as long."""
+    return np.stack([a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=-1)
+
+
+def _window(half: int) -> np.ndarray:
+    """(2 half + 1,) weights with which the slope of a straight line through so many samples means the derivative between them."""
+    j = np.arange(-half, half)
+    between = half * (half + 1) - j * (j + 1.0)
+    weights = np.zeros(2 * half + 1)
+    weights[:-1] += between
+    weights[1:] += between
+    return weights / weights.sum()
+
+
+def _slope(series: np.ndarray, period_s: float) -> np.ndarray:
+    """(n - 2 half, k) slope of the straight line through the samples around each."""
+    j = np.arange(-HALF_WINDOW, HALF_WINDOW + 1.0)
+    return np.column_stack([np.convolve(c, -j / (j @ j) / period_s, "valid") for c in series.T])
+
+
+def _force(curve: ThrusterCurve, u: np.ndarray) -> np.ndarray:
+    """(n,) force of the curve over commands, without its deadband."""
+    powers = np.arange(1, 6)
+    sides = [np.maximum(s * u, 0.0)[:, None] ** powers @ c for s, c in ((1.0, curve.forward), (-1.0, curve.reverse))]
+    return np.asarray(sides[0] - sides[1])
+
+
+def _drag_nodes(vehicle: Vehicle) -> list[np.ndarray]:
+    """Drag tables for face and edge coefficients of (1, 0) and (0, 1)."""
+    pairs = [dataclasses.replace(vehicle.drag, cd_face=face, cd_edge=1.0 - face) for face in (1.0, 0.0)]
+    return [assemble_vehicle(dataclasses.replace(vehicle, drag=drag)).drag.nodes for drag in pairs]
+
+
+def _share(time_s: np.ndarray, weight: Weight | None) -> np.ndarray:
+    if weight is None:
+        return np.zeros(len(time_s))
+    return ((time_s >= weight.from_s) & (time_s < weight.until_s)).astype(float)

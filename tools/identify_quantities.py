@@ -1,0 +1,173 @@
+"""For tools/identify.py: what a fit says, as numbers for people: absolute ones where a reference allows them, ratios otherwise."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from identify_fit import Fit
+
+from firmware_py.core.observation import GRAVITY
+from firmware_py.description.schema import frozen_array
+from firmware_py.description.vehicle import ThrusterCurve, Vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+
+AXES = "xyz"
+SIDES = ("face-on", "edge-on")
+GOOD = 0.10
+"""Half-width of an interval, share of the value, above which something was not excited."""
+NO_SCALE = (
+    "no absolute reference: masses, drag and thrust have one factor in common that no motion shows, so only ratios are given and no mass "
+    "is stated; give --curve (tools/fit_thruster.py) or --weight"
+)
+
+
+class Quantity(NamedTuple):
+    """One number out of the unknowns x; `motion` (of identify_excitation) is what shows it, empty where nothing need be done."""
+
+    name: str
+    unit: str
+    function: Callable[[np.ndarray], float]
+    motion: str = ""
+    of: Callable[[np.ndarray], float] | None = None
+    """What its interval is measured against; None: itself."""
+
+
+class Finding(NamedTuple):
+    """A quantity with its 95 % interval."""
+
+    name: str
+    unit: str
+    value: float
+    half_width: float
+    share: float
+    """The half-width over the value."""
+    motion: str
+
+
+def absolute(fit: Fit, vehicle: Vehicle) -> list[Quantity]:
+    """What only a known scale gives."""
+    at = fit.places
+    mass, inertia, drag, arm = (at[name].start for name in ("mass", "inertia", "drag", "arm"))
+    rotational = assemble_vehicle(vehicle).drag.rotational
+    found = [
+        Quantity(f"total mass along {a}", "kg", lambda x, i=mass + i: float(np.exp(x[i])), f"along {a}") for i, a in enumerate(AXES)
+    ]
+    found += [
+        Quantity(f"total inertia about {a}", "kg m^2", lambda x, i=inertia + i: float(np.exp(x[i])), "turning")
+        for i, a in enumerate(AXES)
+    ]
+    found += [Quantity(f"drag coefficient, {side}", "", lambda x, i=drag + i: float(x[i]), f"fast {side}") for i, side in enumerate(SIDES)]
+    if rotational.all():
+        cd = vehicle.drag.rotational_cd
+        found.append(Quantity("rotational_cd", "", lambda x: cd * float(np.mean(x[at["rotational"]] / rotational))))
+    found += [
+        Quantity(f"righting moment, {a}", "N m", lambda x, i=arm + i: float(x[i]), "turning", _length(at["arm"]))
+        for i, a in enumerate(AXES)
+    ]
+    found.append(Quantity("weight less buoyancy", "N", lambda x: float(x[at["weight"]][0])))
+    found.append(Quantity("deadband, mean", "N", lambda x: float(np.mean(x[at["deadband"]]))))
+    return found + [
+        Quantity(f"gain of thruster {k + 1}", "", lambda x, i=i: float(x[i]), "turning")
+        for k, i in enumerate(range(at["gain"].start, at["gain"].stop))
+    ]
+
+
+def ratios(fit: Fit) -> list[Quantity]:
+    """What every log gives: the common factor cancels."""
+    at = fit.places
+    mass, gains = at["mass"].start, at["gain"]
+
+    def per_mass(name: str, i: int) -> Callable[[np.ndarray], float]:
+        return lambda x: float(x[at[name]][i] / np.exp(x[mass]))
+
+    found = [
+        Quantity(
+            f"total mass along {AXES[i]} over that along x", "", lambda x, i=i: float(np.exp(x[mass + i] - x[mass])), f"along {AXES[i]}"
+        )
+        for i in (1, 2)
+    ]  # fmt: skip
+    found += [
+        Quantity(
+            f"total inertia about {a} over total mass along x", "m^2",
+            lambda x, i=at["inertia"].start + i: float(np.exp(x[i] - x[mass])), "turning",
+        )
+        for i, a in enumerate(AXES)
+    ]  # fmt: skip
+    found += [
+        Quantity(f"drag coefficient, {side}, over total mass along x", "1/kg", per_mass("drag", i), f"fast {side}")
+        for i, side in enumerate(SIDES)
+    ]
+    found += [
+        Quantity(f"righting moment, {a}, over total mass along x", "m^2/s^2", per_mass("arm", i), "turning",
+                 lambda x: _length(at["arm"])(x) / float(np.exp(x[mass])))
+        for i, a in enumerate(AXES)
+    ]  # fmt: skip
+    found += [
+        Quantity(f"gain of thruster {k + 1} over the mean", "", lambda x, k=k: float(x[gains][k] / np.mean(x[gains])), "turning")
+        for k in range(gains.stop - gains.start)
+    ]
+    return [*found, Quantity("thruster lag", "s", lambda x: float(x[at["lag"]][0]), "along x")]
+
+
+def findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
+    """Everything that may be said."""
+    quantities = (absolute(fit, vehicle) if fit.has_scale else []) + ratios(fit)
+    found = []
+    for quantity in quantities:
+        value, half_width = fit.interval(quantity.function)
+        share = half_width / max(abs(quantity.of(fit.x) if quantity.of else value), 1e-12)
+        found.append(Finding(quantity.name, quantity.unit, value, half_width, share, quantity.motion))
+    return found
+
+
+def missing(found: list[Finding]) -> dict[str, list[str]]:
+    """Motions that were not made, or not enough, and what would need them."""
+    wanted: dict[str, list[str]] = {}
+    for each in found:
+        if each.motion and each.share > GOOD:
+            wanted.setdefault(each.motion, []).append(f"{each.name} (+-{min(each.share, 9.99):.0%})")
+    return wanted
+
+
+def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) -> Vehicle:
+    """The vehicle file with what was found.
+
+    The dry mass stays as it was weighed. Rigid and added mass appear only as their sum: the sum is shared as the file has it, the
+    rigid part alike along all axes. What has no field (trim, gains one by one) stays in the report.
+    """
+    old, body = vehicle.inertial, assemble_vehicle(vehicle)
+    total, before = np.exp(np.concatenate([fit.value("mass"), fit.value("inertia")])), np.diag(body.mass)
+    rigid = min((old.dry_kg + old.entrained_kg) * float(np.mean(total[:3] / before[:3])), float(total[:3].min()))
+    turn = min(float(np.mean(total[3:] / before[3:])), float(np.min(total[3:] / np.diag(old.inertia))))
+    inertia, gain = old.inertia * turn, float(np.mean(fit.value("gain")))
+    inertial = dataclasses.replace(
+        old,
+        entrained_kg=max(0.0, rigid - old.dry_kg),
+        inertia=frozen_array(inertia),
+        added=frozen_array(total - np.concatenate([np.full(3, rigid), np.diag(inertia)])),
+        righting_arm_m=float(-fit.value("arm")[2] / (old.dry_kg * GRAVITY)),
+    )
+    face, edge = fit.value("drag")
+    spun = float(np.mean(fit.value("rotational") / body.drag.rotational)) if body.drag.rotational.all() else 1.0
+    drag = dataclasses.replace(
+        vehicle.drag, cd_face=float(face), cd_edge=float(edge), rotational_cd=max(0.0, vehicle.drag.rotational_cd * spun)
+    )
+    curve = dataclasses.replace(
+        curve,
+        forward=frozen_array(curve.forward * gain),
+        reverse=frozen_array(curve.reverse * gain),
+        deadband_n=float(np.mean(fit.value("deadband"))),
+        lag_s=float(fit.value("lag")[0]),
+    )
+    return dataclasses.replace(
+        vehicle, inertial=inertial, drag=drag, curve=curve, source=f"tools/identify.py on {logs}; before: {vehicle.source}",
+        force_max_n=min(vehicle.force_max_n, float(np.sum(curve.forward))),
+        force_min_n=max(vehicle.force_min_n, -float(np.sum(curve.reverse))),
+    )  # fmt: skip
+
+
+def _length(at: slice) -> Callable[[np.ndarray], float]:
+    return lambda x: float(np.linalg.norm(x[at]))
