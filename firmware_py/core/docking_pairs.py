@@ -15,8 +15,10 @@ from numba import njit
 from firmware_py.core.rotations import multiply, to_matrix
 
 NEVER_NS = -(1 << 60)
-PICTURES = 16
-"""Relative positions kept of each pair."""
+PICTURES = 32
+"""Relative positions kept of each pair: their mean tells a locked pair from one that jammed 4 mm short of it."""
+TURNED_COS = math.cos(math.radians(15.0))
+"""Modules that meet are turned by quarter turns against each other; farther off, a tag of one of them was read flipped."""
 CURRENT, POSITION = 0, 1
 """The two conditions, as columns of a pair's row."""
 
@@ -113,26 +115,41 @@ def _same_picture(first, seen, a, b):  # type: ignore[no-untyped-def]
 
 @njit(numba.void(ROW, TABLE), cache=True)
 def _judge_ring(row, ring):  # type: ignore[no-untyped-def]
-    """Distance of the mean from the wanted position, and distance between the means of the older and the newer half."""
-    n, oldest, half = PICTURES, row.pictures, PICTURES // 2
+    """Distance of the mean from the wanted position, and distance between the means of the two newest quarters."""
+    n, oldest, quarter = PICTURES, row.pictures, PICTURES // 4
     off, moved = 0.0, 0.0
     for axis in range(3):
-        older, newer = 0.0, 0.0
-        for i in range(half):
-            older += ring[(oldest + i) % n, axis]
-        for i in range(half, n):
-            newer += ring[(oldest + i) % n, axis]
-        older, newer = older / half, newer / (n - half)
-        off += (0.5 * (older + newer) - row.offset_a[axis]) ** 2
+        mean, older, newer = 0.0, 0.0, 0.0
+        for i in range(n):
+            mean += ring[i, axis] / n
+        for i in range(quarter):
+            older += ring[(oldest + n - 2 * quarter + i) % n, axis] / quarter
+            newer += ring[(oldest + n - quarter + i) % n, axis] / quarter
+        off += (mean - row.offset_a[axis]) ** 2
         moved += (newer - older) ** 2
     row.error_m, row.spread_m = math.sqrt(off), math.sqrt(moved)
+
+
+@njit(numba.boolean(TABLE, numba.int64, numba.int64), cache=True)
+def _on_lattice(poses, i, j):  # type: ignore[no-untyped-def]
+    """Whether two sightings are turned against each other by quarter turns: each axis of one is along an axis of the other."""
+    for a in range(3):
+        along = 0.0
+        for b in range(3):
+            cosine = 0.0
+            for k in range(3):
+                cosine += poses[i, 3 + 3 * k + a] * poses[j, 3 + 3 * k + b]
+            along = max(along, abs(cosine))
+        if along < TURNED_COS:
+            return False
+    return True
 
 
 @njit(numba.boolean(ROW, TABLE, FIRST, SEEN, TABLE, numba.int64, LIMITS), cache=True)
 def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[no-untyped-def]
     """Condition 2 by the pictures of this tick; whether those known are fresh."""
     i, j = _same_picture(first, seen, row.module[0], row.module[1])
-    if i >= 0:
+    if i >= 0 and _on_lattice(poses, i, j):
         here = ring[row.pictures % PICTURES]
         for axis in range(3):
             here[axis] = 0.0

@@ -25,6 +25,10 @@ OFF, FORWARD, REVERSE = 0, 1, 2
 FACES = 6
 
 
+EASED_STEP_N, EASED_S = 0.8, 0.2
+"""Fastest change in a tick while thrusters pass from one body's allocation to another's, and for how long."""
+
+
 class Limiter:
     """Limits one body's thrusters. Remembers the last forces for the slew limit."""
 
@@ -34,8 +38,9 @@ class Limiter:
         self._limits = (
             t.f_min * parameters.force_share, t.f_max * parameters.force_share,
             -np.array([polynomial(curve, 1.0) for curve in t.reverse]), np.array([polynomial(curve, 1.0) for curve in t.forward]),
-            parameters.slew_n_per_s * dt_s,
         )  # fmt: skip
+        self._step_n, self._eased_ticks = parameters.slew_n_per_s * dt_s, round(EASED_S / dt_s)
+        self._eased = 0
         self._supply = [float(watts) for watts in body.supply_power_w]
         self._of_module = [np.flatnonzero(t.module == m) for m in range(len(body.modules))]
         self._power = [(np.ascontiguousarray(t.power_forward[i]), np.ascontiguousarray(t.power_reverse[i])) for i in self._of_module]
@@ -45,6 +50,10 @@ class Limiter:
         self.magnets = [MagnetLimiter(parameters, dt_s) for _ in body.modules]
         """One for each module."""
         self.force_n = np.zeros(t.f_max.size)
+
+    def ease(self, force_n: np.ndarray) -> None:
+        """Goes on from the forces (n,) of the bodies before, whose thrusters these were, and changes them slowly at first."""
+        self.force_n, self._eased = force_n, self._eased_ticks
 
     def step(
         self, wanted_n: np.ndarray, armed: bool, voltage_v: np.ndarray, alive: np.ndarray | None = None
@@ -61,7 +70,9 @@ class Limiter:
             self.force_n = np.zeros_like(self.force_n)
             return self.force_n, np.zeros_like(self.force_n)
         scale, wanted = self._voltage_scale(voltage_v), np.empty_like(self.force_n)
-        limit_forces(wanted_n, self.force_n, self._all if alive is None else alive, scale, *self._limits, wanted)
+        step_n = min(self._step_n, EASED_STEP_N) if self._eased else self._step_n
+        self._eased = max(0, self._eased - 1)
+        limit_forces(wanted_n, self.force_n, self._all if alive is None else alive, scale, *self._limits, step_n, wanted)
         powers = module_power(wanted, self._t.power_forward, self._t.power_reverse, self._t.module, len(self.magnets)).tolist()
         for module, (power, supply_w, magnets) in enumerate(zip(powers, self._supply, self.magnets, strict=True)):
             if power > supply_w - magnets.power_w:

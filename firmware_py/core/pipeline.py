@@ -177,7 +177,7 @@ class BodyPipeline:
                 limited[here] = other.limiter.force_n[there]
                 self.supply.voltage_v[i] = other.supply.voltage_v[j]
         self.lag.restart(*forces)
-        self.limiter.force_n = limited
+        self.limiter.ease(limited)
 
 
 class Pipeline:

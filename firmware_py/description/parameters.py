@@ -191,7 +191,7 @@ class Docking:
         15.0, unit="mA", low=0, high=1000, help="held down to the threshold less this", mavlink="DOCK_MA_HYST"
     )
     position_tolerance_m: float = quantity(
-        0.006, unit="m", low=1e-4, high=0.1, help="relative position off one pitch", mavlink="DOCK_TOL"
+        0.0028, unit="m", low=1e-4, high=0.1, help="relative position off one pitch; less than a jam leaves", mavlink="DOCK_TOL"
     )
     settled_m: float = quantity(
         0.004,

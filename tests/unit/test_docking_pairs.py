@@ -70,10 +70,10 @@ def row() -> Row:
 def test_pair_is_docked_once_both_conditions_were_seen_long_enough(row: Row) -> None:
     bank = PairBank(ROW, P)
     assert not any(status.docked for status in row.watch(bank, 0.14)), "not before the debounce is over"
-    for status in row.watch(bank, 0.6):
+    for status in row.watch(bank, 0.8):
         assert status.docked and status.fresh and status.current_margin_ma == pytest.approx(30.0)
         assert status.position_error_m < 1e-9 and status.spread_m < 1e-9
-        assert 0.15e9 <= status.current_since_ns < 0.3e9 and 0.45e9 <= status.position_since_ns < 0.6e9
+        assert 0.15e9 <= status.current_since_ns < 0.3e9 and 0.75e9 <= status.position_since_ns < 0.9e9
 
 
 def test_either_condition_alone_is_no_dock(row: Row) -> None:
@@ -126,6 +126,24 @@ def test_pair_that_still_moves_is_not_settled(row: Row) -> None:
         assert not bank.status(0).position
 
 
+def test_pair_that_jammed_four_millimetres_short_is_not_docked_in_a_minute_of_noise(row: Row) -> None:
+    row.noise_m, row.gaps_m[0] = 0.002, 0.0045
+    bank = PairBank(ROW[:1], P)
+    assert not any(row.watch(bank, 0.01)[0].position for _ in range(6000))
+
+
+def test_locked_pair_is_found_in_noise_and_through_flipped_tags(row: Row) -> None:
+    """One picture in ten shows a flipped tag, whose module would be thirty millimetres off."""
+    row.noise_m = 0.002
+    bank = PairBank(ROW[:1], P)
+    for n in range(400):
+        time_ns, modules = row.hear()
+        if n % 20 == 0:
+            modules[1].tags = [t._replace(q_wt=multiply(t.q_wt, from_euler(0.3, 0.0, 0.0))) for t in modules[1].tags]
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        assert n < 100 or bank.status(0).docked
+
+
 def test_tag_that_the_vehicle_does_not_carry_places_nobody(row: Row) -> None:
     bank = PairBank(ROW[:1], P)
     for _ in range(100):
@@ -161,7 +179,7 @@ def test_joints_go_on_when_other_joints_come_and_go(row: Row) -> None:
     before = row.watch(bank, 1.0)
     after = PairBank(ROW[1:], P, bank)
     assert after.status(0) == before[1] and not after.status(1).docked
-    assert all(status.docked for status in row.watch(after, 0.6))
+    assert all(status.docked for status in row.watch(after, 0.9))
 
 
 def test_body_has_a_joint_between_every_two_neighbours() -> None:

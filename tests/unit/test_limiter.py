@@ -120,6 +120,27 @@ def test_force_changes_no_faster_than_the_slew_limit(rich: Body, slew: float, si
             np.testing.assert_allclose(force, expected, atol=1e-12)
 
 
+def test_thrusters_that_pass_to_another_body_change_slowly_for_a_fifth_of_a_second(rich: Body) -> None:
+    limiter = Limiter(rich, parameters.Limiter(), DT)
+    limiter.ease(np.full(16, 4.0))
+    forces = np.array([4.0, *(limiter.step(np.full(16, wanted), True, NOMINAL)[0][0] for wanted in [-8.0, 10.0] * 10 + [-8.0])])
+    np.testing.assert_allclose(np.abs(np.diff(forces[:21])), 0.8, atol=1e-12)
+    assert forces[20] - forces[21] == pytest.approx(2.0)
+
+
+def test_eased_thrusters_change_no_faster_than_the_slew_limit_either(rich: Body) -> None:
+    limiter = Limiter(rich, parameters.Limiter(slew_n_per_s=10.0), DT)
+    limiter.ease(np.zeros(16))
+    np.testing.assert_allclose(limiter.step(np.full(16, 5.0), True, NOMINAL)[0], 0.1)
+
+
+def test_eased_thrusters_stop_at_once_when_disarmed(rich: Body) -> None:
+    limiter = Limiter(rich, parameters.Limiter(), DT)
+    limiter.ease(np.full(16, 4.0))
+    force, command = limiter.step(np.full(16, 4.0), False, NOMINAL)
+    assert not force.any() and not command.any()
+
+
 def test_full_reversal_takes_the_time_of_the_slew_limit(rich: Body) -> None:
     """From 10 N to -8 N at 200 N/s: nine ticks of 10 ms."""
     limiter = Limiter(rich, parameters.Limiter(), DT)
