@@ -126,7 +126,7 @@ def test_sound_requests_keep_their_order_and_the_others_are_answered() -> None:
     sound, events = sift(requests, APART)
     assert sound == [requests[0], requests[2]]
     assert events == [
-        Event(4, "HOLD refused: its argument makes no sense"), Event(4, "ARM refused: there is no body 3; there are 0, 1"),
+        Event(4, "HOLD refused: its argument makes no sense", 0), Event(4, "ARM refused: there is no body 3; there are 0, 1", 3),
     ]  # fmt: skip
 
 
