@@ -21,7 +21,7 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.runtime.notify import Notifier
-from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time, use_priority
+from firmware_py.runtime.realtime import GROUND_PRIORITY, TICK_PRIORITY, quiet_garbage, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from firmware_py.runtime.worker import ThreadWorker
 
@@ -119,7 +119,7 @@ def run_vehicle(
         if ground is not None:
             from firmware_py.app.ground_station import GroundSide  # with the planner of missions: 0.2 s and 15 MB
 
-            side = stack.enter_context(GroundSide(ground, firmware))
+            side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY))
             observers.append(side.observe)
             requests = with_ground(operator, side)
         loop = open_loop(stack, firmware, requests, observers)

@@ -46,7 +46,7 @@ def test_reader_threads_inherit_the_priority_and_a_bench_is_ordinary_again_after
 
 
 def test_priorities_let_the_tick_start_before_anybody_reads() -> None:
-    assert realtime.TICK_PRIORITY > realtime.READER_PRIORITY > realtime.PLANT_PRIORITY
+    assert realtime.TICK_PRIORITY > realtime.READER_PRIORITY > realtime.GROUND_PRIORITY > realtime.PLANT_PRIORITY
 
 
 def test_no_garbage_is_collected_in_flight() -> None:
