@@ -30,7 +30,7 @@ from firmware_py.ground.station import GroundStation
 from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import unix_ns
 from firmware_py.runtime.rate_keeper import RateKeeper
-from firmware_py.runtime.realtime import die_with
+from firmware_py.runtime.realtime import die_with, use_priority
 
 _WAIT_S = 0.1
 """A loop that stands still is served this often."""
@@ -64,6 +64,7 @@ class GroundSide:
     Args of the constructor:
         executor: plans missions; None starts a process for it.
         unix_now_ns: the time of day, for signing.
+        priority: SCHED_FIFO priority of the thread, beside a loop that has one; 0: an ordinary thread.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class GroundSide:
         firmware: Firmware,
         executor: Executor | None = None,
         unix_now_ns: Callable[[], int] = unix_ns,
+        priority: int = 0,
     ) -> None:
         """Opens the links. Raises DescriptionError for a link, key file or parameter file that is wrong."""
         self._config, self._pipeline, self._unix_now_ns = config, firmware.pipeline, unix_now_ns
@@ -86,6 +88,7 @@ class GroundSide:
         self._requests: deque[Request] = deque(maxlen=_MOST_REQUESTS)
         self._thread: threading.Thread | None = None
         self._ticked = threading.Event()
+        self._priority = priority
         self._stopping = False
         self._saved_ns = 0
         self._switch_s = 0.0
@@ -159,6 +162,8 @@ class GroundSide:
             self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _run(self) -> None:
+        if self._priority:
+            use_priority(self._priority)  # where the system refuses it, the loop has said so
         try:
             while not self._stopping:
                 self._ticked.wait(_WAIT_S)

@@ -23,7 +23,15 @@ from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.rate_keeper import RateKeeper
-from firmware_py.runtime.realtime import TICK_PRIORITY, beside_the_tick, quiet_garbage, real_time, release_compiler, use_priority
+from firmware_py.runtime.realtime import (
+    GROUND_PRIORITY,
+    TICK_PRIORITY,
+    beside_the_tick,
+    quiet_garbage,
+    real_time,
+    release_compiler,
+    use_priority,
+)
 from firmware_py.runtime.recorder import Recorder
 from firmware_py.runtime.worker import ThreadWorker
 
@@ -109,7 +117,7 @@ def run_vehicle(
             from firmware_py.app.ground_station import GroundSide  # a tenth of a second, and 6 MB of messages
 
             # Like the recorder's and the live view's, its threads start before this one takes its priority, which they would inherit.
-            side = stack.enter_context(GroundSide(ground, firmware))
+            side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY))
             observers.append(side.observe)
             requests = with_ground(operator, side)
         for line in stack.enter_context(real_time()):

@@ -81,6 +81,8 @@ def test_docked_pair_is_one_system(flight: tuple[Pilot, np.ndarray, np.ndarray])
     assert (client.last("COMMAND_ACK").command, client.last("COMMAND_ACK").result) == (400, mavlink.MAV_RESULT_ACCEPTED)
     assert client.last("HEARTBEAT").base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED
     assert {m.port for m in client.all("SERVO_OUTPUT_RAW")} == {0, 1}
+    left = [m.value for m in client.all("NAMED_VALUE_FLOAT") if m.name == "WRENCH_MRG"]
+    assert 0.0 <= min(left) < max(left) <= 1.0
 
 
 @pytest.mark.parametrize("stick", AXES)

@@ -68,7 +68,7 @@ def test_machine_with_one_processor_shares_it(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_priorities_let_the_tick_start_before_anybody_reads() -> None:
-    assert realtime.TICK_PRIORITY > realtime.READER_PRIORITY > realtime.PLANT_PRIORITY
+    assert realtime.TICK_PRIORITY > realtime.READER_PRIORITY > realtime.GROUND_PRIORITY > realtime.PLANT_PRIORITY
 
 
 def test_no_garbage_is_collected_in_flight() -> None:
