@@ -182,14 +182,13 @@ class TestUdp(PortSuite):
         assert pair[1].faults["receive"] == 1
 
 
-class Cable(threading.Thread):
+class Cable:
     """Two slcan adapters and the wire between them: passes the frames of one serial device to the other.
 
     The devices are pseudo terminals behind links in `folder`, as udev names an adapter.
     """
 
     def __init__(self, folder):
-        super().__init__(daemon=True)
         ends = [os.openpty() for _ in range(2)]
         self.masters = [master for master, _ in ends]
         self.links = [folder / name for name in ("one", "other")]
@@ -199,9 +198,10 @@ class Cable(threading.Thread):
         self.addresses = tuple(f"slcan:{link}" for link in self.links)
         self.stop_read, self.stop_write = os.pipe()
         self.files = [*self.masters, *(slave for _, slave in ends), self.stop_read, self.stop_write]
-        self.start()
+        os.write(self.stop_write, b"x")
+        self.go_on()
 
-    def run(self):
+    def pass_on(self):
         partial = dict.fromkeys(self.masters, b"")
         while True:
             ready, _, _ = select.select([*self.masters, self.stop_read], [], [])
@@ -212,9 +212,18 @@ class Cable(threading.Thread):
                 other = self.masters[master == self.masters[0]]
                 os.write(other, b"".join(line + b"\r" for line in lines if line[:1] == b"t"))
 
-    def unplug(self):
+    def stop(self):
+        """Nothing passes until `go_on`."""
         os.write(self.stop_write, b"x")
-        self.join()
+        self.passes.join()
+
+    def go_on(self):
+        os.read(self.stop_read, 1)
+        self.passes = threading.Thread(target=self.pass_on, daemon=True)
+        self.passes.start()
+
+    def unplug(self):
+        self.stop()
         while self.files:
             os.close(self.files.pop())
         for link in self.links:
@@ -248,6 +257,17 @@ class TestSlcan(PortSuite):
         one.close()
         other.close()
         again.unplug()
+
+    def test_adapter_that_takes_no_more_is_counted_and_tears_no_frame(self, pair, cable):
+        one, other = pair
+        cable.stop()
+        sent = 0
+        while one.send(Frame(0x123, sent.to_bytes(8, "little"))):
+            sent += 1
+        assert faults(one) == {"full": 1}
+        cable.go_on()
+        assert poll(lambda: one.send(FRAMES[1]))  # and what was left of the one before it
+        assert receive(other, sent + 1) == [*(Frame(0x123, n.to_bytes(8, "little")) for n in range(sent)), FRAMES[1]]
 
     @pytest.mark.parametrize("garbage", [b"t1z38\r", b"t\r", b"t1239\r", b"t0\xff\r"])
     def test_garbage_of_an_adapter_is_counted(self, pair, cable, garbage):

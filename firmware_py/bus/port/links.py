@@ -231,9 +231,13 @@ class SocketcanLink(Link):
 class SlcanLink(Link):
     """slcan:DEVICE, an adapter on a serial port."""
 
-    send_timeout_s = 0.01
+    def __init__(self, address: str) -> None:
+        super().__init__(address)
+        self._rest = b""
+        """What the device did not take of the last line: another one cannot begin before it is through."""
 
     def open(self) -> can.BusABC:
+        self._rest = b""
         try:
             return can.Bus(interface="slcan", channel=self.address, bitrate=BIT_RATE, sleep_after_open=0.0, timeout=0.0)
         except (OSError, ValueError, can.CanError) as error:
@@ -246,6 +250,19 @@ class SlcanLink(Link):
             bus.shutdown()
         finally:
             bus.serialPortOrig.close()
+
+    def send(self, bus: Any, frame: Frame) -> None:
+        """Hands over what the device takes at once.
+
+        python-can waits until it is transmitted, and calls a frame lost whose process was interrupted for longer than its time-out.
+        """
+        device = bus.fileno()
+        if self._rest:
+            self._rest = self._rest[os.write(device, self._rest) :]
+        if self._rest:
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        line = f"t{frame[0]:03X}{len(frame[1])}{frame[1].hex().upper()}\r".encode()
+        self._rest = line[os.write(device, line) :]
 
     def read(self, bus: Any, timeout_s: float) -> Frame | can.Message | None:
         """python-can keeps a line that is not text and would stumble over it for ever."""
