@@ -1,6 +1,7 @@
 """The search for gains: what a trial costs, that it stops early what is worse, that it goes on where it was killed, and when it refuses."""
 
 import json
+import os
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
@@ -153,3 +154,22 @@ def test_detuned_gains_are_off_by_up_to_three_and_within_the_bounds(tools: tuple
         assert objective.start(wrong) == values
         factors += [value / tools[0].value_of(Parameters(), name) for name, value in values.items()]
     assert 1 / 3 <= min(factors) < 0.4 and 2.5 < max(factors) <= 3.0
+
+
+def test_answers_typed_at_once_are_taken_one_by_one_and_the_end_of_the_input_ends_it(tools: tuple[Any, Any]) -> None:
+    import tune_live
+
+    class Listening:
+        heard = 0
+
+        def listen(self, seconds: float) -> None:
+            self.heard += 1
+            os.write(end, b"Yes\n\nq\n")
+            os.close(end)
+
+    mine, end = os.pipe()
+    vehicle = Listening()
+    with open(mine, "rb", buffering=0) as stream:
+        person = tune_live.Typist(vehicle, stream)
+        assert [person.answer("?") for _ in range(4)] == ["y", "n", "q", "q"]
+    assert vehicle.heard == 1
