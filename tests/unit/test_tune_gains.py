@@ -89,23 +89,23 @@ def test_flight_that_cannot_be_judged_costs_the_most(tools: tuple[Any, Any], tmp
 
 
 def test_search_finds_the_valley_and_ends_early_what_lies_above_it(tools: tuple[Any, Any], tmp_path: Path) -> None:
-    study = search(tools, tmp_path, 60, Inline())
+    study = search(tools, tmp_path, 25, Inline())
     assert study.trials[0].params == {BANDWIDTH: 7.5, DAMPING: 1.0}
-    assert study.best_params[BANDWIDTH] == pytest.approx(2.0, abs=0.4)
+    assert study.best_params == pytest.approx({BANDWIDTH: 2.0, DAMPING: 1.0}, abs=0.1)
     pruned = [t for t in study.trials if len(t.intermediate_values) == 1]
-    assert 10 < len(pruned) < 50
+    assert 1 <= len(pruned) < 20
     assert min(t.intermediate_values[0] for t in pruned) > study.best_trial.intermediate_values[0]
 
 
-@pytest.mark.parametrize("flights", [1, 17, 50])
+@pytest.mark.parametrize("flights", [1, 17, 40])
 def test_search_that_was_killed_loses_no_trial_and_ends_in_the_same_bytes(tools: tuple[Any, Any], tmp_path: Path, flights: int) -> None:
-    search(tools, tmp_path / "whole", 20, Inline())
+    search(tools, tmp_path / "whole", 14, Inline())
     with pytest.raises(PlugError):
-        search(tools, tmp_path / "torn", 20, Dying(flights))
+        search(tools, tmp_path / "torn", 14, Dying(flights))
     path = tmp_path / "torn" / "search.jsonl"
     kept = path.read_bytes()
     path.write_bytes(kept + b'{"number": 1, "param')  # the line that was being written
-    search(tools, tmp_path / "torn", 20, Inline())
+    search(tools, tmp_path / "torn", 14, Inline())
     assert path.read_bytes().startswith(kept)
     assert path.read_bytes() == (tmp_path / "whole" / "search.jsonl").read_bytes()
 
