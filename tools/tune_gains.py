@@ -35,8 +35,9 @@ DETUNED = 3.0
 def unseen_costs(objective: Objective, parameters: Parameters, pool: Pool, folder: Path) -> list[float]:
     """The cost of every flight in the worlds of the comparison; each is a campaign of its own and goes on where it was."""
     costs = []
-    for spec in objective.flight:
-        scenario, here = spec.flown(), folder / spec.scenario
+    for number, spec in enumerate(objective.flight):
+        scenario = spec.flown()
+        here = folder / f"{number}-{scenario.name}"
         run_campaign(scenario, parameters, objective.unseen_seeds, pool, here)
         with TrialFile(here / TRIALS_FILE, identity(scenario, parameters)) as file:
             costs += [objective.cost(spec, file.trials[seed]["metrics"]) for seed in objective.unseen_seeds]

@@ -1,4 +1,4 @@
-"""The search of tune_gains: Optuna's estimator proposes, the bench flies, every trial is on the disk before the next one begins.
+"""The search of tune_gains: a sampler proposes, the bench flies, every trial is on the disk before the next one begins.
 
 A trial's proposal depends on the seed, its number and the trials before it, and on nothing else. So a search that was killed and is
 started again proposes what it would have proposed, and ends in the same bytes as one that never was.
@@ -19,14 +19,15 @@ import optuna
 from optuna.distributions import FloatDistribution
 from optuna.trial import TrialState, create_trial
 from tune_objective import Objective, with_values
+from tune_sampler import GaussianProcessSampler
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from hil.campaign import TrialFile, code_digest, fly_trial
 
 TRIALS_FILE = "search.jsonl"
-FIRST_AT_RANDOM = 10
-"""Trials before the estimator has something to go by."""
+FIRST_AT_RANDOM = 8
+"""Trials before the sampler has something to go by, the start among them."""
 
 
 class Progress(NamedTuple):
@@ -77,13 +78,13 @@ def search(
     """Goes on in `out` until `trials` trials are done, or no more is begun after `end_s` of time.monotonic(); returns the study."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     bounds = {s.parameter: FloatDistribution(s.low, s.high, log=s.logarithmic) for s in objective.search}
-    study = optuna.create_study(pruner=optuna.pruners.MedianPruner(n_startup_trials=4))
+    sampler = GaussianProcessSampler(bounds, seed, FIRST_AT_RANDOM)
+    study = optuna.create_study(sampler=sampler, pruner=optuna.pruners.MedianPruner(n_startup_trials=4))
     with TrialFile(out / TRIALS_FILE, identity(objective, start, seed), key="number") as file:
         for number in sorted(file.trials):
             study.add_trial(_restored(file.trials[number], bounds))
         while len(file.trials) < trials and time.monotonic() < end_s:
             number = len(file.trials)
-            study.sampler = optuna.samplers.TPESampler(seed=[seed, number], multivariate=True, n_startup_trials=FIRST_AT_RANDOM)
             if number == 0:
                 study.enqueue_trial(objective.start(start))
             file.add(_flown(study, study.ask(bounds), objective, start, pool))

@@ -1,27 +1,33 @@
-"""tune_gains --live against a robot that flies in its tank: one confirmed step at a time, and the old values back whatever happens."""
+"""tune_gains --live against a robot that flies in its tank: one confirmed step at a time, and the old values back whatever happens.
+
+The bench flies when the tuner waits, so both live by the bench's clock.
+"""
 
 import os
-import select
-import signal
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import closing
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from firmware_py.app.ground_station import GroundSide
+from firmware_py.app.lockstep import Lockstep, drain, send
+from firmware_py.core.types import Action, Mode, Request
 from firmware_py.description.parameters import Parameters
-from tests.clients.bench_process import ROOT, flying_bench, free_port
+from firmware_py.description.schema import DescriptionError
+from firmware_py.ground.config import GroundConfig
+from hil.bench import open_bench
+from hil.scenario import load_scenario
+from tests.clients.bench_process import ROOT, free_port
+from tests.unit.test_campaign import Inline
 
 os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 
-PATIENCE_S = 180.0
-ARM, SET_MODE, TERMINATE, HOLD = 400, 176, 185, (1, 4, 3)
-SHIPPED = {"POS_BW": Parameters().control.position_bandwidth, "POS_DAMP": Parameters().control.position_damping}
+SECONDS = 2.0
+SHIPPED = Parameters().control
 OBJECTIVE = """
 help = "place alone"
 flight = [{ scenario = "hover" }]
@@ -34,152 +40,214 @@ search = [
 term = [{ metric = "position_rmse_m", per = 0.001 }, { metric = "thrust_rms_n", per = 1.0 }]
 """
 
-pytestmark = pytest.mark.slow
 
+class Robot:
+    """A bench with a ground station, and pymavlink's end of its link: waiting for a message lets it fly."""
 
-class Pilot:
-    """Somebody else at another link of the same robot."""
+    def __init__(self, stack: ExitStack) -> None:
+        port = free_port()
+        address = f"udpin:127.0.0.1:{port}"
+        self._mavlink = stack.enter_context(closing(mavutil.mavlink_connection(address, dialect="all", source_system=255)))
+        self._bench = open_bench(stack, load_scenario("hover"), 0, Parameters(), "virtual:live")
+        config = GroundConfig(links=(f"udpout:127.0.0.1:{port}",))
+        self._side = stack.enter_context(GroundSide(config, self._bench.firmware, Inline(), threaded=False))
+        self._lockstep = Lockstep(self._bench.firmware, [self._bench.firmware_port], [self._side.observe])
+        self._sent: list[Any] = []
+        self.tick = 0
+        self._events: deque[tuple[int, Request | BaseException]] = deque()
+        """What somebody else asks or does to the tuner, and in which tick."""
+        self.is_silent = False
+        self._events += [(200, Request(Action.ARM)), (300, Request(Action.SET_MODE, 0, Mode.POSHOLD))]
+        self.wait(5.0)
 
-    def __init__(self, port: int) -> None:
-        self._link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", dialect="all")
+    @property
+    def mav(self) -> Any:
+        return self._mavlink.mav
 
-    def close(self) -> None:
-        self._link.close()
+    @property
+    def target_system(self) -> int:
+        return int(self._mavlink.target_system)
 
-    def wait(self, name: str, fits: Any = lambda message: True) -> Any:
-        end = time.monotonic() + PATIENCE_S
-        while time.monotonic() < end:
-            message = self._link.recv_match(type=name, blocking=True, timeout=1.0)
-            if message is not None and fits(message):
-                return message
-        raise TimeoutError(name)
+    @property
+    def control(self) -> Any:
+        """The gains with which it flies."""
+        return self._bench.firmware.pipeline.parameters.control
 
-    def command(self, number: int, *values: float) -> None:
-        self._link.mav.command_long_send(1, 1, number, 0, *values, *[float("nan")] * (7 - len(values)))
-        assert self.wait("COMMAND_ACK", lambda m: m.command == number).result == 0
+    def clock(self) -> float:
+        return 0.01 * self.tick
 
-    def hover(self) -> None:
-        """Armed, holding its place."""
-        self.wait("SYS_STATUS", lambda m: m.onboard_control_sensors_health & 0x10000000)
-        self.command(ARM, 1)
-        self.command(SET_MODE, *HOLD)
-        self.wait("HEARTBEAT", lambda m: m.system_status == 4)
-
-    def sees(self, name: str, value: float) -> None:
-        """Somebody has set it: the vehicle tells everybody."""
-        self.wait("PARAM_VALUE", lambda m: m.param_id == name and m.param_value == value)
-
-    def parameters(self) -> dict[str, float]:
-        found = {}
-        for name in SHIPPED:
-            self._link.mav.param_request_read_send(1, 1, name.encode(), -1)
-            found[name] = self.wait("PARAM_VALUE", lambda m, n=name: m.param_id == n).param_value
-        return found
-
-
-class Tuner:
-    """tune_gains --live as a person sees it."""
-
-    def __init__(self, port: int, folder: Path) -> None:
-        (folder / "objective.toml").write_text(OBJECTIVE)
-        command = [sys.executable, "-u", str(ROOT / "tools/tune_gains.py"), str(folder / "objective.toml")]
-        self.process = subprocess.Popen(
-            [*command, "--live", f"mavlink:udpin:127.0.0.1:{port}", "--seconds", "2", "--out", str(folder)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
-        self.text = ""
-
-    def read_until(self, words: str) -> None:
-        """Until the program has said so; what it said before is forgotten."""
-        assert self.process.stdout is not None
-        end = time.monotonic() + PATIENCE_S
-        while words not in self.text:
-            assert time.monotonic() < end, self.text
-            if select.select([self.process.stdout], [], [], 1.0)[0]:
-                piece = os.read(self.process.stdout.fileno(), 4096).decode()
-                assert piece, f"ended: {self.text}"
-                self.text += piece
-        self.text = self.text.partition(words)[2]
-
-    def type(self, line: str) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(line.encode() + b"\n")
-        self.process.stdin.flush()
-
-    def end(self) -> tuple[int, str]:
-        """Its status, and the rest of what it said."""
-        rest, _ = self.process.communicate(timeout=PATIENCE_S)
-        return self.process.returncode, self.text + rest.decode()
+    def recv_match(self, *, blocking: bool, timeout: float | None = None) -> Any:
+        end = self.clock() + (timeout or 0.0)
+        while (message := self._mavlink.recv_match(blocking=False)) is None and blocking and self.clock() < end:
+            self._fly()
+        return None if self.is_silent else message
 
     def close(self) -> None:
-        self.process.kill()
-        self.process.communicate()
+        pass
+
+    def wait(self, seconds: float) -> None:
+        """Flies on; nobody listens."""
+        for _ in range(round(100 * seconds)):
+            self._fly()
+            while self._mavlink.recv_match(blocking=False) is not None:
+                pass
+
+    def soon(self, event: Request | BaseException) -> None:
+        """A second from now."""
+        self._events.append((self.tick + 100, event))
+
+    def _fly(self) -> None:
+        self.tick += 1
+        bench, time_ns, asked = self._bench, self.tick * self._bench.fleet.period_ns, self._side.requests()
+        self._sent += self._lockstep.start_tick(self.tick, time_ns)
+        heard = drain([bench.plant_port], self._sent)
+        answers = send([bench.plant_port], [(0, frame) for frame in bench.nodes.step([frame for _, frame in heard])])
+        while self._events and self._events[0][0] <= self.tick:
+            event = self._events.popleft()[1]
+            if isinstance(event, BaseException):
+                self._sent = self._lockstep.finish_tick(self.tick, time_ns, asked, answers)[1]
+                raise event
+            asked.append(event)
+        self._sent = self._lockstep.finish_tick(self.tick, time_ns, asked, answers)[1]
+        assert self._side.error is None
+
+
+class Scripted:
+    """A person who answers what is written, and sees to what happens after the last answer."""
+
+    def __init__(self, *answers: str, then: Callable[[], None] = lambda: None) -> None:
+        self._answers, self._then = list(answers), then
+        self.questions: list[str] = []
+
+    def answer(self, question: str) -> str:
+        self.questions.append(question)
+        if len(self._answers) == 1:
+            self._then()
+        return self._answers.pop(0)
+
+
+class PlugError(Exception):
+    """Somebody pulled the plug of the tuner's computer."""
+
+
+@pytest.fixture
+def live(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The module tune_live."""
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    import tune_live
+
+    return tune_live
 
 
 @pytest.fixture(scope="module")
-def robot() -> Iterator[tuple[Pilot, int]]:
-    """A robot that hovers, somebody who flies it, and the port for the tuner."""
-    mine, theirs = free_port(), free_port()
-    with flying_bench(f"udpout:127.0.0.1:{mine}", f"udpout:127.0.0.1:{theirs}", "--pace", "4"), closing(Pilot(mine)) as pilot:
-        pilot.hover()
-        yield pilot, theirs
+def hovering() -> Iterator[Robot]:
+    with ExitStack() as stack:
+        yield Robot(stack)
 
 
 @pytest.fixture
-def pilot(robot: tuple[Pilot, int]) -> Pilot:
-    return robot[0]
+def robot(hovering: Robot) -> Iterator[Robot]:
+    """It hovers with the shipped gains, before and after."""
+    assert hovering.control == SHIPPED
+    yield hovering
+    hovering.wait(0.1)  # what was set counts from the next tick on
+    assert hovering.control == SHIPPED
 
 
 @pytest.fixture
-def tuner(robot: tuple[Pilot, int], tmp_path: Path) -> Iterator[Tuner]:
-    """The tuner at its first question; everything is as shipped."""
-    with closing(Tuner(robot[1], tmp_path)) as tuner:
-        tuner.read_until("step 1: POS_BW 2.5 -> 3.125? [y/n/q]")
-        assert robot[0].parameters() == pytest.approx(SHIPPED)
-        yield tuner
+def tuned(live: Any, robot: Robot, tmp_path: Path) -> Callable[..., int]:
+    """The status of a session with that person, about that objective."""
+    import tune_objective
+
+    def run(person: Scripted, text: str = OBJECTIVE) -> int:
+        path = tmp_path / "objective.toml"
+        path.write_text(text)
+        objective = tune_objective.load_objective(path)
+        return int(live.tune(objective, live.Vehicle(robot, robot.clock), person, 10, SECONDS, tmp_path))
+
+    return run
 
 
-def test_step_is_taken_when_it_is_confirmed_and_all_is_as_before_when_nothing_is_kept(pilot: Pilot, tuner: Tuner) -> None:
-    tuner.type("n")
-    tuner.read_until("step 2: POS_BW 2.5 -> 2? [y/n/q]")
-    tuner.type("y")
-    pilot.sees("POS_BW", 2.0)
-    tuner.read_until("step 3:")
-    tuner.type("q")
-    tuner.read_until("? [y/n]")
-    tuner.type("n")
-    status, said = tuner.end()
-    assert status == 0 and "old values are back: POS_BW 2.5, POS_DAMP 1" in said
-    assert pilot.parameters() == pytest.approx(SHIPPED)
+def test_step_is_taken_when_it_is_confirmed_and_goes_when_nothing_is_kept(tuned: Callable[..., int]) -> None:
+    person = Scripted("n", "y", "q", "n")
+    assert tuned(person) == 0
+    assert person.questions[:2] == ["step 1: POS_BW 2.5 -> 3.125? [y/n/q]", "step 2: POS_BW 2.5 -> 2? [y/n/q]"]
+    assert person.questions[-1].startswith("keep POS_BW ")
 
 
-def test_interrupt_puts_the_old_values_back(pilot: Pilot, tuner: Tuner, tmp_path: Path) -> None:
-    tuner.type("y")
-    pilot.sees("POS_BW", 3.125)
-    tuner.process.send_signal(signal.SIGINT)
-    status, said = tuner.end()
-    assert status == 1 and "interrupted" in said and "old values are back" in said
-    assert pilot.parameters() == pytest.approx(SHIPPED)
-    assert not (tmp_path / "live-before.json").exists()
+def test_what_makes_the_hover_stiller_stays_and_the_rest_goes_back_at_once(
+    live: Any, robot: Robot, tuned: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if the softer the stiller."""
+
+    def look(vehicle: Any, seconds: float) -> dict[str, float]:
+        robot.wait(0.1)
+        return {"position_rmse_m": 0.001 * robot.control.position_bandwidth}
+
+    monkeypatch.setattr(live.Vehicle, "look", look)
+    flown: list[float] = []
+
+    class Watching(Scripted):
+        def answer(self, question: str) -> str:
+            robot.wait(0.1)
+            flown.append(robot.control.position_bandwidth)
+            return super().answer(question)
+
+    assert tuned(Watching("y", "y", "q", "y")) == 0
+    assert flown == [2.5, 2.5, 2.0, 2.0] and robot.control.position_bandwidth == 2.0
+    live.Vehicle(robot, robot.clock).set("POS_BW", 2.5)
+
+
+TROUBLES: dict[str, tuple[Request | BaseException, str, list[Request]]] = {
+    "interrupt": (KeyboardInterrupt(), "interrupted", []),
+    "another mode": (Request(Action.SET_MODE, 0, Mode.ALT_HOLD), "mode changed", [Request(Action.SET_MODE, 0, Mode.POSHOLD)]),
+    "disarmed": (
+        Request(Action.DISARM, 0, True), "is stopped, or disarmed", [Request(Action.ARM), Request(Action.SET_MODE, 0, Mode.POSHOLD)],
+    ),
+}  # fmt: skip
+"""What happens in the middle of a step, what is said of it, and what somebody asks to make the robot hover again."""
+
+
+@pytest.mark.parametrize("name", TROUBLES)
+def test_old_values_are_back_after(name: str, live: Any, robot: Robot, tuned: Callable[..., int], tmp_path: Path, capsys: Any) -> None:
+    event, words, cure = TROUBLES[name]
+    assert tuned(Scripted("y", then=lambda: robot.soon(event))) == 1
+    said = capsys.readouterr().out
+    assert words in said and "old values are back: POS_BW 2.5, POS_DAMP 1" in said
+    assert not (tmp_path / live.BEFORE_FILE).exists()
+    for request in cure:
+        robot.soon(request)
+        robot.wait(2.0)
 
 
 def test_tuner_that_was_killed_puts_the_old_values_back_when_it_is_started_again(
-    robot: tuple[Pilot, int], tuner: Tuner, tmp_path: Path
+    robot: Robot, tuned: Callable[..., int], capsys: Any
 ) -> None:
-    tuner.type("y")
-    robot[0].sees("POS_BW", 3.125)
-    tuner.close()
-    with closing(Tuner(robot[1], tmp_path)) as again:
-        again.read_until("old values are back: POS_BW 2.5, POS_DAMP 1")
-    assert robot[0].parameters() == pytest.approx(SHIPPED)
+    with pytest.raises(PlugError):
+        tuned(Scripted("y", then=lambda: robot.soon(PlugError())))
+    assert robot.control.position_bandwidth == 3.125
+    assert tuned(Scripted("q", "n")) == 0
+    assert "is of a run that did not end: its values go back first" in capsys.readouterr().out
 
 
-def test_e_stop_puts_the_old_values_back(pilot: Pilot, tuner: Tuner) -> None:
+def test_vehicle_that_fell_silent_is_to_be_set_by_hand_or_by_the_next_start(robot: Robot, tuned: Callable[..., int]) -> None:
+    def cut() -> None:
+        robot.is_silent = True
+
+    with pytest.raises(DescriptionError, match=r"did not take POS_BW 2.5, POS_DAMP 1; set them by hand, or start again"):
+        tuned(Scripted("y", then=cut))
+    robot.is_silent = False
+    assert tuned(Scripted("q", "n")) == 0
+
+
+def test_objective_that_telemetry_does_not_show_is_refused(tuned: Callable[..., int]) -> None:
+    with pytest.raises(DescriptionError, match="has no term that can be seen from outside"):
+        tuned(Scripted(), OBJECTIVE.replace("position_rmse_m", "supply_power_w"))
+
+
+def test_e_stop_puts_the_old_values_back(robot: Robot, tuned: Callable[..., int], capsys: Any) -> None:
     """The last one: the robot is stopped after it."""
-    tuner.type("y")
-    pilot.sees("POS_BW", 3.125)
-    pilot.command(TERMINATE, 1)
-    status, said = tuner.end()
-    assert status == 1 and ("stopped, or in an emergency" in said or "the vehicle says" in said)
-    assert "old values are back" in said
-    assert pilot.parameters() == pytest.approx(SHIPPED)
+    assert tuned(Scripted("y", then=lambda: robot.soon(Request(Action.ESTOP)))) == 1
+    assert "the vehicle" in capsys.readouterr().out
+    with pytest.raises(DescriptionError, match="let it hover, armed, before it is tuned"):
+        tuned(Scripted())

@@ -1,0 +1,159 @@
+"""A vehicle behind MAVLink as tune_gains --live sees it: is it still as it was, what are its parameters, how still does it hover."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from firmware_py.description.schema import DescriptionError
+
+SETTLE_S = 3.0
+"""After a change, before it is looked at; by the vehicle's clock."""
+SILENT_S, ANSWER_S, ANSWERS = 5.0, 1.0, 5
+"""Without a heartbeat the vehicle is lost; a parameter is sent again after so long, so often."""
+STATE_ACTIVE, ARMED, ERROR = 4, 0x80, 3
+"""MAV_STATE_ACTIVE; MAV_MODE_FLAG_SAFETY_ARMED; worst severity that is only said."""
+ONBOARD_CONTROLLER, INVALID_AUTOPILOT = 18, 8
+"""MAV_TYPE: not a ground station, whose loss the vehicle would act upon."""
+SEEN = ("position_rmse_m", "attitude_rmse_rad")
+"""Metrics that telemetry gives; the objective's other terms are left out."""
+
+
+class TroubleError(Exception):
+    """The vehicle is no longer as it was when the tuning began; the message says why."""
+
+
+class Link(Protocol):
+    """What is used of pymavlink's connection."""
+
+    mav: Any
+    target_system: int
+
+    def recv_match(self, *, blocking: bool, timeout: float | None = None) -> Any:
+        """The next message, or None."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
+
+
+def connect(address: str) -> Link:
+    """The link to a MAVLink address. Raises DescriptionError."""
+    os.environ["MAVLINK20"] = "1"
+    from pymavlink import mavutil
+
+    try:
+        return cast(Link, mavutil.mavlink_connection(address, dialect="all", source_system=255, source_component=191))
+    except (OSError, ValueError) as error:
+        raise DescriptionError(f"--live {address}: {error}; it needs an address such as mavlink:udpin:0.0.0.0:14550") from None
+
+
+class Vehicle:
+    """The vehicle at the other end of a link."""
+
+    def __init__(self, link: Link, clock: Callable[[], float] = time.monotonic) -> None:
+        """Waits for its heartbeat. Raises DescriptionError when none comes."""
+        self.link, self._clock = link, clock
+        self._said_s, self._heard_s = -1e9, clock()
+        self._mode: int | None = None
+        self._watched = False
+        self.seen: list[Any] = []
+        """Messages since `seen` was emptied."""
+        with suppress(TroubleError):
+            self.hear()
+        if self._mode is None:
+            raise DescriptionError(f"--live: no heartbeat in {SILENT_S:g} s; is the vehicle's link set to this address?")
+
+    def listen(self, timeout_s: float) -> None:
+        """Takes what comes for at most so long. Raises TroubleError once `watch` was called."""
+        now = self._clock()
+        if now - self._said_s > 1.0:
+            self._said_s = now
+            self.link.mav.heartbeat_send(ONBOARD_CONTROLLER, INVALID_AUTOPILOT, 0, 0, 4)
+        message = self.link.recv_match(blocking=True, timeout=timeout_s)
+        while message is not None:
+            self._take(message)
+            message = self.link.recv_match(blocking=False)
+        if self._clock() - self._heard_s > SILENT_S:
+            raise TroubleError(f"the vehicle has been silent for {SILENT_S:g} s")
+
+    def hear(self) -> None:
+        """Until the next heartbeat. Raises TroubleError."""
+        self.seen.clear()
+        while not any(m.get_type() == "HEARTBEAT" for m in self.seen):
+            self.listen(0.1)
+
+    def watch(self, on: bool) -> None:
+        """From now on trouble is trouble, or no longer."""
+        self._watched = on
+
+    def _take(self, message: Any) -> None:
+        if self.link.target_system not in (0, message.get_srcSystem()):
+            return
+        self.seen.append(message)
+        kind = message.get_type()
+        if kind == "STATUSTEXT" and self._watched and (message.severity <= ERROR or message.text.startswith("fail-safe on")):
+            raise TroubleError(f"the vehicle says: {message.text}")
+        if kind != "HEARTBEAT" or message.get_srcComponent() != 1:
+            return
+        self._heard_s = self._clock()
+        before, self._mode = self._mode, int(message.custom_mode)
+        if not self._watched:
+            return
+        if message.system_status != STATE_ACTIVE or not message.base_mode & ARMED:
+            raise TroubleError("the vehicle is stopped, or disarmed")
+        if before != self._mode:
+            raise TroubleError(f"the vehicle's mode changed from {before:#x} to {self._mode:#x}")
+
+    def get(self, name: str) -> float:
+        """The value of a parameter. Raises TroubleError when it does not answer."""
+        return self._ask(name, lambda: self.link.mav.param_request_read_send(self.link.target_system, 1, name.encode(), -1))
+
+    def set(self, name: str, value: float) -> None:
+        """Sets a parameter. Raises TroubleError when the vehicle keeps another value."""
+        kept = self._ask(name, lambda: self.link.mav.param_set_send(self.link.target_system, 1, name.encode(), value, 9))
+        if abs(kept - value) > 1e-5 * abs(value):
+            raise TroubleError(f"parameter {name} was set to {value:g}, but the vehicle keeps {kept:g}")
+
+    def _ask(self, name: str, send: Callable[[], None]) -> float:
+        for _ in range(ANSWERS):
+            self.seen.clear()
+            send()
+            end = self._clock() + ANSWER_S
+            while self._clock() < end:
+                self.listen(0.05)
+                for message in self.seen:
+                    if message.get_type() == "PARAM_VALUE" and message.param_id == name:
+                        return float(str(np.float32(message.param_value)))
+        raise TroubleError(f"parameter {name}: no answer in {ANSWERS * ANSWER_S:g} s")
+
+    def look(self, seconds: float) -> dict[str, float]:
+        """Metrics of so long a hover, after it has settled: RMS about the mean pose, by the vehicle's own clock and estimate."""
+        self.seen.clear()
+        began_ms: int | None = None
+        poses: dict[str, list[list[float]]] = {"LOCAL_POSITION_NED": [], "ATTITUDE": []}
+        while True:
+            self.listen(0.1)
+            for m in self.seen:
+                kind = m.get_type()
+                if kind not in poses:
+                    continue
+                began_ms = m.time_boot_ms if began_ms is None else began_ms
+                since_s = 1e-3 * (m.time_boot_ms - began_ms)
+                if since_s >= SETTLE_S:
+                    poses[kind].append([m.x, m.y, m.z] if kind == "LOCAL_POSITION_NED" else [m.roll, m.pitch, m.yaw])
+                if since_s >= SETTLE_S + seconds and all(poses.values()):
+                    return dict(zip(SEEN, map(_spread, poses.values()), strict=True))
+            self.seen.clear()
+
+
+def _spread(values: list[list[float]]) -> float:
+    """RMS distance from the mean; angles are unwrapped."""
+    array = np.unwrap(np.array(values), axis=0)
+    return float(np.sqrt(np.mean(np.sum((array - array.mean(axis=0)) ** 2, axis=1))))
