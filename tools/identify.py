@@ -7,7 +7,7 @@
     .venv/bin/python tools/identify.py --excitation shake.toml                      # the flight to begin with
 
 A log is the folder that `modcube run --out` or `modcube hil run --out` left; can.log and signals.mcap are read, truth.mcap is not.
-Left in --out: identified.json, vehicle.toml (with a reference), excite.toml (where some motion is missing).
+Left in --out: identified.json; vehicle.toml with a reference and where no motion is missing; excite.toml where one is.
 Exit status 0: everything within 10 %; 1: a motion is missing; 2: cannot run.
 """
 
@@ -102,11 +102,11 @@ def identify(given: argparse.Namespace) -> int:
     report = {"logs": given.logs, "has_reference": result.has_scale, "residual": result.residual.tolist(), "missing": wanted}
     report["found"] = [each._asdict() for each in found]
     (given.out / "identified.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    if result.has_scale:
+    if not result.has_scale:
+        print(f"refused: {NO_SCALE}")
+    elif not wanted:
         (given.out / "vehicle.toml").write_text(to_toml(fitted_vehicle(result, vehicle, curve, logs)), encoding="utf-8")
         print(given.out / "vehicle.toml")
-    else:
-        print(f"refused: {NO_SCALE}")
     for motion, needing in wanted.items():
         print(f"missing excitation: {motion}, for {', '.join(needing)}")
     if wanted:

@@ -57,6 +57,10 @@ frequency = {frequency}
 turns = {turns:.2f}
 yaw_turns = {yaw}
 roll_turns = {roll}
+
+[[check]]               # it knew where it was
+metric = "estimate_position_rmse_m"
+high = 0.01
 """
 
 

@@ -8,7 +8,7 @@ Newton and Euler about the centre of mass, body frame, motion relative to the wa
 a is what the accelerometer feels plus gravity, w' the derivative of the gyro; F_i is the thruster's curve over the commands that went
 out, behind a first-order lag, at the measured voltage; v the velocity less the current's; s the first moment of mass about where the
 file has the centre. M, I, s, D, n, arm and k have one factor in common that no motion shows. Both sides are seen through one window
-of 0.11 s: that of a straight line's slope through the gyro.
+of 11 ticks: that of a straight line's slope through the gyro.
 """
 
 from __future__ import annotations

@@ -60,8 +60,8 @@ def examine(seed: int, folder: Path, duration_s: float = 170.0) -> dict[str, obj
     """Flies one plant and identifies it.
 
     Returns:
-        seed; error: by name, share of the truth; covers: by name, whether the 95 % interval holds the truth; states_mass: whether the
-        same log without the reference states one; missing: motions that it calls for.
+        seed; error: by name, share of the truth; before: the same of the vehicle file; covers: by name, whether the 95 % interval holds
+        the truth; half_width: of it, share of the value; states_mass: whether the same log without the reference states one.
     """
     out = folder / str(seed)
     out.mkdir(parents=True, exist_ok=True)
@@ -77,9 +77,11 @@ def examine(seed: int, folder: Path, duration_s: float = 170.0) -> dict[str, obj
     found = {f.name: f for f in findings(fit([Equations(recording, motion, curve)], Reference(0, ACCURACY)), vehicle)}
     blind = findings(fit([Equations(recording, motion, vehicle.curve)]), vehicle)
     truth = truth_of(draw)
+    believed = truth_of(draw_module(vehicle, scenario.with_calm_world().world, seed, 0))
     return {
         "seed": seed,
         "error": {name: found[name].value / value - 1.0 for name, value in truth.items()},
+        "before": {name: believed[name] / value - 1.0 for name, value in truth.items()},
         "covers": {name: abs(found[name].value - value) <= found[name].half_width for name, value in truth.items()},
         "half_width": {name: found[name].share for name in truth},
         "states_mass": any(f.unit == "kg" for f in blind),
@@ -87,9 +89,10 @@ def examine(seed: int, folder: Path, duration_s: float = 170.0) -> dict[str, obj
 
 
 def summary(plants: Sequence[dict]) -> dict[str, float]:  # type: ignore[type-arg]
-    """Worst errors of masses, drag and relative gains, share of intervals that hold the truth, and masses stated without reference."""
+    """Worst errors of masses, drag and relative gains, found and before; share of intervals that hold the truth; masses stated blindly."""
     worst = {
-        kind: max(abs(e) for p in plants for name, e in p["error"].items() if kind in name.split(" over ")[0])
+        kind + suffix: max(abs(e) for p in plants for name, e in p[when].items() if kind in name)
+        for when, suffix in (("error", ""), ("before", "_before"))
         for kind in (MASS, DRAG, GAIN)
     }
     covered = [holds for p in plants for holds in p["covers"].values()]

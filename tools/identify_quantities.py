@@ -159,7 +159,7 @@ def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) 
         curve,
         forward=frozen_array(curve.forward * gain),
         reverse=frozen_array(curve.reverse * gain),
-        deadband_n=float(np.mean(fit.value("deadband"))),
+        deadband_n=max(0.0, float(np.mean(fit.value("deadband")))),
         lag_s=float(fit.value("lag")[0]),
     )
     return dataclasses.replace(
