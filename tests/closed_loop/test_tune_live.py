@@ -27,6 +27,7 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 
 SECONDS = 2.0
+"""Of a look: whatever happens a second after it began is in the next heartbeat, and that in the look."""
 SHIPPED = Parameters().control
 OBJECTIVE = """
 help = "place alone"
@@ -132,10 +133,12 @@ class PlugError(Exception):
 
 @pytest.fixture
 def live(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The module tune_live."""
+    """The module tune_live; it waits less."""
     monkeypatch.syspath_prepend(ROOT / "tools")
     import tune_live
+    import tune_vehicle
 
+    monkeypatch.setattr(tune_vehicle, "SETTLE_S", 0.5)
     return tune_live
 
 
