@@ -15,8 +15,8 @@ RATE_HZ = 9.0 / 170.0
 """Rounds a second at that size; at another, as many as keep the acceleration."""
 FREQUENCY = (1.0, 1.3, 1.7)
 """Of the axes, in rounds: never in step, so that axes, diagonals and all speeds between come by."""
-YAW_TURNS, ROLL_TURNS = 0.61, 0.43
-"""Turns a round."""
+YAW_TURNS, ROLL_TURNS = 0.81, 0.57
+"""Turns a round: half a rad/s each at its peak; slower turning leaves the inertia to the damping."""
 MOTIONS: Mapping[str, tuple[tuple[int, ...], bool]] = {
     "along x": ((0,), False),
     "along y": ((1,), False),
