@@ -145,6 +145,9 @@ GROUPS: tuple[Group, ...] = (
             Figure("spiral, 20 seeds: position RMSE, median", "position_rmse_m.median", high=5.0, unit="mm", scale=MM),
             Figure("spiral, 20 seeds: position RMSE, worst", "position_rmse_m.max", high=8.0, unit="mm", scale=MM),
             Figure("spiral, 20 seeds: attitude RMSE, worst", "attitude_rmse_rad.max", high=1.5, unit="deg", scale=DEG),
+            Figure("spiral, 20 seeds: tags' NIS over its expectation, least", "nis_mean.min", low=0.7),
+            Figure("spiral, 20 seeds: tags' NIS over its expectation, largest", "nis_mean.max", high=1.4),
+            Figure("spiral, 20 seeds: truth inside 3 sigma, worst axis of the worst seed", "sigma3_share.min", low=97.0, unit="%", scale=100.0),
         ),
     ),
     Group(
