@@ -147,7 +147,7 @@ GROUPS: tuple[Group, ...] = (
             Figure("spiral, 20 seeds: attitude RMSE, worst", "attitude_rmse_rad.max", high=1.5, unit="deg", scale=DEG),
             Figure("spiral, 20 seeds: tags' NIS over its expectation, least", "nis_mean.min", low=0.7),
             Figure("spiral, 20 seeds: tags' NIS over its expectation, largest", "nis_mean.max", high=1.4),
-            Figure("spiral, 20 seeds: truth inside 3 sigma, worst axis of the worst seed", "sigma3_share.min", low=97.0, unit="%", scale=100.0),
+            Figure("spiral, 20 seeds: truth inside 3 sigma, worst seed and axis", "sigma3_share.min", low=97.0, unit="%", scale=100.0),
         ),
     ),
     Group(
