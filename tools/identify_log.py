@@ -74,8 +74,8 @@ def read_recording(folder: Path) -> Recording:
             raise LogError(f"{folder}: ticks {before + 1} to {logged.tick - 1} are missing; give a log without a gap")
         before = logged.tick
         collector.sync_sent(logged.tick, logged.time_ns)
-        for bus, number, data in logged.received:
-            collector.take(bus, Frame(number, data))
+        for bus in range(len(firmware.fleet.buses)):
+            collector.take(bus, [Frame(number, data) for at, number, data in logged.received if at == bus])
         inputs = collector.collect(logged.tick, logged.time_ns)
         seen = measurements.fuse(inputs.modules, q_near).tags
         q_near = seen[-1].q_wb if seen else q_near

@@ -47,6 +47,6 @@ def test_detector_needs_both_conditions() -> None:
     """Through real frames: each condition alone would have believed in docks that were none; together they believe in none."""
     found = near_miss.count(range(70))
     assert found["misses"] > 40
-    assert found["current"] >= 3
-    assert found["position"] >= 3
+    assert found["current"] >= 1
+    assert found["position"] >= 1
     assert found["declared"] == 0

@@ -51,8 +51,9 @@ class Robot:
         self._mavlink = stack.enter_context(closing(mavutil.mavlink_connection(address, dialect="all", source_system=255)))
         self._bench = open_bench(stack, load_scenario("hover"), 0, Parameters(), "virtual:live")
         config = GroundConfig(links=(f"udpout:127.0.0.1:{port}",))
-        self._side = stack.enter_context(GroundSide(config, self._bench.firmware, Inline(), threaded=False))
-        self._lockstep = Lockstep(self._bench.firmware, [self._bench.firmware_port], [self._side.observe])
+        self._side = GroundSide(config, self._bench.firmware, Inline())
+        stack.callback(self._side.close)
+        self._lockstep = Lockstep(self._bench.firmware, [self._bench.firmware_port], [self._side.observe, lambda *_: self._side.pump()])
         self._sent: list[Any] = []
         self.tick = 0
         self._events: deque[tuple[int, Request | BaseException]] = deque()
