@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 import time
@@ -59,7 +60,13 @@ def _plan_mission(job: PlanJob, body: Body | None) -> Plan:
 
 
 def _planner() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=die_with, initargs=(os.getpid(),))
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_serve, initargs=(os.getpid(),))
+
+
+def _serve(parent: int) -> None:
+    """The planning process ends when the vehicle's does, and not by the Ctrl-C that asks the vehicle to disarm first."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    die_with(parent)
 
 
 class GroundSide:
