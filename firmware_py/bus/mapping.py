@@ -58,7 +58,9 @@ class InputCollector:
         named = self._make_handlers()
         self._handlers = [named.get(message.name) for message in codec.messages]
         self._names = [message.name for message in codec.messages]
-        self._tag_position = float(self._names.index("TAG_POSITION"))
+        self._tag_position = self._names.index("TAG_POSITION")
+        self._from_camera = frozenset((self._tag_position, self._names.index("TAG_ATTITUDE")))
+        """No sign of life of the module whose number they carry."""
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -85,8 +87,10 @@ class InputCollector:
             index = self._index.get((bus, row[NUMBER]))
             if index is None:
                 self.faults["module"] += 1
-            else:
-                handler(index, self._modules[index], row)
+                continue
+            module = self._modules[index]
+            module.heard |= which not in self._from_camera
+            handler(index, module, row)
 
     def all_answered(self, tick: int) -> bool:
         """Whether MCU_STATUS of `tick` of every module is in: the inputs of the tick may close."""
@@ -133,22 +137,18 @@ class InputCollector:
             self.faults["foreign_sync" if name == "SYNC" else "foreign_command"] += 1
 
     def _take_gyro(self, index: int, module: ModuleInputs, row: Row) -> None:
-        module.heard = True
         if self._is_usable(row[VALUES + 3]):
             module.gyro = np.array(row[VALUES : VALUES + 3])
 
     def _take_accel(self, index: int, module: ModuleInputs, row: Row) -> None:
-        module.heard = True
         if self._is_usable(row[VALUES + 3]):
             module.accel = np.array(row[VALUES : VALUES + 3])
 
     def _take_depth(self, index: int, module: ModuleInputs, row: Row) -> None:
-        module.heard = True
         if self._is_usable(row[VALUES + 2]):
             module.pressure_pa = row[VALUES]
 
     def _take_power(self, index: int, module: ModuleInputs, row: Row) -> None:
-        module.heard = True
         voltage, current, status = row[VALUES : VALUES + 3]
         if status == SENSOR_FAULT:
             self.faults["sensor"] += 1
@@ -156,22 +156,17 @@ class InputCollector:
         module.voltage_v, module.current_a = voltage, current
 
     def _take_environment(self, index: int, module: ModuleInputs, row: Row) -> None:
-        module.heard = True
         module.cabin_temperature_c, module.cabin_pressure_pa, leak = row[VALUES : VALUES + 3]
         module.leak = bool(leak)
 
     def _take_status(self, index: int, module: ModuleInputs, row: Row) -> None:
-        module.heard = True
         tick, _, errors, state = row[VALUES : VALUES + 4]
         self._status_ticks[index] = int(tick)
         module.mcu_errors |= int(errors)
         module.mcu_state = int(state)
 
     def _take_tag(self, index: int, module: ModuleInputs, row: Row) -> None:
-        """Halves of one observation share the counter, and nothing else says that they belong together.
-
-        They come from the camera, so they are no sign of life of the module whose number they carry.
-        """
+        """Halves of one observation share the counter, and nothing else says that they belong together."""
         key = (index, row[COUNTER])
         other = self._halves.pop(key, None)
         if other is None or other[0][MESSAGE] == row[MESSAGE]:
@@ -217,7 +212,6 @@ class InputCollector:
 
 def _dock_handler(first: int) -> Callable[[int, ModuleInputs, Row], None]:
     def take(index: int, module: ModuleInputs, row: Row) -> None:
-        module.heard = True
         module.dock_current_ma[first : first + 3] = row[VALUES : VALUES + 3]
         module.relay_echo[first : first + 3] = map(int, row[VALUES + 3 : VALUES + 6])
 
@@ -226,7 +220,6 @@ def _dock_handler(first: int) -> Callable[[int, ModuleInputs, Row], None]:
 
 def _esc_handler(first: int) -> Callable[[int, ModuleInputs, Row], None]:
     def take(index: int, module: ModuleInputs, row: Row) -> None:
-        module.heard = True
         rpm1, current1, status1, rpm2, current2, status2 = row[VALUES : VALUES + 6]
         module.esc.append(EscFeedback(first, (rpm1, rpm2), (current1, current2), (int(status1), int(status2))))
 

@@ -45,11 +45,10 @@ class Estimator:
         )  # fmt: skip
         self._dt = period_ns * 1e-9
         self._history = History(period_ns)
-        self._x = self._now = np.eye(1, STATES, 3)[0]  # nothing is known
+        self._forget()
         self._covariance = np.eye(ERRORS)
         self.retune(parameters)
         self._anchor_ns = 0
-        self._accepted = 0
         self._refused_in_row = 0
         self._rejected = 0
         self._last_tag_ns = -NEVER_NS
@@ -85,7 +84,7 @@ class Estimator:
         if self._accepted:
             self._advance(max(self._anchor_ns, time_ns - int(WINDOW_S * 1e9)))
             self._carry()
-        return self._sound(time_ns)
+        return self._estimate(time_ns)
 
     @property
     def motion(self) -> Motion:
@@ -180,19 +179,16 @@ class Estimator:
         rest = (self._history.time_of(index) - self._anchor_ns) * 1e-9
         self._now = propagation.carry(self._x, taus, gyros, self._dt, rest, *self._plant)
 
-    def _sound(self, time_ns: int) -> Estimate:
-        """The estimate; when sensors have lied so that it is no number any longer, the filter begins anew with the next tag."""
-        with np.errstate(invalid="ignore"):
-            estimate = self._estimate(time_ns)
-        if self._accepted and not math.isfinite(self._now.sum() + estimate.sigma_p.sum() + estimate.sigma_q.sum()):
-            self._accepted = 0
-            self._x = self._now = np.eye(1, STATES, 3)[0]
-            return self._estimate(time_ns)
-        return estimate
+    def _forget(self) -> None:
+        """Nothing is known: the filter begins anew with the next tag."""
+        self._accepted = 0
+        self._x = self._now = np.eye(1, STATES, 3)[0]
 
     def _estimate(self, time_ns: int) -> Estimate:
-        lag = (time_ns - self._anchor_ns) * 1e-9
-        variance = self._pose_variance(lag) if self._accepted else UNKNOWN_VARIANCE
+        variance = self._pose_variance((time_ns - self._anchor_ns) * 1e-9) if self._accepted else UNKNOWN_VARIANCE
+        if not observation.is_sound(self._now, variance):  # sensors have lied
+            self._forget()
+            variance = UNKNOWN_VARIANCE
         x = self._now
         return Estimate(
             p_wb=x[:3].copy(),

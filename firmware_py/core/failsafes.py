@@ -101,7 +101,6 @@ class Watch:
 
     def __init__(self, row: Row, parameters: FailsafeParameters) -> None:
         self.row = row
-        self._sign = -1.0 if row.below else 1.0
         self.limit: float = getattr(parameters, f"{row.name}_limit", 0.0)
         self.level = Level(getattr(parameters, f"{row.name}_action"))
         self.latched = bool(getattr(parameters, f"{row.name}_latched"))
@@ -115,12 +114,8 @@ class Watch:
 
     def beyond(self, health: Health) -> bool:
         """Whether its cause holds now, whatever the mode. A NaN is no cause."""
-        return self._sign * self.row.value(health) > self._sign * self.limit
-
-    @property
-    def criterion(self) -> tuple[Callable[[Health], float], float, float]:
-        """What `beyond` compares: value, sign and signed limit."""
-        return self.row.value, self._sign, self._sign * self.limit
+        value = self.row.value(health)
+        return value < self.limit if self.row.below else value > self.limit
 
     def counts(self, mode: Mode, forced: bool, armed: bool) -> bool:
         """Whether it counts now."""
@@ -164,7 +159,6 @@ class Failsafes:
 
     def __init__(self, parameters: FailsafeParameters) -> None:
         self._watches = [watch for watch in (Watch(row, parameters) for row in TABLE) if watch.level != Level.NONE]
-        self._rows = [(watch, *watch.criterion) for watch in self._watches]
 
     def step(self, health: Health, mode: Mode, forced: bool, armed: bool) -> list[Alarm]:
         """Those that begin or end in this tick, gravest row first.
@@ -173,8 +167,8 @@ class Failsafes:
             forced: a fail-safe and no person chose `mode`.
         """
         alarms = []
-        for watch, value, sign, limit in self._rows:
-            cause = sign * value(health) > limit and watch.counts(mode, forced, armed)
+        for watch in self._watches:
+            cause = watch.beyond(health) and watch.counts(mode, forced, armed)
             if (cause or not watch.rests) and watch.step(health.time_ns, cause, armed):
                 alarms.append(Alarm(watch.row.name, watch.words(health), watch.level, watch.active))
                 watch.began = alarms[-1].words if watch.active else watch.began

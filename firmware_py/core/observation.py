@@ -148,3 +148,9 @@ def carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance):
     out[:3] += density[6:9] * lag**3 / 3.0
     out[3:] += rate_variance * lag
     return out
+
+
+@njit(f"boolean({V},{V})", cache=True)
+def is_sound(x, variance):  # type: ignore[no-untyped-def]
+    """Whether every number of a state (26,) is finite, and every variance (6,) finite and not negative."""
+    return bool(np.all(np.isfinite(x)) and np.all(np.isfinite(variance)) and variance.min() >= 0.0)

@@ -1,7 +1,4 @@
-"""tune_gains is killed, with its workers, between two trials: started again, it ends in the bytes of a run that was left alone.
-
-Half a minute of starting processes: with MODCUBE_FULL=1. The suite cuts the search off in one process (tests/unit/test_tune_gains.py).
-"""
+"""tune_gains is killed, with its workers, between two trials: started again, it ends in the bytes of a run that was left alone."""
 
 import os
 import signal
@@ -37,7 +34,6 @@ def tune(path: Path, out: Path) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif("MODCUBE_FULL" not in os.environ, reason="half a minute: with MODCUBE_FULL=1")
 def test_tuning_that_was_killed_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     path, whole, torn = objective(tmp_path), tmp_path / "whole", tmp_path / "torn"
     with tune(path, whole) as process:

@@ -85,8 +85,6 @@ class MessageCodec:
         self._crc_start = tuple(crc.register_of_id(can_id) for can_id in ids)
         self._unpack: Callable[[int], tuple[Any, ...]] = _compile(_decode_source(self.field_details))
         self._pack: Callable[[Sequence[Any]], int] = _compile(_encode_source(self.field_details))
-        self.typed: Callable[[Sequence[float]], tuple[Any, ...]] = _compile(_type_source(self.field_details))
-        """Physical values out of floats: int where the factor is 1."""
 
     @property
     def is_limited(self) -> bool:
@@ -139,10 +137,6 @@ class MessageCodec:
         packed = int.from_bytes(data, "little")
         bits = ((field, packed >> field.start & ((1 << field.bits) - 1)) for field in self.field_details)
         return tuple(raw - (1 << f.bits) if f.signed and raw >> (f.bits - 1) else raw for f, raw in bits)
-
-    def counter_of(self, data: bytes) -> int:
-        """The counter that a frame of the right length carries; NO_COUNTER where the message has none."""
-        return data[-2] >> 4 if self.protected else NO_COUNTER
 
     def _frame(self, number: int, packed: int, counter: int) -> Frame:
         if number not in self.numbers:
@@ -215,15 +209,10 @@ def _encode_source(fields: Sequence[Field]) -> str:
     return "\n".join(lines)
 
 
-def _type_source(fields: Sequence[Field]) -> str:
-    items = [f"int(v[{index}])" if field.is_integer else f"v[{index}]" for index, field in enumerate(fields)]
-    return f"lambda v: ({' '.join(item + ',' for item in items)})"
-
-
 def _compile(source: str) -> Any:
     """The function that `source` defines: a lambda, or a def called pack."""
     if source.startswith("lambda"):
-        return eval(source, {"__builtins__": {"int": int}})
+        return eval(source, {"__builtins__": {}})
     namespace: dict[str, Any] = {"__builtins__": {"round": round}}
     exec(source, namespace)
     return namespace["pack"]

@@ -57,7 +57,7 @@ class Receiver:
     @property
     def dropped_in_all(self) -> int:
         """Frames dropped so far."""
-        return int(self._dropped.sum())
+        return sum(self._dropped.tolist())
 
     def rows(self, frames: Sequence[Frame]) -> np.ndarray:
         """(n, 3 + 8) one row for each frame: index of its message in the codec, or ~index of the kind of fault; number; counter; values.
@@ -72,13 +72,12 @@ class Receiver:
     def judge(self, frames: Sequence[Frame]) -> list[Received | str]:
         """What each frame says, or the kind of its fault."""
         found: list[Received | str] = []
-        for row, frame in zip(self.rows(frames).tolist(), frames, strict=True):
-            which, number, counter = (int(value) for value in row[:VALUES])
+        for (which, number, counter), frame in zip(self.rows(frames)[:, :VALUES].astype(int).tolist(), frames, strict=True):
             if which < 0:
                 found.append(KINDS[~which])
                 continue
             message = self._messages[which]
-            values = message.typed(row[VALUES:]) if len(frame.data) == message.length else ()
+            values = message.decode(frame.data) if len(frame.data) == message.length else ()
             found.append(Received(message, number, values, counter))
         return found
 
