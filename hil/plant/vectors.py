@@ -15,8 +15,11 @@ M3 = types.UniTuple(V3, 3)
 
 
 def compiled(signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles for one signature. Dividing by zero gives infinity as in numpy: to check costs a third of the time."""
-    return cast("Callable[[Callable[..., Any]], Any]", njit(signature, cache=True, error_model="numpy"))
+    """Compiles for one signature, code that makes no array: it need not count references, which costs more than the sums.
+
+    Dividing by zero gives infinity as in numpy: to check costs a third of the time.
+    """
+    return cast("Callable[[Callable[..., Any]], Any]", njit(signature, cache=True, error_model="numpy", _nrt=False))
 
 
 @compiled(V3(V3, V3))
