@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -18,6 +17,7 @@ from firmware_py.bus.port import Port, open_port
 from firmware_py.core.types import Outputs
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters
+from firmware_py.runtime.realtime import quiet_garbage
 from firmware_py.runtime.recorder import Recorder
 from hil.dock_script import DockScript
 from hil.faults import Faults
@@ -64,29 +64,27 @@ class Bench:
         period_ns = self.fleet.period_ns
         sent: list[BusFrame] = []
         outputs: Outputs | None = None
-        gc.freeze()  # what exists stays: the collector need not look through it again and again
-        began = time.perf_counter()
-        for tick in range(1, self.script.ticks + 1):
-            time_ns = tick * period_ns
-            if self.faults.process_killed(time_ns):
-                lockstep, outputs, sent = self._without_firmware(observers, sent), None, []
+        with quiet_garbage():
+            began = time.perf_counter()
+            for tick in range(1, self.script.ticks + 1):
+                time_ns = tick * period_ns
+                if self.faults.process_killed(time_ns):
+                    lockstep, outputs, sent = self._without_firmware(observers, sent), None, []
+                    if truth is not None:
+                        truth.record_world(tick, self.nodes.world)
+                    continue
+                self.is_dead = False
+                sent += lockstep.start_tick(tick, time_ns)
+                heard = drain(plant_ports, sent, self.patience_looks)
+                answers = send(plant_ports, [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
                 if truth is not None:
                     truth.record_world(tick, self.nodes.world)
-                continue
-            self.is_dead = False
-            sent += lockstep.start_tick(tick, time_ns)
-            heard = drain(plant_ports, sent, self.patience_looks)
-            answers = send(plant_ports, [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
-            if truth is not None:
-                truth.record_world(tick, self.nodes.world)
-            outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), answers)
-            if self.script.is_over(time_ns):
-                break
-            if progress is not None and tick % self.fleet.rate_hz == 0:
-                progress(time_ns * 1e-9)
-        took_s = time.perf_counter() - began
-        gc.unfreeze()
-        return took_s
+                outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), answers)
+                if self.script.is_over(time_ns):
+                    break
+                if progress is not None and tick % self.fleet.rate_hz == 0:
+                    progress(time_ns * 1e-9)
+            return time.perf_counter() - began
 
     def _without_firmware(self, observers: Sequence[Observer], sent: Sequence[BusFrame]) -> Lockstep:
         """A tick in which the firmware's process is dead; returns the one that will be started in its place."""

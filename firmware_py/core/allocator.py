@@ -36,6 +36,12 @@ def busiest(force, f_min, f_max):  # type: ignore[no-untyped-def]
     return most
 
 
+@njit("boolean(float64[::1],float64[::1],float64[::1])", cache=True)
+def are_within(force, f_min, f_max):  # type: ignore[no-untyped-def]
+    """Whether every force is within its limits; one that is not a number is not."""
+    return bool(np.all((force >= f_min) & (force <= f_max)))
+
+
 class Allocator:
     """Allocates for one body. `alive` leaves thrusters out of the problem at once."""
 
@@ -72,7 +78,7 @@ class Allocator:
     def step(self, wrench: np.ndarray) -> Thrust:
         """The thruster forces for a wanted (6,) wrench, body frame."""
         force = self._preload + self._pinv @ wrench
-        if ((force <= self._f_max) & (force >= self._f_min)).all():
+        if are_within(force, self._f_min, self._f_max):
             return self._thrust(self._cheaper.step(force) if self._cheaper else force, (1.0, 1.0))
         if self._clip_only:
             return self._thrust(np.clip(force, self._f_min, self._f_max), (1.0, 1.0))

@@ -147,6 +147,8 @@ class DockingStage:
         """One tick. `estimates`: body and its estimate, by the body's number."""
         self.events, self.records = [], []
         decisions = Decisions({}, [], [], [])
+        if not (inputs.prepared or self._docks or self._undocks or self._joints.rows.size):
+            return decisions
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, decisions)

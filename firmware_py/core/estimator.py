@@ -104,7 +104,7 @@ class Estimator:
     # ------------------------------------------------------------ fusion at the anchor
 
     def _take(self, pose: BodyPose) -> None:
-        if not (np.isfinite(pose.p_wt).all() and np.isfinite(pose.q_wb).all()):
+        if not observation.are_finite(pose.p_wt, pose.q_wb):
             self._rejected += 1
         elif not self._accepted:
             self._start(pose)
@@ -189,15 +189,15 @@ class Estimator:
         if not observation.is_sound(self._now, variance):  # sensors have lied
             self._forget()
             variance = UNKNOWN_VARIANCE
-        x = self._now
+        x, sigma = self._now, np.sqrt(variance)
         return Estimate(
             p_wb=x[:3].copy(),
             q_wb=x[3:7].copy(),
             nu=x[7:13].copy(),
             force_w=x[19:22].copy(),
             moment_b=x[22:25].copy(),
-            sigma_p=np.sqrt(variance[:3]),
-            sigma_q=np.sqrt(variance[3:]),
+            sigma_p=sigma[:3],
+            sigma_q=sigma[3:],
             tag_age_ns=time_ns - self._last_tag_ns,
             nis=self._nis,
             nis_dof=self._nis_dof,

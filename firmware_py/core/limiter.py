@@ -47,6 +47,7 @@ class Limiter:
         self._curves = (t.forward, t.reverse, t.deadband_n)
         self._full, self._all = np.ones(t.f_max.size), np.ones(t.f_max.size, dtype=bool)
         self._nominal_v = np.array([t.voltage_v[i[0]] for i in self._of_module])
+        self._scale, self._scaled_for = self._full, b""
         self.magnets = [MagnetLimiter(parameters, dt_s) for _ in body.modules]
         """One for each module."""
         self.force_n = np.zeros(t.f_max.size)
@@ -96,8 +97,12 @@ class Limiter:
 
     def _voltage_scale(self, voltage_v: np.ndarray) -> np.ndarray:
         """(n,) force at a full command over that at the nominal voltage; 1 where the reading is not believed."""
-        ratio = voltage_v / self._nominal_v
-        return np.asarray((np.where(is_believed(ratio), ratio, 1.0) ** VOLTAGE_EXPONENT)[self._t.module])
+        reading = voltage_v.tobytes()
+        if reading != self._scaled_for:  # readings come at a tenth of the tick's rate
+            ratio = voltage_v / self._nominal_v
+            self._scale = np.asarray((np.where(is_believed(ratio), ratio, 1.0) ** VOLTAGE_EXPONENT)[self._t.module])
+            self._scaled_for = reading
+        return self._scale
 
 
 @njit(

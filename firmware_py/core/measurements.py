@@ -66,7 +66,7 @@ class Measurements:
         mean = self._mean_of_all
         if len(heard) < len(readings):
             mean = self._rotations[:, [value is not None for value in readings]].reshape(3, -1) / len(heard)
-        return np.asarray(mean @ np.concatenate(heard))
+        return np.asarray(mean @ (heard[0] if len(heard) == 1 else np.concatenate(heard)))
 
     def _depth(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> float | None:
         heard = [m.pressure_pa for m in mine if m.pressure_pa is not None]

@@ -7,6 +7,8 @@ trim, buoyancy) are not looked at.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -36,6 +38,8 @@ RUNNER_UP = 0.5
 """What it leaves unexplained must be less than this share of what the next best leaves."""
 SIGNIFICANT = 20.0
 """Squared sigmas that it must explain."""
+FORCES = 15
+"""Column of a block where the thrusters' forces begin."""
 MOST = 2.6
 """A thruster cannot lose more than this many times its force: 2 is reversed."""
 
@@ -48,11 +52,11 @@ class MissingThrust:
         self._body, self._p = body, parameters
         self._columns = t.matrix.T.copy()
         self._inertia = body.mass[3:, 3:].copy()
-        self._ends = np.cumsum([6, 6, 3, t.f_max.size, 1])
-        """Of a block's columns: wrench missing, wrench that acted, down in the body, forces, doubt about the tilt."""
         self._ticks = max(1, round(BLOCK_NS / period_ns))
-        count = self._modules = len(body.modules)
+        count = len(body.modules)
         self._sigma = np.repeat([SIGMA_FORCE_N * np.sqrt(count), SIGMA_MOMENT * count], 3)
+        self._tilt = np.repeat([UNSURE_LIFT_N * np.sqrt(count), UNSURE_ARM_M * body.dry_kg * GRAVITY], 3)
+        self._doubt = np.repeat([float(body.mass[0, 0]) * GRAVITY, 0.0], 3)
         self._period_s = period_ns * 1e-9
         self.forget()
 
@@ -62,7 +66,7 @@ class MissingThrust:
 
     def forget(self) -> None:
         """What was seen no longer counts, because the body has changed."""
-        self._blocks = np.full((GAP + BASE, self._ends[-1]), np.nan)
+        self._blocks = np.full((GAP + BASE, FORCES + self._columns.shape[0] + 1), np.nan)
         self._suspect, self._count = -1, 0
         self._start_block(None)
 
@@ -128,37 +132,7 @@ class MissingThrust:
 
     def _explain(self, alive: np.ndarray) -> int:
         """The one thruster that explains the change, or -1."""
-        known = ~np.isnan(self._blocks[:, 0])
-        base, recent = known[:BASE], known[-RECENT:]
-        if base.sum() < LEAST_BASE or recent.sum() < RECENT - 1:
-            return -1
-        old = self._blocks[:BASE][base].mean(axis=0)
-        change, acted, tilted, now, _ = np.split(self._blocks[-RECENT:][recent].mean(axis=0) - old, self._ends[:-1])
-        before, tilt_sigma = old[self._ends[2] : self._ends[3]], float(old[-1])
-        now = now + before
-        sigma = self._sigmas(acted, float(np.linalg.norm(tilted)), tilt_sigma)
-        y = change / sigma
-        total = float(y @ y)
-        if total < SIGNIFICANT:
-            return -1
-        left = np.full(alive.size, total)
-        for force in (now, now - before):  # lost since, or lost all along
-            phi = -(self._columns * force[:, None]) / sigma
-            size = np.einsum("ij,ij->i", phi, phi)
-            share = (phi @ y) / np.maximum(size, 1e-12)
-            fits = alive & (share >= self._p.lie_share) & (share <= MOST) & (size >= 1.0)
-            left = np.where(fits, np.minimum(left, total - share * (phi @ y)), left)
-        order = np.argsort(left)
-        best, second = int(order[0]), int(order[1])
-        sure = total - left[best] >= SIGNIFICANT and left[best] <= (1.0 - EXPLAINED) * total
-        return best if sure and left[best] <= RUNNER_UP * left[second] else -1
-
-    def _sigmas(self, acted: np.ndarray, tilted: float, tilt_sigma: float) -> np.ndarray:
-        """(6,) what a healthy body's change may be: noise, model, tilt of the body, and doubt about the tilt."""
-        dry_n = self._body.dry_kg * GRAVITY
-        tilt = np.repeat([UNSURE_LIFT_N * np.sqrt(self._modules), UNSURE_ARM_M * dry_n], 3) * tilted
-        doubt = np.repeat([float(self._body.mass[0, 0]) * GRAVITY * tilt_sigma, 0.0], 3)
-        return np.asarray(np.sqrt(self._sigma**2 + (MODEL_SHARE * acted) ** 2 + tilt**2 + doubt**2))
+        return int(explain(self._blocks, self._columns, alive, self._sigma, self._tilt, self._doubt, self._p.lie_share))
 
 
 DOWN = np.array([0.0, 0.0, GRAVITY])
@@ -173,3 +147,61 @@ def _add_model(inertia, righting, nodes, rotational, linear, nu, q_wb, out):  # 
     out[3] -= w[1] * h[2] - w[2] * h[1]
     out[4] -= w[2] * h[0] - w[0] * h[2]
     out[5] -= w[0] * h[1] - w[1] * h[0]
+
+
+@njit(f"Tuple(({V},int64))({M})", cache=True)
+def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
+    """Mean of the blocks that are whole, and how many there are; others have NaN for a wrench."""
+    total, count = np.zeros(blocks.shape[1]), 0
+    for k in range(blocks.shape[0]):
+        if not math.isnan(blocks[k, 0]):
+            total += blocks[k]
+            count += 1
+    return total / max(count, 1), count
+
+
+@njit(f"int64({M},{M},boolean[::1],{V},{V},{V},float64)", cache=True)
+def explain(blocks, columns, alive, sigma, tilt, doubt, lie_share):  # type: ignore[no-untyped-def]
+    """The one thruster that explains the change of the latest blocks against the oldest, or -1.
+
+    Args:
+        blocks: (GAP + BASE, FORCES + n + 1) wrench missing 0:6, wrench that acted 6:12, down in the body 12:15, forces, sigma of
+            the tilt.
+        columns: (n, 6) wrench of unit force. alive: (n,) who may be suspected.
+        sigma, tilt, doubt: (6,) what a healthy body's change may be: noise and model; by each unit that it tilted; by each radian
+            of doubt about the tilt.
+        lie_share: least share of its force that a liar has lost.
+    """
+    n = columns.shape[0]
+    old, base = _mean_of_whole(blocks[:BASE])
+    new, recent = _mean_of_whole(blocks[-RECENT:])
+    if base < LEAST_BASE or recent < RECENT - 1:
+        return -1
+    change = new - old
+    tilted = math.sqrt(np.sum(change[12:FORCES] ** 2))
+    y, unsure, total = np.empty(6), np.empty(6), 0.0
+    for i in range(6):
+        model = MODEL_SHARE * change[6 + i]
+        unsure[i] = math.sqrt(sigma[i] ** 2 + model**2 + (tilt[i] * tilted) ** 2 + (doubt[i] * old[FORCES + n]) ** 2)
+        y[i] = change[i] / unsure[i]
+        total += y[i] ** 2
+    if total < SIGNIFICANT:
+        return -1
+    best, least, second = -1, total, total
+    for t in range(n):
+        left = total
+        for force in (new[FORCES + t], change[FORCES + t]):  # lost since, or lost all along
+            size, fit = 0.0, 0.0
+            for i in range(6):
+                phi = -columns[t, i] * force / unsure[i]
+                size += phi * phi
+                fit += phi * y[i]
+            share = fit / max(size, 1e-12)
+            if alive[t] and lie_share <= share <= MOST and size >= 1.0:
+                left = min(left, total - share * fit)
+        if left < least:
+            best, least, second = t, left, least
+        else:
+            second = min(second, left)
+    sure = total - least >= SIGNIFICANT and least <= (1.0 - EXPLAINED) * total
+    return best if sure and least <= RUNNER_UP * second else -1

@@ -151,6 +151,12 @@ def carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance):
 
 
 @njit(f"boolean({V},{V})", cache=True)
+def are_finite(a, b):  # type: ignore[no-untyped-def]
+    """Whether every number of two vectors is finite."""
+    return bool(np.all(np.isfinite(a)) and np.all(np.isfinite(b)))
+
+
+@njit(f"boolean({V},{V})", cache=True)
 def is_sound(x, variance):  # type: ignore[no-untyped-def]
     """Whether every number of a state (26,) is finite, and every variance (6,) finite and not negative."""
-    return bool(np.all(np.isfinite(x)) and np.all(np.isfinite(variance)) and variance.min() >= 0.0)
+    return bool(are_finite(x, variance) and variance.min() >= 0.0)

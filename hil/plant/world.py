@@ -125,6 +125,7 @@ class World(DockedBodies):
         if period_ns % step_ns:
             raise DescriptionError(f"plant: the sub-step of {step_ns} ns does not divide the tick of {period_ns} ns")
         self._centres: dict[tuple[int, ...], tuple[tuple[Place, ...], tuple[float, ...]]] = {}
+        self._truths: dict[int, Truth] = {}
         self.time_ns = 0
         self.vehicles = tuple(vehicles)
         self.spec = spec
@@ -222,11 +223,12 @@ class World(DockedBodies):
 
     def _step(self, steps: int) -> None:
         h = 1e-9 * self._step_ns
+        self._truths.clear()
         self._external[:] = 0.0
         if len(self.vehicles) > 1 and self.jet_strength > 0.0:
             jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
             add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._external)
-        for m in np.flatnonzero(self.push.any(axis=1)):
+        for m in sorted(set(self.push.nonzero()[0].tolist())):
             force, moment = (self._modules.turn[m] @ part for part in np.split(self.push[m], 2))
             moment += np.cross(self._modules.position[m], force)
             self._external[self._modules.body[m]] += np.concatenate([force, moment])
@@ -243,6 +245,7 @@ class World(DockedBodies):
             raise DescriptionError(
                 f"plant: a batch is of lone modules that are whole; here are {len(self.vehicles)} modules, {len(self._broken)} faults"
             )
+        self._truths.clear()
         self.time_ns += ticks * self.period_ns
         return Arrays(
             self._body_arrays, self._modules, self._thrusters, self._water, self._gusts.steps(ticks), self._external,
@@ -250,7 +253,12 @@ class World(DockedBodies):
         )  # fmt: skip
 
     def truth(self, module: int) -> Truth:
-        """The truth about one module; its arrays are copies."""
+        """The truth about one module; its arrays are copies, the same ones until the world moves on."""
+        if module not in self._truths:
+            self._truths[module] = self._look_at(module)
+        return self._truths[module]
+
+    def _look_at(self, module: int) -> Truth:
         seen = self._seen[module].copy()
         power = self._thrusters.power[module]
         first, last = self._first[module], self._first[module + 1]
