@@ -129,8 +129,9 @@ class DockingStage:
 
     @property
     def joints(self) -> np.ndarray:
-        """(k,) of PAIR: what is known of every joint in this tick."""
-        return self._joints.rows
+        """(k,) of PAIR: what is known of every joint in this tick; a copy."""
+        rows = self._joints.rows
+        return rows.copy() if rows.size else rows
 
     @property
     def busy(self) -> frozenset[int]:

@@ -99,11 +99,13 @@ def update(x, covariance, residual, h, variance, gate):  # type: ignore[no-untyp
         s = variance[row]
         for j in range(ERRORS):
             s += h[row, j] * ph[j]
-        nis += innovation * innovation / s
+        root = 1.0 / math.sqrt(s)
+        ph *= root  # so that what is taken off is symmetric to the last bit
+        nis += (innovation * root) ** 2
+        error += ph * (innovation * root)
         for i in range(ERRORS):
-            error[i] += ph[i] * innovation / s
             for j in range(ERRORS):
-                p[i, j] -= ph[i] * ph[j] / s
+                p[i, j] -= ph[i] * ph[j]
     if not nis <= gate:
         return nis, x.copy(), covariance.copy()
     return nis, inject(x, error), p

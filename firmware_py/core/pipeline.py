@@ -239,7 +239,7 @@ class Pipeline:
         """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
         decisions = self.docking.step(inputs, {c.body.index: (c.body, estimates[c.body.index]) for c in self._chains})
         outputs.docks += self.docking.records
-        outputs.joints = self.docking.joints.copy()
+        outputs.joints = self.docking.joints
         outputs.events += self.docking.events
         self._steer(decisions)
         for joined in decisions.joins:

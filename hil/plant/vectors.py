@@ -19,7 +19,7 @@ def compiled(signature: Any) -> Callable[[Callable[..., Any]], Any]:
 
     Dividing by zero gives infinity as in numpy: to check costs a third of the time.
     """
-    return cast("Callable[[Callable[..., Any]], Any]", njit(signature, cache=True, error_model="numpy", _nrt=False))
+    return cast("Callable[[Callable[..., Any]], Any]", njit(signature, cache=True, error_model="numpy", _nrt=False))  # type: ignore[call-overload]
 
 
 @compiled(V3(V3, V3))
