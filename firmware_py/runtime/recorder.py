@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Collection, Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,7 @@ WARNING = 4
 _ID_TEXTS = tuple(f"{frame_id:03X}#" for frame_id in range(2048))
 
 
+@lru_cache(maxsize=1)  # all frames of a tick have one
 def candump_stamp(time_ns: int) -> str:
     """The time of a line."""
     seconds, rest = divmod(time_ns, 1_000_000_000)

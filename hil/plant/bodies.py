@@ -10,7 +10,6 @@ to the water), all about O in the body frame (Lamb, Hydrodynamics, ch. VI):
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +26,6 @@ from hil.plant.vectors import (
     V3,
     compiled,
     cross,
-    dot,
     matrix,
     matrix_of,
     minus,
@@ -172,9 +170,13 @@ def _add_drag(bodies, modules, m, water, x, flow):
 def _touches(modules, m, water, x):
     """Whether a module is so near to wall, bottom or surface that its corners must be looked at."""
     b = modules.body[m]
-    centre = turn(matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), triple(modules.position, m, 0))
-    size = triple(modules.size, m, 0)
-    return not is_clear(water, plus(triple(x, b, 0), centre), 0.5 * math.sqrt(dot(size, size)))
+    r, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), matrix(modules.turn, m)
+    centre, half = plus(triple(x, b, 0), turn(r, triple(modules.position, m, 0))), (0.0, 0.0, 0.0)
+    for axis in range(3):
+        edge = turn(r, (inside[0][axis], inside[1][axis], inside[2][axis]))
+        s = 0.5 * modules.size[m, axis]
+        half = (half[0] + s * abs(edge[0]), half[1] + s * abs(edge[1]), half[2] + s * abs(edge[2]))
+    return not is_clear(water, centre, half)
 
 
 @compiled(types.void(BODIES, MODULES, I8, WATER, F2))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import types
 
 from hil.plant.draw import Noise, stream
 from hil.plant.spec import SensorSpec, WorldSpec
+from hil.plant.vectors import F1, F8, compiled
 from hil.plant.world import Truth
 
 
@@ -16,17 +18,26 @@ class Channel:
 
     def __init__(self, rng: np.random.Generator, width: int, sigma: float, bias: float, walk: float) -> None:
         self._noise = Noise(rng, 2 * width)
-        self._width, self._sigma, self._walk = width, sigma, walk
+        self._sigma, self._walk = sigma, walk
         self.bias: np.ndarray = bias * rng.standard_normal(width)
         self._then_ns = 0
 
     def sample(self, time_ns: int) -> np.ndarray:
         """(width,) the error now; the walk goes on by the time since the last sample."""
-        draw = self._noise.take()
-        elapsed_s = 1e-9 * (time_ns - self._then_ns)
+        walked = self._walk * math.sqrt(1e-9 * (time_ns - self._then_ns))
         self._then_ns = time_ns
-        self.bias = self.bias + self._walk * math.sqrt(elapsed_s) * draw[: self._width]
-        return self.bias + self._sigma * draw[self._width :]
+        error = np.empty(self.bias.size)
+        _sample(self._noise.take(), walked, self._sigma, self.bias, error)
+        return error
+
+
+@compiled(types.void(F1, F8, F8, F1, F1))
+def _sample(draw, walked, sigma, bias, error):
+    """Moves `bias` (w,) on by `walked` standard deviations of its walk and writes `error` (w,), by 2 w standard normal numbers."""
+    width = bias.shape[0]
+    for i in range(width):
+        bias[i] += walked * draw[i]
+        error[i] = bias[i] + sigma * draw[width + i]
 
 
 class Sensors:

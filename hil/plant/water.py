@@ -100,14 +100,14 @@ def flow_at(water, since_s):
     return plus(triple(water.flow, 0, 0), plus(target, gap)), times(-rate, gap)
 
 
-@compiled(types.boolean(WATER, V3, F8))
-def is_clear(water, centre, reach):
-    """Whether a ball of radius `reach` touches neither wall, bottom nor surface."""
-    if centre[2] < reach or centre[2] > water.depth - reach:
+@compiled(types.boolean(WATER, V3, V3))
+def is_clear(water, centre, half):
+    """Whether a box of half extents `half` along the world's axes touches neither wall, bottom nor surface."""
+    if centre[2] < half[2] or centre[2] > water.depth - half[2]:
         return False
     if water.is_box:
-        return abs(centre[0]) + reach < water.half_length and abs(centre[1]) + reach < water.half_width
-    return math.hypot(centre[0], centre[1]) + reach < water.half_length
+        return abs(centre[0]) + half[0] < water.half_length and abs(centre[1]) + half[1] < water.half_width
+    return math.hypot(centre[0], centre[1]) + math.hypot(half[0], half[1]) < water.half_length
 
 
 @compiled(V3(WATER, F8, V3, V3))
