@@ -8,7 +8,7 @@ import numpy as np
 
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import ARMED
-from firmware_py.core.types import Action, DockRequest, Outputs, Request
+from firmware_py.core.types import Action, DockRequest, Mode, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare import paths
@@ -92,8 +92,13 @@ class DockScript:
     def _is_over(self, running: _Running, time_ns: int, last: Outputs) -> bool:
         step, bodies = running.step, {r.body for r in last.records}
         if step.do == "dock":
-            if self._leader(running.module) in bodies:
-                return False
+            mode = next((r.mode for r in last.records if r.body == self._leader(running.module)), None)
+            if mode is not None:
+                given_up = running.began and mode != Mode.DOCK
+                running.began = running.began or mode == Mode.DOCK
+                if given_up:  # the steps after it have lost their sense
+                    self._steps.clear()
+                return given_up
             mine, other = self._group(running.module), self._group(running.target)
             self._groups.remove(mine)
             other += mine
@@ -122,6 +127,8 @@ class _Running:
 
     def __init__(self, step: Step, end_ns: int, module: int, target: int) -> None:
         self.step, self.end_ns, self.module, self.target = step, end_ns, module, target
+        self.began = False
+        """A dock is under way."""
 
 
 def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> paths.Trajectory:

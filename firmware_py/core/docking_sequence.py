@@ -118,24 +118,29 @@ class DockingSequence:
         self._p = parameters
         self._r_a, self._q_a = _module_in(active, plan.request.module)
         self._r_t, self._q_t = _module_in(target, plan.request.target_module)
+        self._line_t, self._farthest_m = plan.axis_t, parameters.standoff_m
+        self._fixed: Estimate | None = None
+        """Where the target was in the beginning, at rest, for an approach that does not look at it again."""
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
         self._entered_ns = time_ns
         self._good_since_ns: int | None = None
-        self._gap_m = parameters.standoff_m
+        self._gap_m = self._farthest_m
         self._last_ns = time_ns
         self._turn = 0.0
 
     def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus) -> Steering:
         """Moves the sequence on by one tick."""
+        if self._p.approach == "straight" and self.stage == Stage.PRE_APPROACH:
+            self._come_straight(active, target)
         errors = self.errors(active, target)
         dt = (time_ns - self._last_ns) * 1e-9
         self._last_ns = time_ns
         self._decide(time_ns, active, target, errors, status)
         speed = self._speed(errors)
-        self._gap_m = float(np.clip(self._gap_m + speed * dt, -self._p.push_m, self._p.standoff_m))
-        return Steering(self._setpoint(target, speed), TABLE[self.stage].relay, self._gap_m)
+        self._gap_m = float(np.clip(self._gap_m + speed * dt, -self._p.push_m, self._farthest_m))
+        return Steering(self._setpoint(self._fixed or target, speed), TABLE[self.stage].relay, self._gap_m)
 
     def abort(self, time_ns: int, reason: str) -> None:
         """Ends the dock; both hold apart."""
@@ -144,13 +149,27 @@ class DockingSequence:
 
     def errors(self, active: Estimate, target: Estimate) -> Errors:
         """Errors by the two estimates."""
-        p_a, q_a = _pose_of(active, self._r_a, self._q_a)
-        p_t, q_t = _pose_of(target, self._r_t, self._q_t)
-        off = rotate_back(q_t, p_a - p_t) - self.plan.place_t
+        _, q_a = _pose_of(active, self._r_a, self._q_a)
+        _, q_t = _pose_of(target, self._r_t, self._q_t)
+        off = self._offset(active, target)
         gap = float(off @ self.plan.axis_t)
         lateral = float(np.linalg.norm(off - gap * self.plan.axis_t))
         angle = difference(q_a, multiply(q_t, self._q_wanted()))
         return Errors(gap, lateral, float(np.linalg.norm(angle)))
+
+    def _offset(self, active: Estimate, target: Estimate) -> np.ndarray:
+        """(3,) from its place to the active module, target module frame, m."""
+        p_a, _ = _pose_of(active, self._r_a, self._q_a)
+        p_t, q_t = _pose_of(target, self._r_t, self._q_t)
+        return np.asarray(rotate_back(q_t, p_a - p_t) - self.plan.place_t)
+
+    def _come_straight(self, active: Estimate, target: Estimate) -> None:
+        """From where the active module is to its place by where the target is now, without a halt."""
+        off = self._offset(active, target)
+        self._gap_m = self._farthest_m = float(np.linalg.norm(off))
+        self._line_t = off / self._gap_m
+        self._fixed = target._replace(nu=np.zeros(6))
+        self.stage = Stage.APPROACH
 
     # ------------------------------------------------------------ what comes next
 
@@ -219,7 +238,8 @@ class DockingSequence:
         """Rate of the wanted gap, m/s."""
         p = self._p
         if self.stage == Stage.APPROACH:
-            if errors.lateral_m > CONE * p.align_m or errors.angle_rad > CONE * p.align_rad:
+            astray = errors.lateral_m > CONE * p.align_m or errors.angle_rad > CONE * p.align_rad
+            if astray and p.approach == "staged":
                 return 0.0
             return -float(np.clip(SLOWING_PER_S * self._gap_m, p.contact_speed_m_s, p.speed_m_s))
         if self.stage in (Stage.PUSH, Stage.VERIFY):
@@ -233,7 +253,7 @@ class DockingSequence:
         p_t, q_t = _pose_of(target, self._r_t, self._q_t)
         q_module = normalise(multiply(q_t, self._q_wanted()))
         q_wb = normalise(multiply(q_module, conjugate(self._q_a)))
-        axis_w = rotate(q_t, self.plan.axis_t)
+        axis_w = rotate(q_t, self._line_t if self._gap_m > 0.0 else self.plan.axis_t)
         p_module = p_t + rotate(q_t, self.plan.place_t) + axis_w * self._gap_m
         v_w = rotate(target.q_wb, target.nu[:3].copy()) + axis_w * speed
         zero = np.zeros(3)

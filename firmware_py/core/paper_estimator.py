@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.estimator import NEVER_NS, READY_AFTER
+from firmware_py.core.estimator import NEVER_NS, READY_AFTER, RESET_AFTER
 from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rotations import conjugate, exp, log, multiply, rotate
 from firmware_py.core.topology import Motion
@@ -19,7 +19,7 @@ PAPER_ACCEL_DENSITY = 0.05
 PAPER_ALPHA_DENSITY = 0.5
 """Angular likewise, rad/s^2/sqrt(Hz); synthetic."""
 PAPER_FLIP_RAD = 0.5
-"""A tag that jumps further than this is a flip; any working tag tracker refuses it."""
+"""A tag that jumps further than this is a flip; any working tag tracker refuses it, and begins anew where it stays so."""
 
 
 class TagOnlyEstimator:
@@ -47,7 +47,7 @@ class TagOnlyEstimator:
         self._q_wb = np.array([1.0, 0.0, 0.0, 0.0])
         self._rate_b = np.zeros(3)
         self._accepted = 0
-        self._rejected = 0
+        self._rejected = self._refused_in_row = 0
         self._last_tag_ns = -NEVER_NS
 
     def retune(self, parameters: Estimation) -> None:
@@ -110,15 +110,17 @@ class TagOnlyEstimator:
     def _fuse(self, pose: BodyPose) -> None:
         p_wb = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
         self._last_tag_ns = pose.capture_ns
-        if not self._accepted:
-            self._position[:3] = p_wb
-            self._q_wb = pose.q_wb
-            self._accepted = 1
+        if not self._accepted or self._refused_in_row >= RESET_AFTER:
+            self._position, self._q_wb, self._rate_b = np.concatenate([p_wb, np.zeros(3)]), pose.q_wb, np.zeros(3)
+            self._p_position, self._p_attitude = np.eye(6), np.eye(6)
+            self._accepted, self._refused_in_row = 1, 0
             return
         turn = log(multiply(conjugate(self._q_wb), pose.q_wb))
         if float(np.linalg.norm(turn)) > PAPER_FLIP_RAD and self._accepted > READY_AFTER:
             self._rejected += 1
+            self._refused_in_row += 1
             return
+        self._refused_in_row = 0
         along, angle = self._p.tag_sigma_axis_m, self._p.tag_sigma_rad
         noise = np.diag(np.array([self._p.tag_sigma_m, self._p.tag_sigma_m, along]) ** 2)
         self._position, self._p_position = self._update(self._position, self._p_position, p_wb, noise, self._h)
