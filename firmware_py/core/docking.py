@@ -70,6 +70,8 @@ class Decisions(NamedTuple):
     parts: list[Part]
     ended: list[int]
     """Bodies whose dock is over without a join: they hold where they are."""
+    meets: dict[int, np.ndarray]
+    """By body: (3,) how far it comes to meet the other, world, m, from where it holds."""
 
 
 class _Dock(NamedTuple):
@@ -147,7 +149,7 @@ class DockingStage:
     def step(self, inputs: Inputs, estimates: Mapping[int, tuple[Body, Estimate]]) -> Decisions:
         """One tick. `estimates`: body and its estimate, by the body's number."""
         self.events, self.records = [], []
-        decisions = Decisions({}, [], [], [])
+        decisions = Decisions({}, [], [], [], {})
         if not (inputs.prepared or self._docks or self._undocks or self._joints.rows.size):
             return decisions
         poses = ModulePoses(inputs.modules, self._tags)
@@ -184,6 +186,8 @@ class DockingStage:
             active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
             sequence = DockingSequence(prepared.plan, estimates[active][0], estimates[target][0], self._p, time_ns)
             pair = FacePair(request.target_module, request.target_face, request.module, request.face, prepared.plan.place_t)
+            if request.both_approach or self._p.approach == "straight":
+                decisions.meets[target] = sequence.meet(estimates[active][1], estimates[target][1])
             self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared))
             self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
 

@@ -120,7 +120,8 @@ class DockingSequence:
         self._r_t, self._q_t = _module_in(target, plan.request.target_module)
         self._line_t, self._farthest_m = plan.axis_t, parameters.standoff_m
         self._fixed: Estimate | None = None
-        """Where the target was in the beginning, at rest, for an approach that does not look at it again."""
+        """Where the target is to be met, at rest, for an approach that does not look at it again."""
+        self._met_w = np.zeros(3)
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
@@ -141,6 +142,13 @@ class DockingSequence:
         speed = self._speed(errors)
         self._gap_m = float(np.clip(self._gap_m + speed * dt, -self._p.push_m, self._farthest_m))
         return Steering(self._setpoint(self._fixed or target, speed), TABLE[self.stage].relay, self._gap_m)
+
+    def meet(self, active: Estimate, target: Estimate) -> np.ndarray:
+        """(3,) how far the target comes to meet the active body: half of the way, world, m. Called at most once, before `step`."""
+        left = 0.0 if self._p.approach == "straight" else self._p.standoff_m
+        _, q_t = _pose_of(target, self._r_t, self._q_t)
+        self._met_w = 0.5 * rotate(q_t, self._offset(active, target) - left * self.plan.axis_t)
+        return self._met_w
 
     def abort(self, time_ns: int, reason: str) -> None:
         """Ends the dock; both hold apart."""
@@ -164,11 +172,11 @@ class DockingSequence:
         return np.asarray(rotate_back(q_t, p_a - p_t) - self.plan.place_t)
 
     def _come_straight(self, active: Estimate, target: Estimate) -> None:
-        """From where the active module is to its place by where the target is now, without a halt."""
-        off = self._offset(active, target)
+        """From where the active module is to its place, without a halt, by where the target is and how far it comes."""
+        self._fixed = target._replace(p_wb=target.p_wb + self._met_w, nu=np.zeros(6))
+        off = self._offset(active, self._fixed)
         self._gap_m = self._farthest_m = float(np.linalg.norm(off))
         self._line_t = off / self._gap_m
-        self._fixed = target._replace(nu=np.zeros(6))
         self.stage = Stage.APPROACH
 
     # ------------------------------------------------------------ what comes next

@@ -116,6 +116,11 @@ class Guidance:
         """Where the docking sequence wants the body in this tick."""
         self._docking = setpoint
 
+    def move_by(self, by_w: np.ndarray) -> None:
+        """POSHOLD holds so far (3,), world, m, from where it held."""
+        at = self._glider.at
+        self._goal = rest_at(self._inside(at.p_wb + by_w), at.q_wb)
+
     def finished(self, time_ns: int) -> bool:
         """Whether no trajectory is under way."""
         if self.mode != Mode.AUTO or self._trajectory is None:

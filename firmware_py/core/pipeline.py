@@ -250,6 +250,8 @@ class Pipeline:
     def _steer(self, decisions: Decisions) -> None:
         for chain in self._chains:
             number = chain.body.index
+            if number in decisions.meets:
+                chain.guidance.move_by(decisions.meets[number])
             if number in decisions.setpoints:
                 chain.guidance.dock(decisions.setpoints[number])
             elif number in decisions.ended:

@@ -221,7 +221,7 @@ class Docking:
     approach: str = quantity(
         "staged",
         choices=("staged", "straight"),
-        help="straight: from where it is at contact_speed_m_s, as the paper's; staged: align at standoff_m first",
+        help="staged: align at standoff_m first; straight: both to the middle at contact_speed_m_s, as the paper's",
     )
     standoff_m: float = quantity(
         0.12, unit="m", low=0.02, high=2, help="gap at which the bodies are aligned", mavlink="DOCK_STANDOFF"
@@ -308,7 +308,7 @@ PAPER = Parameters(
     ),
     estimation=Estimation(kind="paper"),
     allocation=Allocation(mode="pseudo_inverse"),
-    docking=Docking(approach="straight", speed_m_s=0.03, contact_speed_m_s=0.03, sigma_m=0.1, tries=1),
+    docking=Docking(approach="straight", speed_m_s=0.03, contact_speed_m_s=0.03, sigma_m=0.1, push_s=15.0, tries=1),
 )
 """The paper's controller with the authors' gains, as accelerations: position 5 and 2, attitude 2 and 1. It docks in a straight line at
 constant speed, without a second try; the paper does not say how fast."""

@@ -1,8 +1,13 @@
 """Docks flown whole, one seed of each scenario; hundreds of seeds belong to `make accept`."""
 
+import dataclasses
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from firmware_py.description.parameters import PAPER, Parameters
+from firmware_py.description.signals import read_signals
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly
 from tools import near_miss
@@ -19,6 +24,26 @@ def test_modules_dock_and_no_command_jumps(fly: Fly, name: str) -> None:
     assert metrics["tries"] >= 1.0
     assert metrics["false_declarations"] == 0.0
     assert 0.0 < metrics["join_jump_n"] <= LARGEST_JUMP_N
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("parameters", "both"), [(Parameters(), False), (Parameters(), True), (PAPER, False)])
+def test_both_come_to_meet_each_other_where_that_is_asked_for(fly: Fly, tmp_path: Path, parameters: Parameters, both: bool) -> None:
+    scenario = load_scenario("dock")
+    step = tuple(dataclasses.replace(each, both_approach=both) for each in scenario.step)
+    result = fly(dataclasses.replace(scenario, step=step), 1, parameters)
+    assert result.metrics["docked"] == 1.0
+    truth = read_signals(tmp_path / "run" / "truth.mcap")
+    start, end = (truth["/plant/module0"]["p_wm"][k] for k in (990, -300))
+    moved = float(np.linalg.norm(end - start))
+    assert moved > 0.1 if both or parameters is PAPER else moved < 0.05
+
+
+@pytest.mark.slow
+def test_paper_s_dock_is_not_tried_again(fly: Fly) -> None:
+    """Seed 0 of its world jams."""
+    metrics = fly(load_scenario("dock"), 0, PAPER).metrics
+    assert (metrics["docked"], metrics["tries"], metrics["jams"]) == (0.0, 1.0, 1.0)
 
 
 @pytest.mark.slow
