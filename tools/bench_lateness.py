@@ -12,7 +12,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -26,9 +25,12 @@ from bench_entry import Entry
 from firmware_py.app.firmware import BusFrame
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.signals import read_signals
 from firmware_py.runtime.clock import MonotonicClock
-from firmware_py.runtime.rate_keeper import RateKeeper, absolute_sleeper
+from firmware_py.runtime.rate_keeper import LATENESS_EDGES_NS, RateKeeper, absolute_sleeper
 from firmware_py.runtime.realtime import TICK_PRIORITY, quiet_garbage, real_time
+from firmware_py.runtime.recorder import SIGNAL_LOG
+from firmware_py.runtime.tick_messages import TIMES
 from hil.realtime import fly_in_real_time
 from hil.scenario import load_scenario
 
@@ -38,7 +40,7 @@ SETTLE_S = 3.0
 BUS = "udp:239.74.163.11:43711"
 NS_PER_S = 1_000_000_000
 ENDS = 0.1
-"""Share of the flying ticks at either end: by how much the earliest end of a tick moves against its deadline is the drift."""
+"""Share of the flight at either end: by how much the median lateness of its ticks' starts differs is the drift."""
 
 
 def idle_loop(rate_hz: int, duration_s: float, begin: Event, result: Connection) -> None:
@@ -59,8 +61,6 @@ def fly(rate_hz: int, duration_s: float) -> dict[str, Any]:
     """One flight and the idle loop beside it."""
     scenario = load_scenario("hover")
     scenario = replace(scenario, task=replace(scenario.task, settle_s=SETTLE_S, duration_s=duration_s - SETTLE_S))
-    period_ns = NS_PER_S // rate_hz
-    offsets_ns = np.zeros(round(duration_s * rate_hz), dtype=np.int64)
     context = multiprocessing.get_context("spawn")
     begin = context.Event()
     ours, theirs = context.Pipe()
@@ -68,16 +68,21 @@ def fly(rate_hz: int, duration_s: float) -> dict[str, Any]:
     ours.recv()
 
     def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        offsets_ns[outputs.tick - 1] = time.monotonic_ns() - outputs.time_ns // period_ns * period_ns
         if outputs.tick == 1:
             begin.set()
 
     with tempfile.TemporaryDirectory() as folder:
         flown = fly_in_real_time(scenario, 0, Parameters(), Path(folder), BUS, rate_hz, observers=[observe])
-    flying_ns = offsets_ns[round(SETTLE_S * rate_hz) :]
-    some = round(ENDS * len(flying_ns))
-    drift_ns = float(np.min(flying_ns[-some:]) - np.min(flying_ns[:some]))
-    return {**flown._asdict(), "idle_ns": ours.recv(), "drift_us": drift_ns * 1e-3}
+        times = read_signals(Path(folder) / SIGNAL_LOG)[TIMES]
+    return {**flown._asdict(), "idle_ns": ours.recv(), "drift_us": drift_ns(times["lateness_ticks"]) * 1e-3}
+
+
+def drift_ns(counts: np.ndarray) -> float:
+    """How much later ticks start at the end of a flight than in the beginning, by counts (k, bins) of all ticks so far."""
+    some = max(1, round(ENDS * len(counts)))
+    first, last = (np.cumsum(counts[end] - counts[start]) for start, end in ((some, 2 * some), (-1 - some, -1)))
+    medians = [LATENESS_EDGES_NS[int(np.searchsorted(ticks, 0.5 * ticks[-1]))] for ticks in (first, last)]
+    return float(medians[1] - medians[0])
 
 
 def lateness_entries() -> list[Entry]:
