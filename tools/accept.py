@@ -29,6 +29,7 @@ from accept_measures import (
     timed,
     told_from_logs,
 )
+from accept_safety import SAFETY
 from accept_tuning import TUNING
 from rich import box
 from rich.console import Console
@@ -280,6 +281,7 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     *GROUND,
+    *SAFETY,
     Group(
         "vehicle-process", 8, "MODCUBE_FULL=1 pytest -s tests/closed_loop/test_vehicle_process.py",
         said_by_tests("tests/closed_loop/test_vehicle_process.py"),

@@ -1,0 +1,153 @@
+"""For tools/accept.py: the figures of flights in which something breaks (hil/safety.py, hil/fuzz.py), over all seeds."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from accept_figures import Figure, Group
+from accept_measures import JOBS, Values
+
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+from hil.fuzz import fuzz_flight
+from hil.metrics import flight_metrics
+from hil.plant.fault_spec import Fault
+from hil.safety import ThrusterFlight, command_outlives_frames_ms, flown, fly_to_estop, hover_blind, spiral_with, timed
+
+HEALTHY, STOPPED, BLIND, LOSSY = range(100), range(1000), range(50), range(5)
+FUZZED_FRAMES = 1_000_000
+LOST_SHARE = 0.3
+
+
+def _all(work: Callable[[Any], Any], inputs: Iterable[Any]) -> list[Any]:
+    with ProcessPoolExecutor(JOBS, mp_context=get_context("spawn")) as pool:
+        return list(pool.map(work, inputs))
+
+
+def _lying(thruster: int) -> ThrusterFlight:
+    return spiral_with([thruster], "thruster_fake_rpm")
+
+
+def _healthy(seed: int) -> ThrusterFlight:
+    return spiral_with([], seed=seed)
+
+
+def _lossy(seed: int) -> float:
+    flight = flown(timed("spiral", 15.0, 40.0, Fault(kind="frame_loss", value=LOST_SHARE)), seed)
+    return flight_metrics(flight.between(15_000_000_000, 55_000_000_000))["position_rmse_m"]
+
+
+def thrusters_out(folder: Path) -> Values:
+    """Every thruster dead, every pair dead, every thruster lying, and healthy flights, all on the spiral."""
+    matrix = assemble_vehicle(load_vehicle("modcube")).thrusters.matrix
+    count = matrix.shape[1]
+    pairs = list(itertools.combinations(range(count), 2))
+    whole = {pair: bool(np.linalg.matrix_rank(np.delete(matrix, pair, axis=1), tol=1e-6) == 6) for pair in pairs}
+    singles = _all(spiral_with, ([thruster] for thruster in range(count)))
+    found = dict(zip(pairs, _all(spiral_with, pairs), strict=True))
+    flown_on, given_up = ([found[pair] for pair in pairs if whole[pair] == is_whole] for is_whole in (True, False))
+    liars, healthy = _all(_lying, range(count)), _all(_healthy, HEALTHY)
+    every = [*singles, *found.values(), *liars, *healthy]
+    return {
+        "single rmse": max(f.rmse_m for f in singles), "single peak": max(f.peak_m for f in singles),
+        "single angle": max(f.angle_peak_deg for f in singles), "single found": max(f.found_s[0] for f in singles),
+        "pairs": len(flown_on), "pair rmse": max(f.rmse_m for f in flown_on), "pair angle": max(f.angle_peak_deg for f in flown_on),
+        "lost rmse": max(f.rmse_m for f in given_up), "lost surfaced": sum(f.ends_in == "SURFACE" for f in given_up) / len(given_up),
+        "lying found": max(f.found_s[0] for f in liars), "blamed": sum(len(f.blamed) for f in every),
+    }  # fmt: skip
+
+
+def frames_lost(folder: Path) -> Values:
+    """Spirals through lost frames, and how long a command outlives the last frame."""
+    return {"rmse": max(_all(_lossy, LOSSY)), "outlives": command_outlives_frames_ms()}
+
+
+def stopped(folder: Path) -> Values:
+    """E-stops at random ticks."""
+    flights = _all(fly_to_estop, STOPPED)
+    return {"violations": sum(f.violations for f in flights), "armed": sum(f.was_armed for f in flights)}
+
+
+def blind(folder: Path) -> Values:
+    """Five seconds without tags."""
+    flights = _all(hover_blind, BLIND)
+    errors, normalised = [f.error_m for f in flights], np.array([f.normalised for f in flights])
+    return {
+        "median": float(np.median(errors)), "p95": float(np.quantile(errors, 0.95)), "sigmas": float(np.abs(normalised).max()),
+        "square": float(np.mean(normalised**2)),
+    }  # fmt: skip
+
+
+def fuzzed(folder: Path) -> Values:
+    """Frames that nobody should send, at a robot that is armed."""
+    result = fuzz_flight(FUZZED_FRAMES)
+    return {"beyond": result.beyond, "unaccounted": abs(result.accepted + sum(result.dropped.values()) - result.frames)}
+
+
+def fault_matrix(folder: Path) -> Values:
+    """Every fault in every mode against what the table promises."""
+    command = [Path(sys.executable).with_name("modcube"), "hil", "campaign", "faults", "--out", folder / "faults"]
+    with (folder / "faults.log").open("w", encoding="utf-8") as log:
+        return {"failed": subprocess.run(command, stdout=log, stderr=subprocess.STDOUT).returncode}
+
+
+SAFETY: tuple[Group, ...] = (
+    Group(
+        "faults", 7, "modcube hil campaign faults", fault_matrix,
+        (Figure("faults by modes: status of the campaign, 0 where all is as the table promises", "failed", high=0.0),),
+    ),
+    Group(
+        "thrusters", 7, "make accept ONLY=thrusters", thrusters_out,
+        (
+            Figure("one thruster dead on the spiral, worst of 8: position RMSE", "single rmse", high=12.0, unit="mm", scale=1e3),
+            Figure("the same: largest position error", "single peak", high=60.0, unit="mm", scale=1e3),
+            Figure("the same: largest attitude error", "single angle", high=15.0, unit="deg"),
+            Figure("the same: found after", "single found", high=0.5, unit="s"),
+            Figure("pairs of dead thrusters that leave all six axes", "pairs", low=25.0, high=25.0),
+            Figure("two thrusters dead, worst of those: position RMSE", "pair rmse", high=25.0, unit="mm", scale=1e3),
+            Figure("the same: largest attitude error", "pair angle", high=30.0, unit="deg"),
+            Figure("pairs that lose an axis: position RMSE until SURFACE, worst", "lost rmse", high=25.0, unit="mm", scale=1e3),
+            Figure("pairs that lose an axis: share that ends in SURFACE", "lost surfaced", low=1.0),
+            Figure("a thruster that lies, worst of 8: found after", "lying found", high=2.0, unit="s"),
+            Figure("healthy thrusters left out, in all of these and 100 healthy spirals", "blamed", high=0.0),
+        ),
+    ),
+    Group(
+        "frame-loss", 7, "make accept ONLY=frame-loss", frames_lost,
+        (
+            Figure("spiral through 30 % lost frames, 5 seeds: position RMSE, worst", "rmse", high=8.0, unit="mm", scale=1e3),
+            Figure("all frames lost: a command outlives the last frame by", "outlives", high=110.0, unit="ms"),
+        ),
+    ),
+    Group(
+        "estop", 7, "make accept ONLY=estop", stopped,
+        (
+            Figure("1000 e-stops: ticks after it with a command, or without the frames that say none", "violations", high=0.0),
+            Figure("the same: flights that were armed when it came", "armed", low=500.0),
+        ),
+    ),
+    Group(
+        "blind", 7, "make accept ONLY=blind", blind,
+        (
+            Figure("hover, five seconds without tags, 50 seeds: horizontal error, median", "median", high=30.0, unit="mm", scale=1e3),
+            Figure("the same: 95 %", "p95", high=70.0, unit="mm", scale=1e3),
+            Figure("the same: error of the estimate, worst, in its own sigmas", "sigmas", high=4.0),
+            Figure("the same: mean square of them (1: consistent)", "square", low=0.5, high=2.0),
+        ),
+    ),
+    Group(
+        "fuzz", 7, "make accept ONLY=fuzz", fuzzed,
+        (
+            Figure("a million fuzzed frames: commands beyond their limits", "beyond", high=0.0),
+            Figure("the same: frames that no count accounts for", "unaccounted", high=0.0),
+        ),
+    ),
+)  # fmt: skip
