@@ -40,7 +40,9 @@ SETTLE_S = 3.0
 BUS = "udp:239.74.163.11:43711"
 NS_PER_S = 1_000_000_000
 ENDS = 0.1
-"""Share of the flight at either end: by how much the median lateness of its ticks' starts differs is the drift."""
+"""Share of the flight: the drift is by how much its last ticks start later, against the grid of the first deadline, than those after the
+settling. Medians, from bins a quarter wide.
+"""
 
 
 def idle_loop(rate_hz: int, duration_s: float, begin: Event, result: Connection) -> None:
@@ -61,6 +63,7 @@ def fly(rate_hz: int, duration_s: float) -> dict[str, Any]:
     """One flight and the idle loop beside it."""
     scenario = load_scenario("hover")
     scenario = replace(scenario, task=replace(scenario.task, settle_s=SETTLE_S, duration_s=duration_s - SETTLE_S))
+    deadlines_ns: list[int] = []
     context = multiprocessing.get_context("spawn")
     begin = context.Event()
     ours, theirs = context.Pipe()
@@ -68,21 +71,31 @@ def fly(rate_hz: int, duration_s: float) -> dict[str, Any]:
     ours.recv()
 
     def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        deadlines_ns.append(outputs.time_ns)
         if outputs.tick == 1:
             begin.set()
 
     with tempfile.TemporaryDirectory() as folder:
         flown = fly_in_real_time(scenario, 0, Parameters(), Path(folder), BUS, rate_hz, observers=[observe])
         times = read_signals(Path(folder) / SIGNAL_LOG)[TIMES]
-    return {**flown._asdict(), "idle_ns": ours.recv(), "drift_us": drift_ns(times["lateness_ticks"]) * 1e-3}
+    drift_us = drift_ns(times["lateness_ticks"], deadlines_ns, NS_PER_S // rate_hz) * 1e-3
+    return {**flown._asdict(), "idle_ns": ours.recv(), "drift_us": drift_us}
 
 
-def drift_ns(counts: np.ndarray) -> float:
-    """How much later ticks start at the end of a flight than in the beginning, by counts (k, bins) of all ticks so far."""
+def drift_ns(counts: np.ndarray, deadlines_ns: Sequence[int], period_ns: int) -> float:
+    """How much later ticks start at the end of a flight than in the beginning.
+
+    Args:
+        counts: (k, bins) of the lateness of all ticks so far, against their deadlines.
+        deadlines_ns: of all ticks.
+    """
+    moved = (np.array(deadlines_ns) - deadlines_ns[0] + period_ns // 2) % period_ns - period_ns // 2
+    grid = float(np.median(moved[-max(1, round(ENDS * len(moved))) :]))
     some = max(1, round(ENDS * len(counts)))
     first, last = (np.cumsum(counts[end] - counts[start]) for start, end in ((some, 2 * some), (-1 - some, -1)))
-    medians = [LATENESS_EDGES_NS[int(np.searchsorted(ticks, 0.5 * ticks[-1]))] for ticks in (first, last)]
-    return float(medians[1] - medians[0])
+    edges = (*LATENESS_EDGES_NS, LATENESS_EDGES_NS[-1])
+    medians = [edges[int(np.searchsorted(ticks, 0.5 * ticks[-1]))] for ticks in (first, last)]
+    return grid + float(medians[1] - medians[0])
 
 
 def lateness_entries() -> list[Entry]:

@@ -5,7 +5,7 @@ Works on the estimates of this tick; the pipeline carries out the joins and part
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -146,15 +146,22 @@ class DockingStage:
             if body in (dock.active, dock.target):
                 dock.sequence.abort(time_ns, reason)
 
-    def step(self, inputs: Inputs, estimates: Mapping[int, tuple[Body, Estimate]]) -> Decisions:
-        """One tick. `estimates`: body and its estimate, by the body's number."""
+    def step(
+        self, inputs: Inputs, estimates: Mapping[int, tuple[Body, Estimate]], holding: Collection[int] = ()
+    ) -> Decisions:
+        """One tick.
+
+        Args:
+            estimates: body and its estimate, by the body's number.
+            holding: bodies that hold a place which may be moved: only these come to meet another.
+        """
         self.events, self.records = [], []
         decisions = Decisions({}, [], [], [], {})
         if not (inputs.prepared or self._docks or self._undocks or self._joints.rows.size):
             return decisions
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:
-            self._begin(prepared, inputs.time_ns, estimates, decisions)
+            self._begin(prepared, inputs.time_ns, estimates, holding, decisions)
         if self._joints.rows.size:
             self._joints.step(inputs.time_ns, inputs.modules, poses)
         for dock in list(self._docks):
@@ -174,7 +181,14 @@ class DockingStage:
 
     # ------------------------------------------------------------ beginnings
 
-    def _begin(self, prepared: Prepared, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions) -> None:
+    def _begin(
+        self,
+        prepared: Prepared,
+        time_ns: int,
+        estimates: Mapping[int, tuple[Body, Estimate]],
+        holding: Collection[int],
+        decisions: Decisions,
+    ) -> None:
         request = prepared.request
         if prepared.plan is None:
             self._say(WARNING, f"dock refused: {prepared.refusal}")
@@ -184,10 +198,10 @@ class DockingStage:
             self._say(INFORMATION, f"undocking module {request.module} from {request.target_module}")
         else:
             active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
-            sequence = DockingSequence(prepared.plan, estimates[active][0], estimates[target][0], self._p, time_ns)
+            taken = any(target in (dock.active, dock.target) for dock in self._docks)
+            comes = (request.both_approach or self._p.approach == "straight") and target in holding and not taken
+            sequence = DockingSequence(prepared.plan, estimates[active][0], estimates[target][0], self._p, time_ns, comes)
             pair = FacePair(request.target_module, request.target_face, request.module, request.face, prepared.plan.place_t)
-            if request.both_approach or self._p.approach == "straight":
-                decisions.meets[target] = sequence.meet(estimates[active][1], estimates[target][1])
             self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared))
             self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
 
@@ -220,11 +234,13 @@ class DockingStage:
         if stage == Stage.DOCKED:
             decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))
             self._docks.remove(dock)
-        elif stage in (Stage.ABORTED, Stage.FAILED) and steering.gap_m >= self._p.standoff_m:
+        elif stage in (Stage.ABORTED, Stage.FAILED) and steering.is_apart:
             decisions.ended.append(dock.active)
             self._docks.remove(dock)
         else:
             decisions.setpoints[dock.active] = steering.active
+        if steering.meets is not None:
+            decisions.meets[dock.target] = steering.meets
 
     def _release(self, undock: _Undock, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions) -> None:
         plan = undock.prepared.plan

@@ -1,7 +1,8 @@
 """Docking as a sequence of stages, a table: what each stage does, what ends it, and what comes then.
 
 The active body is steered against the target's estimated pose, so that the target's wandering is followed. The gap is the distance
-between the two faces; lateral and angle error are those of the active module against its place before the target's face.
+between the two faces; lateral and angle error are those of the active module against its place before the target's face. The paper's way,
+`approach = "straight"`, begins with the approach, on a line that is drawn once; its gap is what is left of that line.
 """
 
 from __future__ import annotations
@@ -107,21 +108,28 @@ class Steering(NamedTuple):
 
     active: Setpoint
     relay: int
-    gap_m: float
+    is_apart: bool
+    """As far from the target as a dock that failed leaves it."""
+    meets: np.ndarray | None
+    """(3,) how far the target is to come to meet the active body, world, m; told once, in the first tick."""
 
 
 class DockingSequence:
     """One dock of one active body to one target body."""
 
-    def __init__(self, plan: DockPlan, active: Body, target: Body, parameters: Docking, time_ns: int) -> None:
+    def __init__(
+        self, plan: DockPlan, active: Body, target: Body, parameters: Docking, time_ns: int, comes: bool = False
+    ) -> None:
+        """`comes`: the target is free to come half of the way."""
         self.plan = plan
+        self._comes = comes
         self._p = parameters
         self._r_a, self._q_a = _module_in(active, plan.request.module)
         self._r_t, self._q_t = _module_in(target, plan.request.target_module)
         self._line_t, self._farthest_m = plan.axis_t, parameters.standoff_m
         self._fixed: Estimate | None = None
         """Where the target is to be met, at rest, for an approach that does not look at it again."""
-        self._met_w = np.zeros(3)
+        self._under_way = False
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
@@ -133,22 +141,16 @@ class DockingSequence:
 
     def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus) -> Steering:
         """Moves the sequence on by one tick."""
-        if self._p.approach == "straight" and self.stage == Stage.PRE_APPROACH:
-            self._come_straight(active, target)
+        meets = None if self._under_way else self._set_off(active, target)
         errors = self.errors(active, target)
         dt = (time_ns - self._last_ns) * 1e-9
         self._last_ns = time_ns
         self._decide(time_ns, active, target, errors, status)
         speed = self._speed(errors)
         self._gap_m = float(np.clip(self._gap_m + speed * dt, -self._p.push_m, self._farthest_m))
-        return Steering(self._setpoint(self._fixed or target, speed), TABLE[self.stage].relay, self._gap_m)
-
-    def meet(self, active: Estimate, target: Estimate) -> np.ndarray:
-        """(3,) how far the target comes to meet the active body: half of the way, world, m. Called at most once, before `step`."""
-        left = 0.0 if self._p.approach == "straight" else self._p.standoff_m
-        _, q_t = _pose_of(target, self._r_t, self._q_t)
-        self._met_w = 0.5 * rotate(q_t, self._offset(active, target) - left * self.plan.axis_t)
-        return self._met_w
+        setpoint = self._setpoint(target if self._fixed is None else self._fixed, speed)
+        is_apart = self._gap_m >= self._p.standoff_m
+        return Steering(setpoint, TABLE[self.stage].relay, is_apart, None if self.stage in ENDED else meets)
 
     def abort(self, time_ns: int, reason: str) -> None:
         """Ends the dock; both hold apart."""
@@ -171,13 +173,21 @@ class DockingSequence:
         p_t, q_t = _pose_of(target, self._r_t, self._q_t)
         return np.asarray(rotate_back(q_t, p_a - p_t) - self.plan.place_t)
 
-    def _come_straight(self, active: Estimate, target: Estimate) -> None:
-        """From where the active module is to its place, without a halt, by where the target is and how far it comes."""
-        self._fixed = target._replace(p_wb=target.p_wb + self._met_w, nu=np.zeros(6))
-        off = self._offset(active, self._fixed)
-        self._gap_m = self._farthest_m = float(np.linalg.norm(off))
-        self._line_t = off / self._gap_m
-        self.stage = Stage.APPROACH
+    def _set_off(self, active: Estimate, target: Estimate) -> np.ndarray | None:
+        """Shares the way with the target if it comes, and draws the line of a straight approach; returns how far it comes."""
+        self._under_way = True
+        straight = self._p.approach == "straight"
+        off, (_, q_t) = self._offset(active, target), _pose_of(target, self._r_t, self._q_t)
+        left = 0.0 if straight else self._p.standoff_m
+        meets = 0.5 * rotate(q_t, off - left * self.plan.axis_t) if self._comes else None
+        if straight:
+            self._fixed = target._replace(p_wb=target.p_wb + (0.0 if meets is None else meets), nu=np.zeros(6))
+            off = self._offset(active, self._fixed)
+            self._gap_m = float(np.linalg.norm(off))
+            self._line_t = off / self._gap_m if self._gap_m > 0.0 else self.plan.axis_t
+            self._farthest_m = max(self._gap_m, self._p.standoff_m)
+            self._enter(Stage.APPROACH, self._entered_ns)
+        return meets
 
     # ------------------------------------------------------------ what comes next
 

@@ -117,7 +117,7 @@ class Guidance:
         self._docking = setpoint
 
     def move_by(self, by_w: np.ndarray) -> None:
-        """POSHOLD holds so far (3,), world, m, from where it held."""
+        """POSHOLD's place moves by so much (3,), world, m, from where its set-point is now."""
         at = self._glider.at
         self._goal = rest_at(self._inside(at.p_wb + by_w), at.q_wb)
 

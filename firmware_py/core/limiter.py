@@ -98,7 +98,7 @@ class Limiter:
     def _voltage_scale(self, voltage_v: np.ndarray) -> np.ndarray:
         """(n,) force at a full command over that at the nominal voltage; 1 where the reading is not believed."""
         reading = voltage_v.tobytes()
-        if reading != self._scaled_for:  # readings come at a tenth of the tick's rate
+        if reading != self._scaled_for:  # readings come at 10 Hz
             ratio = voltage_v / self._nominal_v
             self._scale = np.asarray((np.where(is_believed(ratio), ratio, 1.0) ** VOLTAGE_EXPONENT)[self._t.module])
             self._scaled_for = reading

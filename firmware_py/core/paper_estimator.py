@@ -107,18 +107,23 @@ class TagOnlyEstimator:
             ready=self._accepted >= READY_AFTER,
         )
 
+    def _start(self, p_wb: np.ndarray, q_wb: np.ndarray) -> None:
+        self._position, self._q_wb, self._rate_b = np.concatenate([p_wb, np.zeros(3)]), q_wb, np.zeros(3)
+        self._p_position, self._p_attitude = np.eye(6), np.eye(6)
+        self._accepted, self._refused_in_row = 1, 0
+
     def _fuse(self, pose: BodyPose) -> None:
         p_wb = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
         self._last_tag_ns = pose.capture_ns
-        if not self._accepted or self._refused_in_row >= RESET_AFTER:
-            self._position, self._q_wb, self._rate_b = np.concatenate([p_wb, np.zeros(3)]), pose.q_wb, np.zeros(3)
-            self._p_position, self._p_attitude = np.eye(6), np.eye(6)
-            self._accepted, self._refused_in_row = 1, 0
+        if not self._accepted:
+            self._start(p_wb, pose.q_wb)
             return
         turn = log(multiply(conjugate(self._q_wb), pose.q_wb))
         if float(np.linalg.norm(turn)) > PAPER_FLIP_RAD and self._accepted > READY_AFTER:
             self._rejected += 1
             self._refused_in_row += 1
+            if self._refused_in_row >= RESET_AFTER:
+                self._start(p_wb, pose.q_wb)
             return
         self._refused_in_row = 0
         along, angle = self._p.tag_sigma_axis_m, self._p.tag_sigma_rad

@@ -237,7 +237,8 @@ class Pipeline:
 
     def _dock(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
         """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
-        decisions = self.docking.step(inputs, {c.body.index: (c.body, estimates[c.body.index]) for c in self._chains})
+        holding = [c.body.index for c in self._chains if c.supervisor.armed and c.supervisor.mode == Mode.POSHOLD]
+        decisions = self.docking.step(inputs, {c.body.index: (c.body, estimates[c.body.index]) for c in self._chains}, holding)
         outputs.docks += self.docking.records
         outputs.joints = self.docking.joints
         outputs.events += self.docking.events

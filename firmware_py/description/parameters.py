@@ -221,7 +221,7 @@ class Docking:
     approach: str = quantity(
         "staged",
         choices=("staged", "straight"),
-        help="staged: align at standoff_m first; straight: both to the middle at contact_speed_m_s, as the paper's",
+        help="staged: align at standoff_m first; straight: on one line to the place, which a target that holds comes to meet half way",
     )
     standoff_m: float = quantity(
         0.12, unit="m", low=0.02, high=2, help="gap at which the bodies are aligned", mavlink="DOCK_STANDOFF"

@@ -15,7 +15,8 @@ M3 = types.UniTuple(V3, 3)
 
 
 def compiled(signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles for one signature, code that makes no array: it need not count references, which costs more than the sums.
+    """Compiles for one signature, code that makes no array: it need not count references, which costs more than the sums (numba's own,
+    unpublished `_nrt`).
 
     Dividing by zero gives infinity as in numpy: to check costs a third of the time.
     """

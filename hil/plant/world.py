@@ -237,7 +237,8 @@ class World(DockedBodies):
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
 
     def lend(self, ticks: int) -> Arrays:
-        """The arrays of a lone module for `hil.batch`, which moves them on by so many ticks; the clock already stands at their end.
+        """The arrays of a lone module for `hil.batch`, which moves them on by so many ticks; the clock already stands at their end, and
+        nobody may ask for the truth before the batch has flown.
 
         Raises DescriptionError for more than one module, or a thruster that is broken: these need Python between the ticks.
         """

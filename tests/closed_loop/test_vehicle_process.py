@@ -1,7 +1,8 @@
 """The vehicle's process from outside: how soon it flies, how soon again when it was killed, how much memory it takes.
 
-The clock counts with MODCUBE_FULL=1 (`make accept`). Beside other tests it says nothing: there the processor time that the
-process needs until its first tick is held to twice the limit, which compiling anew, 20 s, would break; and nobody waits for it to arm.
+The module floats upright, so that nothing but the process is waited for. The clock counts with MODCUBE_FULL=1 (`make accept`). Beside
+other tests it says nothing: there the processor time that the process needs until its first tick is held to twice the limit, which
+compiling anew, 20 s, would break; and nobody waits for it to arm.
 """
 
 import os

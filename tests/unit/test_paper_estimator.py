@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body
-from firmware_py.core.estimator import READY_AFTER
+from firmware_py.core.estimator import READY_AFTER, RESET_AFTER
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
 from firmware_py.core.types import BodyPose, Estimate, Measured
@@ -93,3 +93,17 @@ def test_paper_estimator_refuses_flips(body: Body) -> None:
     assert estimate.rejected == 1
     np.testing.assert_allclose(estimate.p_wb, P_WB, atol=1e-6)
     np.testing.assert_allclose(difference(estimate.q_wb, Q_WB), 0.0, atol=1e-6)
+
+
+def test_paper_estimator_begins_anew_where_tags_stay_elsewhere_and_forgives_flips(body: Body) -> None:
+    estimator = TagOnlyEstimator(body, PAPER, PERIOD)
+    turned = multiply(Q_WB, exp(np.array([1.0, 0.0, 0.0])))
+    for k in range(100):
+        estimator.step(k * PERIOD, seen(k * PERIOD), np.zeros(6))
+    for k in range(100, 100 + RESET_AFTER - 1):
+        estimator.step(k * PERIOD, seen(k * PERIOD, P_WB, turned), np.zeros(6))
+    assert estimator.step(200 * PERIOD, seen(200 * PERIOD), np.zeros(6)).ready, "a good tag after many flips is no reason to forget"
+    for k in range(300, 300 + RESET_AFTER + READY_AFTER):
+        estimate = estimator.step(k * PERIOD, seen(k * PERIOD, P_WB, turned), np.zeros(6))
+    np.testing.assert_allclose(difference(estimate.q_wb, turned), 0.0, atol=1e-3)
+    assert estimate.ready
