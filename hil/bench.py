@@ -55,6 +55,7 @@ class Bench:
     is_dead: bool = False
     """The firmware's process is killed, and another waits to take its place."""
 
+    @quiet_garbage()
     def fly(
         self, observers: Sequence[Observer] = (), progress: Callable[[float], None] | None = None, truth: TruthRecorder | None = None
     ) -> float:
@@ -64,27 +65,26 @@ class Bench:
         period_ns = self.fleet.period_ns
         sent: list[BusFrame] = []
         outputs: Outputs | None = None
-        with quiet_garbage():
-            began = time.perf_counter()
-            for tick in range(1, self.script.ticks + 1):
-                time_ns = tick * period_ns
-                if self.faults.process_killed(time_ns):
-                    lockstep, outputs, sent = self._without_firmware(observers, sent), None, []
-                    if truth is not None:
-                        truth.record_world(tick, self.nodes.world)
-                    continue
-                self.is_dead = False
-                sent += lockstep.start_tick(tick, time_ns)
-                heard = drain(plant_ports, sent, self.patience_looks)
-                answers = send(plant_ports, [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
+        began = time.perf_counter()
+        for tick in range(1, self.script.ticks + 1):
+            time_ns = tick * period_ns
+            if self.faults.process_killed(time_ns):
+                lockstep, outputs, sent = self._without_firmware(observers, sent), None, []
                 if truth is not None:
                     truth.record_world(tick, self.nodes.world)
-                outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), answers)
-                if self.script.is_over(time_ns):
-                    break
-                if progress is not None and tick % self.fleet.rate_hz == 0:
-                    progress(time_ns * 1e-9)
-            return time.perf_counter() - began
+                continue
+            self.is_dead = False
+            sent += lockstep.start_tick(tick, time_ns)
+            heard = drain(plant_ports, sent, self.patience_looks)
+            answers = send(plant_ports, [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
+            if truth is not None:
+                truth.record_world(tick, self.nodes.world)
+            outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), answers)
+            if self.script.is_over(time_ns):
+                break
+            if progress is not None and tick % self.fleet.rate_hz == 0:
+                progress(time_ns * 1e-9)
+        return time.perf_counter() - began
 
     def _without_firmware(self, observers: Sequence[Observer], sent: Sequence[BusFrame]) -> Lockstep:
         """A tick in which the firmware's process is dead; returns the one that will be started in its place."""

@@ -44,6 +44,8 @@ class DockScript:
         asked = self._arm(time_ns, last)
         if time_ns < self.begin_ns:
             return asked
+        if any([self._is_given_up(r, last) for r in self._running]):  # the steps after it have lost their sense
+            self._running, self._steps = [], []
         self._running = [r for r in self._running if not self._is_over(r, time_ns, last)]
         if not self._running and self._steps:
             while True:
@@ -89,16 +91,17 @@ class DockScript:
         record = next(r for r in last.records if r.body == body)
         return [Request(Action.TRACK, body, _path(step, self._scenario, record.setpoint.p_wb, record.setpoint.q_wb))]
 
+    def _is_given_up(self, running: _Running, last: Outputs) -> bool:
+        """Whether a dock that was under way has ended, and its bodies are still two. One that is refused never was."""
+        docking = [r.mode == Mode.DOCK for r in last.records if r.body == self._leader(running.module)]
+        was_docking, running.docking = running.docking, any(docking)
+        return running.step.do == "dock" and was_docking and docking == [False]
+
     def _is_over(self, running: _Running, time_ns: int, last: Outputs) -> bool:
         step, bodies = running.step, {r.body for r in last.records}
         if step.do == "dock":
-            mode = next((r.mode for r in last.records if r.body == self._leader(running.module)), None)
-            if mode is not None:
-                given_up = running.began and mode != Mode.DOCK
-                running.began = running.began or mode == Mode.DOCK
-                if given_up:  # the steps after it have lost their sense
-                    self._steps.clear()
-                return given_up
+            if self._leader(running.module) in bodies:
+                return False
             mine, other = self._group(running.module), self._group(running.target)
             self._groups.remove(mine)
             other += mine
@@ -127,8 +130,8 @@ class _Running:
 
     def __init__(self, step: Step, end_ns: int, module: int, target: int) -> None:
         self.step, self.end_ns, self.module, self.target = step, end_ns, module, target
-        self.began = False
-        """A dock is under way."""
+        self.docking = False
+        """In the tick before."""
 
 
 def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> paths.Trajectory:

@@ -22,7 +22,7 @@ from firmware_py.core.types import Action, Inputs, Mode, Outputs, Request, Stick
 from firmware_py.description.parameters import Parameters
 from hil.bench import fly_scenario, open_bench
 from hil.fault_table import ROWS
-from hil.metrics import rotation_vectors
+from hil.metrics import flight_metrics, rotation_vectors
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
 from hil.scenario import MODES, Scenario, load_scenario
@@ -119,6 +119,14 @@ def hover_blind(seed: int, blind_s: float = 5.0, settle_s: float = 12.0) -> Blin
 
 
 # ---------------------------------------------------------------- frames
+
+
+def spiral_through_loss(seed: int, share: float = 0.3) -> float:
+    """Position RMSE of a spiral of which a share of the frames is lost in both directions, m."""
+    base = load_scenario("spiral")
+    begin_ns, end_ns = round(base.task.settle_s * 1e9), round(base.duration_s * 1e9)
+    flight = flown(dataclasses.replace(base, fault=(Fault(kind="frame_loss", value=share),)), seed).between(begin_ns, end_ns)
+    return float(flight_metrics(flight)["position_rmse_m"])
 
 
 def command_outlives_frames_ms(seed: int = 0) -> float:

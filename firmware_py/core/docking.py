@@ -153,7 +153,7 @@ class DockingStage:
 
         Args:
             estimates: body and its estimate, by the body's number.
-            holding: bodies that hold a place which may be moved: only these come to meet another.
+            holding: bodies that hold a place which may be moved: only these come to meet another. Looked at when a dock begins.
         """
         self.events, self.records = [], []
         decisions = Decisions({}, [], [], [], {})

@@ -117,8 +117,8 @@ class Guidance:
         self._docking = setpoint
 
     def move_by(self, by_w: np.ndarray) -> None:
-        """POSHOLD's place moves by so much (3,), world, m, from where its set-point is now."""
-        at = self._glider.at
+        """POSHOLD's place, or the one that it is on its way to, moves by so much (3,), world, m."""
+        at = self._glider.at if self._goal is None else self._goal
         self._goal = rest_at(self._inside(at.p_wb + by_w), at.q_wb)
 
     def finished(self, time_ns: int) -> bool:

@@ -151,7 +151,7 @@ def _add_model(inertia, righting, nodes, rotational, linear, nu, q_wb, out):  # 
 
 @njit(f"Tuple(({V},int64))({M})", cache=True)
 def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
-    """Mean of the blocks that are whole, and how many there are; others have NaN for a wrench."""
+    """Mean (w,) of those of the blocks (k, w) that are whole, and how many there are; others have NaN for a wrench."""
     total, count = np.zeros(blocks.shape[1]), 0
     for k in range(blocks.shape[0]):
         if not math.isnan(blocks[k, 0]):

@@ -237,8 +237,9 @@ class Pipeline:
 
     def _dock(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
         """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
-        holding = [c.body.index for c in self._chains if c.supervisor.armed and c.supervisor.mode == Mode.POSHOLD]
-        decisions = self.docking.step(inputs, {c.body.index: (c.body, estimates[c.body.index]) for c in self._chains}, holding)
+        held = [c for c in self._chains if c.supervisor.armed and c.supervisor.mode == Mode.POSHOLD] if inputs.prepared else []
+        bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self._chains}
+        decisions = self.docking.step(inputs, bodies, [c.body.index for c in held])
         outputs.docks += self.docking.records
         outputs.joints = self.docking.joints
         outputs.events += self.docking.events

@@ -311,7 +311,7 @@ PAPER = Parameters(
     docking=Docking(approach="straight", speed_m_s=0.03, contact_speed_m_s=0.03, sigma_m=0.1, push_s=15.0, tries=1),
 )
 """The paper's controller with the authors' gains, as accelerations: position 5 and 2, attitude 2 and 1. It docks in a straight line at
-constant speed, without a second try; the paper does not say how fast."""
+constant speed, without a second try and however unsure it is. The paper says neither how fast nor for how long it pushes: synthetic."""
 
 CONTROLLERS = {"modcube": Parameters(), "least_power": Parameters(allocation=Allocation(mode="least_power")), "paper": PAPER}
 """Whole sets of parameters by name."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from hil.plant.vectors import F1, F2, F8, M3, V3, compiled, matrix_of, minus, triple, turn_back
 
@@ -59,7 +59,7 @@ def _blocked(start, d, boxes, own, centre, inside):
     return False
 
 
-@njit(types.void(V3, F8, F2, I8, I8, F1), cache=True, error_model="numpy")
+@compiled(types.void(V3, F8, F2, I8, I8, F1), makes_arrays=True)
 def _look(d, weight, boxes, own, rays, out):
     """Adds to out (4,) what direction d sees of box `own`: share of its outline, and that times its centre."""
     half = triple(boxes, own, 8)
@@ -84,7 +84,7 @@ def _look(d, weight, boxes, own, rays, out):
                         out[1 + k] += carried * p[k]
 
 
-@njit(types.void(F2, I8, I8, F4), cache=True, error_model="numpy")
+@compiled(types.void(F2, I8, I8, F4), makes_arrays=True)
 def _fill(boxes, own, rays, out):
     """Writes the map (3, n, n, 4) of module `own`: its first box is its hull."""
     n = out.shape[1]

@@ -14,13 +14,14 @@ V3 = types.UniTuple(F8, 3)
 M3 = types.UniTuple(V3, 3)
 
 
-def compiled(signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles for one signature, code that makes no array: it need not count references, which costs more than the sums (numba's own,
-    unpublished `_nrt`).
+def compiled(signature: Any, makes_arrays: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """Compiles for one signature. Dividing by zero gives infinity as in numpy: to check costs a third of the time.
 
-    Dividing by zero gives infinity as in numpy: to check costs a third of the time.
+    Args:
+        makes_arrays: code that makes none need not count references, which costs more than the sums (numba's unpublished `_nrt`).
     """
-    return cast("Callable[[Callable[..., Any]], Any]", njit(signature, cache=True, error_model="numpy", _nrt=False))  # type: ignore[call-overload]
+    how = {"cache": True, "error_model": "numpy", "_nrt": makes_arrays}
+    return cast("Callable[[Callable[..., Any]], Any]", njit(signature, **how))  # type: ignore[call-overload]
 
 
 @compiled(V3(V3, V3))

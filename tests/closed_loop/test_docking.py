@@ -42,8 +42,10 @@ def test_both_come_to_meet_each_other_where_that_is_asked_for(fly: Fly, tmp_path
 @pytest.mark.slow
 def test_paper_s_dock_is_not_tried_again(fly: Fly) -> None:
     """Seed 0 of its world jams."""
-    metrics = fly(load_scenario("dock"), 0, PAPER).metrics
+    scenario = load_scenario("dock")
+    metrics = fly(scenario, 0, PAPER).metrics
     assert (metrics["docked"], metrics["tries"], metrics["jams"]) == (0.0, 1.0, 1.0)
+    assert metrics["ticks"] < 0.5 * 100 * scenario.task.duration_s, "nobody waits for the end of the time when it was given up"
 
 
 @pytest.mark.slow

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from hil.fuzz import fuzz_flight
-from hil.metrics import flight_metrics
-from hil.plant.fault_spec import Fault
-from hil.safety import command_outlives_frames_ms, flown, fly_to_estop, hover_blind, spiral_with, timed
+from hil.safety import command_outlives_frames_ms, fly_to_estop, hover_blind, spiral_through_loss, spiral_with
 
 TICK_MS = 10.0
 
@@ -56,9 +54,7 @@ def test_healthy_spiral_blames_no_thruster() -> None:
 
 @pytest.mark.slow
 def test_spiral_is_flown_through_thirty_percent_of_lost_frames() -> None:
-    scenario = timed("spiral", 15.0, 40.0, Fault(kind="frame_loss", value=0.3))
-    flight = flown(scenario, 0).between(15_000_000_000, 55_000_000_000)
-    assert flight_metrics(flight)["position_rmse_m"] <= 0.008
+    assert spiral_through_loss(0, 0.3) <= 0.008
 
 
 def test_command_ends_a_tenth_of_a_second_after_the_last_frame() -> None:
