@@ -98,11 +98,11 @@ class Joint(NamedTuple):
 
 
 class _Undock:
-    """An undock under way: magnets push, and once the current is gone the body parts."""
+    """An undock under way: magnets push until the body parts, which is at once where the joint is open already."""
 
-    def __init__(self, prepared: Prepared, time_ns: int) -> None:
+    def __init__(self, prepared: Prepared, until_ns: int) -> None:
         self.prepared = prepared
-        self.began_ns = time_ns
+        self.until_ns = until_ns
 
 
 class DockingStage:
@@ -128,6 +128,17 @@ class DockingStage:
         self._joints = PairBank([joint.pair for joint in joints], self._p, self._joints)
         for joint in joints:
             self._set_relays(joint.request, RELAY_PULL)
+
+    @property
+    def open_joints(self) -> list[DockRequest]:
+        """Joints that should hold and do not, by fresh measurements: an undock of each. Those that are being undocked are left out."""
+        rows = self._joints.rows[self._joints.rows["open"] != 0]
+        parting = [_modules(undock.prepared.request) for undock in self._undocks]
+        found = [
+            DockRequest(module, face, target, target_face)
+            for (target, module), (target_face, face) in zip(rows["module"].tolist(), rows["face"].tolist(), strict=True)
+        ]
+        return [joint for joint in found if _modules(joint) not in parting]
 
     @property
     def joints(self) -> np.ndarray:
@@ -194,7 +205,8 @@ class DockingStage:
             self._say(WARNING, f"dock refused: {prepared.refusal}")
             decisions.ended.append(_body_of(request.module, estimates))
         elif isinstance(prepared.plan, UndockPlan):
-            self._undocks.append(_Undock(prepared, time_ns))
+            holds = _modules(request) not in [_modules(joint) for joint in self.open_joints]
+            self._undocks.append(_Undock(prepared, time_ns + (round(self._p.release_s * 1e9) if holds else 0)))
             self._say(INFORMATION, f"undocking module {request.module} from {request.target_module}")
         else:
             active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
@@ -246,9 +258,8 @@ class DockingStage:
         plan = undock.prepared.plan
         assert isinstance(plan, UndockPlan)
         request = plan.request
-        waited_s = (time_ns - undock.began_ns) * 1e-9
         self._set_relays(request, RELAY_PUSH)
-        if waited_s < self._p.release_s:
+        if time_ns < undock.until_ns:
             return
         self._set_relays(request, RELAY_OFF)
         whole = _body_of(request.module, estimates)
@@ -299,6 +310,10 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
             q_tm = multiply(conjugate(np.ascontiguousarray(body.q_bt[k])), q_bm)
             table[body.modules[i], int(tag)] = np.concatenate([r_mt, q_tm])
     return table
+
+
+def _modules(request: DockRequest) -> frozenset[int]:
+    return frozenset((request.module, request.target_module))
 
 
 def _body_of(module: int, estimates: Mapping[int, tuple[Body, Estimate]]) -> int:

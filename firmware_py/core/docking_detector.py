@@ -62,7 +62,7 @@ class PairBank:
         """`before`: the bank that this one replaces; what it knows of a pair that both watch is kept."""
         p = parameters
         self._limits = Limits(
-            p.current_threshold_ma, p.current_hysteresis_ma, p.position_tolerance_m, p.settled_m, p.hysteresis_m,
+            p.current_threshold_ma, p.current_hysteresis_ma, p.position_tolerance_m, p.settled_m, p.hysteresis_m, p.open_m,
             round(p.debounce_ms * 1e6), round(p.current_fresh_ms * 1e6), round(p.pose_fresh_ms * 1e6),
         )  # fmt: skip
         self.rows = np.zeros(len(pairs), PAIR)

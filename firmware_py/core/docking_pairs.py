@@ -38,6 +38,7 @@ PAIR = np.dtype(
         ("error_m", np.float64),
         ("spread_m", np.float64),
         ("fresh", np.int64),
+        ("open", np.int64),  # by fresh measurements: no current, or further apart than noise makes it
     ],
     align=True,
 )
@@ -52,6 +53,7 @@ class Limits(NamedTuple):
     near_m: float
     settled_m: float
     position_hysteresis_m: float
+    open_m: float
     debounce_ns: int
     current_fresh_ns: int
     pose_fresh_ns: int
@@ -59,7 +61,7 @@ class Limits(NamedTuple):
 
 TABLE, FIRST, SEEN = numba.float64[:, ::1], numba.int64[::1], numba.int64[:, ::1]
 ROW = numba.from_dtype(PAIR)
-LIMITS = numba.typeof(Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))  # type: ignore[no-untyped-call]
+LIMITS = numba.typeof(Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))  # type: ignore[no-untyped-call]
 
 
 @njit(numba.void(ROW, numba.int64, numba.boolean, numba.int64, numba.int64), cache=True)
@@ -183,6 +185,7 @@ def watch(rows, rings, heard_ma, first, seen, poses, time_ns, limits):  # type: 
         fresh_current = _take_currents(row, heard_ma, time_ns, limits)
         fresh_pose = _take_pose(row, rings[k], first, seen, poses, time_ns, limits)
         row.fresh = fresh_current and fresh_pose
+        row.open = (fresh_current and row.holds[CURRENT] == 0) or (fresh_pose and row.error_m > limits.open_m)
     heard_ma[:] = math.nan
 
 

@@ -70,7 +70,7 @@ TABLE = (
     Row("axis_lost", "the thrusters left cannot make every wrench", lambda h: h.lost_axes > 0),
     Row("depth_unknown", "depth unknown for {:.1f} s", lambda h: min(h.depth_age_s, h.tag_age_s), modes=PLACED | {Mode.ALT_HOLD}),
     Row("tag_gone", "no tag for {:.1f} s", attrgetter("tag_age_s"), modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
-    Row("partner_lost", "a docked partner is lost", attrgetter("partner_lost")),
+    Row("partner_lost", "a docked partner is lost", lambda h: h.topology != ""),
     Row("estimator", "sensors and model disagree: {:.1f} of the expected", attrgetter("nis_ratio"), modes=PLACED),
     Row("rejected", "{:.0%} of the tags refused", attrgetter("rejected_share"), modes=PLACED),
     Row("tag_lost", "no tag for {:.1f} s", attrgetter("tag_age_s"), modes=PLACED),
@@ -178,6 +178,10 @@ class Failsafes:
     def level(self) -> Level:
         """What the gravest of those that are on asks for."""
         return max((watch.level for watch in self._watches if watch.active), default=Level.NONE)
+
+    def is_on(self, name: str) -> bool:
+        """Whether the row of that name is on."""
+        return any(watch.active for watch in self._watches if watch.row.name == name)
 
     def active(self, health: Health) -> list[str]:
         """Those that are on and more than a warning, in words."""

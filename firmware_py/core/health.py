@@ -74,12 +74,10 @@ class Health(NamedTuple):
     """Thrusters that count as dead or lying."""
     lost_axes: int
     """Rank that is missing because of them."""
-    partner_lost: bool
-    """A docked module is no longer where it should be (docking detector)."""
     warm: bool
     """Every stage has run at least once."""
     topology: str
-    """What about the topology is not as configured, in words; empty when all is."""
+    """Which docked partner is lost, in words; empty: none."""
 
 
 class HealthMonitor:
@@ -115,10 +113,8 @@ class HealthMonitor:
         self.now: Health
         self.imu_heard = True
         """Whether an IMU that is to be believed was heard in this tick; set by whoever watches them."""
-        self.partner_lost = False
-        """Set by whoever watches the docked faces."""
         self.topology = ""
-        """Set by whoever knows the configured topology."""
+        """Set by whoever watches the docked faces."""
         self.warm = True
         """Cleared and set by whoever compiles."""
 
@@ -160,7 +156,6 @@ class HealthMonitor:
             outside_m=outside(estimate.p_wb, self._fence) if estimate.ready else math.nan,
             dead=faults.dead,
             lost_axes=faults.lost_axes,
-            partner_lost=self.partner_lost,
             warm=self.warm,
             topology=self.topology,
         )

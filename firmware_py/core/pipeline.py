@@ -15,7 +15,6 @@ from firmware_py.core.controller import Controller
 from firmware_py.core.docking import Decisions, DockingStage, Join, Part, joints_of, tag_table
 from firmware_py.core.estimator import Estimator
 from firmware_py.core.faults import FaultDetector
-from firmware_py.core.glide import Glide
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import HealthMonitor
 from firmware_py.core.imu_watch import ImuWatch
@@ -24,7 +23,6 @@ from firmware_py.core.measurements import Measurements
 from firmware_py.core.motor_test import MotorTest
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.requests import FOR_ALL, sift
-from firmware_py.core.setpoint import rest_at
 from firmware_py.core.supervisor import WARNING, Decision, Supervisor
 from firmware_py.core.supply import SupplyMeter
 from firmware_py.core.thruster import ThrusterLag
@@ -67,6 +65,8 @@ class BodyPipeline:
         self.guidance = Guidance(body, parameters)
         self.motor_test = MotorTest(body, parameters.steering)
         self.dock_over = False
+        self.given_up: set[DockRequest] = set()
+        """Joints that were found open and are being parted."""
         self.controller = Controller(body, parameters.control)
         self.allocator = Allocator(body, parameters.allocation)
         self.limiter = Limiter(body, parameters.limiter, period_ns * 1e-9)
@@ -240,6 +240,7 @@ class Pipeline:
         held = [c for c in self._chains if c.supervisor.armed and c.supervisor.mode == Mode.POSHOLD] if inputs.prepared else []
         bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self._chains}
         decisions = self.docking.step(inputs, bodies, [c.body.index for c in held])
+        self._miss_partners(outputs)
         outputs.docks += self.docking.records
         outputs.joints = self.docking.joints
         outputs.events += self.docking.events
@@ -248,6 +249,16 @@ class Pipeline:
             self._join(joined, inputs.time_ns, estimates)
         for parted in decisions.parts:
             self._part(parted, inputs.time_ns, estimates)
+
+    def _miss_partners(self, outputs: Outputs) -> None:
+        """Joints that are open though nobody asked: tells the bodies, and parts those whose fail-safe has gone off over it."""
+        open_joints = self.docking.open_joints
+        for chain in self._chains:
+            mine = [joint for joint in open_joints if joint.module in chain.body.modules]
+            chain.health.topology = "; ".join(f"modules {j.target_module} and {j.module} do not hold together" for j in mine)
+            if mine and chain.supervisor.is_on("partner_lost"):
+                outputs.preparations += [joint for joint in mine if joint not in chain.given_up]
+                chain.given_up |= set(mine)
 
     def _steer(self, decisions: Decisions) -> None:
         for chain in self._chains:
@@ -268,9 +279,7 @@ class Pipeline:
         before = [self._chain(parted.whole)]
         after = [parted.stays, parted.leaves]
         found = [chain.take_over(before, time_ns) for chain in after]
-        start = rest_at(found[1].p_wb, found[1].q_wb)
-        parted.leaves.supervisor.mode = parted.leaves.guidance.mode = Mode.AUTO
-        parted.leaves.guidance.follow(Glide(start, parted.away_w))
+        parted.leaves.guidance.move_by(parted.away_w)
         self._swap(before, after, estimates, found)
 
     def _swap(

@@ -62,6 +62,15 @@ class Supervisor:
         """Whether thrusters may turn."""
         return self.state in ARMED
 
+    @property
+    def safety(self) -> Level:
+        """What its mode is worth as a fail-safe."""
+        return max(self.level, MODE_LEVEL.get(self.mode, Level.NONE))
+
+    def is_on(self, failsafe: str) -> bool:
+        """Whether the fail-safe of that name is on."""
+        return self._failsafes.is_on(failsafe)
+
     def step(self, estop: bool, health: Health, requests: list[Request], endings: Sequence[Trigger] = ()) -> list[Decision]:
         """Runs this tick's triggers in order: e-stop, requests, what has ended by itself, fail-safes.
 
@@ -101,7 +110,7 @@ class Supervisor:
             self._say(severity, f"fail-safe {'on' if alarm.begins else 'over'}: {alarm.words}")
         begun = [alarm.level for alarm in alarms if alarm.begins and alarm.level > Level.WARN]
         level = self._failsafes.level
-        if self.armed and begun and level > max(self.level, MODE_LEVEL.get(self.mode, Level.NONE)):
+        if self.armed and begun and level > self.safety:
             for trigger in LADDER[level]:
                 decision = self._try(trigger, None, health)
                 if decision is not None:
@@ -155,11 +164,15 @@ class Supervisor:
         row = ROWS.get((self.state, trigger))
         return row is not None and {Guard.TESTING: self._testing, Guard.IN_DOCK: self.mode == Mode.DOCK}[row.guard]
 
-    def take_over(self, before: Sequence[Supervisor], mode: Mode = Mode.POSHOLD) -> None:
-        """Goes on from the bodies that this one is made of, or was part of: armed when all were, stopped when one was."""
+    def take_over(self, before: Sequence[Supervisor]) -> None:
+        """Goes on from the bodies that this one is made of, or was part of: armed when all were, stopped when one was.
+
+        It holds its place; where a fail-safe had taken one of them, it stays in that mode.
+        """
         states = {other.state for other in before}
         self.state = State.ESTOP if State.ESTOP in states else State.DISARMED if State.DISARMED in states else State.ARMED
-        self.mode, self.level = mode, max(other.level for other in before)
+        worst = max(before, key=lambda other: other.safety)
+        self.mode, self.level = worst.mode if worst.safety > Level.NONE else Mode.POSHOLD, worst.level
         self.raises_estop = any(other.raises_estop for other in before)
         self._estop_ns = max((other._estop_ns for other in before if other._estop_ns is not None), default=None)
 

@@ -204,6 +204,9 @@ class Docking:
     hysteresis_m: float = quantity(
         0.004, unit="m", low=0, high=0.1, help="more is permitted once docked", mavlink="DOCK_HYST"
     )
+    open_m: float = quantity(
+        0.02, unit="m", low=1e-3, high=1, help="relative position off one pitch: the joint of a body is open", mavlink="DOCK_OPEN"
+    )
     debounce_ms: float = quantity(
         150.0,
         unit="ms",

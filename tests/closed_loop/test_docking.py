@@ -6,8 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Mode
 from firmware_py.description.parameters import PAPER, Parameters
 from firmware_py.description.signals import read_signals
+from firmware_py.description.vehicle import FACE_NAMES
+from firmware_py.prepare.assembly import PITCH_M
+from hil.plant.fault_spec import Fault
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly
 from tools import near_miss
@@ -77,3 +82,25 @@ def test_detector_needs_both_conditions() -> None:
     assert found["current"] >= 3
     assert found["position"] >= 3
     assert found["declared"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("magnet", [0.0, -1.0])
+def test_module_that_loses_its_hold_in_flight_is_missed_and_both_hold_apart(fly: Fly, tmp_path: Path, magnet: float) -> None:
+    """A magnet that dies opens the joint at its coils' next current; one that repels tears it open."""
+    scenario = load_scenario("mobius-2")
+    fault = Fault(kind="magnet", module=2, index=FACE_NAMES.index("-x"), value=magnet, at_s=16.0)
+    task = dataclasses.replace(scenario.task, duration_s=20.0, turns=0.6)
+    fly(dataclasses.replace(scenario, task=task, fault=(fault,)), 1)
+    signals = read_signals(tmp_path / "run" / "signals.mcap")
+    said = dict(zip(signals["/events"]["text"].tolist(), (signals["/events"]["log_time"] * 1e-9).tolist(), strict=True))
+    assert 16.0 < said["fail-safe on: a docked partner is lost"] < 20.0
+    assert "module 1 is undocked from 0" in said
+    truth, ends = read_signals(tmp_path / "run" / "truth.mcap"), []
+    for m in (0, 1):
+        body, is_at = signals[f"/firmware/body{m}"], truth[f"/plant/module{m}"]["p_wm"][-1]
+        assert (body["state"][-1], body["mode"][-1]) == (State.ARMED, Mode.POSHOLD)
+        np.testing.assert_allclose(is_at, body["p_wb"][-1], atol=0.02)
+        np.testing.assert_allclose(body["p_wb"][-1], body["setpoint_p_wb"][-1], atol=0.03)
+        ends.append(is_at)
+    assert float(np.linalg.norm(ends[0] - ends[1])) > PITCH_M

@@ -30,7 +30,6 @@ GOOD = Health(
     outside_m=-50.0,
     dead=(),
     lost_axes=0,
-    partner_lost=False,
     warm=True,
     topology="",
 )

@@ -105,6 +105,25 @@ def test_dock_that_holds_is_lost_later_than_it_was_won(row: Row) -> None:
     assert [status.docked for status in row.watch(bank, 1.0)] == [False, False, True]
 
 
+@pytest.mark.parametrize(
+    ("gap_m", "current_ma", "camera", "is_open"),
+    [
+        (0.0, 100.0, True, False), (0.0, 50.0, True, True), (0.9 * P.open_m, 100.0, True, False), (1.1 * P.open_m, 100.0, True, True),
+        (1.1 * P.open_m, 100.0, False, False), (0.0, math.nan, True, False),
+    ],
+)  # fmt: skip
+def test_joint_is_open_by_what_is_measured_and_never_by_silence(
+    row: Row, gap_m: float, current_ma: float, camera: bool, is_open: bool
+) -> None:
+    bank = PairBank(ROW[:1], P)
+    row.watch(bank, 1.0)
+    assert not bank.rows["open"].any()
+    row.gaps_m[0], row.currents_ma[0], row.camera = gap_m, current_ma, camera
+    for _ in range(200):
+        row.watch(bank, 0.01)
+    assert bool(bank.rows["open"][0]) == is_open
+
+
 def test_what_is_not_seen_any_more_is_not_believed(row: Row) -> None:
     """A coasted pose never counts, and no current is one that is old."""
     bank = PairBank(ROW, P)

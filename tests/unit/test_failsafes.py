@@ -19,13 +19,13 @@ POSE_MODES = {Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK}
 FIELDS: dict[str, str] = {
     "leak": "leak", "bus_silent": "bus_silent_s", "foreign_sync": "foreign_sync", "battery_critical": "voltage_share",
     "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
-    "tag_gone": "tag_age_s", "partner_lost": "partner_lost", "estimator": "nis_ratio", "rejected": "rejected_share",
+    "tag_gone": "tag_age_s", "partner_lost": "topology", "estimator": "nis_ratio", "rejected": "rejected_share",
     "tag_lost": "tag_age_s", "tag_late": "tag_age_s", "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
     "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
     "thruster_lost": "dead", "battery_low": "voltage_share",
 }  # fmt: skip
 """Which figure of Health each fail-safe judges; depth_unknown needs two."""
-YES: dict[str, Any] = {"leak": True, "foreign_sync": True, "axis_lost": 1, "partner_lost": True, "thruster_lost": (3,)}
+YES: dict[str, Any] = {"leak": True, "foreign_sync": True, "axis_lost": 1, "partner_lost": "0 and 1", "thruster_lost": (3,)}
 
 
 def spoilt(name: str, value: float) -> Health:

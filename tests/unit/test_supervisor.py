@@ -529,8 +529,20 @@ def test_joined_robot_is_armed_when_all_were_and_stopped_when_one_was(states: tu
     joined = Supervisor(P)
     joined.take_over([supervisor_in(state) for state in states])
     assert (joined.state, joined.mode, joined.level) == (expected, Mode.POSHOLD, Level.NONE)
-    joined.take_over([supervisor_in(state) for state in states], Mode.AUTO)
-    assert joined.mode == Mode.AUTO
+
+
+@pytest.mark.parametrize("mode", [Mode.SURFACE, Mode.ALT_HOLD])
+def test_robot_that_a_fail_safe_took_stays_in_its_mode_when_it_joins_or_parts(mode: Mode) -> None:
+    taken, other, body = supervisor_in(mode=mode), supervisor_in(mode=Mode.DOCK), Supervisor(P)
+    taken.level = Level.SURFACE if mode == Mode.SURFACE else Level.DEPTH
+    body.take_over([other, taken])
+    assert (body.mode, body.level) == (mode, taken.level)
+
+
+def test_robot_that_a_person_lets_surface_goes_on_when_it_parts() -> None:
+    surfacing, part = supervisor_in(mode=Mode.SURFACE), Supervisor(P)
+    part.take_over([surfacing])
+    assert (part.mode, part.level) == (Mode.SURFACE, Level.NONE)
 
 
 def test_joined_robot_keeps_e_stop_and_fail_safe() -> None:
