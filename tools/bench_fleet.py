@@ -24,7 +24,7 @@ from firmware_py.core.pipeline import CHANNELS, Pipeline
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import multiply, normalise, rotate, to_matrix
 from firmware_py.core.thruster import ThrusterLag
-from firmware_py.core.types import Action, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.core.types import Action, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -96,7 +96,7 @@ class FleetInWater:
         if tick % SLOW_EVERY == m % SLOW_EVERY:
             found.voltage_v = float(body.thrusters.voltage_v[self._mine[m][0]])
             found.cabin_temperature_c, found.cabin_pressure_pa, found.leak = 25.0, 1e5, False
-            found.dock_current_ma = [0.0] * 6
+            found.docks = [DockFeedback(first, (100.0,) * 3, (1, 1, 1)) for first in (0, 3)]
         if tick % TAG_EVERY == 0 and len(self._past) > TAG_DELAY:
             found.tags = [self._tag(self._tags[m], (tick - TAG_DELAY) * PERIOD_NS)]
         return found

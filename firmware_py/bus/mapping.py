@@ -11,7 +11,7 @@ import numpy as np
 
 from firmware_py.bus.codec import Codec, Frame, Receiver, unpack_quaternion
 from firmware_py.bus.codec.receiver import COUNTER, MESSAGE, NUMBER, VALUES
-from firmware_py.core.types import EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.core.types import DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.fleet import Fleet
 
 STALE_NS = 500_000_000
@@ -212,8 +212,8 @@ class InputCollector:
 
 def _dock_handler(first: int) -> Callable[[int, ModuleInputs, Row], None]:
     def take(index: int, module: ModuleInputs, row: Row) -> None:
-        module.dock_current_ma[first : first + 3] = row[VALUES : VALUES + 3]
-        module.relay_echo[first : first + 3] = map(int, row[VALUES + 3 : VALUES + 6])
+        a_ma, b_ma, c_ma, a, b, c = row[VALUES : VALUES + 6]
+        module.docks.append(DockFeedback(first, (a_ma, b_ma, c_ma), (int(a), int(b), int(c))))
 
     return take
 

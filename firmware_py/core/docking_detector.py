@@ -8,7 +8,6 @@ All pairs that are watched are rows of one array, and one compiled pass a tick s
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,8 +18,6 @@ from firmware_py.core.types import ModuleInputs
 from firmware_py.description.parameters import Docking
 
 FACES = 6
-SILENT = [math.nan] * FACES
-"""Currents of a module that reported none."""
 
 
 class FacePair(NamedTuple):
@@ -88,9 +85,9 @@ class PairBank:
 
     def step(self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses) -> None:
         """Brings the rows to the tick at `time_ns`, from its inputs alone and what they were before."""
-        heard = [m for m in self._watched if modules[m].dock_current_ma != SILENT]
-        if heard:
-            self._heard_ma[heard] = [modules[m].dock_current_ma for m in heard]
+        for m in self._watched:
+            for dock in modules[m].docks:
+                self._heard_ma[m, dock.first : dock.first + 3] = dock.current_ma
         watch(self.rows, self._rings, self._heard_ma, *poses.sightings, time_ns, self._limits)
 
     def status(self, i: int) -> PairStatus:

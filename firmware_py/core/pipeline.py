@@ -255,7 +255,7 @@ class Pipeline:
         open_joints = self.docking.open_joints
         for chain in self._chains:
             mine = [joint for joint in open_joints if joint.module in chain.body.modules]
-            chain.health.topology = "; ".join(f"modules {j.target_module} and {j.module} do not hold together" for j in mine)
+            chain.health.topology = _words_of(mine) if mine else ""
             if mine and chain.supervisor.is_on("partner_lost"):
                 outputs.preparations += [joint for joint in mine if joint not in chain.given_up]
                 chain.given_up |= set(mine)
@@ -298,6 +298,13 @@ class Pipeline:
 
     def _chain(self, body: int) -> BodyPipeline:
         return next(chain for chain in self._chains if chain.body.index == body)
+
+
+def _words_of(open_joints: Sequence[DockRequest]) -> str:
+    """The first of them, for people."""
+    first, more = open_joints[0], len(open_joints) - 1
+    others = f", and {more} more pairs" if more else ""
+    return f"modules {first.target_module} and {first.module} do not hold together{others}"
 
 
 IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)

@@ -41,6 +41,16 @@ class EscFeedback(NamedTuple):
     status: tuple[int, int]
 
 
+class DockFeedback(NamedTuple):
+    """Three docking faces of one feedback frame."""
+
+    first: int
+    """Index of the first face."""
+    current_ma: tuple[float, float, float]
+    relay: tuple[int, int, int]
+    """States that the relays are in."""
+
+
 @dataclass(slots=True)
 class ModuleInputs:
     """What one module's frames said since the previous tick; None or empty where nothing fresh came."""
@@ -51,9 +61,7 @@ class ModuleInputs:
     """(3,) specific force, module frame, m/s^2."""
     pressure_pa: float | None = None
     tags: list[TagObservation] = field(default_factory=list)
-    dock_current_ma: list[float] = field(default_factory=lambda: [math.nan] * 6)
-    """Of each face; NaN where nothing fresh came."""
-    relay_echo: list[int | None] = field(default_factory=lambda: [None] * 6)
+    docks: list[DockFeedback] = field(default_factory=list)
     esc: list[EscFeedback] = field(default_factory=list)
     voltage_v: float | None = None
     current_a: float | None = None

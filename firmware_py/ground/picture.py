@@ -62,9 +62,8 @@ class ModulePicture:
             self.cabin_temperature_c = inputs.cabin_temperature_c
         if inputs.leak is not None:
             self.leak = inputs.leak
-        for i, current in enumerate(inputs.dock_current_ma):
-            if not math.isnan(current):
-                self.dock_current_ma[i] = current
+        for dock in inputs.docks:
+            self.dock_current_ma[dock.first : dock.first + 3] = dock.current_ma
         for esc in inputs.esc:
             self.esc_frames += 1
             pair = slice(esc.first, esc.first + 2)

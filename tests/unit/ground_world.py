@@ -14,6 +14,7 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import (
     Action,
     BodyRecord,
+    DockFeedback,
     EscFeedback,
     Estimate,
     Event,
@@ -76,7 +77,7 @@ class Robot:
 
     def _inputs(self) -> ModuleInputs:
         return ModuleInputs(
-            gyro=ZERO, accel=ZERO, pressure_pa=106_000.0, dock_current_ma=[100.0, *[0.0] * 5], voltage_v=12.1,
+            gyro=ZERO, accel=ZERO, pressure_pa=106_000.0, docks=[DockFeedback(0, (100.0, 0.0, 0.0), (1, 0, 0))], voltage_v=12.1,
             current_a=2.5, cabin_temperature_c=25.5, cabin_pressure_pa=101_300.0, leak=False, answered=True, heard=True,
             esc=[EscFeedback(2, (900.0, -450.0), (1.5, 0.5), (0, 4))],
         )  # fmt: skip

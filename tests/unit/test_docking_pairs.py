@@ -9,7 +9,7 @@ import pytest
 from firmware_py.core.docking import joints_of
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, PairStatus, TagTable
 from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
-from firmware_py.core.types import ModuleInputs, TagObservation
+from firmware_py.core.types import DockFeedback, ModuleInputs, TagObservation
 from firmware_py.description.parameters import Docking
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -42,8 +42,9 @@ class Row:
         self.tick += 1
         modules = [ModuleInputs() for _ in range(4)]
         if self.tick % 4 == 0:
-            for joint, current in enumerate(self.currents_ma):
-                modules[joint].dock_current_ma[0] = modules[joint + 1].dock_current_ma[1] = current
+            for m, module in enumerate(modules):
+                after, before = (*self.currents_ma, math.nan)[m], (math.nan, *self.currents_ma)[m]
+                module.docks.append(DockFeedback(0, (after, before, math.nan), (1, 1, 0)))
         if self.camera and self.tick % 2 == 0:
             for m, x in enumerate(np.cumsum([0.0, *(PITCH_M + gap for gap in self.gaps_m)])):
                 modules[m].tags.append(self._tag(float(x)))
@@ -88,7 +89,7 @@ def test_current_of_one_face_alone_does_not_count(row: Row) -> None:
     bank = PairBank(ROW[:1], P)
     for _ in range(100):
         time_ns, modules = row.hear()
-        modules[1].dock_current_ma[1] = math.nan
+        modules[1].docks.clear()
         bank.step(time_ns, modules, ModulePoses(modules, TAGS))
     assert not bank.status(0).current and math.isnan(bank.status(0).current_margin_ma)
 

@@ -85,8 +85,7 @@ def test_every_measurement_of_a_module_arrives_in_its_unit():
     assert module.pressure_pa == 121_325
     assert (module.voltage_v, module.current_a) == pytest.approx((11.8, 4.2))
     assert (module.cabin_temperature_c, module.cabin_pressure_pa, module.leak) == (31.5, 99_000, True)
-    assert module.dock_current_ma == [70, -71, 0, 0, 0, -8192]
-    assert module.relay_echo == [1, 2, 0, 0, 0, 3]
+    assert module.docks == [(0, (70, -71, 0), (1, 2, 0)), (3, (0, 0, -8192), (0, 0, 3))]
     (esc,) = module.esc
     assert (esc.first, esc.rpm, esc.current_a, esc.status) == (2, (2000, -1500), (1.5, 0.5), (0, 3))
     assert (module.mcu_state, module.mcu_errors) == (2, 4)
