@@ -28,6 +28,8 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
 from hil.campaign_summary import Trial, summarise, table_of
+from hil.checks import Result
+from hil.docking_metrics import OUTCOMES
 from hil.flight import fly_and_judge
 from hil.plant.world_parameters import world_parameters
 from hil.scenario import Scenario
@@ -65,15 +67,22 @@ def fly_trial(scenario: Scenario, parameters: Parameters, seed: int, bus: str, c
         raise DescriptionError("a worker runs other code than this machine; install the same version there")
     with tempfile.TemporaryDirectory() as folder:
         result = fly_and_judge(scenario, seed, parameters, Path(folder), bus)
-    failed = [check.name for check in result.checks if not check.passed]
     flown = scenario.for_seed(seed)
     return {
         "seed": seed,
         "passed": result.passed,
-        "outcome": "passed" if result.passed else failed[0] if failed else "not checked",
+        "outcome": outcome_of(result),
         "metrics": _numbers({name: value for name, value in result.metrics.items() if name not in WALL_CLOCK}),
         "world": _numbers(world_parameters([load_vehicle(m.vehicle) for m in flown.module], flown.world, seed)),
     }
+
+
+def outcome_of(result: Result) -> str:
+    """In words: passed, why a dock came to nothing, or the first check that failed."""
+    failed = [check.name for check in result.checks if not check.passed]
+    if failed[:1] == ["docked"]:
+        return OUTCOMES[int(result.metrics["outcome"])]
+    return "passed" if result.passed else failed[0] if failed else "not checked"
 
 
 def _numbers(values: dict[str, float]) -> dict[str, float | None]:

@@ -18,7 +18,7 @@ FAILED = 1
 """Exit status when a check failed."""
 
 ScenarioName = Annotated[str, typer.Argument(help="name of a scenario (`modcube hil list`), or a .toml file")]
-Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, or a file of parameters")]
+Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, paper_sequence, or a file of parameters")]
 Vehicle = Annotated[str, typer.Option(help="vehicle in place of the scenario's")]
 Sensors = Annotated[str, typer.Option(help="real, or ideal: no noise, no delay")]
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from firmware_py.core.rotations import heading
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, DockRequest, Mode, Outputs, Request
@@ -61,7 +62,7 @@ class DockScript:
         return self._over_ns is not None and time_ns >= self._over_ns + AFTERWARDS_NS
 
     def _arm(self, time_ns: int, last: Outputs) -> list[Request]:
-        """Arms every body once; then each holds where it is."""
+        """Arms every body once; then each hovers level where it is, whichever way it hung until it was armed."""
         asked: list[Request] = []
         every = round(ARM_EVERY_S * self._fleet.rate_hz)
         due = time_ns >= ARM_FROM_S * 1e9 and (time_ns // self._fleet.period_ns) % every == 0
@@ -69,7 +70,7 @@ class DockScript:
             if record.body not in self._armed:
                 if record.state in ARMED:
                     self._armed.add(record.body)
-                    here = rest_at(record.estimate.p_wb, record.estimate.q_wb)
+                    here = rest_at(record.estimate.p_wb, heading(record.estimate.q_wb))
                     asked.append(Request(Action.HOLD, record.body, here))
                 elif due:
                     asked.append(Request(Action.ARM, record.body))

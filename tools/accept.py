@@ -196,8 +196,19 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "dock-paper", 5, "modcube hil campaign dock --trials 200 --jobs 2 --controller paper", flown("dock", "paper", 200),
-        (Figure("dock, the paper's sequence, 200 trials: docked", "passed", low=60.0, high=97.0, unit="%", scale=100.0),),
+        "dock-paper", 5, "modcube hil campaign dock --trials 200 --jobs 2 --controller paper_sequence",
+        flown("dock", "paper_sequence", 200),
+        (
+            Figure("dock, the paper's sequence, 200 trials: docked", "passed", low=60.0, high=97.0, unit="%", scale=100.0),
+            Figure("the same: of the failures, jams", "failed.jammed", low=50.0, unit="%", scale=100.0),
+        ),
+    ),
+    Group(
+        "dock-paper-whole", 5, "modcube hil campaign dock --trials 200 --jobs 2 --controller paper", flown("dock", "paper", 200),
+        (
+            Figure("dock, the paper's sequence, controller and filter, 200 trials: docked", "passed", low=0.0, unit="%", scale=100.0),
+            Figure("the same: of the failures, jams", "failed.jammed", low=50.0, unit="%", scale=100.0),
+        ),
     ),
     Group(
         "dock-near-miss", 5, "modcube hil campaign dock-near-miss --trials 300 --jobs 2", flown("dock-near-miss", trials=300),

@@ -36,7 +36,11 @@ Values = Mapping[str, float]
 
 
 def flown(scenario: str, controller: str = "modcube", trials: int = 20, sensors: str = "real") -> Callable[[Path], Values]:
-    """Flies so many seeds; keys are `metric.quantile`, the share `passed` that passed every check, and its lower 95 % bound."""
+    """Flies so many seeds.
+
+    Keys are `metric.quantile`, the share `passed` that passed every check, its lower 95 % bound, and of those that failed the share
+    that `failed.OUTCOME`.
+    """
 
     def measure(folder: Path) -> Values:
         chosen, parameters = load_scenario(scenario), CONTROLLERS[controller]
@@ -45,6 +49,8 @@ def flown(scenario: str, controller: str = "modcube", trials: int = 20, sensors:
         with campaign_progress(f"{scenario}, {controller}, {sensors} sensors", trials) as progress:
             summary = run_campaign(chosen, parameters, range(trials), processes(JOBS), folder, progress)
         values = {f"{m}.{q}": v for m, each in summary["metrics"].items() for q, v in each.items() if v is not None}
+        failed = {name: count / (trials - summary["succeeded"]) for name, count in summary["outcomes"].items() if name != "passed"}
+        values |= {f"failed.{name}": share for name, share in failed.items()}
         return values | {"passed": summary["succeeded"] / trials, "passed.low": summary["confidence_interval"][0]}
 
     return measure

@@ -132,6 +132,8 @@ class DockingStage:
     @property
     def open_joints(self) -> list[DockRequest]:
         """Joints that should hold and do not, by fresh measurements: an undock of each. Those that are being undocked are left out."""
+        if not self._joints.rows.size:
+            return []
         rows = self._joints.rows[self._joints.rows["open"] != 0]
         parting = [_modules(undock.prepared.request) for undock in self._undocks]
         found = [

@@ -5,7 +5,6 @@ No change of mode jumps: set-points go on from where they are, and the wrench mo
 
 from __future__ import annotations
 
-import math
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.health import Health
-from firmware_py.core.rotations import difference, from_euler, rotate, rotate_back, to_matrix
+from firmware_py.core.rotations import difference, heading, rotate, rotate_back
 from firmware_py.core.setpoint import Glider, Trajectory, Wish, ahead_of, at_estimate, rest_at
 from firmware_py.core.supervisor import Decision
 from firmware_py.core.transitions import Effect
@@ -279,10 +278,3 @@ class Guidance:
             force_w[2] = -self._lift_n
         out[:3] = rotate_back(estimate.q_wb, force_w)
         return np.asarray(out)
-
-
-def heading(q_wb: np.ndarray) -> np.ndarray:
-    """The level attitude (4,) that looks the way the body looks; where it looks up or down, the way that its top or bottom does."""
-    r = np.asarray(to_matrix(q_wb))
-    x = r[:, 0] if math.hypot(r[0, 0], r[1, 0]) > 0.3 else r[:, 2] * (1.0 if r[2, 0] < 0.0 else -1.0)
-    return np.asarray(from_euler(0.0, 0.0, math.atan2(x[1], x[0])))

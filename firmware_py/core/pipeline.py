@@ -254,6 +254,8 @@ class Pipeline:
         """Joints that are open though nobody asked: tells the bodies, and parts those whose fail-safe has gone off over it."""
         open_joints = self.docking.open_joints
         for chain in self._chains:
+            if not chain.joints:
+                continue
             mine = [joint for joint in open_joints if joint.module in chain.body.modules]
             chain.health.topology = _words_of(mine) if mine else ""
             if mine and chain.supervisor.is_on("partner_lost"):

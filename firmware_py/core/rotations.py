@@ -134,3 +134,10 @@ def to_euler(q: np.ndarray) -> tuple[float, float, float]:
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def heading(q_wb: np.ndarray) -> np.ndarray:
+    """The level attitude (4,) that looks the way the body looks; where it looks up or down, the way that its top or bottom does."""
+    r = np.asarray(to_matrix(q_wb))
+    x = r[:, 0] if math.hypot(r[0, 0], r[1, 0]) > 0.3 else r[:, 2] * (1.0 if r[2, 0] < 0.0 else -1.0)
+    return np.asarray(from_euler(0.0, 0.0, math.atan2(x[1], x[0])))

@@ -316,8 +316,13 @@ PAPER = Parameters(
 """The paper's controller with the authors' gains, as accelerations: position 5 and 2, attitude 2 and 1. It docks in a straight line at
 constant speed, without a second try and however unsure it is. The paper says neither how fast nor for how long it pushes: synthetic."""
 
-CONTROLLERS = {"modcube": Parameters(), "least_power": Parameters(allocation=Allocation(mode="least_power")), "paper": PAPER}
-"""Whole sets of parameters by name."""
+CONTROLLERS = {
+    "modcube": Parameters(),
+    "least_power": Parameters(allocation=Allocation(mode="least_power")),
+    "paper": PAPER,
+    "paper_sequence": Parameters(docking=PAPER.docking),
+}
+"""Whole sets of parameters by name. `paper_sequence`: docks as the paper does, and flies and estimates as we do."""
 
 
 _TUNABLES = tuple(

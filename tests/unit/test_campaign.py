@@ -17,8 +17,9 @@ import hil.campaign
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
-from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, Pool, dask_cluster, fly_trial, run_campaign
+from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, Pool, dask_cluster, fly_trial, outcome_of, run_campaign
 from hil.campaign_summary import Trial, median_interval, summarise
+from hil.checks import Check, Result
 from hil.console import campaign_progress, print_campaign
 from hil.plant.world_parameters import world_parameters
 from hil.scenario import Scenario, load_scenario
@@ -39,6 +40,13 @@ def trial(seed: int, rmse_m: float, outcome: str = "passed") -> Trial:
 
 
 TRIALS = [trial(0, 0.003), trial(1, 0.011, "position_rmse_m"), trial(2, 0.004), trial(3, 0.005)]
+
+
+def test_dock_that_came_to_nothing_says_why() -> None:
+    docked, fence = Check("docked", 0.0, 1.0, 1.0, False), Check("position_rmse_m", 0.1, 0.0, 0.01, False)
+    assert outcome_of(Result("dock", 0, False, {"outcome": 1.0}, (docked, fence))) == "jammed"
+    assert outcome_of(Result("dock", 0, False, {"outcome": 0.0}, (fence,))) == "position_rmse_m"
+    assert outcome_of(Result("dock", 0, True, {"outcome": 0.0}, ())) == "passed"
 
 
 def test_summary_counts_outcomes_and_names_the_worst_seeds_first() -> None:

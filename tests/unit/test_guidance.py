@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from firmware_py.core.guidance_modes import Guidance, heading
+from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import Health
-from firmware_py.core.rotations import difference, from_euler, rotate
+from firmware_py.core.rotations import difference, from_euler, heading, rotate
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.supervisor import Decision
 from firmware_py.core.transitions import Effect, Trigger
