@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from firmware_py.core import observation, propagation
+from firmware_py.core import observation
 from firmware_py.core.body import Body
 from firmware_py.core.history import WINDOW_S, History
 from firmware_py.core.propagation import ERRORS, STATES
@@ -23,8 +23,8 @@ NEVER_NS = 1 << 60
 """Age of the last tag before the first one."""
 READY_AFTER = 10
 """Tag observations to accept before the pose is believed."""
-UNKNOWN_VARIANCE = np.full(6, 1e6)
-"""Of the pose before the first tag, m^2 and rad^2."""
+UNKNOWN_SIGMA = np.full(6, 1e3)
+"""Of the pose before the first tag, m and rad."""
 RESET_AFTER = 30
 """Observations refused one after the other (half a second) until the filter believes them and not itself."""
 INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
@@ -82,8 +82,7 @@ class Estimator:
         for pose in measured.tags:
             self._take(pose)
         if self._accepted:
-            self._advance(max(self._anchor_ns, time_ns - int(WINDOW_S * 1e9)))
-            self._carry()
+            self._advance(time_ns - int(WINDOW_S * 1e9))
         return self._estimate(time_ns)
 
     @property
@@ -129,24 +128,19 @@ class Estimator:
 
     def _advance(self, to_ns: int) -> None:
         """Moves the filter to `to_ns`, fusing the inertial and depth measurements on the way."""
+        if to_ns <= self._anchor_ns:
+            return
         index = self._history.first_after(self._anchor_ns)
-        while self._anchor_ns < to_ns:
-            tick_ns = self._history.time_of(index)
-            until = min(tick_ns, to_ns)
-            self._predict(self._history.tau(index), (until - self._anchor_ns) * 1e-9)
-            self._anchor_ns = until
-            if until == tick_ns:
-                self._fuse_inertial(index)
-                index += 1
-
-    def _predict(self, tau: np.ndarray, dt: float) -> None:
-        self._x, self._covariance = propagation.predict(self._x, self._covariance, tau, dt, self._density, *self._plant)
-
-    def _fuse_inertial(self, index: int) -> None:
-        sample = self._history.inertial(index)
-        self._x, self._covariance = observation.fuse_inertial(
-            self._x, self._covariance, self._history.tau(index), *sample, self._inertial_sigma, *self._plant
-        )
+        first_ns = self._history.time_of(index)
+        count, rest_ns = divmod(to_ns - first_ns, self._history.period_ns)
+        count += 1
+        if count == 0:
+            rest_ns = to_ns - self._anchor_ns
+        self._x, self._covariance = observation.advance(
+            self._x, self._covariance, *self._history.since(index), (first_ns - self._anchor_ns) * 1e-9, count, self._dt, rest_ns * 1e-9,
+            self._density, self._inertial_sigma, *self._plant,
+        )  # fmt: skip
+        self._anchor_ns = to_ns
 
     def _fuse_tag(self, pose: BodyPose) -> None:
         variance, gate = self._tag_variance / pose.tags, self._p.tag_gate**2
@@ -170,14 +164,16 @@ class Estimator:
 
     # ------------------------------------------------------------ from the anchor to now
 
-    def _carry(self) -> None:
+    def _carry(self, time_ns: int) -> tuple[np.ndarray, bool]:
+        """Brings the state to `time_ns`; returns sigma (6,) of its pose, and whether all of that is sound."""
         index = self._history.first_after(self._anchor_ns)
-        if index > self._history.newest:
-            self._now = self._x
-            return
-        taus, gyros = self._history.since(index)
-        rest = (self._history.time_of(index) - self._anchor_ns) * 1e-9
-        self._now = propagation.carry(self._x, taus, gyros, self._dt, rest, *self._plant)
+        taus, gyros, _ = self._history.since(index)
+        until_first = (self._history.time_of(index) - self._anchor_ns) * 1e-9
+        lag, rate_variance = (time_ns - self._anchor_ns) * 1e-9, self._p.gyro_sigma**2 * self._dt
+        self._now, sigma, sound = observation.carried(
+            self._x, self._covariance, taus, gyros, self._dt, until_first, self._density, lag, rate_variance, *self._plant
+        )
+        return sigma, sound
 
     def _forget(self) -> None:
         """Nothing is known: the filter begins anew with the next tag."""
@@ -185,11 +181,11 @@ class Estimator:
         self._x = self._now = np.eye(1, STATES, 3)[0]
 
     def _estimate(self, time_ns: int) -> Estimate:
-        variance = self._pose_variance((time_ns - self._anchor_ns) * 1e-9) if self._accepted else UNKNOWN_VARIANCE
-        if not observation.is_sound(self._now, variance):  # sensors have lied
+        sigma, sound = self._carry(time_ns) if self._accepted else (UNKNOWN_SIGMA, True)
+        if not sound:  # sensors have lied
             self._forget()
-            variance = UNKNOWN_VARIANCE
-        x, sigma = self._now, np.sqrt(variance)
+            sigma = UNKNOWN_SIGMA
+        x = self._now
         return Estimate(
             p_wb=x[:3].copy(),
             q_wb=x[3:7].copy(),
@@ -203,13 +199,6 @@ class Estimator:
             nis_dof=self._nis_dof,
             rejected=self._rejected,
             ready=self._accepted >= READY_AFTER,
-        )
-
-    def _pose_variance(self, lag: float) -> np.ndarray:
-        return np.asarray(
-            observation.carried_pose_variance(
-                self._x, self._covariance, self._density, self._body.mass_inv, lag, self._p.gyro_sigma**2 * self._dt
-            )
         )
 
     def _process_noise(self) -> np.ndarray:

@@ -51,24 +51,12 @@ class History:
         return self.newest_ns - (self.newest - index) * self.period_ns
 
     def first_after(self, time_ns: int) -> int:
-        """Index of the first sample later than `time_ns`."""
-        return (
-            self.newest - (self.newest_ns - time_ns - 1) // self.period_ns
-            if time_ns < self.newest_ns
-            else self.newest + 1
-        )
+        """Index of the first sample later than `time_ns`, or of the oldest that is kept; one beyond the newest where none is later."""
+        later = (self.newest_ns - time_ns - 1) // self.period_ns + 1 if time_ns < self.newest_ns else 0
+        return self.newest + 1 - min(later, self.length)
 
-    def tau(self, index: int) -> np.ndarray:
-        """(6,) mean thruster wrench of the tick that ended with sample `index`."""
-        return np.asarray(self._tau[index % self.length])
-
-    def inertial(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
-        """Gyro (3,), accelerometer (3,) and depth of sample `index`; NaN where none came."""
-        row = index % self.length
-        return self._gyro[row], self._rows[row, :3], float(self._rows[row, 3])
-
-    def since(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Wrenches (k, 6) and gyro readings (k, 3) of the samples from `index` to the newest."""
-        count = self.newest - index + 1
+    def since(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the samples from `index` to the newest: wrenches (k, 6), gyro readings (k, 3), accelerometer and depth (k, 4)."""
         last = self.newest % self.length + self.length + 1
-        return self._tau[last - count : last], self._gyro[last - count : last]
+        first = last - (self.newest - index + 1)
+        return self._tau[first:last], self._gyro[first:last], self._rows[first:last]

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import float64, njit, types
 
-from firmware_py.core.propagation import ERRORS, PLANT, STATE, inertial_acceleration, inject
+from firmware_py.core.propagation import ERRORS, PLANT, STATE, carry, inertial_acceleration, inject, predict
 from firmware_py.core.rotations import M, V, difference, skew, to_matrix
 
 GRAVITY = 9.80665
@@ -122,6 +122,32 @@ def fuse_inertial(  # type: ignore[no-untyped-def]
     return x_after, after
 
 
+@njit(f"{STATE}({V},{M},{M},{M},{M},float64,int64,float64,float64,{V},{V},{PLANT})", cache=True)
+def advance(  # type: ignore[no-untyped-def]
+    x, covariance, taus, gyros, others, first, count, dt, rest, density, sigma, mass, mass_inv, righting, nodes, rotational, linear
+):  # fmt: skip
+    """State and covariance moved on through stored samples, each fused at its time.
+
+    Args:
+        taus: (k, 6), gyros: (k, 3), others: (k, 4) accelerometer and depth, of each tick, NaN where none came.
+        first: time to the first sample, s; count: samples to fuse; dt: between them, s; rest: what is left after the last, s.
+    """
+    for i in range(count):
+        tau = taus[i].copy()
+        x, covariance = predict(
+            x, covariance, tau, first if i == 0 else dt, density, mass, mass_inv, righting, nodes, rotational, linear
+        )
+        x, covariance = fuse_inertial(
+            x, covariance, tau, gyros[i].copy(), others[i, :3].copy(), others[i, 3], sigma,
+            mass, mass_inv, righting, nodes, rotational, linear,
+        )  # fmt: skip
+    if rest > 0.0:
+        x, covariance = predict(
+            x, covariance, taus[count].copy(), rest, density, mass, mass_inv, righting, nodes, rotational, linear
+        )
+    return x, covariance
+
+
 @njit(f"Tuple((float64,{V},{M}))({V},{M},{V},{V},{V},{V},float64)", cache=True)
 def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, gate):  # type: ignore[no-untyped-def]
     """`update` by a tag, of which `tag` tells."""
@@ -162,3 +188,13 @@ def are_finite(a, b):  # type: ignore[no-untyped-def]
 def is_sound(x, variance):  # type: ignore[no-untyped-def]
     """Whether every number of a state (26,) is finite, and every variance (6,) finite and not negative."""
     return bool(are_finite(x, variance) and variance.min() >= 0.0)
+
+
+@njit(f"Tuple(({V},{V},boolean))({V},{M},{M},{M},float64,float64,{V},float64,float64,{PLANT})", cache=True)
+def carried(  # type: ignore[no-untyped-def]
+    x, covariance, taus, gyros, dt, until_first, density, lag, rate_variance, mass, mass_inv, righting, nodes, rotational, linear
+):  # fmt: skip
+    """State (26,) now, sigma (6,) of its pose, and whether both are sound. Arguments are those of `carry` and `carried_pose_variance`."""
+    now = carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rotational, linear)
+    variance = carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance)
+    return now, np.sqrt(variance), is_sound(now, variance)
