@@ -8,12 +8,14 @@ Error state e (25,): the same with the attitude error as a rotation vector in th
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
-from firmware_py.core.rotations import M, V, cross, exp, multiply, normalise, rotate, rotate_back, skew, to_matrix
+from firmware_py.core.rotations import M, V, cross, exp, multiply, normalise, rotate_back, skew, to_matrix, turn, turned, turned_back
 
 STATES = 26
 ERRORS = 25
@@ -26,17 +28,27 @@ STATE = f"Tuple(({V},{M}))"
 """Types of a state and its covariance."""
 
 
-@njit(f"{V}({V},{V},{V},{PLANT})", cache=True)
-def acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(6,) dnu/dt of the body under the (6,) wrench `external` (thrusters and disturbance, body frame)."""
-    total = external.copy()
+@njit(f"void({V},{V},{V},{PLANT},{V},{V})", cache=True)
+def accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, total, out):  # type: ignore[no-untyped-def]
+    """Writes to `out` (6,) dnu/dt of the body under the (6,) wrench `external` (thrusters and disturbance, body frame), and to the
+    first six of `total` the whole wrench.
+    """
+    for i in range(6):
+        total[i] = external[i]
     take_coriolis(mass, nu, total)
     add_drag(nodes, rotational, linear, nu, total)
     add_restoring(righting, q, total)
-    out = np.zeros(6)
     for i in range(6):
+        out[i] = 0.0
         for j in range(6):
             out[i] += mass_inv[i, j] * total[j]
+
+
+@njit(f"{V}({V},{V},{V},{PLANT})", cache=True)
+def acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
+    """(6,) dnu/dt of the body under the (6,) wrench `external`."""
+    out = np.empty(6)
+    accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, np.empty(6), out)
     return out
 
 
@@ -54,21 +66,43 @@ def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, l
     return rate[:3] + cross(nu[3:].copy(), nu[:3].copy())
 
 
+@njit(f"void({V},{V},float64,{PLANT},{M},{V})", cache=True)
+def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, work, out):  # type: ignore[no-untyped-def]
+    """Writes to `out` (26,), which is not x, the state after dt seconds; `work`: (6, 6) for what lies between. Allocates nothing."""
+    q, q_mid, nu, nu_mid, external, rate = work[0], work[1], work[2], work[3], work[4], work[5]
+    half = 0.5 * dt
+    q[:4] = x[3:7]
+    nu[:] = x[7:13]
+    fx, fy, fz = turned_back(q, x[19], x[20], x[21])
+    external[0], external[1], external[2] = tau[0] + fx, tau[1] + fy, tau[2] + fz
+    for i in range(3):
+        external[3 + i] = tau[3 + i] + x[22 + i]
+    accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, out, rate)
+    for i in range(6):
+        nu_mid[i] = nu[i] + half * rate[i]
+    turn(q, half * nu[3], half * nu[4], half * nu[5], q_mid)
+    fx, fy, fz = turned_back(q_mid, x[19], x[20], x[21])
+    external[0], external[1], external[2] = tau[0] + fx, tau[1] + fy, tau[2] + fz
+    accelerate(nu_mid, q_mid, external, mass, mass_inv, righting, nodes, rotational, linear, out, rate)
+    vx, vy, vz = turned(q_mid, nu_mid[0], nu_mid[1], nu_mid[2])
+    out[:] = x
+    out[0] += dt * vx
+    out[1] += dt * vy
+    out[2] += dt * vz
+    for i in range(6):
+        out[7 + i] = nu[i] + dt * rate[i]
+    turn(q, dt * nu_mid[3], dt * nu_mid[4], dt * nu_mid[5], q_mid)
+    n = math.sqrt(q_mid[0] ** 2 + q_mid[1] ** 2 + q_mid[2] ** 2 + q_mid[3] ** 2)
+    n = n if q_mid[0] >= 0.0 else -n
+    for i in range(4):
+        out[3 + i] = q_mid[i] / n
+
+
 @njit(f"{V}({V},{V},float64,{PLANT})", cache=True)
 def step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """(26,) state after dt seconds under the thruster wrench tau (6,), by the midpoint rule."""
-    q = x[3:7].copy()
-    nu = x[7:13].copy()
-    external = tau.copy()
-    external[3:] += x[22:25]
-    external[:3] += rotate_back(q, x[19:22].copy())
-    nu_mid = nu + 0.5 * dt * acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear)
-    q_mid = multiply(q, exp(0.5 * dt * nu[3:]))
-    external[:3] = tau[:3] + rotate_back(q_mid, x[19:22].copy())
-    out = x.copy()
-    out[7:13] = nu + dt * acceleration(nu_mid, q_mid, external, mass, mass_inv, righting, nodes, rotational, linear)
-    out[:3] += dt * rotate(q_mid, nu_mid[:3].copy())
-    out[3:7] = normalise(multiply(q, exp(dt * nu_mid[3:])))
+    out = np.empty(STATES)
+    step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, np.empty((6, 6)), out)
     return out
 
 
@@ -89,12 +123,13 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
     external = tau.copy()
     external[:3] += force_b
     external[3:] += x[22:25]
-    base = acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear)
+    base, there, total = np.empty(6), np.empty(6), np.empty(6)
+    accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, total, base)
     step_size = 1e-4
     for i in range(6):
         here = nu[i]
         nu[i] += step_size
-        there = acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear)
+        accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, total, there)
         nu[i] = here
         for j in range(6):
             a[6 + j, 6 + i] = (there[j] - base[j]) / step_size
@@ -138,13 +173,16 @@ def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rota
             none came.
         dt: tick, s; until_first: what is left of the first tick, s.
     """
+    now, after, work = x.copy(), np.empty(STATES), np.empty((6, 6))
     for i in range(taus.shape[0]):
         h = until_first if i == 0 else dt
         if h > 0.0:
-            x = step(x, taus[i].copy(), h, mass, mass_inv, righting, nodes, rotational, linear)
-        if not np.isnan(gyros[i, 0]):
-            x[10:13] = gyros[i] - x[13:16]
-    return x
+            step_into(now, taus[i], h, mass, mass_inv, righting, nodes, rotational, linear, work, after)
+            now, after = after, now
+        if not math.isnan(gyros[i, 0]):
+            for k in range(3):
+                now[10 + k] = gyros[i, k] - now[13 + k]
+    return now
 
 
 @njit(f"{V}({V},{V})", cache=True)

@@ -11,15 +11,46 @@ V = "float64[::1]"
 M = "float64[:,::1]"
 
 
+@njit(f"UniTuple(float64,4)({','.join(['float64'] * 8)})", cache=True)
+def _product(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
+    """Hamilton product of (a, b, c, d) and (e, f, g, h)."""
+    return a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g, a * g - b * h + c * e + d * f, a * h + b * g - c * f + d * e
+
+
+@njit(f"UniTuple(float64,4)({','.join(['float64'] * 3)})", cache=True)
+def _exp(x, y, z):  # type: ignore[no-untyped-def]
+    """Unit quaternion of the rotation vector (x, y, z), rad."""
+    angle = math.sqrt(x**2 + y**2 + z**2)
+    s = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
+    return math.cos(0.5 * angle), s * x, s * y, s * z
+
+
+@njit(f"UniTuple(float64,3)({V},{','.join(['float64'] * 3)})", cache=True)
+def turned(q, a, b, c):  # type: ignore[no-untyped-def]
+    """q v q^-1 of v = (a, b, c), without an array."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx
+
+
+@njit(f"UniTuple(float64,3)({V},{','.join(['float64'] * 3)})", cache=True)
+def turned_back(q, a, b, c):  # type: ignore[no-untyped-def]
+    """q^-1 v q of v = (a, b, c), without an array."""
+    w, x, y, z = q[0], -q[1], -q[2], -q[3]
+    tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx
+
+
+@njit(f"void({V},{','.join(['float64'] * 3)},{V})", cache=True)
+def turn(q, a, b, c, out):  # type: ignore[no-untyped-def]
+    """Writes to `out` (4,) the attitude q turned by the rotation vector (a, b, c), rad, of its own frame."""
+    out[0], out[1], out[2], out[3] = _product(q[0], q[1], q[2], q[3], *_exp(a, b, c))
+
+
 @njit(f"{V}({V},{V})", cache=True)
 def multiply(a, b):  # type: ignore[no-untyped-def]
     """Hamilton product a * b, (4,)."""
-    return np.array([
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ])
+    return np.array(_product(a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]))
 
 
 @njit(f"{V}({V})", cache=True)
@@ -69,9 +100,7 @@ def from_matrix(r):  # type: ignore[no-untyped-def]
 @njit(f"{V}({V})", cache=True)
 def exp(v):  # type: ignore[no-untyped-def]
     """Unit quaternion of a rotation vector, (3,) rad -> (4,)."""
-    angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
-    s = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
-    return np.array([math.cos(0.5 * angle), s * v[0], s * v[1], s * v[2]])
+    return np.array(_exp(v[0], v[1], v[2]))
 
 
 @njit(f"{V}({V})", cache=True)
@@ -104,19 +133,13 @@ def cross(a, b):  # type: ignore[no-untyped-def]
 @njit(f"{V}({V},{V})", cache=True)
 def rotate(q, v):  # type: ignore[no-untyped-def]
     """q v q^-1, (3,)."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    tx, ty, tz = 2.0 * (y * v[2] - z * v[1]), 2.0 * (z * v[0] - x * v[2]), 2.0 * (x * v[1] - y * v[0])
-    return np.array([
-        v[0] + w * tx + y * tz - z * ty,
-        v[1] + w * ty + z * tx - x * tz,
-        v[2] + w * tz + x * ty - y * tx,
-    ])
+    return np.array(turned(q, v[0], v[1], v[2]))
 
 
 @njit(f"{V}({V},{V})", cache=True)
 def rotate_back(q, v):  # type: ignore[no-untyped-def]
     """q^-1 v q, (3,)."""
-    return rotate(conjugate(q), v)
+    return np.array(turned_back(q, v[0], v[1], v[2]))
 
 
 def from_euler(roll: float, pitch: float, yaw: float) -> np.ndarray:
