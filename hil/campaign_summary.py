@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom, binomtest, norm, spearmanr
+import scipy  # its parts load when they are used: a second that no worker needs
 
 CONFIDENCE = 0.95
 WORST = 5
@@ -25,7 +25,7 @@ Trial = Mapping[str, Any]
 def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
     """The content of campaign.json. Success has Wilson's interval, a median that of its order statistics."""
     succeeded = sum(bool(trial["passed"]) for trial in trials)
-    interval = binomtest(succeeded, len(trials)).proportion_ci(CONFIDENCE, method="wilson")
+    interval = scipy.stats.binomtest(succeeded, len(trials)).proportion_ci(CONFIDENCE, method="wilson")
     outcomes: dict[str, int] = {}
     for trial in trials:
         outcomes[trial["outcome"]] = outcomes.get(trial["outcome"], 0) + 1
@@ -65,8 +65,8 @@ def median_interval(values: np.ndarray) -> tuple[float | None, float | None]:
     None where there are too few values (David and Nagaraja, Order Statistics, 2003, section 7.1).
     """
     n, ordered = values.size, np.sort(values)
-    below = int(binom.ppf(0.5 * (1.0 - CONFIDENCE), n, 0.5)) - 1 if n else -1
-    while below + 1 < n / 2 and binom.cdf(below + 1, n, 0.5) <= 0.5 * (1.0 - CONFIDENCE):
+    below = int(scipy.stats.binom.ppf(0.5 * (1.0 - CONFIDENCE), n, 0.5)) - 1 if n else -1
+    while below + 1 < n / 2 and scipy.stats.binom.cdf(below + 1, n, 0.5) <= 0.5 * (1.0 - CONFIDENCE):
         below += 1
     if below < 0:
         return None, None
@@ -91,8 +91,8 @@ def sensitivities(trials: Sequence[Trial]) -> dict[str, dict[str, dict[str, floa
 
 
 def _rank_correlation(pairs: np.ndarray) -> dict[str, float]:
-    rho = float(spearmanr(pairs[:, 0], pairs[:, 1]).statistic)
-    half = float(norm.ppf(0.5 + 0.5 * CONFIDENCE)) * math.sqrt((1.0 + 0.5 * rho * rho) / (len(pairs) - 3))
+    rho = float(scipy.stats.spearmanr(pairs[:, 0], pairs[:, 1]).statistic)
+    half = float(scipy.stats.norm.ppf(0.5 + 0.5 * CONFIDENCE)) * math.sqrt((1.0 + 0.5 * rho * rho) / (len(pairs) - 3))
     z = math.atanh(max(-1.0 + 1e-12, min(1.0 - 1e-12, rho)))
     return {"rho": rho, "low": math.tanh(z - half), "high": math.tanh(z + half)}
 

@@ -24,11 +24,18 @@ task = { kind = "hover", settle_s = 3.0, duration_s = 4.0, centre_m = [0.0, 0.0,
 TABLES = ("campaign.json", "trials.csv")
 
 
-@pytest.fixture
-def scenario(tmp_path: Path) -> Path:
-    path = tmp_path / "short.toml"
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("campaign") / "short.toml"
     path.write_text(SCENARIO)
     return path
+
+
+@pytest.fixture(scope="module")
+def whole(scenario: Path) -> list[bytes]:
+    """The tables of a campaign that nothing befell."""
+    assert campaign(scenario, scenario.parent / "whole", "--jobs", "2").wait() == 0
+    return tables(scenario.parent / "whole")
 
 
 def campaign(scenario: Path, out: Path, *arguments: str) -> subprocess.Popen[bytes]:
@@ -80,25 +87,24 @@ def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]
 
 
 @pytest.mark.slow
-def test_campaign_killed_with_all_its_processes_goes_on_to_the_same_bytes(scenario: Path, tmp_path: Path) -> None:
-    whole, torn = tmp_path / "whole", tmp_path / "torn"
-    assert campaign(scenario, whole).wait() == 0
-    process = campaign(scenario, torn)
-    wait_for(torn, 2, process)
+@pytest.mark.xdist_group("campaign")
+def test_campaign_killed_with_all_its_processes_goes_on_to_the_same_bytes(whole: list[bytes], scenario: Path, tmp_path: Path) -> None:
+    process = campaign(scenario, tmp_path, "--jobs", "1")
+    wait_for(tmp_path, 2, process)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    assert 2 <= flown(torn) < TRIALS
-    assert campaign(scenario, torn).wait() == 0
-    assert tables(torn) == tables(whole)
+    assert 2 <= flown(tmp_path) < TRIALS
+    assert campaign(scenario, tmp_path, "--jobs", "1").wait() == 0
+    assert tables(tmp_path) == whole
 
 
 @pytest.mark.slow
-def test_dask_cluster_that_loses_a_worker_gives_the_same_table_as_this_machine(scenario: Path, tmp_path: Path) -> None:
-    local, remote = tmp_path / "local", tmp_path / "remote"
-    assert campaign(scenario, local, "--jobs", "1").wait() == 0
+@pytest.mark.xdist_group("campaign")
+def test_dask_cluster_that_loses_a_worker_gives_the_same_table_as_this_machine(whole: list[bytes], scenario: Path, tmp_path: Path) -> None:
+    remote = tmp_path / "remote"
     with cluster(tmp_path) as (address, workers):
         process = campaign(scenario, remote, "--dask", address)
         wait_for(remote, TRIALS // 2, process)
         workers[0].kill()
         assert process.wait() == 0
-    assert tables(remote) == tables(local)
+    assert tables(remote) == whole
