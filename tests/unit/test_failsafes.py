@@ -84,6 +84,16 @@ def test_what_is_not_known_is_no_alarm(name: str) -> None:
     assert alarms_of(quick(name), spoilt(name, math.nan), Mode.MANUAL) == []
 
 
+def test_row_that_is_on_is_known_by_its_name_and_no_other_is() -> None:
+    failsafes = Failsafes(quick("partner_lost"))
+    assert not failsafes.is_on("partner_lost")
+    failsafes.step(bad("partner_lost"), Mode.AUTO, False, True)
+    assert failsafes.is_on("partner_lost") and not failsafes.is_on("leak")
+    delayed = Failsafes(replace(P, partner_lost_delay_s=1.0))
+    delayed.step(bad("partner_lost"), Mode.AUTO, False, True)
+    assert not delayed.is_on("partner_lost")
+
+
 def test_depth_is_known_by_pressure_or_by_tags() -> None:
     lost = math.nextafter(P.depth_unknown_limit, math.inf)
     assert alarms_of(quick("depth_unknown"), GOOD._replace(depth_age_s=lost)) == []

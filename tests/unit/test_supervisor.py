@@ -378,6 +378,13 @@ QUICK = replace(
 )
 
 
+def test_fail_safe_that_is_on_is_known_by_its_name() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    assert not supervisor.is_on("leak")
+    supervisor.step(False, GOOD._replace(leak=True), [])
+    assert supervisor.is_on("leak") and not supervisor.is_on("partner_lost")
+
+
 def test_leak_brings_the_robot_up() -> None:
     supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
     (decision,) = supervisor.step(False, GOOD._replace(leak=True), [])
@@ -537,6 +544,16 @@ def test_robot_that_a_fail_safe_took_stays_in_its_mode_when_it_joins_or_parts(mo
     taken.level = Level.SURFACE if mode == Mode.SURFACE else Level.DEPTH
     body.take_over([other, taken])
     assert (body.mode, body.level) == (mode, taken.level)
+
+
+def test_graver_fail_safe_of_two_bodies_that_join_decides_whichever_comes_first() -> None:
+    held, deep, surfacing = supervisor_in(mode=Mode.POSHOLD), supervisor_in(mode=Mode.ALT_HOLD), supervisor_in(mode=Mode.SURFACE)
+    held.level, deep.level = Level.HOLD, Level.DEPTH
+    for pair, mode, level in (((held, deep), Mode.ALT_HOLD, Level.DEPTH), ((deep, surfacing), Mode.SURFACE, Level.NONE)):
+        for before in (pair, pair[::-1]):
+            joined = Supervisor(P)
+            joined.take_over(before)
+            assert (joined.mode, joined.level) == (mode, level)
 
 
 def test_robot_that_a_person_lets_surface_goes_on_when_it_parts() -> None:
