@@ -244,6 +244,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--list", action="store_true", help="only say what would be tried")
     options = parser.parse_args(arguments)
+    short = [name.rpartition(".")[2] for name in TARGETS]
+    if unknown := [name for name in options.module if name not in short]:
+        parser.error(f"{', '.join(unknown)}: unknown; there are {', '.join(short)}")
     os.chdir(ROOT)
     os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     sys.path.insert(0, str(ROOT))

@@ -546,6 +546,16 @@ def test_robot_that_a_fail_safe_took_stays_in_its_mode_when_it_joins_or_parts(mo
     assert (body.mode, body.level) == (mode, taken.level)
 
 
+def test_robot_that_joins_holds_its_place_whatever_it_did_before() -> None:
+    joined = Supervisor(P)
+    joined.take_over([supervisor_in(mode=Mode.AUTO), supervisor_in(mode=Mode.DOCK)])
+    assert joined.mode == Mode.POSHOLD
+
+
+def test_severities_are_those_of_syslog() -> None:
+    assert (CRITICAL, WARNING, INFORMATION) == (2, 4, 6)
+
+
 def test_graver_fail_safe_of_two_bodies_that_join_decides_whichever_comes_first() -> None:
     held, deep, surfacing = supervisor_in(mode=Mode.POSHOLD), supervisor_in(mode=Mode.ALT_HOLD), supervisor_in(mode=Mode.SURFACE)
     held.level, deep.level = Level.HOLD, Level.DEPTH
