@@ -96,6 +96,15 @@ def module_power(force, power_forward, power_reverse, module, count):  # type: i
     return out
 
 
+@njit("void(float64[::1],float64[::1],float64[::1],float64[::1],float64[::1])", cache=True)
+def lagged(acting, decay, lag_over_dt, force, mean):  # type: ignore[no-untyped-def]
+    """Moves `force` (n,) on by a tick towards `acting`; writes its mean over that tick."""
+    for i in range(force.shape[0]):
+        end = acting[i] + (force[i] - acting[i]) * decay[i]
+        mean[i] = acting[i] + (force[i] - end) * lag_over_dt[i]
+        force[i] = end
+
+
 class ThrusterLag:
     """The forces that the thrusters are believed to give now: commanded forces through a first-order lag.
 
@@ -112,11 +121,11 @@ class ThrusterLag:
 
     def step(self) -> np.ndarray:
         """(n,) mean force of each thruster over the tick that ends now, N; moves the lag on by one tick."""
-        end = self._acting + (self.force_n - self._acting) * self._decay
-        mean = self._acting + (self.force_n - end) * self._lag_over_dt
-        self.force_n = end
+        mean = np.empty_like(self.force_n)
+        self.force_n = self.force_n.copy()
+        lagged(self._acting, self._decay, self._lag_over_dt, self.force_n, mean)
         self._acting = self._pending
-        return np.asarray(mean)
+        return mean
 
     @property
     def forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

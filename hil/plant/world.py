@@ -126,6 +126,7 @@ class World(DockedBodies):
             raise DescriptionError(f"plant: the sub-step of {step_ns} ns does not divide the tick of {period_ns} ns")
         self._centres: dict[tuple[int, ...], tuple[tuple[Place, ...], tuple[float, ...]]] = {}
         self._truths: dict[int, Truth] = {}
+        self._escs: dict[int, np.ndarray] = {}
         self.time_ns = 0
         self.vehicles = tuple(vehicles)
         self.spec = spec
@@ -224,6 +225,7 @@ class World(DockedBodies):
     def _step(self, steps: int) -> None:
         h = 1e-9 * self._step_ns
         self._truths.clear()
+        self._escs.clear()
         self._external[:] = 0.0
         if len(self.vehicles) > 1 and self.jet_strength > 0.0:
             jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
@@ -247,6 +249,7 @@ class World(DockedBodies):
                 f"plant: a batch is of lone modules that are whole; here are {len(self.vehicles)} modules, {len(self._broken)} faults"
             )
         self._truths.clear()
+        self._escs.clear()
         self.time_ns += ticks * self.period_ns
         return Arrays(
             self._body_arrays, self._modules, self._thrusters, self._water, self._gusts.steps(ticks), self._external,
@@ -291,11 +294,12 @@ class World(DockedBodies):
         return kept[1]
 
     def esc(self, module: int) -> np.ndarray:
-        """(t, 2) speed (1/min) and current (A) of each thruster of a module."""
-        first, last = self._first[module], self._first[module + 1]
-        out = np.empty((last - first, 2))
-        thrusters_module.feedback(self._thrusters, first, out)
-        return out
+        """(t, 2) speed (1/min) and current (A) of each thruster of a module; the same array until the world moves on."""
+        if module not in self._escs:
+            first, last = self._first[module], self._first[module + 1]
+            self._escs[module] = np.empty((last - first, 2))
+            thrusters_module.feedback(self._thrusters, first, self._escs[module])
+        return self._escs[module]
 
     def draw(self, module: int) -> ModuleDraw:
         """What this seed made of a module."""

@@ -81,8 +81,9 @@ class MessageCodec:
         self.numbers: frozenset[int] = _numbers(self.name)
         self._counter_shift = 8 * (self.length - 2) + 4
         self._head = self.length - 1 if self.protected else self.length
-        ids = (self.function << 5 | number for number in range(NUMBERS))
-        self._crc_start = tuple(crc.register_of_id(can_id) for can_id in ids)
+        ids = {number: self.function << 5 | number for number in self.numbers}
+        self._ids = {number: (can_id, crc.register_of_id(can_id)) for number, can_id in ids.items()}
+        """By node number: the id, and the CRC's register behind it."""
         self._unpack: Callable[[int], tuple[Any, ...]] = _compile(_decode_source(self.field_details))
         self._pack: Callable[[Sequence[Any]], int] = _compile(_encode_source(self.field_details))
 
@@ -139,13 +140,13 @@ class MessageCodec:
         return tuple(raw - (1 << f.bits) if f.signed and raw >> (f.bits - 1) else raw for f, raw in bits)
 
     def _frame(self, number: int, packed: int, counter: int) -> Frame:
-        if number not in self.numbers:
+        if number not in self._ids:
             raise ValueError(f"{self.name}: number {number} is not valid for it")
-        can_id = self.function << 5 | number
+        can_id, register = self._ids[number]
         if not self.protected:
             return Frame(can_id, packed.to_bytes(self._head, "little"))
         head = (packed | (counter & 15) << self._counter_shift).to_bytes(self._head, "little")
-        table, register = crc.TABLE, self._crc_start[number]
+        table = crc.TABLE
         for byte in head:
             register = table[register ^ byte]
         return Frame(can_id, head + crc.LAST_BYTE[register])
