@@ -4,7 +4,6 @@ BLAS runs single-threaded: the matrices of a tick are small, and the same inputs
 """
 
 import os
-import time
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -13,13 +12,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 def forget_stale_code(package: Path, *used: Path) -> None:
     """Deletes what numba has cached in `package` before one of its compiled sources, or of those of the packages `used`, was changed.
 
-    numba compares a cache with the source beside it alone; a change of a function that others have taken in would not be seen.
+    numba compares a cache with the source beside it alone; a change of a function that others have taken in would not be seen. Caches
+    that NUMBA_CACHE_DIR leads elsewhere are not looked at.
     """
     caches = list(package.rglob("__pycache__/*.nbi"))
     others = [path for folder in used for path in folder.rglob("__pycache__/*.nbi")]
     sources = {path.parents[1] / f"{path.name.split('.')[0]}.py" for path in (*caches, *others)}
-    changed = [path.stat().st_mtime for path in sources if path.exists()]
-    newest = max((at for at in changed if at <= time.time()), default=0.0)
+    newest = max((path.stat().st_mtime for path in sources if path.exists()), default=0.0)
     for path in caches:
         try:
             if path.stat().st_mtime < newest:

@@ -61,7 +61,7 @@ def outcomes(group: Group, values: Values) -> list[Outcome]:
     """The group's figures held against their limits; one that was not measured fails."""
     found = []
     for figure in group.figures:
-        value = values.get(figure.key, float("nan")) * figure.scale
+        value = float(values.get(figure.key, float("nan"))) * figure.scale
         passed = figure.low <= value <= figure.high
         limit = limit_text(figure.low, figure.high)
         found.append(Outcome(figure.name, value, limit, passed, group.command, figure.unit, group.name, group.issue))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from firmware_py.app.preparation import prepare_dock
+from firmware_py.app.preparation import prepare
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.mapping import InputCollector, OutputEncoder
 from firmware_py.core.pipeline import Pipeline
@@ -60,7 +60,7 @@ class Firmware:
         inputs.prepared = self.worker.results()
         outputs = self.pipeline.step(inputs)
         for request in outputs.preparations:
-            self.worker.submit(partial(prepare_dock, request, self.pipeline, self.vehicles, self.fleet.pitch_m))
+            self.worker.submit(partial(prepare, request, self.pipeline, self.vehicles, self.fleet.pitch_m))
         return outputs
 
 

@@ -49,7 +49,6 @@ FLUSH_EVERY_S = 0.5
 class Operator:
     """Stands in for a person: arms and holds when told to, and disarms when the process is asked to stop."""
 
-    bodies: Sequence[int]
     rate_hz: int
     hold: bool
     stopping: bool = False
@@ -62,7 +61,8 @@ class Operator:
         self._ticks += 1
         if self.stopping:
             self.farewell += 1
-            return [Request(Action.DISARM, body) for body in self.bodies] if self.farewell == 1 else []
+            bodies = [record.body for record in last.records] if last is not None else []
+            return [Request(Action.DISARM, body) for body in bodies] if self.farewell == 1 else []
         if not self.hold or last is None or self._ticks < self._next_try:
             return []
         ready = [record.body for record in last.records if record.state not in ARMED and record.estimate.ready]
@@ -103,7 +103,7 @@ def run_vehicle(
         worker = ThreadWorker()
         stack.callback(worker.close)
         firmware = compose(fleet, parameters, worker=worker)
-        operator = Operator([body.index for body in firmware.pipeline.bodies], fleet.rate_hz, hold)
+        operator = Operator(fleet.rate_hz, hold)
         observers: list[Observer] = []
         recorder = _open_recorder(stack, firmware, out, live)
         if recorder is not None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, TagTable
+from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_sequence import (
     RELAY_OFF,
     RELAY_PULL,
@@ -116,25 +117,29 @@ class DockingStage:
         self._docks: list[_Dock] = []
         self._undocks: list[_Undock] = []
         self._joints = PairBank([], parameters)
+        self._watched: Sequence[Joint] = ()
         self.events: list[Event] = []
         self.records: list[DockRecord] = []
 
     def retune(self, parameters: Docking) -> None:
-        """Takes other parameters for docks that begin from now on."""
+        """Takes other parameters for joints, and for docks that begin from now on."""
         self._p = parameters
+        self._joints = PairBank([joint.pair for joint in self._watched], parameters, self._joints)
 
     def watch_joints(self, joints: Sequence[Joint]) -> None:
         """Watches these joints, all that there are in the fleet; their magnets hold."""
+        self._watched = joints
         self._joints = PairBank([joint.pair for joint in joints], self._p, self._joints)
         for joint in joints:
             self._set_relays(joint.request, RELAY_PULL)
 
-    @property
-    def open_joints(self) -> list[DockRequest]:
-        """Joints that should hold and do not, by fresh measurements: an undock of each. Those that are being undocked are left out."""
+    def open_joints(self, least: int) -> list[DockRequest]:
+        """Joints that are `least` LOOSE or APART though they should hold, as requests that name their faces. Those that are being
+        undocked are left out.
+        """
         if not self._joints.rows.size:
             return []
-        rows = self._joints.rows[self._joints.rows["open"] != 0]
+        rows = self._joints.rows[self._joints.rows["open"] >= least]
         parting = [_modules(undock.prepared.request) for undock in self._undocks]
         found = [
             DockRequest(module, face, target, target_face)
@@ -152,6 +157,15 @@ class DockingStage:
     def busy(self) -> frozenset[int]:
         """Bodies that a dock steers."""
         return frozenset(dock.active for dock in self._docks)
+
+    def forget(self, bodies: Collection[int]) -> list[int]:
+        """Ends every dock that one of these takes part in, bodies that there are no more; returns the active ones."""
+        ended = [dock for dock in self._docks if dock.active in bodies or dock.target in bodies]
+        for dock in ended:
+            self._docks.remove(dock)
+            self._set_relays(dock.prepared.request, RELAY_OFF)
+            self._say(WARNING, f"dock ended: {CHANGED}")
+        return [dock.active for dock in ended]
 
     def abort(self, body: int, time_ns: int, reason: str) -> None:
         """Ends every dock that a body takes part in."""
@@ -206,8 +220,11 @@ class DockingStage:
         if prepared.plan is None:
             self._say(WARNING, f"dock refused: {prepared.refusal}")
             decisions.ended.append(_body_of(request.module, estimates))
+        elif not _fits(prepared.plan, estimates):
+            self._say(WARNING, f"dock refused: {CHANGED}")
+            decisions.ended.append(_body_of(request.module, estimates))
         elif isinstance(prepared.plan, UndockPlan):
-            holds = _modules(request) not in [_modules(joint) for joint in self.open_joints]
+            holds = _modules(request) not in [_modules(joint) for joint in self.open_joints(APART)]
             self._undocks.append(_Undock(prepared, time_ns + (round(self._p.release_s * 1e9) if holds else 0)))
             self._say(INFORMATION, f"undocking module {request.module} from {request.target_module}")
         else:
@@ -260,6 +277,12 @@ class DockingStage:
         plan = undock.prepared.plan
         assert isinstance(plan, UndockPlan)
         request = plan.request
+        if not _fits(plan, estimates):
+            self._undocks.remove(undock)
+            holds = _modules(request) in [_modules(joint.request) for joint in self._watched]
+            self._set_relays(request, RELAY_PULL if holds else RELAY_OFF)
+            self._say(WARNING, f"undock ended: {CHANGED}")
+            return
         self._set_relays(request, RELAY_PUSH)
         if time_ns < undock.until_ns:
             return
@@ -312,6 +335,20 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
             q_tm = multiply(conjugate(np.ascontiguousarray(body.q_bt[k])), q_bm)
             table[body.modules[i], int(tag)] = np.concatenate([r_mt, q_tm])
     return table
+
+
+CHANGED = "the bodies are others than those that it was planned for"
+
+
+def _fits(plan: DockPlan | UndockPlan, estimates: Mapping[int, tuple[Body, Estimate]]) -> bool:
+    """Whether the bodies are still those that a plan is made for."""
+    bodies = {frozenset(body.modules) for body, _ in estimates.values()}
+    if isinstance(plan, UndockPlan):
+        return frozenset((*plan.stays.modules, *plan.leaves.modules)) in bodies
+    request, merged = plan.request, frozenset(plan.merged.modules)
+    mine = {module: body for body in bodies for module in body}
+    active, target = mine[request.module], mine[request.target_module]
+    return active != target and active | target == merged
 
 
 def _modules(request: DockRequest) -> frozenset[int]:

@@ -22,6 +22,9 @@ TURNED_COS = math.cos(math.radians(15.0))
 CURRENT, POSITION = 0, 1
 """The two conditions, as columns of a pair's row."""
 
+CLOSED, LOOSE, APART = 0, 1, 2
+"""A joint: nothing says that it is open; one condition says so and the other does not; all that is seen says so."""
+
 PAIR = np.dtype(
     [
         ("module", np.int64, 2),  # fleet index of module a, of module b; sides a and b in `face` and the currents too
@@ -38,7 +41,7 @@ PAIR = np.dtype(
         ("error_m", np.float64),
         ("spread_m", np.float64),
         ("fresh", np.int64),
-        ("open", np.int64),  # by fresh measurements: no current, or further apart than noise makes it
+        ("open", np.int64),  # CLOSED, LOOSE or APART
     ],
     align=True,
 )
@@ -185,7 +188,11 @@ def watch(rows, rings, heard_ma, first, seen, poses, time_ns, limits):  # type: 
         fresh_current = _take_currents(row, heard_ma, time_ns, limits)
         fresh_pose = _take_pose(row, rings[k], first, seen, poses, time_ns, limits)
         row.fresh = fresh_current and fresh_pose
-        row.open = (fresh_current and row.holds[CURRENT] == 0) or (fresh_pose and row.error_m > limits.open_m)
+        weak = fresh_current and row.holds[CURRENT] == 0 and row.candidate_ns[CURRENT] == NEVER_NS
+        far = fresh_pose and row.error_m > limits.open_m
+        row.open = CLOSED
+        if weak or far:
+            row.open = LOOSE if (fresh_current and not weak) or (fresh_pose and not far) else APART
     heard_ma[:] = math.nan
 
 

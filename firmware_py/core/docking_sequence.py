@@ -194,7 +194,7 @@ class DockingSequence:
     def _decide(self, time_ns: int, active: Estimate, target: Estimate, errors: Errors, status: PairStatus) -> None:
         if self.stage in ENDED:
             return
-        if status.docked:
+        if status.docked and TABLE[self.stage].relay == RELAY_PULL:  # while they push, faces that are still near are no dock
             self._enter(Stage.DOCKED, time_ns)
             return
         sigma = float(np.sqrt(np.max(active.sigma_p**2 + target.sigma_p**2)))

@@ -88,15 +88,15 @@ class Estimator:
     @property
     def motion(self) -> Motion:
         """State and covariance now, for a body that joins or parts."""
-        return Motion(self._now.copy(), self._covariance.copy())
+        return Motion(self._now.copy(), self._covariance.copy(), self._accepted, self._last_tag_ns)
 
     def restart(self, time_ns: int, motion: Motion) -> Estimate:
         """Goes on from `motion` at `time_ns`, as after a dock; returns the estimate of the same tick."""
         self._history.push(time_ns, np.zeros(6), None, None, None)
         self._x, self._covariance = motion.x.copy(), motion.covariance.copy()
         self._now = self._x
-        self._anchor_ns = self._last_tag_ns = time_ns
-        self._accepted, self._refused_in_row = READY_AFTER, 0
+        self._anchor_ns, self._last_tag_ns = time_ns, motion.tag_ns
+        self._accepted, self._refused_in_row = motion.accepted, 0
         self._nis, self._nis_dof = math.nan, 0
         return self._estimate(time_ns)
 

@@ -21,7 +21,7 @@ MODEL = types.Tuple((float64[::1], float64[:, ::1], float64[::1]))  # type: igno
 ANY_NIS = math.inf
 
 
-@njit(MODEL(float64[::1], float64[::1], float64[::1], float64, float64[::1], float64[::1]), cache=True)
+@njit(cache=True)
 def inertial(x, gyro, accel, depth, sigma, moved):  # type: ignore[no-untyped-def]
     """Gyro (3,), accelerometer (3,) and depth; sigma (3,) in that order.
 
@@ -54,7 +54,7 @@ def inertial(x, gyro, accel, depth, sigma, moved):  # type: ignore[no-untyped-de
     return residual[:rows].copy(), h[:rows].copy(), variance[:rows].copy()
 
 
-@njit(MODEL(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1]), cache=True)
+@njit(cache=True)
 def tag(x, p_wt, lever_b, q_wb, variance):  # type: ignore[no-untyped-def]
     """Tag centre p_wt (3,) at lever_b (3,) and attitude q_wb (4,); variance (6,) of position (world) and attitude
     (body).
@@ -71,7 +71,7 @@ def tag(x, p_wt, lever_b, q_wb, variance):  # type: ignore[no-untyped-def]
     return residual, h, variance
 
 
-@njit(f"Tuple((float64,{V},{M}))({V},{M},{V},{M},{V},float64)", cache=True)
+@njit(cache=True)
 def update(x, covariance, residual, h, variance, gate):  # type: ignore[no-untyped-def]
     """Normalised innovation squared, and state and covariance after the measurement; as they were where `gate` is exceeded.
 
@@ -111,7 +111,7 @@ def update(x, covariance, residual, h, variance, gate):  # type: ignore[no-untyp
     return nis, inject(x, error), p
 
 
-@njit(f"{STATE}({V},{M},{V},{V},{V},float64,{V},{PLANT})", cache=True)
+@njit(cache=True)
 def fuse_inertial(  # type: ignore[no-untyped-def]
     x, covariance, tau, gyro, accel, depth, sigma, mass, mass_inv, righting, nodes, rotational, linear
 ):  # fmt: skip
@@ -155,7 +155,7 @@ def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, gate):  # type: ignor
     return update(x, covariance, residual, h, noise, gate)
 
 
-@njit(f"{V}({V},{M},{V},{M},float64,float64)", cache=True)
+@njit(cache=True)
 def carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance):  # type: ignore[no-untyped-def]
     """(6,) variance of position (world) and attitude (body) after carrying the state for `lag` seconds by gyro and
     model.
@@ -184,7 +184,7 @@ def are_finite(a, b):  # type: ignore[no-untyped-def]
     return bool(np.all(np.isfinite(a)) and np.all(np.isfinite(b)))
 
 
-@njit(f"boolean({V},{V})", cache=True)
+@njit(cache=True)
 def is_sound(x, variance):  # type: ignore[no-untyped-def]
     """Whether every number of a state (26,) is finite, and every variance (6,) finite and not negative."""
     return bool(are_finite(x, variance) and variance.min() >= 0.0)

@@ -68,7 +68,7 @@ class TagOnlyEstimator:
         x[10:13] = self._rate_b
         variance = np.full(ERRORS, 1e-4)
         variance[:3], variance[3:6] = self._p_position.diagonal()[:3], self._p_attitude.diagonal()[:3]
-        return Motion(x, np.diag(variance))
+        return Motion(x, np.diag(variance), self._accepted, self._last_tag_ns)
 
     def restart(self, time_ns: int, motion: Motion) -> Estimate:
         """Goes on from `motion` at `time_ns`; returns the estimate of the same tick."""
@@ -76,8 +76,7 @@ class TagOnlyEstimator:
         self._q_wb = x[3:7].copy()
         self._position = np.concatenate([x[:3], rotate(self._q_wb, x[7:10].copy())])
         self._rate_b = x[10:13].copy()
-        self._accepted = READY_AFTER
-        self._last_tag_ns = time_ns
+        self._accepted, self._last_tag_ns = motion.accepted, motion.tag_ns
         return self._estimate(time_ns)
 
     def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:

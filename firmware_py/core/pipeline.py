@@ -13,6 +13,7 @@ from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.controller import Controller
 from firmware_py.core.docking import Decisions, DockingStage, Join, Part, joints_of, tag_table
+from firmware_py.core.docking_pairs import APART, LOOSE
 from firmware_py.core.estimator import Estimator
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.guidance_modes import Guidance
@@ -39,6 +40,7 @@ from firmware_py.core.types import (
     Mode,
     ModuleCommand,
     Outputs,
+    PartRequest,
     Request,
     Thrust,
 )  # fmt: skip
@@ -65,8 +67,8 @@ class BodyPipeline:
         self.guidance = Guidance(body, parameters)
         self.motor_test = MotorTest(body, parameters.steering)
         self.dock_over = False
-        self.given_up: set[DockRequest] = set()
-        """Joints that were found open and are being parted."""
+        self.parting: list[DockRequest] = []
+        """Open joints for which a plan was last asked."""
         self.controller = Controller(body, parameters.control)
         self.allocator = Allocator(body, parameters.allocation)
         self.limiter = Limiter(body, parameters.limiter, period_ns * 1e-9)
@@ -243,24 +245,24 @@ class Pipeline:
         self._miss_partners(outputs)
         outputs.docks += self.docking.records
         outputs.joints = self.docking.joints
-        outputs.events += self.docking.events
         self._steer(decisions)
         for joined in decisions.joins:
             self._join(joined, inputs.time_ns, estimates)
         for parted in decisions.parts:
             self._part(parted, inputs.time_ns, estimates)
+        outputs.events += self.docking.events
 
     def _miss_partners(self, outputs: Outputs) -> None:
-        """Joints that are open though nobody asked: tells the bodies, and parts those whose fail-safe has gone off over it."""
-        open_joints = self.docking.open_joints
+        """Joints that are open though nobody asked: tells the bodies, and parts those that have come apart once their fail-safe is on."""
+        loose, apart = self.docking.open_joints(LOOSE), self.docking.open_joints(APART)
         for chain in self._chains:
             if not chain.joints:
                 continue
-            mine = [joint for joint in open_joints if joint.module in chain.body.modules]
-            chain.health.topology = _words_of(mine) if mine else ""
-            if mine and chain.supervisor.is_on("partner_lost"):
-                outputs.preparations += [joint for joint in mine if joint not in chain.given_up]
-                chain.given_up |= set(mine)
+            chain.health.topology = _words_of([joint for joint in loose if joint.module in chain.body.modules])
+            gone = [joint for joint in apart if joint.module in chain.body.modules]
+            if gone and gone != chain.parting and chain.supervisor.armed and chain.supervisor.is_on("partner_lost"):
+                chain.parting = gone
+                outputs.preparations.append(PartRequest(tuple(gone)))
 
     def _steer(self, decisions: Decisions) -> None:
         for chain in self._chains:
@@ -273,16 +275,27 @@ class Pipeline:
                 chain.dock_over = True
 
     def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
-        before = [self._chain(joined.target), self._chain(joined.active)]
+        before = self._made_of([joined.chain])
+        if before is None or len(before) != 2:
+            return
+        before.sort(key=lambda chain: chain.body.index != joined.target)
         estimate = joined.chain.take_over(before, time_ns)
         self._swap(before, [joined.chain], estimates, [estimate])
 
     def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
-        before = [self._chain(parted.whole)]
         after = [parted.stays, parted.leaves]
+        before = self._made_of(after)
+        if before is None or len(before) != 1:
+            return
         found = [chain.take_over(before, time_ns) for chain in after]
         parted.leaves.guidance.move_by(parted.away_w)
         self._swap(before, after, estimates, found)
+
+    def _made_of(self, after: Sequence[BodyPipeline]) -> list[BodyPipeline] | None:
+        """The bodies whose modules these are made of; None where that is no longer so: another join or part of this tick was first."""
+        modules = {module for chain in after for module in chain.body.modules}
+        before = [chain for chain in self._chains if not modules.isdisjoint(chain.body.modules)]
+        return before if modules == {module for chain in before for module in chain.body.modules} else None
 
     def _swap(
         self, before: Sequence[BodyPipeline], after: Sequence[BodyPipeline], estimates: dict[int, Estimate], found: Sequence[Estimate]
@@ -293,17 +306,19 @@ class Pipeline:
             estimates[chain.body.index] = estimate
         kept = [chain for chain in self._chains if chain not in before]
         self._chains = sorted([*kept, *after], key=lambda chain: chain.body.index)
+        ended = self.docking.forget([chain.body.index for chain in before])
+        for chain in kept:
+            chain.dock_over = chain.dock_over or chain.body.index in ended
         self._watch_joints()
 
     def _watch_joints(self) -> None:
         self.docking.watch_joints([joint for chain in self._chains for joint in chain.joints])
 
-    def _chain(self, body: int) -> BodyPipeline:
-        return next(chain for chain in self._chains if chain.body.index == body)
-
 
 def _words_of(open_joints: Sequence[DockRequest]) -> str:
-    """The first of them, for people."""
+    """The first of them, for people; empty: none is."""
+    if not open_joints:
+        return ""
     first, more = open_joints[0], len(open_joints) - 1
     others = f", and {more} more pairs" if more else ""
     return f"modules {first.target_module} and {first.module} do not hold together{others}"

@@ -28,7 +28,7 @@ STATE = f"Tuple(({V},{M}))"
 """Types of a state and its covariance."""
 
 
-@njit(f"void({V},{V},{V},{PLANT},{V},{V})", cache=True)
+@njit(cache=True)
 def accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, total, out):  # type: ignore[no-untyped-def]
     """Writes to `out` (6,) dnu/dt of the body under the (6,) wrench `external` (thrusters and disturbance, body frame), and to the
     first six of `total` the whole wrench.
@@ -44,7 +44,7 @@ def accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, lin
             out[i] += mass_inv[i, j] * total[j]
 
 
-@njit(f"{V}({V},{V},{V},{PLANT})", cache=True)
+@njit(cache=True)
 def acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """(6,) dnu/dt of the body under the (6,) wrench `external`."""
     out = np.empty(6)
@@ -52,7 +52,7 @@ def acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, l
     return out
 
 
-@njit(f"{V}({V},{V},{PLANT})", cache=True)
+@njit(cache=True)
 def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """(3,) acceleration of the centre of mass against the world, body frame, in state x under the thruster wrench tau
     (6,).
@@ -66,7 +66,7 @@ def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, l
     return rate[:3] + cross(nu[3:].copy(), nu[:3].copy())
 
 
-@njit(f"void({V},{V},float64,{PLANT},{M},{V})", cache=True)
+@njit(cache=True)
 def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, work, out):  # type: ignore[no-untyped-def]
     """Writes to `out` (26,), which is not x, the state after dt seconds; `work`: (6, 6) for what lies between. Allocates nothing."""
     q, q_mid, nu, nu_mid, external, rate = work[0], work[1], work[2], work[3], work[4], work[5]
@@ -98,7 +98,7 @@ def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, w
         out[3 + i] = q_mid[i] / n
 
 
-@njit(f"{V}({V},{V},float64,{PLANT})", cache=True)
+@njit(cache=True)
 def step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """(26,) state after dt seconds under the thruster wrench tau (6,), by the midpoint rule."""
     out = np.empty(STATES)
@@ -106,7 +106,7 @@ def step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # ty
     return out
 
 
-@njit(f"{M}({V},{V},float64,{PLANT})", cache=True)
+@njit(cache=True)
 def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """(12, 25) moving rows of F = I + A dt + (A dt)^2 / 2 of the error over one step, A the Jacobian at x.
 
@@ -147,7 +147,7 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
     return f
 
 
-@njit(f"{STATE}({V},{M},{V},float64,{V},{PLANT})", cache=True)
+@njit(cache=True)
 def predict(x, covariance, tau, dt, density, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """State (26,) and covariance (25, 25) after dt seconds: F P F^T + Q dt. density: (25,) process noise, per second."""
     f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
@@ -164,7 +164,7 @@ def predict(x, covariance, tau, dt, density, mass, mass_inv, righting, nodes, ro
     return step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear), out
 
 
-@njit(f"{V}({V},{M},{M},float64,float64,{PLANT})", cache=True)
+@njit(cache=True)
 def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """(26,) state moved from the anchor to now through stored inputs.
 
@@ -185,7 +185,7 @@ def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rota
     return now
 
 
-@njit(f"{V}({V},{V})", cache=True)
+@njit(cache=True)
 def inject(x, e):  # type: ignore[no-untyped-def]
     """(26,) state with the (25,) error added."""
     out = x.copy()

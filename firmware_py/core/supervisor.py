@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from firmware_py.core.arming import Question, against_arming, missing
 from firmware_py.core.failsafes import Failsafes, Level
 from firmware_py.core.health import NEVER_S, Health
-from firmware_py.core.transitions import ARMED, ROWS, TRIGGERS, Effect, Guard, State, Transition, Trigger
+from firmware_py.core.transitions import ARMED, MODES, ROWS, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger
 from firmware_py.core.types import Event, Mode, Request
 from firmware_py.description.parameters import Parameters
 
@@ -167,12 +167,15 @@ class Supervisor:
     def take_over(self, before: Sequence[Supervisor]) -> None:
         """Goes on from the bodies that this one is made of, or was part of: armed when all were, stopped when one was.
 
-        It holds its place; where a fail-safe had taken one of them, it stays in that mode.
+        It holds its place; where one of them did not, which may be because nobody knows its place, or a fail-safe had taken one, it
+        goes on in that one's mode, the gravest.
         """
         states = {other.state for other in before}
         self.state = State.ESTOP if State.ESTOP in states else State.DISARMED if State.DISARMED in states else State.ARMED
         worst = max(before, key=lambda other: other.safety)
-        self.mode, self.level = worst.mode if worst.safety > Level.NONE else Mode.POSHOLD, worst.level
+        unplaced = [other.mode for other in before if Need.POSITION not in MODES[other.mode].needs]
+        kept = [worst.mode] if worst.safety > Level.NONE else unplaced
+        self.mode, self.level = next(iter(kept), Mode.POSHOLD), worst.level
         self.raises_estop = any(other.raises_estop for other in before)
         self._estop_ns = max((other._estop_ns for other in before if other._estop_ns is not None), default=None)
 

@@ -23,6 +23,10 @@ class Motion(NamedTuple):
 
     x: np.ndarray
     covariance: np.ndarray
+    accepted: int
+    """Tag observations that it rests on."""
+    tag_ns: int
+    """Time of the newest."""
 
 
 def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
@@ -43,7 +47,8 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
     x[19:22], x[22:25] = force, moment
     x[13:19] = np.mean([_biases(part, moved.x, body) for part, moved in parts], axis=0)
     x[25] = np.mean([moved.x[25] for _, moved in parts])
-    return Motion(x, _covariance(parts[0][1].covariance, first, body))
+    accepted, tag_ns = min(moved.accepted for _, moved in parts), min(moved.tag_ns for _, moved in parts)
+    return Motion(x, _covariance(parts[0][1].covariance, first, body), accepted, tag_ns)
 
 
 def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
@@ -57,7 +62,7 @@ def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
     x[19:22] = motion.x[19:22] * share
     x[22:25] = turn @ motion.x[22:25] * share
     x[13:19] = _biases(whole, motion.x, body)
-    return Motion(x, _covariance(motion.covariance, whole, body))
+    return Motion(x, _covariance(motion.covariance, whole, body), motion.accepted, motion.tag_ns)
 
 
 def _common(a: Body, b: Body) -> tuple[int, int]:

@@ -152,6 +152,13 @@ class DockRequest(NamedTuple):
     """Both bodies move, as in the paper."""
 
 
+class PartRequest(NamedTuple):
+    """What asks for a body to be flown as the pieces that it has come to."""
+
+    joints: tuple[DockRequest, ...]
+    """All of its joints that are open."""
+
+
 class Request(NamedTuple):
     """One request that enters a tick: from a ground station, a scenario or the command line."""
 
@@ -337,5 +344,7 @@ class Outputs:
     docks: list[DockRecord] = field(default_factory=list)
     joints: Array | None = None
     """(k,) of docking_pairs.PAIR: all faces that hold modules of one body together."""
-    preparations: list[DockRequest] = field(default_factory=list)
-    """Docks, and undocks of modules of one body, to be prepared beside the loop; they come back in Inputs.prepared."""
+    preparations: list[DockRequest | PartRequest] = field(default_factory=list)
+    """Docks, undocks of modules of one body, and bodies that have come apart, to be prepared beside the loop; they come back in
+    Inputs.prepared.
+    """

@@ -67,8 +67,12 @@ def plan_undock(
     vehicles: Sequence[Vehicle],
     pitch_m: float = PITCH_M,
     cache: DragCache | None = None,
+    also_open: Sequence[DockRequest] = (),
 ) -> UndockPlan:
     """The plan of parting at the joint between two modules of one body.
+
+    Args:
+        also_open: joints of it that hold nothing any longer.
 
     Raises:
         DescriptionError: the two are not neighbours, or something else still holds the pieces together.
@@ -77,7 +81,8 @@ def plan_undock(
     step = _cell_of(whole, far) - _cell_of(whole, near)
     if int(np.abs(step).sum()) != 1:
         raise DescriptionError(f"modules {near} and {far} are not docked to each other")
-    piece = _reachable(whole, far, (near, far))
+    cuts = [{joint.module, joint.target_module} for joint in (request, *also_open)]
+    piece = _reachable(whole, far, cuts)
     if near in piece:
         raise DescriptionError(f"modules {near} and {far} are also held together by other modules: undock those first")
     halves = ([m for m in whole.modules if m not in piece], [m for m in whole.modules if m in piece])
@@ -114,14 +119,14 @@ def _mated(turn_t: np.ndarray, request: DockRequest, normal: np.ndarray) -> np.n
     return np.asarray(MATRICES[nearest(quarter @ least)])
 
 
-def _reachable(body: Body, start: int, cut: tuple[int, int]) -> set[int]:
-    """Modules that hang together with `start` when the joint between the two of `cut` is open."""
+def _reachable(body: Body, start: int, cuts: Sequence[set[int]]) -> set[int]:
+    """Modules that hang together with `start` when the joints between the pairs of `cuts` are open."""
     reached, ends = {start}, [start]
     while ends:
         here = ends.pop()
         for other in body.modules:
             apart = int(np.abs(_cell_of(body, other) - _cell_of(body, here)).sum())
-            if apart == 1 and other not in reached and {here, other} != set(cut):
+            if apart == 1 and other not in reached and {here, other} not in cuts:
                 reached.add(other)
                 ends.append(other)
     return reached

@@ -86,21 +86,23 @@ def test_detector_needs_both_conditions() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("magnet", [0.0, -1.0])
-def test_module_that_loses_its_hold_in_flight_is_missed_and_both_hold_apart(fly: Fly, tmp_path: Path, magnet: float) -> None:
-    """A magnet that dies opens the joint at its coils' next current; one that repels tears it open."""
+def test_module_whose_magnet_fails_in_flight_is_missed(fly: Fly, tmp_path: Path, magnet: float) -> None:
+    """One dead coil leaves half of the pull, which holds: the pair stops, and stays one. One that repels tears the joint open: the two
+    are flown apart.
+    """
     scenario = load_scenario("mobius-2")
     fault = Fault(kind="magnet", module=2, index=FACE_NAMES.index("-x"), value=magnet, at_s=16.0)
     task = dataclasses.replace(scenario.task, duration_s=20.0, turns=0.6)
     fly(dataclasses.replace(scenario, task=task, fault=(fault,)), 1)
-    signals = read_signals(tmp_path / "run" / "signals.mcap")
+    signals, truth = read_signals(tmp_path / "run" / "signals.mcap"), read_signals(tmp_path / "run" / "truth.mcap")
     said = dict(zip(signals["/events"]["text"].tolist(), (signals["/events"]["log_time"] * 1e-9).tolist(), strict=True))
-    assert 16.0 < said["fail-safe on: a docked partner is lost"] < 20.0
-    assert "module 1 is undocked from 0" in said
-    truth, ends = read_signals(tmp_path / "run" / "truth.mcap"), []
-    for m in (0, 1):
-        body, is_at = signals[f"/firmware/body{m}"], truth[f"/plant/module{m}"]["p_wm"][-1]
+    assert 16.0 < said["fail-safe on: a docked partner is lost"] < (17.0 if magnet == 0.0 else 19.0)
+    is_torn = magnet < 0.0
+    assert ("module 1 is undocked from 0" in said) == is_torn
+    for m in (0, 1) if is_torn else (0,):
+        body = signals[f"/firmware/body{m}"]
         assert (body["state"][-1], body["mode"][-1]) == (State.ARMED, Mode.POSHOLD)
-        np.testing.assert_allclose(is_at, body["p_wb"][-1], atol=0.02)
+        np.testing.assert_allclose(truth[f"/plant/body{m}"]["p_wb"][-1], body["p_wb"][-1], atol=0.02)
         np.testing.assert_allclose(body["p_wb"][-1], body["setpoint_p_wb"][-1], atol=0.03)
-        ends.append(is_at)
-    assert float(np.linalg.norm(ends[0] - ends[1])) > PITCH_M
+    apart = float(np.linalg.norm(truth["/plant/module0"]["p_wm"][-1] - truth["/plant/module1"]["p_wm"][-1]))
+    assert (apart > PITCH_M + 0.005) == is_torn

@@ -552,6 +552,14 @@ def test_robot_that_joins_holds_its_place_whatever_it_did_before() -> None:
     assert joined.mode == Mode.POSHOLD
 
 
+@pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD])
+def test_robot_that_a_pilot_steers_is_steered_by_him_when_it_joins_or_parts(mode: Mode) -> None:
+    for before in ([supervisor_in(mode=mode)], [supervisor_in(mode=Mode.DOCK), supervisor_in(mode=mode)]):
+        body = Supervisor(P)
+        body.take_over(before)
+        assert (body.mode, body.level) == (mode, Level.NONE)
+
+
 def test_severities_are_those_of_syslog() -> None:
     assert (CRITICAL, WARNING, INFORMATION) == (2, 4, 6)
 

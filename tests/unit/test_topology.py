@@ -53,7 +53,7 @@ def two() -> tuple[Body, Body, Body, np.ndarray, np.ndarray]:
 def test_bodies_that_dock_keep_their_momentum(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
     target, active, merged, x_t, x_a = two
     covariance = np.eye(ERRORS)
-    joined = join([(target, Motion(x_t, covariance)), (active, Motion(x_a, covariance))], merged)
+    joined = join([(target, Motion(x_t, covariance, 10, 0)), (active, Motion(x_a, covariance, 10, 0))], merged)
     about = np.array([0.3, -1.0, 2.0])
     before = momentum(target, x_t, about) + momentum(active, x_a, about)
     np.testing.assert_allclose(momentum(merged, joined.x, about), before, atol=1e-9)
@@ -62,7 +62,7 @@ def test_bodies_that_dock_keep_their_momentum(two: tuple[Body, Body, Body, np.nd
 def test_docked_modules_are_where_they_were(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
     target, active, merged, x_t, x_a = two
     covariance = np.eye(ERRORS)
-    joined = join([(target, Motion(x_t, covariance)), (active, Motion(x_a, covariance))], merged)
+    joined = join([(target, Motion(x_t, covariance, 10, 0)), (active, Motion(x_a, covariance, 10, 0))], merged)
     for body, x, module in ((target, x_t, 0), (active, x_a, 1)):
         p, q = module_pose(body, x, module)
         p_new, q_new = module_pose(merged, joined.x, module)
@@ -73,7 +73,7 @@ def test_docked_modules_are_where_they_were(two: tuple[Body, Body, Body, np.ndar
 def test_disturbance_of_a_joined_body_is_the_sum(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
     target, active, merged, x_t, x_a = two
     covariance = np.eye(ERRORS)
-    joined = join([(target, Motion(x_t, covariance)), (active, Motion(x_a, covariance))], merged)
+    joined = join([(target, Motion(x_t, covariance, 10, 0)), (active, Motion(x_a, covariance, 10, 0))], merged)
     np.testing.assert_allclose(joined.x[19:22], x_t[19:22] + x_a[19:22])
     moment_w = np.zeros(3)
     for x in (x_t, x_a):
@@ -84,7 +84,7 @@ def test_disturbance_of_a_joined_body_is_the_sum(two: tuple[Body, Body, Body, np
 def test_parting_undoes_joining_when_nothing_turns_apart(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
     target, active, merged, x_t, x_a = two
     covariance = np.eye(ERRORS)
-    joined = join([(target, Motion(x_t, covariance)), (active, Motion(x_a, covariance))], merged)
+    joined = join([(target, Motion(x_t, covariance, 10, 0)), (active, Motion(x_a, covariance, 10, 0))], merged)
     plan = plan_undock(DockRequest(1, 1, 0, 0), merged, VEHICLES)
     stays, leaves = (part_of(merged, joined, b) for b in (plan.stays, plan.leaves))
     about = np.zeros(3)

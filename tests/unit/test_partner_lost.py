@@ -1,0 +1,195 @@
+"""A docked partner that is lost in flight: what is believed, who is told, and that every module is always flown by just one body."""
+
+import pytest
+
+from firmware_py.app.preparation import prepare
+from firmware_py.core.body import Body
+from firmware_py.core.docking import CHANGED, Prepared
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Action, DockFeedback, DockRequest, Inputs, Mode, ModuleInputs, Outputs, Request
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import PITCH_M, assemble
+from tests.unit.test_pipeline import Tank
+
+MODCUBE = load_vehicle("modcube")
+RING = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
+LOST = "fail-safe on: a docked partner is lost"
+
+
+class Docked(Tank):
+    """A tank in which the magnets of some modules carry no current, and some modules' tags are out of sight."""
+
+    def __init__(self, cells: list[tuple[int, int, int]], parameters: Parameters | None = None, delay: int = 0) -> None:
+        """`delay`: ticks until a plan that was asked for is there."""
+        count = len(cells)
+        whole: Body = assemble(cells, [0] * count, [MODCUBE] * count, list(range(count)))
+        super().__init__([whole], parameters)
+        self.weak: set[int] = set()
+        self.hidden: set[int] = set()
+        self.said: list[tuple[float, str]] = []
+        self._delay, self._plans = delay, list[tuple[int, Prepared]]()
+        self._step, self.pipeline.step = self.pipeline.step, self._step_with_plans  # type: ignore[method-assign]
+
+    def _hear(self, tick: int) -> list[ModuleInputs]:
+        modules = super()._hear(tick)
+        for m, module in enumerate(modules):
+            if m in self.hidden:
+                module.tags.clear()
+            if tick % 4 == 0:
+                current = 0.0 if m in self.weak else 110.0
+                module.docks = [DockFeedback(first, (current,) * 3, (1, 1, 1)) for first in (0, 3)]
+        return modules
+
+    def _step_with_plans(self, inputs: Inputs) -> Outputs:
+        inputs.prepared = [plan for due, plan in self._plans if due <= inputs.tick]
+        self._plans = [each for each in self._plans if each[0] > inputs.tick]
+        outputs = self._step(inputs)
+        for request in outputs.preparations:
+            plan = prepare(request, self.pipeline, [MODCUBE] * len(inputs.modules), PITCH_M)
+            self._plans.append((inputs.tick + 1 + self._delay, plan))
+        self.said += [(1e-9 * inputs.time_ns, event.text) for event in outputs.events]
+        return outputs
+
+    def fly(self) -> None:
+        """Armed, and holding its place."""
+        self.run(0.5)
+        assert self.run(1.0, Request(Action.ARM)).records[0].state == State.ARMED
+
+    def lose(self, *modules: int) -> float:
+        """These are out of sight, and their magnets carry no current; returns the time."""
+        self.weak |= set(modules)
+        self.hidden |= set(modules)
+        return len(self.outputs) * 0.01
+
+    @property
+    def shape(self) -> list[tuple[int, ...]]:
+        return sorted(body.modules for body in self.pipeline.bodies)
+
+    def when(self, text: str) -> float:
+        return next(at for at, said in self.said if text in said)
+
+
+def test_module_that_is_lost_is_parted_half_a_second_later_and_both_hold() -> None:
+    tank = Docked(RING[:2])
+    tank.fly()
+    lost_s = tank.lose(1)
+    outputs = tank.run(1.0)
+    assert tank.shape == [(0,), (1,)]
+    assert [(record.state, record.mode) for record in outputs.records] == [(State.ARMED, Mode.POSHOLD)] * 2
+    assert 0.5 < tank.when(LOST) - lost_s < 0.65
+    assert tank.when("is undocked") - tank.when(LOST) < 0.05, "an open joint needs no pushing apart"
+
+
+def test_current_alone_is_reported_and_parts_nothing_that_pictures_show_in_its_place() -> None:
+    tank = Docked(RING[:2])
+    tank.fly()
+    tank.weak.add(1)
+    outputs = tank.run(2.0)
+    assert tank.when(LOST)
+    assert tank.shape == [(0, 1)]
+    assert (outputs.records[0].state, outputs.records[0].mode) == (State.ARMED, Mode.POSHOLD)
+
+
+def test_silent_magnets_lose_nobody() -> None:
+    tank = Docked(RING[:2])
+    tank.fly()
+    tank.hidden.add(1)
+    tank.run(2.0)
+    assert tank.shape == [(0, 1)] and LOST not in [text for _, text in tank.said]
+
+
+@pytest.mark.parametrize("changes", [{"docking.debounce_ms": 1000.0}, {"failsafes.partner_lost_delay_s": 0.0}])
+def test_healthy_pair_is_never_taken_for_an_open_one_however_soon_one_asks(changes: dict[str, float]) -> None:
+    parameters = Parameters()
+    for name, value in changes.items():
+        parameters = parameters.replace(name, value)
+    tank = Docked(RING[:2], parameters)
+    tank.fly()
+    assert tank.shape == [(0, 1)] and LOST not in [text for _, text in tank.said]
+
+
+def test_disarmed_pair_stays_one_body_and_may_not_arm() -> None:
+    tank = Docked(RING[:2])
+    tank.lose(1)
+    tank.run(1.0)
+    outputs = tank.run(0.2, Request(Action.ARM))
+    assert tank.shape == [(0, 1)] and outputs.records[0].state == State.DISARMED
+    assert any("ARM refused" in text and "do not hold together" in text for _, text in tank.said)
+
+
+def test_fail_safe_that_is_switched_off_parts_nothing() -> None:
+    tank = Docked(RING[:2], Parameters().replace("failsafes.partner_lost_action", 0))
+    tank.fly()
+    tank.lose(1)
+    tank.run(1.0)
+    assert tank.shape == [(0, 1)]
+
+
+def test_middle_of_three_that_is_lost_leaves_three() -> None:
+    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
+    tank.fly()
+    tank.lose(1)
+    tank.run(2.0)
+    assert tank.shape == [(0,), (1,), (2,)]
+
+
+@pytest.mark.parametrize("delay", [0, 5, 30])
+def test_joint_that_opens_while_another_is_being_parted_waits_its_turn(delay: int) -> None:
+    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)], delay=delay)
+    tank.fly()
+    tank.lose(2)
+    tank.run(0.7)
+    tank.lose(1)
+    tank.run(3.0)
+    assert tank.shape == [(0,), (1,), (2,)]
+
+
+def test_corner_of_a_ring_is_lost_by_both_its_joints() -> None:
+    tank = Docked(RING)
+    tank.fly()
+    tank.lose(3)
+    tank.run(1.5)
+    assert tank.shape == [(0, 1, 2), (3,)]
+
+
+def test_ring_with_one_open_joint_is_still_one_body_and_asks_once() -> None:
+    tank = Docked(RING)
+    tank.fly()
+    tank.hidden |= {0, 1}
+    step = tank.pipeline.docking.open_joints
+    tank.pipeline.docking.open_joints = lambda least: [DockRequest(1, 1, 0, 0)]  # type: ignore[method-assign]
+    tank.run(1.5)
+    assert tank.shape == [(0, 1, 2, 3)]
+    assert sum("also held together" in text for _, text in tank.said) == 1
+    tank.pipeline.docking.open_joints = step  # type: ignore[method-assign]
+
+
+def test_undock_that_is_asked_for_twice_parts_once() -> None:
+    tank = Docked(RING[:2])
+    tank.fly()
+    for _ in range(2):
+        tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    tank.run(2.5)
+    assert tank.shape == [(0,), (1,)]
+    assert sum(CHANGED in text for _, text in tank.said) == 1
+
+
+def test_undock_that_is_asked_for_while_the_partner_is_being_lost_parts_once() -> None:
+    tank = Docked(RING[:2], delay=30)
+    tank.fly()
+    tank.lose(1)
+    tank.run(0.7)
+    tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.shape == [(0,), (1,)]
+
+
+def test_estimate_of_a_part_is_as_old_as_that_of_the_whole() -> None:
+    tank = Docked(RING[:2])
+    tank.fly()
+    (chain,) = tank.pipeline._chains
+    fresh = tank.pipeline.chain_of(chain.body)
+    motion = chain.estimator.motion
+    old = fresh.estimator.restart(5_000_000_000, motion._replace(tag_ns=2_000_000_000))
+    assert old.ready and old.tag_age_ns == 3_000_000_000
+    assert not fresh.estimator.restart(5_000_000_000, motion._replace(accepted=0)).ready
