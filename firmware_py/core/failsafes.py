@@ -100,7 +100,7 @@ class Watch:
     """One row and its time."""
 
     def __init__(self, row: Row, parameters: FailsafeParameters) -> None:
-        self.row = row
+        self.row, self._value, self._below = row, row.value, row.below
         self.limit: float = getattr(parameters, f"{row.name}_limit", 0.0)
         self.level = Level(getattr(parameters, f"{row.name}_action"))
         self.latched = bool(getattr(parameters, f"{row.name}_latched"))
@@ -114,8 +114,8 @@ class Watch:
 
     def beyond(self, health: Health) -> bool:
         """Whether its cause holds now, whatever the mode. A NaN is no cause."""
-        value = self.row.value(health)
-        return value < self.limit if self.row.below else value > self.limit
+        value = self._value(health)
+        return value < self.limit if self._below else value > self.limit
 
     def counts(self, mode: Mode, forced: bool, armed: bool) -> bool:
         """Whether it counts now."""

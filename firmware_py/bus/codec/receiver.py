@@ -72,13 +72,14 @@ class Receiver:
     def judge(self, frames: Sequence[Frame]) -> list[Received | str]:
         """What each frame says, or the kind of its fault."""
         found: list[Received | str] = []
-        for (which, number, counter), frame in zip(self.rows(frames)[:, :VALUES].astype(int).tolist(), frames, strict=True):
+        for row, frame in zip(self.rows(frames).tolist(), frames, strict=True):
+            which = int(row[MESSAGE])
             if which < 0:
                 found.append(KINDS[~which])
                 continue
             message = self._messages[which]
             values = message.decode(frame.data) if len(frame.data) == message.length else ()
-            found.append(Received(message, number, values, counter))
+            found.append(Received(message, int(row[NUMBER]), values, int(row[COUNTER])))
         return found
 
     def accept(self, frame: Frame) -> Received | None:
