@@ -1,9 +1,10 @@
 """Run every test that this machine can run; name what was left out, and why, in the last lines.
 
-Arguments: the Debian packages that the tests marked `vcan` need. Those run in a virtual machine, beside all others. The
-exit status is pytest's, the worse of both.
+Arguments: the Debian packages that the tests marked `vcan` need. Those run in a virtual machine, beside all others and beside the setup
+of the clients. The exit status is pytest's, the worse of both.
 """
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -28,11 +29,12 @@ def main() -> int:
     left_out = {"jetson": "they take half an hour (make test-flash)"}
     if missing := [package for package in sys.argv[1:] if not is_installed(package)]:
         left_out["vcan"] = f"missing Debian packages: {' '.join(missing)} (make setup-system)"
-    if not CLIENTS.exists():
-        left_out["clients"] = f"{CLIENTS.parent} is not complete (make setup-clients)"
-    markers = " and ".join(f"not {marker}" for marker in sorted({"vcan", *left_out}))
     with tempfile.TemporaryFile("w+") as report:
         beside = None if missing else subprocess.Popen(VCAN, stdout=report, stderr=subprocess.STDOUT)
+        subprocess.run([os.environ.get("MAKE", "make"), "--no-print-directory", "setup-clients"])
+        if not CLIENTS.exists():
+            left_out["clients"] = f"{CLIENTS.parent} is not complete (make setup-clients)"
+        markers = " and ".join(f"not {marker}" for marker in sorted({"vcan", *left_out}))
         status = subprocess.run([*PYTEST, "-n", "2", "--dist", "loadgroup", "-m", markers]).returncode
         if beside is not None:
             print("tests marked vcan, in the virtual machine:", flush=True)
