@@ -13,7 +13,7 @@ import scipy  # its parts load when they are used: a second that no worker needs
 
 CONFIDENCE = 0.95
 WORST = 5
-"""Seeds named as the worst."""
+"""Seeds named as the worst: those that failed first."""
 QUANTILES = {"min": 0.0, "q05": 0.05, "median": 0.5, "q95": 0.95, "max": 1.0}
 LEAST_TRIALS = 10
 """Fewer say nothing of what a metric depends on."""
@@ -29,7 +29,7 @@ def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
     outcomes: dict[str, int] = {}
     for trial in trials:
         outcomes[trial["outcome"]] = outcomes.get(trial["outcome"], 0) + 1
-    worst = sorted(trials, key=lambda trial: -(trial["metrics"].get("position_rmse_m") or 0.0))[:WORST]
+    worst = sorted(trials, key=lambda trial: (bool(trial["passed"]), -(trial["metrics"].get("position_rmse_m") or 0.0)))[:WORST]
     return {
         "scenario": scenario,
         "trials": len(trials),

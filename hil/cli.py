@@ -85,6 +85,7 @@ def campaign(
     controller: Controller = "modcube",
     vehicle: Vehicle = "",
     sensors: Sensors = "real",
+    draw: Annotated[int, typer.Option(min=0, max=5, help="so many of the worst seeds are flown again for logs, plots and report")] = 1,
 ) -> None:
     """Fly many seeds of a scenario; prints a table and leaves every trial. Interrupted and started again, it goes on.
 
@@ -94,6 +95,7 @@ def campaign(
         raise typer.Exit(_fly_faults(jobs, seed, out))
     from hil.campaign import dask_cluster, processes, run_campaign
     from hil.console import campaign_progress, print_campaign
+    from hil.flight import fly_and_judge, illustrate
 
     chosen = scenario_of(scenario, vehicle, sensors)
     folder = out if out is not None else Path("runs") / f"{chosen.name}-campaign"
@@ -102,6 +104,9 @@ def campaign(
         pool = dask_cluster(dask) if dask else processes(jobs)
         summary = run_campaign(chosen, parameters, seeds, pool, folder, progress)
     print_campaign(summary)
+    for worst in summary["worst_seeds"][:draw]:
+        again = folder / f"seed-{worst}"
+        print(f"seed {worst}: {illustrate(chosen, fly_and_judge(chosen, worst, parameters, again, DEFAULT_BUS), again)}")
     raise typer.Exit(0 if summary["succeeded"] == summary["trials"] else FAILED)
 
 

@@ -42,7 +42,7 @@ def campaign(scenario: Path, out: Path, *arguments: str) -> subprocess.Popen[byt
     """modcube hil campaign, in a group of its own."""
     command = [sys.executable, "-c", "from firmware_py.cli import main; main()", "hil", "campaign", str(scenario)]
     return subprocess.Popen(
-        [*command, "--trials", str(TRIALS), "--out", str(out), *arguments], stdout=subprocess.DEVNULL, start_new_session=True
+        [*command, "--trials", str(TRIALS), "--draw", "0", "--out", str(out), *arguments], stdout=subprocess.DEVNULL, start_new_session=True
     )
 
 

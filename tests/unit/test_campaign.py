@@ -49,6 +49,10 @@ def test_dock_that_came_to_nothing_says_why() -> None:
     assert outcome_of(Result("dock", 0, True, {"outcome": 0.0}, ())) == "passed"
 
 
+def test_seeds_that_failed_are_the_worst_however_near_they_flew() -> None:
+    assert summarise("dock", [trial(0, 0.9), trial(1, 0.001, "jammed"), trial(2, 0.5)])["worst_seeds"] == [1, 0, 2]
+
+
 def test_summary_counts_outcomes_and_names_the_worst_seeds_first() -> None:
     summary = summarise("spiral", TRIALS)
     assert (summary["trials"], summary["succeeded"]) == (4, 3)
