@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from firmware_py.core.body import Body
 from firmware_py.core.docking import Prepared
 from firmware_py.core.docking_sequence import UndockPlan
 from firmware_py.core.pipeline import Pipeline
@@ -19,14 +20,19 @@ def prepare(request: DockRequest | PartRequest, pipeline: Pipeline, vehicles: Se
     Args:
         vehicles: by fleet index.
     """
+    bodies = {module: body for body in pipeline.bodies for module in body.modules}
     if isinstance(request, PartRequest):
-        return _prepare_part(request, pipeline, vehicles, pitch_m)
-    return _prepare_dock(request, pipeline, vehicles, pitch_m)
+        return _prepare_part(request, bodies, pipeline, vehicles, pitch_m)
+    return _prepare_dock(request, bodies, pipeline, vehicles, pitch_m)
 
 
-def _prepare_part(request: PartRequest, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
+Bodies = Mapping[int, Body]
+"""The bodies that there are, by each of their modules."""
+
+
+def _prepare_part(request: PartRequest, bodies: Bodies, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
     """At the first joint where the body has come apart."""
-    bodies, refusal = {module: body for body in pipeline.bodies for module in body.modules}, ""
+    refusal = "they are apart already"
     for joint in request.joints:
         whole = bodies[joint.module]
         if whole is not bodies[joint.target_module]:
@@ -37,15 +43,14 @@ def _prepare_part(request: PartRequest, pipeline: Pipeline, vehicles: Sequence[V
             refusal = str(error)
             continue
         return _parting(plan, pipeline)
-    return Prepared(request.joints[0], None, (), refusal or "they are apart already")
+    return Prepared(request.joints[0], None, (), refusal)
 
 
 def _parting(plan: UndockPlan, pipeline: Pipeline) -> Prepared:
     return Prepared(plan.request, plan, (pipeline.chain_of(plan.stays), pipeline.chain_of(plan.leaves)))
 
 
-def _prepare_dock(request: DockRequest, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
-    bodies = {module: body for body in pipeline.bodies for module in body.modules}
+def _prepare_dock(request: DockRequest, bodies: Bodies, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
     active, target = bodies.get(request.module), bodies.get(request.target_module)
     if active is None or target is None:
         return Prepared(request, None, (), f"there is no module {request.module} or {request.target_module}")

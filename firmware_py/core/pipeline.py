@@ -254,7 +254,8 @@ class Pipeline:
 
     def _miss_partners(self, outputs: Outputs) -> None:
         """Joints that are open though nobody asked: tells the bodies, and parts those that have come apart once their fail-safe is on."""
-        loose, apart = self.docking.open_joints(LOOSE), self.docking.open_joints(APART)
+        loose = self.docking.open_joints(LOOSE)
+        apart = self.docking.open_joints(APART) if loose else []
         for chain in self._chains:
             if not chain.joints:
                 continue

@@ -25,20 +25,23 @@ def _exp(x, y, z):  # type: ignore[no-untyped-def]
     return math.cos(0.5 * angle), s * x, s * y, s * z
 
 
-@njit(f"UniTuple(float64,3)({V},{','.join(['float64'] * 3)})", cache=True)
-def turned(q, a, b, c):  # type: ignore[no-untyped-def]
-    """q v q^-1 of v = (a, b, c), without an array."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
+@njit(f"UniTuple(float64,3)({','.join(['float64'] * 7)})", cache=True)
+def _turned(w, x, y, z, a, b, c):  # type: ignore[no-untyped-def]
+    """(a, b, c) turned by the unit quaternion (w, x, y, z)."""
     tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
     return a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx
+
+
+@njit(f"UniTuple(float64,3)({V},{','.join(['float64'] * 3)})", cache=True)
+def turned(q, a, b, c):  # type: ignore[no-untyped-def]
+    """q v q^-1 of q (4,) and v = (a, b, c), without an array."""
+    return _turned(q[0], q[1], q[2], q[3], a, b, c)
 
 
 @njit(f"UniTuple(float64,3)({V},{','.join(['float64'] * 3)})", cache=True)
 def turned_back(q, a, b, c):  # type: ignore[no-untyped-def]
-    """q^-1 v q of v = (a, b, c), without an array."""
-    w, x, y, z = q[0], -q[1], -q[2], -q[3]
-    tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
-    return a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx
+    """q^-1 v q of q (4,) and v = (a, b, c), without an array."""
+    return _turned(q[0], -q[1], -q[2], -q[3], a, b, c)
 
 
 @njit(f"void({V},{','.join(['float64'] * 3)},{V})", cache=True)

@@ -98,7 +98,11 @@ def module_power(force, power_forward, power_reverse, module, count):  # type: i
 
 @njit("void(float64[::1],float64[::1],float64[::1],float64[::1],float64[::1])", cache=True)
 def lagged(acting, decay, lag_over_dt, force, mean):  # type: ignore[no-untyped-def]
-    """Moves `force` (n,) on by a tick towards `acting`; writes its mean over that tick."""
+    """Moves `force` (n,), N, on by a tick towards `acting` (n,), N; writes to `mean` (n,) what it is on the mean of that tick, N.
+
+    Args:
+        decay: (n,) share of a difference that is left after a tick. lag_over_dt: (n,) lag over the length of a tick.
+    """
     for i in range(force.shape[0]):
         end = acting[i] + (force[i] - acting[i]) * decay[i]
         mean[i] = acting[i] + (force[i] - end) * lag_over_dt[i]

@@ -205,7 +205,12 @@ class Docking:
         0.004, unit="m", low=0, high=0.1, help="more is permitted once docked", mavlink="DOCK_HYST"
     )
     open_m: float = quantity(
-        0.02, unit="m", low=1e-3, high=1, help="relative position off one pitch: the joint of a body is open", mavlink="DOCK_OPEN"
+        0.02,
+        unit="m",
+        low=1e-3,
+        high=1,
+        help="off one pitch: a joint is open; sound ones read up to 12 mm on the Moebius strip",
+        mavlink="DOCK_OPEN",
     )
     debounce_ms: float = quantity(
         150.0,

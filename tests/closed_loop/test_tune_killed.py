@@ -11,7 +11,7 @@ import pytest
 from tests.clients.bench_process import ROOT
 from tests.closed_loop.test_campaign_workers import SCENARIO
 
-TRIALS = 3
+TRIALS = 4
 FILES = ("search.jsonl", "parameters.toml", "tuning.json")
 
 
@@ -40,12 +40,12 @@ def test_tuning_that_was_killed_goes_on_to_the_same_bytes(tmp_path: Path) -> Non
         process.communicate()
     assert process.returncode == 0
     with tune(path, torn) as process:
-        assert process.stdout is not None and b"trial    1 of 3" in process.stdout.readline()
+        assert process.stdout is not None and b"trial    1 of 4" in process.stdout.readline()
         os.killpg(process.pid, signal.SIGKILL)
     kept = (torn / "search.jsonl").read_bytes()
     assert kept.count(b'"totals"') in range(1, TRIALS)
     with tune(path, torn) as process:
         said, _ = process.communicate()
-    assert process.returncode == 0 and b"trial    1 of 3" not in said
+    assert process.returncode == 0 and b"trial    1 of 4" not in said
     assert (torn / "search.jsonl").read_bytes().startswith(kept)
     assert [(torn / name).read_bytes() for name in FILES] == [(whole / name).read_bytes() for name in FILES]

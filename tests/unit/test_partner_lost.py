@@ -157,12 +157,10 @@ def test_ring_with_one_open_joint_is_still_one_body_and_asks_once() -> None:
     tank = Docked(RING)
     tank.fly()
     tank.hidden |= {0, 1}
-    step = tank.pipeline.docking.open_joints
     tank.pipeline.docking.open_joints = lambda least: [DockRequest(1, 1, 0, 0)]  # type: ignore[method-assign]
     tank.run(1.5)
     assert tank.shape == [(0, 1, 2, 3)]
     assert sum("also held together" in text for _, text in tank.said) == 1
-    tank.pipeline.docking.open_joints = step  # type: ignore[method-assign]
 
 
 def test_undock_that_is_asked_for_twice_parts_once() -> None:

@@ -27,7 +27,7 @@ RESUMED_S = 0.5
 UNANSWERED_TICKS = 5
 SETTLE_S = 5.0 if FULL else 2.5
 HOVER_S = 10.0 if FULL else 1.0
-EVENTS = 100 if FULL else 4
+EVENTS = 100 if FULL else 6
 EVENT_S = 0.4
 """Time from one link event to the next: 0.11 to 0.45 s on average, by how the link is."""
 DAYS = [f"link events of seed {seed}" for seed in range(10 if FULL else 1)]

@@ -94,7 +94,7 @@ class MessageCodec:
 
     def id_of(self, number: int) -> int:
         """The id of this message for node `number`. Raises ValueError where the number is not valid for it."""
-        if number not in self.numbers:
+        if number not in self._ids:
             raise ValueError(f"{self.name}: number {number} is not valid for it")
         return self.function << 5 | number
 
