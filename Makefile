@@ -11,6 +11,8 @@ PYTHONS := /usr/bin/python3.12 /usr/bin/python3.11 python3.12 python3.11 python3
 SYSTEM_PACKAGES := qemu-system-x86 busybox-static cpio kmod can-utils iproute2 gcc
 FLASH_PACKAGES := debootstrap e2fsprogs openssh-client
 PYTHON_PACKAGES := python3-venv
+# What `make bench` measures beside; nothing else needs it.
+PEERS := mujoco==4.0.0
 PIP_INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-deps
 
 # $(call make_venv,DIR): keep DIR if its Python runs, else make it with the first Python that is new enough.
@@ -80,6 +82,7 @@ mutants: setup ## change limiter, supervisor and fail-safes one thing at a time:
 	@$(PY) tools/mutants.py
 
 bench: setup ## measure the code; writes bench.json and README's tables
+	-@$(PY) -m pip install --quiet --disable-pip-version-check $(PEERS)
 	@$(PY) tools/bench.py && $(PY) tools/readme_tables.py
 
 # The locks pin the newest releases that pyproject.toml allows; `make lock UPGRADE=--upgrade` moves the pins.

@@ -1,6 +1,6 @@
 """For tools/bench.py: many worlds in one call, beside MuJoCo's rollout of the same robot on the same cores.
 
-MuJoCo is no dependency: where it is missing (`pip install mujoco`) the plant is measured alone and the bench says so.
+MuJoCo is no dependency: `make bench` installs it; where it is missing the plant is measured alone and the bench says so.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hil.batch import fly
 from hil.plant.world import STEP_NS
 from hil.scenario import load_scenario, make_world
 
-WORLDS, TICKS, PERIOD_NS = 64, 200, 10_000_000
+WORLDS, TICKS, PERIOD_NS = 64, 1000, 10_000_000
 STEPS = PERIOD_NS // STEP_NS
 """Sub-steps of a tick."""
 THREADS = 2

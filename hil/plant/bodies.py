@@ -10,6 +10,7 @@ to the water), all about O in the body frame (Lamb, Hydrodynamics, ch. VI):
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -23,21 +24,29 @@ from hil.plant.vectors import (
     F3,
     F8,
     I1,
+    M3,
+    MASS,
     V3,
     compiled,
     cross,
+    inlined,
+    mass_of,
     matrix,
     matrix_of,
     minus,
+    momenta,
     plus,
+    six,
     times,
     triple,
     turn,
     turn_back,
 )  # fmt: skip
-from hil.plant.water import WATER, is_clear, push_of_walls
+from hil.plant.water import WATER, is_clear, push_of_walls, room
 
 I8 = types.int64
+NEAR_M = 1e-6
+"""Beyond its half diagonal: what rounding could hide."""
 
 
 class Bodies(NamedTuple):
@@ -92,7 +101,7 @@ BODIES = types.NamedTuple((F2, F3, F3, F3, F2, F2, F2, I1), Bodies)
 MODULES = types.NamedTuple((I1, F2, F3, F2, F2, F2, F2, F2, I1, F2, F5), Modules)
 
 
-@compiled(types.void(F2, I8, V3, V3))
+@inlined(types.void(F2, I8, V3, V3))
 def add_force(wrench, b, at, f):
     """Adds the force f at the point `at` to row b of wrenches; body frame."""
     n = cross(at, f)
@@ -101,31 +110,62 @@ def add_force(wrench, b, at, f):
         wrench[b, 3 + i] += n[i]
 
 
-@compiled(V3(F3, I8, I8, V3, V3))
-def half_momentum(mass, b, first, v, w):
-    """Rows `first` to first + 2 of mass matrix number b times [v; w]: linear momentum from 0, angular from 3."""
-    p = (0.0, 0.0, 0.0)
-    for j in range(3):
-        p = plus(p, times(v[j], (mass[b, first, j], mass[b, first + 1, j], mass[b, first + 2, j])))
-        p = plus(p, times(w[j], (mass[b, first, 3 + j], mass[b, first + 1, 3 + j], mass[b, first + 2, 3 + j])))
-    return p
+@inlined(types.UniTuple(V3, 2)(F8, V3, F8, V3, F8, V3, M3, V3))
+def weigh(weight, weight_at, lift, lift_at, displaced, displaced_at, r, flow_rate):
+    """Force and moment of weight, buoyancy, and the pressure gradient of water that accelerates (Froude-Krylov), body frame.
 
-
-@compiled(types.void(BODIES, I8, F2, V3))
-def _add_weight(bodies, b, x, flow_rate):
-    """Weight, buoyancy, and the pressure gradient of water that accelerates (Froude-Krylov)."""
-    r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
+    Args:
+        weight, lift, displaced: N, N, kg; `_at`: the same times where they act, N m, N m, kg m.
+        r: body to world. flow_rate: acceleration of the water, world.
+    """
     down, rate = r[2], turn_back(r, flow_rate)
-    weight, hull = bodies.weight, bodies.hull
-    f = plus(times(weight[b, 0] - weight[b, 1], down), times(hull[b, 0], rate))
-    lever = minus(triple(weight, b, 2), triple(weight, b, 5))
-    n = plus(cross(lever, down), cross(triple(hull, b, 1), rate))
+    f = plus(times(weight - lift, down), times(displaced, rate))
+    return f, plus(cross(minus(weight_at, lift_at), down), cross(displaced_at, rate))
+
+
+@inlined(types.UniTuple(V3, 2)(MASS, MASS, MASS, M3, V3, V3, V3, V3, V3, V3))
+def respond(rigid, added, inverse, r, v, w, flow, flow_rate, f, n):
+    """Kirchhoff's equations solved for the accelerations of O and of the rate, body frame.
+
+    Args:
+        rigid, added, inverse: mass matrices, see `Bodies`.
+        r: body to world. v, w: velocity of O and rate, body frame. flow, flow_rate: of the water, world.
+        f, n: force and moment about O.
+    """
+    u = turn_back(r, flow)
+    slip = minus(v, u)
+    carried = minus(cross(w, u), turn_back(r, flow_rate))  # dv_r/dt = dv/dt + carried
+    (p, spin), (h, swirl) = momenta(rigid, v, w), momenta(added, slip, w)
+    f = minus(minus(f, turn(added[0], carried)), cross(w, plus(p, h)))
+    n = minus(minus(n, turn(added[2], carried)), cross(w, plus(spin, swirl)))
+    n = minus(minus(n, cross(v, p)), cross(slip, h))
+    return momenta(inverse, f, n)
+
+
+@inlined(types.UniTuple(F8, 4)(types.UniTuple(F8, 4), V3))
+def turning(q, w):
+    """Rate of change of a quaternion, body to world, that turns at w, body frame."""
+    return (
+        -0.5 * (q[1] * w[0] + q[2] * w[1] + q[3] * w[2]),
+        0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1]),
+        0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2]),
+        0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0]),
+    )
+
+
+@inlined(types.void(BODIES, I8, F2, V3))
+def _add_weight(bodies, b, x, flow_rate):
+    """What `weigh` says of body b."""
+    weight, hull, r = bodies.weight, bodies.hull, matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
+    f, n = weigh(
+        weight[b, 0], triple(weight, b, 2), weight[b, 1], triple(weight, b, 5), hull[b, 0], triple(hull, b, 1), r, flow_rate
+    )
     for i in range(3):
         bodies.wrench[b, i] += f[i]
         bodies.wrench[b, 3 + i] += n[i]
 
 
-@compiled(types.void(BODIES, MODULES, I8, WATER, F2, V3))
+@inlined(types.void(BODIES, MODULES, I8, WATER, F2, V3))
 def _add_drag(bodies, modules, m, water, x, flow):
     """Drag of one module at its hull centre, by its velocity relative to the water."""
     b = modules.body[m]
@@ -137,41 +177,30 @@ def _add_drag(bodies, modules, m, water, x, flow):
     rate = triple(x, b, 10)
     v = turn_back(inside, plus(minus(triple(x, b, 7), turn_back(r, flow)), cross(rate, at)))
     w = turn_back(inside, rate)
-    sx, sy, sz = triple(modules.size, m, 0)
-    ox, oy, oz = triple(modules.sides, m, 0)
-    c, linear, quadratic, half_rho = modules.drag, modules.linear, modules.quadratic, 0.5 * water.density
-    factor = half_rho * drag.translation(sx, sy, sz, c[m, 0], c[m, 1], v[0], v[1], v[2])
+    size, c, half_rho = triple(modules.size, m, 0), modules.drag, 0.5 * water.density
+    factor = half_rho * drag.translation(size[0], size[1], size[2], c[m, 0], c[m, 1], v[0], v[1], v[2])
     share, lever = 1.0, (0.0, 0.0, 0.0)
     if modules.shelter[m] >= 0 and factor > 0.0:
         share, x_off, y_off, z_off = seen_share(modules.maps, modules.shelter[m], v)
         lever = (x_off, y_off, z_off)
-    n = cross(lever, times(-factor, v))
-    factor *= share
-    f = (
-        -(factor + linear[m, 0] + quadratic[m, 0] * abs(v[0])) * v[0],
-        -(factor + linear[m, 1] + quadratic[m, 1] * abs(v[1])) * v[1],
-        -(factor + linear[m, 2] + quadratic[m, 2] * abs(v[2])) * v[2],
-    )
-    n = (
-        n[0] - half_rho * c[m, 2] * drag.rotation(sy, sz, sx, v[1], v[2], w[0], oy, oz)
-        - (linear[m, 3] + quadratic[m, 3] * abs(w[0])) * w[0],
-        n[1] - half_rho * c[m, 3] * drag.rotation(sz, sx, sy, v[2], v[0], w[1], oz, ox)
-        - (linear[m, 4] + quadratic[m, 4] * abs(w[1])) * w[1],
-        n[2] - half_rho * c[m, 4] * drag.rotation(sx, sy, sz, v[0], v[1], w[2], ox, oy)
-        - (linear[m, 5] + quadratic[m, 5] * abs(w[2])) * w[2],
-    )  # fmt: skip
+    moment = cross(lever, times(-factor, v))
+    sides, linear, quadratic = triple(modules.sides, m, 0), six(modules.linear, m), six(modules.quadratic, m)
+    f, n = drag.box(size, sides, triple(c, m, 2), linear, quadratic, half_rho, factor * share, moment, v, w)
     add_force(bodies.wrench, b, at, turn(inside, f))
     n = turn(inside, n)
     for i in range(3):
         bodies.wrench[b, 3 + i] += n[i]
 
 
-@compiled(types.boolean(MODULES, I8, WATER, F2))
-def _touches(modules, m, water, x):
+@inlined(types.boolean(MODULES, I8, WATER, F2))
+def touches(modules, m, water, x):
     """Whether a module is so near to wall, bottom or surface that its corners must be looked at."""
-    b = modules.body[m]
-    r, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), matrix(modules.turn, m)
+    b, (sx, sy, sz) = modules.body[m], triple(modules.size, m, 0)
+    r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
     centre, half = plus(triple(x, b, 0), turn(r, triple(modules.position, m, 0))), (0.0, 0.0, 0.0)
+    if room(water, centre) > 0.5 * math.sqrt(sx * sx + sy * sy + sz * sz) + NEAR_M:
+        return False
+    inside = matrix(modules.turn, m)
     for axis in range(3):
         edge = turn(r, (inside[0][axis], inside[1][axis], inside[2][axis]))
         s = 0.5 * modules.size[m, axis]
@@ -180,7 +209,7 @@ def _touches(modules, m, water, x):
 
 
 @compiled(types.void(BODIES, MODULES, I8, WATER, F2))
-def _add_walls(bodies, modules, m, water, x):
+def add_walls(bodies, modules, m, water, x):
     """Walls, bottom and surface on the eight corners of one module."""
     b = modules.body[m]
     r, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), matrix(modules.turn, m)
@@ -201,35 +230,25 @@ def _add_walls(bodies, modules, m, water, x):
         add_force(bodies.wrench, b, at, turn_back(r, f))
 
 
-@compiled(types.void(BODIES, I8, F2, F2, V3, V3))
+@inlined(types.void(BODIES, I8, F2, F2, V3, V3))
 def accelerate(bodies, b, x, out, flow, flow_rate):
     """Kirchhoff's equations solved for the accelerations, and the kinematics. A clamped body stays where it is."""
     if bodies.clamped[b]:
         for i in range(13):
             out[b, i] = 0.0
         return
-    q = (x[b, 3], x[b, 4], x[b, 5], x[b, 6])
-    r, v, w = matrix_of(q[0], q[1], q[2], q[3]), triple(x, b, 7), triple(x, b, 10)
-    u, none = turn_back(r, flow), (0.0, 0.0, 0.0)
-    slip = minus(v, u)
-    carried = minus(cross(w, u), turn_back(r, flow_rate))  # dv_r/dt = dv/dt + carried
-    p, spin = half_momentum(bodies.rigid, b, 0, v, w), half_momentum(bodies.rigid, b, 3, v, w)
-    h, swirl = half_momentum(bodies.added, b, 0, slip, w), half_momentum(bodies.added, b, 3, slip, w)
-    f, n = triple(bodies.wrench, b, 0), triple(bodies.wrench, b, 3)
-    f = minus(minus(f, half_momentum(bodies.added, b, 0, carried, none)), cross(w, plus(p, h)))
-    n = minus(minus(n, half_momentum(bodies.added, b, 3, carried, none)), cross(w, plus(spin, swirl)))
-    n = minus(minus(n, cross(v, p)), cross(slip, h))
-    a, alpha = half_momentum(bodies.inverse, b, 0, f, n), half_momentum(bodies.inverse, b, 3, f, n)
-    rate = turn(r, v)
+    q, v, w = (x[b, 3], x[b, 4], x[b, 5], x[b, 6]), triple(x, b, 7), triple(x, b, 10)
+    r, f, n = matrix_of(q[0], q[1], q[2], q[3]), triple(bodies.wrench, b, 0), triple(bodies.wrench, b, 3)
+    masses = (mass_of(bodies.rigid, b), mass_of(bodies.added, b), mass_of(bodies.inverse, b))
+    a, alpha = respond(masses[0], masses[1], masses[2], r, v, w, flow, flow_rate, f, n)
+    rate, spin = turn(r, v), turning(q, w)
     for i in range(3):
         out[b, i], out[b, 7 + i], out[b, 10 + i] = rate[i], a[i], alpha[i]
-    out[b, 3] = -0.5 * (q[1] * w[0] + q[2] * w[1] + q[3] * w[2])
-    out[b, 4] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1])
-    out[b, 5] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2])
-    out[b, 6] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0])
+    for i in range(4):
+        out[b, 3 + i] = spin[i]
 
 
-@compiled(types.void(BODIES, MODULES, WATER, V3, V3, F2, F2))
+@inlined(types.void(BODIES, MODULES, WATER, V3, V3, F2, F2))
 def load(bodies, modules, water, flow, flow_rate, thrust, x):
     """Writes into `bodies.wrench` what thrusters, weight, drag and walls do; arguments as `integrator.derivative`."""
     for b in range(x.shape[0]):
@@ -238,8 +257,8 @@ def load(bodies, modules, water, flow, flow_rate, thrust, x):
         _add_weight(bodies, b, x, flow_rate)
     for m in range(modules.body.shape[0]):
         _add_drag(bodies, modules, m, water, x, flow)
-        if _touches(modules, m, water, x):
-            _add_walls(bodies, modules, m, water, x)
+        if touches(modules, m, water, x):
+            add_walls(bodies, modules, m, water, x)
 
 
 @compiled(types.void(BODIES, MODULES, F2, F8, F2))

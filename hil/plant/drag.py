@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 
-from hil.plant.vectors import F8, compiled
+from numba import types
+
+from hil.plant.vectors import F8, V3, V6, inlined
 
 
-@compiled(F8(F8, F8, F8, F8, F8, F8, F8, F8))
+@inlined(F8(F8, F8, F8, F8, F8, F8, F8, F8))
 def translation(a, b, c, cd_face, cd_edge, vx, vy, vz):
     """Cd(d) A(d) |v|, m^3/s, of a box with edges a, b, c (m) moving at v (m/s, box frame) through the water.
 
@@ -26,7 +28,7 @@ def translation(a, b, c, cd_face, cd_edge, vx, vy, vz):
     return cd * (b * c * abs(vx) + a * c * abs(vy) + a * b * abs(vz))
 
 
-@compiled(F8(F8, F8, F8))
+@inlined(F8(F8, F8, F8))
 def strip(v, w, h):
     """Integral over y from -h to h of |v + w y| (v + w y) y dy, m^5/s^2 per metre: strips of a side in cross-flow.
 
@@ -38,10 +40,34 @@ def strip(v, w, h):
     return math.copysign(inner, w)
 
 
-@compiled(F8(F8, F8, F8, F8, F8, F8, F8, F8))
+@inlined(F8(F8, F8, F8, F8, F8, F8, F8, F8))
 def rotation(a, b, c, vx, vy, wz, open_x, open_y):
     """Integral, m^5/s^2, of a box with edges a, b and c along z: times 1/2 rho Cd the moment against its rate wz.
 
     open_x, open_y: shares of the sides across x and y that the water reaches.
     """
     return c * (open_y * strip(vy, wz, 0.5 * a) + open_x * strip(-vx, wz, 0.5 * b))
+
+
+@inlined(types.UniTuple(V3, 2)(V3, V3, V3, V6, V6, F8, F8, V3, V3, V3))
+def box(size, sides, turning, linear, quadratic, half_rho, factor, moment, v, w):
+    """Force, and moment about the centre, of the water on one hull; all in the hull's frame.
+
+    Args:
+        size, sides, linear, quadratic: a row of `bodies.Modules` each. turning: its coefficients of rotation.
+        half_rho: half the density of the water. factor: half_rho Cd(d) A(d) |v| of the part that the flow sees, see `translation`.
+        moment: because that part is not in the middle.
+        v, w: velocity relative to the water, m/s, and rate, rad/s.
+    """
+    (sx, sy, sz), (ox, oy, oz), c = size, sides, turning
+    f = (
+        -(factor + linear[0] + quadratic[0] * abs(v[0])) * v[0],
+        -(factor + linear[1] + quadratic[1] * abs(v[1])) * v[1],
+        -(factor + linear[2] + quadratic[2] * abs(v[2])) * v[2],
+    )
+    n = (
+        moment[0] - half_rho * c[0] * rotation(sy, sz, sx, v[1], v[2], w[0], oy, oz) - (linear[3] + quadratic[3] * abs(w[0])) * w[0],
+        moment[1] - half_rho * c[1] * rotation(sz, sx, sy, v[2], v[0], w[1], oz, ox) - (linear[4] + quadratic[4] * abs(w[1])) * w[1],
+        moment[2] - half_rho * c[2] * rotation(sx, sy, sz, v[0], v[1], w[2], ox, oy) - (linear[5] + quadratic[5] * abs(w[2])) * w[2],
+    )
+    return f, n

@@ -9,21 +9,28 @@ from numba import types
 from hil.plant.bodies import BODIES, MODULES, accelerate, load, observe
 from hil.plant.contact import FACES, interact
 from hil.plant.thrusters import THRUSTERS, forces_after, load_supplies, settle
-from hil.plant.vectors import F2, F3, F8, V3, compiled
+from hil.plant.vectors import F2, F3, F8, V3, compiled, inlined, plus, times, triple
 from hil.plant.water import WATER, flow_at
 
 I8 = types.int64
 
 
-@compiled(types.void(THRUSTERS, F2, F2))
+@inlined(types.void(THRUSTERS, F2, F2))
 def wrenches(thrusters, external, out):
     """Writes the wrench (b, 6) about O, body frame, of all thrusters and of `external` (b, 6)."""
     for b in range(out.shape[0]):
         for i in range(6):
             out[b, i] = external[b, i]
-    for t in range(thrusters.force.shape[0]):
-        for i in range(6):
-            out[thrusters.body[t], i] += thrusters.column[t, i] * thrusters.force[t]
+    t, column = 0, thrusters.column
+    while t < thrusters.force.shape[0]:
+        b = thrusters.body[t]
+        f, n = triple(out, b, 0), triple(out, b, 3)
+        while t < thrusters.force.shape[0] and thrusters.body[t] == b:  # those of one body are summed in registers
+            f = plus(f, times(thrusters.force[t], triple(column, t, 0)))
+            n = plus(n, times(thrusters.force[t], triple(column, t, 3)))
+            t += 1
+        for i in range(3):
+            out[b, i], out[b, 3 + i] = f[i], n[i]
 
 
 @compiled(types.void(F2, F8, F2, F2))
@@ -45,7 +52,7 @@ def close_step(x, h, stage):
             x[b, i] /= norm
 
 
-@compiled([types.void(BODIES, MODULES, faces, WATER, V3, V3, F2, F2, F2) for faces in (FACES, types.none)])
+@inlined([types.void(BODIES, MODULES, faces, WATER, V3, V3, F2, F2, F2) for faces in (FACES, types.none)])
 def derivative(bodies, modules, faces, water, flow, flow_rate, thrust, x, out):
     """Rate of change of the states.
 

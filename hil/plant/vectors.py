@@ -11,56 +11,67 @@ F8 = types.float64
 F1, F2, F3 = F8[::1], F8[:, ::1], F8[:, :, ::1]
 I1 = types.int64[::1]
 V3 = types.UniTuple(F8, 3)
+V6 = types.UniTuple(F8, 6)
 M3 = types.UniTuple(V3, 3)
 
 
-def compiled(signature: Any, makes_arrays: bool = False) -> Callable[[Callable[..., Any]], Any]:
+MASS = types.UniTuple(M3, 4)
+"""A (6, 6) matrix of masses by its blocks: force by linear, force by angular, moment by linear, moment by angular acceleration."""
+
+
+def compiled(signature: Any, makes_arrays: bool = False, **options: bool) -> Callable[[Callable[..., Any]], Any]:
     """Compiles for one signature. Dividing by zero gives infinity as in numpy: to check costs a third of the time.
 
     Args:
         makes_arrays: code that makes none need not count references, which costs more than the sums (numba's unpublished `_nrt`).
+        options: of numba.njit.
     """
-    how = {"cache": True, "error_model": "numpy", "_nrt": makes_arrays}
+    how = {"cache": True, "error_model": "numpy", "_nrt": makes_arrays, **options}
     return cast("Callable[[Callable[..., Any]], Any]", njit(signature, **how))  # type: ignore[call-overload]
 
 
-@compiled(V3(V3, V3))
+def inlined(signature: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compiles sums without arrays that become a part of whoever calls them: a loop over lanes turns them into vector instructions."""
+    return compiled(signature, forceinline=True)
+
+
+@inlined(V3(V3, V3))
 def cross(a, b):
     """a x b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@compiled(V3(V3, V3))
+@inlined(V3(V3, V3))
 def plus(a, b):
     """a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-@compiled(V3(V3, V3))
+@inlined(V3(V3, V3))
 def minus(a, b):
     """a - b."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
-@compiled(V3(F8, V3))
+@inlined(V3(F8, V3))
 def times(s, a):
     """s a."""
     return (s * a[0], s * a[1], s * a[2])
 
 
-@compiled(F8(V3, V3))
+@inlined(F8(V3, V3))
 def dot(a, b):
     """a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled(V3(M3, V3))
+@inlined(V3(M3, V3))
 def turn(r, a):
     """r a."""
     return (dot(r[0], a), dot(r[1], a), dot(r[2], a))
 
 
-@compiled(V3(M3, V3))
+@inlined(V3(M3, V3))
 def turn_back(r, a):
     """r^T a."""
     return (
@@ -70,10 +81,44 @@ def turn_back(r, a):
     )
 
 
+@inlined(types.UniTuple(V3, 2)(MASS, V3, V3))
+def momenta(mass, v, w):
+    """Linear and angular momentum of a body with the velocity v and the rate w."""
+    p, spin = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for j in range(3):
+        p = plus(p, times(v[j], (mass[0][0][j], mass[0][1][j], mass[0][2][j])))
+        p = plus(p, times(w[j], (mass[1][0][j], mass[1][1][j], mass[1][2][j])))
+        spin = plus(spin, times(v[j], (mass[2][0][j], mass[2][1][j], mass[2][2][j])))
+        spin = plus(spin, times(w[j], (mass[3][0][j], mass[3][1][j], mass[3][2][j])))
+    return p, spin
+
+
 @compiled(V3(F2, types.int64, types.int64))
 def triple(array, row, first):
     """Three numbers of a row, from column `first`."""
     return (array[row, first], array[row, first + 1], array[row, first + 2])
+
+
+@compiled(V6(F2, types.int64))
+def six(array, row):
+    """Six numbers of a row."""
+    return (array[row, 0], array[row, 1], array[row, 2], array[row, 3], array[row, 4], array[row, 5])
+
+
+@compiled(M3(F3, types.int64, types.int64, types.int64))
+def block(array, b, i, j):
+    """Rows i to i + 2, columns j to j + 2 of matrix number b."""
+    return (
+        (array[b, i, j], array[b, i, j + 1], array[b, i, j + 2]),
+        (array[b, i + 1, j], array[b, i + 1, j + 1], array[b, i + 1, j + 2]),
+        (array[b, i + 2, j], array[b, i + 2, j + 1], array[b, i + 2, j + 2]),
+    )
+
+
+@compiled(MASS(F3, types.int64))
+def mass_of(array, b):
+    """Matrix number b of masses by its blocks."""
+    return (block(array, b, 0, 0), block(array, b, 0, 3), block(array, b, 3, 0), block(array, b, 3, 3))
 
 
 @compiled(M3(F3, types.int64))
@@ -86,7 +131,7 @@ def matrix(array, row):
     )
 
 
-@compiled(M3(F8, F8, F8, F8))
+@inlined(M3(F8, F8, F8, F8))
 def matrix_of(w, i, j, k):
     """Rotation matrix of a unit quaternion."""
     return (

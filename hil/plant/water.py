@@ -14,7 +14,7 @@ from numba import types
 
 from hil.plant.draw import Noise
 from hil.plant.spec import Tank, WorldSpec
-from hil.plant.vectors import F1, F2, F8, V3, compiled, dot, minus, plus, times, triple
+from hil.plant.vectors import F1, F2, F8, V3, compiled, dot, inlined, minus, plus, times, triple
 
 FRICTION = 0.3
 """Largest friction at a wall, share of the normal force (synthetic)."""
@@ -98,6 +98,15 @@ def flow_at(water, since_s):
     target = triple(water.flow, 2, 0)
     gap = times(keep, minus(triple(water.flow, 1, 0), target))
     return plus(triple(water.flow, 0, 0), plus(target, gap)), times(-rate, gap)
+
+
+@inlined(F8(WATER, V3))
+def room(water, p):
+    """How far p is from the nearest of walls, bottom and surface, m."""
+    x, y, z = p
+    corner = min(water.half_length - abs(x), water.half_width - abs(y))
+    rim = water.half_length - math.sqrt(x * x + y * y)
+    return min(corner if water.is_box else rim, min(z, water.depth - z))
 
 
 @compiled(types.boolean(WATER, V3, V3))

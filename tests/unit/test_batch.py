@@ -14,8 +14,8 @@ TICKS = 1500
 PERIOD_NS = 10_000_000
 
 
-def worlds(count: int) -> list[World]:
-    return [make_world(load_scenario("spiral"), seed, PERIOD_NS) for seed in range(count)]
+def worlds(count: int, scenario: str = "spiral") -> list[World]:
+    return [make_world(load_scenario(scenario), seed, PERIOD_NS) for seed in range(count)]
 
 
 def pushes(count: int, ticks: int = TICKS) -> np.ndarray:
@@ -32,23 +32,34 @@ def one_by_one(world: World, commands: np.ndarray) -> np.ndarray:
     return np.array(rows)
 
 
-def test_batch_is_the_single_plant_to_the_last_bit() -> None:
-    commands = pushes(3)
-    together = fly(worlds(3), commands, threads=2)
-    for each, world, u in zip(together, worlds(3), commands, strict=True):
+@pytest.mark.parametrize("count", [1, 3, 10])  # alone; eight lanes, some idle; eight and two
+def test_batch_is_the_single_plant_to_the_last_bit(count: int) -> None:
+    commands = pushes(count)
+    together = fly(worlds(count), commands, threads=2)
+    for each, world, u in zip(together, worlds(count), commands, strict=True):
         assert np.array_equal(each, one_by_one(world, u))
-    assert not np.array_equal(together[0], together[1])
+    assert count == 1 or not np.array_equal(together[0], together[1])
 
 
-def test_world_goes_on_where_the_batch_has_put_it() -> None:
-    commands = pushes(1, 60)
-    world, alone = worlds(1)[0], worlds(1)[0]
-    fly([world], commands[:, :20])
-    one_by_one(world, commands[0, 20:40])
-    last = fly([world], commands[:, 40:])
+@pytest.mark.parametrize("scenario", ["spiral", "mobius-1"])
+def test_batch_is_the_single_plant_in_a_box_and_in_a_cylinder(scenario: str) -> None:
+    commands = pushes(4, 400)
+    together = fly(worlds(4, scenario), commands)
+    for each, world, u in zip(together, worlds(4, scenario), commands, strict=True):
+        assert np.array_equal(each, one_by_one(world, u))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_world_goes_on_where_the_batch_has_put_it(count: int) -> None:
+    commands = pushes(count, 60)
+    moved, alone = worlds(count), worlds(count)[0]
+    fly(moved, commands[:, :20])
+    for world, u in zip(moved, commands, strict=True):
+        one_by_one(world, u[20:40])
+    last = fly(moved, commands[:, 40:])
     assert np.array_equal(last[0], one_by_one(alone, commands[0])[40:])
-    assert world.time_ns == alone.time_ns
-    assert np.array_equal(world.truth(0).force_n, alone.truth(0).force_n)
+    assert moved[0].time_ns == alone.time_ns
+    assert np.array_equal(moved[0].truth(0).force_n, alone.truth(0).force_n)
 
 
 def test_numbers_taken_together_are_those_taken_singly() -> None:
@@ -71,3 +82,8 @@ def test_commands_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
 def test_docked_modules_are_refused() -> None:
     with pytest.raises(DescriptionError, match="lone modules"):
         fly([make_world(load_scenario("mobius-2"), 0, PERIOD_NS)], np.zeros((10, 8)))
+
+
+def test_worlds_in_unlike_tanks_are_refused() -> None:
+    with pytest.raises(DescriptionError, match="differ in tank"):
+        fly([*worlds(1), *worlds(1, "mobius-1")], np.zeros((10, 8)))
