@@ -7,7 +7,7 @@ acceleration. Walls are soft: springs and dampers at the corners of each hull.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numba import types
@@ -16,6 +16,8 @@ from hil.plant.draw import Noise
 from hil.plant.spec import Tank, WorldSpec
 from hil.plant.vectors import F1, F2, F8, V3, compiled, dot, inlined, minus, plus, times, triple
 
+AHEAD = 128
+"""Ticks whose gusts are drawn together."""
 FRICTION = 0.3
 """Largest friction at a wall, share of the normal force (synthetic)."""
 
@@ -68,14 +70,24 @@ class Gusts:
         )
         self._push = math.sqrt(1.0 - self._keep**2)
         self._noise = Noise(rng, 3)
+        self._ahead = np.empty((0, 3))
+        self._taken = 0
 
     def step(self) -> np.ndarray:
         """(3,) where the gust tends during the next tick, m/s."""
-        self._unit = self._keep * self._unit + self._push * self._noise.take()
-        return self._sigma * self._unit
+        if self._taken == len(self._ahead):
+            self._ahead, self._taken = self._draw(AHEAD), 0
+        self._taken += 1
+        return cast("np.ndarray", self._ahead[self._taken - 1])
 
     def steps(self, count: int) -> np.ndarray:
         """(count, 3) what so many calls of `step` give, at once."""
+        ready = self._ahead[self._taken : self._taken + count]
+        self._taken += len(ready)
+        return np.concatenate([ready, self._draw(count - len(ready))]) if count > len(ready) else ready
+
+    def _draw(self, count: int) -> np.ndarray:
+        """(count, 3) the next ones."""
         out = self._noise.take_many(count)
         _lag(self._unit, self._keep, self._push, out)
         self._unit = out[-1].copy()

@@ -230,7 +230,8 @@ class World(DockedBodies):
         if len(self.vehicles) > 1 and self.jet_strength > 0.0:
             jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
             add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._external)
-        for m in sorted(set(self.push.nonzero()[0].tolist())):
+        pushed = sorted(set(self.push.nonzero()[0].tolist())) if np.count_nonzero(self.push) else []
+        for m in pushed:
             force, moment = (self._modules.turn[m] @ part for part in np.split(self.push[m], 2))
             moment += np.cross(self._modules.position[m], force)
             self._external[self._modules.body[m]] += np.concatenate([force, moment])
