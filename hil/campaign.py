@@ -16,7 +16,7 @@ import socket
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import cache
 from importlib import resources
 from multiprocessing import get_context
@@ -40,7 +40,7 @@ WALL_CLOCK = ("real_time_factor", "deadline_misses")
 PACKAGES = ("firmware_py", "hil", "can_dbc")
 SOURCES = (".py", ".toml", ".dbc")
 
-Pool = Callable[[], Executor]
+Pool = Callable[[], AbstractContextManager[Executor]]
 
 
 @cache
@@ -138,6 +138,25 @@ class TrialFile:
 def processes(jobs: int) -> Pool:
     """So many processes of this machine."""
     return lambda: ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
+
+
+@contextmanager
+def kept(pool: Pool) -> Iterator[Pool]:
+    """The pool, whose workers stay from one use to the next: to start them takes longer than a flight. A broken one is made anew."""
+    with ExitStack() as stack:
+        executors: list[Executor] = []
+
+        @contextmanager
+        def use() -> Iterator[Executor]:
+            if not executors:
+                executors.append(stack.enter_context(pool()))
+            try:
+                yield executors[0]
+            except BrokenExecutor:
+                executors.clear()
+                raise
+
+        yield use
 
 
 def dask_cluster(address: str) -> Pool:

@@ -26,7 +26,7 @@ from tune_objective import Objective, detuned, load_objective, with_values
 
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError, to_toml
-from hil.campaign import TRIALS_FILE, Pool, TrialFile, code_digest, dask_cluster, identity, processes, run_campaign
+from hil.campaign import TRIALS_FILE, Pool, TrialFile, code_digest, dask_cluster, identity, kept, processes, run_campaign
 
 DETUNED = 3.0
 """Largest factor by which --detune puts each gain off."""
@@ -84,14 +84,15 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
 
     check_folder(given.out, objective, start, given.seed)
     began = time.monotonic()
-    with pool() as executor:
-        study = search(objective, start, given.trials, given.out, executor, given.seed, tell, began + 60.0 * given.minutes)
-    best = with_values(start, study.best_params)
     figures = {}
-    for name, parameters in (("shipped", Parameters()), ("tuned", best)):
-        costs = unseen_costs(objective, parameters, pool, given.out / "unseen" / name)
-        figures[name] = {"objective": objective.total(costs), "worst": max(costs), "flights": len(costs)}
-        print(f"{name:8s} objective on unseen seeds {figures[name]['objective']:9.4f}, worst flight {max(costs):9.4f}", flush=True)
+    with kept(pool) as workers:
+        with workers() as executor:
+            study = search(objective, start, given.trials, given.out, executor, given.seed, tell, began + 60.0 * given.minutes)
+        best = with_values(start, study.best_params)
+        for name, parameters in (("shipped", Parameters()), ("tuned", best)):
+            costs = unseen_costs(objective, parameters, workers, given.out / "unseen" / name)
+            figures[name] = {"objective": objective.total(costs), "worst": max(costs), "flights": len(costs)}
+            print(f"{name:8s} objective on unseen seeds {figures[name]['objective']:9.4f}, worst flight {max(costs):9.4f}", flush=True)
     write_result(objective, best, study, given.out, figures, given.seed)
     print(f"parameters: {given.out / 'parameters.toml'}  ({time.monotonic() - began:.0f} s)", flush=True)
     if not given.no_plots:

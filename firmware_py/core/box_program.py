@@ -44,7 +44,7 @@ def _look(rows, weights, free, low, high, x, gradient, curvature):  # type: igno
     return np.abs(gradient).max()
 
 
-@njit(f"void({M},float64,{V},{V})", cache=True)
+@njit(cache=True)
 def _newton(curvature, ridge, gradient, step):  # type: ignore[no-untyped-def]
     """Writes -(curvature + ridge)^-1 gradient into `step` by Cholesky's factors, which take the place of the curvature's lower half."""
     for k in range(6):
@@ -63,7 +63,7 @@ def _newton(curvature, ridge, gradient, step):  # type: ignore[no-untyped-def]
         step[k] /= curvature[k, k]
 
 
-@njit(f"float64({V},{V},{V},{V},{V})", cache=True)
+@njit(cache=True)
 def _lowest(weights, free, slope, low, high):  # type: ignore[no-untyped-def]
     """How many times `slope` leads from `free` to the lowest point of that line; there the derivative, which only rises, is zero."""
     first, shortest, longest, length = 0.0, 0.0, math.inf, 1.0

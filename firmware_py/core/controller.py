@@ -51,7 +51,7 @@ class Controller:
         )
 
 
-@njit(f"{V}({V},{V},{V},{V})", cache=True)
+@njit(cache=True)
 def _body_velocity(q_set, v_w, w_b, q):  # type: ignore[no-untyped-def]
     """(6,) wanted velocity in the present body frame."""
     out = np.empty(6)

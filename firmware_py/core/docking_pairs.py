@@ -87,7 +87,7 @@ def _lose(row, which, time_ns):  # type: ignore[no-untyped-def]
     row.candidate_ns[which] = NEVER_NS
 
 
-@njit(numba.boolean(ROW, TABLE, numba.int64, LIMITS), cache=True)
+@njit(cache=True)
 def _take_currents(row, heard_ma, time_ns, limits):  # type: ignore[no-untyped-def]
     """Condition 1 by the currents of this tick; whether those known are fresh."""
     heard = False
@@ -108,7 +108,7 @@ def _take_currents(row, heard_ma, time_ns, limits):  # type: ignore[no-untyped-d
     return fresh
 
 
-@njit("UniTuple(int64,2)(int64[::1],int64[:,::1],int64,int64)", cache=True)
+@njit(cache=True)
 def _same_picture(first, seen, a, b):  # type: ignore[no-untyped-def]
     """Sightings of modules a and b in the newest picture that shows both; -1 without one."""
     for i in range(first[a + 1] - 1, first[a] - 1, -1):
@@ -118,7 +118,7 @@ def _same_picture(first, seen, a, b):  # type: ignore[no-untyped-def]
     return -1, -1
 
 
-@njit(numba.void(ROW, TABLE), cache=True)
+@njit(cache=True)
 def _judge_ring(row, ring):  # type: ignore[no-untyped-def]
     """Distance of the mean from the wanted position, and distance between the means of the two newest quarters."""
     n, oldest, quarter = PICTURES, row.pictures, PICTURES // 4
@@ -135,7 +135,7 @@ def _judge_ring(row, ring):  # type: ignore[no-untyped-def]
     row.error_m, row.spread_m = math.sqrt(off), math.sqrt(moved)
 
 
-@njit(numba.boolean(TABLE, numba.int64, numba.int64), cache=True)
+@njit(cache=True)
 def _on_lattice(poses, i, j):  # type: ignore[no-untyped-def]
     """Whether two sightings are turned against each other by quarter turns: each axis of one is along an axis of the other."""
     for a in range(3):
@@ -150,7 +150,7 @@ def _on_lattice(poses, i, j):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(numba.boolean(ROW, TABLE, FIRST, SEEN, TABLE, numba.int64, LIMITS), cache=True)
+@njit(cache=True)
 def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[no-untyped-def]
     """Condition 2 by the pictures of this tick; whether those known are fresh."""
     i, j = _same_picture(first, seen, row.module[0], row.module[1])

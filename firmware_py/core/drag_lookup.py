@@ -17,7 +17,7 @@ STILL = 1e-12
 """m/s; below it there is no direction, and no drag."""
 
 
-@njit(f"UniTuple(float64, 4)({NODES}, float64, float64, float64)", cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def _interpolate(nodes, x, y, z):  # type: ignore[no-untyped-def]
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax >= ay and ax >= az:
@@ -44,7 +44,7 @@ def _interpolate(nodes, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(f"{V}({NODES}, {V})", cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def look_up(nodes, direction):  # type: ignore[no-untyped-def]
     """Coefficient and centre of pressure for flow along one direction.
 
@@ -58,7 +58,7 @@ def look_up(nodes, direction):  # type: ignore[no-untyped-def]
     return np.array(_interpolate(nodes, direction[0], direction[1], direction[2]))
 
 
-@njit(f"void({NODES}, {V}, {V}, {V}, {V})", cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def add_drag(nodes, rotational, linear, nu, out):  # type: ignore[no-untyped-def]
     """Add the wrench of the water on the body to `out` (6,). Arguments as `drag_wrench`; allocates nothing."""
     k, rx, ry, rz = _interpolate(nodes, nu[0], nu[1], nu[2])

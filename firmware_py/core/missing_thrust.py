@@ -149,7 +149,7 @@ def _add_model(inertia, righting, nodes, rotational, linear, nu, q_wb, out):  # 
     out[5] -= w[0] * h[1] - w[1] * h[0]
 
 
-@njit(f"Tuple(({V},int64))({M})", cache=True)
+@njit(cache=True)
 def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
     """Mean (w,) of those of the blocks (k, w) that are whole, and how many there are; others have NaN for a wrench."""
     total, count = np.zeros(blocks.shape[1]), 0

@@ -9,7 +9,7 @@ from numba import njit
 from firmware_py.core.rotations import M, V, skew
 
 
-@njit(f"{M}({M},{V})", cache=True)
+@njit(cache=True)
 def coriolis(mass, nu):  # type: ignore[no-untyped-def]
     """(6, 6) Coriolis and centripetal matrix of a symmetric (6, 6) mass matrix; skew-symmetric for every nu.
 
@@ -24,7 +24,7 @@ def coriolis(mass, nu):  # type: ignore[no-untyped-def]
     return c
 
 
-@njit(f"void({M},{V},{V})", cache=True)
+@njit(cache=True)
 def take_coriolis(mass, nu, out):  # type: ignore[no-untyped-def]
     """Takes the (6,) wrench C(nu) nu from `out`, without the matrix and without an allocation."""
     px, py, pz, hx, hy, hz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -52,7 +52,7 @@ def coriolis_wrench(mass, nu):  # type: ignore[no-untyped-def]
     return -out
 
 
-@njit(f"void({V},{V},{V})", cache=True)
+@njit(cache=True)
 def add_restoring(righting, q_wb, out):  # type: ignore[no-untyped-def]
     """Adds the moment of buoyancy to the wrench `out` (6,): righting x (upwards, seen in the body)."""
     w, x, y, z = q_wb[0], q_wb[1], q_wb[2], q_wb[3]

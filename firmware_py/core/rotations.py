@@ -11,13 +11,13 @@ V = "float64[::1]"
 M = "float64[:,::1]"
 
 
-@njit(f"UniTuple(float64,4)({','.join(['float64'] * 8)})", cache=True)
+@njit(cache=True)
 def _product(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     """Hamilton product of (a, b, c, d) and (e, f, g, h)."""
     return a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g, a * g - b * h + c * e + d * f, a * h + b * g - c * f + d * e
 
 
-@njit(f"UniTuple(float64,4)({','.join(['float64'] * 3)})", cache=True)
+@njit(cache=True)
 def _exp(x, y, z):  # type: ignore[no-untyped-def]
     """Unit quaternion of the rotation vector (x, y, z), rad."""
     angle = math.sqrt(x**2 + y**2 + z**2)
@@ -38,7 +38,7 @@ def turned(q, a, b, c):  # type: ignore[no-untyped-def]
     return _turned(q[0], q[1], q[2], q[3], a, b, c)
 
 
-@njit(f"UniTuple(float64,3)({V},{','.join(['float64'] * 3)})", cache=True)
+@njit(cache=True)
 def turned_back(q, a, b, c):  # type: ignore[no-untyped-def]
     """q^-1 v q of q (4,) and v = (a, b, c), without an array."""
     return _turned(q[0], -q[1], -q[2], -q[3], a, b, c)

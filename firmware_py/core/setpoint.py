@@ -68,7 +68,7 @@ def limited(vector, size):  # type: ignore[no-untyped-def]
     return vector.copy() if norm <= size else vector * (size / norm)
 
 
-@njit(f"UniTuple({V}, 3)({V},{V},{V},float64,float64)", cache=True)
+@njit(cache=True)
 def _follow(v, a, wanted, w, dt):  # type: ignore[no-untyped-def]
     """Speed, acceleration and way after `dt`: exact answer of v'' = w^2 (wanted - v) - 2 w v' to a step."""
     decay = math.exp(-w * dt)

@@ -24,9 +24,8 @@ from hil.plant.vectors import (
     F3,
     F8,
     I1,
-    M3,
-    MASS,
     V3,
+    callee,
     compiled,
     cross,
     inlined,
@@ -42,7 +41,7 @@ from hil.plant.vectors import (
     turn,
     turn_back,
 )  # fmt: skip
-from hil.plant.water import WATER, is_clear, push_of_walls, room
+from hil.plant.water import is_clear, push_of_walls, room
 
 I8 = types.int64
 NEAR_M = 1e-6
@@ -101,7 +100,7 @@ BODIES = types.NamedTuple((F2, F3, F3, F3, F2, F2, F2, I1), Bodies)
 MODULES = types.NamedTuple((I1, F2, F3, F2, F2, F2, F2, F2, I1, F2, F5), Modules)
 
 
-@inlined(types.void(F2, I8, V3, V3))
+@inlined
 def add_force(wrench, b, at, f):
     """Adds the force f at the point `at` to row b of wrenches; body frame."""
     n = cross(at, f)
@@ -110,7 +109,7 @@ def add_force(wrench, b, at, f):
         wrench[b, 3 + i] += n[i]
 
 
-@inlined(types.UniTuple(V3, 2)(F8, V3, F8, V3, F8, V3, M3, V3))
+@inlined
 def weigh(weight, weight_at, lift, lift_at, displaced, displaced_at, r, flow_rate):
     """Force and moment of weight, buoyancy, and the pressure gradient of water that accelerates (Froude-Krylov), body frame.
 
@@ -123,7 +122,7 @@ def weigh(weight, weight_at, lift, lift_at, displaced, displaced_at, r, flow_rat
     return f, plus(cross(minus(weight_at, lift_at), down), cross(displaced_at, rate))
 
 
-@inlined(types.UniTuple(V3, 2)(MASS, MASS, MASS, M3, V3, V3, V3, V3, V3, V3))
+@inlined
 def respond(rigid, added, inverse, r, v, w, flow, flow_rate, f, n):
     """Kirchhoff's equations solved for the accelerations of O and of the rate, body frame.
 
@@ -142,7 +141,7 @@ def respond(rigid, added, inverse, r, v, w, flow, flow_rate, f, n):
     return momenta(inverse, f, n)
 
 
-@inlined(types.UniTuple(F8, 4)(types.UniTuple(F8, 4), V3))
+@inlined
 def turning(q, w):
     """Rate of change of a quaternion, body to world, that turns at w, body frame."""
     return (
@@ -153,7 +152,7 @@ def turning(q, w):
     )
 
 
-@inlined(types.void(BODIES, I8, F2, V3))
+@inlined
 def _add_weight(bodies, b, x, flow_rate):
     """What `weigh` says of body b."""
     weight, hull, r = bodies.weight, bodies.hull, matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
@@ -165,7 +164,7 @@ def _add_weight(bodies, b, x, flow_rate):
         bodies.wrench[b, 3 + i] += n[i]
 
 
-@inlined(types.void(BODIES, MODULES, I8, WATER, F2, V3))
+@inlined
 def _add_drag(bodies, modules, m, water, x, flow):
     """Drag of one module at its hull centre, by its velocity relative to the water."""
     b = modules.body[m]
@@ -192,7 +191,7 @@ def _add_drag(bodies, modules, m, water, x, flow):
         bodies.wrench[b, 3 + i] += n[i]
 
 
-@inlined(types.boolean(MODULES, I8, WATER, F2))
+@inlined
 def touches(modules, m, water, x):
     """Whether a module is so near to wall, bottom or surface that its corners must be looked at."""
     b, (sx, sy, sz) = modules.body[m], triple(modules.size, m, 0)
@@ -208,7 +207,7 @@ def touches(modules, m, water, x):
     return not is_clear(water, centre, half)
 
 
-@compiled(types.void(BODIES, MODULES, I8, WATER, F2))
+@callee
 def add_walls(bodies, modules, m, water, x):
     """Walls, bottom and surface on the eight corners of one module."""
     b = modules.body[m]
@@ -230,7 +229,7 @@ def add_walls(bodies, modules, m, water, x):
         add_force(bodies.wrench, b, at, turn_back(r, f))
 
 
-@inlined(types.void(BODIES, I8, F2, F2, V3, V3))
+@inlined
 def accelerate(bodies, b, x, out, flow, flow_rate):
     """Kirchhoff's equations solved for the accelerations, and the kinematics. A clamped body stays where it is."""
     if bodies.clamped[b]:
@@ -248,7 +247,7 @@ def accelerate(bodies, b, x, out, flow, flow_rate):
         out[b, 3 + i] = spin[i]
 
 
-@inlined(types.void(BODIES, MODULES, WATER, V3, V3, F2, F2))
+@inlined
 def load(bodies, modules, water, flow, flow_rate, thrust, x):
     """Writes into `bodies.wrench` what thrusters, weight, drag and walls do; arguments as `integrator.derivative`."""
     for b in range(x.shape[0]):

@@ -11,12 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from hil.plant.bodies import BODIES, MODULES, add_force
+from hil.plant.bodies import MODULES, add_force
 from hil.plant.vectors import (
     F2,
     F8,
     M3,
     V3,
+    callee,
     compiled,
     cross,
     dot,
@@ -78,7 +79,7 @@ def column(r, k):
     return (r[0][k], r[1][k], r[2][k])
 
 
-@compiled(types.Tuple((V3, M3))(MODULES, F2, I8))
+@callee
 def pose_of(modules, x, m):
     """Hull centre in the world, and module frame to world."""
     b = modules.body[m]
@@ -86,7 +87,7 @@ def pose_of(modules, x, m):
     return plus(triple(x, b, 0), turn(r, triple(modules.position, m, 0))), product(r, matrix(modules.turn, m))
 
 
-@compiled(V3(F2, I8, V3))
+@callee
 def velocity_at(x, b, p):
     """Velocity of body b's point that is at p, world."""
     r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
@@ -94,7 +95,7 @@ def velocity_at(x, b, p):
     return turn(r, plus(triple(x, b, 7), cross(triple(x, b, 10), at)))
 
 
-@compiled(types.void(F2, F2, I8, I8, V3, V3))
+@callee
 def push_apart(wrench, x, i, j, p, f):
     """Force f (world) on body j at the world point p, and its counter-force on body i."""
     ri = matrix_of(x[i, 3], x[i, 4], x[i, 5], x[i, 6])
@@ -103,7 +104,7 @@ def push_apart(wrench, x, i, j, p, f):
     add_force(wrench, i, turn_back(ri, minus(p, triple(x, i, 0))), turn_back(ri, times(-1.0, f)))
 
 
-@compiled(types.void(F2, F2, I8, I8, V3))
+@callee
 def turn_apart(wrench, x, i, j, n):
     """Moment n (world) on body j, and its counter-moment on body i."""
     ni = turn_back(matrix_of(x[i, 3], x[i, 4], x[i, 5], x[i, 6]), n)
@@ -113,7 +114,7 @@ def turn_apart(wrench, x, i, j, n):
         wrench[i, 3 + k] -= ni[k]
 
 
-@compiled(I8(M3, V3))
+@callee
 def face_to(r, d):
     """Face (0..5: +x, -x, +y, ...) of a module with axes r that looks most along d (world)."""
     inside = turn_back(r, d)
@@ -124,7 +125,7 @@ def face_to(r, d):
     return 2 * axis + (1 if inside[axis] < 0.0 else 0)
 
 
-@compiled(types.void(MODULES, FACES, F2, I8, I8, F2))
+@callee
 def _corners(modules, faces, x, i, j, wrench):
     """Corners of module i in the box of module j: pushed out through the face that looks at i."""
     p_i, r_i = pose_of(modules, x, i)
@@ -179,7 +180,7 @@ def mating(modules, faces, x, i, j):
     return float(f_i), float(f_j), gap, math.sqrt(dot(side, side)), tilt, roll, closing, fits
 
 
-@compiled(types.void(MODULES, FACES, F2, I8, I8, F2))
+@callee
 def _mate(modules, faces, x, i, j, wrench):
     """Magnets, funnel and jam of the two faces that look at each other."""
     p_i, r_i = pose_of(modules, x, i)
@@ -236,7 +237,7 @@ def near(modules, x, i, j):
     return dot(d, d) < NEAR_M * NEAR_M
 
 
-@compiled(types.void(BODIES, MODULES, FACES, F2))
+@callee
 def interact(bodies, modules, faces, x):
     """Adds what modules of different bodies do to each other to `bodies.wrench`."""
     count = modules.body.shape[0]

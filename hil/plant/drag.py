@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import math
 
-from numba import types
-
-from hil.plant.vectors import F8, V3, V6, inlined
+from hil.plant.vectors import inlined
 
 
-@inlined(F8(F8, F8, F8, F8, F8, F8, F8, F8))
+@inlined
 def translation(a, b, c, cd_face, cd_edge, vx, vy, vz):
     """Cd(d) A(d) |v|, m^3/s, of a box with edges a, b, c (m) moving at v (m/s, box frame) through the water.
 
@@ -28,7 +26,7 @@ def translation(a, b, c, cd_face, cd_edge, vx, vy, vz):
     return cd * (b * c * abs(vx) + a * c * abs(vy) + a * b * abs(vz))
 
 
-@inlined(F8(F8, F8, F8))
+@inlined
 def strip(v, w, h):
     """Integral over y from -h to h of |v + w y| (v + w y) y dy, m^5/s^2 per metre: strips of a side in cross-flow.
 
@@ -40,7 +38,7 @@ def strip(v, w, h):
     return math.copysign(inner, w)
 
 
-@inlined(F8(F8, F8, F8, F8, F8, F8, F8, F8))
+@inlined
 def rotation(a, b, c, vx, vy, wz, open_x, open_y):
     """Integral, m^5/s^2, of a box with edges a, b and c along z: times 1/2 rho Cd the moment against its rate wz.
 
@@ -49,7 +47,7 @@ def rotation(a, b, c, vx, vy, wz, open_x, open_y):
     return c * (open_y * strip(vy, wz, 0.5 * a) + open_x * strip(-vx, wz, 0.5 * b))
 
 
-@inlined(types.UniTuple(V3, 2)(V3, V3, V3, V6, V6, F8, F8, V3, V3, V3))
+@inlined
 def box(size, sides, turning, linear, quadratic, half_rho, factor, moment, v, w):
     """Force, and moment about the centre, of the water on one hull; all in the hull's frame.
 

@@ -9,13 +9,13 @@ from numba import types
 from hil.plant.bodies import BODIES, MODULES, accelerate, load, observe
 from hil.plant.contact import FACES, interact
 from hil.plant.thrusters import THRUSTERS, forces_after, load_supplies, settle
-from hil.plant.vectors import F2, F3, F8, V3, compiled, inlined, plus, times, triple
+from hil.plant.vectors import F2, F3, F8, callee, compiled, inlined, plus, times, triple
 from hil.plant.water import WATER, flow_at
 
 I8 = types.int64
 
 
-@inlined(types.void(THRUSTERS, F2, F2))
+@inlined
 def wrenches(thrusters, external, out):
     """Writes the wrench (b, 6) about O, body frame, of all thrusters and of `external` (b, 6)."""
     for b in range(out.shape[0]):
@@ -33,7 +33,7 @@ def wrenches(thrusters, external, out):
             out[b, i], out[b, 3 + i] = f[i], n[i]
 
 
-@compiled(types.void(F2, F8, F2, F2))
+@callee
 def along(x, h, rate, out):
     """out = x + h rate."""
     for b in range(x.shape[0]):
@@ -41,7 +41,7 @@ def along(x, h, rate, out):
             out[b, i] = x[b, i] + h * rate[b, i]
 
 
-@compiled(types.void(F2, F8, F3))
+@callee
 def close_step(x, h, stage):
     """Sums the four stages into x and makes the quaternions of unit length."""
     for b in range(x.shape[0]):
@@ -52,7 +52,7 @@ def close_step(x, h, stage):
             x[b, i] /= norm
 
 
-@inlined([types.void(BODIES, MODULES, faces, WATER, V3, V3, F2, F2, F2) for faces in (FACES, types.none)])
+@inlined
 def derivative(bodies, modules, faces, water, flow, flow_rate, thrust, x, out):
     """Rate of change of the states.
 

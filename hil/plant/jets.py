@@ -8,7 +8,7 @@ from numba import types
 
 from hil.plant.bodies import BODIES, MODULES, add_force
 from hil.plant.thrusters import THRUSTERS
-from hil.plant.vectors import F2, F8, V3, compiled, dot, matrix_of, minus, plus, times, triple, turn, turn_back
+from hil.plant.vectors import F2, F8, V3, callee, compiled, dot, matrix_of, minus, plus, times, triple, turn, turn_back
 
 I8 = types.int64
 SPREADING = 0.1
@@ -21,7 +21,7 @@ def to_world(x, b, r):
     return plus(triple(x, b, 0), turn(matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), r))
 
 
-@compiled(types.UniTuple(F8, 2)(MODULES, F2, I8, V3, V3, F8))
+@callee
 def in_the_way(modules, x, m, start, jet, radius):
     """(way along the jet to the point nearest to module m's centre, share of the jet that it catches: 0 is a miss)."""
     gap = minus(to_world(x, modules.body[m], triple(modules.position, m, 0)), start)

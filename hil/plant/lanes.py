@@ -19,6 +19,7 @@ from hil.plant.vectors import (
     F2,
     F3,
     F8,
+    callee,
     compiled,
     cross,
     matrix_of,
@@ -138,7 +139,7 @@ def _reached(w, j, halves):
     return target + (now - target) * w[(DECAY + halves * CHANNELS) * LANES + j]
 
 
-@compiled(types.void(F1, I8))
+@callee
 def _command(w, n):
     """As `thrusters.command`; the commands stand in the memory."""
     for j in range(CHANNELS * n):
@@ -190,14 +191,14 @@ def _push(w, n, halves):
         _put(w, WRENCH + 3, m, moment)
 
 
-@compiled(types.void(F1, I8))
+@callee
 def _settle(w, n):
     """As `thrusters.settle`."""
     for j in range(CHANNELS * n):
         w[NOW * LANES + j] = _reached(w, j, 2)
 
 
-@compiled(types.void(F1, I8, WATER, F8))
+@callee
 def _flow(w, n, water, keep):
     """As `water.flow_at`; keep: what the smoothing leaves of a difference by then."""
     rate = 1.0 / water.smoothing_s
@@ -208,14 +209,14 @@ def _flow(w, n, water, keep):
         _put(w, FLOW + 12, m, times(-rate, gap))
 
 
-@compiled(types.void(F1, I8, F8))
+@callee
 def _along(w, n, h):
     """As `integrator.along`."""
     for j in range(13 * n):
         w[TRIAL * LANES + j] = w[STATE * LANES + j] + h * w[RATES * LANES + j]
 
 
-@compiled(types.void(F1, I8, WATER))
+@callee
 def _load(w, n, water):
     """What `bodies.load` sums, but for the walls; how far these are."""
     half_rho = 0.5 * water.density
@@ -235,7 +236,7 @@ def _load(w, n, water):
         w[ROOM * LANES + m] = room(water, at) - w[(SIZE + 23) * LANES + m]
 
 
-@compiled(types.void(F1, I8, BODIES, MODULES, WATER))
+@callee
 def _meet_walls(w, n, bodies, modules, water):
     """Walls for the few lanes that are near one; `bodies` is working memory."""
     for m in range(n):
@@ -250,7 +251,7 @@ def _meet_walls(w, n, bodies, modules, water):
                     w[(WRENCH + 6 + i) * LANES + m] = bodies.wrench[m, i]
 
 
-@compiled(types.void(F1, I8))
+@callee
 def _accelerate(w, n):
     """As `bodies.accelerate`."""
     for m in range(n):
@@ -266,7 +267,7 @@ def _accelerate(w, n):
         _put(w, RATES + 10, m, alpha)
 
 
-@compiled(types.void(F1, I8, F8))
+@callee
 def _close_step(w, n, h):
     """As `integrator.close_step`."""
     for j in range(13 * n):
@@ -279,7 +280,7 @@ def _close_step(w, n, h):
         _put(w, STATE + 4, m, (b / norm, c / norm, d / norm))
 
 
-@compiled(types.void(F1, F8, F3, I8))
+@callee
 def _observe(w, gravity, out, k):
     """As `bodies.observe`: tick k of out (worlds, k, 16)."""
     for m in range(out.shape[0]):
@@ -293,7 +294,7 @@ def _observe(w, gravity, out, k):
             out[m, k, 7 + i], out[m, k, 10 + i], out[m, k, 13 + i] = velocity[i], rate[i], felt[i]
 
 
-@compiled(types.void(F1, I8, BODIES, MODULES, WATER, F8, F8))
+@callee
 def _look(w, n, bodies, modules, water, since_s, ahead_s):
     """Rates of change where the rates so far lead in `ahead_s`; the water is that of `since_s` into the tick."""
     _flow(w, n, water, math.exp(-since_s / water.smoothing_s))

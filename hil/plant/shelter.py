@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import types
 
-from hil.plant.vectors import F1, F2, F8, M3, V3, compiled, matrix_of, minus, triple, turn_back
+from hil.plant.vectors import F1, F2, F8, V3, callee, compiled, matrix_of, minus, triple, turn_back
 
 I8 = types.int64
 F3, F4, F5 = F8[:, :, ::1], F8[:, :, :, ::1], F8[:, :, :, :, ::1]
@@ -24,7 +24,7 @@ FINE, COARSE = (13, 8), (7, 4)
 MANY_MODULES = 12
 
 
-@compiled(types.boolean(V3, V3, F2, I8, V3, M3))
+@callee
 def _blocked(start, d, boxes, own, centre, inside):
     """Whether the ray from `start` along d (both in the frame of module `own`) runs into another box.
 
@@ -100,7 +100,7 @@ def _fill(boxes, own, rays, out):
                 _look(astern, 0.5, boxes, own, rays, out[axis, i, j])
 
 
-@compiled(types.UniTuple(F8, 4)(F5, I8, V3))
+@callee
 def seen_share(tables, k, d):
     """(share, share times centre (3)) of map k for flow along d (any length but zero), module frame; bilinear.
 

@@ -13,6 +13,7 @@ from hil.plant.vectors import (
     F2,
     F8,
     V3,
+    callee,
     compiled,
     dot,
     matrix_of,
@@ -27,7 +28,7 @@ from hil.plant.vectors import (
 OUT_OF_SIGHT = -1.0
 
 
-@compiled(types.boolean(V3, V3, F2, types.int64, F2))
+@callee
 def crosses(a, b, boxes, k, poses):
     """Whether the segment from a to b (world) crosses box k (slab test)."""
     m = int(boxes[k, 0])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from hil.plant.vectors import F1, F2, F3, F8, I1, compiled, inlined
+from hil.plant.vectors import F1, F2, F3, I1, compiled, inlined
 
 
 class Thrusters(NamedTuple):
@@ -47,7 +47,7 @@ class Thrusters(NamedTuple):
 THRUSTERS = types.NamedTuple((I1, I1, F2, F2, F3, F3, F2, F2, F2, F1, F2, F2), Thrusters)
 
 
-@inlined(F8(F3, types.int64, types.int64, F8))
+@inlined
 def polynomial(curves, t, side, x):
     """sum c[i] x^(i+1) of one curve (side 0 forward, 1 reverse) of thruster t."""
     total = 0.0
@@ -67,7 +67,7 @@ def command(thrusters, first, u):
         thrusters.level[t, 0] = force if u[i] > 0.0 else -force
 
 
-@inlined(F8(F8, F8, F8, F8, F8))
+@inlined
 def voltage_of(open_v, resistance, limit_a, idle_a, conductance):
     """Voltage at which supply and load agree.
 
@@ -83,7 +83,7 @@ def voltage_of(open_v, resistance, limit_a, idle_a, conductance):
     return v
 
 
-@inlined(types.void(THRUSTERS, types.int64))
+@inlined
 def load_supplies(thrusters, halves):
     """Finds voltage and current of every module from what its propellers do so many half sub-steps from now."""
     supply, power = thrusters.supply, thrusters.power
@@ -101,7 +101,7 @@ def load_supplies(thrusters, halves):
         power[m, 0], power[m, 1] = v, idle_a + conductance * v * v
 
 
-@inlined(types.void(THRUSTERS, types.int64))
+@inlined
 def forces_after(thrusters, halves):
     """Sets every thruster's force to that so many half sub-steps from now, at the voltages of `load_supplies`."""
     for t in range(thrusters.force.shape[0]):
@@ -113,7 +113,7 @@ def forces_after(thrusters, halves):
         )
 
 
-@inlined(types.void(THRUSTERS))
+@inlined
 def settle(thrusters):
     """Moves the lagged forces on by a sub-step."""
     level = thrusters.level

@@ -20,7 +20,7 @@ MASS = types.UniTuple(M3, 4)
 
 
 def compiled(signature: Any, makes_arrays: bool = False, **options: bool) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles for one signature. Dividing by zero gives infinity as in numpy: to check costs a third of the time.
+    """Compiles for one signature; None: for any, when it is used. Dividing by zero gives infinity as in numpy: to check costs a third.
 
     Args:
         makes_arrays: code that makes none need not count references, which costs more than the sums (numba's unpublished `_nrt`).
@@ -30,48 +30,49 @@ def compiled(signature: Any, makes_arrays: bool = False, **options: bool) -> Cal
     return cast("Callable[[Callable[..., Any]], Any]", njit(signature, **how))  # type: ignore[call-overload]
 
 
-def inlined(signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles sums without arrays that become a part of whoever calls them: a loop over lanes turns them into vector instructions."""
-    return compiled(signature, forceinline=True)
+callee = compiled(None)
+"""Compiles what only compiled code calls, for whatever types that gives it: it is made, and loaded, with its callers."""
+inlined = compiled(None, forceinline=True)
+"""As `callee`, and it becomes a part of its callers: a loop over lanes turns it into vector instructions."""
 
 
-@inlined(V3(V3, V3))
+@inlined
 def cross(a, b):
     """a x b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@inlined(V3(V3, V3))
+@inlined
 def plus(a, b):
     """a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-@inlined(V3(V3, V3))
+@inlined
 def minus(a, b):
     """a - b."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
-@inlined(V3(F8, V3))
+@inlined
 def times(s, a):
     """s a."""
     return (s * a[0], s * a[1], s * a[2])
 
 
-@inlined(F8(V3, V3))
+@inlined
 def dot(a, b):
     """a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inlined(V3(M3, V3))
+@inlined
 def turn(r, a):
     """r a."""
     return (dot(r[0], a), dot(r[1], a), dot(r[2], a))
 
 
-@inlined(V3(M3, V3))
+@inlined
 def turn_back(r, a):
     """r^T a."""
     return (
@@ -81,7 +82,7 @@ def turn_back(r, a):
     )
 
 
-@inlined(types.UniTuple(V3, 2)(MASS, V3, V3))
+@inlined
 def momenta(mass, v, w):
     """Linear and angular momentum of a body with the velocity v and the rate w."""
     p, spin = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -93,19 +94,19 @@ def momenta(mass, v, w):
     return p, spin
 
 
-@compiled(V3(F2, types.int64, types.int64))
+@callee
 def triple(array, row, first):
     """Three numbers of a row, from column `first`."""
     return (array[row, first], array[row, first + 1], array[row, first + 2])
 
 
-@compiled(V6(F2, types.int64))
+@callee
 def six(array, row):
     """Six numbers of a row."""
     return (array[row, 0], array[row, 1], array[row, 2], array[row, 3], array[row, 4], array[row, 5])
 
 
-@compiled(M3(F3, types.int64, types.int64, types.int64))
+@callee
 def block(array, b, i, j):
     """Rows i to i + 2, columns j to j + 2 of matrix number b."""
     return (
@@ -115,13 +116,13 @@ def block(array, b, i, j):
     )
 
 
-@compiled(MASS(F3, types.int64))
+@callee
 def mass_of(array, b):
     """Matrix number b of masses by its blocks."""
     return (block(array, b, 0, 0), block(array, b, 0, 3), block(array, b, 3, 0), block(array, b, 3, 3))
 
 
-@compiled(M3(F3, types.int64))
+@callee
 def matrix(array, row):
     """Matrix number `row`."""
     return (
@@ -131,7 +132,7 @@ def matrix(array, row):
     )
 
 
-@inlined(M3(F8, F8, F8, F8))
+@inlined
 def matrix_of(w, i, j, k):
     """Rotation matrix of a unit quaternion."""
     return (

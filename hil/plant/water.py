@@ -14,7 +14,7 @@ from numba import types
 
 from hil.plant.draw import Noise
 from hil.plant.spec import Tank, WorldSpec
-from hil.plant.vectors import F1, F2, F8, V3, compiled, dot, inlined, minus, plus, times, triple
+from hil.plant.vectors import F1, F2, F8, callee, compiled, dot, inlined, minus, plus, times, triple
 
 AHEAD = 128
 """Ticks whose gusts are drawn together."""
@@ -103,7 +103,7 @@ def _lag(start, keep, push, out):
             out[k, i] = keep * before + push * out[k, i]
 
 
-@compiled(types.Tuple((V3, V3))(WATER, F8))
+@callee
 def flow_at(water, since_s):
     """Velocity and acceleration of the water, world frame, `since_s` after `water.flow` was set."""
     keep, rate = math.exp(-since_s / water.smoothing_s), 1.0 / water.smoothing_s
@@ -112,7 +112,7 @@ def flow_at(water, since_s):
     return plus(triple(water.flow, 0, 0), plus(target, gap)), times(-rate, gap)
 
 
-@inlined(F8(WATER, V3))
+@inlined
 def room(water, p):
     """How far p is from the nearest of walls, bottom and surface, m."""
     x, y, z = p
@@ -121,7 +121,7 @@ def room(water, p):
     return min(corner if water.is_box else rim, min(z, water.depth - z))
 
 
-@compiled(types.boolean(WATER, V3, V3))
+@callee
 def is_clear(water, centre, half):
     """Whether a box of half extents `half` along the world's axes touches neither wall, bottom nor surface."""
     if centre[2] < half[2] or centre[2] > water.depth - half[2]:
@@ -131,7 +131,7 @@ def is_clear(water, centre, half):
     return math.hypot(centre[0], centre[1]) + math.hypot(half[0], half[1]) < water.half_length
 
 
-@compiled(V3(WATER, F8, V3, V3))
+@callee
 def _push(water, deep, outward, v):
     """Force of one wall on a point that is `deep` metres into it."""
     if deep <= 0.0:
@@ -144,7 +144,7 @@ def _push(water, deep, outward, v):
     return plus(times(-normal, outward), times(-rub, along))
 
 
-@compiled(V3(WATER, V3, V3))
+@callee
 def push_of_walls(water, p, v):
     """Force of walls and bottom on one corner at p with velocity v, world frame."""
     f = _push(water, p[2] - water.depth, (0.0, 0.0, 1.0), v)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-TRIALS = 8
+TRIALS = 6
 SCENARIO = """
 name = "short"
 help = "a hover that is over soon"

@@ -1,8 +1,8 @@
 """Real time on vcan0, plant and firmware as two processes: lateness, a flood at full speed, link events, the C node.
 
 The guest's clock counts instructions here, so that lateness is the program's own and not that of a busy machine. All
-flights that were asked for share one boot. Reduced lengths; with MODCUBE_FULL=1 ten seconds of hover each, 200 Hz too,
-and a thousand link events.
+flights that were asked for share one boot. Reduced: three short flights. With MODCUBE_FULL=1 ten seconds of hover each, the
+C node and the busy loops in flights of their own, 200 Hz too, and a thousand link events.
 """
 
 import dataclasses
@@ -31,7 +31,8 @@ EVENTS = 100 if FULL else 6
 EVENT_S = 0.4
 """Time from one link event to the next: 0.11 to 0.45 s on average, by how the link is."""
 DAYS = [f"link events of seed {seed}" for seed in range(10 if FULL else 1)]
-ON_TIME = ["beside four busy loops", *(["alone", "200 Hz", "200 Hz beside four busy loops"] if FULL else [])]
+ON_TIME = ["alone", "beside four busy loops", "200 Hz", "200 Hz beside four busy loops"] if FULL else []
+NODES = ["C node"] if FULL else ["C node beside four busy loops"]
 PLANS = {
     "alone": Plan(SETTLE_S, HOVER_S),
     "beside four busy loops": Plan(SETTLE_S, HOVER_S, busy_loops=4),
@@ -39,6 +40,7 @@ PLANS = {
     "200 Hz beside four busy loops": Plan(SETTLE_S, HOVER_S, rate_hz=200, busy_loops=4),
     "in a flood": Plan(SETTLE_S, HOVER_S, flood=True),
     "C node": Plan(SETTLE_S, HOVER_S, node=True),
+    "C node beside four busy loops": Plan(SETTLE_S, HOVER_S, node=True, busy_loops=4),
     **{day: Plan(SETTLE_S, EVENTS * EVENT_S + 1.0, link_events=EVENTS, seed=seed) for seed, day in enumerate(DAYS)},
 }
 TIMEOUT_S = 14_400 if FULL else 1200
@@ -82,7 +84,7 @@ def flight(request: pytest.FixtureRequest, flights: dict[str, Flight]) -> Flight
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flight", ON_TIME, indirect=True)
+@pytest.mark.parametrize("flight", [*ON_TIME, *([] if FULL else NODES)], indirect=True)
 def test_robot_keeps_time_and_place(flight: Flight, request: pytest.FixtureRequest) -> None:
     name, rate_hz = request.node.callspec.params["flight"], flight["plan"]["rate_hz"]
     figure(f"real time on vcan0, {name}: p99 lateness", flight["lateness_ns"]["p99"] * 1e-3, "us")
@@ -110,7 +112,7 @@ def test_flight_goes_on_soon_after_each_link_event(flight: Flight) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flight", ["C node"], indirect=True)
+@pytest.mark.parametrize("flight", NODES, indirect=True)
 def test_c_node_flies_the_hover(flight: Flight) -> None:
     figure("real time on vcan0, C node: position RMSE", flight["position_rmse_m"] * 1e3, "mm")
     assert flight["position_rmse_m"] <= RMSE_M
