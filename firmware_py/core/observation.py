@@ -12,7 +12,7 @@ import numpy as np
 from numba import float64, njit, types
 
 from firmware_py.core.propagation import ERRORS, PLANT, STATE, carry, inertial_acceleration, inject, predict
-from firmware_py.core.rotations import M, V, difference, skew, to_matrix
+from firmware_py.core.rotations import M, V, difference, rotate_back, skew, to_matrix
 
 GRAVITY = 9.80665
 """m/s^2, standard gravity."""
@@ -22,11 +22,11 @@ ANY_NIS = math.inf
 
 
 @njit(cache=True)
-def inertial(x, gyro, accel, depth, sigma, moved):  # type: ignore[no-untyped-def]
+def inertial(x, gyro, accel, depth, sigma, moved, mobility):  # type: ignore[no-untyped-def]
     """Gyro (3,), accelerometer (3,) and depth; sigma (3,) in that order.
 
-    The accelerometer gives the tilt: its model is gravity plus `moved` (3,), the acceleration that thrusters and drag
-    give the body by the process model, body frame, taken as known.
+    The accelerometer gives the tilt and the disturbance: its model is gravity plus `moved` (3,), the acceleration that thrusters, drag
+    and disturbance give the body by the process model, body frame. mobility: (3, 3) acceleration for a force, body frame.
     """
     residual = np.empty(7)
     h = np.zeros((7, ERRORS))
@@ -39,8 +39,10 @@ def inertial(x, gyro, accel, depth, sigma, moved):  # type: ignore[no-untyped-de
             variance[i] = sigma[0] ** 2
         rows = 3
     if not math.isnan(accel[0]):
-        down = to_matrix(x[3:7].copy())[2].copy()
-        h[rows : rows + 3, 3:6] = -GRAVITY * skew(down)
+        r = to_matrix(x[3:7].copy())
+        down, pushed = r[2].copy(), rotate_back(x[3:7].copy(), x[19:22].copy())
+        h[rows : rows + 3, 3:6] = mobility @ skew(pushed) - GRAVITY * skew(down)
+        h[rows : rows + 3, 18:21] = mobility @ np.ascontiguousarray(r.T)
         for i in range(3):
             residual[rows + i] = accel[i] - (x[16 + i] + moved[i] - GRAVITY * down[i])
             h[rows + i, 15 + i] = 1.0
@@ -72,7 +74,7 @@ def tag(x, p_wt, lever_b, q_wb, variance):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def update(x, covariance, residual, h, variance, gate):  # type: ignore[no-untyped-def]
+def update(x, covariance, residual, h, variance, shared, gate):  # type: ignore[no-untyped-def]
     """Normalised innovation squared, and state and covariance after the measurement; as they were where `gate` is exceeded.
 
     The Kalman filter's update, a row at a time: the noise of the rows is independent, so that no matrix is inverted, and the
@@ -82,6 +84,8 @@ def update(x, covariance, residual, h, variance, gate):  # type: ignore[no-untyp
     Args:
         x, covariance: (26,) and (25, 25).
         residual, h, variance: (m,), (m, 25), (m,) of the measurement.
+        shared: (m, 25) covariance of the noise of each row with the error: what moved the state may be what was measured. Only of
+            errors that no row sees itself (a column of zeros in h), so that the rows stay independent.
         gate: largest normalised innovation squared that is believed. One that is not a number is not.
     """
     p = covariance.copy()
@@ -89,7 +93,7 @@ def update(x, covariance, residual, h, variance, gate):  # type: ignore[no-untyp
     ph = np.empty(ERRORS)
     nis = 0.0
     for row in range(residual.size):
-        ph[:] = 0.0
+        ph[:] = shared[row]
         innovation = residual[row]
         for j in range(ERRORS):
             if h[row, j] != 0.0:
@@ -113,12 +117,24 @@ def update(x, covariance, residual, h, variance, gate):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def fuse_inertial(  # type: ignore[no-untyped-def]
-    x, covariance, tau, gyro, accel, depth, sigma, mass, mass_inv, righting, nodes, rotational, linear
+    x, covariance, tau, gyro, accel, depth, elapsed, dt, density, sigma, mass, mass_inv, righting, nodes, rotational, linear
 ):  # fmt: skip
-    """State and covariance after one sample of gyro, accelerometer and depth, each NaN where it did not come."""
+    """State and covariance after one sample of gyro, accelerometer and depth, each NaN where it did not come.
+
+    The acceleration that no model foresaw (white, `density` (25,) per second) has moved the body over the `elapsed` seconds of the last
+    prediction, and the accelerometer has felt it: so the velocity follows what was felt, not what was commanded. What it says of a part
+    of its `dt` seconds counts for that part.
+    """
     moved = inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, linear)
-    residual, h, variance = inertial(x, gyro, accel, depth, sigma, moved)
-    _, x_after, after = update(x, covariance, residual, h, variance, ANY_NIS)
+    mobility = np.ascontiguousarray(mass_inv[:3, :3])
+    residual, h, variance = inertial(x, gyro, accel, depth, sigma, moved, mobility)
+    shared = np.zeros((residual.size, ERRORS))
+    if not math.isnan(accel[0]) and elapsed > 0.0:
+        first = 0 if math.isnan(gyro[0]) else 3
+        for i in range(3):
+            shared[first + i, 6 + i] = density[6 + i]
+            variance[first + i] = (variance[first + i] * dt + density[6 + i]) / elapsed
+    _, x_after, after = update(x, covariance, residual, h, variance, shared, ANY_NIS)
     return x_after, after
 
 
@@ -133,18 +149,19 @@ def advance(  # type: ignore[no-untyped-def]
         first: time to the first sample, s; count: samples to fuse; dt: between them, s; rest: what is left after the last, s.
     """
     for i in range(count):
-        tau = taus[i].copy()
-        x, covariance = predict(
-            x, covariance, tau, first if i == 0 else dt, density, mass, mass_inv, righting, nodes, rotational, linear
-        )
+        tau, elapsed = taus[i].copy(), first if i == 0 else dt
+        x, covariance = predict(x, covariance, tau, elapsed, density, mass, mass_inv, righting, nodes, rotational, linear)
         x, covariance = fuse_inertial(
-            x, covariance, tau, gyros[i].copy(), others[i, :3].copy(), others[i, 3], sigma,
+            x, covariance, tau, gyros[i].copy(), others[i, :3].copy(), others[i, 3], elapsed, dt, density, sigma,
             mass, mass_inv, righting, nodes, rotational, linear,
         )  # fmt: skip
     if rest > 0.0:
-        x, covariance = predict(
-            x, covariance, taus[count].copy(), rest, density, mass, mass_inv, righting, nodes, rotational, linear
-        )
+        tau = taus[count].copy()
+        x, covariance = predict(x, covariance, tau, rest, density, mass, mass_inv, righting, nodes, rotational, linear)
+        x, covariance = fuse_inertial(
+            x, covariance, tau, np.full(3, math.nan), others[count, :3].copy(), math.nan, rest, dt, density, sigma,
+            mass, mass_inv, righting, nodes, rotational, linear,
+        )  # fmt: skip
     return x, covariance
 
 
@@ -152,7 +169,7 @@ def advance(  # type: ignore[no-untyped-def]
 def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, gate):  # type: ignore[no-untyped-def]
     """`update` by a tag, of which `tag` tells."""
     residual, h, noise = tag(x, p_wt, lever_b, q_wb, variance)
-    return update(x, covariance, residual, h, noise, gate)
+    return update(x, covariance, residual, h, noise, np.zeros((6, ERRORS)), gate)
 
 
 @njit(cache=True)

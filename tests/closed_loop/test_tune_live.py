@@ -175,7 +175,7 @@ def tuned(live: Any, robot: Robot, tmp_path: Path) -> Callable[..., int]:
 def test_step_is_taken_when_it_is_confirmed_and_goes_when_nothing_is_kept(tuned: Callable[..., int]) -> None:
     person = Scripted("n", "y", "q", "n")
     assert tuned(person) == 0
-    assert person.questions[:2] == ["step 1: POS_BW 2.5 -> 3.125? [y/n/q]", "step 2: POS_BW 2.5 -> 2? [y/n/q]"]
+    assert person.questions[:2] == ["step 1: POS_BW 2.6 -> 3.25? [y/n/q]", "step 2: POS_BW 2.6 -> 2.08? [y/n/q]"]
     assert person.questions[-1].startswith("keep POS_BW ")
 
 
@@ -198,8 +198,8 @@ def test_what_makes_the_hover_stiller_stays_and_the_rest_goes_back_at_once(
             return super().answer(question)
 
     assert tuned(Watching("y", "y", "q", "y")) == 0
-    assert flown == [2.5, 2.5, 2.0, 2.0] and robot.control.position_bandwidth == 2.0
-    live.Vehicle(robot, robot.clock).set("POS_BW", 2.5)
+    assert flown == [2.6, 2.6, 2.08, 2.08] and robot.control.position_bandwidth == 2.08
+    live.Vehicle(robot, robot.clock).set("POS_BW", 2.6)
 
 
 TROUBLES: dict[str, tuple[Request | BaseException, str, list[Request]]] = {
@@ -217,7 +217,7 @@ def test_old_values_are_back_after(name: str, live: Any, robot: Robot, tuned: Ca
     event, words, cure = TROUBLES[name]
     assert tuned(Scripted("y", then=lambda: robot.soon(event))) == 1
     said = capsys.readouterr().out
-    assert words in said and "old values are back: POS_BW 2.5, POS_DAMP 1" in said
+    assert words in said and "old values are back: POS_BW 2.6, POS_DAMP 1.15" in said
     assert not (tmp_path / live.BEFORE_FILE).exists()
     for request in cure:
         robot.soon(request)
@@ -229,7 +229,7 @@ def test_tuner_that_was_killed_puts_the_old_values_back_when_it_is_started_again
 ) -> None:
     with pytest.raises(PlugError):
         tuned(Scripted("y", then=lambda: robot.soon(PlugError())))
-    assert robot.control.position_bandwidth == 3.125
+    assert robot.control.position_bandwidth == 3.25
     assert tuned(Scripted("q", "n")) == 0
     assert "is of a run that did not end: its values go back first" in capsys.readouterr().out
 
@@ -238,7 +238,7 @@ def test_vehicle_that_fell_silent_is_to_be_set_by_hand_or_by_the_next_start(robo
     def cut() -> None:
         robot.is_silent = True
 
-    with pytest.raises(DescriptionError, match=r"did not take POS_BW 2.5, POS_DAMP 1; set them by hand, or start again"):
+    with pytest.raises(DescriptionError, match=r"did not take POS_BW 2.6, POS_DAMP 1.15; set them by hand, or start again"):
         tuned(Scripted("y", then=cut))
     robot.is_silent = False
     assert tuned(Scripted("q", "n")) == 0

@@ -28,7 +28,7 @@ search = [
 ]
 term = [{ metric = "position_rmse_m", per = 0.001 }, { metric = "thrust_rms_n", per = 1.0, weight = 0.5 }]
 """
-START = Parameters().replace(BANDWIDTH, 7.5)
+START = Parameters().replace(BANDWIDTH, 7.5).replace(DAMPING, 1.0)
 
 
 @pytest.fixture
