@@ -94,7 +94,7 @@ def test_module_at_rest_reports_gravity_pressure_and_pose() -> None:
     assert named(frames, "DEPTH").values[0] == pytest.approx(101325 + 998.2 * 9.81 * 0.38, abs=1)
     np.testing.assert_allclose(named(frames, "TAG_POSITION").values, [0.0, 0.0, 0.38 - 0.105], atol=0.0003)
     attitude = named(frames, "TAG_ATTITUDE").values
-    assert np.linalg.norm(rotations.log(unpack_quaternion(*attitude[:4]))) < 0.003
+    assert np.linalg.norm(rotations.log(unpack_quaternion(*attitude[:4]))) < 0.006  # a step of the frame: half of one stays as noise
     assert attitude[4] == 5
     assert named(frames, "POWER").values[0] == pytest.approx(12.0)
 
