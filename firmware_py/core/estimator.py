@@ -4,7 +4,7 @@ The filter stands at its anchor: the time of the newest tag picture, or half a s
 order in which it happened; from the anchor the state is carried to now through the stored thruster wrenches and gyro readings.
 
 The body moves by the model of `propagation`, and the accelerometer measures what that model left out (`observation.fuse_inertial`): so the
-velocity follows the robot and not the command, which is worth 16 degrees of phase (docs/tuning.md).
+velocity follows the robot and not the command, which is worth 15 degrees of phase (docs/tuning.md).
 """
 
 from __future__ import annotations
