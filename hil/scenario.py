@@ -214,7 +214,9 @@ class Scenario:
         return dataclasses.replace(self, module=modules, polycube=None)
 
     def with_ideal_sensors(self) -> Scenario:
-        """The same with perfect sensors; quantisation by the frames stays, and half a count of noise on the inertial ones.
+        """The same with perfect sensors.
+
+        Quantisation by the frames stays, and half a count of noise on inertial sensors and the tags' attitude.
 
         Checks that are none of theirs (`ideal`) are left out.
         """

@@ -55,8 +55,8 @@ class GaussianProcessSampler(optuna.samplers.BaseSampler):
         return self._values(candidates[np.argmax(expected_improvement(x, y, candidates))])
 
     def sample_independent(self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution) -> Any:
-        """Never asked: every parameter is in the relative space."""
-        raise NotImplementedError
+        """Never asked: every parameter is in the relative space. Raises ValueError."""
+        raise ValueError(f"{param_name} is none of the parameters that are searched")
 
     def _values(self, shares: np.ndarray) -> dict[str, float]:
         return {name: _value(d, float(share)) for (name, d), share in zip(self._bounds.items(), shares, strict=True)}

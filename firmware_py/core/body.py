@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+CRUISE_M_S = 0.2
+"""Speed of a robot under way, by which a change of the water's own speed is turned into a change of drag."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThrusterSet:
@@ -53,6 +56,11 @@ class DragTable:
     nodes: np.ndarray
     rotational: np.ndarray
     linear: np.ndarray
+
+    @property
+    def cruise_slope(self) -> float:
+        """What a change of the water's speed does to the force on a robot under way, mean of all directions, N s/m: dF/dv = 2 c v."""
+        return 2.0 * CRUISE_M_S * float(self.nodes[..., 0].mean())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

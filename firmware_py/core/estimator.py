@@ -33,9 +33,6 @@ RESET_AFTER = 30
 INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
 """Of position m, attitude rad, velocity m/s, rate rad/s, gyro bias, accelerometer bias, disturbance over mass, over inertia, depth bias."""
 
-CRUISE_M_S = 0.2
-"""Speed at which a change of the water's own speed is turned into a change of drag, dF/dv = 2 c v."""
-
 
 class Estimator:
     """One body's estimator. Same inputs, same outputs; time comes in."""
@@ -213,8 +210,7 @@ class Estimator:
         density[9:12] = p.alpha_process
         density[12:15] = p.gyro_bias_walk
         density[15:18] = p.accel_bias_walk
-        per_speed = 2.0 * CRUISE_M_S * float(self._body.drag.nodes[..., 0].mean())
-        density[18:21] = np.maximum(p.force_walk * inertia[:3], p.current_walk * per_speed)
+        density[18:21] = np.maximum(p.force_walk * inertia[:3], p.current_walk * self._body.drag.cruise_slope)
         density[21:24] = p.moment_walk * inertia[3:]
         density[24] = p.depth_bias_walk
         return density**2

@@ -14,7 +14,6 @@ from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.drag_lookup import add_drag
-from firmware_py.core.estimator import CRUISE_M_S
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rigid_body import add_restoring
 from firmware_py.core.rotations import M, V, rotate_back
@@ -31,7 +30,7 @@ SIGMA_FORCE_N, SIGMA_MOMENT = 0.15, 0.010
 """What a healthy module's half-second mean is off, N and N m: accelerometer tilt and noise, gains, gusts (measured on the bench)."""
 GUST_M_S, GUST_LEVER_M = 0.0135, 0.03
 """Change of the water's speed within seconds that counts as noise: what it does to the drag of a body under way, and how far beside the
-centre that acts. A module feels 0.15 N of it, a BlueROV2 Heavy 0.7 N."""
+centre that acts. Of a module that is the 0.15 N measured above, of a BlueROV2 Heavy 0.7 N."""
 UNSURE_ARM_M, UNSURE_LIFT_N = 0.008, 0.5
 """Righting arm and trim (times dry weight a moment) and buoyancy of a module may be off by this much: felt when the body tilts."""
 MODEL_SHARE = 0.12
@@ -58,7 +57,7 @@ class MissingThrust:
         self._inertia = body.mass[3:, 3:].copy()
         self._ticks = max(1, round(BLOCK_NS / period_ns))
         count = len(body.modules)
-        gust = GUST_M_S * 2.0 * CRUISE_M_S * float(body.drag.nodes[..., 0].mean())
+        gust = GUST_M_S * body.drag.cruise_slope
         self._sigma = np.repeat([max(SIGMA_FORCE_N * np.sqrt(count), gust), np.hypot(SIGMA_MOMENT * count, GUST_LEVER_M * gust)], 3)
         self._tilt = np.repeat([UNSURE_LIFT_N * np.sqrt(count), UNSURE_ARM_M * body.dry_kg * GRAVITY], 3)
         self._doubt = np.repeat([float(body.mass[0, 0]) * GRAVITY, 0.0], 3)

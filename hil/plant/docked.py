@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -19,7 +20,7 @@ from hil.plant.thrusters import Thrusters
 from hil.plant.water import Water
 
 
-class DockedBodies:
+class DockedBodies(ABC):
     """Bodies of one or more modules. `World` makes the parts and moves time."""
 
     vehicles: tuple[Vehicle, ...]
@@ -36,8 +37,9 @@ class DockedBodies:
     _body_arrays: Bodies
     _stage: np.ndarray
 
+    @abstractmethod
     def _step(self, steps: int) -> None:
-        raise NotImplementedError
+        """Moves everything on by so many sub-steps."""
 
     def _seat(self, groups: Sequence[Sequence[int]], places: Sequence[Place]) -> None:
         """Puts the modules into bodies; their states are the caller's business."""

@@ -164,17 +164,23 @@ def _load_supplies(w, n, halves):
 
 
 @pasted
+def _column(w, row, m):
+    """Three numbers of one thruster."""
+    return (w[row * LANES + m], w[(row + CHANNELS) * LANES + m], w[(row + 2 * CHANNELS) * LANES + m])
+
+
+@pasted
 def _add(w, t, m, scale, f, moment):
     """Force and moment with those of thruster t, whose lagged force stands in the memory; scale: share of the curve's voltage."""
-    force, c = w[(GAIN + t) * LANES + m] * scale * scale * w[(MEMORY + t) * LANES + m], COLUMN + t
+    force = w[(GAIN + t) * LANES + m] * scale * scale * w[(MEMORY + t) * LANES + m]
     w[(FORCE + t) * LANES + m] = force
-    f = plus(f, times(force, (w[c * LANES + m], w[(c + 8) * LANES + m], w[(c + 16) * LANES + m])))
-    return f, plus(moment, times(force, (w[(c + 24) * LANES + m], w[(c + 32) * LANES + m], w[(c + 40) * LANES + m])))
+    f = plus(f, times(force, _column(w, COLUMN + t, m)))
+    return f, plus(moment, times(force, _column(w, COLUMN + 3 * CHANNELS + t, m)))
 
 
 @pasted
 def _push(w, n, halves):
-    """As `thrusters.forces_after` and `integrator.wrenches`."""
+    """As `thrusters.forces_after` and `integrator.wrenches`; a loop over thrusters inside that over lanes would make no vectors."""
     for j in range(CHANNELS * n):
         w[MEMORY * LANES + j] = _reached(w, j, halves)
     for m in range(n):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-TRIALS = 6
+TRIALS = 8
 SCENARIO = """
 name = "short"
 help = "a hover that is over soon"

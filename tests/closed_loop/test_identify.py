@@ -19,6 +19,7 @@ from hil.plant.draw import draw_module
 from hil.plant.spec import WorldSpec
 from hil.scenario import load_scenario
 from hil.signals import read_flight
+from tests.closed_loop.flights import Fly, shortened
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 fit_thruster, identify, identify_fit, identify_log, identify_model, identify_motion, identify_plants, identify_quantities = (
@@ -133,15 +134,17 @@ def test_known_weight_takes_the_place_of_the_load_cell(equations) -> None:  # ty
 
 
 def test_flight_that_only_holds_its_place_is_told_what_to_fly(
-    tmp_path: Path, flown: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, fly: Fly, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(identify_log, "LEAST_S", 4.0)
-    assert run(monkeypatch, str(flown), "--out", str(tmp_path)) == 1
+    fly(shortened("hover", duration_s=4.0, settle_s=6.0).with_calm_world(), folder="held")
+    capsys.readouterr()
+    assert run(monkeypatch, str(tmp_path / "held"), "--out", str(tmp_path)) == 1
     said = capsys.readouterr().out
     assert "missing excitation: fast edge-on, for drag coefficient, edge-on" in said
+    assert "missing excitation: turning" in said
     assert "fly it: modcube hil run" in said
     wanted = load_scenario(str(tmp_path / "excite.toml"))
-    assert wanted.task.amplitude_m.any()
+    assert wanted.task.yaw_turns and wanted.task.amplitude_m.any()
 
 
 def test_log_of_five_seconds_is_refused(flown: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

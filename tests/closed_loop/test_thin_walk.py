@@ -46,6 +46,10 @@ def test_tuning_script_betters_one_detuned_axis_on_worlds_that_it_never_saw(tmp_
     result = json.loads((tmp_path / "tuning.json").read_text(encoding="utf-8"))
     assert result["best_value"] < 0.8 * result["start_value"]
     assert result["unseen"]["tuned"]["objective"] < 1.1 * result["unseen"]["shipped"]["objective"] < 0.8 * result["start_value"]
+    again = subprocess.run(
+        [*command, "--start", str(start), "--out", str(tmp_path)], check=True, capture_output=True, text=True
+    )
+    assert "trial" not in again.stdout, "four trials were done already"
 
 
 @pytest.mark.slow

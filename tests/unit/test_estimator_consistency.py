@@ -305,11 +305,16 @@ def test_wrong_lever_arm_of_the_tag_would_be_noticed(body: Body, drawn: list[tup
 
 
 def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
-    """At 0.7 m/s a filter that believes water to push along takes the drag for a disturbance, though the accelerometer keeps its place."""
+    """At 0.7 m/s a filter that believes water to push along refuses good tags; the right one refuses none.
+
+    With the shipped figures, which believe the accelerometer more than the model, it keeps its place and takes the drag for a disturbance.
+    """
     flight = fly(body, 3.0, 1, lambda n: 45.0, push=6.0)
     pushed = replace(body, drag=replace(body.drag, nodes=-body.drag.nodes))
+    believing = replace(P, accel_process=0.012, force_walk=0.015)
+    assert run(body, flight, believing)[1][-1].rejected == 0
+    assert run(pushed, flight, believing)[1][-1].rejected > 10
     right, wrong = (run(each, flight)[1] for each in (body, pushed))
     assert right[-1].rejected == 0
-    nis = [np.nanmean([e.nis / e.nis_dof for e in each if e.nis_dof]) for each in (right, wrong)]
     forces = [np.mean([np.linalg.norm(e.force_w) for e in each]) for each in (right, wrong)]
-    assert nis[1] > 2.0 * nis[0] or forces[1] > 3.0 * forces[0], (nis, forces)
+    assert forces[1] > 3.0 * forces[0]
