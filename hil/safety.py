@@ -109,10 +109,10 @@ class BlindFlight(NamedTuple):
     """North and east error of the estimate at the end, over its own sigma."""
 
 
-def hover_blind(seed: int, blind_s: float = 5.0, settle_s: float = 12.0) -> BlindFlight:
-    """Hovers, and loses the tags for `blind_s`."""
-    absent = Fault(kind="tag_absent", at_s=settle_s, until_s=settle_s + blind_s)
-    flight = flown(timed("hover", settle_s, blind_s, absent), seed).between(round(settle_s * 1e9), round((settle_s + blind_s) * 1e9))
+def hover_blind(seed: int) -> BlindFlight:
+    """Hovers, and loses the tags for a while."""
+    scenario = load_scenario("hover-blind")
+    flight = flown(scenario, seed).between(round(scenario.task.settle_s * 1e9), round(scenario.duration_s * 1e9))
     off = np.linalg.norm((flight.p_wb - flight.firmware["setpoint_p_wb"])[:, :2], axis=1)
     wrong = (flight.firmware["p_wb"] - flight.p_wb)[-1, :2] / flight.firmware["sigma_p"][-1, :2]
     return BlindFlight(float(off.max()), (float(wrong[0]), float(wrong[1])))

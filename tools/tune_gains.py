@@ -91,7 +91,8 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
         best = with_values(start, study.best_params)
         for name, parameters in (("shipped", Parameters()), ("tuned", best)):
             costs = unseen_costs(objective, parameters, workers, given.out / "unseen" / name)
-            figures[name] = {"objective": objective.total(costs), "worst": max(costs), "flights": len(costs)}
+            total = objective.shortfall(parameters) + objective.total(costs)
+            figures[name] = {"objective": total, "worst": max(costs), "flights": len(costs)}
             print(f"{name:8s} objective on unseen seeds {figures[name]['objective']:9.4f}, worst flight {max(costs):9.4f}", flush=True)
     write_result(objective, best, study, given.out, figures, given.seed)
     print(f"parameters: {given.out / 'parameters.toml'}  ({time.monotonic() - began:.0f} s)", flush=True)

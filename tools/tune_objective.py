@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from loop_response import BODIES, Scale, margins, measure
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
@@ -56,6 +57,24 @@ class Term:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Stability:
+    """Margins that the loops broken at the plant's input should keep in one world; what they lack costs."""
+
+    modules: int = quantity(1, low=1, high=4, help="of the body: 1, 2 or 4")
+    mass: float = quantity(1.0, low=0.5, high=2, help="factor of the mass that the controller believes")
+    inertia: float = quantity(1.0, low=0.5, high=2, help="the same of the inertia")
+    lag: float = quantity(1.0, low=0.5, high=2, help="the same of the thrusters' lag")
+    gain_db: float = quantity(unit="dB", low=0, high=60, help="gain margin of every axis")
+    phase_deg: float = quantity(unit="deg", low=0, high=180, help="phase margin of every axis")
+    per_db: float = quantity(low=1e-3, high=60, help="so many dB too little cost 1")
+    per_deg: float = quantity(low=1e-3, high=180, help="so many degrees too little cost 1")
+
+    def cost(self, gain_db: float, phase_deg: float) -> float:
+        """Of the least margins of all axes."""
+        return max(0.0, self.gain_db - gain_db) / self.per_db + max(0.0, self.phase_deg - phase_deg) / self.per_deg
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Objective:
     """What is to be made small."""
 
@@ -66,6 +85,7 @@ class Objective:
     seeds: tuple[int, ...] = quantity(low=0, high=2**31, help="worlds of the search")
     unseen_seeds: tuple[int, ...] = quantity(low=0, high=2**31, help="worlds of the comparison")
     worst_share: float = quantity(0.0, low=0, high=1, help="share of the worst flight in the objective")
+    stability: tuple[Stability, ...] = quantity((), help="margins to keep")
 
     def __post_init__(self) -> None:
         if set(self.seeds) & set(self.unseen_seeds):
@@ -75,6 +95,9 @@ class Objective:
                 raise DescriptionError(f"parameter {search.parameter}: low {search.low:g} is not below high {search.high:g}")
             Parameters().replace(search.parameter, search.low)
             Parameters().replace(search.parameter, search.high)
+        for wanted in self.stability:
+            if wanted.modules not in BODIES:
+                raise DescriptionError(f"stability of {wanted.modules} modules; there are bodies of {', '.join(map(str, BODIES))}")
 
     def cost(self, spec: FlightSpec, metrics: Mapping[str, float | None]) -> float:
         """Of one flight. A metric that is missing costs the most."""
@@ -86,6 +109,17 @@ class Objective:
     def total(self, costs: Sequence[float]) -> float:
         """The objective, out of the costs of all flights: their mean, and of the worst one its share."""
         return (1.0 - self.worst_share) * float(np.mean(costs)) + self.worst_share * max(costs)
+
+    def shortfall(self, parameters: Parameters) -> float:
+        """What the margins lack, for the vehicle of the first flight; comes on top of the flights."""
+        if not self.stability:
+            return 0.0
+        vehicle, costs = self.flight[0].flown().module[0].vehicle, []
+        for wanted in self.stability:
+            responses = measure(wanted.modules, parameters, Scale(wanted.mass, wanted.inertia, wanted.lag), vehicle)
+            gains, phases, _ = zip(*map(margins, responses), strict=True)
+            costs.append(wanted.cost(min(gains), min(phases)))
+        return math.fsum(costs)
 
     def start(self, parameters: Parameters) -> dict[str, float]:
         """Where the search begins: the values in `parameters`, moved within the bounds."""

@@ -56,13 +56,17 @@ def check_folder(out: Path, objective: Objective, start: Parameters, seed: int) 
 
 
 def running_totals(objective: Objective, parameters: Parameters, pool: Executor) -> Iterator[float]:
-    """The objective over the search's seeds, after each flight of it that was flown in all worlds."""
+    """The objective over the search's seeds, after each flight of it that was flown in all worlds.
+
+    The margins are measured here, while the first flight is in the air.
+    """
     costs: list[float] = []
-    code = code_digest()
+    code, lacking = code_digest(), None
     for spec in objective.flight:
         jobs = [pool.submit(fly_trial, spec.flown(), parameters, seed, f"virtual:tune{seed}", code) for seed in objective.seeds]
+        lacking = objective.shortfall(parameters) if lacking is None else lacking
         costs += [objective.cost(spec, job.result()["metrics"]) for job in jobs]
-        yield objective.total(costs)
+        yield lacking + objective.total(costs)
 
 
 def search(

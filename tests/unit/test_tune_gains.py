@@ -28,6 +28,7 @@ search = [
 ]
 term = [{ metric = "position_rmse_m", per = 0.001 }, { metric = "thrust_rms_n", per = 1.0, weight = 0.5 }]
 """
+MARGINS = "gain_db = 8.0, phase_deg = 40.0, per_db = 0.5, per_deg = 4.0"
 START = Parameters().replace(BANDWIDTH, 7.5).replace(DAMPING, 1.0)
 
 
@@ -88,6 +89,26 @@ def test_flight_that_cannot_be_judged_costs_the_most(tools: tuple[Any, Any], tmp
     assert objective.cost(objective.flight[1], metrics) == tools[0].FAILED_COST
 
 
+def test_margins_that_lack_cost_on_top_and_those_that_suffice_cost_nothing(
+    tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Any, ...]] = []
+
+    def measured(modules: int, parameters: Parameters, scale: tuple[float, ...], vehicle: str) -> list[Any]:
+        asked.append((modules, tuple(scale), vehicle))
+        return [(10.0, 50.0, 3.0), (7.0, 38.0, 3.0)]
+
+    monkeypatch.setattr(tools[0], "measure", measured)
+    monkeypatch.setattr(tools[0], "margins", lambda response: response)
+    light = f"modules = 2, mass = 0.85, lag = 1.15, {MARGINS.replace('8.0', '6.0').replace('40.0', '30.0')}"
+    text = f"{OBJECTIVE}stability = [{{ {MARGINS} }}, {{ {light} }}]\n"
+    objective = objective_of(tools, tmp_path, text)
+    assert objective.shortfall(START) == pytest.approx(1.0 / 0.5 + 2.0 / 4.0)
+    assert asked == [(1, (1.0, 1.0, 1.0), "modcube"), (2, (0.85, 1.0, 1.15), "modcube")]
+    flights, lacking = (list(tools[1].running_totals(objective_of(tools, tmp_path, t), START, Inline())) for t in (OBJECTIVE, text))
+    assert lacking == pytest.approx([value + 2.5 for value in flights])
+
+
 def test_search_finds_the_valley_and_ends_early_what_lies_above_it(tools: tuple[Any, Any], tmp_path: Path) -> None:
     study = search(tools, tmp_path, 25, Inline())
     assert study.trials[0].params == {BANDWIDTH: 7.5, DAMPING: 1.0}
@@ -131,6 +152,7 @@ def test_folder_of_another_search_is_not_thrown_away(tools: tuple[Any, Any], tmp
         ("high = 8.0", "high = 80.0", "position_bandwidth: 80.0 is out of range"),
         ("high = 8.0", "high = 0.4", "low 0.5 is not below high 0.4"),
         ('scenario = "hover"', 'scenario = "hoover"', "scenario 'hoover' is unknown"),
+        ("term = [", f"stability = [{{ modules = 3, {MARGINS} }}]\nterm = [", "stability of 3 modules; there are bodies of 1, 2, 4"),
     ],
 )
 def test_objective_that_makes_no_sense_is_refused(tools: tuple[Any, Any], tmp_path: Path, old: str, new: str, words: str) -> None:
@@ -139,7 +161,7 @@ def test_objective_that_makes_no_sense_is_refused(tools: tuple[Any, Any], tmp_pa
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("name", ["hover", "spiral", "spiral-and-push"])
+@pytest.mark.parametrize("name", ["hover", "shipped", "spiral", "spiral-and-push"])
 def test_objectives_that_are_shipped_can_be_flown(tools: tuple[Any, Any], name: str) -> None:
     objective = tools[0].load_objective(ROOT / "tools" / "objectives" / f"{name}.toml")
     assert set(objective.start(Parameters())) == {s.parameter for s in objective.search}
