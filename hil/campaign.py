@@ -213,6 +213,8 @@ def _flown(scenario: Scenario, parameters: Parameters, seeds: Sequence[int], poo
             finally:
                 for future in futures:
                     future.cancel()
+            if left:
+                raise BrokenExecutor  # told to a pool that is kept
         in_vain = in_vain + 1 if len(left) == before else 0
         if in_vain == 2:
             raise DescriptionError(f"workers die before they finish a trial; {len(left)} seeds are left, {min(left)} the first")

@@ -17,7 +17,7 @@ import hil.campaign
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
-from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, Pool, dask_cluster, fly_trial, outcome_of, run_campaign
+from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, Pool, dask_cluster, fly_trial, kept, outcome_of, run_campaign
 from hil.campaign_summary import Trial, median_interval, summarise
 from hil.checks import Check, Result
 from hil.console import campaign_progress, print_campaign
@@ -195,6 +195,23 @@ def test_workers_that_die_at_once_are_given_up(tmp_path: Path, monkeypatch: pyte
     flying(monkeypatch)
     with pytest.raises(DescriptionError, match="workers die before they finish a trial; 5 seeds are left, 0 the first"):
         fly(tmp_path, range(5), dying(after=0))
+
+
+def test_workers_that_are_kept_serve_every_campaign_until_one_dies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    def pool() -> Executor:
+        made.append(len(made))
+        return dying(after=3)() if len(made) == 1 else Inline()
+
+    flying(monkeypatch)
+    with kept(pool) as workers:
+        fly(tmp_path / "first", range(2), workers)
+        assert made == [0]
+        fly(tmp_path / "second", range(2), workers)
+        fly(tmp_path / "third", range(2), workers)
+    assert made == [0, 1]
+    assert content(tmp_path / "first") == content(tmp_path / "second") == content(tmp_path / "third")
 
 
 @pytest.mark.parametrize(
