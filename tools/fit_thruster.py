@@ -3,9 +3,9 @@
 
     .venv/bin/python tools/fit_thruster.py bench.csv --voltage 12 --out curve.toml
 
-The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w. The force is brought to one voltage by its
-square. Written are the fields of a vehicle file's [curve], for it or for tools/identify.py --curve; what was not measured (power, lag,
-speed) is --vehicle's.
+The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w, above 0 wherever it pushes. The force is
+brought to one voltage by its square. Written are the fields of a vehicle file's [curve], for it or for tools/identify.py --curve; what
+was not measured (power, lag, speed) is --vehicle's.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ import csv
 import dataclasses
 import math
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import nnls
 
-from firmware_py.description.schema import DescriptionError, frozen_array, to_toml
+from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of, to_toml
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
 DEGREE = 5
@@ -29,6 +30,9 @@ LEAST_SLOPE = 1e-3
 LEAST_POINTS = 6
 """On either side, beyond the deadband."""
 COLUMNS = ("command", "force_n")
+MOST = 1e6
+"""Of any number that is read; W and N beyond it no thruster has."""
+VOLTAGE = limits_of(ThrusterCurve, "voltage_v")
 
 
 def rising_polynomial(x: np.ndarray, y: np.ndarray, end: float) -> np.ndarray:
@@ -49,20 +53,34 @@ def rising_polynomial(x: np.ndarray, y: np.ndarray, end: float) -> np.ndarray:
 
 def read_points(path: Path) -> dict[str, np.ndarray]:
     """The columns of the CSV. Raises DescriptionError and OSError."""
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
-        lacking = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
-        if lacking:
-            raise DescriptionError(f"{path}:1: no column {', '.join(lacking)}; the header needs command,force_n (and voltage_v, power_w)")
-        rows = list(reader)
+    rows = _rows(path)
     points = {}
     for name in (*COLUMNS, "voltage_v", "power_w"):
-        if rows and name in rows[0]:
+        if name in rows[0]:
             points[name] = np.array([_number(row[name], path, line) for line, row in enumerate(rows, 2)])
-    if rows and np.max(np.abs(points["command"])) > 1.0:
-        line = 2 + int(np.argmax(np.abs(points["command"]) > 1.0))
-        raise DescriptionError(f"{path}:{line}: command {points['command'][line - 2]:g} is out of range; it runs from -1 to 1")
+    for name, low, high, permitted in (("command", -1.0, 1.0, "-1 to 1"), ("voltage_v", VOLTAGE.low, VOLTAGE.high, describe(VOLTAGE))):
+        wrong = np.flatnonzero((points[name] < low) | (points[name] > high)) if name in points else np.array([])
+        if wrong.size:
+            raise DescriptionError(f"{path}:{2 + wrong[0]}: {name} {points[name][wrong[0]]:g} is out of range; permitted: {permitted}")
     return points
+
+
+def _rows(path: Path) -> list[dict[str, str | None]]:
+    """At least one; every one has COLUMNS."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file)
+            lacking = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
+            if lacking:
+                raise DescriptionError(
+                    f"{path}:1: no column {', '.join(lacking)}; the header needs command,force_n (and voltage_v, power_w)"
+                )
+            rows = list(reader)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DescriptionError(f"{path}: is no CSV in UTF-8: {error}") from None
+    if not rows:
+        raise DescriptionError(f"{path}: no measurement follows the header")
+    return rows
 
 
 def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: float, zero_n: float) -> tuple[ThrusterCurve, float]:
@@ -72,6 +90,10 @@ def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: flo
         points: columns of `read_points`. like: what was not measured. voltage_v: to which forces are brought.
         zero_n: size of a force that counts as none.
     """
+    if not VOLTAGE.low <= voltage_v <= VOLTAGE.high:
+        raise DescriptionError(f"--voltage {voltage_v:g} is out of range; permitted: {describe(VOLTAGE)}")
+    if not 0.0 <= zero_n < math.inf:
+        raise DescriptionError(f"--zero {zero_n:g}: a force of 0 N or more is needed")
     u, force = points["command"], points["force_n"].copy()
     if "voltage_v" in points:
         force *= np.square(voltage_v / points["voltage_v"])
@@ -92,7 +114,10 @@ def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: flo
         between = 0.5 * (float(x.min()) + float(idle.max())) if idle.size else 0.0
         edges.append(float(between**powers @ changed[side]) if idle.size else 0.0)
         if "power_w" in points:
-            changed[f"power_{side}"] = rising_polynomial(y, points["power_w"][works], float(np.sum(changed[side])))
+            power = points["power_w"][works]
+            if np.any(power <= 0.0):
+                raise DescriptionError(f"{side}: power_w {power.min():g} with a force; it must be above 0 wherever the thruster pushes")
+            changed[f"power_{side}"] = rising_polynomial(y, power, float(np.sum(changed[side])))
     curve = dataclasses.replace(
         like, voltage_v=voltage_v, deadband_n=float(np.mean(edges)), **{name: frozen_array(c) for name, c in changed.items()}
     )
@@ -104,9 +129,16 @@ def _number(text: str | None, path: Path, line: int) -> float:
         value = float(text or "")
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise DescriptionError(f"{path}:{line}: {text!r} is not a number")
+    if not abs(value) <= MOST:
+        raise DescriptionError(f"{path}:{line}: {text!r} is not a number of at most {MOST:g}")
     return value
+
+
+def checked_toml(curve: ThrusterCurve, out: Path) -> str:
+    """The TOML text of the curve for `out`, as a vehicle file takes it. Raises DescriptionError."""
+    text = to_toml(curve)
+    build(ThrusterCurve, tomllib.loads(text), Source(f"{out} (not written)", text))
+    return text
 
 
 def main() -> int:
@@ -120,8 +152,9 @@ def main() -> int:
     given = parser.parse_args()
     try:
         like = load_vehicle(given.vehicle).curve
-        curve, left_n = fit_curve(read_points(given.csv), like, given.voltage or like.voltage_v, given.zero)
-        given.out.write_text(to_toml(curve), encoding="utf-8")
+        voltage_v = like.voltage_v if given.voltage is None else given.voltage
+        curve, left_n = fit_curve(read_points(given.csv), like, voltage_v, given.zero)
+        given.out.write_text(checked_toml(curve, given.out), encoding="utf-8")
     except (DescriptionError, OSError) as error:
         print(f"fit_thruster: {error}", file=sys.stderr)
         return 2

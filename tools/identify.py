@@ -15,11 +15,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from identify_excitation import MOTIONS, SPACE_M, excitation
+from identify_excitation import MOTIONS, SPACE_M, check_space, excitation
 from identify_fit import Reference, fit
 from identify_log import Recording, read_recording
 from identify_model import Equations, Weight
@@ -48,9 +49,19 @@ def parse_weight(text: str) -> Weight:
         raise DescriptionError(
             f"--weight {text!r} is not NEWTON:KG:FROM:UNTIL, such as 2.0:0.22:60:120 (weight in water, mass in air, seconds of the log)"
         ) from None
-    if weight.newton == 0.0 or weight.kg < 0.0 or not 0.0 <= weight.from_s < weight.until_s:
+    if not all(map(math.isfinite, weight)) or weight.newton == 0.0 or weight.kg < 0.0 or not 0.0 <= weight.from_s < weight.until_s:
         raise DescriptionError(f"--weight {text!r}: a weight other than 0, a mass of 0 or more, and a beginning before its end are needed")
     return weight
+
+
+def check_hung(weight: Weight, flight: Equations) -> None:
+    """Raises DescriptionError where the weight neither came nor went."""
+    hung = (flight.time_s >= weight.from_s) & (flight.time_s < weight.until_s)
+    if hung.all() or not hung.any():
+        raise DescriptionError(
+            f"--weight: it {'hung during all of' if hung.any() else 'did not hang during'} the log's armed time; it must hang for a part "
+            "of it, for only the change tells a force"
+        )
 
 
 def reference_of(recording: Recording, thruster: int, accuracy_percent: float) -> Reference:
@@ -75,6 +86,7 @@ def print_findings(found: Sequence[Finding]) -> None:
 
 def identify(given: argparse.Namespace) -> int:
     """Fits, prints and writes; the exit status. Raises DescriptionError and OSError."""
+    check_space(given.space)
     if not given.logs:
         if given.excitation is None:
             raise DescriptionError("no LOG was given; give the folder of a flight, or --excitation FILE for the flight to begin with")
@@ -94,6 +106,8 @@ def identify(given: argparse.Namespace) -> int:
     curve = read_curve(given.curve) if given.curve else vehicle.curve
     reference = reference_of(recordings[0], given.thruster, given.accuracy) if given.curve else None
     flights = [Equations(recording, smooth(recording), curve, weight) for recording in recordings]
+    if weight is not None:
+        check_hung(weight, flights[0])
     result = fit(flights, reference, weight is not None)
     found, logs = findings(result, vehicle), ", ".join(given.logs)
     print_findings(found)

@@ -64,24 +64,35 @@ high = 0.01
 """
 
 
+def check_space(space_m: Sequence[float]) -> None:
+    """Raises DescriptionError where a room is none, m."""
+    if not all(0.0 <= free < math.inf for free in space_m):
+        raise DescriptionError(f"--space {_words(space_m)}: three distances of 0 m or more are needed, what is free to either side")
+
+
+def _words(space_m: Sequence[float]) -> str:
+    return " ".join(f"{free:g}" for free in space_m)
+
+
 def excitation(motions: Collection[str], vehicle: str, space_m: Sequence[float] = SPACE_M, duration_s: float = 170.0) -> str:
-    """The TOML text of a scenario that makes the `motions` (keys of MOTIONS). Raises DescriptionError where nothing can move.
+    """The TOML text of a scenario that makes the `motions` (keys of MOTIONS). Raises DescriptionError where one has no room.
 
     Args:
         vehicle: name or file. space_m: (3,) how far the vehicle may go to either side of the middle, along each world axis.
     """
+    check_space(space_m)
     axes = {axis for motion in motions for axis in MOTIONS[motion][0]}
     turns = any(MOTIONS[motion][1] for motion in motions)
-    amplitude = [min(most, free) if i in axes else 0.0 for i, (most, free) in enumerate(zip(SPACE_M, space_m, strict=True))]
-    if axes and max(amplitude) <= 0.0:
-        raise DescriptionError(f"--space {' '.join(f'{s:g}' for s in space_m)} leaves no room to move; give what is free to either side, m")
+    amplitude = [round(min(most, free), 3) if i in axes else 0.0 for i, (most, free) in enumerate(zip(SPACE_M, space_m, strict=True))]
+    if narrow := ", ".join("xyz"[i] for i in sorted(axes) if amplitude[i] == 0.0):
+        raise DescriptionError(f"--space {_words(space_m)} leaves no room along {narrow}; give what is free to either side, m")
     reach = np.array([a / full for a, full in zip(amplitude, SPACE_M, strict=True) if a > 0.0])
     rounds = RATE_HZ * duration_s / math.sqrt(reach.max() if reach.size else 1.0)
     return TEMPLATE.format(
         why=", ".join(motion for motion in MOTIONS if motion in motions),
         vehicle=vehicle,
         duration=duration_s,
-        amplitude=[round(a, 3) for a in amplitude],
+        amplitude=amplitude,
         frequency=list(FREQUENCY),
         turns=rounds,
         yaw=YAW_TURNS if turns else 0.0,

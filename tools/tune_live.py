@@ -1,15 +1,17 @@
 """tune_gains --live: tunes a vehicle that hovers, through MAVLink parameters, one confirmed step at a time.
 
 One parameter moves in a step, up or down by a factor; what makes the objective smaller stays, the rest goes back at once. A person
-says yes to every step. On a fail-safe, an e-stop, a disarmed vehicle, another mode, silence or an interrupt every parameter gets the
-value that it had in the beginning; so it does when the program was killed and is started again.
+says yes to every step. On a fail-safe, an e-stop, a disarmed vehicle, another mode, silence, an interrupt or an error of this program
+every parameter gets the value that it had in the beginning; so it does when the program was killed and is started again.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import select
 import signal
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -28,6 +30,8 @@ FACTOR, SMALLEST_FACTOR = 1.25, 1.03
 BETTER = 0.97
 """Share of the best cost that counts as better: two looks at one hover differ by a per cent or two."""
 BEFORE_FILE = "live-before.json"
+ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that end the tuning; SIGHUP comes when the terminal is closed or the connection is lost."""
 
 
 class Person(Protocol):
@@ -51,7 +55,7 @@ class Typist:
         while not select.select([self._stream], [], [], 0.0)[0]:
             self._vehicle.listen(0.1)
         line = self._stream.readline()
-        return (line.decode().strip().lower() or "n")[0] if line else "q"
+        return (line.decode(errors="replace").strip().lower() or "n")[0] if line else "q"
 
 
 def proposals(now: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]) -> Iterator[tuple[str, float]]:
@@ -76,10 +80,18 @@ def tune_live(objective: Objective, live: str, steps: int, seconds: float, out: 
     scheme, _, address = live.partition(":")
     if scheme != "mavlink" or not address:
         raise DescriptionError(f"--live {live!r} is no address; it needs mavlink:ADDRESS, such as mavlink:udpin:127.0.0.1:14550")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in ENDINGS:
+        signal.signal(number, _end)
     with closing(connect(address)) as link, open(0, "rb", buffering=0, closefd=False) as stdin:
         vehicle = Vehicle(link)
         return tune(objective, vehicle, Typist(vehicle, cast(BinaryIO, stdin)), steps, seconds, out)
+
+
+def _end(number: int, frame: object) -> None:
+    """The first of ENDINGS interrupts. Those that follow, as when a terminal is closed, find the old values going back."""
+    for each in ENDINGS:
+        signal.signal(each, signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 def tune(objective: Objective, vehicle: Vehicle, person: Person, steps: int, seconds: float, out: Path) -> int:
@@ -93,7 +105,7 @@ def tune(objective: Objective, vehicle: Vehicle, person: Person, steps: int, sec
     memory = out / BEFORE_FILE
     try:
         if memory.exists():
-            print(f"{memory} is of a run that did not end: its values go back first", flush=True)
+            _say(f"{memory} is of a run that did not end: its values go back first")
             put_back(vehicle, json.loads(memory.read_text(encoding="utf-8")), memory)
         before = {name: vehicle.get(name) for name in bounds}
         vehicle.watch(True)
@@ -104,20 +116,21 @@ def tune(objective: Objective, vehicle: Vehicle, person: Person, steps: int, sec
     kept, status = False, 0
     try:
         kept = _steps(objective, vehicle, person, dict(before), bounds, steps, seconds)
-    except (TroubleError, KeyboardInterrupt) as error:
+    except (TroubleError, OSError, KeyboardInterrupt) as error:
         status = 1
-        print(f"\n{str(error) or 'interrupted'}: old values go back", flush=True)
-    with _undisturbed():
-        if not kept:
-            put_back(vehicle, before, memory)
-        memory.unlink(missing_ok=True)
+        _say(f"\n{str(error) or 'interrupted'}: old values go back")
+    finally:
+        with _undisturbed():
+            if not kept:
+                put_back(vehicle, before, memory)
+            memory.unlink(missing_ok=True)
     return status
 
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
     """Nothing comes between the vehicle and its old values."""
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in ENDINGS}
     try:
         yield
     finally:
@@ -126,18 +139,24 @@ def _undisturbed() -> Iterator[None]:
 
 
 def put_back(vehicle: Vehicle, values: Mapping[str, float], memory: Path) -> None:
-    """Sets every value, as long as the vehicle answers; then forgets them. Raises DescriptionError with what it did not take."""
+    """Sets every value, then forgets them. Raises DescriptionError with what the vehicle did not take in RESTORE_S."""
     vehicle.watch(False)
-    left = dict(values)
-    for name, value in values.items():
-        with suppress(TroubleError):
-            vehicle.set(name, value)
-            del left[name]
+    left = vehicle.restore(values)
     if left:
         rest = ", ".join(f"{name} {value:g}" for name, value in left.items())
         raise DescriptionError(f"the vehicle did not take {rest}; set them by hand, or start again: {memory} keeps them")
     memory.unlink(missing_ok=True)
-    print("old values are back: " + ", ".join(f"{name} {value:g}" for name, value in values.items()), flush=True)
+    _say("old values are back: " + ", ".join(f"{name} {value:g}" for name, value in values.items()))
+
+
+def _say(text: str) -> None:
+    """A line on stdout, or where that is gone on stderr; never in the way of what comes after."""
+    with suppress(OSError, ValueError):
+        try:
+            print(text, flush=True)
+        except OSError:
+            print(text, file=sys.stderr, flush=True)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what it still holds must not become the exit status
 
 
 def _steps(

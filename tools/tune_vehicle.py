@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, Protocol, cast
 
@@ -16,6 +16,8 @@ SETTLE_S = 3.0
 """After a change, before it is looked at; by the vehicle's clock."""
 SILENT_S, ANSWER_S, ANSWERS = 5.0, 1.0, 5
 """Without a heartbeat the vehicle is lost; a parameter is sent again after so long, so often."""
+RESTORE_S, PAUSE_S = 60.0, 0.2
+"""So long every value that was changed is set again; after one that was not taken nothing is sent for so long."""
 STATE_ACTIVE, ARMED, ERROR = 4, 0x80, 3
 """MAV_STATE_ACTIVE; MAV_MODE_FLAG_SAFETY_ARMED; worst severity that is only said."""
 ONBOARD_CONTROLLER, INVALID_AUTOPILOT = 18, 8
@@ -57,9 +59,9 @@ def connect(address: str) -> Link:
 class Vehicle:
     """The vehicle at the other end of a link."""
 
-    def __init__(self, link: Link, clock: Callable[[], float] = time.monotonic) -> None:
-        """Waits for its heartbeat. Raises DescriptionError when none comes."""
-        self.link, self._clock = link, clock
+    def __init__(self, link: Link, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
+        """Waits for its heartbeat. Raises DescriptionError when none comes. `clock` and `sleep`: s."""
+        self.link, self._clock, self._sleep = link, clock, sleep
         self._said_s, self._heard_s = -1e9, clock()
         self._mode: int | None = None
         self._watched = False
@@ -71,7 +73,12 @@ class Vehicle:
             raise DescriptionError(f"--live: no heartbeat in {SILENT_S:g} s; is the vehicle's link set to this address?")
 
     def listen(self, timeout_s: float) -> None:
-        """Takes what comes for at most so long. Raises TroubleError once `watch` was called."""
+        """Takes what comes for at most so long. Raises TroubleError on silence, and once `watch` was called on any trouble."""
+        self._receive(timeout_s)
+        if self._clock() - self._heard_s > SILENT_S:
+            raise TroubleError(f"the vehicle has been silent for {SILENT_S:g} s")
+
+    def _receive(self, timeout_s: float) -> None:
         now = self._clock()
         if now - self._said_s > 1.0:
             self._said_s = now
@@ -80,8 +87,6 @@ class Vehicle:
         while message is not None:
             self._take(message)
             message = self.link.recv_match(blocking=False)
-        if self._clock() - self._heard_s > SILENT_S:
-            raise TroubleError(f"the vehicle has been silent for {SILENT_S:g} s")
 
     def hear(self) -> None:
         """Until the next heartbeat. Raises TroubleError."""
@@ -118,8 +123,21 @@ class Vehicle:
     def set(self, name: str, value: float) -> None:
         """Sets a parameter. Raises TroubleError when the vehicle keeps another value."""
         kept = self._ask(name, lambda: self.link.mav.param_set_send(self.link.target_system, 1, name.encode(), value, 9))
-        if abs(kept - value) > 1e-5 * abs(value):
+        if not abs(kept - value) <= 1e-5 * abs(value):  # also when it is NaN
             raise TroubleError(f"parameter {name} was set to {value:g}, but the vehicle keeps {kept:g}")
+
+    def restore(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Sets every parameter until the vehicle confirms it, for at most RESTORE_S however silent it is; returns what it did not take."""
+        left, end = dict(values), self._clock() + RESTORE_S
+        while left and self._clock() < end:
+            name = next(iter(left))
+            value = left.pop(name)
+            try:
+                self.set(name, value)
+            except (TroubleError, OSError):
+                left[name] = value  # behind the others
+                self._sleep(PAUSE_S)
+        return {name: value for name, value in values.items() if name in left}
 
     def _ask(self, name: str, send: Callable[[], None]) -> float:
         for _ in range(ANSWERS):
@@ -127,7 +145,7 @@ class Vehicle:
             send()
             end = self._clock() + ANSWER_S
             while self._clock() < end:
-                self.listen(0.05)
+                self._receive(0.05)
                 for message in self.seen:
                     if message.get_type() == "PARAM_VALUE" and message.param_id == name:
                         return float(str(np.float32(message.param_value)))

@@ -82,6 +82,16 @@ def test_without_a_reference_no_mass_is_stated(
     assert not plant[1]["states_mass"]
 
 
+@pytest.mark.parametrize(("hung", "complaint"), [("0:1000", "hung during all of the log"), ("500:1000", "did not hang during the log")])
+def test_weight_that_neither_came_nor_went_states_no_mass(
+    hung: str, complaint: str, plant: tuple[Path, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, str(plant[0]), "--weight", f"2.0:0.22:{hung}", "--out", str(tmp_path)) == 2
+    said = capsys.readouterr().err
+    assert complaint in said and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
 def test_with_a_curve_it_leaves_a_vehicle_file_of_the_plant(
     plant: tuple[Path, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

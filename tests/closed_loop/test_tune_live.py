@@ -3,13 +3,19 @@
 The bench flies when the tuner waits, so both live by the bench's clock.
 """
 
+import io
+import math
 import os
+import signal
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from firmware_py.app.ground_station import GroundSide
@@ -29,6 +35,9 @@ from pymavlink import mavutil
 SECONDS = 2.0
 """Of a look: whatever happens a second after it began is in the next heartbeat, and that in the look."""
 SHIPPED = Parameters().control
+BANDWIDTH = SHIPPED.position_bandwidth
+UP, DOWN = (float(str(np.float32(value))) for value in (1.25 * BANDWIDTH, BANDWIDTH / 1.25))  # as MAVLink carries them
+OLD = f"POS_BW {BANDWIDTH:g}, POS_DAMP {SHIPPED.position_damping:g}"
 OBJECTIVE = """
 help = "place alone"
 flight = [{ scenario = "hover" }]
@@ -58,13 +67,18 @@ class Robot:
         self.tick = 0
         self._events: deque[tuple[int, Request | BaseException]] = deque()
         """What somebody else asks or does to the tuner, and in which tick."""
-        self.is_silent = False
+        self.silent_until_s = 0.0
+        """Till then the link is cut, both ways."""
         self._events += [(200, Request(Action.ARM)), (300, Request(Action.SET_MODE, 0, Mode.POSHOLD))]
         self.wait(5.0)
 
     @property
     def mav(self) -> Any:
-        return self._mavlink.mav
+        return Mock() if self.is_silent else self._mavlink.mav
+
+    @property
+    def is_silent(self) -> bool:
+        return self.clock() < self.silent_until_s
 
     @property
     def target_system(self) -> int:
@@ -128,6 +142,13 @@ class Scripted:
         return self._answers.pop(0)
 
 
+class ClosedOutput(io.TextIOBase):
+    """Nobody reads it any more."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+
 class PlugError(Exception):
     """Somebody pulled the plug of the tuner's computer."""
 
@@ -167,7 +188,7 @@ def tuned(live: Any, robot: Robot, tmp_path: Path) -> Callable[..., int]:
         path = tmp_path / "objective.toml"
         path.write_text(text)
         objective = tune_objective.load_objective(path)
-        return int(live.tune(objective, live.Vehicle(robot, robot.clock), person, 10, SECONDS, tmp_path))
+        return int(live.tune(objective, live.Vehicle(robot, robot.clock, robot.wait), person, 10, SECONDS, tmp_path))
 
     return run
 
@@ -175,7 +196,7 @@ def tuned(live: Any, robot: Robot, tmp_path: Path) -> Callable[..., int]:
 def test_step_is_taken_when_it_is_confirmed_and_goes_when_nothing_is_kept(tuned: Callable[..., int]) -> None:
     person = Scripted("n", "y", "q", "n")
     assert tuned(person) == 0
-    assert person.questions[:2] == ["step 1: POS_BW 2.6 -> 3.25? [y/n/q]", "step 2: POS_BW 2.6 -> 2.08? [y/n/q]"]
+    assert person.questions[:2] == [f"step {k}: POS_BW {BANDWIDTH:g} -> {v:g}? [y/n/q]" for k, v in ((1, UP), (2, DOWN))]
     assert person.questions[-1].startswith("keep POS_BW ")
 
 
@@ -198,12 +219,13 @@ def test_what_makes_the_hover_stiller_stays_and_the_rest_goes_back_at_once(
             return super().answer(question)
 
     assert tuned(Watching("y", "y", "q", "y")) == 0
-    assert flown == [2.6, 2.6, 2.08, 2.08] and robot.control.position_bandwidth == 2.08
-    live.Vehicle(robot, robot.clock).set("POS_BW", 2.6)
+    assert flown == [BANDWIDTH, BANDWIDTH, DOWN, DOWN] and robot.control.position_bandwidth == DOWN
+    live.Vehicle(robot, robot.clock).set("POS_BW", BANDWIDTH)
 
 
 TROUBLES: dict[str, tuple[Request | BaseException, str, list[Request]]] = {
     "interrupt": (KeyboardInterrupt(), "interrupted", []),
+    "link that broke": (OSError("no such device"), "no such device", []),
     "another mode": (Request(Action.SET_MODE, 0, Mode.ALT_HOLD), "mode changed", [Request(Action.SET_MODE, 0, Mode.POSHOLD)]),
     "disarmed": (
         Request(Action.DISARM, 0, True), "is stopped, or disarmed", [Request(Action.ARM), Request(Action.SET_MODE, 0, Mode.POSHOLD)],
@@ -217,31 +239,126 @@ def test_old_values_are_back_after(name: str, live: Any, robot: Robot, tuned: Ca
     event, words, cure = TROUBLES[name]
     assert tuned(Scripted("y", then=lambda: robot.soon(event))) == 1
     said = capsys.readouterr().out
-    assert words in said and "old values are back: POS_BW 2.6, POS_DAMP 1.15" in said
+    assert words in said and f"old values are back: {OLD}" in said
     assert not (tmp_path / live.BEFORE_FILE).exists()
     for request in cure:
         robot.soon(request)
         robot.wait(2.0)
 
 
-def test_tuner_that_was_killed_puts_the_old_values_back_when_it_is_started_again(
-    robot: Robot, tuned: Callable[..., int], capsys: Any
+def test_link_that_breaks_again_while_the_old_values_go_back_is_tried_again(robot: Robot, tuned: Callable[..., int], capsys: Any) -> None:
+    def cut() -> None:
+        for _ in range(2):
+            robot.soon(OSError("no such device"))
+
+    assert tuned(Scripted("y", then=cut)) == 1
+    assert f"old values are back: {OLD}" in capsys.readouterr().out
+
+
+def test_error_that_nobody_foresaw_puts_the_old_values_back_before_it_is_seen(robot: Robot, tuned: Callable[..., int], capsys: Any) -> None:
+    with pytest.raises(ZeroDivisionError):
+        tuned(Scripted("y", then=lambda: robot.soon(ZeroDivisionError())))
+    assert f"old values are back: {OLD}" in capsys.readouterr().out
+
+
+def test_output_that_nobody_reads_any_more_puts_the_old_values_back(
+    tuned: Callable[..., int], capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(PlugError):
+    assert tuned(Scripted("y", then=lambda: monkeypatch.setattr(sys, "stdout", ClosedOutput()))) == 1
+    assert f"old values are back: {OLD}" in capsys.readouterr().err
+
+
+@pytest.fixture
+def signals(live: Any) -> Iterator[tuple[signal.Signals, ...]]:
+    """Those that end the tuning; they interrupt, and are as they were afterwards."""
+    wanted = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, signal.default_int_handler) for number in wanted}
+    yield wanted
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("first", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_terminal_that_is_closed_interrupts_once(
+    first: str, live: Any, signals: tuple[signal.Signals, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shell tells its children of it again."""
+
+    def tune(*_: object) -> None:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.Signals[first])
+        assert {signal.getsignal(number) for number in signals} == {signal.SIG_IGN}
+
+    for name, stand_in in (("connect", Mock()), ("Vehicle", Mock()), ("tune", tune)):
+        monkeypatch.setattr(live, name, stand_in)
+    live.tune_live(None, "mavlink:udpin:nowhere", 1, SECONDS, tmp_path)
+
+
+def test_signals_do_not_come_between_the_vehicle_and_its_old_values(
+    live: Any, robot: Robot, tuned: Callable[..., int], signals: tuple[signal.Signals, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_back, meanwhile = live.put_back, set[Any]()
+
+    def watched(*arguments: Any) -> None:
+        meanwhile.update(map(signal.getsignal, signals))
+        put_back(*arguments)
+
+    monkeypatch.setattr(live, "put_back", watched)
+    assert tuned(Scripted("y", then=lambda: robot.soon(KeyboardInterrupt()))) == 1
+    assert meanwhile == {signal.SIG_IGN}
+    assert {signal.getsignal(number) for number in signals} == {signal.default_int_handler}
+
+
+def test_byte_that_is_no_letter_is_no_yes(live: Any) -> None:
+    mine, end = os.pipe()
+    os.write(end, b"\xff\n")
+    os.close(end)
+    with open(mine, "rb", buffering=0) as stream:
+        assert live.Typist(None, stream).answer("?") not in ("y", "q")
+
+
+def test_tuner_that_was_killed_puts_the_old_values_back_when_it_is_started_again(
+    live: Any, robot: Robot, tuned: Callable[..., int], capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as killed, pytest.raises(PlugError):
+        killed.setattr(live, "put_back", Mock(side_effect=PlugError))
         tuned(Scripted("y", then=lambda: robot.soon(PlugError())))
-    assert robot.control.position_bandwidth == 3.25
+    assert robot.control.position_bandwidth == UP
     assert tuned(Scripted("q", "n")) == 0
     assert "is of a run that did not end: its values go back first" in capsys.readouterr().out
 
 
 def test_vehicle_that_fell_silent_is_to_be_set_by_hand_or_by_the_next_start(robot: Robot, tuned: Callable[..., int]) -> None:
-    def cut() -> None:
-        robot.is_silent = True
+    """It was tried for a minute."""
 
-    with pytest.raises(DescriptionError, match=r"did not take POS_BW 2.6, POS_DAMP 1.15; set them by hand, or start again"):
+    def cut() -> None:
+        robot.silent_until_s = math.inf
+
+    began_s = robot.clock()
+    with pytest.raises(DescriptionError, match=f"did not take {OLD}; set them by hand, or start again"):
         tuned(Scripted("y", then=cut))
-    robot.is_silent = False
+    assert 60.0 < robot.clock() - began_s < 90.0
+    robot.silent_until_s = 0.0
     assert tuned(Scripted("q", "n")) == 0
+
+
+def test_vehicle_that_is_heard_again_within_a_minute_gets_its_old_values(
+    live: Any, robot: Robot, tuned: Callable[..., int], tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The link is cut during the look, which ends after 5 s of silence."""
+    look = live.Vehicle.look
+
+    def cut(vehicle: Any, seconds: float) -> Any:
+        robot.wait(0.1)
+        if robot.control != SHIPPED:
+            robot.silent_until_s = robot.clock() + 40.0
+        return look(vehicle, seconds)
+
+    monkeypatch.setattr(live.Vehicle, "look", cut)
+    assert tuned(Scripted("y")) == 1
+    said = capsys.readouterr().out
+    assert "has been silent for 5 s" in said and f"old values are back: {OLD}" in said
+    assert not (tmp_path / live.BEFORE_FILE).exists()
 
 
 def test_objective_that_telemetry_does_not_show_is_refused(tuned: Callable[..., int]) -> None:

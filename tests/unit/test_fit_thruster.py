@@ -55,8 +55,10 @@ def test_noise_does_not_make_the_curve_fall() -> None:
         assert np.all(np.diff(np.linspace(0.0, 1.0, 500)[:, None] ** POWERS @ curve.forward) > 0.0)
 
 
-def test_file_that_is_written_is_a_vehicle_files_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])  # a spreadsheet's
+def test_file_that_is_written_is_a_vehicle_files_curve(mark: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source, out = write_csv(tmp_path / "bench.csv", measured(0.02)), tmp_path / "curve.toml"
+    source.write_bytes(mark + source.read_bytes())
     monkeypatch.setattr(sys, "argv", ["fit_thruster", str(source), "--out", str(out)])
     assert tool.main() == 0
     table, where = read_toml(out)
@@ -72,17 +74,60 @@ def test_file_that_is_written_is_a_vehicle_files_curve(tmp_path: Path, monkeypat
         ("command,force_n\n0,zero\n", "2: 'zero' is not a number"),
         ("command,force_n\n0,0\n1.5,3\n", "3: command 1.5 is out of range"),
         ("command,force_n\n1,5\n", "forward: 1 points"),
+        ("", "no column command, force_n"),
+        ("command,force_n\n", "no measurement follows the header"),
+        ("command,force_n\n0,\xff\n", "is no CSV in UTF-8"),
+        ("command,force_n\n0,1e7\n", "2: '1e7' is not a number of at most 1e+06"),
+        ("command,force_n,voltage_v\n0,0,12\n1,5,0\n", "3: voltage_v 0 is out of range; permitted: 1 to 100 V"),
     ],
 )
 def test_measurement_that_will_not_do_is_refused_in_one_line(
     text: str, complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "bench.csv").write_text(text)
-    monkeypatch.setattr(sys, "argv", ["fit_thruster", str(tmp_path / "bench.csv"), "--out", str(tmp_path / "curve.toml")])
+    (tmp_path / "bench.csv").write_text(text, encoding="latin-1")
+    refused(tmp_path, monkeypatch, capsys, complaint)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "complaint"),
+    [
+        ("--voltage", "-12", "--voltage -12 is out of range; permitted: 1 to 100 V"),
+        ("--voltage", "0", "--voltage 0 is out of range"),
+        ("--voltage", "nan", "--voltage nan is out of range"),
+        ("--zero", "-1", "--zero -1: a force of 0 N or more is needed"),
+        ("--zero", "nan", "--zero nan: a force of 0 N or more is needed"),
+    ],
+)
+def test_option_that_makes_no_sense_is_refused_in_one_line(
+    option: str, value: str, complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_csv(tmp_path / "bench.csv", measured())
+    refused(tmp_path, monkeypatch, capsys, complaint, option, value)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "complaint"),
+    [
+        ("force_n", 2e4, "(not written):2: forward: ["),
+        ("power_w", 0.0, "forward: power_w 0 with a force"),
+        ("power_w", -1.0, "forward: power_w -"),
+    ],
+)
+def test_thruster_that_no_vehicle_file_takes_is_refused_in_one_line(
+    name: str, factor: float, complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = measured()
+    write_csv(tmp_path / "bench.csv", points | {name: factor * points[name]})
+    refused(tmp_path, monkeypatch, capsys, complaint)
+
+
+def refused(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], complaint: str, *options: str) -> None:
+    """bench.csv in `folder` gives that complaint, and no curve."""
+    monkeypatch.setattr(sys, "argv", ["fit_thruster", str(folder / "bench.csv"), "--out", str(folder / "curve.toml"), *options])
     assert tool.main() == 2
     said = capsys.readouterr().err
     assert complaint in said and said.count("\n") == 1
-    assert not (tmp_path / "curve.toml").exists()
+    assert not (folder / "curve.toml").exists()
 
 
 def test_thruster_that_pushes_against_its_command_is_refused() -> None:

@@ -3,6 +3,7 @@
 import importlib
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -70,28 +71,71 @@ def test_smaller_room_is_kept_and_shaken_faster() -> None:
     assert "turns = 18.00" in text  # a quarter of the way, twice as often: the same acceleration
 
 
-def test_no_room_is_refused() -> None:
-    with pytest.raises(DescriptionError, match="leaves no room"):
-        excitation.excitation(["along x"], "modcube", (0.0, 0.5, 0.3))
+@pytest.mark.parametrize(
+    ("motions", "space_m", "axes"),
+    [
+        (["along x"], (0.0, 0.5, 0.3), "x"),
+        (["along x", "along z"], (0.6, 0.5, 0.0), "z"),
+        (["fast face-on"], (0.0, 0.0, 0.3), "x, y"),
+        (["along y"], (0.6, 0.0004, 0.3), "y"),  # written in millimetres
+    ],
+)
+def test_no_room_for_a_wanted_motion_is_refused(motions: list[str], space_m: tuple[float, ...], axes: str) -> None:
+    with pytest.raises(DescriptionError, match=f"leaves no room along {axes};"):
+        excitation.excitation(motions, "modcube", space_m)
 
 
-@pytest.mark.parametrize("text", ["2.0", "2.0:0.2:60", "a:b:c:d", "0:0.2:60:120", "2:0.2:120:60"])
+@pytest.mark.parametrize("motion", ["along y", "turning"])
+def test_motion_that_needs_no_room_along_x_takes_none(motion: str) -> None:
+    assert "amplitude_m = [0.0, " in excitation.excitation([motion], "modcube", (0.0, 0.5, 0.3))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2.0", "2.0:0.2:60", "a:b:c:d", "0:0.2:60:120", "2:0.2:120:60", "nan:0.2:60:120", "inf:0.2:60:120", "2:nan:60:120",
+        "2:inf:60:120", "2:0.2:60:inf",
+    ],
+)  # fmt: skip
 def test_weight_that_makes_no_sense_is_refused(text: str) -> None:
     with pytest.raises(DescriptionError, match="--weight"):
         tool.parse_weight(text)
 
 
 @pytest.mark.parametrize(
+    ("from_s", "until_s", "complaint"),
+    [(0.0, 20.0, "hung during all"), (2.0, 10.1, "hung during all"), (11.0, 20.0, "did not hang"), (0.0, 2.0, "did not hang")],
+)
+def test_weight_that_neither_came_nor_went_is_refused(from_s: float, until_s: float, complaint: str) -> None:
+    flight = SimpleNamespace(time_s=np.linspace(2.0, 10.0, 81))
+    with pytest.raises(DescriptionError, match=complaint):
+        tool.check_hung(model.Weight(2.0, 0.2, from_s, until_s), flight)
+    tool.check_hung(model.Weight(2.0, 0.2, 0.0, 2.1), flight)
+    tool.check_hung(model.Weight(2.0, 0.2, 2.1, 20.0), flight)
+
+
+@pytest.mark.parametrize(
     ("arguments", "complaint"),
-    [([], "no LOG was given"), (["nowhere"], "no can.log"), (["a", "b", "--weight", "2:0.2:1:2"], "give one LOG")],
+    [
+        ([], "no LOG was given"),
+        (["nowhere"], "no can.log"),
+        (["a", "b", "--weight", "2:0.2:1:2"], "give one LOG"),
+        (["--excitation", "shake.toml", "--space", "nan", "nan", "nan"], "--space nan nan nan: three distances of 0 m or more"),
+        (["--excitation", "shake.toml", "--space", "0.6", "-0.5", "0.3"], "--space 0.6 -0.5 0.3: three distances of 0 m or more"),
+        (["--excitation", "shake.toml", "--space", "0.6", "0.5", "inf"], "--space 0.6 0.5 inf: three distances of 0 m or more"),
+        (["--excitation", "shake.toml", "--space", "0.6", "0.5", "0"], "--space 0.6 0.5 0 leaves no room along z"),
+        (["nowhere", "--space", "nan", "0.5", "0.3"], "--space nan 0.5 0.3"),
+    ],
 )
 def test_what_cannot_run_says_so_in_one_line(
-    arguments: list[str], complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["identify", *arguments])
     assert tool.main() == 2
     said = capsys.readouterr().err
     assert complaint in said and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", vehicle_names())
