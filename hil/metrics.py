@@ -39,6 +39,7 @@ SHOWN = {
     "sigma3_share": Shown("Truth inside 3 sigma, worst of six axes", "%", 100.0, 1),
     **{f"sigma3_share_{axis}": Shown(f"Truth inside 3 sigma, {axis}", "%", 100.0, 1) for axis in AXES},
     "thrust_rms_n": Shown("Commanded force of a thruster, RMS", "N"),
+    "thrust_rate_rms_n_s": Shown("Its rate of change, RMS: what wears a thruster", "N/s"),
     "supply_power_w": Shown("Electrical power of all modules, mean", "W"),
     "wrench_margin_min": Shown("Busiest thruster, worst tick: share of its range left", "%", 100.0, 1),
     "tags_rejected": Shown("Tag observations refused by the gate", digits=0),
@@ -148,6 +149,7 @@ def flight_metrics(
     return metrics | {
         "sigma3_share": float(inside.mean(axis=0).min()),
         "thrust_rms_n": float(np.sqrt(np.nanmean(np.square(firmware["commanded_n"])))),
+        "thrust_rate_rms_n_s": rate_rms(firmware["commanded_n"], period_s),
         "supply_power_w": float(np.nansum(flight.truth["power_w"], axis=1).mean()),
         "wrench_margin_min": float(np.fmin.reduce(firmware["wrench_margin"])),
         "tags_rejected": float(firmware["rejected"][-1] - firmware["rejected"][0]),
@@ -158,6 +160,11 @@ def flight_metrics(
         "unmatched_ticks": float(flight.unmatched),
         "deadline_misses": float(deadline_misses),
     }
+
+
+def rate_rms(values: np.ndarray, period_s: float) -> float:
+    """RMS of the rate of change of (n, k) values that come every `period_s` seconds, per second; not a number of less than two."""
+    return float(np.sqrt(np.nanmean(np.square(np.diff(values, axis=0) / period_s)))) if len(values) > 1 else math.nan
 
 
 def warnings(severity: np.ndarray, text: np.ndarray) -> int:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -13,15 +15,21 @@ import numpy as np
 from accept_figures import Figure, Group
 from accept_measures import JOBS, Values
 
+from firmware_py.app.replay import replay
+from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
+from hil.bench import fly_scenario
 from hil.campaign import processes
 from hil.fuzz import fuzz_flight
 from hil.safety import ThrusterFlight, command_outlives_frames_ms, fly_to_estop, hover_blind, spiral_through_loss, spiral_with
+from hil.scenario import load_scenario
 
 HEALTHY, STOPPED, BLIND, LOSSY = range(100), range(1000), range(50), range(5)
 """Seeds, as the issue counts them; of lossy spirals as many as take a minute."""
 FUZZED_FRAMES = 1_000_000
+LOGGED_S = 600.0
+"""Length of the log that is replayed."""
 MOST_SIGMAS, SQUARES = 4.0, (0.5, 2.0)
 """Of 100 normal numbers one is beyond 4 in one set of 160; their mean square leaves 0.7 to 1.3 in one of 30, so two is no chance."""
 
@@ -93,6 +101,16 @@ def fault_matrix(folder: Path) -> Values:
         return {"failed": subprocess.run(command, stdout=log, stderr=subprocess.STDOUT).returncode}
 
 
+def replayed(folder: Path) -> Values:
+    """A hover of ten minutes, fed through the same code again."""
+    base = load_scenario("hover")
+    task = dataclasses.replace(base.task, duration_s=LOGGED_S - base.task.settle_s)
+    fly_scenario(dataclasses.replace(base, task=task), 0, Parameters(), folder, "virtual:replayed")
+    began_s = time.perf_counter()
+    outcome = replay(folder)
+    return {"differs": outcome.first is not None, "speed": outcome.seconds / (time.perf_counter() - began_s), "seconds": outcome.seconds}
+
+
 SAFETY: tuple[Group, ...] = (
     Group(
         "faults", 7, "modcube hil campaign faults", fault_matrix,
@@ -142,6 +160,14 @@ SAFETY: tuple[Group, ...] = (
         (
             Figure("a million fuzzed frames: commands beyond their limits", "beyond", high=0.0),
             Figure("the same: frames that no count accounts for", "unaccounted", high=0.0),
+        ),
+    ),
+    Group(
+        "replay", 7, "make accept ONLY=replay", replayed,
+        (
+            Figure("replay of a log: length", "seconds", low=LOGGED_S - 1.0, unit="s"),
+            Figure("the same: bytes that differ (0: none)", "differs", high=0.0),
+            Figure("the same: faster than real time by", "speed", low=25.0, unit="times"),
         ),
     ),
 )  # fmt: skip

@@ -23,6 +23,7 @@ from firmware_py.core.setpoint import rest_at
 from firmware_py.core.thruster import commands
 from firmware_py.core.types import Inputs, ModuleInputs, TagObservation
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
 from hil.plant.camera import Camera
@@ -47,6 +48,8 @@ LOWEST_RAD_S, HIGHEST_RAD_S, LINES = 0.3, 30.0, 20
 """Frequencies at which each axis is shaken."""
 SHAKE = np.repeat([0.01, 0.02], 3)
 """Acceleration of one sine, m/s^2 and rad/s^2: all together stay far from the thrusters' limits."""
+MOST_STRAY = 0.05
+"""Stable loops have up to 0.015, by the beat of tags and ticks; those that swing 0.14 and more (measured)."""
 HEIGHT_M = 1.5
 HOME = rest_at(np.array([0.0, 0.0, HEIGHT_M]), np.array([1.0, 0.0, 0.0, 0.0]))
 STEP = np.repeat([0.05, math.radians(5.0)], 3)
@@ -76,6 +79,8 @@ class Response(NamedTuple):
 
     frequency: np.ndarray
     loop: np.ndarray
+    stray: float = 0.0
+    """Share of what the controller gives that is beside the sines: a loop that swings by itself has much of it."""
 
 
 class Loop:
@@ -94,6 +99,8 @@ class Loop:
         self._seen = self._camera.watch(self._world)
         self._commanded = np.zeros(self.body.thrusters.f_max.size)
         self._tick = 0
+        self.is_ready = False
+        """Whether the estimator believes its pose."""
         self.pose = np.zeros(6)
         """Estimated place, m, and rotation vector, rad."""
 
@@ -109,6 +116,7 @@ class Loop:
         chain.lag.command(self._commanded)
         self._world.advance(PERIOD_NS)
         self._seen += self._camera.watch(self._world)
+        self.is_ready = bool(estimate.ready)
         self.pose = np.concatenate([estimate.p_wb, log(estimate.q_wb)])
         return np.asarray(self.body.thrusters.matrix @ self._commanded)
 
@@ -173,18 +181,22 @@ def lines() -> np.ndarray:
 
 
 def measure(modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicle: str = "modcube") -> list[Response]:
-    """The open-loop response of each axis of a body of so many modules."""
+    """The open-loop response of each axis of a body of so many modules. Raises DescriptionError where it never finds its pose."""
     loop, chosen = Loop(modules, parameters, scale, vehicle), lines()
     phase = 2.0 * math.pi * np.random.default_rng(0).uniform(size=chosen.shape)
     time = np.arange(SETTLE_TICKS + RECORD_TICKS) / RECORD_TICKS
     size = SHAKE * np.diag(loop.body.mass)
     shake = np.array([s * np.sin(2.0 * math.pi * np.outer(time, n) + p).sum(axis=1) for s, n, p in zip(size, chosen, phase, strict=True)]).T
     given = np.array([loop.step(each) for each in shake])
+    if not loop.is_ready:
+        raise DescriptionError(f"{vehicle}: its loops are open, for the camera sees no tag of it; margins need a vehicle with a tag on top")
     # What was commanded in one tick is pushed in the next: the sine of a tick meets the wrench of the tick before.
     u = np.fft.rfft(given[SETTLE_TICKS - 1 : -1], axis=0)
     p = u + np.fft.rfft(shake[SETTLE_TICKS:], axis=0)
     base = 2.0 * math.pi / (RECORD_TICKS * PERIOD_NS * 1e-9)
-    return [Response(base * n, -u[n, axis] / p[n, axis]) for axis, n in enumerate(chosen)]
+    power = np.square(np.abs(u[1:]))
+    beside = np.delete(power, chosen.ravel() - 1, axis=0).sum(axis=0) / np.maximum(power.sum(axis=0), 1e-300)
+    return [Response(base * n, -u[n, axis] / p[n, axis], float(beside[axis])) for axis, n in enumerate(chosen)]
 
 
 def step_responses(parameters: Parameters, axes: Sequence[int], vehicle: str = "modcube") -> np.ndarray:
@@ -218,13 +230,20 @@ class Margins(NamedTuple):
 
 
 def margins(response: Response) -> Margins:
-    """Margins of one loop, interpolated over the logarithm of the frequency; infinite where nothing is crossed."""
+    """Margins of one loop, interpolated over the logarithm of the frequency; infinite where nothing is crossed.
+
+    A loop that swings by itself has none. Where the phase reaches -180 degrees above the last frequency, the gain there counts: it is
+    not more by then.
+    """
+    if response.stray > MOST_STRAY or np.isnan(response.loop).any():
+        return Margins(0.0, 0.0, math.nan)
     x = np.log(response.frequency)
     gain_db = 20.0 * np.log10(np.abs(response.loop))
     phase = np.unwrap(np.angle(response.loop))
     phase += -2.0 * math.pi * round((phase[int(np.argmin(np.abs(gain_db)))] + math.pi) / (2.0 * math.pi))  # near -180 at crossover
     turns = math.pi * np.array([-3.0, -1.0, 1.0])
     gains = [np.interp(c, x, gain_db) for turn in turns for c in _crossings(x, phase - turn)]
+    gains += [gain_db[-1]] if phase[-1] > -math.pi else []
     crossovers = _crossings(x, gain_db)
     phases = [abs((math.degrees(np.interp(c, x, phase)) + 360.0) % 360.0 - 180.0) for c in crossovers]
     return Margins(

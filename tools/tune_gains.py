@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import platform
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from importlib.metadata import version
 from pathlib import Path
@@ -73,6 +75,7 @@ def write_result(objective: Objective, best: Parameters, study: Any, out: Path, 
 
 def tune(objective: Objective, start: Parameters, given: argparse.Namespace, pool: Pool) -> None:
     """Searches, compares, writes and draws."""
+    from optuna.trial import TrialState
     from tune_plots import draw
     from tune_search import Progress, check_folder, search
 
@@ -88,8 +91,12 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
     with kept(pool) as workers:
         with workers() as executor:
             study = search(objective, start, given.trials, given.out, executor, given.seed, tell, began + 60.0 * given.minutes)
+        if not any(trial.state == TrialState.COMPLETE for trial in study.trials):
+            raise DescriptionError(f"no trial was finished in {given.minutes:g} minutes; give more")
         best = with_values(start, study.best_params)
-        for name, parameters in (("shipped", Parameters()), ("tuned", best)):
+        first = with_values(start, objective.start(start))
+        sets = {"start": first, "shipped": Parameters(), "tuned": best}
+        for name, parameters in sets.items():
             costs = unseen_costs(objective, parameters, workers, given.out / "unseen" / name)
             total = objective.shortfall(parameters) + objective.total(costs)
             figures[name] = {"objective": total, "worst": max(costs), "flights": len(costs)}
@@ -97,25 +104,45 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
     write_result(objective, best, study, given.out, figures, given.seed)
     print(f"parameters: {given.out / 'parameters.toml'}  ({time.monotonic() - began:.0f} s)", flush=True)
     if not given.no_plots:
-        vehicle = objective.flight[0].flown().module[0].vehicle
-        first = with_values(start, objective.start(start))
-        draw(given.out, objective, study, {"start": first, "shipped": Parameters(), "tuned": best}, vehicle)
+        draw(given.out, objective, study, sets, objective.flight[0].flown().module[0].vehicle)
+
+
+def whole(least: int) -> Callable[[str], int]:
+    """Reads a whole number that is not below `least`."""
+
+    def read(text: str) -> int:
+        if not text.isdigit() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least} on")
+        return int(text)
+
+    return read
+
+
+def positive(text: str) -> float:
+    """Reads a number above zero."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value > 0.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value
 
 
 def arguments() -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("objective", type=Path, help="objective file, such as tools/objectives/spiral.toml")
-    parser.add_argument("--trials", type=int, default=40, help="trials in all, earlier ones in the same folder counted")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="no trial is begun after so long")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--trials", type=whole(1), default=40, help="trials in all, earlier ones in the same folder counted")
+    parser.add_argument("--minutes", type=positive, default=float("inf"), help="no trial is begun after so long")
+    parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
     parser.add_argument("--dask", metavar="ADDRESS", default="", help="scheduler of a dask cluster, tcp://HOST:PORT, in place of processes")
     parser.add_argument("--start", type=Path, help="parameter file to start from; the shipped gains without it")
-    parser.add_argument("--detune", type=int, metavar="SEED", help=f"put each gain of the start off by a factor of up to {DETUNED:g}")
-    parser.add_argument("--seed", type=int, default=0, help="of the search itself")
+    parser.add_argument("--detune", type=whole(0), metavar="SEED", help=f"put each gain of the start off by a factor of up to {DETUNED:g}")
+    parser.add_argument("--seed", type=whole(0), default=0, help="of the search itself")
     parser.add_argument("--no-plots", action="store_true", help="leave the plots out")
     parser.add_argument("--live", metavar="mavlink:ADDRESS", help="tune the vehicle there, step by step, in place of the bench")
-    parser.add_argument("--seconds", type=float, default=20.0, help="--live: how long each step is looked at")
+    parser.add_argument("--seconds", type=positive, default=20.0, help="--live: how long each step is looked at")
     parser.add_argument("--out", type=Path, default=Path("runs/tune"), metavar="DIR", help="for trials, parameters.toml and tuning.json")
     return parser.parse_args()
 

@@ -13,6 +13,9 @@ from loop_response import BODIES, Scale, margins, measure
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+from hil.metrics import SHOWN
 from hil.scenario import Scenario, load_scenario
 
 FAILED_COST = 1e6
@@ -88,6 +91,17 @@ class Objective:
     stability: tuple[Stability, ...] = quantity((), help="margins to keep")
 
     def __post_init__(self) -> None:
+        for name in ("flight", "search", "term", "seeds", "unseen_seeds"):
+            if not getattr(self, name):
+                raise DescriptionError(f"{name} is empty; an objective needs one at least")
+        if "\n" in self.help:
+            raise DescriptionError("help has more than one line")
+        names = [search.parameter for search in self.search]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise DescriptionError(f"parameter {min(twice)} is searched twice")
+        for term in self.term:
+            if term.metric not in SHOWN:
+                raise DescriptionError(f"metric '{term.metric}' is unknown; there are {', '.join(SHOWN)}")
         if set(self.seeds) & set(self.unseen_seeds):
             raise DescriptionError("a seed is both in seeds and in unseen_seeds; the comparison needs worlds of its own")
         for search in self.search:
@@ -150,6 +164,9 @@ def load_objective(path: Path) -> Objective:
     """The objective in a file, its scenarios checked. Raises DescriptionError, one line."""
     table, source = read_toml(path)
     objective: Objective = build(Objective, table, source)
+    vehicle = load_vehicle(objective.flight[0].flown().module[0].vehicle)
     for spec in objective.flight:
         spec.flown()
+    for wanted in objective.stability:
+        assemble(BODIES[wanted.modules], [0] * wanted.modules, [vehicle] * wanted.modules)
     return objective

@@ -67,7 +67,7 @@ def draw_steps(path: Path, steps: Mapping[str, np.ndarray]) -> None:
         panel.set(title=AXES[axis], xlabel="time, s", ylim=(-0.2, 1.8))
     panels[0, 0].set_ylabel("share of the step")
     panels[0, 0].legend(frameon=False, loc="lower right")
-    _save(figure, path, "Step of the set-point, 50 mm and 5 deg: as estimated; no noise, with thruster lag, tick and tag delay")
+    _save(figure, path, "One module: step of the set-point, 50 mm and 5 deg, as estimated; no noise, with thruster lag, tick and tag delay")
 
 
 def draw_bode(path: Path, loops: Mapping[str, list[Response]]) -> None:
@@ -89,7 +89,7 @@ def draw_bode(path: Path, loops: Mapping[str, list[Response]]) -> None:
         phase.set_xlabel("frequency, rad/s")
     panels[0, 0].set(xscale="log", ylabel="loop gain, dB", ylim=(-40, 50))
     panels[1, 0].set(ylabel="phase, deg", ylim=(-400, -80), yticks=range(-360, -80, 45))
-    _save(figure, path, "Loops broken at the plant's input: gain and phase margin; dotted: crossover")
+    _save(figure, path, "One module: loops broken at the plant's input, gain and phase margin; dotted: crossover")
 
 
 def draw_search(path: Path, objective: Objective, study: optuna.Study) -> None:

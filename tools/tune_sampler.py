@@ -22,6 +22,8 @@ from scipy.stats import norm
 
 NOISE = 1e-3
 """Standard deviation of the logarithm of the objective: one world flown twice costs the same, but ticks and frames are steps."""
+LEAST = 1e-9
+"""Of an objective: what is below counts as this, for its logarithm is taken."""
 WORST = 2.0
 """Logarithms above the best that still count: how badly the unstable fly teaches nothing."""
 LENGTH, LENGTH_SPREAD = 0.5, 1.0
@@ -74,7 +76,7 @@ def _value(d: FloatDistribution, share: float) -> float:
 
 
 def logarithms(trials: list[FrozenTrial]) -> np.ndarray:
-    """(n,) logarithm of the objective, which is positive, at most `WORST` above the best.
+    """(n,) logarithm of the objective, which is not negative, at most `WORST` above the best.
 
     What was ended early goes on as the others did, in the median.
     """
@@ -82,10 +84,14 @@ def logarithms(trials: list[FrozenTrial]) -> np.ndarray:
     values = []
     for t in trials:
         step = max(t.intermediate_values, default=0)
-        others = [math.log(w.value / w.intermediate_values[step]) for w in whole] if t.state == TrialState.PRUNED else [0.0]
-        values.append(math.log(t.value) + float(np.median(others)))
+        others = [_log(w.value) - _log(w.intermediate_values[step]) for w in whole] if t.state == TrialState.PRUNED else [0.0]
+        values.append(_log(t.value) + float(np.median(others)))
     y = np.array(values)
     return np.minimum(y, y.min() + WORST)
+
+
+def _log(value: float) -> float:
+    return math.log(max(value, LEAST))
 
 
 def kernel(a: np.ndarray, b: np.ndarray, lengths: np.ndarray) -> np.ndarray:

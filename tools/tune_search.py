@@ -23,9 +23,12 @@ from tune_sampler import GaussianProcessSampler
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
+from hil import campaign
 from hil.campaign import TrialFile, code_digest, fly_trial
 
 TRIALS_FILE = "search.jsonl"
+SOURCES = ("loop_response.py", "tune_objective.py", "tune_sampler.py", "tune_search.py")
+"""What a trial depends on beside the packages."""
 FIRST_AT_RANDOM = 8
 """Trials before the sampler has something to go by, the start among them."""
 
@@ -40,8 +43,10 @@ class Progress(NamedTuple):
 
 
 def identity(objective: Objective, start: Parameters, seed: int) -> str:
-    """Same identity and same number, same trial."""
-    parts = (code_digest(), asdict(objective), asdict(start), seed)
+    """Same identity and same number, same trial: the flights as they are in their files, and the code here and in the packages."""
+    flights = [campaign.identity(spec.flown(), start) for spec in objective.flight]
+    here = [(Path(__file__).parent / name).read_bytes() for name in SOURCES]
+    parts = (flights, hashlib.sha256(b"".join(here)).hexdigest(), asdict(objective), seed)
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
@@ -51,7 +56,7 @@ def check_folder(out: Path, objective: Objective, start: Parameters, seed: int) 
     if not path.exists():
         return
     head, newline, _ = path.read_bytes().partition(b"\n")
-    if newline and json.loads(head) != {"campaign": identity(objective, start, seed)}:
+    if newline and head != json.dumps({"campaign": identity(objective, start, seed)}).encode():
         raise DescriptionError(f"{path} holds trials of another objective, start, seed or code; give another --out")
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from tools.loop_response import AXES, LINES, Loop, Response, Scale, corners, lines, margins, measure
 
 SURGE = 0
@@ -52,6 +53,20 @@ def swing(gain: float) -> float:
         given = loop.step(shake)
         swings.append(abs(float(given[SURGE])))
     return max(swings[3200:]) / max(swings[2200:2600])
+
+
+@pytest.mark.slow
+def test_loop_that_one_decibel_more_makes_swing_shows_less_than_that_and_one_that_swings_shows_none() -> None:
+    """The first crosses -180 degrees above the last frequency that is measured."""
+    hard = Parameters().replace("control.position_bandwidth", 8.0).replace("control.position_damping", 3.5)
+    assert margins(measure(1, hard)[SURGE]).gain_db < 1.0
+    swinging = [margins(response) for response in measure(1, hard, Scale(0.85, 0.85, 1.15))]
+    assert swinging[SURGE][:2] == (0.0, 0.0)
+
+
+def test_vehicle_that_never_finds_its_pose_has_no_margins() -> None:
+    with pytest.raises(DescriptionError, match="girona500: its loops are open"):
+        measure(1, Parameters(), vehicle="girona500")
 
 
 @pytest.mark.slow

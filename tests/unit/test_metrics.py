@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil.checks import Limit, check_metrics, judge, write_result
-from hil.metrics import body_positions, flight_metrics, nis_mean, rotation_vectors, warnings
+from hil.metrics import body_positions, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
 from hil.signals import Flight, read_flight
 from tests.unit.flights import MARGIN, POWER_W, START_NS, write_flight
 
@@ -50,6 +50,13 @@ def test_honest_filter_is_consistent_in_all_six_axes(tmp_path: Path) -> None:
     assert 0.85 < metrics["nis_mean"] < 1.15
     assert all(metrics[f"sigma3_share_{axis}"] > 0.97 for axis in ("x", "y", "z", "roll", "pitch", "yaw"))
     assert metrics["sigma3_share"] == min(v for k, v in metrics.items() if k.startswith("sigma3_share_"))
+
+
+def test_rate_of_a_sine_is_its_frequency_times_its_rms_and_thrusters_that_fell_silent_do_not_count() -> None:
+    time = np.arange(2000) * 0.001
+    force = np.stack([3.0 * np.sin(2.0 * np.pi * 5.0 * time), np.full(2000, np.nan)], axis=1)
+    assert rate_rms(force, 0.001) == pytest.approx(3.0 / math.sqrt(2.0) * 2.0 * np.pi * 5.0, rel=1e-3)
+    assert math.isnan(rate_rms(force[:1], 0.001))
 
 
 def test_one_bad_tick_is_seen_in_the_worst_error(tmp_path: Path) -> None:

@@ -131,6 +131,15 @@ def test_search_that_was_killed_loses_no_trial_and_ends_in_the_same_bytes(tools:
     assert path.read_bytes() == (tmp_path / "whole" / "search.jsonl").read_bytes()
 
 
+def test_objective_that_reaches_zero_is_searched_on(tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fly(scenario: Scenario, parameters: Parameters, seed: int, bus: str, code: str) -> dict[str, Any]:
+        return {"seed": seed, "metrics": {"position_rmse_m": 0.0, "thrust_rms_n": max(0.0, parameters.control.position_bandwidth - 2.0)}}
+
+    monkeypatch.setattr(tools[1], "fly_trial", fly)
+    study = search(tools, tmp_path, 14, Inline())
+    assert study.best_value == 0.0 and len(study.trials) == 14
+
+
 def test_other_seed_searches_elsewhere(tools: tuple[Any, Any], tmp_path: Path) -> None:
     first, second = (search(tools, tmp_path / str(seed), 5, Inline(), seed) for seed in (0, 1))
     assert first.trials[0].params == second.trials[0].params and first.trials[1].params != second.trials[1].params
@@ -145,6 +154,29 @@ def test_folder_of_another_search_is_not_thrown_away(tools: tuple[Any, Any], tmp
     assert json.loads((tmp_path / "search.jsonl").read_text().splitlines()[-1])["number"] == 1
 
 
+def test_folder_is_of_another_search_when_its_scenario_was_edited(tools: tuple[Any, Any], tmp_path: Path) -> None:
+    scenario = tmp_path / "mine.toml"
+    scenario.write_bytes((ROOT / "hil" / "scenarios" / "hover.toml").read_bytes())
+    text = OBJECTIVE.replace('"hover"', f'"{scenario}"')
+    before = tools[1].identity(objective_of(tools, tmp_path, text), START, 0)
+    assert tools[1].identity(objective_of(tools, tmp_path, text), START, 0) == before
+    scenario.write_text(scenario.read_text().replace("duration_s = 60.0", "duration_s = 50.0"))
+    assert tools[1].identity(objective_of(tools, tmp_path, text), START, 0) != before
+
+
+@pytest.mark.parametrize("words", ["--trials 0", "--jobs 0", "--seed -1", "--detune -1", "--minutes -1", "--minutes nan", "--seconds nan"])
+def test_number_that_makes_no_sense_is_refused_in_one_line(
+    tools: tuple[Any, Any], words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import tune_gains
+
+    monkeypatch.setattr("sys.argv", ["tune_gains.py", "tools/objectives/hover.toml", *words.split()])
+    with pytest.raises(SystemExit) as refusal:
+        tune_gains.main()
+    assert refusal.value.code == 2
+    assert "is not a" in capsys.readouterr().err.splitlines()[-1]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -152,6 +184,10 @@ def test_folder_of_another_search_is_not_thrown_away(tools: tuple[Any, Any], tmp
         ("high = 8.0", "high = 80.0", "position_bandwidth: 80.0 is out of range"),
         ("high = 8.0", "high = 0.4", "low 0.5 is not below high 0.4"),
         ('scenario = "hover"', 'scenario = "hoover"', "scenario 'hoover' is unknown"),
+        ("unseen_seeds = [7]", "unseen_seeds = []", "unseen_seeds is empty; an objective needs one at least"),
+        ("help = \"a valley\"", "help = \"\"\"a\nvalley\"\"\"", "help has more than one line"),
+        ("control.position_damping", "control.position_bandwidth", "position_bandwidth is searched twice"),
+        ("position_rmse_m", "position_rmse", "metric 'position_rmse' is unknown; there are position_rmse_m, position_max_m"),
         ("term = [", f"stability = [{{ modules = 3, {MARGINS} }}]\nterm = [", "stability of 3 modules; there are bodies of 1, 2, 4"),
     ],
 )
