@@ -1,6 +1,6 @@
 """A golden log: a flight's log, thinned and packed. `pack` makes one, `unpack` gives the folder that `modcube replay` takes.
 
-Every frame is kept, and of each body the signals of every 50th tick.
+Every frame is kept, and of the signals of bodies and joints those of some ticks.
 """
 
 import json
@@ -10,18 +10,22 @@ from pathlib import Path
 from firmware_py.runtime.log_recovery import rewrite
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG
 
-KEEP_EVERY = 50
-BODY = "/firmware/body"
+KEEP_EVERY = {"/firmware/body": 50, "/firmware/docks": 10}
+"""Ticks, by how a topic begins; of other topics every message is kept."""
 
 
 def pack(log: Path, golden: Path, period_ns: int) -> None:
     """Makes the folder `golden` of the log in the folder `log`."""
     golden.mkdir(exist_ok=True)
     thin = log / "thin.mcap"
+
+    def every(topic: str) -> int:
+        return next((ticks for begin, ticks in KEEP_EVERY.items() if topic.startswith(begin)), 1)
+
     rewrite(
         log / SIGNAL_LOG,
         thin,
-        lambda topic, message: not topic.startswith(BODY) or message.log_time // period_ns % KEEP_EVERY == 0,
+        lambda topic, message: message.log_time // period_ns % every(topic) == 0,
         lambda data: json.dumps(json.loads(data) | {"thinned": True}, sort_keys=True).encode(),
     )
     for name, path in ((CAN_LOG, log / CAN_LOG), (SIGNAL_LOG, thin)):

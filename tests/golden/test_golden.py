@@ -19,7 +19,7 @@ from tests.golden.packed import pack, unpack
 FOLDER = Path(__file__).parent
 TOLERANCE = 1e-6
 """Share by which another processor's rounding may move a signal; frames may differ by one count."""
-MOST_BYTES = 500_000
+MOST_BYTES = 450_000
 """All golden logs together."""
 
 
