@@ -40,17 +40,14 @@ def fly(worlds: Sequence[World], commands: np.ndarray, threads: int = 0) -> np.n
         (n, k, 16) each module after each tick, see SEEN.
 
     Raises:
-        DescriptionError: a world has more than one module or differs in its tank, or the shape of `commands` is another.
+        DescriptionError: worlds that cannot fly together, commands of another shape, or no ticks. No world has moved then.
     """
-    count, thrusters = len(worlds), len(worlds[0].vehicles[0].thruster) if worlds else 0
-    given = np.asarray(commands, dtype=np.float64)
-    if given.ndim not in (2, 3) or given.shape[-1] != thrusters or (given.ndim == 3 and len(given) != count):
-        raise DescriptionError(f"batch: commands have the shape {given.shape}; (ticks, {thrusters}) or ({count}, ticks, {thrusters}) fit")
-    if thrusters > CHANNELS or any(len(world.vehicles[0].thruster) != thrusters for world in worlds):
-        raise DescriptionError(f"batch: modules differ in their thrusters; all need the same number, at most {CHANNELS}")
+    given, count = np.asarray(commands, dtype=np.float64), len(worlds)
+    _check_worlds(worlds)
+    _check_commands(given, count, len(worlds[0].vehicles[0].thruster))
+    if threads < 0:
+        raise DescriptionError(f"batch: {threads} threads; it needs 0, one a core, or more")
     parts = [world.lend(given.shape[-2]) for world in worlds]
-    if len({(part.water[1:], part.steps, part.step_s) for part in parts}) > 1:
-        raise DescriptionError("batch: worlds differ in tank, water or tick; all need the same")
     given = np.array(np.broadcast_to(given, (count, *given.shape[-2:])), order="C")
     out = np.empty((count, given.shape[1], SEEN))
 
@@ -62,6 +59,27 @@ def fly(worlds: Sequence[World], commands: np.ndarray, threads: int = 0) -> np.n
     with ThreadPoolExecutor(wanted) as pool:
         list((pool.map if wanted > 1 else map)(some, range(0, count, LANES)))
     return out
+
+
+def _check_worlds(worlds: Sequence[World]) -> None:
+    """Raises DescriptionError where these cannot fly together."""
+    if not worlds:
+        raise DescriptionError("batch: no worlds; it needs one at least")
+    if len({id(world) for world in worlds}) < len(worlds):
+        raise DescriptionError("batch: the same world is given twice; each needs to be one of its own")
+    if len({world.terms() for world in worlds}) > 1:
+        raise DescriptionError("batch: worlds differ in tank, water or tick; all need the same")
+    counts = {len(world.vehicles[0].thruster) for world in worlds}
+    if len(counts) > 1 or max(counts) > CHANNELS:
+        raise DescriptionError(f"batch: modules differ in their thrusters; all need the same number, at most {CHANNELS}")
+
+
+def _check_commands(given: np.ndarray, worlds: int, thrusters: int) -> None:
+    """Raises DescriptionError where `given` is no commands for so many worlds of so many thrusters each."""
+    if given.ndim not in (2, 3) or given.shape[-1] != thrusters or (given.ndim == 3 and len(given) != worlds):
+        raise DescriptionError(f"batch: commands have the shape {given.shape}; (ticks, {thrusters}) or ({worlds}, ticks, {thrusters}) fit")
+    if given.shape[-2] == 0:
+        raise DescriptionError("batch: commands of no ticks; it needs one at least")
 
 
 def _fly_some(parts: Sequence[Arrays], commands: np.ndarray, out: np.ndarray) -> None:

@@ -2,25 +2,31 @@
 
 Every trial goes to trials.jsonl the moment it is flown. Started again in the same folder, a campaign flies what is missing; since a seed
 always gives the same flight, it ends in the same bytes as one that was never interrupted. campaign.json and trials.csv say what came of it.
+A worker that dies costs the trials under way, and these are flown again.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import hashlib
 import json
 import math
 import os
 import re
 import socket
+import sys
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from importlib import resources
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from types import TracebackType
 from typing import Any
 
@@ -39,6 +45,10 @@ WALL_CLOCK = ("real_time_factor", "deadline_misses")
 """Metrics of the machine and not of the flight: no two campaigns would agree on them."""
 PACKAGES = ("firmware_py", "hil", "can_dbc")
 SOURCES = (".py", ".toml", ".dbc")
+FEW = max(8, 2 * (os.cpu_count() or 1))
+"""Trials under way after a worker's death: enough to keep this machine busy, and no more than these does the next death cost."""
+IN_VAIN = 12
+"""Deaths without a trial between them that are no seed's fault."""
 
 Pool = Callable[[], AbstractContextManager[Executor]]
 
@@ -92,31 +102,50 @@ def _numbers(values: dict[str, float]) -> dict[str, float | None]:
 class TrialFile:
     """trials.jsonl: who it belongs to, then a line for each trial, with the disk before the next one is waited for."""
 
-    def __init__(self, path: Path, owner: str, key: str = "seed") -> None:
-        """Goes on in `path` if it is `owner`'s, else begins it anew. A line that was torn is flown again; `key` tells trials apart."""
+    def __init__(self, path: Path, owner: str, key: str = "seed", anew: bool = False) -> None:
+        """Goes on in `path` if it is `owner`'s; a line that was torn is flown again.
+
+        Args:
+            key: tells trials apart.
+            anew: throws another owner's trials away.
+
+        Raises:
+            DescriptionError: `path` is being written, or holds trials of another owner.
+        """
         self.trials: dict[int, Trial] = {}
         self._key = key
-        kept = self._read(path, owner) if path.exists() else 0
-        self._file = path.open("r+b" if kept else "wb")
-        self._file.truncate(kept)
-        self._file.seek(kept)
-        if not kept:
+        with ExitStack() as refused:
+            self._file = refused.enter_context(path.open("a+b"))
+            self._claim(path)
+            stands = self._read(path, owner, anew)
+            self._file.truncate(stands)
+            refused.pop_all()
+        if not stands:
             self._write({"campaign": owner})
 
-    def _read(self, path: Path, owner: str) -> int:
+    def _claim(self, path: Path) -> None:
+        """The file is this one's until it is closed."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DescriptionError(f"{path} is being written by another campaign; wait for it or give another --out") from None
+
+    def _read(self, path: Path, owner: str, anew: bool) -> int:
         """Bytes that stand."""
-        kept = 0
-        for line in path.read_bytes().splitlines(keepends=True):
-            try:
-                entry = json.loads(line) if line.endswith(b"\n") else None
-            except ValueError:
-                entry = None
-            if not isinstance(entry, dict) or (kept == 0 and entry != {"campaign": owner}):
+        self._file.seek(0)
+        lines = self._file.readlines()
+        if not lines or _entry(lines[0]) != {"campaign": owner}:
+            if lines[1:] and not anew:
+                raise DescriptionError(f"{path} holds trials of another scenario, controller or code; give another --out or delete it")
+            return 0
+        stands = len(lines[0])
+        for line in lines[1:]:
+            entry = _entry(line)
+            if entry is None:
                 break
-            if kept:
-                self.trials[int(entry[self._key])] = entry
-            kept += len(line)
-        return kept
+            self.trials[int(entry[self._key])] = entry
+            stands += len(line)
+        return stands
 
     def add(self, trial: Trial) -> None:
         """One more trial, on the disk when this returns."""
@@ -135,9 +164,27 @@ class TrialFile:
         self._file.close()
 
 
+def _entry(line: bytes) -> Trial | None:
+    """What a line holds; None where it was torn."""
+    try:
+        entry = json.loads(line) if line.endswith(b"\n") else None
+    except ValueError:
+        entry = None
+    return entry if isinstance(entry, dict) else None
+
+
 def processes(jobs: int) -> Pool:
-    """So many processes of this machine."""
-    return lambda: ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
+    """So many processes of this machine, which end with this one, however it ends."""
+    return lambda: ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    def wait() -> None:
+        if parent := parent_process():
+            parent.join()
+            os._exit(1)
+
+    Thread(target=wait, daemon=True).start()
 
 
 @contextmanager
@@ -159,19 +206,63 @@ def kept(pool: Pool) -> Iterator[Pool]:
         yield use
 
 
+class DaskExecutor(Executor):
+    """The workers of a dask client. Dask's own executor never answers for what was under way when the scheduler was lost."""
+
+    def __init__(self, client: Any) -> None:
+        """Executor of this client, which stays the caller's to close."""
+        self._client = client
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Begins one call. Raises BrokenExecutor where the scheduler is gone."""
+        task = self._client.submit(fn, *args, pure=False, **kwargs)
+        if self._client.status != "running":
+            raise BrokenExecutor("the dask scheduler is gone")
+        future: Future[Any] = Future()
+        task.add_done_callback(partial(_pass_on, future))
+        return future
+
+
+def _pass_on(future: Future[Any], task: Any) -> None:
+    """Tells `future` what has come of dask's `task`; its result may be lost with the scheduler that holds it."""
+    if not future.set_running_or_notify_cancel():
+        return
+    try:
+        if task.status == "error":
+            future.set_exception(task.exception())
+        else:
+            future.set_result(task.result())
+    except Exception as error:
+        future.set_exception(BrokenExecutor(str(error)))
+
+
 def dask_cluster(address: str) -> Pool:
-    """The workers of the dask scheduler at `address`, such as tcp://host:8786. Raises DescriptionError when none answers."""
+    """The workers of the dask scheduler at `address`, such as tcp://host:8786. Raises DescriptionError when none answers, now or later."""
+
+    @contextmanager
+    def use() -> Iterator[Executor]:
+        client = _dask_client(address)
+        try:
+            yield DaskExecutor(client)
+        finally:
+            if client.status == "running":
+                client.close()
+
+    with use():
+        return use
+
+
+def _dask_client(address: str) -> Any:
     found = re.fullmatch(r"t(?:cp|ls)://(.+):(\d+)", address)
     if not found:
         raise DescriptionError(f"--dask {address!r} is no address; it needs tcp://HOST:PORT, as `dask scheduler` prints it")
     try:
         socket.create_connection((found[1], int(found[2])), timeout=10).close()
+        from distributed import Client
+
+        return Client(address, timeout=10, set_as_default=False)
     except (OSError, OverflowError) as error:
         raise DescriptionError(f"no dask scheduler at {address}: {error}; start one with `dask scheduler`") from None
-    from distributed import Client
-
-    client = Client(address, timeout=10, set_as_default=False)
-    return lambda: client.get_executor(pure=False)
 
 
 def run_campaign(
@@ -181,10 +272,14 @@ def run_campaign(
     pool: Pool,
     out: Path,
     progress: Callable[[int, int], None] | None = None,
+    anew: bool = False,
 ) -> dict[str, Any]:
-    """Flies every seed that `out` does not hold yet; writes campaign.json and trials.csv there; returns what the first holds."""
+    """Flies every seed that `out` does not hold yet; writes campaign.json and trials.csv there; returns what the first holds.
+
+    Raises DescriptionError where `out` holds another campaign, which `anew` throws away; and for seeds that kill their workers.
+    """
     out.mkdir(parents=True, exist_ok=True)
-    with TrialFile(out / TRIALS_FILE, identity(scenario, parameters)) as file:
+    with TrialFile(out / TRIALS_FILE, identity(scenario, parameters), anew=anew) as file:
         missing = [seed for seed in seeds if seed not in file.trials]
         for trial in _flown(scenario, parameters, missing, pool):
             file.add(trial)
@@ -198,23 +293,58 @@ def run_campaign(
 
 
 def _flown(scenario: Scenario, parameters: Parameters, seeds: Sequence[int], pool: Pool) -> Iterator[Trial]:
-    """Trials as they come. A worker that dies costs the trials under way; without any trial between two deaths it is given up."""
+    """Trials as they come. Those under way at a worker's death are flown again when the others are done: among few, then alone, twice."""
     left, code, in_vain = set(seeds), code_digest(), 0
-    while left:
-        before = len(left)
-        with suppress(BrokenExecutor), pool() as executor:
-            futures = [executor.submit(fly_trial, scenario, parameters, s, f"virtual:trial{s}", code) for s in sorted(left)]
+
+    def begin(executor: Executor, seed: int) -> Future[Trial]:
+        return executor.submit(fly_trial, scenario, parameters, seed, f"virtual:trial{seed}", code)
+
+    for at_once in (len(left), FEW, 1, 1):
+        waiting = deque(sorted(left))
+        while waiting:
+            in_vain += 1
+            with suppress(BrokenExecutor), pool() as executor:
+                for trial in _together(partial(begin, executor), waiting, at_once):
+                    left.discard(int(trial["seed"]))
+                    in_vain = 0
+                    yield trial
+            if in_vain == IN_VAIN:
+                raise DescriptionError(f"workers die before they finish a trial; {len(left)} seeds are left, {min(left)} the first")
+    if left:
+        named = ", ".join(map(str, sorted(left)))
+        raise DescriptionError(f"workers die of these seeds, each flown alone: {named}; all others are flown")
+
+
+def _together(begin: Callable[[int], Future[Trial]], waiting: deque[int], at_once: int) -> Iterator[Trial]:
+    """Flies seeds out of `waiting`. When a worker dies no more are begun, and BrokenExecutor is raised as soon as none is under way."""
+    under_way: set[Future[Trial]] = set()
+    ended: SimpleQueue[Future[Trial]] = SimpleQueue()
+    died = False
+    try:
+        while under_way or (waiting and not died):
             try:
-                for future in as_completed(futures):
-                    if not isinstance(future.exception(), BrokenExecutor):
-                        trial = future.result()
-                        left.discard(int(trial["seed"]))
-                        yield trial
-            finally:
-                for future in futures:
-                    future.cancel()
-            if left:
-                raise BrokenExecutor  # told to a pool that is kept
-        in_vain = in_vain + 1 if len(left) == before else 0
-        if in_vain == 2:
-            raise DescriptionError(f"workers die before they finish a trial; {len(left)} seeds are left, {min(left)} the first")
+                while waiting and not died and len(under_way) < at_once:
+                    under_way.add(future := begin(waiting[0]))
+                    waiting.popleft()
+                    future.add_done_callback(ended.put)
+                future = ended.get()
+                under_way.remove(future)
+                trial = future.result()
+            except _deaths():
+                died = True
+            else:
+                yield trial
+    except Exception:
+        yield from (f.result() for f in under_way if f.done() and not f.cancelled() and not f.exception())
+        raise
+    finally:
+        for future in under_way:
+            future.cancel()
+    if died:
+        raise BrokenExecutor  # told to a pool that is kept
+
+
+def _deaths() -> tuple[type[BaseException], ...]:
+    """What a future raises whose worker has died; dask has words of its own for it, and cancels all when its scheduler is gone."""
+    dask = sys.modules.get("distributed")
+    return (BrokenExecutor, CancelledError, *((dask.KilledWorker,) if dask else ()))

@@ -98,7 +98,8 @@ def campaign(
     from hil.flight import fly_and_judge, illustrate
 
     chosen = scenario_of(scenario, vehicle, sensors)
-    folder = out if out is not None else Path("runs") / f"{chosen.name}-campaign"
+    special = (Path(vehicle).stem, Path(controller).stem.replace("modcube", ""), sensors.replace("real", ""))
+    folder = out if out is not None else Path("runs") / "-".join(filter(None, (chosen.name, *special, "campaign")))
     parameters, seeds = parameters_of(controller), range(seed, seed + trials)
     with campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
         pool = dask_cluster(dask) if dask else processes(jobs)

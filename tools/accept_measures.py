@@ -47,7 +47,7 @@ def flown(scenario: str, controller: str = "modcube", trials: int = 20, sensors:
         if sensors == "ideal":
             chosen = chosen.with_ideal_sensors()
         with campaign_progress(f"{scenario}, {controller}, {sensors} sensors", trials) as progress:
-            summary = run_campaign(chosen, parameters, range(trials), processes(JOBS), folder, progress)
+            summary = run_campaign(chosen, parameters, range(trials), processes(JOBS), folder, progress, anew=True)
         values = {f"{m}.{q}": v for m, each in summary["metrics"].items() for q, v in each.items() if v is not None}
         failed = {name: count / (trials - summary["succeeded"]) for name, count in summary["outcomes"].items() if name != "passed"}
         values |= {f"failed.{name}": share for name, share in failed.items()}
@@ -61,7 +61,7 @@ def saved_by_least_power(folder: Path) -> Values:
     found = {}
     for name in ("modcube", "least_power"):
         with campaign_progress(f"mobius-1, {name}", len(FEWER)) as progress:
-            summary = run_campaign(load_scenario("mobius-1"), CONTROLLERS[name], FEWER, processes(JOBS), folder / name, progress)
+            summary = run_campaign(load_scenario("mobius-1"), CONTROLLERS[name], FEWER, processes(JOBS), folder / name, progress, anew=True)
         found[name] = summary["metrics"]
     both = ("supply_power_w", "position_rmse_m")
     power, error = (found["least_power"][m]["median"] / found["modcube"][m]["median"] for m in both)

@@ -40,7 +40,7 @@ def unseen_costs(objective: Objective, parameters: Parameters, pool: Pool, folde
     for number, spec in enumerate(objective.flight):
         scenario = spec.flown()
         here = folder / f"{number}-{scenario.name}"
-        run_campaign(scenario, parameters, objective.unseen_seeds, pool, here)
+        run_campaign(scenario, parameters, objective.unseen_seeds, pool, here, anew=True)
         with TrialFile(here / TRIALS_FILE, identity(scenario, parameters)) as file:
             costs += [objective.cost(spec, file.trials[seed]["metrics"]) for seed in objective.unseen_seeds]
     return costs

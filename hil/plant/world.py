@@ -239,9 +239,8 @@ class World(DockedBodies):
         arrays = (self._body_arrays, self._modules, faces, self._thrusters, self._water)
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
 
-    def lend(self, ticks: int) -> Arrays:
-        """The arrays of a lone module for `hil.batch`, which moves them on by so many ticks; the clock already stands at their end, and
-        nobody may ask for the truth before the batch has flown.
+    def terms(self) -> tuple[object, ...]:
+        """What the worlds of one batch must agree in: water, tank, tick and sub-step.
 
         Raises DescriptionError for more than one module, or a thruster that is broken: these need Python between the ticks.
         """
@@ -249,6 +248,12 @@ class World(DockedBodies):
             raise DescriptionError(
                 f"plant: a batch is of lone modules that are whole; here are {len(self.vehicles)} modules, {len(self._broken)} faults"
             )
+        return (self._water[1:], self.period_ns, self._step_ns)
+
+    def lend(self, ticks: int) -> Arrays:
+        """The arrays of a lone module for `hil.batch`, which has asked for the terms and moves them on by so many ticks; the clock already
+        stands at their end, and nobody may ask for the truth before the batch has flown.
+        """
         self._truths.clear()
         self._escs.clear()
         self.time_ns += ticks * self.period_ns

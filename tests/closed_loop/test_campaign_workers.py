@@ -1,15 +1,24 @@
-"""Campaigns on real workers: a dask cluster that loses one, and a campaign killed with its processes, end in the same bytes."""
+"""Campaigns on real workers: a cluster that loses one or its scheduler, a campaign killed with its processes, a seed that kills its own."""
 
+import importlib
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import pytest
+
+import hil.campaign
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
+from hil.campaign import TRIALS_FILE, processes, run_campaign
+from hil.scenario import load_scenario
 
 TRIALS = 8
 SCENARIO = """
@@ -38,12 +47,11 @@ def whole(scenario: Path) -> list[bytes]:
     return tables(scenario.parent / "whole")
 
 
-def campaign(scenario: Path, out: Path, *arguments: str) -> subprocess.Popen[bytes]:
+def campaign(scenario: Path, out: Path, *arguments: str, errors: IO[bytes] | None = None) -> subprocess.Popen[bytes]:
     """modcube hil campaign, in a group of its own."""
     command = [sys.executable, "-c", "from firmware_py.cli import main; main()", "hil", "campaign", str(scenario)]
-    return subprocess.Popen(
-        [*command, "--trials", str(TRIALS), "--draw", "0", "--out", str(out), *arguments], stdout=subprocess.DEVNULL, start_new_session=True
-    )
+    words = [*command, "--trials", str(TRIALS), "--draw", "0", "--out", str(out), *arguments]
+    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True)
 
 
 def flown(out: Path) -> int:
@@ -64,7 +72,7 @@ def tables(out: Path) -> list[bytes]:
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """Address of a dask scheduler, and its two workers, all with this Python."""
+    """Address of a dask scheduler; its two workers and itself, all with this Python."""
     log, dask = folder / "scheduler.log", [sys.executable, "-m", "distributed.cli.dask_scheduler"]
     with log.open("wb") as file:
         scheduler = subprocess.Popen([*dask, "--host", "127.0.0.1", "--port", "0", "--no-dashboard"], stderr=file)
@@ -79,7 +87,7 @@ def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]
         subprocess.Popen([*worker, "--local-directory", str(folder)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for _ in "12"
     ]
     try:
-        yield address, workers
+        yield address, [*workers, scheduler]
     finally:
         for process in (*workers, scheduler):
             process.kill()
@@ -102,9 +110,66 @@ def test_campaign_killed_with_all_its_processes_goes_on_to_the_same_bytes(whole:
 @pytest.mark.xdist_group("campaign")
 def test_dask_cluster_that_loses_a_worker_gives_the_same_table_as_this_machine(whole: list[bytes], scenario: Path, tmp_path: Path) -> None:
     remote = tmp_path / "remote"
-    with cluster(tmp_path) as (address, workers):
+    with cluster(tmp_path) as (address, (worker, _, _)):
         process = campaign(scenario, remote, "--dask", address)
         wait_for(remote, TRIALS // 2, process)
-        workers[0].kill()
+        worker.kill()
         assert process.wait() == 0
     assert tables(remote) == whole
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("campaign")
+def test_lost_scheduler_is_said_in_one_line_and_the_campaign_goes_on_elsewhere(whole: list[bytes], scenario: Path, tmp_path: Path) -> None:
+    remote, said = tmp_path / "remote", tmp_path / "said"
+    with cluster(tmp_path) as (address, (_, _, scheduler)), said.open("wb") as errors:
+        process = campaign(scenario, remote, "--dask", address, errors=errors)
+        wait_for(remote, 2, process)
+        scheduler.kill()
+        assert process.wait() == 2
+    assert f": no dask scheduler at {address}: " in said.read_text()
+    assert campaign(scenario, remote, "--jobs", "2").wait() == 0
+    assert tables(remote) == whole
+
+
+DEADLY = """
+import os
+import time
+
+
+def fly(scenario, parameters, seed, bus, code):
+    with open(os.environ["STARTED"], "a") as file:
+        file.write(f"{seed}\\n")
+    time.sleep(0.1)
+    if seed == 0:
+        os._exit(1)
+    return {"seed": seed, "passed": True, "outcome": "passed", "metrics": {"position_rmse_m": 0.001}, "world": {"mass_factor": 1.0}}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("campaign")
+def test_seed_that_kills_its_process_costs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "deadly.py").write_text(DEADLY)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("STARTED", str(tmp_path / "started"))
+    monkeypatch.setattr(hil.campaign, "fly_trial", importlib.import_module("deadly").fly)
+    with pytest.raises(DescriptionError, match="each flown alone: 0; all others are flown"):
+        run_campaign(load_scenario("hover"), Parameters(), range(20), processes(2), tmp_path)
+    assert len((tmp_path / TRIALS_FILE).read_bytes().splitlines()) == 1 + 19
+    started = (tmp_path / "started").read_text().split()
+    assert started.count("0") == 4  # with all, with few, and alone twice
+    assert len(started) <= 19 + 4 + 2 * 3  # and what two processes had under way at the two deaths that were not alone
+
+
+def test_workers_end_with_the_process_that_began_them() -> None:
+    code = (
+        "import os; from hil.campaign import processes\n"
+        "with processes(1)() as pool: print(pool.submit(os.getpid).result(), flush=True); input()"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = os.pidfd_open(int(parent.stdout.readline()))
+        parent.kill()
+        assert select.select([worker], [], [], 20.0)[0], "it goes on alone"
+        os.close(worker)

@@ -87,3 +87,34 @@ def test_docked_modules_are_refused() -> None:
 def test_worlds_in_unlike_tanks_are_refused() -> None:
     with pytest.raises(DescriptionError, match="differ in tank"):
         fly([*worlds(1), *worlds(1, "mobius-1")], np.zeros((10, 8)))
+
+
+@pytest.mark.parametrize("other", ["mobius-1", "mobius-2"])  # a cylinder; two modules
+def test_worlds_that_are_refused_have_not_moved(other: str) -> None:
+    refused, commands = worlds(1), pushes(1, 20)
+    with pytest.raises(DescriptionError):
+        fly([*refused, make_world(load_scenario(other), 0, PERIOD_NS)], commands[0])
+    assert refused[0].time_ns == 0
+    assert np.array_equal(fly(refused, commands), fly(worlds(1), commands))
+
+
+@pytest.mark.parametrize("shape", [(0, 8), (3, 0, 8)])
+def test_commands_of_no_ticks_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(DescriptionError, match="batch: commands of no ticks"):
+        fly(worlds(3), np.zeros(shape))
+
+
+def test_no_worlds_are_refused() -> None:
+    with pytest.raises(DescriptionError, match="batch: no worlds"):
+        fly([], np.zeros((10, 0)))
+
+
+def test_world_that_is_given_twice_is_refused() -> None:
+    one, other = worlds(2)
+    with pytest.raises(DescriptionError, match="the same world is given twice"):
+        fly([one, other, one], np.zeros((10, 8)))
+
+
+def test_less_than_no_threads_are_refused() -> None:
+    with pytest.raises(DescriptionError, match="batch: -1 threads"):
+        fly(worlds(1), np.zeros((10, 8)), threads=-1)

@@ -17,7 +17,18 @@ import hil.campaign
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
-from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, Pool, dask_cluster, fly_trial, kept, outcome_of, run_campaign
+from hil.campaign import (
+    SUMMARY_FILE,
+    TABLE_FILE,
+    TRIALS_FILE,
+    Pool,
+    TrialFile,
+    dask_cluster,
+    fly_trial,
+    kept,
+    outcome_of,
+    run_campaign,
+)
 from hil.campaign_summary import Trial, median_interval, summarise
 from hil.checks import Check, Result
 from hil.console import campaign_progress, print_campaign
@@ -149,12 +160,43 @@ def test_line_that_was_torn_off_is_flown_again(tmp_path: Path, monkeypatch: pyte
     assert [seed for seed, _ in flown] == [3, 4]
 
 
-def test_other_gains_begin_a_campaign_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trials_of_other_gains_are_thrown_away_only_when_told_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flown = flying(monkeypatch)
     fly(tmp_path, range(2))
-    other = Parameters().replace("control.position_bandwidth", 2.0)
-    run_campaign(load_scenario("spiral"), other, range(2), Inline, tmp_path)
+    kept_bytes = (tmp_path / TRIALS_FILE).read_bytes()
+    spiral, other = load_scenario("spiral"), Parameters().replace("control.position_bandwidth", 2.0)
+    with pytest.raises(DescriptionError, match=r"trials.jsonl holds trials of another scenario, controller or code; give another --out"):
+        run_campaign(spiral, other, range(2), Inline, tmp_path)
+    assert (tmp_path / TRIALS_FILE).read_bytes() == kept_bytes
+    fly(tmp_path, range(2))
+    assert [seed for seed, _ in flown] == [0, 1]
+    run_campaign(spiral, other, range(2), Inline, tmp_path, anew=True)
     assert [seed for seed, _ in flown] == [0, 1, 0, 1]
+    run_campaign(spiral, other, range(2), Inline, tmp_path, anew=True)
+    assert [seed for seed, _ in flown] == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize("begun", [b"", b'{"campaign": "other"}\n', b'{"campa'])
+def test_campaign_begins_where_another_has_left_no_trial(begun: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown = flying(monkeypatch)
+    (tmp_path / TRIALS_FILE).write_bytes(begun)
+    fly(tmp_path, range(2))
+    fly(tmp_path, range(2))
+    assert [seed for seed, _ in flown] == [0, 1]
+
+
+def test_two_campaigns_in_one_folder_do_not_fly_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flying(monkeypatch)
+
+    def meddle(done: int, total: int) -> None:
+        before = (tmp_path / TRIALS_FILE).read_bytes()
+        with pytest.raises(DescriptionError, match=r"trials.jsonl is being written by another campaign"):
+            fly(tmp_path, range(2))
+        assert (tmp_path / TRIALS_FILE).read_bytes() == before
+
+    fly(tmp_path, range(2), progress=meddle)
+    with TrialFile(tmp_path / TRIALS_FILE, "another", anew=True) as file:
+        assert not file.trials
 
 
 def test_order_in_which_trials_end_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,6 +237,97 @@ def test_workers_that_die_at_once_are_given_up(tmp_path: Path, monkeypatch: pyte
     flying(monkeypatch)
     with pytest.raises(DescriptionError, match="workers die before they finish a trial; 5 seeds are left, 0 the first"):
         fly(tmp_path, range(5), dying(after=0))
+
+
+def deadly(*seeds: int) -> Pool:
+    """Executors that break, as a pool of processes does, when one of these seeds is flown."""
+
+    class Deadly(Inline):
+        broken = False
+
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            if self.broken:
+                raise BrokenProcessPool("a worker died")
+            if args[2] not in seeds:
+                return super().submit(fn, *args, **kwargs)
+            self.broken = True
+            future: Future[Any] = Future()
+            future.set_exception(BrokenProcessPool("a worker died"))
+            return future
+
+    return Deadly
+
+
+@pytest.mark.parametrize(
+    ("seeds", "words"),
+    [
+        ((0,), "workers die of these seeds, each flown alone: 0; all others are flown"),
+        ((3, 4, 19), "each flown alone: 3, 4, 19; all others are flown"),
+        (tuple(range(10)), "10 seeds are left, 0 the first"),
+    ],
+)
+def test_seeds_that_kill_their_workers_are_named_when_all_others_are_flown(
+    seeds: tuple[int, ...], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown = flying(monkeypatch)
+    fly(tmp_path / "whole", range(20))
+    with pytest.raises(DescriptionError, match=words):
+        fly(tmp_path / "deadly", range(20), deadly(*seeds))
+    flown.clear()
+    fly(tmp_path / "deadly", range(20))
+    assert [seed for seed, _ in flown] == list(seeds)
+    assert content(tmp_path / "deadly") == content(tmp_path / "whole")
+
+
+def test_few_trials_are_under_way_after_a_death(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown, under_way = flying(monkeypatch), []
+    executors = iter([dying(after=0)(), Inline()])
+    monkeypatch.setattr(hil.campaign, "FEW", 4)
+    fly(tmp_path, range(20), lambda: next(executors), progress=lambda done, total: under_way.append(len(flown) - done + 1))
+    assert max(under_way) == 4
+
+
+def ending(end: Callable[[Future[Any]], object]) -> Pool:
+    """An executor in which seed 2 ends otherwise, and then ones that do all."""
+
+    class Ending(Inline):
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            if args[2] != 2:
+                return super().submit(fn, *args, **kwargs)
+            future: Future[Any] = Future()
+            end(future)
+            return future
+
+    left = [Ending]
+    return lambda: left.pop()() if left else Inline()
+
+
+def killed_on_dask(future: Future[Any]) -> None:
+    distributed = pytest.importorskip("distributed")
+    future.set_exception(distributed.KilledWorker("fly_trial", None, 3))
+
+
+def cancelled_on_dask(future: Future[Any]) -> None:
+    """As everything is when the scheduler is gone."""
+    future.cancel()
+    future.set_running_or_notify_cancel()
+
+
+@pytest.mark.parametrize("end", [killed_on_dask, cancelled_on_dask])
+def test_trial_that_a_cluster_loses_is_flown_again(
+    end: Callable[[Future[Any]], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown = flying(monkeypatch)
+    fly(tmp_path, range(5), ending(end))
+    assert [seed for seed, _ in flown] == [0, 1, 3, 4, 2]
+
+
+def test_trial_that_raises_takes_no_finished_one_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown = flying(monkeypatch)
+    with pytest.raises(PlugError):
+        fly(tmp_path, range(20), ending(lambda future: future.set_exception(PlugError())))
+    fly(tmp_path, range(20))
+    assert [seed for seed, _ in flown] == [0, 1, *range(3, 20), 2]
 
 
 def test_workers_that_are_kept_serve_every_campaign_until_one_dies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
