@@ -46,13 +46,19 @@ class Unknown(NamedTuple):
 
 
 def unknowns(thrusters: int) -> tuple[Unknown, ...]:
-    """What belongs to the vehicle. mass, inertia: logarithms of the totals; SI units."""
+    """What belongs to the vehicle. mass, inertia: logarithms of the totals; SI units.
+
+    shape: how the curve's shape is wrong. Shares of the force: reverse against forward, small commands against full ones forwards and in
+    reverse; and what small commands push too little, N, forwards and in reverse. A load cell with 0.02 N of noise is off by some per cent
+    where a robot that hovers pushes, and with it would be the gains of thrusters that push one way against those that push the other.
+    """
     return (
         Unknown("mass", 3, 1.0),
         Unknown("inertia", 3, 1.0),
         Unknown("gain", thrusters, 0.5),
         Unknown("deadband", thrusters, 0.1, 0.003),
         Unknown("lag", 1, 0.1),
+        Unknown("shape", 5, 0.05),
         Unknown("drag", 2, 1.0),
         Unknown("rotational", 3, 0.05),
         Unknown("crossflow", 3, 0.5),
@@ -93,6 +99,7 @@ def beginning(vehicle: Vehicle) -> dict[str, np.ndarray]:
         "gain": np.ones(count),
         "deadband": np.full(count, vehicle.curve.deadband_n),
         "lag": np.array([max(vehicle.curve.lag_s, SHORTEST_LAG_S)]),
+        "shape": np.zeros(5),
         "drag": np.array([vehicle.drag.cd_face, vehicle.drag.cd_edge]),
         "rotational": body.drag.rotational,
         "crossflow": np.zeros(3),
@@ -122,6 +129,7 @@ class Equations:
         moved = _cross(slope, lever) + _cross(motion.w_b, _cross(motion.w_b, lever)) if lever.any() else 0.0
         felt = self._seen(filled(recording.accel) + GRAVITY * down - moved)
         self.measured = np.hstack([felt, _slope(motion.w_b, recording.period_s)[self._rows - HALF_WINDOW]])
+        self._command = recording.command
         self._static = np.column_stack([_force(curve, u) for u in recording.command.T])
         self._scale = np.square(recording.voltage_v / curve.voltage_v)
         self._nodes = _drag_nodes(vehicle)
@@ -132,7 +140,7 @@ class Equations:
     def predict(self, x: Mapping[str, np.ndarray]) -> np.ndarray:
         """(n, 6) acceleration of the centre of mass and derivative of the rate; `x` holds the unknowns and nuisances by name."""
         thrust = np.column_stack([
-            self._once(i, np.array([x["lag"][0], x["deadband"][i]]), self._thrust) for i in range(len(x["gain"]))
+            self._once(i, np.array([x["lag"][0], x["deadband"][i], *x["shape"]]), self._thrust) for i in range(len(x["gain"]))
         ])  # fmt: skip
         v, drags = self._once("drag", x["current"], self._drag)
         w, mass, inertia = self._w, np.exp(x["mass"]), np.exp(x["inertia"])
@@ -155,9 +163,12 @@ class Equations:
         return kept[1]
 
     def _thrust(self, thruster: int, at: np.ndarray) -> np.ndarray:
-        """(n,) force of one thruster of gain 1, for a lag and a deadband."""
-        lag_s, deadband_n = max(float(at[0]), SHORTEST_LAG_S), at[1]
-        static = self._static[:, thruster]
+        """(n,) force of one thruster of gain 1, for a lag, a deadband and a shape (5,) of its curve."""
+        lag_s, deadband_n, (reverse, bent, bent_back, more, more_back) = max(float(at[0]), SHORTEST_LAG_S), at[1], at[2:]
+        static, small = self._static[:, thruster], 1.0 - np.abs(self._command[:, thruster])
+        backwards = static < 0.0
+        static = static * (1.0 + np.where(backwards, reverse + bent_back * small, bent * small))
+        static = static + np.sign(static) * np.where(backwards, more_back, more) * small**4
         working = 0.5 + 0.5 * np.tanh((np.abs(static) - deadband_n) / (2.0 * DEADBAND_EDGE_N))
         keep = np.exp(-self._period_s / lag_s)
         return self._seen(lfilter([1.0 - keep], [1.0, -keep], static * working) * self._scale)

@@ -111,7 +111,7 @@ def test_one_factor_of_everything_changes_no_motion(equations) -> None:  # type:
     """The errata's homogeneity: so no log alone can tell a mass."""
     x = identify_model.beginning(equations.vehicle) | {"current": np.array([0.05, -0.02, 0.0]), "bias": np.full(3, 0.03)}
     x["offset"], x["crossflow"], x["weight"] = np.full(3, 0.01), np.full(3, 0.2), np.array([0.3])
-    factor, logarithms, rest = 1.3, ("mass", "inertia"), ("lag", "deadband", "current", "bias")
+    factor, logarithms, rest = 1.3, ("mass", "inertia"), ("lag", "deadband", "shape", "current", "bias")
     scaled = {k: v + np.log(factor) if k in logarithms else v * (1.0 if k in rest else factor) for k, v in x.items()}
     free = without_weight(equations)
     assert free.predict(scaled) == pytest.approx(free.predict(x), rel=1e-9, abs=1e-12)
