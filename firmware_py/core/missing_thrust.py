@@ -43,6 +43,8 @@ SIGNIFICANT = 20.0
 """Squared sigmas that it must explain."""
 FORCES = 15
 """Column of a block where the thrusters' forces begin."""
+FRESH_NS = 500_000_000
+"""Age of the newest tag from which on nothing is judged: without tags a robot that tumbles knows its tilt and speed too badly."""
 MOST = 2.6
 """A thruster cannot lose more than this many times its force: 2 is reversed."""
 
@@ -116,6 +118,7 @@ class MissingThrust:
         n = self._n
         span = (self._last_n - self._first_n) * self._period_s
         whole = self._accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
+        whole = whole and estimate.tag_age_ns < FRESH_NS
         rest, acted = np.full(6, np.nan), self._columns.T @ (self._sum_f / n)
         if whole and self._last is not None and self._first is not None:
             motion = np.r_[self._sum_a / self._accels, (self._last - self._first) / span]
