@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from statistics import median
 
 from accept_figures import Figure, Group
 from accept_measures import Values, said_by_tests
@@ -18,21 +19,24 @@ from hil.scenario import load_scenario
 
 TRIALS = range(16)
 """Of the campaign that is timed: enough for a start of its processes not to count."""
+REPETITIONS = 3
+"""One worker and two in turn, for this machine's speed changes within minutes."""
 WORKERS_TEST = "tests/closed_loop/test_campaign_workers.py"
 TUNE = ["tools/objectives/spiral-and-push.toml", "--detune", "1", "--trials", "1000", "--minutes", "10"]
 
 
 def speedup(folder: Path) -> Values:
-    """How many times as fast two processes fly a campaign as one does, and tables of theirs that differ, of two."""
-    took_s, tables = [], []
-    for jobs in (1, 2):
+    """How many times as fast two processes fly a campaign as one does, by medians, and files of theirs that differ from the first's."""
+    took_s: dict[int, list[float]] = {1: [], 2: []}
+    tables = []
+    for jobs in REPETITIONS * (1, 2):
         out = folder / f"jobs-{jobs}"
         shutil.rmtree(out, ignore_errors=True)
         began_s = time.monotonic()
         run_campaign(load_scenario("spiral"), Parameters(), TRIALS, processes(jobs), out)
-        took_s.append(time.monotonic() - began_s)
+        took_s[jobs].append(time.monotonic() - began_s)
         tables.append([(out / name).read_bytes() for name in (SUMMARY_FILE, TABLE_FILE)])
-    return {"speedup": took_s[0] / took_s[1], "different": sum(one != two for one, two in zip(*tables, strict=True))}
+    return {"speedup": median(took_s[1]) / median(took_s[2]), "different": sum(table != tables[0] for table in tables)}
 
 
 def tuned(folder: Path) -> Values:
@@ -54,7 +58,7 @@ TUNING: tuple[Group, ...] = (
         "workers", 9, "modcube hil campaign spiral --trials 16 --jobs 1, and --jobs 2", speedup,
         (
             Figure("campaign, 16 spirals: two workers faster than one by", "speedup", low=1.8, unit="times"),
-            Figure("campaign, 16 spirals: tables of one and of two workers that differ, of two", "different", high=0.0),
+            Figure("the same: tables of one and of two workers that differ, of six", "different", high=0.0),
         ),
     ),
     Group(
