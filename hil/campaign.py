@@ -102,12 +102,15 @@ def _numbers(values: dict[str, float]) -> dict[str, float | None]:
 class TrialFile:
     """trials.jsonl: who it belongs to, then a line for each trial, with the disk before the next one is waited for."""
 
-    def __init__(self, path: Path, owner: str, key: str = "seed", anew: bool = False) -> None:
+    def __init__(
+        self, path: Path, owner: str, key: str = "seed", anew: bool = False, who: str = "scenario, controller or code"
+    ) -> None:
         """Goes on in `path` if it is `owner`'s; a line that was torn is flown again.
 
         Args:
             key: tells trials apart.
             anew: throws another owner's trials away.
+            who: in what another owner may differ, for people.
 
         Raises:
             DescriptionError: `path` is being written, or holds trials of another owner.
@@ -117,7 +120,7 @@ class TrialFile:
         with ExitStack() as refused:
             self._file = refused.enter_context(path.open("a+b"))
             self._claim(path)
-            stands = self._read(path, owner, anew)
+            stands = self._read(path, {"campaign": owner}, "" if anew else who)
             self._file.truncate(stands)
             refused.pop_all()
         if not stands:
@@ -130,13 +133,13 @@ class TrialFile:
         except BlockingIOError:
             raise DescriptionError(f"{path} is being written by another campaign; wait for it or give another --out") from None
 
-    def _read(self, path: Path, owner: str, anew: bool) -> int:
-        """Bytes that stand."""
+    def _read(self, path: Path, head: Trial, who: str) -> int:
+        """Bytes that stand; without `who` those of another head do not."""
         self._file.seek(0)
         lines = self._file.readlines()
-        if not lines or _entry(lines[0]) != {"campaign": owner}:
-            if lines[1:] and not anew:
-                raise DescriptionError(f"{path} holds trials of another scenario, controller or code; give another --out or delete it")
+        if not lines or _entry(lines[0]) != head:
+            if lines[1:] and who:
+                raise DescriptionError(f"{path} holds trials of another {who}; give another --out or delete it")
             return 0
         stands = len(lines[0])
         for line in lines[1:]:
@@ -179,6 +182,8 @@ def processes(jobs: int) -> Pool:
 
 
 def _end_with_parent() -> None:
+    """In a worker: a parent that is killed tells nobody, and its workers would wait for work for ever."""
+
     def wait() -> None:
         if parent := parent_process():
             parent.join()

@@ -98,8 +98,8 @@ def campaign(
     from hil.flight import fly_and_judge, illustrate
 
     chosen = scenario_of(scenario, vehicle, sensors)
-    special = (Path(vehicle).stem, Path(controller).stem.replace("modcube", ""), sensors.replace("real", ""))
-    folder = out if out is not None else Path("runs") / "-".join(filter(None, (chosen.name, *special, "campaign")))
+    unusual = [Path(given).stem for given, usual in ((vehicle, ""), (controller, "modcube"), (sensors, "real")) if given != usual]
+    folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual, "campaign"])
     parameters, seeds = parameters_of(controller), range(seed, seed + trials)
     with campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
         pool = dask_cluster(dask) if dask else processes(jobs)

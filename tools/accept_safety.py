@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import shutil
 import subprocess
 import sys
 import time
@@ -105,6 +106,7 @@ def replayed(folder: Path) -> Values:
     """A hover of ten minutes, fed through the same code again."""
     base = load_scenario("hover")
     task = dataclasses.replace(base.task, duration_s=LOGGED_S - base.task.settle_s)
+    shutil.rmtree(folder, ignore_errors=True)
     fly_scenario(dataclasses.replace(base, task=task), 0, Parameters(), folder, "virtual:replayed")
     began_s = time.perf_counter()
     outcome = replay(folder)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import math
 import sys
 import tomllib
 from collections.abc import Callable, Sequence
@@ -24,6 +23,7 @@ from typing import Any, NoReturn
 import characterise_blas  # noqa: F401
 import characterise_table as table
 import numpy as np
+from argument_types import positive, whole
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -71,15 +71,15 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument("--module", default="modcube", help="vehicle of every module of an assembly")
     parser.add_argument("--table1", action="store_true", help="the paper's seven robots beside its Table I")
-    parser.add_argument("--choose", type=_count, metavar="N", help="rank all shapes of N modules, 1 to 5")
+    parser.add_argument("--choose", type=whole(1), metavar="N", help="rank all shapes of N modules, 1 to 5")
     parser.add_argument("--task", type=Path, metavar="FILE", help="task file for --choose")
     parser.add_argument("--out", type=Path, metavar="DIR", help="CSV, JSON, figure (PNG) and report (HTML) go there")
-    parser.add_argument("--directions", type=_count, default=DIRECTIONS, help="directions over the sphere, 121 or more")
-    parser.add_argument("--force", type=_size, default=1.0, metavar="N", help="wrench of the power space, force frame")
+    parser.add_argument("--directions", type=whole(1), default=DIRECTIONS, help="directions over the sphere, 121 or more")
+    parser.add_argument("--force", type=positive, default=1.0, metavar="N", help="wrench of the power space, force frame")
     parser.add_argument(
-        "--torque", type=_size, default=1.0, metavar="NM", help="wrench of the power space, torque frame"
+        "--torque", type=positive, default=1.0, metavar="NM", help="wrench of the power space, torque frame"
     )
-    parser.add_argument("--jobs", type=_count, default=2, help="processes")
+    parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
     given = parser.parse_args()
     if sum([bool(given.vehicle), given.assembly is not None, given.table1, given.choose is not None]) != 1:
         parser.error("give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE")
@@ -88,22 +88,6 @@ def arguments() -> argparse.Namespace:
     if not LEAST_DIRECTIONS <= given.directions <= MOST_DIRECTIONS:
         parser.error(f"--directions {given.directions}: permitted: {LEAST_DIRECTIONS} to {MOST_DIRECTIONS}")
     return given
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
-    return int(text)
-
-
-def _size(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above zero")
-    return value
 
 
 def run(given: argparse.Namespace) -> None:

@@ -109,6 +109,7 @@ def ratios(fit: Fit) -> list[Quantity]:
         Quantity(f"gain of thruster {k + 1} over the mean", "", lambda x, k=k: float(x[gains][k] / np.mean(x[gains])), "turning")
         for k in range(gains.stop - gains.start)
     ]
+    found.append(Quantity("force in reverse over that forwards, against the curve's", "", lambda x: 1.0 + float(x[at["shape"]][0])))
     return [*found, Quantity("thruster lag", "s", lambda x: float(x[at["lag"]][0]), "along x")]
 
 

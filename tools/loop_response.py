@@ -74,6 +74,11 @@ def corners(spread: float) -> list[Scale]:
     return [Scale(m, i, t) for m in sides for i in sides for t in sides]
 
 
+def body_of(modules: int, vehicle: str) -> Body:
+    """The body of so many of these vehicles. Raises DescriptionError."""
+    return assemble(BODIES[modules], [0] * modules, [load_vehicle(vehicle)] * modules)
+
+
 class Response(NamedTuple):
     """L of one axis: (k,) frequencies, rad/s, and (k,) complex values."""
 
@@ -88,8 +93,7 @@ class Loop:
 
     def __init__(self, modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicle: str = "modcube") -> None:
         described = load_vehicle(vehicle)
-        cells = BODIES[modules]
-        self.body = assemble(cells, [0] * modules, [described] * modules)
+        self.body = body_of(modules, vehicle)
         self._chain = BodyPipeline(self.body, parameters, PERIOD_NS)
         self.aim = HOME
         self._sensors_spec = dataclasses.replace(SensorSpec(), **{**IDEAL, "tag_delay_ms": SensorSpec().tag_delay_ms})

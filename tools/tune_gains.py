@@ -14,16 +14,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import platform
 import sys
 import time
-from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from argument_types import positive, whole
 from tune_objective import Objective, detuned, load_objective, with_values
 
 from firmware_py.description.parameters import Parameters, load_parameters
@@ -77,7 +76,7 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
     """Searches, compares, writes and draws."""
     from optuna.trial import TrialState
     from tune_plots import draw
-    from tune_search import Progress, check_folder, search
+    from tune_search import Progress, search
 
     def tell(p: Progress) -> None:
         print(
@@ -85,7 +84,6 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
             f"  {time.monotonic() - began:6.0f} s", flush=True,
         )  # fmt: skip
 
-    check_folder(given.out, objective, start, given.seed)
     began = time.monotonic()
     figures = {}
     with kept(pool) as workers:
@@ -104,29 +102,7 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
     write_result(objective, best, study, given.out, figures, given.seed)
     print(f"parameters: {given.out / 'parameters.toml'}  ({time.monotonic() - began:.0f} s)", flush=True)
     if not given.no_plots:
-        draw(given.out, objective, study, sets, objective.flight[0].flown().module[0].vehicle)
-
-
-def whole(least: int) -> Callable[[str], int]:
-    """Reads a whole number that is not below `least`."""
-
-    def read(text: str) -> int:
-        if not text.isdigit() or int(text) < least:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least} on")
-        return int(text)
-
-    return read
-
-
-def positive(text: str) -> float:
-    """Reads a number above zero."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not value > 0.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
-    return value
+        draw(given.out, objective, study, sets, objective.vehicle)
 
 
 def arguments() -> argparse.Namespace:

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from loop_response import BODIES, Scale, margins, measure
+from loop_response import BODIES, Scale, body_of, margins, measure
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
-from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.assembly import assemble
 from hil.metrics import SHOWN
 from hil.scenario import Scenario, load_scenario
 
@@ -124,13 +122,16 @@ class Objective:
         """The objective, out of the costs of all flights: their mean, and of the worst one its share."""
         return (1.0 - self.worst_share) * float(np.mean(costs)) + self.worst_share * max(costs)
 
+    @property
+    def vehicle(self) -> str:
+        """Whose margins and plots: that of the first flight."""
+        return self.flight[0].flown().module[0].vehicle
+
     def shortfall(self, parameters: Parameters) -> float:
-        """What the margins lack, for the vehicle of the first flight; comes on top of the flights."""
-        if not self.stability:
-            return 0.0
-        vehicle, costs = self.flight[0].flown().module[0].vehicle, []
+        """What the margins lack; comes on top of the flights."""
+        costs = []
         for wanted in self.stability:
-            responses = measure(wanted.modules, parameters, Scale(wanted.mass, wanted.inertia, wanted.lag), vehicle)
+            responses = measure(wanted.modules, parameters, Scale(wanted.mass, wanted.inertia, wanted.lag), self.vehicle)
             gains, phases, _ = zip(*map(margins, responses), strict=True)
             costs.append(wanted.cost(min(gains), min(phases)))
         return math.fsum(costs)
@@ -164,9 +165,8 @@ def load_objective(path: Path) -> Objective:
     """The objective in a file, its scenarios checked. Raises DescriptionError, one line."""
     table, source = read_toml(path)
     objective: Objective = build(Objective, table, source)
-    vehicle = load_vehicle(objective.flight[0].flown().module[0].vehicle)
     for spec in objective.flight:
         spec.flown()
     for wanted in objective.stability:
-        assemble(BODIES[wanted.modules], [0] * wanted.modules, [vehicle] * wanted.modules)
+        body_of(wanted.modules, objective.vehicle)
     return objective

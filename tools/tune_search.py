@@ -7,7 +7,6 @@ started again proposes what it would have proposed, and ends in the same bytes a
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
@@ -22,7 +21,6 @@ from tune_objective import Objective, with_values
 from tune_sampler import GaussianProcessSampler
 
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.schema import DescriptionError
 from hil import campaign
 from hil.campaign import TrialFile, code_digest, fly_trial
 
@@ -50,16 +48,6 @@ def identity(objective: Objective, start: Parameters, seed: int) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-def check_folder(out: Path, objective: Objective, start: Parameters, seed: int) -> None:
-    """Raises DescriptionError where `out` holds the trials of another search: nobody's hours are thrown away."""
-    path = out / TRIALS_FILE
-    if not path.exists():
-        return
-    head, newline, _ = path.read_bytes().partition(b"\n")
-    if newline and head != json.dumps({"campaign": identity(objective, start, seed)}).encode():
-        raise DescriptionError(f"{path} holds trials of another objective, start, seed or code; give another --out")
-
-
 def running_totals(objective: Objective, parameters: Parameters, pool: Executor) -> Iterator[float]:
     """The objective over the search's seeds, after each flight of it that was flown in all worlds.
 
@@ -84,12 +72,16 @@ def search(
     tell: Callable[[Progress], None],
     end_s: float = float("inf"),
 ) -> optuna.Study:
-    """Goes on in `out` until `trials` trials are done, or no more is begun after `end_s` of time.monotonic(); returns the study."""
+    """Goes on in `out` until `trials` trials are done, or no more is begun after `end_s` of time.monotonic(); returns the study.
+
+    Raises DescriptionError where `out` holds the trials of another search: nobody's hours are thrown away.
+    """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     bounds = {s.parameter: FloatDistribution(s.low, s.high, log=s.logarithmic) for s in objective.search}
     sampler = GaussianProcessSampler(bounds, seed, FIRST_AT_RANDOM)
     study = optuna.create_study(sampler=sampler, pruner=optuna.pruners.MedianPruner(n_startup_trials=4))
-    with TrialFile(out / TRIALS_FILE, identity(objective, start, seed), key="number") as file:
+    who = "objective, start, seed or code"
+    with TrialFile(out / TRIALS_FILE, identity(objective, start, seed), key="number", who=who) as file:
         for number in sorted(file.trials):
             study.add_trial(_restored(file.trials[number], bounds))
         while len(file.trials) < trials and time.monotonic() < end_s:

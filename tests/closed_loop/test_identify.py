@@ -82,6 +82,18 @@ def test_without_a_reference_no_mass_is_stated(
     assert not plant[1]["states_mass"]
 
 
+def test_wrong_shape_of_the_measured_curve_moves_no_gain(equations) -> None:  # type: ignore[no-untyped-def]
+    """Reverse 2 % strong, small commands some per cent off: as by the noise of a load cell. Thrusters push one way more than the other."""
+    free = without_weight(equations)
+    x = identify_model.beginning(free.vehicle)
+    x["gain"] = x["gain"] * np.linspace(0.95, 1.05, 8)
+    x["shape"] = np.array([0.02, 0.02, -0.03, -0.01, 0.02])
+    noise = np.random.default_rng(0).standard_normal(free.measured.shape) * np.repeat([0.001, 0.003], 3)
+    free.measured = free.predict(x | {"current": np.zeros(3), "bias": np.zeros(3)}) + noise
+    gain = identify_fit.fit([free], identify_fit.Reference(0, 0.02)).value("gain")
+    assert gain / gain.mean() == pytest.approx(x["gain"] / x["gain"].mean(), abs=0.004)
+
+
 @pytest.mark.parametrize(("hung", "complaint"), [("0:1000", "hung during all of the log"), ("500:1000", "did not hang during the log")])
 def test_weight_that_neither_came_nor_went_states_no_mass(
     hung: str, complaint: str, plant: tuple[Path, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -165,3 +165,16 @@ def test_compiled_code_older_than_any_source_that_it_may_have_taken_in_is_forgot
     forget_stale_code(tmp_path / "mine", tmp_path / "used")
     assert not paths.pop("mine/__pycache__/sums.run-3.py311.nbi").exists()
     assert all(path.exists() for path in paths.values())
+
+
+def test_folder_that_cannot_be_read_does_not_stop_the_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone" / "__pycache__").mkdir(parents=True)
+    scandir = os.scandir
+
+    def listed_but_gone(path: Path) -> object:
+        if Path(path).name == "__pycache__":
+            raise FileNotFoundError(path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", listed_but_gone)
+    forget_stale_code(tmp_path)

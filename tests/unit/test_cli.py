@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 import hil.bench
+import hil.campaign
 from firmware_py.cli import main
 from hil.scenario import scenario_names
 
@@ -157,3 +158,30 @@ def test_list_names_every_scenario_with_one_line_of_help(
     assert ended.value.code == 0
     assert [line.split()[0] for line in lines] == scenario_names()
     assert all(len(line.split()) > 3 for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("options", "folder"),
+    [
+        ([], "hover-campaign"),
+        (["--controller", "paper", "--sensors", "ideal"], "hover-paper-ideal-campaign"),
+        (["--controller", "mymodcube.toml", "--vehicle", "bluerov2_heavy"], "hover-bluerov2_heavy-mymodcube-campaign"),
+    ],
+)
+def test_campaigns_of_different_robots_have_folders_of_their_own(
+    options: list[str], folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None refuses to begin for the trials of the other."""
+    taken: list[Path] = []
+
+    def fly(scenario: object, parameters: object, seeds: object, pool: object, out: Path, progress: object) -> None:
+        taken.append(out)
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mymodcube.toml").write_text("")
+    monkeypatch.setattr(hil.campaign, "run_campaign", fly)
+    monkeypatch.setattr("sys.argv", ["modcube", "hil", "campaign", "hover", *options])
+    with pytest.raises((SystemExit, KeyboardInterrupt)):
+        main()
+    assert taken == [Path("runs") / folder]

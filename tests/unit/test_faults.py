@@ -39,6 +39,7 @@ class Water:
         self.speed_factor = np.ones(n)
         self.status = np.zeros(n, dtype=int)
         self.heard = 1.0
+        self.tag_age_ns = 0
         self.x = np.zeros(STATES)
         self.x[3:7] = from_euler(0.05, -0.02, 0.3)
         self.x[19:22], self.x[22:25] = [0.1, -0.05, 0.1], [0.003, -0.004, 0.002]
@@ -66,7 +67,7 @@ class Water:
         self.x = propagation.step(self.x, tau, DT, *plant)
         estimate = Estimate(
             self.x[:3].copy(), self.x[3:7].copy(), self.x[7:13].copy(), ZERO, ZERO, np.full(3, 0.002), np.full(3, 0.0009),
-            0, 1.0, 6, 0, True,
+            self.tag_age_ns, 1.0, 6, 0, True,
         )  # fmt: skip
         gyro = self.x[10:13] + 0.005 + 0.002 * self.rng.normal(size=3)
         weight = to_matrix(self.x[3:7].copy()).T @ np.array([0.0, 0.0, 9.80665])
@@ -182,6 +183,19 @@ def test_lying_thruster_is_found_within_two_seconds(thruster: int, gain: float) 
     water.gain[thruster] *= gain
     found = water.run(2.0)
     assert [words for _, words in found] == [f"thruster {thruster + 1} does not push as it says: left out"]
+
+
+def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_sees_no_tag_and_is_when_it_sees_one_again() -> None:
+    """Blind it knows its tilt and speed too badly."""
+    water = Water(seed=2)
+    water.fly()
+    water.tag_age_ns = 600_000_000
+    water.gain[2] = 0.0
+    assert water.run(2.0) == []
+    water.gain[2], water.tag_age_ns = 1.0, 0
+    assert water.run(6.0) == []
+    water.gain[2] = 0.0
+    assert [words for _, words in water.run(2.0)] == ["thruster 3 does not push as it says: left out"]
 
 
 def test_lying_thruster_is_found_from_the_moment_of_arming() -> None:

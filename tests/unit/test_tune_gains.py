@@ -148,9 +148,9 @@ def test_other_seed_searches_elsewhere(tools: tuple[Any, Any], tmp_path: Path) -
 def test_folder_of_another_search_is_not_thrown_away(tools: tuple[Any, Any], tmp_path: Path) -> None:
     search(tools, tmp_path, 2, Inline())
     objective = objective_of(tools, tmp_path)
-    tools[1].check_folder(tmp_path, objective, START, 0)
+    search(tools, tmp_path, 2, Inline())
     with pytest.raises(DescriptionError, match=r"search.jsonl holds trials of another objective.*give another --out"):
-        tools[1].check_folder(tmp_path, objective, Parameters(), 0)
+        tools[1].search(objective, Parameters(), 2, tmp_path, Inline(), 0, lambda progress: None)
     assert json.loads((tmp_path / "search.jsonl").read_text().splitlines()[-1])["number"] == 1
 
 
