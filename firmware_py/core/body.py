@@ -78,6 +78,7 @@ class Body:
         tag_ids: (t,) ids; tag_module: (t,) index within the body; r_bt: (t, 3); q_bt: (t, 4) tag frame to body frame.
         tag_module and r_bt follow the order of tag_ids.
         supply_power_w: (m,) what each module's supply gives to its thrusters and magnets.
+        reach_m: no point of its hulls is farther from the centre of mass, m.
         cells: (m, 3) lattice cells; name: for people.
     """
 
@@ -99,6 +100,7 @@ class Body:
     r_bt: np.ndarray
     q_bt: np.ndarray
     supply_power_w: np.ndarray
+    reach_m: float
 
     @property
     def index(self) -> int:

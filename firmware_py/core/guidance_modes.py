@@ -5,6 +5,7 @@ No change of mode jumps: set-points go on from where they are, and the wrench mo
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -14,13 +15,13 @@ from firmware_py.core.body import Body
 from firmware_py.core.health import Health
 from firmware_py.core.rotations import difference, heading, rotate, rotate_back
 from firmware_py.core.setpoint import Glider, Trajectory, Wish, ahead_of, at_estimate, rest_at
-from firmware_py.core.supervisor import Decision
+from firmware_py.core.supervisor import TAKES_OVER, Decision
 from firmware_py.core.transitions import Effect
 from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 
 NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-ZERO = np.zeros(3)
+ZERO, DOWN = np.zeros(3), np.array([0.0, 0.0, 1.0])
 NEAR_M, NEAR_RAD = 0.2, 0.35
 """A set-point no farther from the body is gone on from; otherwise the body itself is."""
 
@@ -89,12 +90,20 @@ class Guidance:
             self._point = (time_ns, argument)
         elif effect == Effect.STOP:
             self.rest(estimate)
-        elif effect in (Effect.ENTER_MODE, Effect.HOLD_AT, Effect.FOLLOW, Effect.TEST_MOTOR):
+        elif effect in (*TAKES_OVER, Effect.TEST_MOTOR):
             self._enter(decision.mode, estimate)
-            if effect == Effect.HOLD_AT and argument is not None:
+            if effect == Effect.ENTER_LEVEL:
+                self._level()
+            elif effect == Effect.HOLD_AT and argument is not None:
                 self._goal = rest_at(self._inside(argument.p_wb), argument.q_wb)
             elif effect == Effect.FOLLOW:
                 self.follow(argument)
+
+    def _level(self) -> None:
+        """A body that is steeper than a hold may keep is to turn upright where it is."""
+        at = self._glider.at
+        if rotate(at.q_wb, DOWN)[2] < math.cos(self._p.hold_tilt_rad):
+            self._goal = rest_at(self._inside(at.p_wb), heading(at.q_wb))
 
     def rest(self, estimate: Estimate) -> None:
         """The body is disarmed: the set-point stays where it is believed to be."""
@@ -181,10 +190,11 @@ class Guidance:
             return Wish(ZERO, ZERO)
         sticks = self._read_sticks(time_ns)
         rate = p.rate_rad_s * np.array(sticks.moment)
-        if self.mode == Mode.ALT_HOLD:
-            return Wish(np.array([0.0, 0.0, p.speed_m_s * sticks.force[2]]), rate)
         if any(sticks.force) or any(sticks.moment):
             self._goal = None
+        if self.mode == Mode.ALT_HOLD:
+            upright = None if self._goal is None else self._goal.q_wb
+            return Wish(np.array([0.0, 0.0, p.speed_m_s * sticks.force[2]]), rate, None, upright)
         if self._goal is not None:
             return Wish(ZERO, ZERO, self._goal.p_wb, self._goal.q_wb)
         v_w = np.asarray(rotate(at.q_wb, p.speed_m_s * np.array(sticks.force)))

@@ -118,7 +118,8 @@ class MissingThrust:
         n = self._n
         span = (self._last_n - self._first_n) * self._period_s
         felt = self._accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
-        whole = felt and estimate.tag_age_ns < FRESH_NS
+        alone = estimate.p_wb[2] > self._body.reach_m  # at the surface pushes what no model here knows
+        whole = felt and alone and estimate.tag_age_ns < FRESH_NS
         rest, acted = np.full(6, np.nan), self._columns.T @ (self._sum_f / n)
         if whole and self._last is not None and self._first is not None:
             motion = np.r_[self._sum_a / self._accels, (self._last - self._first) / span]

@@ -186,5 +186,5 @@ class Supervisor:
         self.events.append(Event(severity, text))
 
 
-TAKES_OVER = (Effect.ENTER_MODE, Effect.HOLD_AT, Effect.FOLLOW)
-"""Effects by which a person chooses how the body is steered."""
+TAKES_OVER = (Effect.ENTER_MODE, Effect.ENTER_LEVEL, Effect.HOLD_AT, Effect.FOLLOW)
+"""Effects by which a person or a fail-safe chooses how the body is steered."""

@@ -96,6 +96,8 @@ class Effect(IntEnum):
     """Note the pilot's sticks."""
     TEST_MOTOR = 7
     """Turn the given thruster."""
+    ENTER_LEVEL = 8
+    """Steer by the new mode, from where the body is, and turn upright if it is steep: cameras see its tags then."""
 
 
 class Transition(NamedTuple):
@@ -143,8 +145,8 @@ TABLE = (
     Transition(A, T.MOTOR_TEST, G.IN_MOTOR_DETECT, F.TEST_MOTOR, A),
     Transition(A, T.TEST_OVER, G.TESTING, F.STOP, D, Mode.POSHOLD),
     Transition(A, T.DOCK_OVER, G.IN_DOCK, F.ENTER_MODE, A, Mode.POSHOLD),
-    Transition(A, T.FAILSAFE_HOLD, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.POSHOLD),
-    Transition(A, T.FAILSAFE_DEPTH, G.MODE_NEEDS, F.ENTER_MODE, A, Mode.ALT_HOLD),
+    Transition(A, T.FAILSAFE_HOLD, G.MODE_NEEDS, F.ENTER_LEVEL, A, Mode.POSHOLD),
+    Transition(A, T.FAILSAFE_DEPTH, G.MODE_NEEDS, F.ENTER_LEVEL, A, Mode.ALT_HOLD),
     Transition(A, T.FAILSAFE_SURFACE, G.ALWAYS, F.ENTER_MODE, A, Mode.SURFACE),
     Transition(A, T.FAILSAFE_DISARM, G.ALWAYS, F.STOP, D),
     Transition(E, T.ESTOP_FRAME, G.ALWAYS, F.NOTHING, E),

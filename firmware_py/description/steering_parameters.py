@@ -45,6 +45,9 @@ class Steering:
     join_rad: float = quantity(
         0.20, unit="rad", low=0, high=3.2, help="the same for its attitude", mavlink="AUTO_JOIN_ANG"
     )
+    hold_tilt_rad: float = quantity(
+        0.6, unit="rad", low=0, high=3.2, help="a body that a fail-safe makes hold turns upright if it is steeper", mavlink="HOLD_TILT"
+    )
     surface_speed_m_s: float = quantity(0.10, unit="m/s", low=0.01, high=2, help="of rising", mavlink="SURF_SPEED")
     surface_depth_m: float = quantity(
         0.12, unit="m", low=0, high=10, help="depth of the centre of mass at the surface", mavlink="SURF_DEPTH"

@@ -127,6 +127,7 @@ def _body(
         r_bt=np.array([r_bm[k] + turns[k] @ tag.position_m for k, tag in tags]).reshape(-1, 3),
         q_bt=np.array([_turned(q_bm[k], tag.quaternion) for k, tag in tags]).reshape(-1, 4),
         supply_power_w=np.array([_power(p.vehicle) for p in placements]),
+        reach_m=max(_reach_m(p.vehicle, r) for p, r in zip(placements, r_bm, strict=True)),
     )
 
 
@@ -136,6 +137,11 @@ def _turned(q_bm: np.ndarray, q_mt: np.ndarray) -> np.ndarray:
 
 def _power(vehicle: Vehicle) -> float:
     return vehicle.supply.voltage_v * vehicle.supply.current_a - vehicle.supply.idle_w
+
+
+def _reach_m(vehicle: Vehicle, r_bm: np.ndarray) -> float:
+    """How far the corners of the hull's box may be from the centre of mass, m."""
+    return float(np.linalg.norm(r_bm) + 0.5 * np.linalg.norm(vehicle.hull.size_m))
 
 
 def _righting(placement: Placement) -> np.ndarray:

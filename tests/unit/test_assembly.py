@@ -222,6 +222,15 @@ def test_supply_of_each_module_is_what_its_electronics_leave(modcube: Vehicle) -
     np.testing.assert_allclose(assemble(SHAPES["2x2"], [0] * 4, [modcube] * 4).supply_power_w, 12.0 * 10.0 - 8.0)
 
 
+def test_no_corner_of_a_hull_is_farther_than_the_reach_of_the_body(modcube: Vehicle) -> None:
+    half = 0.5 * modcube.hull.size_m
+    for cells in SHAPES.values():
+        body = assemble(cells, [0] * len(cells), [modcube] * len(cells))
+        corners = [r + half * sign for r in body.r_bm for sign in itertools.product((-1, 1), repeat=3)]
+        farthest = np.linalg.norm(corners, axis=1).max()
+        assert farthest - 1e-12 <= body.reach_m < 1.25 * farthest
+
+
 def test_arrays_of_a_body_suit_compiled_functions(modcube: Vehicle) -> None:
     body = assemble(SHAPES["tripod"], [0] * 4, [modcube] * 4)
     arrays = [getattr(body, f.name) for f in dataclasses.fields(body)]

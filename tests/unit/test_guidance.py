@@ -1,13 +1,14 @@
 """Guidance: what each mode makes of sticks, set-points and trajectories, and that no change of mode jumps."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import Health
-from firmware_py.core.rotations import difference, from_euler, heading, rotate
+from firmware_py.core.rotations import difference, from_euler, heading, rotate, to_matrix
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.supervisor import Decision
 from firmware_py.core.transitions import Effect, Trigger
@@ -222,6 +223,25 @@ def test_single_point_is_flown_to_without_a_stream() -> None:
     flight.run(0.5)
     flight.do(Effect.TAKE_POINT, Mode.GUIDED, rest_at(np.array([0.0, 0.0, 2.0]), estimate().q_wb))
     assert flight.run(15.0).p_wb[2] == pytest.approx(2.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("mode", [Mode.POSHOLD, Mode.ALT_HOLD])
+@pytest.mark.parametrize(
+    ("roll", "given", "tilt"),
+    [(2.6, None, 0.0), (0.62, None, 0.0), (0.58, None, 0.58), (2.6, Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)), 2.6)],
+    ids=["upside down", "steep", "tilted", "a pilot turns it"],
+)
+def test_steep_robot_that_a_failsafe_makes_hold_turns_upright_where_it_is(
+    mode: Mode, roll: float, given: Sticks | None, tilt: float
+) -> None:
+    flight = Flight()
+    flight.estimate = estimate((1.0, 0.5, 2.0), from_euler(roll, 0.0, 0.3))
+    flight.do(Effect.ENTER_LEVEL, mode)
+    now = flight.run(15.0, given)
+    assert math.acos(to_matrix(now.q_wb)[2, 2]) == pytest.approx(tilt, abs=0.02)
+    np.testing.assert_allclose(now.p_wb, [1.0, 0.5, 2.0], atol=0.02)
+    steps = [np.linalg.norm(difference(a.q_wb, b.q_wb)) for a, b in itertools.pairwise(flight.setpoints)]
+    assert max(steps) < 0.01
 
 
 def test_surfacing_robot_rises_levels_and_stays_up() -> None:

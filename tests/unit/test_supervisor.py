@@ -81,7 +81,7 @@ def test_numbers_are_those_of_the_logs() -> None:
     ]  # fmt: skip
     assert [int(trigger) for trigger in Trigger] == list(range(20))
     assert [int(guard) for guard in Guard] == list(range(9))
-    assert [int(effect) for effect in Effect] == list(range(8))
+    assert [int(effect) for effect in Effect] == list(range(9))
     assert [int(need) for need in Need] == list(range(4))
     assert {Trigger.DOCK, Trigger.UNDOCK} == DOCKING and {State.ARMED} == ARMED
 
@@ -152,8 +152,8 @@ def test_armed_robot_changes_its_mode_by_these_rows() -> None:
     assert row(a, Trigger.TRACK) == (permitted, Effect.FOLLOW, a, Mode.AUTO)
     assert row(a, Trigger.DOCK) == row(a, Trigger.UNDOCK) == (permitted, Effect.ENTER_MODE, a, Mode.DOCK)
     assert row(a, Trigger.DOCK_OVER) == (Guard.IN_DOCK, Effect.ENTER_MODE, a, Mode.POSHOLD)
-    assert row(a, Trigger.FAILSAFE_HOLD) == (needs, Effect.ENTER_MODE, a, Mode.POSHOLD)
-    assert row(a, Trigger.FAILSAFE_DEPTH) == (needs, Effect.ENTER_MODE, a, Mode.ALT_HOLD)
+    assert row(a, Trigger.FAILSAFE_HOLD) == (needs, Effect.ENTER_LEVEL, a, Mode.POSHOLD)
+    assert row(a, Trigger.FAILSAFE_DEPTH) == (needs, Effect.ENTER_LEVEL, a, Mode.ALT_HOLD)
     assert row(a, Trigger.FAILSAFE_SURFACE) == (Guard.ALWAYS, Effect.ENTER_MODE, a, Mode.SURFACE)
     assert row(a, Trigger.MOTOR_TEST) == (Guard.IN_MOTOR_DETECT, Effect.TEST_MOTOR, a, None)
     for trigger in (Trigger.CLEAR_ESTOP, Trigger.ARM, Trigger.FORCED_ARM):
