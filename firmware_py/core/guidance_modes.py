@@ -69,7 +69,7 @@ class Guidance:
         self._glider = Glider(p.bandwidth, p.speed_m_s, p.rate_rad_s)
         self._trajectory: Trajectory | None = None
         self._start_ns: int | None = None
-        self._goal: Setpoint | None = None
+        self._goal: Wish | None = None
         self._point: tuple[int, Setpoint] | None = None
         self._docking: Setpoint | None = None
         self._sticks, self._sticks_ns = NEUTRAL, 0
@@ -95,7 +95,7 @@ class Guidance:
             if effect == Effect.ENTER_LEVEL:
                 self._level()
             elif effect == Effect.HOLD_AT and argument is not None:
-                self._goal = rest_at(self._inside(argument.p_wb), argument.q_wb)
+                self._goal = Wish(ZERO, ZERO, self._inside(argument.p_wb), argument.q_wb)
             elif effect == Effect.FOLLOW:
                 self.follow(argument)
 
@@ -103,7 +103,7 @@ class Guidance:
         """A body that is steeper than a hold may keep is to turn upright where it is."""
         at = self._glider.at
         if rotate(at.q_wb, DOWN)[2] < math.cos(self._p.hold_tilt_rad):
-            self._goal = rest_at(self._inside(at.p_wb), heading(at.q_wb))
+            self._goal = Wish(ZERO, ZERO, self._inside(at.p_wb), heading(at.q_wb), self._p.level_rad_s)
 
     def rest(self, estimate: Estimate) -> None:
         """The body is disarmed: the set-point stays where it is believed to be."""
@@ -126,8 +126,9 @@ class Guidance:
 
     def move_by(self, by_w: np.ndarray) -> None:
         """POSHOLD's place, or the one that it is on its way to, moves by so much (3,), world, m."""
-        at = self._glider.at if self._goal is None else self._goal
-        self._goal = rest_at(self._inside(at.p_wb + by_w), at.q_wb)
+        at = self._glider.at
+        goal = self._goal or Wish(ZERO, ZERO, at.p_wb, at.q_wb)
+        self._goal = goal._replace(p_wb=self._inside(goal.p_wb + by_w))
 
     def finished(self, time_ns: int) -> bool:
         """Whether no trajectory is under way."""
@@ -193,10 +194,10 @@ class Guidance:
         if any(sticks.force) or any(sticks.moment):
             self._goal = None
         if self.mode == Mode.ALT_HOLD:
-            upright = None if self._goal is None else self._goal.q_wb
-            return Wish(np.array([0.0, 0.0, p.speed_m_s * sticks.force[2]]), rate, None, upright)
+            turn = self._goal or Wish(ZERO, ZERO)
+            return turn._replace(v_w=np.array([0.0, 0.0, p.speed_m_s * sticks.force[2]]), w_b=rate, p_wb=None)
         if self._goal is not None:
-            return Wish(ZERO, ZERO, self._goal.p_wb, self._goal.q_wb)
+            return self._goal
         v_w = np.asarray(rotate(at.q_wb, p.speed_m_s * np.array(sticks.force)))
         return Wish(self._held_in(at.p_wb, v_w), rate)
 

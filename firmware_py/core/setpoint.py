@@ -55,6 +55,8 @@ class Wish(NamedTuple):
     """(3,) place, or None: speed alone. An axis that is NaN goes by speed alone."""
     q_wb: np.ndarray | None = None
     """(4,) attitude, or None: rate alone."""
+    rate_rad_s: float | None = None
+    """Largest turning rate to `q_wb`; None: the glider's."""
 
 
 UNKNOWN = np.full(4, np.nan)
@@ -115,9 +117,10 @@ class Glider:
     def step(self, wish: Wish, dt_s: float) -> Setpoint:
         """Moves on by `dt_s`."""
         out = np.empty(19)
+        rate = self._rate if wish.rate_rad_s is None else wish.rate_rad_s
         place = UNKNOWN if wish.p_wb is None else np.ascontiguousarray(wish.p_wb)
         attitude = UNKNOWN if wish.q_wb is None else np.ascontiguousarray(wish.q_wb)
-        _glide(*self.at, wish.v_w, wish.w_b, place, attitude, self._w, self._speed, self._rate, dt_s, out)
+        _glide(*self.at, wish.v_w, wish.w_b, place, attitude, self._w, self._speed, rate, dt_s, out)
         self.at = Setpoint(out[0:3], out[3:7], out[7:10], out[10:13], out[13:16], out[16:19])
         return self.at
 

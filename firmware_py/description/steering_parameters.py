@@ -48,6 +48,9 @@ class Steering:
     hold_tilt_rad: float = quantity(
         0.6, unit="rad", low=0, high=3.2, help="a body that a fail-safe makes hold turns upright if it is steeper", mavlink="HOLD_TILT"
     )
+    level_rad_s: float = quantity(
+        1.5, unit="rad/s", low=0.01, high=10, help="turning rate of that: until it is upright nobody sees its tags", mavlink="HOLD_LVL_RATE"
+    )
     surface_speed_m_s: float = quantity(0.10, unit="m/s", low=0.01, high=2, help="of rising", mavlink="SURF_SPEED")
     surface_depth_m: float = quantity(
         0.12, unit="m", low=0, high=10, help="depth of the centre of mass at the surface", mavlink="SURF_DEPTH"
