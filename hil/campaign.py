@@ -8,26 +8,19 @@ A worker that dies costs the trials under way, and these are flown again.
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import hashlib
 import json
 import math
 import os
-import re
-import socket
-import sys
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import suppress
 from functools import cache, partial
 from importlib import resources
-from multiprocessing import get_context, parent_process
 from pathlib import Path
 from queue import SimpleQueue
-from threading import Thread
-from types import TracebackType
 from typing import Any
 
 from firmware_py.description.parameters import Parameters
@@ -39,6 +32,8 @@ from hil.docking_metrics import OUTCOMES
 from hil.flight import fly_and_judge
 from hil.plant.world_parameters import world_parameters
 from hil.scenario import Scenario
+from hil.trial_file import TrialFile
+from hil.workers import Pool, deaths
 
 SUMMARY_FILE, TABLE_FILE, TRIALS_FILE = "campaign.json", "trials.csv", "trials.jsonl"
 WALL_CLOCK = ("real_time_factor", "deadline_misses")
@@ -49,9 +44,6 @@ FEW = max(8, 2 * (os.cpu_count() or 1))
 """Trials under way after a worker's death: enough to keep this machine busy, and no more than these does the next death cost."""
 IN_VAIN = 12
 """Deaths without a trial between them that are no seed's fault."""
-
-Pool = Callable[[], AbstractContextManager[Executor]]
-
 
 @cache
 def code_digest() -> str:
@@ -97,177 +89,6 @@ def outcome_of(result: Result) -> str:
 
 def _numbers(values: dict[str, float]) -> dict[str, float | None]:
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
-
-
-class TrialFile:
-    """trials.jsonl: who it belongs to, then a line for each trial, with the disk before the next one is waited for."""
-
-    def __init__(
-        self, path: Path, owner: str, key: str = "seed", anew: bool = False, who: str = "scenario, controller or code"
-    ) -> None:
-        """Goes on in `path` if it is `owner`'s; a line that was torn is flown again.
-
-        Args:
-            key: tells trials apart.
-            anew: throws another owner's trials away.
-            who: in what another owner may differ, for people.
-
-        Raises:
-            DescriptionError: `path` is being written, or holds trials of another owner.
-        """
-        self.trials: dict[int, Trial] = {}
-        self._key = key
-        with ExitStack() as refused:
-            self._file = refused.enter_context(path.open("a+b"))
-            self._claim(path)
-            stands = self._read(path, {"campaign": owner}, "" if anew else who)
-            self._file.truncate(stands)
-            refused.pop_all()
-        if not stands:
-            self._write({"campaign": owner})
-
-    def _claim(self, path: Path) -> None:
-        """The file is this one's until it is closed."""
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise DescriptionError(f"{path} is being written by another campaign; wait for it or give another --out") from None
-
-    def _read(self, path: Path, head: Trial, who: str) -> int:
-        """Bytes that stand; without `who` those of another head do not."""
-        self._file.seek(0)
-        lines = self._file.readlines()
-        if not lines or _entry(lines[0]) != head:
-            if lines[1:] and who:
-                raise DescriptionError(f"{path} holds trials of another {who}; give another --out or delete it")
-            return 0
-        stands = len(lines[0])
-        for line in lines[1:]:
-            entry = _entry(line)
-            if entry is None:
-                break
-            self.trials[int(entry[self._key])] = entry
-            stands += len(line)
-        return stands
-
-    def add(self, trial: Trial) -> None:
-        """One more trial, on the disk when this returns."""
-        self.trials[int(trial[self._key])] = trial
-        self._write(trial)
-
-    def _write(self, entry: Trial) -> None:
-        self._file.write(json.dumps(entry).encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
-
-    def __enter__(self) -> TrialFile:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._file.close()
-
-
-def _entry(line: bytes) -> Trial | None:
-    """What a line holds; None where it was torn."""
-    try:
-        entry = json.loads(line) if line.endswith(b"\n") else None
-    except ValueError:
-        entry = None
-    return entry if isinstance(entry, dict) else None
-
-
-def processes(jobs: int) -> Pool:
-    """So many processes of this machine, which end with this one, however it ends."""
-    return lambda: ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_end_with_parent)
-
-
-def _end_with_parent() -> None:
-    """In a worker: a parent that is killed tells nobody, and its workers would wait for work for ever."""
-
-    def wait() -> None:
-        if parent := parent_process():
-            parent.join()
-            os._exit(1)
-
-    Thread(target=wait, daemon=True).start()
-
-
-@contextmanager
-def kept(pool: Pool) -> Iterator[Pool]:
-    """The pool, whose workers stay from one use to the next: to start them takes longer than a flight. A broken one is made anew."""
-    with ExitStack() as stack:
-        executors: list[Executor] = []
-
-        @contextmanager
-        def use() -> Iterator[Executor]:
-            if not executors:
-                executors.append(stack.enter_context(pool()))
-            try:
-                yield executors[0]
-            except BrokenExecutor:
-                executors.clear()
-                raise
-
-        yield use
-
-
-class DaskExecutor(Executor):
-    """The workers of a dask client. Dask's own executor never answers for what was under way when the scheduler was lost."""
-
-    def __init__(self, client: Any) -> None:
-        """Executor of this client, which stays the caller's to close."""
-        self._client = client
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Begins one call. Raises BrokenExecutor where the scheduler is gone."""
-        task = self._client.submit(fn, *args, pure=False, **kwargs)
-        if self._client.status != "running":
-            raise BrokenExecutor("the dask scheduler is gone")
-        future: Future[Any] = Future()
-        task.add_done_callback(partial(_pass_on, future))
-        return future
-
-
-def _pass_on(future: Future[Any], task: Any) -> None:
-    """Tells `future` what has come of dask's `task`; its result may be lost with the scheduler that holds it."""
-    if not future.set_running_or_notify_cancel():
-        return
-    try:
-        if task.status == "error":
-            future.set_exception(task.exception())
-        else:
-            future.set_result(task.result())
-    except Exception as error:
-        future.set_exception(BrokenExecutor(str(error)))
-
-
-def dask_cluster(address: str) -> Pool:
-    """The workers of the dask scheduler at `address`, such as tcp://host:8786. Raises DescriptionError when none answers, now or later."""
-
-    @contextmanager
-    def use() -> Iterator[Executor]:
-        client = _dask_client(address)
-        try:
-            yield DaskExecutor(client)
-        finally:
-            if client.status == "running":
-                client.close()
-
-    with use():
-        return use
-
-
-def _dask_client(address: str) -> Any:
-    found = re.fullmatch(r"t(?:cp|ls)://(.+):(\d+)", address)
-    if not found:
-        raise DescriptionError(f"--dask {address!r} is no address; it needs tcp://HOST:PORT, as `dask scheduler` prints it")
-    try:
-        socket.create_connection((found[1], int(found[2])), timeout=10).close()
-        from distributed import Client
-
-        return Client(address, timeout=10, set_as_default=False)
-    except (OSError, OverflowError) as error:
-        raise DescriptionError(f"no dask scheduler at {address}: {error}; start one with `dask scheduler`") from None
 
 
 def run_campaign(
@@ -335,7 +156,7 @@ def _together(begin: Callable[[int], Future[Trial]], waiting: deque[int], at_onc
                 future = ended.get()
                 under_way.remove(future)
                 trial = future.result()
-            except _deaths():
+            except deaths():
                 died = True
             else:
                 yield trial
@@ -347,9 +168,3 @@ def _together(begin: Callable[[int], Future[Trial]], waiting: deque[int], at_onc
             future.cancel()
     if died:
         raise BrokenExecutor  # told to a pool that is kept
-
-
-def _deaths() -> tuple[type[BaseException], ...]:
-    """What a future raises whose worker has died; dask has words of its own for it, and cancels all when its scheduler is gone."""
-    dask = sys.modules.get("distributed")
-    return (BrokenExecutor, CancelledError, *((dask.KilledWorker,) if dask else ()))

@@ -93,9 +93,10 @@ def campaign(
     """
     if scenario == "faults":
         raise typer.Exit(_fly_faults(jobs, seed, out))
-    from hil.campaign import dask_cluster, processes, run_campaign
+    from hil.campaign import run_campaign
     from hil.console import campaign_progress, print_campaign
     from hil.flight import fly_and_judge, illustrate
+    from hil.workers import dask_cluster, processes
 
     chosen = scenario_of(scenario, vehicle, sensors)
     unusual = [Path(given).stem for given, usual in ((vehicle, ""), (controller, "modcube"), (sensors, "real")) if given != usual]

@@ -105,6 +105,8 @@ class BlindFlight(NamedTuple):
 
     error_m: float
     """Largest horizontal distance of the truth from the place."""
+    rmse_m: float
+    """Root mean square of that distance over the time without tags."""
     normalised: tuple[float, float]
     """North and east error of the estimate at the end, over its own sigma."""
 
@@ -115,7 +117,7 @@ def hover_blind(seed: int) -> BlindFlight:
     flight = flown(scenario, seed).between(round(scenario.task.settle_s * 1e9), round(scenario.duration_s * 1e9))
     off = np.linalg.norm((flight.p_wb - flight.firmware["setpoint_p_wb"])[:, :2], axis=1)
     wrong = (flight.firmware["p_wb"] - flight.p_wb)[-1, :2] / flight.firmware["sigma_p"][-1, :2]
-    return BlindFlight(float(off.max()), (float(wrong[0]), float(wrong[1])))
+    return BlindFlight(float(off.max()), float(np.sqrt(np.mean(off**2))), (float(wrong[0]), float(wrong[1])))
 
 
 # ---------------------------------------------------------------- frames

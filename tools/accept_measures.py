@@ -18,9 +18,10 @@ import identify_plants
 import near_miss
 
 from firmware_py.description.parameters import CONTROLLERS
-from hil.campaign import processes, run_campaign
+from hil.campaign import run_campaign
 from hil.console import campaign_progress
 from hil.scenario import load_scenario
+from hil.workers import processes
 
 FEWER = range(8)
 JOBS = 2

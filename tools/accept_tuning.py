@@ -14,8 +14,9 @@ from accept_figures import Figure, Group
 from accept_measures import Values, said_by_tests
 
 from firmware_py.description.parameters import Parameters
-from hil.campaign import SUMMARY_FILE, TABLE_FILE, processes, run_campaign
+from hil.campaign import SUMMARY_FILE, TABLE_FILE, run_campaign
 from hil.scenario import load_scenario
+from hil.workers import processes
 
 TRIALS = range(16)
 """Of the campaign that is timed: enough for a start of its processes not to count."""

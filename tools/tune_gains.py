@@ -27,7 +27,9 @@ from tune_objective import Objective, detuned, load_objective, with_values
 
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError, to_toml
-from hil.campaign import TRIALS_FILE, Pool, TrialFile, code_digest, dask_cluster, identity, kept, processes, run_campaign
+from hil.campaign import TRIALS_FILE, code_digest, identity, run_campaign
+from hil.trial_file import TrialFile
+from hil.workers import Pool, dask_cluster, kept, processes
 
 DETUNED = 3.0
 """Largest factor by which --detune puts each gain off."""

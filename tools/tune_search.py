@@ -22,7 +22,8 @@ from tune_sampler import GaussianProcessSampler
 
 from firmware_py.description.parameters import Parameters
 from hil import campaign
-from hil.campaign import TrialFile, code_digest, fly_trial
+from hil.campaign import code_digest, fly_trial
+from hil.trial_file import TrialFile
 
 TRIALS_FILE = "search.jsonl"
 SOURCES = ("loop_response.py", "tune_objective.py", "tune_sampler.py", "tune_search.py")

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from firmware_py.core import observation
-from firmware_py.core.body import Body
+from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.history import WINDOW_S, History
 from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rotations import rotate
@@ -59,6 +59,7 @@ class Estimator:
         """Takes other noise figures from the next tick on; the estimate stays."""
         p = self._p = parameters
         self._density = self._process_noise()
+        self._drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
         self._inertial_sigma = np.array([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m])
         self._tag_variance = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2
 
@@ -138,7 +139,7 @@ class Estimator:
             rest_ns = to_ns - self._anchor_ns
         self._x, self._covariance = observation.advance(
             self._x, self._covariance, *self._history.since(index), (first_ns - self._anchor_ns) * 1e-9, count, self._dt, rest_ns * 1e-9,
-            self._density, self._inertial_sigma, *self._plant,
+            self._density, self._drag_walk, self._inertial_sigma, *self._plant,
         )  # fmt: skip
         self._anchor_ns = to_ns
 
@@ -202,7 +203,7 @@ class Estimator:
         )
 
     def _process_noise(self) -> np.ndarray:
-        """(25,) spectral density of the process noise, per second."""
+        """(25,) spectral density of the process noise of a body at rest, per second."""
         p = self._p
         inertia = np.diag(self._body.mass)
         density = np.zeros(ERRORS)
@@ -210,7 +211,7 @@ class Estimator:
         density[9:12] = p.alpha_process
         density[12:15] = p.gyro_bias_walk
         density[15:18] = p.accel_bias_walk
-        density[18:21] = np.maximum(p.force_walk * inertia[:3], p.current_walk * self._body.drag.cruise_slope)
+        density[18:21] = p.force_walk * inertia[:3]
         density[21:24] = p.moment_walk * inertia[3:]
         density[24] = p.depth_bias_walk
         return density**2

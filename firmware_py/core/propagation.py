@@ -148,8 +148,14 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
 
 
 @njit(cache=True)
-def predict(x, covariance, tau, dt, density, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """State (26,) and covariance (25, 25) after dt seconds: F P F^T + Q dt. density: (25,) process noise, per second."""
+def predict(x, covariance, tau, dt, density, drag_walk, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
+    """State (26,) and covariance (25, 25) after dt seconds: F P F^T + Q dt.
+
+    Args:
+        density: (25,) process noise of a body at rest, per second.
+        drag_walk: what its speed adds to the random walk of the disturbance force, N/sqrt(s) for each m/s: current and drag that are
+            not as believed are felt in proportion to it.
+    """
     f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
     moved = f @ covariance
     out = covariance.copy()
@@ -161,6 +167,8 @@ def predict(x, covariance, tau, dt, density, mass, mass_inv, righting, nodes, ro
             out[i, j] = out[j, i] = moved[i, j]
     for i in range(ERRORS):
         out[i, i] += density[i] * dt
+    for i in range(18, 21):
+        out[i, i] += drag_walk * drag_walk * (x[7] * x[7] + x[8] * x[8] + x[9] * x[9]) * dt
     return step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear), out
 
 

@@ -23,16 +23,16 @@ class Control:
         "model", choices=("model", "paper"), help="model: desired velocity in drag and Coriolis; paper: measured"
     )
     position_bandwidth: float = quantity(
-        2.5, unit="rad/s", low=0.1, high=10, help="of the position loop", mavlink="POS_BW"
+        3.63, unit="rad/s", low=0.1, high=20, help="of the position loop", mavlink="POS_BW"
     )
     position_damping: float = quantity(
-        1.18, low=0.1, high=5, help="damping ratio of the position loop", mavlink="POS_DAMP"
+        1.16, low=0.1, high=5, help="damping ratio of the position loop", mavlink="POS_DAMP"
     )
     attitude_bandwidth: float = quantity(
-        2.8, unit="rad/s", low=0.1, high=20, help="of the attitude loop", mavlink="ATT_BW"
+        2.45, unit="rad/s", low=0.1, high=20, help="of the attitude loop", mavlink="ATT_BW"
     )
     attitude_damping: float = quantity(
-        1.04, low=0.1, high=5, help="damping ratio of the attitude loop", mavlink="ATT_DAMP"
+        1.16, low=0.1, high=5, help="damping ratio of the attitude loop", mavlink="ATT_DAMP"
     )
     drag_feedforward: float = quantity(
         1.0, low=-2, high=2, help="share of the modelled drag fed forward", mavlink="FF_DRAG"
@@ -67,7 +67,7 @@ class Estimation:
         2e-5, unit="rad/s/sqrt(s)", low=0, high=1, help="gyro bias random walk", mavlink="GYRO_WALK"
     )
     accel_sigma: float = quantity(
-        0.054, unit="m/s^2", low=1e-4, high=10, help="accelerometer noise, and what its place makes it feel", mavlink="ACC_SD"
+        0.073, unit="m/s^2", low=1e-4, high=10, help="accelerometer noise, and what its place makes it feel", mavlink="ACC_SD"
     )
     accel_bias_walk: float = quantity(
         1e-4, unit="m/s^2/sqrt(s)", low=0, high=1, help="accelerometer bias random walk", mavlink="ACC_WALK"
@@ -77,19 +77,19 @@ class Estimation:
         2e-4, unit="m/sqrt(s)", low=0, high=1, help="depth bias random walk", mavlink="DEPTH_WALK"
     )
     force_walk: float = quantity(
-        0.0225, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass", mavlink="DIST_F_WALK"
+        0.0021, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass, of a body at rest", mavlink="DIST_F_WALK"
     )
     current_walk: float = quantity(
-        0.02, unit="m/s/sqrt(s)", low=0, high=1, help="water's speed, felt as drag; counts where above force_walk", mavlink="DIST_C_WALK"
+        0.072, unit="m/s/sqrt(s)", low=0, high=1, help="water's speed, felt by the drag of a body under way", mavlink="DIST_C_WALK"
     )
     moment_walk: float = quantity(
-        0.115, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia", mavlink="DIST_M_WALK"
+        0.037, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia", mavlink="DIST_M_WALK"
     )
     accel_process: float = quantity(
-        0.033, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC"
+        0.013, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC"
     )
     alpha_process: float = quantity(
-        0.125,
+        0.029,
         unit="rad/s^2/sqrt(Hz)",
         low=0,
         high=10,

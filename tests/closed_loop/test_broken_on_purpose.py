@@ -59,7 +59,8 @@ def test_tag_glued_on_ten_degrees_askew_fails_the_flight(fly: Fly, rebuild: Rebu
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_drag_feed_forward_of_the_wrong_sign_fails_the_flight(fly: Fly, seed: int) -> None:
-    result = fly(load_scenario("spiral"), seed, Parameters().replace("control.drag_feedforward", -1.0))
+    """The spiral is too slow for that: its drag is a quarter of a newton, which the disturbance makes up for."""
+    result = fly(load_scenario("mobius-1"), seed, Parameters().replace("control.drag_feedforward", -1.0))
     assert failed(result) == {"position_rmse_m"}
 
 

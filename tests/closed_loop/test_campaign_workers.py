@@ -17,8 +17,9 @@ import pytest
 import hil.campaign
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from hil.campaign import TRIALS_FILE, processes, run_campaign
+from hil.campaign import TRIALS_FILE, run_campaign
 from hil.scenario import load_scenario
+from hil.workers import processes
 
 TRIALS = 8
 SCENARIO = """
@@ -162,7 +163,7 @@ def test_seed_that_kills_its_process_costs_no_other(tmp_path: Path, monkeypatch:
 
 def test_workers_end_with_the_process_that_began_them() -> None:
     code = (
-        "import os; from hil.campaign import processes\n"
+        "import os; from hil.workers import processes\n"
         "with processes(1)() as pool: print(pool.submit(os.getpid).result(), flush=True); input()"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:

@@ -21,11 +21,7 @@ from hil.campaign import (
     SUMMARY_FILE,
     TABLE_FILE,
     TRIALS_FILE,
-    Pool,
-    TrialFile,
-    dask_cluster,
     fly_trial,
-    kept,
     outcome_of,
     run_campaign,
 )
@@ -34,6 +30,8 @@ from hil.checks import Check, Result
 from hil.console import campaign_progress, print_campaign
 from hil.plant.world_parameters import world_parameters
 from hil.scenario import Scenario, load_scenario
+from hil.trial_file import TrialFile
+from hil.workers import Pool, dask_cluster, kept
 
 
 class Inline(Executor):

@@ -206,7 +206,7 @@ def displaced(error: np.ndarray) -> np.ndarray:
 def test_error_decays_by_the_bandwidth_that_was_asked_for(body: Body, axis: int) -> None:
     """Critically damped, an error falls as (1 + w t) exp(-w t): the same for every shape and axis."""
     dry = replace(body, drag=replace(body.drag, nodes=0.0 * body.drag.nodes, rotational=np.zeros(3)))
-    c = Control(position_bandwidth=1.5, position_damping=1.0, attitude_bandwidth=2.5)
+    c = Control(position_bandwidth=1.5, position_damping=1.0, attitude_bandwidth=2.5, attitude_damping=1.0)
     states = fly(dry, displaced(0.02 * np.eye(6)[axis]), rest_at(np.zeros(3), LEVEL), 2.0, c)
     errors = [np.r_[x[:3], difference(x[3:7].copy(), LEVEL)][axis] for x in states]
     wt = (1.5 if axis < 3 else 2.5) * 0.01 * np.arange(len(states))

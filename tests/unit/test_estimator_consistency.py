@@ -75,10 +75,12 @@ class Flight:
             yield k * PERIOD, tau, measured
 
 
-def process_sigma(body: Body, p: Estimation) -> np.ndarray:
-    """(25,) root spectral density of what the model leaves out, from the parameters' own words."""
+def process_sigma(body: Body, p: Estimation, x: np.ndarray) -> np.ndarray:
+    """(25,) root spectral density of what the model leaves out of a robot in state x, from the parameters' own words."""
     m, j = np.diag(body.mass)[:3], np.diag(body.mass)[3:]
-    walks = [p.gyro_bias_walk] * 3 + [p.accel_bias_walk] * 3 + list(p.force_walk * m) + list(p.moment_walk * j)
+    drag_slope = 2.0 * body.drag.nodes[..., 0].mean() * np.linalg.norm(x[7:10])
+    force = np.hypot(p.force_walk * m, p.current_walk * drag_slope)
+    walks = [p.gyro_bias_walk] * 3 + [p.accel_bias_walk] * 3 + list(force) + list(p.moment_walk * j)
     return np.array([0.0] * 6 + [p.accel_process] * 3 + [p.alpha_process] * 3 + walks + [p.depth_bias_walk])
 
 
@@ -90,7 +92,6 @@ def fly(
     flight = Flight()
     x = start_state()
     x[13:16], x[16:19], x[25] = rng.normal(scale=0.02, size=3), rng.normal(scale=0.1, size=3), 0.03
-    sigma = process_sigma(body, P)
     tag_sigma = np.repeat([P.tag_sigma_m, P.tag_sigma_axis_m, P.tag_sigma_rad], [2, 1, 3])
     count = round(seconds / DT)
     arriving: dict[int, list[BodyPose]] = {}
@@ -101,7 +102,7 @@ def fly(
         tau *= k > 0
         before, surprise = x, np.zeros(ERRORS)
         if k:
-            surprise = sigma * np.sqrt(DT) * rng.normal(size=ERRORS)
+            surprise = process_sigma(body, P, x) * np.sqrt(DT) * rng.normal(size=ERRORS)
             x = propagation.inject(propagation.step(x, tau, DT, *plant(body)), surprise)
         while taken < len(pictures) and pictures[taken] <= t:
             capture = pictures[taken]
@@ -131,8 +132,7 @@ class InOrder:
         m, j = np.diag(body.mass)[:3], np.diag(body.mass)[3:]
         sigma = [0.02] * 3 + [0.05] * 3 + [0.2] * 3 + [0.3] * 3 + [0.02] * 3 + [0.1] * 3 + list(0.1 * m) + list(0.3 * j)
         self.covariance = np.diag(np.r_[sigma, 0.1]) ** 2
-        self.q = np.diag(process_sigma(body, p) ** 2)
-        self.p = p
+        self.body, self.p = body, p
         self.time_ns = first.capture_ns
 
     @staticmethod
@@ -144,8 +144,9 @@ class InOrder:
         dt = (to_ns - self.time_ns) * 1e-9
         if dt > 0.0:
             f = np.vstack([propagation.transition(self.x, tau, dt, *self.plant), np.eye(ERRORS)[propagation.MOVING :]])
+            noise = np.diag(process_sigma(self.body, self.p, self.x) ** 2)
             self.x = propagation.step(self.x, tau, dt, *self.plant)
-            self.covariance = f @ self.covariance @ f.T + self.q * dt
+            self.covariance = f @ self.covariance @ f.T + noise * dt
         self.time_ns = to_ns
         return dt
 
@@ -311,7 +312,7 @@ def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
     """
     flight = fly(body, 3.0, 1, lambda n: 45.0, push=6.0)
     pushed = replace(body, drag=replace(body.drag, nodes=-body.drag.nodes))
-    believing = replace(P, accel_process=0.012, force_walk=0.015)
+    believing = replace(P, accel_process=0.012, force_walk=0.015, current_walk=0.0)
     assert run(body, flight, believing)[1][-1].rejected == 0
     assert run(pushed, flight, believing)[1][-1].rejected > 10
     right, wrong = (run(each, flight)[1] for each in (body, pushed))
