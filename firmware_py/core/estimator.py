@@ -59,7 +59,8 @@ class Estimator:
         """Takes other noise figures from the next tick on; the estimate stays."""
         p = self._p = parameters
         self._density = self._process_noise()
-        self._drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
+        drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
+        self._under_way = np.array([drag_walk, drag_walk * self._body.reach_m, p.alpha_turning])
         self._inertial_sigma = np.array([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m])
         self._tag_variance = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2
 
@@ -139,7 +140,7 @@ class Estimator:
             rest_ns = to_ns - self._anchor_ns
         self._x, self._covariance = observation.advance(
             self._x, self._covariance, *self._history.since(index), (first_ns - self._anchor_ns) * 1e-9, count, self._dt, rest_ns * 1e-9,
-            self._density, self._drag_walk, self._inertial_sigma, *self._plant,
+            self._density, self._under_way, self._inertial_sigma, *self._plant,
         )  # fmt: skip
         self._anchor_ns = to_ns
 

@@ -138,9 +138,9 @@ def fuse_inertial(  # type: ignore[no-untyped-def]
     return x_after, after
 
 
-@njit(f"{STATE}({V},{M},{M},{M},{M},float64,int64,float64,float64,{V},float64,{V},{PLANT})", cache=True)
+@njit(f"{STATE}({V},{M},{M},{M},{M},float64,int64,float64,float64,{V},{V},{V},{PLANT})", cache=True)
 def advance(  # type: ignore[no-untyped-def]
-    x, covariance, taus, gyros, others, first, count, dt, rest, density, drag_walk, sigma,
+    x, covariance, taus, gyros, others, first, count, dt, rest, density, under_way, sigma,
     mass, mass_inv, righting, nodes, rotational, linear,
 ):  # fmt: skip
     """State and covariance moved on through stored samples, each fused at its time.
@@ -148,18 +148,18 @@ def advance(  # type: ignore[no-untyped-def]
     Args:
         taus: (k, 6), gyros: (k, 3), others: (k, 4) accelerometer and depth, of each tick, NaN where none came.
         first: time to the first sample, s; count: samples to fuse; dt: between them, s; rest: what is left after the last, s.
-        density, drag_walk: as `predict`. sigma: (3,) as `inertial`.
+        density, under_way: as `predict`. sigma: (3,) as `inertial`.
     """
     for i in range(count):
         tau, elapsed = taus[i].copy(), first if i == 0 else dt
-        x, covariance = predict(x, covariance, tau, elapsed, density, drag_walk, mass, mass_inv, righting, nodes, rotational, linear)
+        x, covariance = predict(x, covariance, tau, elapsed, density, under_way, mass, mass_inv, righting, nodes, rotational, linear)
         x, covariance = fuse_inertial(
             x, covariance, tau, gyros[i].copy(), others[i, :3].copy(), others[i, 3], elapsed, dt, density, sigma,
             mass, mass_inv, righting, nodes, rotational, linear,
         )  # fmt: skip
     if rest > 0.0:
         tau = taus[count].copy()
-        x, covariance = predict(x, covariance, tau, rest, density, drag_walk, mass, mass_inv, righting, nodes, rotational, linear)
+        x, covariance = predict(x, covariance, tau, rest, density, under_way, mass, mass_inv, righting, nodes, rotational, linear)
         x, covariance = fuse_inertial(
             x, covariance, tau, np.full(3, math.nan), others[count, :3].copy(), math.nan, rest, dt, density, sigma,
             mass, mass_inv, righting, nodes, rotational, linear,

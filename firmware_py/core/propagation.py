@@ -148,13 +148,13 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
 
 
 @njit(cache=True)
-def predict(x, covariance, tau, dt, density, drag_walk, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
+def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """State (26,) and covariance (25, 25) after dt seconds: F P F^T + Q dt.
 
     Args:
         density: (25,) process noise of a body at rest, per second.
-        drag_walk: what its speed adds to the random walk of the disturbance force, N/sqrt(s) for each m/s: current and drag that are
-            not as believed are felt in proportion to it.
+        under_way: (3,) what motion adds, as what is not as believed of current and drag is felt in proportion to it: to the random walk
+            of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz) for each rad/s.
     """
     f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
     moved = f @ covariance
@@ -167,8 +167,10 @@ def predict(x, covariance, tau, dt, density, drag_walk, mass, mass_inv, righting
             out[i, j] = out[j, i] = moved[i, j]
     for i in range(ERRORS):
         out[i, i] += density[i] * dt
-    for i in range(18, 21):
-        out[i, i] += drag_walk * drag_walk * (x[7] * x[7] + x[8] * x[8] + x[9] * x[9]) * dt
+    speed, rate = x[7] ** 2 + x[8] ** 2 + x[9] ** 2, x[10] ** 2 + x[11] ** 2 + x[12] ** 2
+    for i in range(3):
+        out[9 + i, 9 + i] += under_way[2] ** 2 * rate * dt
+        out[18 + i, 18 + i] += (under_way[0] ** 2 * speed + under_way[1] ** 2 * rate) * dt
     return step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear), out
 
 

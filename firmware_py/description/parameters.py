@@ -96,6 +96,9 @@ class Estimation:
         help="white unmodelled angular acceleration",
         mavlink="PROC_ALPHA",
     )
+    alpha_turning: float = quantity(
+        0.05, unit="rad/s^2/sqrt(Hz)/(rad/s)", low=0, high=10, help="what turning adds to that", mavlink="PROC_ALPHA_W"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -78,10 +78,12 @@ class Flight:
 def process_sigma(body: Body, p: Estimation, x: np.ndarray) -> np.ndarray:
     """(25,) root spectral density of what the model leaves out of a robot in state x, from the parameters' own words."""
     m, j = np.diag(body.mass)[:3], np.diag(body.mass)[3:]
-    drag_slope = 2.0 * body.drag.nodes[..., 0].mean() * np.linalg.norm(x[7:10])
+    rate = np.linalg.norm(x[10:13])
+    drag_slope = 2.0 * body.drag.nodes[..., 0].mean() * np.hypot(np.linalg.norm(x[7:10]), body.reach_m * rate)
     force = np.hypot(p.force_walk * m, p.current_walk * drag_slope)
+    alpha = np.hypot(p.alpha_process, p.alpha_turning * rate)
     walks = [p.gyro_bias_walk] * 3 + [p.accel_bias_walk] * 3 + list(force) + list(p.moment_walk * j)
-    return np.array([0.0] * 6 + [p.accel_process] * 3 + [p.alpha_process] * 3 + walks + [p.depth_bias_walk])
+    return np.array([0.0] * 6 + [p.accel_process] * 3 + [alpha] * 3 + walks + [p.depth_bias_walk])
 
 
 def fly(
@@ -312,7 +314,7 @@ def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
     """
     flight = fly(body, 3.0, 1, lambda n: 45.0, push=6.0)
     pushed = replace(body, drag=replace(body.drag, nodes=-body.drag.nodes))
-    believing = replace(P, accel_process=0.012, force_walk=0.015, current_walk=0.0)
+    believing = replace(P, accel_process=0.012, force_walk=0.015, current_walk=0.0, alpha_turning=0.0)
     assert run(body, flight, believing)[1][-1].rejected == 0
     assert run(pushed, flight, believing)[1][-1].rejected > 10
     right, wrong = (run(each, flight)[1] for each in (body, pushed))

@@ -348,9 +348,10 @@ def test_measurement_beyond_the_gate_changes_nothing(spoil: float) -> None:
 def test_prediction_is_that_of_filterpy(body: Body, seed: int) -> None:
     covariance, density = measurement(seed)[0], np.random.default_rng(seed).uniform(1, 2, ERRORS)
     f = transition(state(seed), DT, body)
-    speed = np.repeat([0.0, 0.7 * np.linalg.norm(state(seed)[7:10]), 0.0], [18, 3, 4])
-    _, expected = kalman.predict(np.zeros(ERRORS), covariance, f, np.diag(density + speed**2) * DT)
-    x, got = propagation.predict(state(seed), covariance, TAU, DT, density, 0.7, *plant(body))
+    speed, rate = (np.linalg.norm(state(seed)[at]) for at in (slice(7, 10), slice(10, 13)))
+    moving = np.repeat([0.0, 0.4 * rate, 0.0, np.hypot(0.7 * speed, 0.2 * rate), 0.0], [9, 3, 6, 3, 4])
+    _, expected = kalman.predict(np.zeros(ERRORS), covariance, f, np.diag(density + moving**2) * DT)
+    x, got = propagation.predict(state(seed), covariance, TAU, DT, density, np.array([0.7, 0.2, 0.4]), *plant(body))
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(got, got.T)
     np.testing.assert_array_equal(x, propagation.step(state(seed), TAU, DT, *plant(body)))
