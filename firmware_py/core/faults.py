@@ -76,7 +76,8 @@ class FaultDetector:
         self._modules = body.modules
         full_n = np.array([(polynomial(f, 1.0), polynomial(r, 1.0)) for f, r in zip(t.forward, t.reverse, strict=True)])
         self._believed = (full_n, t.rpm_at_full)
-        self._limits, self._dead_count = (parameters.force_n, parameters.dead_share), parameters.dead_count
+        self._limits = parameters.force_n, parameters.dead_share
+        self._needed = np.array([parameters.dead_count, parameters.dead_count, parameters.stray_count])
         self._motion = MissingThrust(body, parameters, period_ns)
         n = t.f_max.size
         self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
@@ -124,8 +125,8 @@ class FaultDetector:
         if not heard:
             return
         feedback = np.array(heard, dtype=np.float64).reshape(-1, 3, 2)
-        if judge(feedback, force_n, self.now.alive, *self._believed, *self._limits, self._dead_count, self._counts):
-            for i, kind in np.argwhere(self._counts >= self._dead_count).tolist():
+        if judge(feedback, force_n, self.now.alive, *self._believed, *self._limits, self._needed, self._counts):
+            for i, kind in np.argwhere(self._counts >= self._needed).tolist():
                 if self.now.alive[i]:
                     self._lose(i, WHY[kind])
 
@@ -154,14 +155,15 @@ def believed_rpm(force_n, full_n, rpm_at_full):  # type: ignore[no-untyped-def]
     return math.copysign(rpm_at_full * math.sqrt(abs(force_n) / full_n[0 if force_n > 0.0 else 1]), force_n)
 
 
-@njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},float64,float64,int64,int64[:,::1])", cache=True)
-def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, dead_count, counts):  # type: ignore[no-untyped-def]
+@njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},float64,float64,int64[::1],int64[:,::1])", cache=True)
+def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts):  # type: ignore[no-untyped-def]
     """Counts what each feedback shows; whether it was shown often enough by a thruster.
 
     Args:
         feedback: (k, 3, 2) of two thrusters each their indices (-1: there is none), speeds 1/min and EscStatus.
         force_n, alive, full_n, rpm_at_full: of all thrusters; force believed, may be used, full forces (n, 2), full speed.
-        least_n: force from which a speed is judged, N; dead_share, dead_count: as the parameters.
+        least_n: force from which a speed is judged, N; dead_share: as the parameter.
+        needed: (3,) feedbacks in a row that suffice for DOWN, STANDS, DISOBEYS.
         counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS.
     """
     found = False
@@ -172,10 +174,11 @@ def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, de
                 continue
             believed = believed_rpm(force_n[i], full_n[i], rpm_at_full[i])
             count, margin = counts[i], FAST_MARGIN * rpm_at_full[i]
-            wrong_way = rpm * believed < 0.0 and abs(rpm - believed) > margin
+            stands = abs(rpm) < dead_share * abs(believed)
+            wrong_way = rpm * believed < 0.0 and not stands and abs(rpm - believed) > margin
             count[DOWN] = count[DOWN] + 1 if status in ESC_DOWN else 0
             if abs(force_n[i]) >= least_n:
-                count[STANDS] = count[STANDS] + 1 if abs(rpm) < dead_share * abs(believed) else 0
+                count[STANDS] = count[STANDS] + 1 if stands else 0
             count[DISOBEYS] = count[DISOBEYS] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
-            found = found or count.max() >= dead_count
+            found = found or bool(np.any(count >= needed))
     return found
