@@ -60,7 +60,9 @@ class Result(NamedTuple):
 
 
 def limit_text(low: float, high: float) -> str:
-    """A range in words."""
+    """A range in words; empty where there is none."""
+    if low <= -UNBOUNDED and high >= UNBOUNDED:
+        return ""
     if low <= -UNBOUNDED:
         return f"<= {high:.4g}"
     return f">= {low:.4g}" if high >= UNBOUNDED else f"{low:.4g} to {high:.4g}"

@@ -38,8 +38,8 @@ def accept_table(entries: Entries, groups: Sequence[str]) -> str:
     """The figures of these groups, or of all, with limit, verdict and the command that measures them."""
     body = [
         (
-            e["name"], f"{number(e['value'])} {e['unit']}".strip(), f"{e['limit']} {e['unit']}".strip(),
-            "passed" if e["passed"] else "**failed**", f"`{e['command']}`",
+            e["name"], f"{number(e['value'])} {e['unit']}".strip(), e["limit"] and f"{e['limit']} {e['unit']}".strip(),
+            e["limit"] and ("passed" if e["passed"] else "**failed**"), f"`{e['command']}`",
         )
         for e in entries if not groups or e["group"] in groups
     ]  # fmt: skip

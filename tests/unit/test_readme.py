@@ -52,12 +52,14 @@ def test_tables_of_figures_come_from_the_measurements() -> None:
     accept = [
         {"name": "spiral: RMSE", "value": 3.5265, "unit": "mm", "limit": "<= 5", "passed": True, "command": "x",
          "group": "spiral"},
+        {"name": "spiral: largest", "value": 9.0, "unit": "mm", "limit": "", "passed": True, "command": "x", "group": "spiral"},
         {"name": "hover: RMSE", "value": 7.0, "unit": "mm", "limit": "<= 5", "passed": False, "command": "y",
          "group": "hover"},
     ]  # fmt: skip
     text = "<!-- table: accept spiral -->\nold\n<!-- end -->\n\n<!-- table: bench -->\nkept\n<!-- end -->\n"
     filled = readme_tables.filled(text, {"accept": accept})
     assert "| spiral: RMSE | 3.53 mm | <= 5 mm | passed | `x` |" in filled
+    assert "| spiral: largest | 9 mm |  |  | `x` |" in filled
     assert "hover" not in filled
     assert "old" not in filled
     assert "kept" in filled
