@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.description.parameters import registry
+from firmware_py.description.parameters import Parameters, registry
 from tests.clients.bench_process import CLIENT_PYTHON, flying_bench, free_port
 
 pytestmark = [pytest.mark.clients, pytest.mark.slow]
@@ -86,7 +86,8 @@ def test_mavproxy_flies_the_robot(mavproxy: MavProxy, tmp_path: Path) -> None:
     mavproxy.read(r"Mode POSHOLD")
     # it asks for all by itself; by hand too
     mavproxy.read(rf"Received {exposed} parameters")
-    mavproxy.ask("param fetch POS_BW", r"POS_BW = 2\.5")
+    fetched = mavproxy.ask("param fetch POS_BW", r"POS_BW = (\S+)")
+    assert float(fetched[1]) == pytest.approx(Parameters().control.position_bandwidth)
     mavproxy.type("param set POS_BW 2.7")  # it says nothing when that worked
     while float(mavproxy.ask("param fetch POS_BW", r"POS_BW = (\S+)")[1]) != pytest.approx(2.7):
         pass
