@@ -77,7 +77,7 @@ class Estimation:
         2e-4, unit="m/sqrt(s)", low=0, high=1, help="depth bias random walk", mavlink="DEPTH_WALK"
     )
     force_walk: float = quantity(
-        0.0021, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass, of a body at rest", mavlink="DIST_F_WALK"
+        0.004, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass, of a body at rest", mavlink="DIST_F_WALK"
     )
     current_walk: float = quantity(
         0.072, unit="m/s/sqrt(s)", low=0, high=1, help="water's speed, felt by the drag of a body under way", mavlink="DIST_C_WALK"
