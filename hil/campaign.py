@@ -45,6 +45,7 @@ FEW = max(8, 2 * (os.cpu_count() or 1))
 IN_VAIN = 12
 """Deaths without a trial between them that are no seed's fault."""
 
+
 @cache
 def code_digest() -> str:
     """What all code and data of the robot and the bench come to."""

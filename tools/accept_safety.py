@@ -82,7 +82,7 @@ def stopped(folder: Path) -> Values:
 def blind(folder: Path) -> Values:
     """Five seconds without tags."""
     flights = _all(hover_blind, BLIND)
-    errors, rmse, normalised = (np.array([getattr(f, name) for f in flights]) for name in ("error_m", "rmse_m", "normalised"))
+    errors, rmse, normalised = (np.array(values) for values in zip(*flights, strict=True))
     return {
         "median": float(np.median(errors)), "p95": float(np.quantile(errors, 0.95)), "rmse_median": float(np.median(rmse)),
         "rmse_p95": float(np.quantile(rmse, 0.95)), "sigmas": float(np.abs(normalised).max()), "square": float(np.mean(normalised**2)),

@@ -155,10 +155,10 @@ def with_values(parameters: Parameters, values: Mapping[str, float]) -> Paramete
 
 
 def detuned(objective: Objective, parameters: Parameters, factor: float, seed: int) -> Parameters:
-    """A copy in which everything that is searched is off by a random factor, log-uniform from 1/factor to factor."""
+    """A copy in which everything that is searched is off by a random factor, log-uniform from 1/factor to factor, within its bounds."""
     factors = factor ** np.random.default_rng(seed).uniform(-1.0, 1.0, len(objective.search))
-    wrong = {s.parameter: value_of(parameters, s.parameter) * float(f) for s, f in zip(objective.search, factors, strict=True)}
-    return with_values(parameters, wrong)
+    off = [(s, value_of(parameters, s.parameter) * float(f)) for s, f in zip(objective.search, factors, strict=True)]
+    return with_values(parameters, {s.parameter: min(max(value, s.low), s.high) for s, value in off})
 
 
 def load_objective(path: Path) -> Objective:

@@ -180,5 +180,6 @@ def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, ne
             if abs(force_n[i]) >= least_n:
                 count[STANDS] = count[STANDS] + 1 if stands else 0
             count[DISOBEYS] = count[DISOBEYS] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
-            found = found or bool(np.any(count >= needed))
+            for kind in range(len(WHY)):
+                found = found or count[kind] >= needed[kind]
     return found

@@ -23,7 +23,7 @@ class Control:
         "model", choices=("model", "paper"), help="model: desired velocity in drag and Coriolis; paper: measured"
     )
     position_bandwidth: float = quantity(
-        3.63, unit="rad/s", low=0.1, high=12, help="of the position loop", mavlink="POS_BW"
+        3.63, unit="rad/s", low=0.1, high=10, help="of the position loop", mavlink="POS_BW"
     )
     position_damping: float = quantity(
         1.16, low=0.1, high=5, help="damping ratio of the position loop", mavlink="POS_DAMP"

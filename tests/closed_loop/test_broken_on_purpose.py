@@ -59,9 +59,12 @@ def test_tag_glued_on_ten_degrees_askew_fails_the_flight(fly: Fly, rebuild: Rebu
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_drag_feed_forward_of_the_wrong_sign_fails_the_flight(fly: Fly, seed: int) -> None:
-    """The spiral is too slow for that: its drag is a quarter of a newton, which the disturbance makes up for."""
-    result = fly(load_scenario("mobius-1"), seed, Parameters().replace("control.drag_feedforward", -1.0))
-    assert failed(result) == {"position_rmse_m"}
+    """The spiral's drag is a quarter of a newton, which the disturbance makes up for within the check: twice the error shows it."""
+    wrong = Parameters().replace("control.drag_feedforward", -1.0)
+    assert failed(fly(load_scenario("mobius-1"), seed, wrong)) == {"position_rmse_m"}
+    spiral = load_scenario("spiral")
+    right_m, wrong_m = (fly(spiral, seed, each).metrics["position_rmse_m"] for each in (Parameters(), wrong))
+    assert wrong_m > 2.0 * right_m
 
 
 @pytest.mark.slow

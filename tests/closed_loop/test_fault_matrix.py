@@ -39,6 +39,16 @@ def test_leak_brings_the_robot_up_from_every_mode(mode: str) -> None:
     assert cell.happened.startswith("as before" if mode == "SURFACE" else "SURFACE 0.6")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "mode"),
+    [("IMU frozen", "MOTOR_DETECT"), ("ground station silent", "MOTOR_DETECT"), ("thruster stuck at half", "AUTO")],
+)
+def test_robot_that_tumbles_or_is_turned_over_comes_to_rest(fault: str, mode: str) -> None:
+    """One thruster after another at 3 N turns a module on its head; one stuck at half its speed turns it by 20 deg until it is left out."""
+    assert fly_cell(BY_NAME[fault], mode, 0).broken == ()
+
+
 def test_fail_safe_that_was_switched_off_breaks_the_promise() -> None:
     deaf = Parameters().replace("failsafes.leak_action", 0)
     assert fly_cell(BY_NAME["leak"], "POSHOLD", 0, deaf).broken == (

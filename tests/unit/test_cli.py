@@ -119,7 +119,7 @@ def test_wrong_scenario_file_is_refused_with_line_and_permitted_range(
     ("text", "wrong", "right"),
     [
         ("[control]\nposition_bandwith = 2.0\n", "position_bandwith: unknown key", "position_bandwidth"),
-        ("[control]\nposition_bandwidth = 99.0\n", "99.0 is out of range", "0.1 to 12 rad/s"),
+        ("[control]\nposition_bandwidth = 99.0\n", "99.0 is out of range", "0.1 to 10 rad/s"),
         ('[allocation]\nmode = "hope"\n', "'hope' is unknown", "least_squares, least_power, pseudo_inverse"),
     ],
 )

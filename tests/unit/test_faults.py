@@ -156,6 +156,18 @@ def test_thruster_that_turns_the_wrong_way_or_races_is_found(water: Water, facto
     assert found[0][1] == "thruster 4 does not obey: left out" and found[0][0] <= 0.6
 
 
+@pytest.mark.parametrize("factor", [-1.0, 4.0])
+def test_two_feedbacks_of_a_disobedient_thruster_are_enough_and_one_is_not(water: Water, factor: float) -> None:
+    """Each ESC is heard ten times a second."""
+    water.run(1.0, 2.0 * PUSH)
+    water.speed_factor[3] = factor
+    assert water.run(0.1, 2.0 * PUSH) == []
+    water.speed_factor[3] = 1.0
+    assert water.run(1.0, 2.0 * PUSH) == []
+    water.speed_factor[3] = factor
+    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == ["thruster 4 does not obey: left out"]
+
+
 def test_slow_thruster_below_its_deadband_is_healthy(water: Water) -> None:
     """At 0.09 N no propeller turns."""
     assert water.run(2.0, 0.15 * PUSH) == []

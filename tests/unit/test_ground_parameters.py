@@ -64,7 +64,7 @@ def test_a_set_parameter_reaches_the_next_tick_and_the_file(world: World, client
 
 def test_out_of_range_is_refused_in_words_and_the_old_value_echoed(world: World, client: Client) -> None:
     assert put(world, client, "POS_BW", 1000.0) == SHIPPED
-    assert "out of range; permitted: 0.1 to 12 rad/s" in client.texts
+    assert "out of range; permitted: 0.1 to 10 rad/s" in client.texts
     for nonsense in (math.nan, math.inf, -math.inf):
         assert put(world, client, "POS_BW", nonsense) == SHIPPED
     assert not world.robot.asked
