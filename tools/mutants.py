@@ -26,12 +26,11 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 TIMEOUT_S = 60
 """A mutant that runs longer is killed."""
-SUPERVISOR_TESTS = ("tests/unit/test_supervisor.py", "tests/unit/test_arming.py", "tests/unit/test_failsafes.py")
 TARGETS: dict[str, tuple[str, ...]] = {
-    "firmware_py.core.transitions": SUPERVISOR_TESTS[:1],
-    "firmware_py.core.supervisor": SUPERVISOR_TESTS[:1],
-    "firmware_py.core.arming": SUPERVISOR_TESTS[1:2],
-    "firmware_py.core.failsafes": SUPERVISOR_TESTS[2:],
+    "firmware_py.core.transitions": ("tests/unit/test_transitions.py", "tests/unit/test_supervisor.py"),
+    "firmware_py.core.supervisor": ("tests/unit/test_supervisor.py",),
+    "firmware_py.core.arming": ("tests/unit/test_arming.py",),
+    "firmware_py.core.failsafes": ("tests/unit/test_failsafes.py",),
     "firmware_py.core.limiter": ("tests/unit/test_limiter.py",),
 }
 """The tests of each module, those that must kill its mutants."""
