@@ -20,6 +20,9 @@ from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "supervisor.md"
+WHILE_TESTED = """\
+In MOTOR_DETECT a body is disarmed instead, whatever the action, where a motor test has armed it or where it never had a pose: it may lie on a
+bench. A cause that comes back before its fail-safe is over acts again when it has lasted its delay."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -116,7 +119,7 @@ def page() -> str:
         "## States", "", *diagram(), "Every transition there is; what has no row is refused in words.", "", *transitions(),
         "## Modes", "", *modes(), "## Arming checks", "", *arming(),
         "## Fail-safes", "", "Gravest first, with the default parameters (`failsafes.NAME_limit`, `_delay_s`, `_action`, `_latched`).", "",
-        *failsafes(), "### Actions", "", *permitted(),
+        *failsafes(), "### Actions", "", *permitted(), WHILE_TESTED,
     ]  # fmt: skip
     return "\n".join(lines).rstrip() + "\n"
 

@@ -197,14 +197,19 @@ class DockingStage:
             self._release(undock, inputs.time_ns, estimates, decisions)
         return decisions
 
-    def relays(self, time_ns: int) -> dict[int, tuple[int, ...]]:
-        """By module: the relay states that it is to be sent in this tick."""
+    @property
+    def relays(self) -> list[list[int]]:
+        """By module: the relay states that docks and joints want."""
+        return self._relays.tolist()
+
+    def due(self, time_ns: int) -> list[int]:
+        """Modules whose relay states are to be sent in this tick."""
         if min(self._due_ns) > time_ns:
-            return {}
+            return []
         due = [module for module, at_ns in enumerate(self._due_ns) if at_ns <= time_ns]
         for module in due:
             self._due_ns[module] = time_ns + RELAY_PERIOD_NS
-        return {module: tuple(self._relays[module].tolist()) for module in due}
+        return due
 
     # ------------------------------------------------------------ beginnings
 

@@ -5,7 +5,7 @@ The first row is the gravest. `Failsafes` keeps the time of each row; the superv
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from operator import attrgetter
 from typing import NamedTuple
@@ -88,12 +88,14 @@ TABLE = (
 
 
 class Alarm(NamedTuple):
-    """A fail-safe that has just begun or ended."""
+    """A fail-safe that has just begun, begun anew or ended."""
 
     name: str
     words: str
     level: Level
     begins: bool
+    again: bool = False
+    """Its cause has come back before it ended."""
 
 
 class Watch:
@@ -101,16 +103,31 @@ class Watch:
 
     def __init__(self, row: Row, parameters: FailsafeParameters) -> None:
         self.row, self._value, self._below = row, row.value, row.below
-        self.limit: float = getattr(parameters, f"{row.name}_limit", 0.0)
-        self.level = Level(getattr(parameters, f"{row.name}_action"))
-        self.latched = bool(getattr(parameters, f"{row.name}_latched"))
-        self._delay_ns = round(getattr(parameters, f"{row.name}_delay_s") * 1e9)
-        self._clear_ns = round(parameters.clear_s * 1e9)
         self._since_ns: int | None = None
         self._gone_ns: int | None = None
-        self.active = False
+        self.active, self.level = False, Level.NONE
+        self._told = False
+        """Whether its cause has not gone since it was last reported."""
         self.began = ""
         """Its words when it last began."""
+        self.retune(parameters)
+
+    def retune(self, parameters: FailsafeParameters) -> None:
+        """Takes other limits; its time goes on. Another action is acted on anew."""
+        name, before = self.row.name, self.level
+        self.limit: float = getattr(parameters, f"{name}_limit", 0.0)
+        self.level = Level(getattr(parameters, f"{name}_action"))
+        self.latched = bool(getattr(parameters, f"{name}_latched"))
+        self._told = self._told and self.level == before
+        self._delay_ns = round(getattr(parameters, f"{name}_delay_s") * 1e9)
+        self._clear_ns = round(parameters.clear_s * 1e9)
+
+    def take_over(self, before: Sequence[Watch]) -> None:
+        """Goes on from the watches of the same row of the bodies before: on where one was, its cause as old as the oldest."""
+        self.active = any(w.active for w in before)
+        self._told = self.active and all(w._told for w in before if w.active)
+        self._since_ns = min((w._since_ns for w in before if w._since_ns is not None), default=None)
+        self.began = next((w.began for w in before if w.active), "")
 
     def beyond(self, health: Health) -> bool:
         """Whether its cause holds now, whatever the mode. A NaN is no cause."""
@@ -137,31 +154,43 @@ class Watch:
         return not self.active and self._since_ns is None
 
     def step(self, now: int, cause: bool, armed: bool) -> bool:
-        """Moves its time on; whether it has begun or ended in this tick."""
+        """Moves its time on; whether it has begun or ended in this tick, or its cause has come back to stay."""
         if cause:
             self._gone_ns = None
             if self._since_ns is None:
                 self._since_ns = now
         else:
-            self._since_ns = None
+            self._since_ns, self._told = None, False
             if self._gone_ns is None:
                 self._gone_ns = now
-        before = self.active
+        before, told = self.active, self._told
         if self._since_ns is not None and now - self._since_ns >= self._delay_ns:
-            self.active = True
+            self.active = self._told = True
         elif self._gone_ns is not None and now - self._gone_ns >= self._clear_ns and not (self.latched and armed):
             self.active = False
-        return self.active != before
+        return self.active != before or (self._told and not told)
 
 
 class Failsafes:
     """All fail-safes of one body."""
 
     def __init__(self, parameters: FailsafeParameters) -> None:
-        self._watches = [watch for watch in (Watch(row, parameters) for row in TABLE) if watch.level != Level.NONE]
+        self._all = [Watch(row, parameters) for row in TABLE]
+        self.retune(parameters)
+
+    def retune(self, parameters: FailsafeParameters) -> None:
+        """Takes other limits and actions; what is on stays on."""
+        for watch in self._all:
+            watch.retune(parameters)
+        self._watches = [watch for watch in self._all if watch.level != Level.NONE]
+
+    def take_over(self, before: Sequence[Failsafes]) -> None:
+        """Goes on from those of the bodies that this one is made of, or was part of."""
+        for watch, *theirs in zip(self._all, *(other._all for other in before), strict=True):
+            watch.take_over(theirs)
 
     def step(self, health: Health, mode: Mode, forced: bool, armed: bool) -> list[Alarm]:
-        """Those that begin or end in this tick, gravest row first.
+        """Those that begin, come back or end in this tick, gravest row first.
 
         Args:
             forced: a fail-safe and no person chose `mode`.
@@ -169,8 +198,10 @@ class Failsafes:
         alarms = []
         for watch in self._watches:
             cause = watch.beyond(health) and watch.counts(mode, forced, armed)
+            was_active = watch.active
             if (cause or not watch.rests) and watch.step(health.time_ns, cause, armed):
-                alarms.append(Alarm(watch.row.name, watch.words(health), watch.level, watch.active))
+                again = was_active and watch.active
+                alarms.append(Alarm(watch.row.name, watch.words(health), watch.level, watch.active, again))
                 watch.began = alarms[-1].words if watch.active else watch.began
         return alarms
 

@@ -1,11 +1,12 @@
 """Which thrusters are dead or lie: by what their ESCs report, and by the motion that is missing. Between estimate and supervisor.
 
-What is found stays out until the body is armed anew.
+What is found stays out until the body is disarmed.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.missing_thrust import MissingThrust
 from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
+from firmware_py.core.topology import in_both
 from firmware_py.core.types import Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 
@@ -72,13 +74,13 @@ class FaultDetector:
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
         self._t = t
-        self._pairs = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in by_channel(body)]
+        self._thruster_at = by_channel(body)
+        self._pairs = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in self._thruster_at]
         self._modules = body.modules
         full_n = np.array([(polynomial(f, 1.0), polynomial(r, 1.0)) for f, r in zip(t.forward, t.reverse, strict=True)])
         self._believed = (full_n, t.rpm_at_full)
-        self._limits = parameters.force_n, parameters.dead_share
-        self._needed = np.array([parameters.dead_count, parameters.dead_count, parameters.stray_count])
         self._motion = MissingThrust(body, parameters, period_ns)
+        self.retune(parameters)
         n = t.f_max.size
         self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
@@ -87,6 +89,21 @@ class FaultDetector:
         self.changed = False
         """Whether `now` changed in this tick."""
         self.now = self._judge(np.ones(n, dtype=bool))
+
+    def retune(self, parameters: Faults) -> None:
+        """Takes other limits from this tick on; what is known stays."""
+        self._limits = parameters.force_n, parameters.dead_share
+        self._needed = np.array([parameters.dead_count, parameters.dead_count, parameters.stray_count])
+        self._motion.parameters = parameters
+
+    def take_over(self, before: Sequence[FaultDetector]) -> None:
+        """Goes on from the bodies that this one is made of, or was part of: what is left out stays out."""
+        alive = self.now.alive.copy()
+        for other in before:
+            for i, j in in_both(self._modules, other._modules):
+                for channel, thruster in self._thruster_at[i].items():
+                    alive[thruster] = other.now.alive[other._thruster_at[j][channel]]
+        self.now = self._judge(alive)
 
     def reset(self) -> None:
         """All thrusters are trusted again."""

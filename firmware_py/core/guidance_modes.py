@@ -59,14 +59,9 @@ class Guidance:
     """Keeps what was asked for, and makes each tick's set-point of it."""
 
     def __init__(self, body: Body, parameters: Parameters) -> None:
-        p = parameters.steering
-        self._p, self._fence = p, parameters.fence
-        self._lead_s = parameters.control.lead_s
-        self._no_place_s, self._no_depth_s = parameters.failsafes.tag_lost_limit, parameters.failsafes.depth_unknown_limit
-        reach = 0.5 * np.abs(body.thrusters.matrix) @ (body.thrusters.f_max - body.thrusters.f_min)
-        self._full_stick = p.stick_share * reach
-        self._lift_n = p.surface_force_n * len(body.modules)
-        self._glider = Glider(p.bandwidth, p.speed_m_s, p.rate_rad_s)
+        self._body = body
+        self._glider = Glider(0.0, 0.0, 0.0)
+        self.retune(parameters)
         self._trajectory: Trajectory | None = None
         self._start_ns: int | None = None
         self._goal: Wish | None = None
@@ -78,6 +73,16 @@ class Guidance:
         self._wrench = np.zeros(6)
         self._blend = False
         self.mode = Mode.POSHOLD
+
+    def retune(self, parameters: Parameters) -> None:
+        """Takes other limits from this tick on; set-point and what was asked for stay."""
+        p, t = parameters.steering, self._body.thrusters
+        self._p, self._fence = p, parameters.fence
+        self._lead_s = parameters.control.lead_s
+        self._no_place_s, self._no_depth_s = parameters.failsafes.tag_lost_limit, parameters.failsafes.depth_unknown_limit
+        self._full_stick = p.stick_share * (0.5 * np.abs(t.matrix) @ (t.f_max - t.f_min))
+        self._lift_n = p.surface_force_n * len(self._body.modules)
+        self._glider.retune(p.bandwidth, p.speed_m_s, p.rate_rad_s)
 
     # ------------------------------------------------------------ what is asked for
 
@@ -91,7 +96,7 @@ class Guidance:
         elif effect == Effect.STOP:
             self.rest(estimate)
         elif effect in (*TAKES_OVER, Effect.TEST_MOTOR):
-            self._enter(decision.mode, estimate)
+            self._enter(decision.mode, time_ns, estimate)
             if effect == Effect.ENTER_LEVEL:
                 self._level()
             elif effect == Effect.HOLD_AT and argument is not None:
@@ -136,12 +141,14 @@ class Guidance:
             return True
         return self._start_ns is not None and (time_ns - self._start_ns) * 1e-9 >= self._trajectory.duration_s
 
-    def _enter(self, mode: Mode, estimate: Estimate) -> None:
+    def _enter(self, mode: Mode, time_ns: int, estimate: Estimate) -> None:
         at = self._glider.at
         gap, turn = np.linalg.norm(at.p_wb - estimate.p_wb), np.linalg.norm(difference(at.q_wb, estimate.q_wb))
         if STEERING[self.mode] != STEERING[Mode.POSHOLD] or gap > NEAR_M or turn > NEAR_RAD:
             self._glider.put(at_estimate(estimate))
         self._trajectory = self._goal = self._docking = None
+        if self._point is not None and time_ns - self._point[0] > self._p.guided_timeout_s * 1e9:
+            self._point = None
         self.mode, self._blend = mode, True
 
     # ------------------------------------------------------------ the set-point
@@ -239,9 +246,9 @@ class Guidance:
         return np.asarray(np.clip(p_wb, low, np.array([f.north_m, f.east_m, f.bottom_m])))
 
     def _held_in(self, p_wb: np.ndarray, v_w: np.ndarray) -> np.ndarray:
-        """The speed without what would lead out of the fence within a second."""
+        """The speed without what would lead out of the fence within a second, or farther out."""
         soon = p_wb + v_w
-        return np.where(self._inside(soon) == soon, v_w, 0.0)
+        return np.where(np.abs(self._inside(soon) - soon) > np.abs(self._inside(p_wb) - p_wb), 0.0, v_w)
 
     def _placed(self, health: Health) -> bool:
         return health.ready and health.tag_age_s <= self._no_place_s

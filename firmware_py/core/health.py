@@ -7,6 +7,7 @@ Figures that are not known yet are NaN, so that no comparison with them holds.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from math import isfinite
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults, by_channel
+from firmware_py.core.topology import in_both
 from firmware_py.core.types import Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
@@ -24,6 +26,8 @@ NEVER_S = 1e9
 """Age of what never came."""
 MEAN_S = 1.0
 """Time over which rates and shares are averaged."""
+DRY_NS = 3_000_000_000
+"""A cabin that was wet is dry when its sensor has been for so long: water in it moves. ArduSub's detector waits as long."""
 VOLTAGE_SHARE = 0.2
 """Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
 
@@ -87,20 +91,18 @@ class HealthMonitor:
         count = len(body.modules)
         t = body.thrusters
         self._modules = body.modules
-        self._fence = parameters.fence
-        self._answer_ns = round(parameters.supervision.answer_ms * 1e6)
-        self._esc_fresh_ns = round(parameters.supervision.esc_fresh_ms * 1e6)
         self._period_ns = period_ns
         self._nominal_v = [float(t.voltage_v[t.module == m][0]) for m in range(count)]
         self._thruster_at = by_channel(body)
         self._esc_ns = [NEVER_NS] * t.module.size
         self._heard_ns = [0] * count
         self._answered_ns = [NEVER_NS] * count
-        self._leak = [False] * count
+        self._leak, self._wet_ns = [False] * count, [NEVER_NS] * count
         self._voltage_share: dict[int, float] = {}
         self._cabin_c: dict[int, float] = {}
         self._cabin_start_pa: dict[int, float] = {}
         self._cabin_change_pa: dict[int, float] = {}
+        self._readings = (self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa)
         self._depth_ns = self._imu_ns = 0
         self._ground_ns: int | None = None
         self._pilot_ns: int | None = None
@@ -117,6 +119,31 @@ class HealthMonitor:
         """Set by whoever watches the docked faces."""
         self.warm = True
         """Cleared and set by whoever compiles."""
+        self.retune(parameters)
+
+    def retune(self, parameters: Parameters) -> None:
+        """Takes other limits from this tick on."""
+        self._fence = parameters.fence
+        self._answer_ns = round(parameters.supervision.answer_ms * 1e6)
+        self._esc_fresh_ns = round(parameters.supervision.esc_fresh_ms * 1e6)
+
+    def take_over(self, before: Sequence[HealthMonitor]) -> None:
+        """Goes on from the bodies that this one is made of, or was part of: what each module said last, and when people were heard."""
+        for other in before:
+            for i, j in in_both(self._modules, other._modules):
+                self._heard_ns[i], self._answered_ns[i] = other._heard_ns[j], other._answered_ns[j]
+                self._leak[i], self._wet_ns[i] = other._leak[j], other._wet_ns[j]
+                for mine, theirs in zip(self._readings, other._readings, strict=True):
+                    mine.update({i: theirs[j]} if j in theirs else {})
+                for channel, thruster in self._thruster_at[i].items():
+                    self._esc_ns[thruster] = other._esc_ns[other._thruster_at[j][channel]]
+        self._depth_ns, self._imu_ns = (max(other._depth_ns for other in before), max(other._imu_ns for other in before))
+        self._time_ns = max((other._time_ns for other in before if other._time_ns is not None), default=None)
+        self._ground_ns = max((other._ground_ns for other in before if other._ground_ns is not None), default=None)
+        self._pilot_ns = max((other._pilot_ns for other in before if other._pilot_ns is not None), default=None)
+        self._stick = max(other._stick for other in before)
+        self._errors, self._error_rate = max((other._errors, other._error_rate) for other in before)
+        self._missed_rate = max(other._missed_rate for other in before)
 
     def step(self, inputs: Inputs, estimate: Estimate, requests: list[Request], faults: ThrusterFaults) -> Health:
         """The figures of this tick; `now` keeps them."""
@@ -169,8 +196,10 @@ class HealthMonitor:
                 self._heard_ns[index] = now
             if module.pressure_pa is not None:
                 self._depth_ns = now
-            if module.leak is not None:
-                self._leak[index] = module.leak
+            if module.leak:
+                self._leak[index], self._wet_ns[index] = True, now
+            elif module.leak is not None and now - self._wet_ns[index] >= DRY_NS:
+                self._leak[index] = False
             if module.voltage_v is not None and isfinite(module.voltage_v):
                 share = module.voltage_v / self._nominal_v[index]
                 before = self._voltage_share.get(index, share)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from firmware_py.core.topology import in_both
 from firmware_py.core.types import ModuleInputs
 
 REPEATS = 10
@@ -27,6 +28,12 @@ class ImuWatch:
         self._last: list[tuple[bytes, np.ndarray]] = [(b"", np.zeros(0))] * len(self._modules)
         self._repeats = [0] * len(self._modules)
         self.frozen = [False] * len(self._modules)
+
+    def take_over(self, before: Sequence[ImuWatch]) -> None:
+        """Goes on from the bodies that this one is made of, or was part of."""
+        for other in before:
+            for i, j in in_both(self._modules, other._modules):
+                self._last[i], self._repeats[i], self.frozen[i] = other._last[j], other._repeats[j], other.frozen[j]
 
     def step(self, modules: Sequence[ModuleInputs]) -> bool:
         """Whether any IMU that is to be believed gave a sample in this tick. `modules`: by fleet index."""

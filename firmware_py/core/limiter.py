@@ -6,6 +6,7 @@ Whatever asks for a force, nothing leaves that this file has not passed.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
@@ -34,13 +35,8 @@ class Limiter:
 
     def __init__(self, body: Body, parameters: LimiterParameters, dt_s: float) -> None:
         t = body.thrusters
-        self._t = t
-        self._limits = (
-            t.f_min * parameters.force_share, t.f_max * parameters.force_share,
-            -np.array([polynomial(curve, 1.0) for curve in t.reverse]), np.array([polynomial(curve, 1.0) for curve in t.forward]),
-        )  # fmt: skip
-        self._step_n, self._eased_ticks = parameters.slew_n_per_s * dt_s, round(EASED_S / dt_s)
-        self._eased = 0
+        self._t, self._dt_s = t, dt_s
+        self._eased, self._eased_ticks = 0, round(EASED_S / dt_s)
         self._supply = [float(watts) for watts in body.supply_power_w]
         self._of_module = [np.flatnonzero(t.module == m) for m in range(len(body.modules))]
         self._power = [(np.ascontiguousarray(t.power_forward[i]), np.ascontiguousarray(t.power_reverse[i])) for i in self._of_module]
@@ -51,6 +47,18 @@ class Limiter:
         self.magnets = [MagnetLimiter(parameters, dt_s) for _ in body.modules]
         """One for each module."""
         self.force_n = np.zeros(t.f_max.size)
+        self.retune(parameters)
+
+    def retune(self, parameters: LimiterParameters) -> None:
+        """Takes other limits from this tick on; forces and the magnets' accounts stay."""
+        t = self._t
+        self._limits = (
+            t.f_min * parameters.force_share, t.f_max * parameters.force_share,
+            -np.array([polynomial(curve, 1.0) for curve in t.reverse]), np.array([polynomial(curve, 1.0) for curve in t.forward]),
+        )  # fmt: skip
+        self._step_n = parameters.slew_n_per_s * self._dt_s
+        for magnets in self.magnets:
+            magnets.parameters = parameters
 
     def ease(self, force_n: np.ndarray) -> None:
         """Goes on from the forces (n,) of the bodies before, whose thrusters these were, and changes them slowly at first."""
@@ -139,18 +147,22 @@ class MagnetLimiter:
     """
 
     def __init__(self, parameters: LimiterParameters, dt_s: float) -> None:
-        self._p, self._dt_s = parameters, dt_s
-        self._left_s = np.full(FACES, parameters.relay_on_s)
-        self._resting = np.zeros(FACES, dtype=bool)
+        self.parameters, self._dt_s = parameters, dt_s
+        self._left_s = [parameters.relay_on_s] * FACES
+        self._resting = [False] * FACES
+        self.states = (OFF,) * FACES
+        """Relay states of the last tick."""
         self.power_w = 0.0
         """What the magnets that are on take, W."""
 
-    def step(self, wanted: tuple[int, ...]) -> tuple[int, ...]:
+    def step(self, wanted: Sequence[int]) -> tuple[int, ...]:
         """The relay states that are permitted in this tick; a state that does not exist is off. To be called in every tick."""
-        asked = np.array([state in (FORWARD, REVERSE) for state in wanted])
-        on = asked & ~self._resting
-        full = self._p.relay_on_s
-        self._left_s = np.minimum(full, self._left_s + self._dt_s * (self._p.relay_duty - on))
-        self._resting = np.where(self._resting, self._left_s < 0.5 * full, self._left_s <= 0.0)
-        self.power_w = float(np.sum(on)) * self._p.relay_w
-        return tuple(int(wanted[face]) if on[face] else OFF for face in range(FACES))
+        full, duty = self.parameters.relay_on_s, self.parameters.relay_duty
+        on = [state in (FORWARD, REVERSE) and not resting for state, resting in zip(wanted, self._resting, strict=True)]
+        for face in range(FACES):
+            left_s = min(full, self._left_s[face] + self._dt_s * (duty - on[face]))
+            self._resting[face] = left_s < 0.5 * full if self._resting[face] else left_s <= 0.0
+            self._left_s[face] = left_s
+        self.power_w = sum(on) * self.parameters.relay_w
+        self.states = tuple(state if lit else OFF for state, lit in zip(wanted, on, strict=True))
+        return self.states

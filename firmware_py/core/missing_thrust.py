@@ -54,7 +54,7 @@ class MissingThrust:
 
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
-        self._body, self._p = body, parameters
+        self._body, self.parameters = body, parameters
         self._columns = t.matrix.T.copy()
         self._inertia = body.mass[3:, 3:].copy()
         self._ticks = max(1, round(BLOCK_NS / period_ns))
@@ -136,11 +136,11 @@ class MissingThrust:
             self._suspect, self._count = best, int(best >= 0)
             return None
         self._count += 1
-        return best if self._count >= self._p.lie_count else None
+        return best if self._count >= self.parameters.lie_count else None
 
     def _explain(self, alive: np.ndarray) -> int:
         """The one thruster that explains the change, or -1."""
-        return int(explain(self._blocks, self._columns, alive, self._sigma, self._tilt, self._doubt, self._p.lie_share))
+        return int(explain(self._blocks, self._columns, alive, self._sigma, self._tilt, self._doubt, self.parameters.lie_share))
 
 
 DOWN = np.array([0.0, 0.0, GRAVITY])

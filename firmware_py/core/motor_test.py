@@ -21,7 +21,7 @@ class MotorTest:
     """The forces of the running test."""
 
     def __init__(self, body: Body, parameters: Steering) -> None:
-        self._p = parameters
+        self.parameters = parameters
         self._high, self._low = body.thrusters.f_max, body.thrusters.f_min
         self._plan: list[tuple[int, int, float]] = []
 
@@ -38,16 +38,16 @@ class MotorTest:
         index, share, seconds = argument
         if not isinstance(index, int) or not 0 <= index < self._high.size or not math.isfinite(share + seconds):
             return
-        share = max(-self._p.test_share, min(self._p.test_share, share))
+        share = max(-self.parameters.test_share, min(self.parameters.test_share, share))
         self._plan = [(time_ns + round(1e9 * max(0.0, min(seconds, LONGEST_S))), index, share)]
 
     def detect(self, time_ns: int) -> None:
         """All thrusters, one after the other."""
         self.stop()
-        turn, pause = round(1e9 * self._p.test_s), round(1e9 * self._p.test_s * PAUSE_SHARE)
+        turn, pause = round(1e9 * self.parameters.test_s), round(1e9 * self.parameters.test_s * PAUSE_SHARE)
         for index in range(self._high.size):
             begin = time_ns + index * (turn + pause)
-            self._plan += [(begin + turn, index, self._p.test_share), (begin + turn + pause, index, 0.0)]
+            self._plan += [(begin + turn, index, self.parameters.test_share), (begin + turn + pause, index, 0.0)]
 
     def stop(self) -> None:
         """Ends it at once."""

@@ -5,7 +5,7 @@ One call serves the whole fleet.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from firmware_py.core.requests import FOR_ALL, sift
 from firmware_py.core.supervisor import WARNING, Decision, Supervisor
 from firmware_py.core.supply import SupplyMeter
 from firmware_py.core.thruster import ThrusterLag
-from firmware_py.core.topology import join, part_of
+from firmware_py.core.topology import in_both, join, part_of
 from firmware_py.core.transitions import DOCKING, Effect, Trigger
 from firmware_py.core.types import (
     Action,
@@ -56,7 +56,7 @@ class BodyPipeline:
     """The stages of one body, in order."""
 
     def __init__(self, body: Body, parameters: Parameters, period_ns: int) -> None:
-        self.body = body
+        self.body, self.parameters = body, parameters
         self.joints = joints_of(body)
         self.measurements = Measurements(body)
         self.imus = ImuWatch(body.modules)
@@ -77,8 +77,14 @@ class BodyPipeline:
         self.supply = SupplyMeter(body)
 
     def retune(self, parameters: Parameters) -> None:
-        """Takes other gains, noise figures and allocation from this tick on; estimate, set-point and forces stay as they are."""
+        """Takes other gains, noise figures and limits from this tick on; estimate, mode, set-point and forces stay as they are."""
+        self.parameters = parameters
         self.estimator.retune(parameters.estimation)
+        self.faults.retune(parameters.faults)
+        self.motor_test.parameters = parameters.steering
+        for stage in (self.health, self.supervisor, self.guidance):
+            stage.retune(parameters)
+        self.limiter.retune(parameters.limiter)
         self.controller = Controller(self.body, parameters.control)
         if parameters.allocation != self.allocator.parameters:
             self.allocator = Allocator(self.body, parameters.allocation)
@@ -109,7 +115,7 @@ class BodyPipeline:
         for decision in decisions:
             self._apply(decision, inputs.time_ns, estimate)
         self.supervisor.events[:0] = [Event(WARNING, words) for words in self.faults.words]
-        if self.supervisor.armed and not was_armed:
+        if self.supervisor.armed != was_armed:
             self.faults.reset()
             if self.faults.changed:
                 self.allocator.set_alive(self.faults.now.alive)
@@ -145,6 +151,20 @@ class BodyPipeline:
         record = BodyRecord(self.body.index, state, mode, estimate, setpoint, wrench, thrust, force)
         return record, command
 
+    def magnets(self, wanted: Sequence[Sequence[int]], due: Collection[int]) -> dict[int, tuple[int, ...]]:
+        """Relay states that are wanted -> those that may be. Returns what is to be sent, by module: what is due, and what changed.
+
+        Args:
+            wanted: six states of each module of the fleet.
+            due: fleet indices of modules.
+        """
+        sent = {}
+        for module, limiter in zip(self.body.modules, self.limiter.magnets, strict=True):
+            before, states = limiter.states, limiter.step(wanted[module])
+            if module in due or states != before:
+                sent[module] = states
+        return sent
+
     def _allocate(self, wrench: np.ndarray, time_ns: int) -> Thrust:
         """Forces for the wrench, less what the thrusters left cannot make; or those of a motor test."""
         if self.supervisor.mode == Mode.MOTOR_DETECT:
@@ -153,31 +173,34 @@ class BodyPipeline:
         return self.allocator.step(self.faults.now.keep @ wrench if self.faults.now.lost_axes else wrench)
 
     def take_over(self, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
-        """Goes on from the bodies that this one is made of, or was part of: motion, forces, supplies, arm state. Returns its estimate."""
+        """Goes on from the bodies that this one is made of, or was part of: motion, forces, health, arm state. Returns its estimate."""
         if len(before) == 1:
             motion = part_of(before[0].body, before[0].estimator.motion, self.body)
         else:
             motion = join([(chain.body, chain.estimator.motion) for chain in before], self.body)
         for chain in before:
             self._take_forces(chain)
+        self.imus.take_over([chain.imus for chain in before])
+        self.faults.take_over([chain.faults for chain in before])
+        self.allocator.set_alive(self.faults.now.alive)
+        self.health.take_over([chain.health for chain in before])
         self.supervisor.take_over([chain.supervisor for chain in before])
         estimate = self.estimator.restart(time_ns, motion)
         self.guidance.take_over(self.supervisor.mode, estimate, self.body.thrusters.matrix @ self.limiter.force_n)
         return estimate
 
     def _take_forces(self, other: BodyPipeline) -> None:
-        """Thrusters keep the forces they have, so that no command jumps."""
+        """Thrusters keep the forces they have, so that no command jumps; magnets keep the time that they may still be on."""
         mine, theirs = self.body, other.body
         forces = [array.copy() for array in self.lag.forces]
         limited = self.limiter.force_n.copy()
-        for i, module in enumerate(mine.modules):
-            if module in theirs.modules:
-                j = theirs.modules.index(module)
-                here, there = mine.thrusters.module == i, theirs.thrusters.module == j
-                for array, source in zip(forces, other.lag.forces, strict=True):
-                    array[here] = source[there]
-                limited[here] = other.limiter.force_n[there]
-                self.supply.voltage_v[i] = other.supply.voltage_v[j]
+        for i, j in in_both(mine.modules, theirs.modules):
+            here, there = mine.thrusters.module == i, theirs.thrusters.module == j
+            for array, source in zip(forces, other.lag.forces, strict=True):
+                array[here] = source[there]
+            limited[here] = other.limiter.force_n[there]
+            self.limiter.magnets[i] = other.limiter.magnets[j]
+            self.supply.voltage_v[i] = other.supply.voltage_v[j]
         self.lag.restart(*forces)
         self.limiter.ease(limited)
 
@@ -210,12 +233,13 @@ class Pipeline:
         requests, refusals = sift(inputs.requests, {chain.body.index: chain.body for chain in self._chains})
         outputs.events += refusals
         self._retune(requests, outputs)
-        relays = self.docking.relays(inputs.time_ns)
+        wanted, due = self.docking.relays, self.docking.due(inputs.time_ns)
         for chain in self._chains:
             estimate = estimates[chain.body.index]
             outputs.preparations += chain.decide(inputs, estimate, requests)
             if chain.supervisor.mode != Mode.DOCK and chain.body.index in self.docking.busy:
                 self.docking.abort(chain.body.index, inputs.time_ns, "the mode was changed")
+            relays = chain.magnets(wanted, due)
             record, command = chain.control(inputs.time_ns, estimate)
             outputs.records.append(record)
             outputs.events += [event._replace(body=chain.body.index) for event in chain.supervisor.events]
@@ -280,7 +304,7 @@ class Pipeline:
         if before is None or len(before) != 2:
             return
         before.sort(key=lambda chain: chain.body.index != joined.target)
-        estimate = joined.chain.take_over(before, time_ns)
+        estimate = self._begin(joined.chain, before, time_ns)
         self._swap(before, [joined.chain], estimates, [estimate])
 
     def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
@@ -288,9 +312,15 @@ class Pipeline:
         before = self._made_of(after)
         if before is None or len(before) != 1:
             return
-        found = [chain.take_over(before, time_ns) for chain in after]
+        found = [self._begin(chain, before, time_ns) for chain in after]
         parted.leaves.guidance.move_by(parted.away_w)
         self._swap(before, after, estimates, found)
+
+    def _begin(self, chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
+        """A body that was prepared takes over, with the parameters of now. Returns its estimate."""
+        if chain.parameters is not self.parameters:
+            chain.retune(self.parameters)
+        return chain.take_over(before, time_ns)
 
     def _made_of(self, after: Sequence[BodyPipeline]) -> list[BodyPipeline] | None:
         """The bodies whose modules these are made of; None where that is no longer so: another join or part of this tick was first."""
@@ -330,7 +360,7 @@ IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)
 
 
 def _command(chain: BodyPipeline, command: np.ndarray, relays: Mapping[int, tuple[int, ...]], outputs: Outputs) -> None:
-    """Hands each module its own thrusters, and its relays when they are due."""
+    """Hands each module its own thrusters and, where there are any to be sent, its relays."""
     armed, channels = chain.supervisor.armed, np.zeros((len(chain.body.modules), CHANNELS))
     channels.reshape(-1)[chain.slots] = command
     for module, thrusters in zip(chain.body.modules, channels, strict=True):

@@ -106,9 +106,12 @@ class Glider:
     """
 
     def __init__(self, bandwidth: float, speed: float, rate: float) -> None:
-        self._w = bandwidth
-        self._speed, self._rate = speed, rate
+        self.retune(bandwidth, speed, rate)
         self.at = rest_at(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def retune(self, bandwidth: float, speed: float, rate: float) -> None:
+        """Moves otherwise from now on: rad/s, m/s, rad/s."""
+        self._w, self._speed, self._rate = bandwidth, speed, rate
 
     def put(self, setpoint: Setpoint) -> None:
         """Go on from `setpoint`."""

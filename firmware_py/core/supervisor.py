@@ -72,7 +72,7 @@ class Supervisor:
         return self._failsafes.is_on(failsafe)
 
     def step(self, estop: bool, health: Health, requests: list[Request], endings: Sequence[Trigger] = ()) -> list[Decision]:
-        """Runs this tick's triggers in order: e-stop, requests, what has ended by itself, fail-safes.
+        """Runs this tick's triggers in order: e-stop, what has ended by itself, requests, fail-safes.
 
         Args:
             estop: an ESTOP frame came since the previous tick.
@@ -85,8 +85,8 @@ class Supervisor:
         if estop:
             self._estop_ns = health.time_ns
             decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
-        decisions += [self._request(request, health) for request in requests]
         decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger)]
+        decisions += [self._request(request, health) for request in requests]
         decisions += self._guard(health)
         return [decision for decision in decisions if decision is not None]
 
@@ -105,19 +105,27 @@ class Supervisor:
         """Runs the fail-safes."""
         decisions: list[Decision | None] = []
         alarms = self._failsafes.step(health, self.mode, self.level > Level.NONE, self.armed)
-        for alarm in alarms:
-            severity = INFORMATION if not alarm.begins else CRITICAL if alarm.level > Level.HOLD else WARNING
-            self._say(severity, f"fail-safe {'on' if alarm.begins else 'over'}: {alarm.words}")
         begun = [alarm.level for alarm in alarms if alarm.begins and alarm.level > Level.WARN]
         level = self._failsafes.level
-        if self.armed and begun and level > self.safety:
-            for trigger in LADDER[level]:
+        acts = self.armed and bool(begun) and level > self.safety
+        for alarm in alarms:
+            severity = INFORMATION if not alarm.begins else CRITICAL if alarm.level > Level.HOLD else WARNING
+            if acts or not alarm.again:  # one that comes and goes is said when it takes the robot from somebody
+                self._say(severity, f"fail-safe {'on' if alarm.begins else 'over'}: {alarm.words}")
+        if acts:
+            for trigger in self._ladder(level, health):
                 decision = self._try(trigger, None, health)
                 if decision is not None:
                     decisions.append(decision)
                     self.level = level
                     break
         return decisions
+
+    def _ladder(self, level: Level, health: Health) -> tuple[Trigger, ...]:
+        """What is tried. A body whose thrusters are tested, or that never had a pose, may lie on a bench: no test becomes a flight."""
+        if self.mode == Mode.MOTOR_DETECT and (self._testing or not health.ready):
+            return LADDER[Level.DISARM]
+        return LADDER[level]
 
     def _try(self, trigger: Trigger, argument: Any, health: Health) -> Decision | None:
         """Makes the transition of the table's row, or says why not."""
@@ -164,9 +172,15 @@ class Supervisor:
         row = ROWS.get((self.state, trigger))
         return row is not None and {Guard.TESTING: self._testing, Guard.IN_DOCK: self.mode == Mode.DOCK}[row.guard]
 
+    def retune(self, parameters: Parameters) -> None:
+        """Takes other limits from this tick on; state and mode stay."""
+        self._p = parameters
+        self._failsafes.retune(parameters.failsafes)
+
     def take_over(self, before: Sequence[Supervisor]) -> None:
         """Goes on from the bodies that this one is made of, or was part of: armed when all were, stopped when one was.
 
+        Fail-safes that were on stay on.
         It holds its place. Where a fail-safe had taken one of them, it goes on in that one's mode, the gravest; else, where one of them
         was in a mode that needs no place, in the first such mode.
         """
@@ -178,6 +192,7 @@ class Supervisor:
         self.mode, self.level = next(iter(kept), Mode.POSHOLD), worst.level
         self.raises_estop = any(other.raises_estop for other in before)
         self._estop_ns = max((other._estop_ns for other in before if other._estop_ns is not None), default=None)
+        self._failsafes.take_over([other._failsafes for other in before])
 
     def _estop_age_ms(self, health: Health) -> float:
         return NEVER_S if self._estop_ns is None else (health.time_ns - self._estop_ns) * 1e-6

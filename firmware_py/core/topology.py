@@ -29,6 +29,11 @@ class Motion(NamedTuple):
     """Time of the newest."""
 
 
+def in_both(mine: Sequence[int], theirs: Sequence[int]) -> list[tuple[int, int]]:
+    """Where each module that is in both bodies stands in the one and in the other."""
+    return [(i, theirs.index(module)) for i, module in enumerate(mine) if module in theirs]
+
+
 def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
     """State of `body`, made of the bodies `parts`; its first module is one of the first part."""
     x = np.zeros(STATES)

@@ -160,7 +160,9 @@ def test_alarm_ends_when_its_cause_is_gone_for_a_while() -> None:
     failsafes.step(GOOD._replace(cabin_c=80.0), Mode.AUTO, False, True)
     assert failsafes.level == Level.SURFACE
     assert failsafes.step(at(GOOD, 1.0), Mode.AUTO, False, True) == []
-    assert failsafes.step(at(GOOD._replace(cabin_c=80.0), 2.0), Mode.AUTO, False, True) == []
+    again = Alarm("cabin_hot", "cabin at 80 degC", Level.SURFACE, True, again=True)
+    assert failsafes.step(at(GOOD._replace(cabin_c=80.0), 2.0), Mode.AUTO, False, True) == [again]
+    assert failsafes.step(at(GOOD._replace(cabin_c=80.0), 2.5), Mode.AUTO, False, True) == []
     assert failsafes.step(at(GOOD, 3.0), Mode.AUTO, False, True) == []
     late = at(GOOD, 5.0)
     assert failsafes.step(late._replace(time_ns=late.time_ns - 1), Mode.AUTO, False, True) == []
@@ -283,3 +285,66 @@ def test_mode_is_permitted_as_soon_as_the_cause_is_gone_unless_it_is_latched() -
 def test_row_needs_neither_limit_nor_mode() -> None:
     row = Row("leak", "", lambda health: health.leak)
     assert not row.below and row.modes == ANY and row.forced_modes == frozenset()
+
+
+def test_cause_that_comes_back_is_reported_again_when_it_has_lasted_its_delay() -> None:
+    failsafes = Failsafes(replace(quick("leak"), leak_delay_s=0.5, leak_latched=1))
+    wet = GOOD._replace(leak=True)
+    assert failsafes.step(wet, Mode.AUTO, False, True) == []
+    (first,) = failsafes.step(at(wet, 0.5), Mode.AUTO, False, True)
+    assert first.begins and not first.again
+    for seconds, health in ((60.0, GOOD), (61.0, wet), (61.49, wet)):
+        assert failsafes.step(at(health, seconds), Mode.AUTO, False, True) == []
+    assert failsafes.step(at(wet, 61.5), Mode.AUTO, False, True) == [first._replace(again=True)]
+    assert failsafes.step(at(wet, 90.0), Mode.AUTO, False, True) == []
+
+
+# ---------------------------------------------------------------- other parameters, other bodies
+
+
+def test_other_limits_count_from_the_next_tick_on_and_what_is_on_stays_on() -> None:
+    failsafes = Failsafes(quick("cabin_hot"))
+    failsafes.step(GOOD._replace(cabin_c=71.0), Mode.AUTO, False, True)
+    failsafes.retune(replace(quick("cabin_hot"), cabin_hot_limit=90.0, clear_s=1.0))
+    assert failsafes.level == Level.SURFACE
+    failsafes.step(at(GOOD._replace(cabin_c=89.0), 1.0), Mode.AUTO, False, True)
+    (alarm,) = failsafes.step(at(GOOD._replace(cabin_c=89.0), 2.0), Mode.AUTO, False, True)
+    assert not alarm.begins
+    failsafes.retune(replace(quick("cabin_hot"), cabin_hot_limit=80.0))
+    assert failsafes.step(at(GOOD._replace(cabin_c=89.0), 3.0), Mode.AUTO, False, True)[0].begins
+
+
+def test_other_action_is_acted_on_anew_and_one_that_is_switched_off_is_over() -> None:
+    hot = GOOD._replace(cabin_c=80.0)
+    failsafes = Failsafes(replace(quick("cabin_hot"), cabin_hot_action=int(Level.WARN)))
+    failsafes.step(hot, Mode.AUTO, False, True)
+    failsafes.retune(quick("cabin_hot"))
+    (alarm,) = failsafes.step(at(hot, 1.0), Mode.AUTO, False, True)
+    assert (alarm.begins, alarm.again, alarm.level) == (True, True, Level.SURFACE)
+    failsafes.retune(quick("cabin_hot"))
+    assert failsafes.step(at(hot, 2.0), Mode.AUTO, False, True) == [], "the same action"
+    failsafes.retune(quick("leak"))
+    assert failsafes.level == Level.NONE and not failsafes.is_on("cabin_hot")
+
+
+def test_body_that_takes_over_goes_on_with_every_fail_safe_and_its_time() -> None:
+    leaky, weak, after = (Failsafes(P) for _ in range(3))
+    wet, low = GOOD._replace(leak=True), GOOD._replace(voltage_share=0.79)
+    for seconds in (0.0, 0.5):
+        leaky.step(at(wet, seconds), Mode.AUTO, False, True)
+        weak.step(at(low, seconds), Mode.AUTO, False, True)
+    after.take_over([weak, leaky])
+    assert after.is_on("leak") and after.level == Level.SURFACE
+    assert after.active(GOOD) == ["water in a cabin"]
+    both = low._replace(leak=True)
+    assert after.step(at(both, 1.0), Mode.AUTO, False, True) == [], "told already"
+    assert [alarm.name for alarm in after.step(at(both, 4.99), Mode.AUTO, False, True)] == []
+    assert [alarm.name for alarm in after.step(at(both, 5.0), Mode.AUTO, False, True)] == ["battery_critical", "battery_low"]
+
+
+def test_body_made_of_calm_ones_is_calm() -> None:
+    after = Failsafes(quick("leak"))
+    after.take_over([Failsafes(quick("leak")), Failsafes(quick("leak"))])
+    assert after.level == Level.NONE
+    (alarm,) = after.step(GOOD._replace(leak=True), Mode.AUTO, False, True)
+    assert alarm.begins and not alarm.again

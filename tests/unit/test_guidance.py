@@ -173,6 +173,25 @@ def test_held_place_stays_within_the_fence() -> None:
     assert flight.run(15.0, sticks(forward=1.0)).p_wb[0] < 0.6
 
 
+def test_robot_beyond_the_fence_can_be_steered_back_and_no_farther() -> None:
+    flight = Flight(Parameters().replace("fence.north_m", 0.5))
+    flight.estimate = estimate((0.9, 0.0, 1.0))
+    flight.do(Effect.ENTER_MODE, Mode.POSHOLD)
+    assert flight.run(3.0, sticks(forward=1.0)).p_wb[0] == pytest.approx(0.9, abs=1e-3)
+    assert flight.run(6.0, sticks(forward=-1.0)).p_wb[0] < 0.5
+
+
+def test_fence_and_speeds_may_change_in_flight() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.POSHOLD)
+    before = flight.run(1.0, sticks(forward=1.0))
+    flight.guidance.retune(Parameters().replace("fence.north_m", 0.5).replace("steering.speed_m_s", 0.05))
+    after = flight.run(DT := 0.01, sticks(forward=1.0))
+    assert np.linalg.norm(after.p_wb - before.p_wb) < 1.5 * DT * np.linalg.norm(before.v_w), "nothing jumps"
+    assert flight.run(3.0, sticks(forward=1.0)).v_w[0] < 0.0501
+    assert flight.run(20.0, sticks(forward=1.0)).p_wb[0] < 0.55
+
+
 def test_trajectory_is_sampled_now_and_a_thruster_lag_ahead() -> None:
     flight = Flight()
     flight.do(Effect.FOLLOW, Mode.AUTO, Ramp())
@@ -215,6 +234,15 @@ def test_streamed_points_are_followed_and_a_stream_that_ends_stops_the_robot() -
     assert flight.setpoints[-1].v_w[0] == pytest.approx(0.2, abs=1e-3)
     flight.run(2.5)
     assert np.abs(flight.setpoints[-1].v_w).max() < 1e-3
+
+
+@pytest.mark.parametrize(("silence_s", "north_m"), [(60.0, 0.0), (0.1, 3.0)])
+def test_point_of_long_ago_is_no_place_to_go_to_when_the_mode_is_entered(silence_s: float, north_m: float) -> None:
+    flight = Flight()
+    flight.do(Effect.TAKE_POINT, Mode.GUIDED, rest_at(np.array([3.0, 0.0, 1.0]), estimate().q_wb))
+    flight.time_ns += round(silence_s * 1e9)
+    flight.do(Effect.ENTER_MODE, Mode.GUIDED)
+    assert flight.run(40.0).p_wb[0] == pytest.approx(north_m, abs=0.01)
 
 
 def test_single_point_is_flown_to_without_a_stream() -> None:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults
 from firmware_py.core.health import NEVER_S, Health, HealthMonitor, is_sticks, outside
 from firmware_py.core.types import Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
@@ -15,15 +16,15 @@ from firmware_py.prepare.assembly import assemble
 
 TICK_NS = 10_000_000
 BODY = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2, [1, 3])
-ALL_WELL = ThrusterFaults(np.ones(16, dtype=bool), (), 0, np.eye(6))
 ZERO = np.zeros(3)
 
 
 class Ear:
     """A monitor and its ticks. Modules 1 and 3 of a fleet of four."""
 
-    def __init__(self) -> None:
-        self.monitor = HealthMonitor(BODY, Parameters(), TICK_NS)
+    def __init__(self, body: Body = BODY) -> None:
+        self.monitor = HealthMonitor(body, Parameters(), TICK_NS)
+        self.count = body.thrusters.f_max.size
         self.tick = 0
         self.time_ns = 0
         self.dropped = 0
@@ -38,7 +39,7 @@ class Ear:
         )  # fmt: skip
         estimate = estimate._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
         inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped)
-        return self.monitor.step(inputs, estimate, list(requests), ALL_WELL)
+        return self.monitor.step(inputs, estimate, list(requests), ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6)))
 
     def wait(self, seconds: float, **more: object) -> Health:
         for _ in range(round(seconds / 0.01)):
@@ -95,7 +96,47 @@ def test_leak_of_any_module_counts_until_it_says_dry() -> None:
     ear = Ear()
     assert not ear.hear(here(leak=False), here(leak=False)).leak
     assert ear.hear(here(), here(leak=True)).leak and ear.hear(here(leak=False), here()).leak
+    assert ear.wait(2.97).leak and ear.hear(here(), here(leak=False)).leak, "water in a cabin moves"
     assert not ear.hear(here(), here(leak=False)).leak
+
+
+def test_wet_sensor_that_flickers_is_a_leak_all_the_time() -> None:
+    ear = Ear()
+    ear.hear(here(leak=True))
+    assert all(ear.hear(here(leak=tick % 290 == 0)).leak for tick in range(3000))
+
+
+def test_body_that_takes_over_knows_what_its_modules_said_and_when_people_were_heard() -> None:
+    """The module that was number 3 of the fleet, alone; and the pair again."""
+    whole = Ear()
+    sticks = Request(Action.STICKS, 0, Sticks((0.5, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    whole.dropped = 1000
+    said = {"voltage_v": 11.4, "cabin_temperature_c": 44.0, "pressure_pa": 1.2e5, "esc": [EscFeedback(6, (0.0, 0.0), (0.0, 0.0), (0, 0))]}
+    whole.hear(here(cabin_pressure_pa=90e3), here(cabin_pressure_pa=100e3), Request(Action.GROUND_ALIVE, 0), sticks)
+    whole.hear(here(leak=True), here(cabin_pressure_pa=93e3, **said))
+    before = whole.wait(0.5)
+    alone = Ear(assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [3]))
+    alone.monitor.take_over([whole.monitor])
+    alone.tick, alone.time_ns, alone.dropped = whole.tick, whole.time_ns, whole.dropped
+    after = alone.hear()
+    assert (after.cabin_change_pa, after.cabin_c, after.leak, after.silent) == (7e3, 44.0, False, (3,))
+    assert after.voltage_share == pytest.approx(0.95)
+    assert after.silent_s == after.depth_age_s == pytest.approx(0.51)
+    assert after.ground_age_s == after.pilot_age_s == pytest.approx(0.52) and after.stick == 0.5
+    assert 6 not in after.esc_missing and 5 in after.esc_missing
+    assert after.frame_errors_per_s == pytest.approx(before.frame_errors_per_s, rel=0.02), "no frame counts twice"
+    pair = Ear()
+    pair.monitor.take_over([whole.monitor, alone.monitor])
+    pair.tick, pair.time_ns, pair.dropped = alone.tick, alone.time_ns, alone.dropped
+    assert pair.hear().leak and pair.hear().cabin_change_pa == 7e3
+
+
+def test_fence_and_delays_may_change() -> None:
+    ear = Ear()
+    ear.monitor.retune(Parameters().replace("fence.north_m", 0.25).replace("supervision.answer_ms", 1000.0))
+    ear.hear(here(), here())
+    health = ear.wait(0.5)
+    assert health.outside_m == 0.75 and health.silent == ()
 
 
 def test_esc_that_fails_or_falls_silent_is_missing() -> None:

@@ -55,6 +55,19 @@ def test_each_module_is_watched_by_itself() -> None:
     assert watch.frozen == [True, False]
 
 
+def test_body_that_takes_over_knows_which_imu_is_frozen() -> None:
+    whole = ImuWatch([0, 1])
+    for n in range(REPEATS + 1):
+        whole.step([sample(0.1 * n), sample(0.1)])
+    parts = ImuWatch([0]), ImuWatch([1])
+    for part in parts:
+        part.take_over([whole])
+    assert [part.step([sample(7.0), sample(0.1)]) for part in parts] == [True, False]
+    again = ImuWatch([1, 0])
+    again.take_over(parts)
+    assert again.frozen == [True, False]
+
+
 def test_frozen_imu_is_left_out_of_the_mean() -> None:
     modules = [sample(1.0, 4.0), sample(3.0, 8.0)]
     fuse = Measurements(PAIR).fuse

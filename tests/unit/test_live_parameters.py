@@ -5,6 +5,7 @@ import pytest
 
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.rotations import to_matrix
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
@@ -48,3 +49,28 @@ def test_value_out_of_range_is_refused_in_words_and_changes_nothing(flying: Pipe
     outputs = step(flying, 120, [Request(Action.SET_PARAMETER, 0, ("control.position_bandwidth", 99.0))])
     assert flying.parameters.control.position_bandwidth == Parameters().control.position_bandwidth
     assert any("out of range" in event.text for event in outputs.events)
+
+
+def test_limits_set_in_flight_are_those_of_every_stage_from_that_tick_on(flying: Pipeline) -> None:
+    """A step that only kept what it was built with would fly on by the old ones."""
+    chain = flying._chains[0]
+    wanted = {
+        "limiter.force_share": 0.2, "limiter.slew_n_per_s": 20.0, "fence.east_m": 0.1, "failsafes.ground_lost_limit": 0.5,
+        "failsafes.leak_action": 5, "supervision.arm_sigma_m": 0.5, "steering.speed_m_s": 0.07, "faults.dead_count": 9,
+    }  # fmt: skip
+    requests = [Request(Action.SET_PARAMETER, 0, pair) for pair in wanted.items()]
+    outputs = step(flying, 120, [*requests, Request(Action.GROUND_ALIVE, 0)])
+    assert [event.text for event in outputs.events] == []
+    assert chain.health.now.outside_m == pytest.approx(0.1, abs=0.01)
+    full_n = chain.body.thrusters.f_max
+    forces, _ = chain.limiter.step(10.0 * full_n, True, np.array([12.0]))
+    assert np.all(forces <= 0.2 * full_n + 1e-9) and np.all(np.abs(forces - outputs.records[0].commanded_n) <= 0.2 + 1e-9)
+    said = []
+    for tick in range(121, 175):
+        said += [event.text for event in step(flying, tick, []).events]
+    assert any("ground station silent for 0.5 s" in text for text in said)
+    for tick in range(175, 230):
+        wet = resting(tick, [])
+        wet.modules[0].leak = True
+        outputs = flying.step(wet)
+    assert outputs.records[0].state == State.DISARMED, "the leak disarms now"

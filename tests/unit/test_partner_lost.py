@@ -25,6 +25,7 @@ class Docked(Tank):
         count = len(cells)
         whole: Body = assemble(cells, [0] * count, [MODCUBE] * count, list(range(count)))
         super().__init__([whole], parameters)
+        self.cabin_pa = [101_325.0] * count
         self.weak: set[int] = set()
         self.hidden: set[int] = set()
         self.said: list[tuple[float, str]] = []
@@ -34,6 +35,7 @@ class Docked(Tank):
     def _hear(self, tick: int) -> list[ModuleInputs]:
         modules = super()._hear(tick)
         for m, module in enumerate(modules):
+            module.cabin_pressure_pa = self.cabin_pa[m]
             if m in self.hidden:
                 module.tags.clear()
             if tick % 4 == 0:
@@ -191,3 +193,64 @@ def test_estimate_of_a_part_is_as_old_as_that_of_the_whole() -> None:
     old = fresh.estimator.restart(5_000_000_000, motion._replace(tag_ns=2_000_000_000))
     assert old.ready and old.tag_age_ns == 3_000_000_000
     assert not fresh.estimator.restart(5_000_000_000, motion._replace(accepted=0)).ready
+
+
+# ---------------------------------------------------------------- what is known is not forgotten
+
+
+def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
+    """A thruster is out, a cabin loses its pressure, the ground station has fallen silent; then the joint opens."""
+    tank = Docked(RING[:2])
+    tank.run(0.5)
+    tank.run(1.0, Request(Action.GROUND_ALIVE), Request(Action.ARM))
+    whole = tank.pipeline._chains[0]
+    whole.faults._lose(3, "stands still")
+    whole.allocator.set_alive(whole.faults.now.alive)
+    tank.cabin_pa[0] = 130e3
+    tank.run(2.5)
+    tank.lose(1)
+    tank.run(1.0)
+    assert tank.shape == [(0,), (1,)]
+    hurt, sound = tank.pipeline._chains
+    assert hurt.faults.now.dead == (3,) and sound.faults.now.dead == ()
+    assert hurt.health.now.cabin_change_pa == 130e3 - 101_325.0 and sound.health.now.cabin_change_pa == 0.0
+    assert all(chain.supervisor.is_on("cabin_pressure") and chain.supervisor.mode == Mode.SURFACE for chain in (hurt, sound))
+    assert tank.outputs[-1].modules[0].thrusters[3] == 0.0 and hurt.supervisor.is_on("thruster_lost")
+    assert hurt.health.now.ground_age_s == sound.health.now.ground_age_s == pytest.approx(4.49, abs=0.02)
+    tank.run(0.1, Request(Action.DISARM, 0))
+    assert tank.run(0.1, Request(Action.ARM, 0)).records[0].state == State.DISARMED, "a hull that fails flies no more"
+
+
+def test_body_that_was_prepared_with_other_gains_flies_with_those_of_now() -> None:
+    tank = Docked(RING[:2], delay=30)
+    tank.fly()
+    tank.lose(1)
+    while not tank._plans:
+        tank.run(0.01)
+    tank.run(0.05, Request(Action.SET_PARAMETER, 0, ("control.position_bandwidth", 1.5)))
+    tank.run(0.6)
+    assert tank.shape == [(0,), (1,)]
+    assert all(chain.parameters.control.position_bandwidth == 1.5 for chain in tank.pipeline._chains)
+
+
+def test_magnets_of_a_joint_rest_when_their_account_is_empty_and_take_power_while_they_pull() -> None:
+    parameters = Parameters().replace("limiter.relay_on_s", 2.0).replace("limiter.relay_duty", 0.25)
+    tank = Docked(RING[:2], parameters)
+    tank.run(1.0)
+    assert [magnets.power_w for magnets in tank.pipeline._chains[0].limiter.magnets] == [6.0, 6.0]
+    tank.run(3.0)
+    sent = [(tick, outputs.modules[0].relays) for tick, outputs in enumerate(tank.outputs) if outputs.modules[0].relays is not None]
+    pulling = {tick for tick, states in sent if any(states)}
+    resting = sorted({tick for tick, states in sent if not any(states)})
+    assert resting and resting[0] == pytest.approx(2.0 / 0.75 / 0.01, abs=2), "sent at once, not with the next tenth of a second"
+    assert not pulling & set(resting) and tank.pipeline._chains[0].limiter.magnets[0].power_w == 0.0
+
+
+def test_parted_modules_magnets_keep_their_accounts() -> None:
+    tank = Docked(RING[:2], Parameters().replace("limiter.relay_on_s", 60.0).replace("limiter.relay_duty", 0.01))
+    tank.fly()
+    before = [list(magnets._left_s) for magnets in tank.pipeline._chains[0].limiter.magnets]
+    tank.lose(1)
+    tank.run(1.0)
+    after = [list(chain.limiter.magnets[0]._left_s) for chain in tank.pipeline._chains]
+    assert min(before[0]) < 59.0 and min(after[0]) < min(before[0]) and min(after[1]) < min(before[1])

@@ -11,6 +11,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
@@ -219,6 +220,28 @@ def test_stopped_robot_can_be_cleared_and_armed_again(tank: Tank) -> None:
     assert not tank.run(DT, Request(Action.ARM)).modules[0].armed, "not before it is cleared"
     tank.run(0.1, Request(Action.CLEAR_ESTOP))
     assert tank.run(DT, Request(Action.ARM)).modules[0].armed
+
+
+def test_motor_test_of_a_disarmed_robot_turns_one_thruster_and_disarms(tank: Tank) -> None:
+    tank.run(1.0)
+    first = len(tank.outputs)
+    tank.run(3.0, Request(Action.MOTOR_TEST, 0, (2, 0.2, 2.0)))
+    turned = np.array([outputs.modules[0].thrusters for outputs in tank.outputs[first:]])
+    assert 195 <= np.count_nonzero(turned[:, 2]) <= 205 and not np.delete(turned, 2, axis=1).any()
+    assert tank.outputs[-1].records[0].state == State.DISARMED
+
+
+def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(tank: Tank) -> None:
+    """What no longer turns is found again within half a second of flying."""
+    tank.run(0.5)
+    tank.run(0.5, Request(Action.ARM))
+    chain = tank.pipeline._chains[0]
+    for thruster in (4, 7):
+        chain.faults._lose(thruster, "stands still")
+    chain.allocator.set_alive(chain.faults.now.alive)
+    assert tank.run(0.1).records[0].state == State.ARMED and chain.health.now.lost_axes == 1
+    tank.run(0.1, Request(Action.DISARM))
+    assert chain.faults.now.dead == () and tank.run(3.0, Request(Action.ARM)).records[0].state == State.ARMED
 
 
 def test_same_inputs_give_the_same_bytes() -> None:

@@ -242,6 +242,16 @@ def test_motor_test_in_another_mode_is_refused() -> None:
     assert texts(supervisor) == ["MOTOR_TEST refused: the mode is not MOTOR_DETECT"]
 
 
+def test_what_has_ended_ends_before_what_is_asked_for_begins() -> None:
+    """No test runs before the tick in which one is asked for, and a dock that is over is not the next one."""
+    supervisor = supervisor_in(State.DISARMED)
+    supervisor.step(False, GOOD, [Request(Action.MOTOR_TEST, 0, (0, 0.1, 1.0))], [Trigger.TEST_OVER])
+    assert supervisor.armed and supervisor.mode == Mode.MOTOR_DETECT
+    docking = supervisor_in(State.ARMED, Mode.DOCK)
+    docking.step(False, GOOD, [Request(Action.UNDOCK, 0, DOCK)], [Trigger.DOCK_OVER])
+    assert docking.mode == Mode.DOCK
+
+
 def test_dock_that_has_given_up_leaves_the_robot_holding() -> None:
     supervisor = supervisor_in(State.ARMED, Mode.DOCK)
     (decision,) = supervisor.step(False, GOOD, [], [Trigger.DOCK_OVER])
@@ -328,6 +338,78 @@ def test_end_of_one_fail_safe_does_not_wake_another() -> None:
     ask(supervisor, Action.SET_MODE, Mode.MANUAL, at(both, 1))
     supervisor.step(False, at(GOOD._replace(leak=True), 2), [])
     assert supervisor.step(False, at(GOOD._replace(leak=True), 5), []) == [] and supervisor.mode == Mode.MANUAL
+
+
+SPELLS = {
+    "no tag": (Mode.GUIDED, "tag_age_s", 1.1, Mode.POSHOLD),
+    "module silent": (Mode.GUIDED, "silent_s", 0.6, Mode.POSHOLD),
+    "pilot silent": (Mode.MANUAL, "pilot_age_s", 1.1, Mode.POSHOLD),
+    "outside the fence": (Mode.GUIDED, "outside_m", 0.1, Mode.POSHOLD),
+    "leak": (Mode.ALT_HOLD, "leak", True, Mode.SURFACE),
+}
+"""A mode, what goes wrong in it, and where its fail-safe leads."""
+
+
+@pytest.mark.parametrize("spell", SPELLS)
+def test_cause_that_was_gone_for_a_moment_acts_again_on_a_robot_that_was_taken_back_meanwhile(spell: str) -> None:
+    mode, figure, value, leads_to = SPELLS[spell]
+    supervisor = supervisor_in(mode=mode)
+    bad = GOOD._replace(**{figure: value})
+    for tick in range(60):
+        supervisor.step(False, at(bad, 0.01 * tick), [])
+    assert supervisor.mode == leads_to
+    ask(supervisor, Action.SET_MODE, mode, at(GOOD, 0.6))
+    assert (supervisor.mode, supervisor.level) == (mode, Level.NONE)
+    said = []
+    for tick in range(60):
+        supervisor.step(False, at(bad, 0.61 + 0.01 * tick), [])
+        said += texts(supervisor)
+    assert supervisor.mode == leads_to and said[0].startswith("fail-safe on: ")
+
+
+def test_cause_that_comes_and_goes_is_said_once_while_it_takes_the_robot_from_nobody() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    said = []
+    for tick in range(100):
+        supervisor.step(False, at(GOOD._replace(silent_s=1.0 * (tick % 2)), 0.01 * tick), [])
+        said += texts(supervisor)
+    assert said == ["fail-safe on: a module is silent for 1.0 s", "ARMED AUTO -> ARMED POSHOLD"]
+
+
+@pytest.mark.parametrize(
+    ("figure", "value"),
+    [("silent_s", 1.0), ("ground_age_s", 6.0), ("imu_age_s", 1.0), ("lost_axes", 1), ("leak", True), ("outside_m", 9.0)],
+)
+@pytest.mark.parametrize("base", [GOOD, BLIND], ids=["placed", "blind"])
+def test_fail_safe_during_a_motor_test_disarms(base: Health, figure: str, value: float) -> None:
+    """The robot may lie on a bench, with hands near its propellers."""
+    supervisor = supervisor_in(State.DISARMED)
+    ask(supervisor, Action.MOTOR_TEST, (0, 0.1, 10.0), base)
+    assert supervisor.armed
+    for tick in range(400):
+        supervisor.step(False, at(base._replace(**{figure: value}), 0.01 * tick), [])
+    counts = figure != "outside_m"
+    assert (supervisor.state, supervisor.mode) == (State.DISARMED if counts else State.ARMED, Mode.MOTOR_DETECT)
+
+
+def test_robot_that_detects_its_motors_is_disarmed_where_it_never_had_a_pose_and_holds_where_it_has_one() -> None:
+    for base, state, mode in ((BLIND, State.DISARMED, Mode.MOTOR_DETECT), (GOOD, State.ARMED, Mode.POSHOLD)):
+        supervisor = supervisor_in(State.ARMED, Mode.MOTOR_DETECT)
+        supervisor.step(False, base._replace(silent_s=1.0), [])
+        assert (supervisor.state, supervisor.mode) == (state, mode)
+
+
+def test_other_parameters_count_from_the_next_tick_on() -> None:
+    supervisor = supervisor_in(mode=Mode.AUTO)
+    supervisor.retune(replace(P, failsafes=replace(P.failsafes, module_silent_limit=20.0)))
+    assert supervisor.step(False, GOOD._replace(silent_s=10.0), []) == []
+    supervisor.retune(P)
+    assert supervisor.step(False, at(GOOD._replace(silent_s=10.0), 1), [])[0].mode == Mode.POSHOLD
+    ask(supervisor, Action.DISARM, None, at(GOOD, 2))
+    supervisor.step(False, at(GOOD, 9), [])
+    supervisor.retune(P.replace("supervision.arm_sigma_m", 0.001))
+    assert ask(supervisor, Action.ARM, None, at(GOOD, 10)) == []
+    assert texts(supervisor) == ["ARM refused: pose sigma 2 mm, 1 permitted"]
 
 
 def test_sticks_alone_do_not_end_what_a_fail_safe_chose() -> None:
