@@ -28,9 +28,6 @@ from hil.bench import fleet_of, script_of
 from hil.plant_process import PlantProcess
 from hil.scenario import Scenario
 
-PLANT_READY_S = 120.0
-"""Longest that the plant's process may take to start."""
-
 
 class RealTimeFlight(NamedTuple):
     """How the ticks went."""

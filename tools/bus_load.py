@@ -26,7 +26,7 @@ from firmware_py.description.fleet import load_fleet
 from firmware_py.description.schema import DescriptionError
 
 USUAL = ((1, 100), (2, 100), (4, 100), (2, 200), (1, 400))
-"""Modules and ticks a second that DESIGN section 5 asks for."""
+"""Modules and ticks a second that one bus must carry."""
 
 
 def expanded_dbc(numbers: Sequence[int]) -> str:

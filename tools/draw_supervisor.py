@@ -21,8 +21,8 @@ from firmware_py.description.parameters import Parameters
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "supervisor.md"
 WHILE_TESTED = """\
-In MOTOR_DETECT a body is disarmed instead, whatever the action, where a motor test has armed it or where it never had a pose: it may lie on a
-bench. A cause that comes back before its fail-safe is over acts again when it has lasted its delay."""
+In MOTOR_DETECT a body is disarmed instead, whatever the action, where a motor test has armed it or where it never had a pose: it may lie
+on a bench. A cause that comes back before its fail-safe is over acts again when it has lasted its delay."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -14,7 +14,7 @@ from firmware_py.bus.codec import Codec, MessageCodec
 BIT_RATE = 1_000_000
 """bit/s of every bus."""
 MEAN_LIMIT = 0.5
-"""Most of a bus that may be in use on average (DESIGN section 5)."""
+"""Most of a bus that may be in use on average."""
 TICK_LIMIT = 0.8
 """Most of any one tick."""
 FRAME_BITS, BYTE_BITS = 55, 10

@@ -15,7 +15,7 @@ from firmware_py.core.types import DockFeedback, EscFeedback, Inputs, ModuleInpu
 from firmware_py.description.fleet import Fleet
 
 STALE_NS = 500_000_000
-"""A tag picture older than this is dropped (DESIGN section 5)."""
+"""A tag picture older than this is dropped."""
 NS_PER_MS = 1_000_000
 REMEMBERED_TICKS = 256
 """CaptureTick has 8 bits."""

@@ -9,15 +9,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import float64, njit, types
+from numba import njit
 
 from firmware_py.core.propagation import ERRORS, PLANT, STATE, carry, inertial_acceleration, inject, predict
 from firmware_py.core.rotations import M, V, difference, rotate_back, skew, to_matrix
 
 GRAVITY = 9.80665
 """m/s^2, standard gravity."""
-MODEL = types.Tuple((float64[::1], float64[:, ::1], float64[::1]))  # type: ignore[no-untyped-call]
-"""Residual (m,), Jacobian (m, 25), variance of the noise (m,)."""
 ANY_NIS = math.inf
 
 

@@ -46,14 +46,8 @@ INVERSE = np.argmax(PRODUCT == 0, axis=1)
 INVERSE.flags.writeable = False
 
 
-def face_direction(rotation: int, face: int) -> tuple[int, int, int]:
-    """Lattice direction into which face `face` (0..5, description.vehicle.FACE_NAMES) of a turned module looks."""
-    x, y, z = (round(float(c)) for c in MATRICES[rotation] @ FACE_NORMALS[face])
-    return x, y, z
-
-
 def face_towards(rotation: int, direction: tuple[int, int, int]) -> int:
-    """Face of a turned module that looks into a lattice direction (one of the six unit vectors)."""
+    """Face (0..5, description.vehicle.FACE_NAMES) of a turned module that looks into a lattice direction (one of the six unit vectors)."""
     return int(np.argmax(FACE_NORMALS @ (MATRICES[rotation].T @ np.array(direction, dtype=float))))
 
 

@@ -11,10 +11,7 @@ F8 = types.float64
 F1, F2, F3 = F8[::1], F8[:, ::1], F8[:, :, ::1]
 I1 = types.int64[::1]
 V3 = types.UniTuple(F8, 3)
-V6 = types.UniTuple(F8, 6)
 M3 = types.UniTuple(V3, 3)
-
-
 MASS = types.UniTuple(M3, 4)
 """A (6, 6) matrix of masses by its blocks: force by linear, force by angular, moment by linear, moment by angular acceleration."""
 

@@ -11,8 +11,6 @@ from hil.scenario import Scenario
 
 NS_PER_S = 1_000_000_000
 THRUSTERS, FACES = 8, 6
-OUTPUTS_ALONE = -1.0
-"""`due` of a request that wants no answer."""
 
 
 class Outputs(ctypes.Structure):

@@ -1,6 +1,6 @@
 /* Reference node: what the microcontroller of one module does on the bus, without its hardware. SYNC in, status and
  * sensors out, zero thrust after 100 ms of silence. No allocation, no clock, no global state: the caller gives the time
- * and three functions of the hardware. DESIGN section 5 and can_dbc/README.md say the rules. */
+ * and three functions of the hardware. can_dbc/README.md says the rules. */
 #ifndef MODCUBE_NODE_H
 #define MODCUBE_NODE_H
 

@@ -1,4 +1,4 @@
-"""The house of DESIGN section 2: who may import whom, and what core must never do.
+"""The house: who may import whom, and what core must never do.
 
 import-linter checks the contracts of pyproject.toml; here stands what it cannot express.
 """

@@ -1,4 +1,4 @@
-"""The buses are never too full: figures of DESIGN section 5 from the DBC, and the expanded DBC for other tools."""
+"""The buses are never too full: figures from the DBC, and the expanded DBC for other tools."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The DBC says what DESIGN section 5 says, and makes none of the mistakes that cantools loads without a word.
+"""The DBC has the messages of the table below, and makes none of the mistakes that cantools loads without a word.
 
 Each rule is tried on a DBC that breaks it (the negative controls at the end).
 """
@@ -15,7 +15,7 @@ THRUSTERS_A = [f"Thruster{i}" for i in range(1, 5)] + ["Mode"]
 THRUSTERS_B = [f"Thruster{i}" for i in range(5, 9)] + ["Mode"]
 ESC = ["Rpm{}", "EscCurrent{}", "EscStatus{}"]
 
-# DESIGN section 5: id, bytes, protected (E), cycle in ms (None: once a tick), signals without Counter and Crc.
+# id, bytes, protected (E), cycle in ms (None: once a tick), signals without Counter and Crc.
 TABLE = {
     "ESTOP": (0x000, 0, False, 50, []),
     "SYNC": (0x020, 4, False, None, ["Tick"]),

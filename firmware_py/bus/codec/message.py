@@ -159,7 +159,7 @@ class MessageCodec:
 
 
 def _numbers(name: str) -> frozenset[int]:
-    """Numbers that are valid for a message: DESIGN section 5 (0 firmware, 1..29 modules, 30 e-stop box, 31 camera)."""
+    """Numbers that are valid for a message (can_dbc/README.md: 0 firmware, 1..29 modules, 30 e-stop box, 31 camera)."""
     if name in ("ESTOP", "HEARTBEAT"):
         return frozenset(range(NUMBERS))
     return frozenset((0,)) if name == "SYNC" else frozenset(range(1, 30))
