@@ -150,5 +150,5 @@ def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:
     if Need.DEPTH in needs and min(health.depth_age_s, health.tag_age_s) > limits.depth_unknown_limit:
         reasons.append("depth unknown")
     if Need.PILOT in needs and not health.pilot_age_s <= limits.pilot_lost_limit:  # a NaN is not
-        reasons.append("pilot input lost" if health.pilot_age_s > limits.pilot_lost_limit else "no pilot input yet")
+        reasons.append("no pilot input yet" if math.isnan(health.pilot_age_s) else "pilot input lost")
     return reasons

@@ -105,9 +105,9 @@ class Watch:
         self.row, self._value, self._below = row, row.value, row.below
         self._since_ns: int | None = None
         self._gone_ns: int | None = None
+        self._told_ns: int | None = None
+        """`_since_ns` when it was last reported: a cause that comes back is another one."""
         self.active, self.level = False, Level.NONE
-        self._told = False
-        """Whether its cause has not gone since it was last reported."""
         self.began = ""
         """Its words when it last began."""
         self.retune(parameters)
@@ -118,16 +118,16 @@ class Watch:
         self.limit: float = getattr(parameters, f"{name}_limit", 0.0)
         self.level = Level(getattr(parameters, f"{name}_action"))
         self.latched = bool(getattr(parameters, f"{name}_latched"))
-        self._told = self._told and self.level == before
+        self._told_ns = self._told_ns if self.level == before else None
         self._delay_ns = round(getattr(parameters, f"{name}_delay_s") * 1e9)
         self._clear_ns = round(parameters.clear_s * 1e9)
 
     def take_over(self, before: Sequence[Watch]) -> None:
         """Goes on from the watches of the same row of the bodies before: on where one was, its cause as old as the oldest."""
-        self.active = any(w.active for w in before)
-        self._told = self.active and all(w._told for w in before if w.active)
-        self._since_ns = min((w._since_ns for w in before if w._since_ns is not None), default=None)
-        self.began = next((w.began for w in before if w.active), "")
+        on = [watch for watch in before if watch.active]
+        self.active, self.began = bool(on), next((watch.began for watch in on), "")
+        self._since_ns = min((watch._since_ns for watch in before if watch._since_ns is not None), default=None)
+        self._told_ns = self._since_ns if on and all(watch._told_ns == watch._since_ns for watch in on) else None
 
     def beyond(self, health: Health) -> bool:
         """Whether its cause holds now, whatever the mode. A NaN is no cause."""
@@ -160,15 +160,16 @@ class Watch:
             if self._since_ns is None:
                 self._since_ns = now
         else:
-            self._since_ns, self._told = None, False
+            self._since_ns = None
             if self._gone_ns is None:
                 self._gone_ns = now
-        before, told = self.active, self._told
         if self._since_ns is not None and now - self._since_ns >= self._delay_ns:
-            self.active = self._told = True
-        elif self._gone_ns is not None and now - self._gone_ns >= self._clear_ns and not (self.latched and armed):
+            told, self._told_ns, self.active = self._told_ns == self._since_ns, self._since_ns, True
+            return not told
+        before = self.active
+        if self._gone_ns is not None and now - self._gone_ns >= self._clear_ns and not (self.latched and armed):
             self.active = False
-        return self.active != before or (self._told and not told)
+        return self.active != before
 
 
 class Failsafes:

@@ -342,6 +342,10 @@ def test_body_that_takes_over_goes_on_with_every_fail_safe_and_its_time() -> Non
     assert [alarm.name for alarm in after.step(at(both, 5.0), Mode.AUTO, False, True)] == ["battery_critical", "battery_low"]
 
 
+def test_fail_safe_that_never_began_has_nothing_to_say() -> None:
+    assert Watch(ROWS["leak"], P).reason(GOOD) == ""
+
+
 def test_body_made_of_calm_ones_is_calm() -> None:
     after = Failsafes(quick("leak"))
     after.take_over([Failsafes(quick("leak")), Failsafes(quick("leak"))])
