@@ -14,14 +14,16 @@ import typer
 from typer.exceptions import TyperException
 
 from firmware_py.bus.port import PortError
-from firmware_py.description.fleet import load_fleet, single
+from firmware_py.description.fleet import Fleet, single
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.ground.config import GroundConfig, load_ground
+from firmware_py.ground.config import GroundConfig, check_store, load_ground
 from firmware_py.ground.identity import IDENTITIES
 
 CANNOT_RUN = 2
 """Exit status when nothing could be started: wrong usage, no such bus, a file that is wrong."""
+BUS, VEHICLE, RATE_HZ = "socketcan:can0", "modcube", 100
+"""Of one module, where the command line does not say."""
 
 app = typer.Typer(
     help="Controller of a self-reconfigurable underwater robot.", no_args_is_help=True, pretty_exceptions_enable=False
@@ -40,21 +42,26 @@ def modcube() -> None:
 @app.command()
 def run(
     bus: Annotated[
-        str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")
-    ] = "socketcan:can0",
-    fleet: Annotated[Path | None, typer.Option(help="fleet file; without it one module, number 1")] = None,
-    vehicle: Annotated[str, typer.Option(help="vehicle of the one module")] = "modcube",
+        str | None, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE", show_default=BUS)
+    ] = None,
+    fleet: Annotated[
+        Path | None, typer.Option(help="fleet file: buses, rate and modules, so not beside --bus, --rate, --vehicle; without it module 1")
+    ] = None,
+    vehicle: Annotated[str | None, typer.Option(help="vehicle of the one module", show_default=VEHICLE)] = None,
     parameters: Annotated[Path | None, typer.Option(help="file of parameters")] = None,
-    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="ticks a second")] = 100,
+    rate_hz: Annotated[int | None, typer.Option("--rate", min=50, max=400, help="ticks a second", show_default=f"{RATE_HZ}")] = None,
     hold: Annotated[bool, typer.Option("--hold", help="arm as soon as the vehicle may, and hold the place")] = False,
-    out: Annotated[Path | None, typer.Option(help="folder for the logs")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for the logs; where it holds one, 0002, 0003, ... in it")] = None,
     ground: Annotated[
         list[str] | None, typer.Option(help="link to ground stations: udpout:, udpin:, tcpin:HOST:PORT, /dev/NAME,BAUD")
     ] = None,
-    identity: Annotated[str, typer.Option(help="generic (PX4's modes) or ardusub")] = "generic",
-    store: Annotated[str, typer.Option(help="folder for parameters and signing key of ground stations")] = "",
+    identity: Annotated[str | None, typer.Option(help="generic (PX4's modes) or ardusub", show_default="generic")] = None,
+    store: Annotated[str | None, typer.Option(help="folder for parameters and signing key of ground stations")] = None,
     ground_file: Annotated[
-        Path | None, typer.Option(help="file of the ground side: links, identity, store, whom it watches, dock buttons")
+        Path | None,
+        typer.Option(
+            help="file of the ground side: links, identity, store, whom it watches, dock buttons; --ground, --identity, --store go first"
+        ),
     ] = None,
     stats: Annotated[bool, typer.Option("--stats", help="print how the ticks kept their deadlines")] = False,
     live: Annotated[bool, typer.Option("--live", help="serve a live view for Foxglove")] = False,
@@ -67,34 +74,65 @@ def run(
     from firmware_py.app.vehicle import run_vehicle
     from firmware_py.runtime.notify import Notifier
 
-    described = load_fleet(fleet) if fleet is not None else single(vehicle, bus, rate_hz)
+    described = fleet_of(fleet, bus, vehicle, rate_hz)
     chosen = load_parameters(parameters) if parameters is not None else Parameters()
-    links = ground_config(ground_file, ground or [], identity, store, out)
+    links = ground_config(ground_file, ground or [], identity, store, out, len(described.module))
     notifier = Notifier.of(os.environ)
     with ExitStack() as stack:
         # Its threads start before this process takes its real-time priority, which they would inherit.
         view = stack.enter_context(LiveView(live_host, live_port)) if live else None
-        summary = run_vehicle(described, chosen, hold, out, lambda line: typer.echo(line), notifier, links, view)
+        summary = run_vehicle(described, chosen, hold, out, notifier=notifier, ground=links, live=view)
     for line in stats_lines(summary) if stats else ():
         typer.echo(line)
 
 
-def ground_config(file: Path | None, links: list[str], identity: str, store: str, logs: Path | None) -> GroundConfig | None:
-    """What `file`, or else the command line, says of ground stations; None without either. Raises DescriptionError."""
+def fleet_of(file: Path | None, bus: str | None, vehicle: str | None, rate_hz: int | None) -> Fleet:
+    """The fleet in `file`, or else one module; what is None keeps its default. Raises DescriptionError."""
+    from firmware_py.app.firmware import read_fleet
+
+    options = {"--bus": bus, "--vehicle": vehicle, "--rate": rate_hz}
+    beside = [name for name, value in options.items() if value is not None]
+    if file is None:
+        return single(VEHICLE if vehicle is None else vehicle, BUS if bus is None else bus, RATE_HZ if rate_hz is None else rate_hz)
+    if beside:
+        raise DescriptionError(f"{', '.join(beside)} beside --fleet: buses, vehicles and rate_hz stand in {file}; give one or the other")
+    return read_fleet(file)
+
+
+def ground_config(
+    file: Path | None, links: list[str], identity: str | None, store: str | None, logs: Path | None, modules: int
+) -> GroundConfig | None:
+    """What the command line, and else `file`, says of ground stations; None without either. Raises DescriptionError.
+
+    Args:
+        identity, store: None where the command line does not say.
+        logs: folder of the logs, unless the file names one.
+        modules: of the fleet.
+    """
     if file is None and not links:
+        if identity is not None or store is not None:
+            raise DescriptionError("--identity and --store go with a link to ground stations; give --ground LINK or --ground-file FILE too")
         return None
-    if identity not in IDENTITIES:
+    if identity is not None and identity not in IDENTITIES:
         raise DescriptionError(f"identity {identity!r} is unknown; there are {', '.join(IDENTITIES)}")
-    config = load_ground(file) if file is not None else GroundConfig(identity=identity, store=store)
-    return replace(config, links=tuple(links) or config.links, logs=config.logs or str(logs or ""))
+    config = load_ground(file, modules) if file is not None else GroundConfig()
+    config = replace(
+        config,
+        links=tuple(links) or config.links,
+        identity=config.identity if identity is None else identity,
+        store=config.store if store is None else store,
+        logs=config.logs or str(logs or ""),
+    )
+    check_store(config.store)
+    return config
 
 
 @app.command()
 def doctor(
     bus: Annotated[
-        str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")
-    ] = "socketcan:can0",
-    fleet: Annotated[Path | None, typer.Option(help="fleet file; without it one module, number 1")] = None,
+        str | None, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE", show_default=BUS)
+    ] = None,
+    fleet: Annotated[Path | None, typer.Option(help="fleet file, not beside --bus; without it module 1")] = None,
     out: Annotated[Path, typer.Option(help="folder for logs")] = Path(),
     warm: Annotated[bool, typer.Option("--warm", help="only compile what a tick calls, into the cache")] = False,
 ) -> None:
@@ -104,7 +142,7 @@ def doctor(
     if warm:
         typer.echo(f"compiled code is there, after {warm_up():.1f} s")
         return
-    described = load_fleet(fleet) if fleet is not None else single(bus=bus)
+    described = fleet_of(fleet, bus, None, None)
     raise typer.Exit(examine(described, out, say=lambda line: typer.echo(line)))
 
 

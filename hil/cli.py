@@ -43,6 +43,12 @@ def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
     return scenario.with_vehicle(vehicle) if vehicle else scenario
 
 
+def check_reaches_others(bus: str, who: str) -> None:
+    """Raises DescriptionError where a bus ends with its process, and `who` needs another process at its other end."""
+    if bus.startswith("virtual:"):
+        raise DescriptionError(f"bus {bus!r} does not reach another process; {who} needs udp:GROUP:PORT or socketcan:IFACE")
+
+
 @app.command()
 def run(
     scenario: ScenarioName,
@@ -63,10 +69,8 @@ def run(
     chosen = scenario_of(scenario, vehicle, sensors)
     parameters = parameters_of(controller)
     folder = out if out is not None else Path("runs") / chosen.name
-    if realtime and bus.startswith("virtual:"):
-        raise DescriptionError(
-            f"bus {bus!r} does not reach another process; --realtime needs udp:GROUP:PORT or socketcan:IFACE"
-        )
+    if realtime:
+        check_reaches_others(bus, "--realtime")
     with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:
         result = fly_and_judge(chosen, seed, parameters, folder, bus, rate_hz, progress, realtime)
     report = illustrate(chosen, result, folder) if plots else None
@@ -76,6 +80,7 @@ def run(
 
 @app.command()
 def campaign(
+    context: typer.Context,
     scenario: ScenarioName,
     trials: Annotated[int, typer.Option(min=1, help="number of seeds")] = 20,
     jobs: Annotated[int, typer.Option(min=1, help="processes")] = 2,
@@ -89,9 +94,10 @@ def campaign(
 ) -> None:
     """Fly many seeds of a scenario; prints a table and leaves every trial. Interrupted and started again, it goes on.
 
-    `faults`: everything that can break, in every mode.
+    `faults`: everything that can break, in every mode; takes --jobs, --seed and --out.
     """
     if scenario == "faults":
+        _check_fault_options(context)
         raise typer.Exit(_fly_faults(jobs, seed, out))
     from hil.campaign import run_campaign
     from hil.console import campaign_progress, print_campaign
@@ -110,6 +116,18 @@ def campaign(
         again = folder / f"seed-{worst}"
         print(f"seed {worst}: {illustrate(chosen, fly_and_judge(chosen, worst, parameters, again, DEFAULT_BUS), again)}")
     raise typer.Exit(0 if summary["succeeded"] == summary["trials"] else FAILED)
+
+
+FAULT_OPTIONS = ("scenario", "jobs", "seed", "out")
+"""Of `campaign`, those that apply to the matrix of faults."""
+
+
+def _check_fault_options(context: typer.Context) -> None:
+    """Raises DescriptionError where an option was given that the matrix of faults does not take."""
+    given = [name for name in context.params if (source := context.get_parameter_source(name)) and source.name == "COMMANDLINE"]
+    if idle := [f"--{name}" for name in given if name not in FAULT_OPTIONS]:
+        takes = ", ".join(f"--{name}" for name in FAULT_OPTIONS[1:])
+        raise DescriptionError(f"campaign faults: {', '.join(idle)} does not apply: it flies every fault in every mode; it takes {takes}")
 
 
 def _fly_faults(jobs: int, seed: int, out: Path | None) -> int:
@@ -137,6 +155,7 @@ def plant(
     """Run the simulated plant alone, in real time, until SIGINT or SIGTERM: the other end of `modcube run`."""
     from hil.plant_process import serve_until_signal
 
+    check_reaches_others(bus, "the plant alone")
     serve_until_signal(load_scenario(scenario), seed, bus, rate_hz, out)
 
 

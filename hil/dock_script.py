@@ -17,6 +17,8 @@ from hil.scenario import Scenario, Step
 
 ARM_FROM_S = 1.0
 ARM_EVERY_S = 0.5
+NOBODY = -1
+"""Index of a module that a step is not about."""
 SPEED_M_S = 0.05
 """Mean speed at which a body goes to the start of a path."""
 AFTERWARDS_NS = 3_000_000_000
@@ -77,7 +79,7 @@ class DockScript:
         return asked
 
     def _begin(self, step: Step, time_ns: int, last: Outputs) -> list[Request]:
-        module, target = self._scenario.index_of(step.module), self._scenario.index_of(step.target_module)
+        module, target = [*(self._scenario.index_of(number) for number in step.modules), NOBODY, NOBODY][:2]
         running = _Running(step, time_ns + round(step.duration_s * 1e9), module, target)
         self._running.append(running)
         if step.do == "wait":
@@ -94,9 +96,11 @@ class DockScript:
 
     def _is_given_up(self, running: _Running, last: Outputs) -> bool:
         """Whether a dock that was under way has ended, and its bodies are still two. One that is refused never was."""
+        if running.step.do != "dock":
+            return False
         docking = [r.mode == Mode.DOCK for r in last.records if r.body == self._leader(running.module)]
         was_docking, running.docking = running.docking, any(docking)
-        return running.step.do == "dock" and was_docking and docking == [False]
+        return was_docking and docking == [False]
 
     def _is_over(self, running: _Running, time_ns: int, last: Outputs) -> bool:
         step, bodies = running.step, {r.body for r in last.records}

@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from firmware_py.description.signals import Columns, read_signals
-from hil.scenario import Scenario
 from hil.signals import SIGNAL_LOG, TRUTH_LOG
+
+if TYPE_CHECKING:
+    from hil.scenario import Scenario
 
 DEGREE = 3
 """Of the polynomial that is fitted to the measured force over the wanted one."""
 NAMES = {1: "one", 2: "two"}
+PHASES = ("off", "on")
+"""Before and after the jets interfere."""
+
+
+def force_names(counts: Iterable[int]) -> list[str]:
+    """Names of the metrics of bodies with so many modules each."""
+    names = [NAMES.get(count, str(count)) for count in counts]
+    rmse = [f"force_rmse_{name}_{phase}_n" for phase in PHASES for name in names]
+    fits = [f"force_fit{k}_{name}_{phase}" for phase in PHASES for name in names for k in range(DEGREE + 1)]
+    return [f"force_difference_{phase}" for phase in PHASES] + rmse + fits
 
 
 def force_metrics(scenario: Scenario, folder: Path, begin_ns: int) -> dict[str, float]:
@@ -26,7 +40,7 @@ def force_metrics(scenario: Scenario, folder: Path, begin_ns: int) -> dict[str, 
     truths, signals = read_signals(folder / TRUTH_LOG), read_signals(folder / SIGNAL_LOG)
     half_ns = round(0.5e9 * scenario.task.duration_s)
     metrics: dict[str, float] = {}
-    for phase, start_ns in (("off", begin_ns), ("on", begin_ns + half_ns)):
+    for phase, start_ns in zip(PHASES, (begin_ns, begin_ns + half_ns), strict=True):
         rmse = {}
         for members in scenario.groups:
             leader, count = members[0], len(members)

@@ -58,6 +58,8 @@ SHOWN = {
     "deadline_misses": Shown("Deadlines missed", digits=0),
 }
 """Metrics in the order in which tables show them."""
+DOCKING = ("docked", "tries", "jams", "outcome", "false_declarations", "docked_rmse_m", "join_jump_n")
+"""Those that only a run with [[step]]s has."""
 
 
 def metric_order(names: Iterable[str]) -> list[str]:

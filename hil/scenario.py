@@ -22,6 +22,7 @@ from hil.plant.lattice import is_connected, place
 from hil.plant.polycube import grow
 from hil.plant.spec import CALM, HALF_A_COUNT, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
+from hil.scenario_rules import mistakes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,6 +81,15 @@ class Step:
     position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-100, high=100, shape=(3,), help="move: where to, world")
     duration_s: float = quantity(10.0, unit="s", low=0, high=3600, help="move, moebius, wait: how long")
     also: bool = quantity(False, help="begins together with the step before")
+
+    def __post_init__(self) -> None:
+        if self.do in ("dock", "undock") and self.module == self.target_module:
+            raise DescriptionError(f"module and target_module are both {self.module}; a {self.do} is of two modules")
+
+    @property
+    def modules(self) -> tuple[int, ...]:
+        """Numbers of the modules that it is about: the active one, then the target of a dock or an undock."""
+        return {"wait": (), "move": (self.module,), "moebius": (self.module,)}.get(self.do, (self.module, self.target_module))
 
 
 MODES = ("MANUAL", "STABILIZE", "ALT_HOLD", "POSHOLD", "AUTO", "GUIDED", "SURFACE", "MOTOR_DETECT")
@@ -283,4 +293,6 @@ def load_scenario(name: str) -> Scenario:
         )
     table, source = read_toml(path)
     scenario: Scenario = build(Scenario, table, source)
+    if (mistake := next(mistakes(scenario), None)) is not None:
+        raise source.error(*mistake)
     return scenario

@@ -18,6 +18,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from argument_types import positive, whole
 from fit_thruster import fit_curve
 from identify_excitation import MOTIONS, excitation
 from identify_fit import Reference, fit
@@ -27,6 +28,7 @@ from identify_motion import smooth
 from identify_quantities import findings
 
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 from hil.bench import fly_scenario
 from hil.plant.draw import ModuleDraw, draw_module
@@ -111,13 +113,17 @@ def examine_all(seeds: Sequence[int], jobs: int, folder: Path, duration_s: float
 def main() -> int:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--plants", type=int, default=10, help="number of seeds")
-    parser.add_argument("--seed", type=int, default=0, help="first seed")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--seconds", type=float, default=170.0, help="of each flight, after it has settled")
+    parser.add_argument("--plants", type=whole(1), default=10, help="number of seeds")
+    parser.add_argument("--seed", type=whole(0), default=0, help="first seed")
+    parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
+    parser.add_argument("--seconds", type=positive, default=170.0, help="of each flight, after it has settled")
     parser.add_argument("--out", type=Path, default=Path("runs/plants"), help="for logs and plants.json")
     given = parser.parse_args()
-    found = examine_all(range(given.seed, given.seed + given.plants), given.jobs, given.out, given.seconds)
+    try:
+        found = examine_all(range(given.seed, given.seed + given.plants), given.jobs, given.out, given.seconds)
+    except (DescriptionError, OSError) as error:
+        print(f"identify_plants: {error}", file=sys.stderr)
+        return 2
     print(json.dumps(found, indent=2))
     return 0 if max(found[kind] for kind in (MASS, DRAG, GAIN)) <= 0.1 and found["covered"] >= 0.85 and not found["stated"] else 1
 

@@ -7,6 +7,7 @@ what was measured is written; a table whose file is missing stays as it is.
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import sys
@@ -73,13 +74,40 @@ def filled(text: str, sources: dict[str, Entries]) -> str:
     return MARKER.sub(table, text)
 
 
+def read_source(path: Path) -> Entries:
+    """What was measured. Raises ValueError where the file is not as the tools write it."""
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: no JSON: {error}") from None
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ValueError(f"{path}: not a list of figures")
+    return entries
+
+
 def main() -> int:
-    """Writes README.md; says what is missing."""
-    sources = {kind: json.loads(path.read_text(encoding="utf-8")) for kind, path in SOURCES.items() if path.exists()}
+    """The command line."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    if not README.is_file():
+        print(f"readme: no {README} in {Path.cwd()}; run this in the root of the project", file=sys.stderr)
+        return 2
+    try:
+        write_tables()
+    except KeyError as error:
+        print(f"readme: {error} is no table of {README}, or no column of its file; there are {', '.join(TABLES)}", file=sys.stderr)
+        return 2
+    except (ValueError, OSError) as error:
+        print(f"readme: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def write_tables() -> None:
+    """Writes README.md; says what is missing. Raises KeyError, ValueError and OSError."""
+    sources = {kind: read_source(path) for kind, path in SOURCES.items() if path.exists()}
     for kind in set(SOURCES) - set(sources):
         print(f"readme: no {SOURCES[kind]}; its tables stay as they are (make {kind})", file=sys.stderr)
     README.write_text(filled(README.read_text(encoding="utf-8"), sources), encoding="utf-8")
-    return 0
 
 
 if __name__ == "__main__":

@@ -22,6 +22,9 @@ STATE_ACTIVE, ARMED, ERROR = 4, 0x80, 3
 """MAV_STATE_ACTIVE; MAV_MODE_FLAG_SAFETY_ARMED; worst severity that is only said."""
 ONBOARD_CONTROLLER, INVALID_AUTOPILOT = 18, 8
 """MAV_TYPE: not a ground station, whose loss the vehicle would act upon."""
+NETWORK, LAST_PORT = ("udp", "udpin", "udpout", "udpbcast", "tcp", "tcpin"), 65535
+"""Kinds of address that end in a port, of which pymavlink finds some wrong only when it sends."""
+RIGHT = "an address such as mavlink:udpin:0.0.0.0:14550"
 SEEN = ("position_rmse_m", "attitude_rmse_rad")
 """Metrics that telemetry gives; the objective's other terms are left out."""
 
@@ -47,13 +50,17 @@ class Link(Protocol):
 
 def connect(address: str) -> Link:
     """The link to a MAVLink address. Raises DescriptionError."""
+    kind, _, place = address.partition(":")
+    port = place.rpartition(":")[2]
+    if kind in NETWORK and not (port.isascii() and port.isdecimal() and len(port) <= 5 and int(port) <= LAST_PORT):
+        raise DescriptionError(f"--live mavlink:{address}: {port!r} is no port, 0 to {LAST_PORT}; it needs {RIGHT}")
     os.environ["MAVLINK20"] = "1"
     from pymavlink import mavutil
 
     try:
         return cast(Link, mavutil.mavlink_connection(address, dialect="all", source_system=255, source_component=191))
-    except (OSError, ValueError) as error:
-        raise DescriptionError(f"--live {address}: {error}; it needs an address such as mavlink:udpin:0.0.0.0:14550") from None
+    except (ImportError, OSError, OverflowError, ValueError) as error:
+        raise DescriptionError(f"--live mavlink:{address}: {error}; it needs {RIGHT}") from None
 
 
 class Vehicle:

@@ -12,10 +12,11 @@ from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.mapping import InputCollector, OutputEncoder
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.types import Inputs, Outputs, Request
-from firmware_py.description.fleet import Fleet
+from firmware_py.description.fleet import Fleet, load_fleet
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle, load_vehicle
-from firmware_py.prepare.assembly import assemble_fleet
+from firmware_py.prepare.assembly import assemble_fleet, check_fleet
 from firmware_py.runtime.worker import InlineWorker, Worker
 
 BusFrame = tuple[int, Frame]
@@ -67,6 +68,16 @@ class Firmware:
 def vehicles_of(fleet: Fleet, folder: Path | None = None) -> dict[str, Vehicle]:
     """The vehicles that a fleet names; each file is read once."""
     return {name: load_vehicle(name, folder) for name in dict.fromkeys(m.vehicle for m in fleet.module)}
+
+
+def read_fleet(path: Path) -> Fleet:
+    """The fleet in `path`, whose modules can be docked as it says. Raises DescriptionError, which names the file."""
+    fleet = load_fleet(path)
+    try:
+        check_fleet(fleet, vehicles_of(fleet))
+    except DescriptionError as error:
+        raise DescriptionError(f"{path}: {error}") from None
+    return fleet
 
 
 def compose(

@@ -24,6 +24,7 @@ from firmware_py.app.deadlines import times_of
 from firmware_py.app.firmware import BusFrame, Firmware
 from firmware_py.core.body import Body
 from firmware_py.core.types import Inputs, Outputs, Request
+from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.link import Links
@@ -76,6 +77,7 @@ class GroundSide:
         executor: plans missions; None starts a process for it.
         unix_now_ns: the time of day, for signing.
         priority: SCHED_FIFO priority of the thread, beside a loop that has one; 0: an ordinary thread.
+        started: parameters before the stored ones were laid over them; None: the firmware's.
     """
 
     def __init__(
@@ -85,11 +87,12 @@ class GroundSide:
         executor: Executor | None = None,
         unix_now_ns: Callable[[], int] = unix_ns,
         priority: int = 0,
+        started: Parameters | None = None,
     ) -> None:
         """Opens the links. Raises DescriptionError for a link, key file or parameter file that is wrong."""
         self._config, self._pipeline, self._unix_now_ns = config, firmware.pipeline, unix_now_ns
         self._period_ns = firmware.fleet.period_ns
-        self.station = GroundStation(config, firmware.fleet, firmware.parameters, _signing_of(config))
+        self.station = GroundStation(config, firmware.fleet, started or firmware.parameters, _signing_of(config))
         try:
             self.links = Links(config.links)
         except LinkError as error:

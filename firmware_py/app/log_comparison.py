@@ -7,9 +7,10 @@ from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
 from firmware_py.bus.codec import Codec
-from firmware_py.runtime.flight_log import LoggedTick
+from firmware_py.runtime.flight_log import LoggedTick, shown
 from firmware_py.runtime.tick_messages import Message
 
 SMALL = 1e-3
@@ -65,13 +66,16 @@ class Comparison:
         topic, layout, data = replayed
         try:
             before = layout.values(recorded)
-        except ValueError:
+        except (ValueError, DecodeError):
             return topic, f"{len(recorded)} bytes", f"{len(data)} bytes"
         for name, was, now in zip(layout.names, before, layout.values(data), strict=True):
             for place, (a, b) in enumerate(zip(np.atleast_1d(was), np.atleast_1d(now), strict=True)):
                 if not self._same(a, b):
-                    return f"{topic} {name}{f'[{place}]' if np.ndim(was) else ''}", str(a), str(b)
-        return None if self._tolerance else (topic, recorded.hex(), data.hex())
+                    return f"{topic} {name}{f'[{place}]' if np.ndim(was) else ''}", _words(a), _words(b)
+        if self._tolerance:
+            return None
+        at = next(i for i, (a, b) in enumerate(zip_longest(recorded, data)) if a != b)
+        return f"{topic} from byte {at} on", shown(recorded[at:].hex()), shown(data[at:].hex())
 
     def _same(self, was: Any, now: Any) -> bool:
         if isinstance(was, np.floating):
@@ -82,11 +86,15 @@ class Comparison:
         (where, number, before), (there, other, after) = _frame_of(was), _frame_of(now)
         message = self._codec.by_id(number)
         if (where, number, len(before)) != (there, other, len(after)) or message is None:
-            return "frame", was.strip() or "nothing", now.strip() or "nothing"
+            return "frame", shown(was) if was else "nothing", shown(now) if now else "nothing"
         for field, one, two in zip(message.fields, message.decode_raw(before), message.decode_raw(after), strict=True):
             if abs(one - two) > (1 if self._tolerance else 0):
                 return f"{where} {message.name} {field} of number {number & 31}", str(one), str(two)
         return None if self._tolerance else (f"{where} {message.name}", before.hex(), after.hex())
+
+
+def _words(value: Any) -> str:
+    return shown(value) if isinstance(value, str) else str(value)
 
 
 def _frame_of(line: str) -> tuple[str, int, bytes]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from firmware_py.app.replay import replay
+from firmware_py.runtime.flight_log import LogError
 
 SAME, DIFFERENT = 0, 1
 """Exit statuses."""
@@ -17,6 +18,8 @@ def replay_and_say(folder: Path, tolerance: float, say: Callable[[str], None]) -
     began = time.perf_counter()
     outcome = replay(folder, tolerance)
     took_s = time.perf_counter() - began
+    if not outcome.ticks:
+        raise LogError(f"{folder}: no tick of the log is whole, so nothing can be replayed: {outcome.torn or 'it holds none'}")
     if outcome.torn:
         say(f"the log is torn: {outcome.torn}; `modcube log recover {folder}` mends it")
     say(f"{outcome.ticks} ticks, {outcome.seconds:.2f} s, replayed in {took_s:.2f} s: {outcome.seconds / took_s:.1f} x real time")

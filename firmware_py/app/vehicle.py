@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import Summary, recording_times, summary_of
 from firmware_py.app.firmware import BusFrame, Firmware, compose, vehicles_of
+from firmware_py.app.last_flight import modules_in_flight
 from firmware_py.app.live_view import LiveView
 from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import open_loop
 from firmware_py.app.service import reporting
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet
-from firmware_py.description.parameters import Parameters, load_parameters
+from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.stored_parameters import laid_over, stored_line
+from firmware_py.runtime.clock import unix_ns
+from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.rate_keeper import RateKeeper
 from firmware_py.runtime.realtime import (
@@ -32,7 +36,8 @@ from firmware_py.runtime.realtime import (
     release_compiler,
     use_priority,
 )
-from firmware_py.runtime.recorder import Recorder
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
+from firmware_py.runtime.teller import Teller, write_line
 from firmware_py.runtime.worker import ThreadWorker
 
 if TYPE_CHECKING:
@@ -43,14 +48,19 @@ FAREWELL_TICKS = 10
 ARM_EVERY_S = 1.0
 """How often arming is tried again with `--hold`, once the pose is known."""
 FLUSH_EVERY_S = 0.5
+MISUSED = (FileExistsError, NotADirectoryError, PermissionError)
+"""A folder for logs that is none, or not ours: whoever starts the vehicle is told. What else a disk may fail in, it flies without."""
+STOPPED_BY = frozenset({Action.DISARM, Action.ESTOP})
+"""Requests of a person after which nothing is armed but by a person."""
 
 
 @dataclass(slots=True)
 class Operator:
-    """Stands in for a person: arms and holds when told to, and disarms when the process is asked to stop."""
+    """Stands in for a person: arms and holds when told to, once, and disarms when the process is asked to stop."""
 
     rate_hz: int
-    hold: bool
+    to_arm: set[int] = field(default_factory=set)
+    """Fleet indices of modules that are still to be armed. A body goes by its leader; who was armed once, by whomever, leaves."""
     stopping: bool = False
     farewell: int = 0
     _ticks: int = 0
@@ -63,12 +73,20 @@ class Operator:
             self.farewell += 1
             bodies = [record.body for record in last.records] if last is not None else []
             return [Request(Action.DISARM, body) for body in bodies] if self.farewell == 1 else []
-        if not self.hold or last is None or self._ticks < self._next_try:
+        if not self.to_arm or last is None:
             return []
-        ready = [record.body for record in last.records if record.state not in ARMED and record.estimate.ready]
-        if ready:
-            self._next_try = self._ticks + round(ARM_EVERY_S * self.rate_hz)
+        self._strike_out(last)
+        ready = [record.body for record in last.records if record.body in self.to_arm and record.estimate.ready]
+        if not ready or self._ticks < self._next_try:
+            return []
+        self._next_try = self._ticks + round(ARM_EVERY_S * self.rate_hz)
         return [Request(Action.ARM, body) for body in ready]
+
+    def _strike_out(self, last: Outputs) -> None:
+        """Who has been armed, and after an e-stop everybody, is a person's to arm."""
+        self.to_arm.difference_update(index for index, command in enumerate(last.modules) if command.armed)
+        if any(record.state == State.ESTOP for record in last.records):
+            self.to_arm.clear()
 
     def is_done(self, tick: int, outputs: Outputs) -> bool:
         """Whether every module has been told for long enough."""
@@ -80,7 +98,7 @@ def run_vehicle(
     parameters: Parameters,
     hold: bool = False,
     out: Path | None = None,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = write_line,
     notifier: Notifier | None = None,
     ground: GroundConfig | None = None,
     live: LiveView | None = None,
@@ -89,39 +107,43 @@ def run_vehicle(
 
     Args:
         hold: arm as soon as the vehicle may, and hold the place.
-        out: folder for the logs; None keeps none.
-        say: told every event, one line each.
+        out: folder for the logs; None keeps none. What is there already stays.
+        say: told every event, one line each, by a thread of its own; it may wait and fail as it likes.
         notifier: of the service manager.
         live: serves the log's channels and a scene to viewers.
-        ground: links to ground stations; parameters that they stored earlier take the place of `parameters`.
+        ground: links to ground stations; parameters that they stored earlier are laid over `parameters`.
     """
-    if ground is not None and ground.parameter_file is not None and ground.parameter_file.exists():
-        parameters = load_parameters(ground.parameter_file)
+    store = ground.parameter_file if ground is not None else None
+    laid = laid_over(parameters, store)
     release_compiler()
     with ExitStack() as stack:
+        teller = Teller(say)  # before this thread takes its priority, like every thread below that is none of the loop's
+        stack.callback(teller.close)
         move_to_own_processor = stack.enter_context(beside_the_tick())
         worker = ThreadWorker()
         stack.callback(worker.close)
-        firmware = compose(fleet, parameters, worker=worker)
-        operator = Operator(fleet.rate_hz, hold)
+        if line := stored_line(parameters, laid, store):
+            teller.say(line)
+        firmware = compose(fleet, laid, worker=worker)
+        operator = Operator(fleet.rate_hz, _to_arm(firmware, hold, out, teller.say))
         observers: list[Observer] = []
-        recorder = _open_recorder(stack, firmware, out, live)
+        recorder = _open_recorder(stack, firmware, out, live, teller.say)
         if recorder is not None:
             observers.append(recording(recorder, fleet.rate_hz))
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
-        observers.append(telling(say))  # after the recorder, which may have something to say
+        observers.append(telling(teller.say))  # after the recorder, which may have something to say
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
         side: GroundSide | None = None
         if ground is not None:
             from firmware_py.app.ground_station import GroundSide  # a tenth of a second, and 6 MB of messages
 
             # Like the recorder's and the live view's, its threads start before this one takes its priority, which they would inherit.
-            side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY))
+            side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY, started=parameters))
             observers.append(side.observe)
             requests = with_ground(operator, side)
         for line in stack.enter_context(real_time()):
-            say(f"warning: {line}")
+            teller.say(f"warning: {line}")
         loop = open_loop(stack, firmware, requests)
         loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier)]
         use_priority(TICK_PRIORITY)
@@ -129,25 +151,62 @@ def run_vehicle(
         loop.listen()
         stack.enter_context(_stopping_by_signal(operator))
         stack.enter_context(quiet_garbage())
-        say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
+        teller.say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
         loop.run(operator.is_done)
         if recorder is not None and loop.last is not None:
             recorder.record_times(loop.last.tick, loop.last.time_ns, loop.rate_keeper)
         return summary_of(loop)
 
 
-def _open_recorder(stack: ExitStack, firmware: Firmware, out: Path | None, live: LiveView | None) -> Recorder | None:
+def _to_arm(firmware: Firmware, hold: bool, out: Path | None, say: Callable[[str], None]) -> set[int]:
+    """Modules that are armed without a person: all with `hold`; with REARM, those in whose flight the process before was killed."""
+    if hold:
+        return set(range(len(firmware.fleet.module)))
+    if out is None or not firmware.parameters.supervision.rearm:
+        return set()
+    flying = modules_in_flight(out, firmware.fleet, firmware.codec, unix_ns())
+    if flying:
+        say("the process before ended in flight: holding as soon as the vehicle may (REARM)")
+    return flying
+
+
+def _open_recorder(
+    stack: ExitStack, firmware: Firmware, out: Path | None, live: LiveView | None, say: Callable[[str], None]
+) -> Recorder | None:
     """The recorder for a folder, for viewers, or for both."""
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-    elif live is None:
+    folder = _log_folder(out, say) if out is not None else None
+    if folder is None and live is None:
         return None
     configuration = configuration_of(firmware, rate_hz=firmware.fleet.rate_hz)
-    recorder = Recorder(out, configuration, live.context if live is not None else None, queued=True)
+    recorder = Recorder(folder, configuration, live.context if live is not None else None, queued=True)
+    if folder is not None:
+        stack.callback(_forget_failed_start, recorder, folder, out)
     stack.callback(recorder.close)
     for body in firmware.pipeline.bodies:
         recorder.expect(body.index, body.thrusters.f_max.size)
     return recorder
+
+
+def _log_folder(out: Path, say: Callable[[str], None]) -> Path | None:
+    """A folder for a new log; None where the disk has none to give. Raises OSError where `out` cannot be meant."""
+    try:
+        return make_log_folder(out)
+    except MISUSED:
+        raise
+    except OSError as error:
+        say(f"warning: no log: {error.filename or out}: {error.strerror}")
+        return None
+
+
+def _forget_failed_start(recorder: Recorder, folder: Path, out: Path | None) -> None:
+    """A start that came to no tick leaves no log: a service that waits for its bus starts again and again."""
+    if recorder.ticks:
+        return
+    with suppress(OSError):
+        for name in (CAN_LOG, SIGNAL_LOG):
+            (folder / name).unlink(missing_ok=True)
+        if folder != out:
+            folder.rmdir()
 
 
 def _watching(
@@ -163,11 +222,17 @@ def _watching(
 
 
 def with_ground(operator: Operator, side: GroundSide) -> Callable[[int, Outputs | None], list[Request]]:
-    """The operator's requests and those of ground stations; a reboot that was asked for ends the process, the service starts it anew."""
+    """The operator's requests and those of ground stations; a reboot that was asked for ends the process, the service starts it anew.
+
+    Once a ground station disarms or stops the vehicle, the operator arms nobody any more.
+    """
 
     def requests(time_ns: int, last: Outputs | None) -> list[Request]:
         operator.stopping = operator.stopping or side.reboot_asked
-        return [*operator.requests(time_ns, last), *side.requests()]
+        asked = side.requests()
+        if any(request.action in STOPPED_BY for request in asked):
+            operator.to_arm.clear()
+        return [*operator.requests(time_ns, last), *asked]
 
     return requests
 
@@ -188,8 +253,12 @@ def event_line(time_ns: int, event: Event) -> str:
 
 
 def recording(recorder: Recorder, rate_hz: int) -> Observer:
-    """An observer that writes every tick to `recorder`, in the order in which frames went over the bus."""
+    """An observer that writes every tick to `recorder`, in the order in which frames went over the bus.
+
+    Who is armed is with the system at once: a process that is killed then knows it when it comes back.
+    """
     flush_every = max(1, round(FLUSH_EVERY_S * rate_hz))
+    was_armed: list[bool] = []
 
     def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
         buses = sorted({bus for bus, _ in sent})
@@ -199,7 +268,9 @@ def recording(recorder: Recorder, rate_hz: int) -> Observer:
             recorder.received(outputs.time_ns, bus, [f for b, f in received if b == bus])
             recorder.sent(outputs.time_ns, bus, [f for b, f in sent[syncs:] if b == bus])
         recorder.record(inputs, outputs)
-        if outputs.tick % flush_every == 0:
+        armed = [command.armed for command in outputs.modules]
+        if armed != was_armed or outputs.tick % flush_every == 0:
+            was_armed[:] = armed
             outputs.events += recorder.flush()
 
     return observe

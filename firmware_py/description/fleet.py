@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
+
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,25 +39,39 @@ class Fleet:
     altitude_m: float = quantity(0.0, unit="m", low=-500, high=9000, help="geodetic origin of the tank")
 
     def __post_init__(self) -> None:
-        addresses = [(m.bus, m.number) for m in self.module]
-        if not addresses:
+        if not self.module:
             raise DescriptionError("has no [[module]] table; a fleet needs at least one")
-        if len(set(addresses)) != len(addresses):
-            raise DescriptionError("two modules have the same bus and number")
-        if max(m.bus for m in self.module) >= len(self.buses):
-            raise DescriptionError(f"a module names a bus beyond the {len(self.buses)} in `buses`")
+        if twice := _first_twice(self.buses):
+            raise DescriptionError(f"buses has {twice} twice; each bus stands there once, and modules share it by its index")
+        for module in self.module:
+            if module.bus >= len(self.buses):
+                raise DescriptionError(f"module number {module.number} is on bus {module.bus}; `buses` has {len(self.buses)}, from 0 on")
+        if again := _first_twice([(m.bus, m.number) for m in self.module]):
+            raise DescriptionError(f"two modules have the number {again[1]} on {self.buses[again[0]]}; each needs one of its own there")
 
     @property
     def period_ns(self) -> int:
         """Length of a tick."""
         return 1_000_000_000 // self.rate_hz
 
+    def label(self, index: int) -> str:
+        """How errors name a module: by its number, and by its bus where there are several."""
+        module = self.module[index]
+        return f"{module.number}" if len(self.buses) == 1 else f"{module.number} on {self.buses[module.bus]}"
+
 
 def load_fleet(path: Path) -> Fleet:
-    """The fleet in `path`. Raises DescriptionError, one line."""
+    """The fleet in `path`, which names its buses. Raises DescriptionError, one line."""
     table, source = read_toml(path)
+    if "buses" not in table:
+        raise source.error(("buses",), 'missing key; it needs the bus of each index, such as ["socketcan:can0"]')
     fleet: Fleet = build(Fleet, table, source)
     return fleet
+
+
+def _first_twice(items: Sequence[_Item]) -> _Item | None:
+    """The first item that was there before; None where all differ."""
+    return next((item for at, item in enumerate(items) if item in items[:at]), None)
 
 
 def single(vehicle: str = "modcube", bus: str = "virtual:modcube", rate_hz: int = 100) -> Fleet:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.ground.identity import IDENTITIES, Identity
 
 
@@ -34,6 +36,8 @@ class GroundConfig:
             raise DescriptionError("has no links; a ground side needs at least one")
         if len(self.dock_button) not in (0, 4):
             raise DescriptionError("dock_button needs four numbers: module, face, target module, target face")
+        if wrong := [face for face in self.dock_button[1::2] if face >= len(FACE_NAMES)]:
+            raise DescriptionError(f"dock_button names face {wrong[0]}; faces are 0 to {len(FACE_NAMES) - 1}: {', '.join(FACE_NAMES)}")
 
     @property
     def encoding(self) -> Identity:
@@ -51,8 +55,26 @@ class GroundConfig:
         return Path(self.store) / "signing.json" if self.store else None
 
 
-def load_ground(path: Path) -> GroundConfig:
-    """The ground side in `path`; what it leaves out keeps its default. Raises DescriptionError, one line."""
+def load_ground(path: Path, modules: int) -> GroundConfig:
+    """The ground side in `path` of a fleet of so many modules; what it leaves out keeps its default. Raises DescriptionError, one line."""
     table, source = read_toml(path)
     config: GroundConfig = build(GroundConfig, table, source)
+    docked = config.dock_button[::2]
+    if docked and (max(docked) >= modules or len(set(docked)) == 1):
+        raise source.error(
+            ("dock_button",), f"module {docked[0]} to module {docked[1]}; it needs two modules of the fleet, which has {modules}, from 0 on"
+        )
     return config
+
+
+def check_store(store: str) -> None:
+    """Refuse a folder that can neither be made nor written to; none and a disk that fails are no mistake. Raises DescriptionError."""
+    if not store:
+        return
+    nearest = next(place for place in (Path(store), *Path(store).parents) if place.exists())
+    try:
+        TemporaryFile(dir=nearest).close()
+    except (NotADirectoryError, PermissionError) as error:
+        raise DescriptionError(f"store {store}: {nearest}: {error.strerror}; it needs a folder that this user may write to") from None
+    except OSError:
+        return

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.core.types import Action
-from firmware_py.description.parameters import Parameters, load_parameters, registry
-from firmware_py.description.schema import DescriptionError, Limits, to_toml
+from firmware_py.description.parameters import Parameters, registry
+from firmware_py.description.schema import DescriptionError, Limits
 from firmware_py.ground.files import write_atomically
+from firmware_py.ground.stored_parameters import differences_toml, laid_over
 from firmware_py.ground.system import Arrival, Handler, System
 
 REAL32 = 9
@@ -31,9 +32,9 @@ class ParameterStore:
     """The parameters of the process; a change is a new object."""
 
     def __init__(self, parameters: Parameters, path: Path | None = None) -> None:
-        """Takes what `path` holds, when it is there. Raises DescriptionError."""
-        self._path = path
-        self.values = load_parameters(path) if path is not None and path.exists() else parameters
+        """Lays what `path` holds over `parameters`, with which the process was started. Raises DescriptionError."""
+        self._path, self._started = path, parameters
+        self.values = laid_over(parameters, path)
         self.names: dict[str, tuple[str, Limits]] = {
             limits.mavlink: (dotted, limits) for dotted, limits in registry() if limits.mavlink
         }
@@ -46,7 +47,7 @@ class ParameterStore:
         return float(getattr(getattr(self.values, group), field))
 
     def set(self, name: str, value: float) -> tuple[str, float]:
-        """Change one and store all; returns its name in the registry and the value as kept.
+        """Change one and store all that differ from the start; returns its name in the registry and the value as kept.
 
         Raises:
             DescriptionError: out of range.
@@ -58,7 +59,7 @@ class ParameterStore:
         kept = kind(value) if kind is not int else round(value)
         changed = self.values.replace(dotted, kept)
         if self._path is not None:
-            write_atomically(self._path, to_toml(changed).encode())
+            write_atomically(self._path, differences_toml(changed, self._started).encode())
         self.values = changed
         return dotted, kept
 

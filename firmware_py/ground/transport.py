@@ -13,6 +13,7 @@ import serial
 LOOPBACK = "127.0.0.1"
 _DATAGRAM = 65536
 _READ = 4096
+_LAST_PORT, _FASTEST_BAUD = 65535, 12_000_000
 _READS_AT_ONCE = 64
 """Datagrams taken from one socket before the next has its turn."""
 
@@ -223,13 +224,19 @@ def open_link(address: str) -> Link:
     try:
         if address.startswith("/"):
             device, _, baud = address.partition(",")
-            return SerialLink(device, int(baud or 921600))
+            return SerialLink(device, _number(address, baud or "921600", _FASTEST_BAUD, "/dev/NAME,BAUD, as /dev/ttyTHS1,921600"))
         kind, _, rest = address.partition(":")
         host, _, port = rest.rpartition(":")
-        if kind in ("udpin", "udpout"):
-            return UdpLink(host or LOOPBACK, int(port), kind == "udpin")
-        if kind == "tcpin":
-            return TcpLink(host or LOOPBACK, int(port))
+        if kind in ("udpin", "udpout", "tcpin"):
+            number = _number(address, port, _LAST_PORT, f"{kind}:HOST:PORT, as {kind}:{LOOPBACK}:14550, and behind it at most one +trusted")
+            return TcpLink(host or LOOPBACK, number) if kind == "tcpin" else UdpLink(host or LOOPBACK, number, kind == "udpin")
     except (OSError, ValueError, OverflowError) as error:
         raise LinkError(f"link {address}: cannot be opened: {error}") from None
     raise LinkError(f"link {address}: unknown; there are udpin:, udpout:, tcpin:HOST:PORT and /dev/NAME,BAUD")
+
+
+def _number(address: str, text: str, most: int, right: str) -> int:
+    """A port or a baud rate. Raises LinkError, which says what would be right."""
+    if not (text.isascii() and text.isdecimal() and len(text) <= len(str(most)) and int(text) <= most):
+        raise LinkError(f"link {address}: {text!r} is no whole number up to {most}; it needs {right}")
+    return int(text)

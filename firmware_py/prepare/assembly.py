@@ -61,8 +61,7 @@ def assemble(
     modules = tuple(range(count)) if modules is None else tuple(int(m) for m in modules)
     if not 1 <= count <= MOST_MODULES or not len(cells) == len(rotation) == len(modules) == count:
         raise DescriptionError(f"a body has 1 to {MOST_MODULES} modules with cell, rotation and vehicle, not {count}")
-    turned = zip(vehicles, cells, rotation, strict=True)
-    placements = [Placement(v, (int(c[0]), int(c[1]), int(c[2])), int(r)) for v, c, r in turned]
+    placements = _placements(cells, rotation, vehicles)
     check_joints(placements, modules, pitch_m)
     return _body(placements, modules, pitch_m, cache, name or _name(placements))
 
@@ -74,19 +73,41 @@ def assemble_vehicle(vehicle: Vehicle, module_index: int = 0, cache: DragCache |
 
 def assemble_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle], cache: DragCache | None = None) -> list[Body]:
     """The bodies that the fleet starts as, in the order of their leaders; `vehicles` by the name in the fleet file."""
+    check_fleet(fleet, vehicles)
+    return [assemble(*_described(fleet, members, vehicles), members, fleet.pitch_m, cache) for members in _groups(fleet)]
+
+
+def check_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> None:
+    """Refuse modules that cannot be docked so, and thrusters that no frame carries. Raises DescriptionError, which names numbers."""
+    for vehicle in vehicles.values():
+        if len(vehicle.thruster) > CHANNELS:
+            raise DescriptionError(f"vehicle {vehicle.name}: {len(vehicle.thruster)} thrusters; a module's frames carry {CHANNELS}")
+    for members in _groups(fleet):
+        check_joints(_placements(*_described(fleet, members, vehicles)), [fleet.label(i) for i in members], fleet.pitch_m)
+
+
+def _groups(fleet: Fleet) -> list[list[int]]:
+    """Fleet indices of the modules of each body."""
     groups: dict[object, list[int]] = {}
     for index, module in enumerate(fleet.module):
         groups.setdefault(module.body if module.body >= 0 else (index,), []).append(index)
-    bodies = []
-    for members in groups.values():
-        chosen = [fleet.module[i] for i in members]
-        cells = np.rint([m.cell for m in chosen]).astype(int)
-        descriptions = [vehicles[m.vehicle] for m in chosen]
-        for vehicle in descriptions:
-            if len(vehicle.thruster) > CHANNELS:
-                raise DescriptionError(f"vehicle {vehicle.name}: {len(vehicle.thruster)} thrusters; a module's frames carry {CHANNELS}")
-        bodies.append(assemble(cells, [m.rotation for m in chosen], descriptions, members, fleet.pitch_m, cache))
-    return bodies
+    return list(groups.values())
+
+
+def _described(
+    fleet: Fleet, members: Sequence[int], vehicles: Mapping[str, Vehicle]
+) -> tuple[np.ndarray, list[int], list[Vehicle]]:
+    """Cells, rotations and vehicles of a body's modules."""
+    chosen = [fleet.module[i] for i in members]
+    cells = np.rint([m.cell for m in chosen]).astype(int)
+    return cells, [m.rotation for m in chosen], [vehicles[m.vehicle] for m in chosen]
+
+
+def _placements(
+    cells: Sequence[Sequence[int]] | np.ndarray, rotation: Sequence[int], vehicles: Sequence[Vehicle]
+) -> list[Placement]:
+    turned = zip(vehicles, cells, rotation, strict=True)
+    return [Placement(v, (int(c[0]), int(c[1]), int(c[2])), int(r)) for v, c, r in turned]
 
 
 def _name(placements: Sequence[Placement]) -> str:

@@ -27,12 +27,12 @@ class Placement:
     rotation: int
 
 
-def check_joints(placements: Sequence[Placement], modules: Sequence[int], pitch_m: float) -> None:
+def check_joints(placements: Sequence[Placement], modules: Sequence[object], pitch_m: float) -> None:
     """Refuse placements that cannot be docked.
 
     Args:
         placements: the modules.
-        modules: their fleet indices, by which they are named.
+        modules: their fleet indices, or whatever errors are to name them by.
         pitch_m: lattice pitch.
 
     Raises:
@@ -65,7 +65,7 @@ def _neighbour(cell: Cell, axis: int) -> Cell:
     return x, y, z
 
 
-def _joined(placements: Sequence[Placement], modules: Sequence[int], i: int, j: int, axis: int) -> bool:
+def _joined(placements: Sequence[Placement], modules: Sequence[object], i: int, j: int, axis: int) -> bool:
     """Whether the faces between neighbours i and j (i below j along `axis`) dock. A probe needs a drogue before it."""
     unit = [0, 0, 0]
     unit[axis] = 1
@@ -93,7 +93,7 @@ def _reached(joints: Mapping[int, Sequence[int]]) -> set[int]:
 
 
 def _check_payloads(
-    placements: Sequence[Placement], modules: Sequence[int], at: Mapping[Cell, int], pitch_m: float
+    placements: Sequence[Placement], modules: Sequence[object], at: Mapping[Cell, int], pitch_m: float
 ) -> None:
     for i, placement in enumerate(placements):
         turn = MATRICES[placement.rotation]

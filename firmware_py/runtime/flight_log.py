@@ -9,10 +9,15 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from firmware_py.description.schema import DescriptionError
-from firmware_py.description.signals import Layout, TextLayout, is_closed, read_attachment, read_messages
+from google.protobuf.message import DecodeError
+
+from firmware_py.description.schema import SHOWN_CHARACTERS, DescriptionError
+from firmware_py.description.signals import Layout, LogMessage, TextLayout, is_closed, read_attachment, read_messages
 from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG, candump_stamp
 from firmware_py.runtime.tick_messages import REQUESTS, TICK_SIGNALS, TICKS, TIMES
+
+HIGHEST_ID, LONGEST_DATA = 0x1FFF_FFFF, 64
+"""Of any frame: 29 bits, and the bytes of CAN FD."""
 
 
 class LogError(DescriptionError):
@@ -20,11 +25,27 @@ class LogError(DescriptionError):
 
 
 class LoggedFrame(NamedTuple):
-    """One frame that came."""
+    """One frame that came or went."""
 
     bus: int
     id: int
     data: bytes
+
+
+def shown(text: str) -> str:
+    """A piece of a log as it stands in a line of words: quoted, in printable characters, cut short."""
+    quoted = ascii(text.strip())
+    return quoted if len(quoted) <= SHOWN_CHARACTERS else f"{quoted[: SHOWN_CHARACTERS - 3]}..."
+
+
+def frame_of(line: str) -> LoggedFrame:
+    """The frame of a line of can.log. Raises ValueError where it holds none."""
+    _, channel, frame, _ = line.split(" ")
+    number, _, data = frame.partition("#")
+    logged = LoggedFrame(int(channel[3:]), int(number, 16), bytes.fromhex(data))
+    if logged.bus < 0 or not 0 <= logged.id <= HIGHEST_ID or len(logged.data) > LONGEST_DATA:
+        raise ValueError(f"{channel} {frame} is no frame of a bus")
+    return logged
 
 
 @dataclass(slots=True)
@@ -59,8 +80,17 @@ class FlightLog:
             if not (folder / name).is_file():
                 raise LogError(f"{folder}: no {name} there; give the folder that a run left")
         text = read_attachment(folder / SIGNAL_LOG, CONFIGURATION)
-        self.configuration: dict[str, Any] | None = json.loads(text) if text is not None else None
+        self.configuration: dict[str, Any] | None = self._configuration(text) if text is not None else None
         self.torn = "" if is_closed(folder / SIGNAL_LOG) else f"{SIGNAL_LOG} was not closed"
+
+    def _configuration(self, text: bytes) -> dict[str, Any]:
+        try:
+            configuration = json.loads(text)
+        except ValueError as error:
+            raise LogError(f"{self.folder}: {CONFIGURATION} in {SIGNAL_LOG} is no JSON: {error}") from None
+        if not isinstance(configuration, dict):
+            raise LogError(f"{self.folder}: {CONFIGURATION} in {SIGNAL_LOG} is no table")
+        return configuration
 
     def ticks(self) -> Iterator[LoggedTick]:
         """Every tick that both files hold whole, in order. Raises LogError where they do not belong together.
@@ -74,7 +104,7 @@ class FlightLog:
                 self.torn = self.torn or f"{CAN_LOG} ends before tick {logged.tick}"
                 return
             if group.stamp != candump_stamp(logged.time_ns):
-                raise LogError(f"{self.folder}: {CAN_LOG} has frames of {group.stamp} where {SIGNAL_LOG} has tick {logged.tick}")
+                raise LogError(f"{self.folder}: {CAN_LOG} has frames of {shown(group.stamp)} where {SIGNAL_LOG} has tick {logged.tick}")
             _sort_lines(group.lines, logged)
             wanted, came = _received_frames(logged), len(logged.received)
             if group.is_last and (self.torn or came != wanted or next(thoughts, None) is not None):
@@ -93,15 +123,23 @@ class FlightLog:
             if message.topic == TICKS:
                 if now is not None:
                     yield now
-                tick, time_ns, *_, prepared = _TICK.values(message.data)
+                tick, time_ns, *_, prepared = self._values(message)
                 now = LoggedTick(int(tick), int(time_ns), int(prepared))
             if now is None or message.topic == TIMES:
                 continue
             now.messages.append((message.topic, message.data))
             if message.topic == REQUESTS:
-                now.requests.append(_REQUEST.values(message.data)[1])
+                now.requests.append(self._values(message)[1])
         if now is not None:
             yield now
+
+    def _values(self, message: LogMessage) -> tuple[Any, ...]:
+        """Of a tick or a request."""
+        try:
+            return (_TICK if message.topic == TICKS else _REQUEST).values(message.data)
+        except (ValueError, IndexError, DecodeError):
+            what = f"a message of {message.topic} that this version does not write"
+            raise LogError(f"{self.folder}: {SIGNAL_LOG} has {what}; it is spoilt or another version's") from None
 
     def _frames(self) -> Iterator[_Group]:
         """The lines of can.log tick by tick; half a line at the end is left out."""
@@ -142,8 +180,6 @@ def _sort_lines(lines: list[str], logged: LoggedTick) -> None:
             logged.sent.append(line)
             continue
         try:
-            _, channel, frame, _ = line.split(" ")
-            number, _, data = frame.partition("#")
-            logged.received.append(LoggedFrame(int(channel[3:]), int(number, 16), bytes.fromhex(data)))
+            logged.received.append(frame_of(line))
         except ValueError:
-            raise LogError(f"{CAN_LOG}: {line.strip()!r} is no frame as `candump -L -x` writes it") from None
+            raise LogError(f"{CAN_LOG}: {shown(line)} is no frame as `candump -L -x` writes it") from None

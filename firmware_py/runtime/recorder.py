@@ -67,6 +67,9 @@ class Recorder:
 
     Call `sent` and `received` as frames go and come, `record` once a tick after the step, `flush` every half second once the tick's
     commands are out, `close` at the end.
+
+    Attributes:
+        ticks: recorded so far.
     """
 
     def __init__(
@@ -89,6 +92,7 @@ class Recorder:
         self._mcap = kind(folder / SIGNAL_LOG if folder is not None else Path(os.devnull))
         self._lines: list[str] = []
         self._received = 0
+        self.ticks = 0
         self._reported = False
         self._closed = False
         self._context = context if context is not None else foxglove.Context()
@@ -140,6 +144,7 @@ class Recorder:
         for topic, layout, data in self._messages.of(self._received, inputs, outputs):
             self._channel(topic, layout).log(data, log_time=outputs.time_ns)
         self._received = 0
+        self.ticks += 1
 
     def record_times(self, tick: int, time_ns: int, keeper: RateKeeper) -> None:
         """How the ticks that are done kept their deadlines. Real time only: another run is never the same."""
@@ -151,6 +156,10 @@ class Recorder:
         self._can.write("".join(self._lines).encode())
         self._lines.clear()
         self._writer.flush()
+        return self._failure()
+
+    def _failure(self) -> list[Event]:
+        """A warning where a file has failed, once."""
         failed = next((file for file in (self._can, self._mcap) if file.error is not None), None)
         if failed is None or self._reported:
             return []
@@ -158,7 +167,7 @@ class Recorder:
         return [Event(WARNING, f"no more log: {failed.path.name}: {failed.error and failed.error.strerror}")]
 
     def close(self) -> list[Event]:
-        """Flush and finish both files; a second time does nothing."""
+        """Flush and finish both files; a warning where that fails, or failed unsaid. A second time does nothing."""
         if self._closed:
             return []
         self._closed = True
@@ -166,4 +175,4 @@ class Recorder:
         self._writer.close()
         self._can.close()
         self._mcap.close()
-        return events
+        return events or self._failure()

@@ -2,6 +2,8 @@
 
 import pytest
 
+from hil.force_metrics import force_names
+from hil.metrics import SHOWN
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly
 
@@ -25,4 +27,6 @@ def test_random_shape_of_modules_flies_a_closed_curve(fly: Fly) -> None:
 
 @pytest.mark.slow
 def test_force_of_two_docked_modules_is_tracked_as_well_as_that_of_one_without_interference(fly: Fly) -> None:
-    assert fly(load_scenario("force-tracking"), 0).passed
+    result = fly(load_scenario("force-tracking"), 0)
+    assert result.passed
+    assert set(result.metrics) - set(SHOWN) == set(force_names([1, 2]))

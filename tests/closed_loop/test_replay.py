@@ -11,7 +11,13 @@ from firmware_py.app.replay_report import replay_and_say
 from firmware_py.core.estimator import Estimator
 from firmware_py.core.limiter import Limiter
 from firmware_py.description.schema import DescriptionError
-from firmware_py.runtime.recorder import CAN_LOG, Recorder
+from firmware_py.description.signals import MCAP_MAGIC, Layout, Signal, read_messages
+from firmware_py.runtime import flight_log
+from firmware_py.runtime.flight_log import LogError
+from firmware_py.runtime.log_recovery import recover
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
+from firmware_py.runtime.tick_messages import TICK_SIGNALS
+from firmware_py.runtime.tick_messages import TICKS as TICKS_TOPIC
 from hil.plant.fault_spec import Fault
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly, shortened
@@ -19,6 +25,8 @@ from tests.closed_loop.flights import Fly, shortened
 TICKS = 500
 THRUSTER_CMD_A, GYRO = "081", "101"
 """Ids of the one module."""
+NOISE = "\x1b" * 9000
+"""What no line should hold, and no terminal should be given."""
 
 
 def spoil(path: Path, frame_id: str, tick: int, change: int) -> None:
@@ -128,5 +136,88 @@ def test_log_that_does_not_say_what_flew_is_refused(tmp_path: Path) -> None:
 def test_logs_of_two_flights_are_not_taken_for_one(log: Path) -> None:
     lines = (log / CAN_LOG).read_text().splitlines(True)
     (log / CAN_LOG).write_text("".join(lines[100:]))
-    with pytest.raises(DescriptionError, match=r"can\.log has frames of \(.*\) where signals\.mcap has tick 1$"):
+    with pytest.raises(DescriptionError, match=r"can\.log has frames of '\(.*\)' where signals\.mcap has tick 1$"):
+        replay(log)
+
+
+def spoil_messages(path: Path) -> None:
+    """From the first message of a tick on, the signal log is noise; its end says that it is whole."""
+    data = path.read_bytes()
+    first = next(message.data for message in read_messages(path) if message.topic == TICKS_TOPIC)
+    begin = data.index(first) - 64
+    path.write_bytes(data[:begin] + bytes([255]) * (len(data) - begin - len(MCAP_MAGIC)) + MCAP_MAGIC)
+
+
+@pytest.mark.parametrize(("spoilt", "why"), [(CAN_LOG, "can.log ends before tick 1"), (SIGNAL_LOG, "signals.mcap ends before can.log")])
+def test_log_without_a_whole_tick_is_no_replay(log: Path, spoilt: str, why: str) -> None:
+    """Nothing is said of bytes that were never compared, nor of a way to mend it: there is none."""
+    if spoilt == CAN_LOG:
+        (log / CAN_LOG).write_bytes(b"")
+    else:
+        spoil_messages(log / SIGNAL_LOG)
+    said: list[str] = []
+    with pytest.raises(LogError) as refused:
+        replay_and_say(log, 0.0, said.append)
+    assert str(refused.value) == f"{log}: no tick of the log is whole, so nothing can be replayed: {why}"
+    assert said == []
+
+
+def test_binary_can_log_is_refused_in_a_short_line_of_plain_characters(log: Path) -> None:
+    (log / CAN_LOG).write_bytes(np.random.default_rng(0).bytes(40_000).replace(b"\n", b".") + b"\n")
+    for read in (replay, recover):
+        with pytest.raises(LogError) as refused:
+            read(log)
+        line = str(refused.value).removeprefix(str(log))
+        assert line.startswith(": can.log has frames of ")
+        assert line.endswith("... where signals.mcap has tick 1")
+        assert line.isascii()
+        assert line.isprintable()
+        assert len(line) < 150
+
+
+def test_line_that_is_no_frame_is_named_in_short(log: Path) -> None:
+    head, _, rest = (log / CAN_LOG).read_text().partition("\n")
+    stamp = head.partition(" ")[0]
+    (log / CAN_LOG).write_bytes(f"{stamp} {NOISE} R\n{rest}".encode())
+    with pytest.raises(LogError, match=r"is no frame as `candump -L -x` writes it$") as refused:
+        replay(log)
+    assert str(refused.value).isprintable()
+    assert len(str(refused.value)) < 150
+
+
+@pytest.mark.parametrize("frame", ["FFFFFFFF#00", "-101#00", f"101#{'00' * 65}"])
+def test_frame_that_no_bus_carries_is_named(log: Path, frame: str) -> None:
+    """A byte that was spoilt on the disk makes such a one of another."""
+    lines = (log / CAN_LOG).read_text().splitlines(True)
+    at = next(i for i, line in enumerate(lines) if f" {GYRO}#" in line)
+    lines[at] = f"{lines[at].partition(' ')[0]} can0 {frame} R\n"
+    (log / CAN_LOG).write_text("".join(lines))
+    with pytest.raises(LogError, match=r"is no frame as `candump -L -x` writes it$"):
+        replay(log)
+
+
+def test_sent_line_that_is_no_frame_differs_in_short(log: Path) -> None:
+    lines = (log / CAN_LOG).read_text().splitlines(True)
+    at = next(i for i, line in enumerate(lines) if line.endswith(" T\n"))
+    lines[at] = f"{lines[at].partition(' ')[0]} {NOISE} T\n"
+    (log / CAN_LOG).write_text("".join(lines))
+    first = replay(log).first
+    assert first is not None
+    assert first.signal == "frame"
+    assert str(first).isprintable()
+    assert len(str(first)) < 250
+
+
+def test_spoilt_configuration_is_refused(log: Path) -> None:
+    """The attachment has no checksum of its own where it was written as the log went on."""
+    data = (log / SIGNAL_LOG).read_bytes()
+    begin = data.index(b'{"') + 1
+    (log / SIGNAL_LOG).write_bytes(data[:begin] + b"!" + data[begin + 1 :])
+    with pytest.raises(LogError, match=r"in signals\.mcap is no JSON: "):
+        replay(log)
+
+
+def test_message_that_this_version_does_not_write_is_refused(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight_log, "_TICK", Layout("Tick", (*TICK_SIGNALS, Signal("more"))))
+    with pytest.raises(LogError, match=r"signals\.mcap has a message of /firmware/ticks that this version does not write"):
         replay(log)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_py.app.firmware import read_fleet
 from firmware_py.description.fleet import Fleet, load_fleet, single
 from firmware_py.description.schema import DescriptionError
 
@@ -23,12 +24,27 @@ body = 4
 cell = [1, 0, -1]
 rotation = 23
 """
+APART = """\
+buses = ["virtual:a"]
+[[module]]
+number = 7
+body = 0
+[[module]]
+number = 9
+body = 0
+cell = [2, 0, 0]
+"""
+JETSON = Path(__file__).resolve().parents[2] / "docs" / "jetson.md"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "fleet.toml"
+    path.write_text(text)
+    return path
 
 
 def load(folder: Path, text: str) -> Fleet:
-    path = folder / "fleet.toml"
-    path.write_text(text)
-    return load_fleet(path)
+    return load_fleet(written(folder, text))
 
 
 def test_modules_come_in_the_order_of_the_file(tmp_path: Path) -> None:
@@ -54,23 +70,60 @@ def test_single_module_is_number_one_on_its_bus() -> None:
 WRONG = {
     "no module": ("rate_hz = 100\n", r"fleet.toml:1: module: missing key"),
     "empty": ("module = []\n", r"has no \[\[module\]\] table; a fleet needs at least one"),
-    "two of a kind": ("[[module]]\nnumber = 2\n[[module]]\nnumber = 2\n", "two modules have the same bus and number"),
-    "bus beyond": ("[[module]]\nnumber = 2\nbus = 1\n", "a module names a bus beyond the 1 in `buses`"),
-    "firmware's number": ("[[module]]\nnumber = 0\n", r"fleet.toml:2: module\[0\].number: 0 is out of range; .*29"),
+    "two of a kind": ("[[module]]\nnumber = 2\n[[module]]\nnumber = 2\n", r"fleet.toml:1: two modules have the number 2 on virtual:a"),
+    "bus twice": ('buses = ["udp:a", "udp:b", "udp:a"]\n[[module]]\nnumber = 2\n', "fleet.toml:1: buses has udp:a twice"),
+    "no bus": ("buses = []\n[[module]]\nnumber = 2\n", "`buses` has 0"),
+    "bus beyond": ("[[module]]\nnumber = 2\nbus = 1\n", "module number 2 is on bus 1; `buses` has 1, from 0 on"),
+    "firmware's number": ("[[module]]\nnumber = 0\n", r"fleet.toml:3: module\[0\].number: 0 is out of range; .*29"),
     "e-stop's number": ("[[module]]\nnumber = 30\n", r"module\[0\].number: 30 is out of range; .* 1 to 29"),
-    "too slow": ("rate_hz = 49\n[[module]]\nnumber = 2\n", r"fleet.toml:1: rate_hz: 49 is out of range; .* to 400 Hz"),
+    "too slow": ("rate_hz = 49\n[[module]]\nnumber = 2\n", r"fleet.toml:2: rate_hz: 49 is out of range; .* to 400 Hz"),
     "too fast": ("rate_hz = 401\n[[module]]\nnumber = 2\n", r"rate_hz: 401 is out of range; permitted: 50 to 400 Hz"),
-    "rotation": ("[[module]]\nnumber = 2\nrotation = 24\n", r"fleet.toml:3: module\[0\].rotation: 24 is out of range"),
+    "rotation": ("[[module]]\nnumber = 2\nrotation = 24\n", r"fleet.toml:4: module\[0\].rotation: 24 is out of range"),
     "half a rate": ("rate_hz = 99.5\n[[module]]\nnumber = 2\n", r"rate_hz: 99.5 is not a whole number"),
     "cell": ("[[module]]\nnumber = 2\ncell = [1, 2]\n", r"module\[0\].cell: has shape \(2,\); needs \(3,\)"),
 }
+
+
+def on_one_bus(text: str) -> str:
+    """The text, behind a first line that names a bus, unless it names some."""
+    return text if "buses" in text else f'buses = ["virtual:a"]\n{text}'
 
 
 @pytest.mark.parametrize("case", WRONG)
 def test_odd_fleet_is_refused(tmp_path: Path, case: str) -> None:
     text, words = WRONG[case]
     with pytest.raises(DescriptionError, match=words):
-        load(tmp_path, text)
+        load(tmp_path, on_one_bus(text))
+
+
+def test_fleet_file_that_names_no_bus_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DescriptionError, match=r"fleet.toml:1: buses: missing key; .*socketcan:can0"):
+        load(tmp_path, "[[module]]\nnumber = 1\nbus = 1\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (APART, r"fleet\.toml: no docked face joins module 9 to module 7$"),
+        (APART.replace("[2,", "[0,"), r"fleet\.toml: modules 7 and 9 overlap"),
+        (
+            APART.replace('["virtual:a"]', '["virtual:a", "virtual:b"]').replace("number = 9", "number = 7\nbus = 1"),
+            r"fleet\.toml: no docked face joins module 7 on virtual:b to module 7 on virtual:a$",
+        ),
+        ('buses = ["virtual:a"]\n[[module]]\nnumber = 7\nvehicle = "yacht"\n', r"fleet\.toml: vehicle 'yacht'"),
+    ],
+)
+def test_modules_that_cannot_be_docked_so_are_refused_by_file_and_number(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(DescriptionError, match=words):
+        read_fleet(written(tmp_path, text))
+
+
+def test_fleet_file_of_the_documentation_loads_as_it_stands_there(tmp_path: Path) -> None:
+    lines = JETSON.read_text(encoding="utf-8").partition("    # /etc/modcube/fleet.toml\n")[2].splitlines()
+    end = next(at for at, line in enumerate(lines) if line and not line.startswith("    "))
+    fleet = read_fleet(written(tmp_path, "\n".join(line[4:] for line in lines[:end])))
+    assert [(m.number, m.bus, m.body) for m in fleet.module] == [(1, 0, 0), (1, 1, 0)]
+    assert fleet.buses == ("socketcan:can0", "socketcan:can1")
 
 
 def test_same_number_on_two_buses_is_two_modules(tmp_path: Path) -> None:

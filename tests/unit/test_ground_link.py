@@ -2,6 +2,7 @@
 
 import os
 import pty
+import re
 import socket
 import time
 from contextlib import closing
@@ -179,6 +180,21 @@ def test_an_address_that_cannot_be_opened_is_refused_in_one_line(address: str) -
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("address", "right"),
+    [
+        ("udpin:127.0.0.1:14550+trusted,1", "it needs udpin:HOST:PORT"),
+        ("tcpin:5760x", "it needs tcpin:HOST:PORT"),
+        ("udpout:127.0.0.1:99999", "no whole number up to 65535"),
+        ("/dev/ttyX,abc", "it needs /dev/NAME,BAUD"),
+    ],
+)
+def test_a_port_or_rate_that_is_none_is_refused_with_what_would_be_right(address: str, right: str) -> None:
+    with pytest.raises(LinkError, match=f"^link {re.escape(address)}: ") as error:
+        open_link(address)
+    assert right in str(error.value) and "invalid literal" not in str(error.value)
+
+
 def test_messages_for_others_are_passed_on_to_where_they_were_heard() -> None:
     world = World()
     first, second, third = world.client(255), world.client(201), world.client(202)
@@ -233,3 +249,15 @@ def test_logs_are_listed_and_fetched(tmp_path: Path) -> None:
     client.send("LOG_ERASE", 1, 1)
     world.run(1)
     assert "logs are not erased" in client.texts and (tmp_path / "can.log").exists()
+
+
+def test_logs_of_all_runs_are_listed_oldest_first(tmp_path: Path) -> None:
+    """The first run logs into the folder itself, later ones into numbered folders in it."""
+    for size, name in enumerate((".", "0002", "0003", "0010"), 1):
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / "can.log").write_bytes(bytes(size))
+        os.utime(tmp_path / name / "can.log", (1_000_000 + size, 1_000_000 + size))
+    client = (world := World(config=GroundConfig(logs=str(tmp_path)))).client()
+    client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(1)
+    assert [(e.id, e.size) for e in client.all("LOG_ENTRY")] == [(1, 1), (2, 2), (3, 3), (4, 4)]

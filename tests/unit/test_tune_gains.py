@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
@@ -231,3 +232,11 @@ def test_answers_typed_at_once_are_taken_one_by_one_and_the_end_of_the_input_end
         person = tune_live.Typist(vehicle, stream)
         assert [person.answer("?") for _ in range(4)] == ["y", "n", "q", "q"]
     assert vehicle.heard == 1
+
+
+@pytest.mark.parametrize("address", ["udpin:127.0.0.1:99999", "udpout:127.0.0.1:99999", "tcp:127.0.0.1:5760x", "udpin:14550+trusted"])
+def test_live_address_whose_port_is_none_is_refused_in_one_line(tools: tuple[Any, Any], address: str) -> None:
+    from tune_vehicle import connect
+
+    with pytest.raises(DescriptionError, match=f"--live mavlink:{re.escape(address)}: .* is no port, 0 to 65535; it needs an address"):
+        connect(address)

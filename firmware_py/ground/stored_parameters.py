@@ -1,0 +1,49 @@
+"""The file of parameters that ground stations changed: what differs from the start alone, so that a new release's own values count.
+
+Read at the start before anything is made of the parameters, and written at every change.
+"""
+
+from __future__ import annotations
+
+from operator import attrgetter
+from pathlib import Path
+
+from firmware_py.description.parameters import Parameters, registry
+from firmware_py.description.schema import build, read_toml, to_plain, to_toml
+
+_FEW = 8
+"""Names of stored parameters that one line holds."""
+
+
+def laid_over(parameters: Parameters, path: Path | None) -> Parameters:
+    """`parameters` with what `path` holds in their place; a file that is not there holds nothing. Raises DescriptionError."""
+    if path is None or not path.exists():
+        return parameters
+    table, source = read_toml(path)
+    build(Parameters, table, source)  # refuses what is wrong in it
+    merged = {group: values | table.get(group, {}) for group, values in to_plain(parameters).items()}
+    laid: Parameters = build(Parameters, merged, source)
+    return laid
+
+
+def differing(parameters: Parameters, others: Parameters) -> list[str]:
+    """Names of the parameters that have another value in `others`."""
+    return [name for name, _ in registry() if attrgetter(name)(parameters) != attrgetter(name)(others)]
+
+
+def stored_line(started: Parameters, laid: Parameters, path: Path | None) -> str:
+    """How many stored values take the place of those of the start, in one line; empty when none does."""
+    names = differing(laid, started)
+    which = f": {', '.join(names)}" if len(names) <= _FEW else ""
+    return f"stored parameters in place of shipped or given ones: {len(names)} of {path}{which}" if names else ""
+
+
+def differences_toml(parameters: Parameters, others: Parameters) -> str:
+    """The TOML text of those that have another value in `others`."""
+    kept = {name.partition(".")[::2] for name in differing(parameters, others)}
+    text = ""
+    for group in dict.fromkeys(name.partition(".")[0] for name, _ in registry()):
+        lines = to_toml(getattr(parameters, group)).splitlines()
+        chosen = [line for line in lines if (group, line.partition(" =")[0]) in kept]
+        text += "\n".join([f"[{group}]", *chosen, "", ""]) if chosen else ""
+    return text

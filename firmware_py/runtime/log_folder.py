@@ -1,0 +1,39 @@
+"""Where the vehicle's process logs: into the folder that it is given, and where that holds a log, into 0002, 0003, ... in it.
+
+A service that is started again after a crash thus keeps the log of the crash.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG
+
+_FIRST = 1
+_DIGITS = 4
+
+
+def make_log_folder(out: Path) -> Path:
+    """A folder for a new log: `out`, or one in it that is newer than all that are there. Raises OSError."""
+    number = max(_numbers(out), default=_FIRST - 1) + 1
+    folder = _folder(out, number)
+    folder.mkdir(parents=True, exist_ok=number == _FIRST)
+    return folder
+
+
+def newest_log_folder(out: Path) -> Path:
+    """The folder of the last log under `out`; `out` where there is none. Raises OSError."""
+    return _folder(out, max(_numbers(out), default=_FIRST))
+
+
+def _numbers(out: Path) -> list[int]:
+    """Of the logs under `out`, whose own is the first."""
+    if not out.exists():
+        return []
+    names = [path.name for path in out.iterdir()]
+    numbers = [int(name) for name in names if len(name) >= _DIGITS and name.isdecimal()]
+    return numbers + [_FIRST for name in names if name in (CAN_LOG, SIGNAL_LOG)]
+
+
+def _folder(out: Path, number: int) -> Path:
+    return out if number == _FIRST else out / f"{number:0{_DIGITS}d}"

@@ -1,0 +1,108 @@
+"""What a scenario must be beyond the range of each field, so that a mistake in its file is refused before anything flies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from firmware_py.description.schema import limits_of
+from hil.force_metrics import force_names
+from hil.metrics import DOCKING, SHOWN
+
+if TYPE_CHECKING:
+    from hil.scenario import Scenario
+
+Mistake = tuple[tuple[str | int, ...], str]
+"""The keys that lead to what is wrong, and what is wrong with it."""
+
+
+def mistakes(scenario: Scenario) -> Iterator[Mistake]:
+    """Everything that is wrong with a scenario as its file has it."""
+    for rule in (_in_name, _in_numbers, _in_polycube, _in_steps, _in_bodies, _in_mentions, _in_faults, _in_checks):
+        yield from rule(scenario)
+
+
+def metric_names(scenario: Scenario) -> list[str]:
+    """Names of the metrics that a run of it has."""
+    kind = scenario.task.kind
+    names = [name for name in SHOWN if kind == "dock" or name not in DOCKING]
+    return names + (force_names([len(members) for members in scenario.groups]) if kind == "force" else [])
+
+
+def module_numbers(scenario: Scenario) -> list[int]:
+    """Numbers of the modules that every seed has."""
+    if scenario.polycube is None:
+        return [module.number for module in scenario.module]
+    first = scenario.module[0].number
+    return list(range(first, first + scenario.polycube.fewest))
+
+
+def _in_name(scenario: Scenario) -> Iterator[Mistake]:
+    name = scenario.name
+    if name in ("", ".", "..") or "/" in name or "\\" in name or not name.isprintable():
+        yield ("name",), f"{name!r} cannot be the name of a folder; give one without separators, as in the file's name"
+
+
+def _in_numbers(scenario: Scenario) -> Iterator[Mistake]:
+    numbers = [module.number for module in scenario.module]
+    for i, number in enumerate(numbers):
+        if number in numbers[:i]:
+            yield ("module", i, "number"), f"{number} is the number of another module too; each needs one of its own"
+
+
+def _in_polycube(scenario: Scenario) -> Iterator[Mistake]:
+    if scenario.polycube is None:
+        return
+    first, most = scenario.module[0], scenario.polycube.most
+    highest = int(limits_of(type(first), "number").high)
+    if len(scenario.module) > 1:
+        yield ("module", 1), "a [polycube] takes the place of all modules; give the first alone"
+    if first.number + most - 1 > highest:
+        what = f"{first.number} and {most - 1} more go up to {first.number + most - 1}; the bus has numbers to {highest}"
+        yield ("module", 0, "number"), f"{what}, so it is {highest - most + 1} at the most"
+
+
+def _in_steps(scenario: Scenario) -> Iterator[Mistake]:
+    kind = scenario.task.kind
+    if kind != "dock" and scenario.step:
+        yield ("step", 0), f"a task of the kind {kind} runs no steps; only dock does"
+    if kind == "dock" and not scenario.step:
+        yield ("task", "kind"), "dock runs the [[step]]s, and there are none"
+
+
+def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:
+    kind, counts = scenario.task.kind, [len(members) for members in scenario.groups]
+    if kind == "dock" and len(module_numbers(scenario)) < 2:
+        yield ("task", "kind"), "dock needs two modules at least, and there is one"
+    if kind == "force" and not {1, 2} <= set(counts):
+        found = ", ".join(map(str, counts))
+        yield ("task", "kind"), f"force compares a module alone with two docked ones; the bodies here have {found} modules"
+
+
+def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:
+    """Of modules that are not there."""
+    numbers = module_numbers(scenario)
+    mentions: list[tuple[tuple[str | int, ...], int]] = []
+    for i, step in enumerate(scenario.step):
+        mentions += [(("step", i, key), number) for key, number in zip(("module", "target_module"), step.modules, strict=False)]
+    for table in ("fault", "camera"):
+        mentions += [((table, i, "module"), each.module) for i, each in enumerate(getattr(scenario, table)) if each.module]
+    every = "in every seed there are" if scenario.polycube else "there are"
+    for keys, number in mentions:
+        if number not in numbers:
+            yield keys, f"no module has the number {number}; {every} {', '.join(map(str, numbers))}"
+
+
+def _in_faults(scenario: Scenario) -> Iterator[Mistake]:
+    for i, fault in enumerate(scenario.fault):
+        if fault.until_s <= fault.at_s:
+            yield ("fault", i, "until_s"), f"{fault.until_s:g} s is not after at_s, {fault.at_s:g} s; the fault would never begin"
+
+
+def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
+    names = metric_names(scenario)
+    for i, check in enumerate(scenario.check):
+        if check.metric not in names:
+            yield ("check", i, "metric"), f"{check.metric!r} is unknown; a run of the kind {scenario.task.kind} has {', '.join(names)}"
+        if check.low > check.high:
+            yield ("check", i, "low"), f"{check.low:g} is above high, {check.high:g}; no value would pass"

@@ -1,0 +1,61 @@
+"""The bench's command line: what does not apply is refused in one line, and nothing flies."""
+
+from pathlib import Path
+
+import pytest
+
+import hil.fault_campaign
+import hil.plant_process
+from firmware_py.cli import main
+from hil.fault_campaign import Cell
+
+OFF = [["--trials", "20"], ["--controller", "modcube"], ["--vehicle", "modcube_sim"], ["--sensors", "real"], ["--dask", "tcp://a:1"]]
+
+
+def status_of(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr("sys.argv", ["modcube", "hil", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture
+def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
+    """With what the matrix of faults was asked to fly; it flies nothing."""
+    asked: list[tuple[object, ...]] = []
+
+    def fly(jobs: int, out: Path, seed: int, **_: object) -> list[Cell]:
+        asked.append((jobs, out, seed))
+        return []
+
+    monkeypatch.setattr(hil.fault_campaign, "run_fault_campaign", fly)
+    return asked
+
+
+@pytest.mark.parametrize("option", [*OFF, ["--draw", "1"]], ids=lambda option: str(option[0]))
+def test_matrix_of_faults_refuses_what_it_does_not_take(
+    option: list[str], flown: list[object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Even where it is the usual value: who gives it believes that it counts."""
+    assert status_of(["campaign", "faults", *option], monkeypatch) == 2
+    line = capsys.readouterr().err
+    assert f"campaign faults: {option[0]} does not apply" in line
+    assert "it takes --jobs, --seed, --out" in line
+    assert line.count("\n") == 1
+    assert flown == []
+
+
+def test_matrix_of_faults_takes_the_others(flown: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert status_of(["campaign", "faults", "--jobs", "3", "--seed", "5", "--out", str(tmp_path)], monkeypatch) == 0
+    assert flown == [(3, tmp_path, 5)]
+
+
+def test_plant_alone_refuses_a_bus_that_nobody_else_reaches(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    served: list[object] = []
+    monkeypatch.setattr(hil.plant_process, "serve_until_signal", lambda *arguments: served.append(arguments))
+    assert status_of(["plant", "hover", "--bus", "virtual:x"], monkeypatch) == 2
+    line = capsys.readouterr().err
+    assert "bus 'virtual:x' does not reach another process" in line
+    assert "udp:GROUP:PORT or socketcan:IFACE" in line
+    assert line.count("\n") == 1
+    assert served == []

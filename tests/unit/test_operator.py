@@ -1,0 +1,134 @@
+"""`modcube run --hold` arms each body once: whoever disarms or stops it afterwards has the last word."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from firmware_py.app.vehicle import ARM_EVERY_S, Operator, with_ground
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Action, Outputs, Request
+from tests.unit.ground_world import Robot
+
+RATE_HZ = 100
+SECOND = round(ARM_EVERY_S * RATE_HZ)
+
+
+class Flight:
+    """A robot, its operator, and a ground station that asks for what `asks` holds, each once."""
+
+    def __init__(self, modules: int = 1, to_arm: set[int] | None = None) -> None:
+        self.robot = Robot(modules)
+        self.operator = Operator(RATE_HZ, set(range(modules)) if to_arm is None else to_arm)
+        self.asks: list[Request] = []
+        side: Any = SimpleNamespace(reboot_asked=False, requests=self._asked)
+        self._requests = with_ground(self.operator, side)
+        self.last: Outputs | None = None
+
+    def _asked(self) -> list[Request]:
+        asked, self.asks = self.asks, []
+        return asked
+
+    def run(self, ticks: int) -> None:
+        for _ in range(ticks):
+            _, self.last = self.robot.step(self._requests(self.robot.tick, self.last))
+
+    def ask(self, action: Action, body: int = 0) -> None:
+        self.asks.append(Request(action, body))
+        self.run(1)
+
+    @property
+    def arms(self) -> list[int]:
+        """Bodies that were asked to arm, in order."""
+        return [request.body for request in self.robot.asked if request.action == Action.ARM]
+
+
+def test_every_body_is_armed_once() -> None:
+    flight = Flight(modules=3)
+    flight.run(10 * SECOND)
+    assert flight.arms == [0, 1, 2]
+    assert flight.robot.state == [State.ARMED] * 3
+
+
+def test_arming_that_is_refused_is_tried_again_every_second() -> None:
+    flight = Flight()
+    flight.robot.refuse[Action.ARM] = "no pose"
+    flight.run(1 + 3 * SECOND)
+    assert flight.arms == [0] * 3
+    del flight.robot.refuse[Action.ARM]
+    flight.run(SECOND)
+    assert flight.robot.state == [State.ARMED]
+
+
+def test_body_that_a_person_disarmed_stays_disarmed() -> None:
+    flight = Flight()
+    flight.run(10)
+    flight.ask(Action.DISARM)
+    flight.run(10 * SECOND)
+    assert flight.robot.state == [State.DISARMED]
+    assert flight.arms == [0]
+
+
+def test_body_that_disarmed_by_itself_stays_disarmed() -> None:
+    flight = Flight(modules=2)
+    flight.run(10)
+    flight.robot.state[1] = State.DISARMED
+    flight.run(10 * SECOND)
+    assert flight.robot.state == [State.ARMED, State.DISARMED]
+
+
+def test_module_that_was_disarmed_as_part_of_a_body_stays_disarmed_on_its_own() -> None:
+    flight = Flight(modules=2)
+    flight.robot.dock()
+    flight.robot.state = [State.ARMED] * 2
+    flight.run(10)
+    flight.robot.state = [State.DISARMED] * 2
+    flight.robot.bodies = Robot(2).bodies
+    flight.run(10 * SECOND)
+    assert flight.arms == []
+
+
+@pytest.mark.parametrize("armed_before", [True, False])
+def test_emergency_stop_ends_the_hold_of_every_body(armed_before: bool) -> None:
+    """The stop comes from the bus: no ground station asked for it."""
+    flight = Flight(modules=2)
+    if not armed_before:
+        flight.robot.refuse[Action.ARM] = "no pose"
+    flight.run(10)
+    flight.robot.state = [State.DISARMED, State.ESTOP]
+    flight.run(1)
+    flight.robot.refuse.clear()
+    flight.ask(Action.CLEAR_ESTOP, body=1)
+    flight.robot.asked.clear()
+    flight.run(10 * SECOND)
+    assert flight.robot.state == [State.DISARMED] * 2
+    assert flight.arms == []
+
+
+@pytest.mark.parametrize("action", [Action.DISARM, Action.ESTOP])
+def test_ground_station_that_stops_ends_the_hold_before_anything_was_armed(action: Action) -> None:
+    flight = Flight(modules=2)
+    flight.asks = [Request(action, 1)]  # in the very tick in which the operator would arm
+    flight.robot.step([])
+    _, flight.last = flight.robot.step([])
+    flight.run(10 * SECOND)
+    assert flight.arms == []
+
+
+def test_other_requests_of_a_ground_station_leave_the_hold_alone() -> None:
+    flight = Flight()
+    flight.ask(Action.GROUND_ALIVE)
+    flight.run(10)
+    assert flight.robot.state == [State.ARMED]
+
+
+def test_operator_without_orders_arms_nobody() -> None:
+    flight = Flight(modules=2, to_arm=set())
+    flight.run(10 * SECOND)
+    assert flight.arms == []
+
+
+def test_only_the_bodies_that_were_meant_are_armed() -> None:
+    flight = Flight(modules=3, to_arm={1})
+    flight.run(10 * SECOND)
+    assert flight.arms == [1]

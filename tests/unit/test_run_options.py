@@ -1,0 +1,81 @@
+"""`modcube run` takes no option that it would not use: each is refused in one line, with status 2, before anything is started."""
+
+from pathlib import Path
+
+import pytest
+
+from firmware_py.cli import fleet_of
+from tests.unit.test_cli import refusal
+
+FLEET = 'buses = ["virtual:options"]\n[[module]]\nnumber = 7\n'
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Path:
+    path = tmp_path / "fleet.toml"
+    path.write_text(FLEET)
+    return path
+
+
+@pytest.mark.parametrize("command", ["run", "doctor"])
+def test_bus_beside_a_fleet_file_is_refused(
+    command: str, fleet: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal([command, "--fleet", str(fleet), "--bus", "socketcan:can7"], monkeypatch, capsys)
+    assert line == f"modcube: --bus beside --fleet: buses, vehicles and rate_hz stand in {fleet}; give one or the other"
+
+
+def test_rate_and_vehicle_beside_a_fleet_file_are_refused_even_at_their_defaults(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal(["run", "--fleet", str(fleet), "--rate", "100", "--vehicle", "modcube"], monkeypatch, capsys)
+    assert line.startswith("modcube: --vehicle, --rate beside --fleet: ")
+
+
+def test_fleet_file_without_buses_is_refused(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet.write_text(FLEET.partition("\n")[2])
+    assert f"{fleet}:1: buses: missing key" in refusal(["run", "--fleet", str(fleet)], monkeypatch, capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--identity", "px4"], "--identity and --store go with a link"),
+        (["--store", "kept"], "--ground LINK or --ground-file FILE"),
+        (["--ground", "udpin:127.0.0.1:0", "--store", __file__], f"store {__file__}: {__file__}: Not a directory; it needs a folder"),
+        (["--ground", "udpin:127.0.0.1:0", "--identity", "px4"], "identity 'px4' is unknown; there are generic, ardusub"),
+    ],
+)
+def test_options_of_the_ground_side_that_cannot_count_are_refused(
+    arguments: list[str], words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert words in refusal(["run", "--bus", "virtual:options", *arguments], monkeypatch, capsys)
+
+
+def test_dock_button_of_a_module_that_the_fleet_lacks_is_refused(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = fleet.with_name("ground.toml")
+    file.write_text('links = ["udpin:127.0.0.1:0"]\ndock_button = [0, 0, 60, 1]\n')
+    line = refusal(["run", "--fleet", str(fleet), "--ground-file", str(file)], monkeypatch, capsys)
+    assert line.startswith(f"modcube: {file}:2: dock_button: module 0 to module 60; ")
+
+
+def test_one_module_keeps_the_defaults_and_what_the_command_line_says(fleet: Path) -> None:
+    usual, other = fleet_of(None, None, None, None), fleet_of(None, "virtual:x", "modcube_sim", 200)
+    assert (usual.buses, usual.module[0].vehicle, usual.rate_hz) == (("socketcan:can0",), "modcube", 100)
+    assert (other.buses, other.module[0].vehicle, other.rate_hz) == (("virtual:x",), "modcube_sim", 200)
+    assert fleet_of(fleet, None, None, None).module[0].number == 7
+
+
+def test_help_tells_the_defaults(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr("sys.argv", ["modcube", "run", "--help"])
+    with pytest.raises(SystemExit):
+        from firmware_py.cli import main
+
+        main()
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("socketcan:can0", "[default: (modcube)]", "[default: (100)]", "not beside --bus"))

@@ -1,0 +1,82 @@
+"""The tools' command lines: --help says what they do and does nothing, and wrong arguments end with status 2 and no traceback."""
+
+import importlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+TOOLS = Path(__file__).resolve().parents[2] / "tools"
+Run = Callable[..., int]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
+    """run(tool, *arguments): its exit status, started in an empty folder; nothing that takes long begins."""
+    monkeypatch.syspath_prepend(str(TOOLS))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    before = set(sys.modules)
+
+    def begins(*_: object) -> None:
+        raise AssertionError("it began")
+
+    def run_it(tool: str, *arguments: str) -> int:
+        monkeypatch.setattr("sys.argv", [tool, *arguments])
+        module = importlib.import_module(tool)
+        for name in ("batch_entries", "ProcessPoolExecutor"):
+            monkeypatch.setattr(module, name, begins, raising=False)
+        try:
+            return int(module.main() or 0)
+        except SystemExit as ended:
+            return int(ended.code or 0)
+
+    yield run_it
+    for name in set(sys.modules) - before:
+        if (TOOLS / f"{name}.py").exists():
+            del sys.modules[name]
+
+
+@pytest.mark.parametrize("tool", ["bench", "identify_plants", "readme_tables"])
+def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(tool, "--help") == 0
+    assert "usage: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "refusal"),
+    [
+        ("bench", ["--quick"], "unrecognized arguments: --quick"),
+        ("readme_tables", ["README.md"], "unrecognized arguments: README.md"),
+        ("identify_plants", ["--plants", "0"], "--plants: '0' is not a whole number above zero"),
+        ("identify_plants", ["--jobs", "0"], "--jobs: '0' is not a whole number above zero"),
+        ("identify_plants", ["--seed", "-1"], "--seed: '-1' is not a whole number from 0 on"),
+        ("identify_plants", ["--seconds", "nan"], "--seconds: 'nan' is not a number above zero"),
+    ],
+)
+def test_wrong_arguments_are_refused(
+    run: Run, tool: str, arguments: list[str], refusal: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(tool, *arguments) == 2
+    assert refusal in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_tables_of_the_readme_need_the_project_s_root(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("readme_tables") == 2
+    assert capsys.readouterr().err == f"readme: no README.md in {tmp_path}; run this in the root of the project\n"
+
+
+@pytest.mark.parametrize(("text", "refusal"), [("[", "accept.json: no JSON"), ("{}", "accept.json: not a list"), ("[{}]", "'group'")])
+def test_spoilt_measurements_leave_the_readme(
+    run: Run, tmp_path: Path, text: str, refusal: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    readme = "<!-- table: accept spiral -->\nold\n<!-- end -->\n"
+    (tmp_path / "README.md").write_text(readme)
+    (tmp_path / "bench.json").write_text("[]")
+    (tmp_path / "accept.json").write_text(text)
+    assert run("readme_tables") == 2
+    line = capsys.readouterr().err
+    assert refusal in line
+    assert line.count("\n") == 1
+    assert (tmp_path / "README.md").read_text() == readme

@@ -1,0 +1,189 @@
+"""The vehicle's process on a bus where nobody answers: what it says, where it logs, how it starts and ends."""
+
+import errno
+import os
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.app.vehicle import recording, run_vehicle
+from firmware_py.bus.port import PortError
+from firmware_py.core.types import Event, Inputs, ModuleCommand, Outputs
+from firmware_py.description.fleet import Fleet, single
+from firmware_py.description.parameters import Parameters, Supervision
+from firmware_py.runtime import teller
+from firmware_py.runtime.flight_log import FlightLog
+from firmware_py.runtime.log_folder import make_log_folder
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
+from tests.unit.test_last_flight import FLEET, lines_of
+
+REARM = Parameters(supervision=Supervision(rearm=1))
+HOLDS = "the process before ended in flight: holding as soon as the vehicle may (REARM)"
+LOGS = (CAN_LOG, SIGNAL_LOG)
+
+
+def bus_of(path: Path) -> str:
+    """A bus of this test's own."""
+    return f"virtual:{path.name}"
+
+
+def fly(
+    tmp_path: Path, out: Path | None = None, then: Callable[[], None] = lambda: None, parameters: Parameters | None = None,
+    fleet: Fleet | None = None,
+) -> list[str]:  # fmt: skip
+    """Starts, and asks for the end in the first tick. `then` is done by whoever says so. Returns what was said."""
+    said: list[str] = []
+
+    def say(line: str) -> None:
+        said.append(line)
+        if line.startswith("running at"):
+            os.kill(os.getpid(), signal.SIGTERM)
+            then()
+
+    run_vehicle(fleet or single(bus=bus_of(tmp_path)), parameters or Parameters(), out=out, say=say)
+    return said
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_tick_is_not_held_up_by_who_reads_its_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(teller, "CLOSE_S", 0.01)
+    let, over = threading.Event(), threading.Event()
+
+    def stall() -> None:
+        assert threading.current_thread() is not threading.main_thread()
+        let.wait()
+        over.set()
+
+    fly(tmp_path, then=stall)
+    let.set()
+    assert over.wait(10)
+
+
+def test_flight_goes_on_when_nobody_reads_its_lines_any_more(tmp_path: Path) -> None:
+    def hang_up() -> None:
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    assert fly(tmp_path, tmp_path / "log", hang_up)[-1].startswith("running at")
+    assert len(list(FlightLog(tmp_path / "log").ticks())) >= 10  # the farewell
+
+
+def test_lines_are_said_by_an_ordinary_thread(tmp_path: Path) -> None:
+    policies: list[int] = []
+    fly(tmp_path, then=lambda: policies.append(os.sched_getscheduler(0)))
+    assert policies == [os.SCHED_OTHER]
+
+
+def test_log_of_the_process_before_is_kept(tmp_path: Path) -> None:
+    out = tmp_path / "log"
+    fly(tmp_path, out)
+    first = content(out)
+    assert sorted(first) == [*LOGS]
+    fly(tmp_path, out)
+    fly(tmp_path, out)
+    kept = content(out)
+    assert sorted(kept) == sorted([*LOGS, *(f"{n}/{name}" for n in ("0002", "0003") for name in LOGS)])
+    assert {name: kept[name] for name in LOGS} == first
+    assert all(list(FlightLog(out / number).ticks()) for number in ("0002", "0003"))
+
+
+@pytest.mark.parametrize("left", [CAN_LOG, SIGNAL_LOG, "0007"])
+def test_new_log_is_newer_than_all_that_are_there(tmp_path: Path, left: str) -> None:
+    (tmp_path / left).touch()
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "calibration-2026").mkdir()
+    assert make_log_folder(tmp_path) == tmp_path / ("0008" if left == "0007" else "0002")
+
+
+def test_folder_without_a_log_takes_the_first(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    assert make_log_folder(tmp_path) == tmp_path
+    assert make_log_folder(tmp_path / "made" / "anew").is_dir()
+
+
+def test_start_that_failed_leaves_no_log_behind(tmp_path: Path) -> None:
+    """A service that waits for its bus would fill the disk, and the log of the crash would not be the newest."""
+    fly(tmp_path, tmp_path / "log")
+    before = content(tmp_path / "log")
+    for out in (tmp_path / "log", tmp_path):
+        with pytest.raises(PortError):
+            run_vehicle(single(bus="socketcan:nocan7"), Parameters(), out=out, say=lambda line: None)
+    assert content(tmp_path / "log") == before
+    assert [path.name for path in tmp_path.iterdir()] == ["log"]
+    assert not (tmp_path / "log" / "0002").exists()
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_vehicle_flies_without_log_where_the_disk_takes_no_folder(
+    tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    said = fly(tmp_path, tmp_path / "log")
+    assert f"warning: no log: {tmp_path / 'log'}: {os.strerror(number)}" in said
+    assert any(line.startswith("running at") for line in said)
+
+
+def test_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "taken").touch()
+    for out in (tmp_path / "taken", tmp_path / "taken" / "log"):
+        with pytest.raises(OSError, match="taken") as refused:
+            fly(tmp_path, out)
+        assert refused.value.filename is not None  # the command line makes one line and status 2 of it
+
+
+def in_flight(tmp_path: Path) -> Fleet:
+    """Leaves the log of a process that was killed in flight just now."""
+    tmp_path.joinpath("log").mkdir()
+    tmp_path.joinpath("log", CAN_LOG).write_text(lines_of([True] * 3))
+    return Fleet(module=FLEET.module, buses=(bus_of(tmp_path), f"{bus_of(tmp_path)}-b"))
+
+
+def test_process_killed_in_flight_holds_again_where_a_parameter_says_so(tmp_path: Path) -> None:
+    fleet = in_flight(tmp_path)
+    assert HOLDS in fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet)
+    assert (tmp_path / "log" / "0002" / CAN_LOG).exists()
+    assert HOLDS not in fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet)  # 0002 ended disarmed
+
+
+def test_process_killed_in_flight_waits_to_be_armed_otherwise(tmp_path: Path) -> None:
+    fleet = in_flight(tmp_path)
+    assert HOLDS not in fly(tmp_path, None, parameters=REARM, fleet=fleet)
+    assert HOLDS not in fly(tmp_path, tmp_path / "log", fleet=fleet)
+
+
+class Tape(Recorder):
+    """A recorder that only counts when it hands over what it has."""
+
+    def __init__(self) -> None:
+        self.flushed: list[int] = []
+
+    def sent(self, *_: object) -> None: ...
+
+    def received(self, *_: object) -> None: ...
+
+    def record(self, inputs: Inputs, outputs: Outputs) -> None:
+        self.tick = outputs.tick
+
+    def flush(self) -> list[Event]:
+        self.flushed.append(self.tick)
+        return []
+
+
+def test_log_says_at_once_who_is_armed() -> None:
+    """A process that is killed just after a DISARM must not take it for a flight."""
+    tape = Tape()
+    observe = recording(tape, 100)
+    armed: Sequence[bool] = [20 < tick <= 33 for tick in range(120)]
+    for tick in range(1, 120):
+        commands = [ModuleCommand(armed[tick], np.zeros(8), None)]
+        observe([], [], Inputs(tick, 0, []), Outputs(tick, 0, commands, False, [], []))
+    assert tape.flushed == [1, 21, 34, 50, 100]
