@@ -187,8 +187,8 @@ class Failsafes:
 
     def take_over(self, before: Sequence[Failsafes]) -> None:
         """Goes on from those of the bodies that this one is made of, or was part of."""
-        for watch, *theirs in zip(self._all, *(other._all for other in before), strict=True):
-            watch.take_over(theirs)
+        for i, watch in enumerate(self._all):
+            watch.take_over([other._all[i] for other in before])
 
     def step(self, health: Health, mode: Mode, forced: bool, armed: bool) -> list[Alarm]:
         """Those that begin, come back or end in this tick, gravest row first.
@@ -226,5 +226,5 @@ class Failsafes:
             for watch in self._watches
             if mode not in PERMITTED[watch.level]
             and (watch.beyond(health) or (watch.active and watch.latched))
-            and watch.counts(mode, False, True)
+            and mode in watch.row.modes
         ]
