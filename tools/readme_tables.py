@@ -1,8 +1,8 @@
 """Writes README.md's tables between their markers, out of accept.json and bench.json: no figure is typed by hand.
 
 A marker names a table: `<!-- table: accept -->` (all groups), `<!-- table: accept hover spiral -->` (those groups),
-`<!-- table: bench -->`, or `<!-- table: bench WORD -->` (names with WORD in them). Each ends at `<!-- end -->`. Only
-what was measured is written; a table whose file is missing stays as it is.
+`<!-- table: bench -->`, or `<!-- table: bench WORD -->` (names with WORD in them). Each ends at `<!-- end -->`. A table whose
+file is missing stays as it is, and so does a figure of `accept` while any group of its table has not been measured.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 README = Path("README.md")
 SOURCES = {"accept": Path("accept.json"), "bench": Path("bench.json")}
-MARKER = re.compile(r"(<!-- table: (?P<kind>\w+)(?P<words>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
+MARKER = re.compile(r"(<!-- table: (?P<kind>\w+)(?P<words>[^>]*?) -->\n)(?P<old>.*?)(<!-- end -->)", re.DOTALL)
 
 Entries = Sequence[dict[str, Any]]
 
@@ -35,8 +35,12 @@ def rows(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(cell.replace('|', ',') for cell in line)} |\n" for line in lines)
 
 
-def accept_table(entries: Entries, groups: Sequence[str]) -> str:
-    """The figures of these groups, or of all, with limit, verdict and the command that measures them."""
+def accept_table(entries: Entries, groups: Sequence[str], old: str) -> str:
+    """The figures of these groups, or of all, with limit, verdict and the command that measures them.
+
+    Args:
+        old: the table as it stands; its rows stay where some groups were measured and others were not.
+    """
     body = [
         (
             e["name"], f"{number(e['value'])} {e['unit']}".strip(), e["limit"] and f"{e['limit']} {e['unit']}".strip(),
@@ -44,10 +48,22 @@ def accept_table(entries: Entries, groups: Sequence[str]) -> str:
         )
         for e in entries if not groups or e["group"] in groups
     ]  # fmt: skip
-    return rows(("figure", "measured", "limit", "", "command"), body)
+    new = rows(("figure", "measured", "limit", "", "command"), body)
+    whole = set(groups) <= {e["group"] for e in entries}
+    return new if whole else "".join((rows_by_name(old) | rows_by_name(new)).values())
 
 
-def bench_table(entries: Entries, words: Sequence[str]) -> str:
+def rows_by_name(table: str) -> dict[tuple[str, str], str]:
+    """The lines of a table by what they say first, and by what `the same` in it means."""
+    found, meant = {}, ""
+    for line in table.splitlines(keepends=True):
+        name = line.split("|")[1].strip()
+        meant = meant if name.startswith("the same") else name
+        found[meant, name] = line
+    return found
+
+
+def bench_table(entries: Entries, words: Sequence[str], old: str) -> str:
     """What `make bench` measured, beside its peers."""
     body = [
         (
@@ -69,7 +85,7 @@ def filled(text: str, sources: dict[str, Entries]) -> str:
         make = TABLES[match["kind"]]
         if match["kind"] not in sources:
             return match[0]
-        return match[1] + make(sources[match["kind"]], match["words"].split()) + match[4]
+        return match[1] + make(sources[match["kind"]], match["words"].split(), match["old"]) + match[5]
 
     return MARKER.sub(table, text)
 

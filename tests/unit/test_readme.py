@@ -68,6 +68,21 @@ def test_tables_of_figures_come_from_the_measurements() -> None:
     assert "| 7 mm | <= 5 mm | **failed** |" in everything
 
 
+def test_figure_that_was_not_measured_stays_as_it_is_while_others_of_its_table_are_written() -> None:
+    readme_tables = tool("readme_tables")
+
+    def entry(group: str, name: str, value: float) -> dict[str, object]:
+        return {"name": name, "value": value, "unit": "mm", "limit": "", "passed": True, "command": "x", "group": group}
+
+    both = [("hover", "hover: RMSE"), ("hover", "the same: worst"), ("spiral", "spiral: RMSE"), ("spiral", "the same: worst")]
+    text = "<!-- table: accept hover spiral -->\n<!-- end -->\n"
+    first = readme_tables.filled(text, {"accept": [entry(*figure, 1.0 + n) for n, figure in enumerate(both)]})
+    assert re.findall(r"(\d) mm", first) == ["1", "2", "3", "4"]
+    again = readme_tables.filled(first, {"accept": [entry(*figure, 8.0) for figure in both[2:]]})
+    assert re.findall(r"(\d) mm", again) == ["1", "2", "8", "8"]
+    assert [line for line in again.splitlines() if "hover: RMSE" in line] == [line for line in first.splitlines() if "hover: RMSE" in line]
+
+
 def test_every_table_of_the_readme_is_of_a_known_kind_and_filled() -> None:
     readme_tables = tool("readme_tables")
     found = list(readme_tables.MARKER.finditer(README))

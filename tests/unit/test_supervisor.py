@@ -569,3 +569,11 @@ def test_milder_fail_safe_does_not_end_surfacing() -> None:
     supervisor = supervisor_in(mode=Mode.SURFACE)
     supervisor.step(False, GOOD._replace(bus_silent_s=2.1), [])
     assert supervisor.state == State.DISARMED
+
+
+def test_fail_safe_of_a_body_that_is_taken_over_is_on_already() -> None:
+    before, after = supervisor_in(mode=Mode.AUTO, parameters=QUICK), supervisor_in(State.DISARMED)
+    before.step(False, GOOD._replace(leak=True), [])
+    after.take_over([before])
+    assert (after.mode, after.level) == (Mode.SURFACE, Level.SURFACE) and after.is_on("leak")
+    assert after.step(False, at(GOOD._replace(leak=True), 1), []) == [] == after.events
