@@ -9,6 +9,7 @@ import numpy as np
 
 from firmware_py.app.firmware import compose
 from firmware_py.bus.codec import Codec, Frame, MessageCodec, Receiver
+from firmware_py.core.guidance_modes import NEUTRAL
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Mode, Outputs, Request
 from firmware_py.description.parameters import Parameters
@@ -22,7 +23,7 @@ STOPPING = 0.0002
 """Share of the frames with ids of ESTOP and SYNC: they stop the robot, so they are few."""
 LOWEST_OTHER_ID = 0x040
 ARM_EVERY, CLEAR_EVERY = 20, 30
-"""Ticks: somebody takes another mode, arms it by force and clears the e-stop again and again."""
+"""Ticks: a pilot is there, who takes another mode, arms it by force and clears the e-stop again and again."""
 
 
 class Fuzzer:
@@ -120,7 +121,8 @@ def fuzz_flight(frames: int, seed: int = 0, a_tick: int = 100) -> Fuzzed:
 def _asked(tick: int) -> list[Request]:
     asked = [Request(Action.CLEAR_ESTOP)] if tick % CLEAR_EVERY == 0 else []
     if tick % ARM_EVERY == 0:
-        asked += [Request(Action.SET_MODE, 0, Mode[MODES[tick // ARM_EVERY % len(MODES)]]), Request(Action.ARM, 0, True)]
+        mode = Mode[MODES[tick // ARM_EVERY % len(MODES)]]
+        asked += [Request(Action.STICKS, 0, NEUTRAL), Request(Action.SET_MODE, 0, mode), Request(Action.ARM, 0, True)]
     return asked
 
 
