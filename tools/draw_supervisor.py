@@ -22,7 +22,8 @@ from firmware_py.description.parameters import Parameters
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "supervisor.md"
 WHILE_TESTED = """\
 In MOTOR_DETECT a body is disarmed instead, whatever the action, where a motor test has armed it or where it never had a pose: it may lie
-on a bench. A cause that comes back before its fail-safe is over acts again when it has lasted its delay."""
+on a bench. A cause that comes back before its fail-safe is over acts again when it has lasted its delay. A body that is disarmed or stopped
+keeps the mode that a person chose for it; out of a motor test, a dock or a fail-safe's mode it goes to POSHOLD."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -173,6 +173,22 @@ class DockingStage:
             if body in (dock.active, dock.target):
                 dock.sequence.abort(time_ns, reason)
 
+    def leave(self, body: Body, armed: bool) -> list[Event]:
+        """The body is not in the mode DOCK: its undocks end at once, and where it is disarmed its docks. Says so.
+
+        An open joint is parted all the same: that its modules are apart is no wish.
+        """
+        left: list[tuple[str, DockRequest]] = []
+        for undock in [each for each in self._undocks if each.prepared.request.module in body.modules and self._holds(each)]:
+            self._undocks.remove(undock)
+            self._set_relays(undock.prepared.request, RELAY_PULL)
+            left.append(("undock", undock.prepared.request))
+        for dock in [each for each in self._docks if each.active == body.index and not armed]:
+            self._docks.remove(dock)
+            self._set_relays(dock.prepared.request, RELAY_OFF)
+            left.append(("dock", dock.prepared.request))
+        return [Event(WARNING, f"{what} of module {request.module} ended: {NO_LONGER}") for what, request in left]
+
     def step(
         self, inputs: Inputs, estimates: Mapping[int, tuple[Body, Estimate]], holding: Collection[int] = ()
     ) -> Decisions:
@@ -284,8 +300,7 @@ class DockingStage:
         request = plan.request
         if not _fits(plan, estimates):
             self._undocks.remove(undock)
-            holds = _modules(request) in [_modules(joint.request) for joint in self._watched]
-            self._set_relays(request, RELAY_PULL if holds else RELAY_OFF)
+            self._set_relays(request, RELAY_PULL if self._holds(undock) else RELAY_OFF)
             self._say(WARNING, f"undock ended: {CHANGED}")
             return
         self._set_relays(request, RELAY_PUSH)
@@ -299,6 +314,10 @@ class DockingStage:
         decisions.parts.append(Part(whole, stays, leaves, away_w))
         self._undocks.remove(undock)
         self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
+
+    def _holds(self, undock: _Undock) -> bool:
+        """Whether there still is a joint to be undone."""
+        return _modules(undock.prepared.request) in [_modules(joint.request) for joint in self._watched]
 
     def _set_relays(self, request: DockRequest, relay: int) -> None:
         for module, face in ((request.module, request.face), (request.target_module, request.target_face)):
@@ -343,6 +362,7 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
 
 
 CHANGED = "the bodies are others than those that it was planned for"
+NO_LONGER = "its body is no longer in DOCK"
 
 
 def _fits(plan: DockPlan | UndockPlan, estimates: Mapping[int, tuple[Body, Estimate]]) -> bool:

@@ -27,7 +27,7 @@ NEVER_S = 1e9
 MEAN_S = 1.0
 """Time over which rates and shares are averaged."""
 DRY_NS = 3_000_000_000
-"""A cabin that was wet is dry when its sensor has been for so long: water in it moves. ArduSub's detector waits as long."""
+"""A cabin that was wet in two readings running is dry when its sensor has been for so long: water in it moves. ArduSub waits as long."""
 VOLTAGE_SHARE = 0.2
 """Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
 
@@ -97,7 +97,7 @@ class HealthMonitor:
         self._esc_ns = [NEVER_NS] * t.module.size
         self._heard_ns = [0] * count
         self._answered_ns = [NEVER_NS] * count
-        self._leak, self._wet_ns = [False] * count, [NEVER_NS] * count
+        self._leak, self._wet, self._wet_ns = [False] * count, [False] * count, [NEVER_NS] * count
         self._voltage_share: dict[int, float] = {}
         self._cabin_c: dict[int, float] = {}
         self._cabin_start_pa: dict[int, float] = {}
@@ -132,7 +132,7 @@ class HealthMonitor:
         for other in before:
             for i, j in in_both(self._modules, other._modules):
                 self._heard_ns[i], self._answered_ns[i] = other._heard_ns[j], other._answered_ns[j]
-                self._leak[i], self._wet_ns[i] = other._leak[j], other._wet_ns[j]
+                self._leak[i], self._wet[i], self._wet_ns[i] = other._leak[j], other._wet[j], other._wet_ns[j]
                 for mine, theirs in zip(self._readings, other._readings, strict=True):
                     mine.update({i: theirs[j]} if j in theirs else {})
                 for channel, thruster in self._thruster_at[i].items():
@@ -196,10 +196,10 @@ class HealthMonitor:
                 self._heard_ns[index] = now
             if module.pressure_pa is not None:
                 self._depth_ns = now
-            if module.leak:
-                self._leak[index], self._wet_ns[index] = True, now
-            elif module.leak is not None and now - self._wet_ns[index] >= DRY_NS:
-                self._leak[index] = False
+            if module.leak is not None:
+                self._wet_ns[index] = now if module.leak and self._wet[index] else self._wet_ns[index]
+                self._leak[index] = module.leak or now - self._wet_ns[index] < DRY_NS
+                self._wet[index] = module.leak
             if module.voltage_v is not None and isfinite(module.voltage_v):
                 share = module.voltage_v / self._nominal_v[index]
                 before = self._voltage_share.get(index, share)

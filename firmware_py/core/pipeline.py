@@ -233,19 +233,27 @@ class Pipeline:
         requests, refusals = sift(inputs.requests, {chain.body.index: chain.body for chain in self._chains})
         outputs.events += refusals
         self._retune(requests, outputs)
-        wanted, due = self.docking.relays, self.docking.due(inputs.time_ns)
         for chain in self._chains:
-            estimate = estimates[chain.body.index]
-            outputs.preparations += chain.decide(inputs, estimate, requests)
-            if chain.supervisor.mode != Mode.DOCK and chain.body.index in self.docking.busy:
-                self.docking.abort(chain.body.index, inputs.time_ns, "the mode was changed")
-            relays = chain.magnets(wanted, due)
-            record, command = chain.control(inputs.time_ns, estimate)
-            outputs.records.append(record)
+            outputs.preparations += chain.decide(inputs, estimates[chain.body.index], requests)
             outputs.events += [event._replace(body=chain.body.index) for event in chain.supervisor.events]
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
+            self._leave_docks(chain, inputs.time_ns, outputs)
+        wanted, due = self.docking.relays, self.docking.due(inputs.time_ns)
+        for chain in self._chains:
+            relays = chain.magnets(wanted, due)
+            record, command = chain.control(inputs.time_ns, estimates[chain.body.index])
+            outputs.records.append(record)
             _command(chain, command, relays, outputs)
         return outputs
+
+    def _leave_docks(self, chain: BodyPipeline, time_ns: int, outputs: Outputs) -> None:
+        """Docks and undocks go on in the mode DOCK alone: an armed body backs off from one, any other lets go at once."""
+        index, supervisor = chain.body.index, chain.supervisor
+        if supervisor.mode == Mode.DOCK:
+            return
+        if supervisor.armed and index in self.docking.busy:
+            self.docking.abort(index, time_ns, "the mode was changed")
+        outputs.events += [event._replace(body=index) for event in self.docking.leave(chain.body, supervisor.armed)]
 
     def _retune(self, requests: Sequence[Request], outputs: Outputs) -> None:
         """Parameters that were set since the last tick. What a ground station's registry let through still may be refused here."""
@@ -301,7 +309,9 @@ class Pipeline:
 
     def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
         before = self._made_of([joined.chain])
-        if before is None or len(before) != 2:
+        if before is None or len(before) != 2:  # another dock to the same body was first, in this tick
+            for chain in self._chains:
+                chain.dock_over = chain.dock_over or chain.body.index == joined.active
             return
         before.sort(key=lambda chain: chain.body.index != joined.target)
         estimate = self._begin(joined.chain, before, time_ns)

@@ -133,13 +133,19 @@ class Supervisor:
         if row is None:
             self._say(WARNING, f"{trigger.name} refused: not possible in {self.state.name}")
             return None
-        mode = row.mode if row.mode is not None else argument if trigger == Trigger.SET_MODE else self.mode
+        mode = row.mode if row.mode is not None else argument if trigger == Trigger.SET_MODE else self._mode_after(row)
         reasons = self._reasons(row.guard, mode, health)
         if reasons:
             self._say(WARNING, f"{trigger.name} refused: {'; '.join(dict.fromkeys(reasons))}")
             return None
         self._go(row, mode)
         return Decision(trigger, row.effect, mode, argument)
+
+    def _mode_after(self, row: Transition) -> Mode:
+        """As before; but a body that comes to rest keeps no mode that a person did not choose or cannot: it would be armed in it."""
+        comes_to_rest = self.armed and row.next_state not in ARMED
+        chosen = self.level == Level.NONE and not self._testing and MODES[self.mode].request
+        return Mode.POSHOLD if comes_to_rest and not chosen else self.mode
 
     def _go(self, row: Transition, mode: Mode) -> None:
         if (row.next_state, mode) != (self.state, self.mode):

@@ -1,16 +1,18 @@
-"""A docked partner that is lost in flight: what is believed, who is told, and that every module is always flown by just one body."""
+"""A docked partner that is lost or let go in flight: what is believed, who is told, and that every module is flown by just one body."""
 
+import numpy as np
 import pytest
 
 from firmware_py.app.preparation import prepare
 from firmware_py.core.body import Body
 from firmware_py.core.docking import CHANGED, Prepared
+from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockFeedback, DockRequest, Inputs, Mode, ModuleInputs, Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
-from tests.unit.test_pipeline import Tank
+from tests.unit.test_pipeline import Tank, single
 
 MODCUBE = load_vehicle("modcube")
 RING = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
@@ -20,11 +22,13 @@ LOST = "fail-safe on: a docked partner is lost"
 class Docked(Tank):
     """A tank in which the magnets of some modules carry no current, and some modules' tags are out of sight."""
 
-    def __init__(self, cells: list[tuple[int, int, int]], parameters: Parameters | None = None, delay: int = 0) -> None:
-        """`delay`: ticks until a plan that was asked for is there."""
+    def __init__(
+        self, cells: list[tuple[int, int, int]], parameters: Parameters | None = None, delay: int = 0, apart: bool = False
+    ) -> None:
+        """`delay`: ticks until a plan that was asked for is there. `apart`: each module is a body of its own."""
         count = len(cells)
         whole: Body = assemble(cells, [0] * count, [MODCUBE] * count, list(range(count)))
-        super().__init__([whole], parameters)
+        super().__init__([single(m) for m in range(count)] if apart else [whole], parameters)
         self.cabin_pa = [101_325.0] * count
         self.weak: set[int] = set()
         self.hidden: set[int] = set()
@@ -254,3 +258,45 @@ def test_parted_modules_magnets_keep_their_accounts() -> None:
     tank.run(1.0)
     after = [list(chain.limiter.magnets[0]._left_s) for chain in tank.pipeline._chains]
     assert min(before[0]) < 59.0 and min(after[0]) < min(before[0]) and min(after[1]) < min(before[1])
+
+
+# ---------------------------------------------------------------- an undock that is over
+
+
+@pytest.mark.parametrize("stop", ["e-stop", "DISARM", "mode"])
+def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
+    tank = Docked(RING[:2])
+    tank.fly()
+    tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert any(2 in states for states in tank.pipeline.docking.relays), "magnets push"
+    request = Request(Action.SET_MODE, 0, Mode.POSHOLD) if stop == "mode" else Request(Action.DISARM, 0)
+    tank.run(0.02, *([] if stop == "e-stop" else [request]), estop=stop == "e-stop")
+    outputs = tank.run(3.0)
+    assert tank.shape == [(0, 1)] and tank.when("undock of module 1 ended")
+    assert [max(states) for states in tank.pipeline.docking.relays] == [1, 1], "and pull again"
+    assert outputs.records[0].mode == Mode.POSHOLD
+
+
+@pytest.mark.parametrize("stop", ["e-stop", "DISARM"])
+def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str) -> None:
+    tank = Docked(RING[:2], apart=True)
+    tank.weak = {0, 1}
+    tank.states[1][1] = 0.6
+    tank.run(2.0)
+    tank.run(3.0, Request(Action.ARM, 0), Request(Action.ARM, 1))
+    outputs = tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, False)))
+    while not (outputs.docks and outputs.docks[0].stage == Stage.APPROACH):
+        outputs = tank.run(0.01)
+    outputs = tank.run(1.0)
+    assert outputs.records[1].mode == Mode.DOCK and any(any(states) for states in tank.pipeline.docking.relays)
+    stopping = [] if stop == "e-stop" else [Request(Action.DISARM, 0), Request(Action.DISARM, 1)]
+    tank.run(0.02, *stopping, estop=stop == "e-stop")
+    outputs = tank.run(5.0)
+    assert outputs.docks == [] and not any(any(states) for states in tank.pipeline.docking.relays)
+    assert tank.when("dock of module 1 ended")
+    tank.run(0.1, Request(Action.CLEAR_ESTOP, 1))
+    outputs = tank.run(0.1, Request(Action.ARM, 1))
+    before = tank.states[1][:3].copy()
+    outputs = tank.run(5.0)
+    assert (outputs.records[1].state, outputs.records[1].mode) == (State.ARMED, Mode.POSHOLD)
+    assert np.linalg.norm(tank.states[1][:3] - before) < 0.02

@@ -388,8 +388,26 @@ def test_fail_safe_during_a_motor_test_disarms(base: Health, figure: str, value:
     assert supervisor.armed
     for tick in range(400):
         supervisor.step(False, at(base._replace(**{figure: value}), 0.01 * tick), [])
-    counts = figure != "outside_m"
-    assert (supervisor.state, supervisor.mode) == (State.DISARMED if counts else State.ARMED, Mode.MOTOR_DETECT)
+    ended = (State.ARMED, Mode.MOTOR_DETECT) if figure == "outside_m" else (State.DISARMED, Mode.POSHOLD)
+    assert (supervisor.state, supervisor.mode) == ended
+
+
+@pytest.mark.parametrize("rest", ["e-stop", "ESTOP", "DISARM"])
+def test_body_that_comes_to_rest_keeps_no_mode_that_no_person_chose(rest: str) -> None:
+    """Armed again it would dock, surface or turn every thruster, without a pose and without being asked."""
+
+    def after(supervisor: Supervisor, health: Health = GOOD) -> Mode:
+        supervisor.step(rest == "e-stop", health, [] if rest == "e-stop" else [Request(Action[rest], 0, None)])
+        assert not supervisor.armed
+        return supervisor.mode
+
+    testing, surfacing = supervisor_in(State.DISARMED), supervisor_in(mode=Mode.AUTO, parameters=QUICK)
+    ask(testing, Action.MOTOR_TEST, (0, 0.1, 10.0))
+    surfacing.step(False, GOOD._replace(leak=True), [])
+    assert surfacing.mode == Mode.SURFACE
+    assert [after(each) for each in (testing, surfacing, supervisor_in(mode=Mode.DOCK))] == [Mode.POSHOLD] * 3
+    chosen = (Mode.MANUAL, Mode.SURFACE, Mode.MOTOR_DETECT, Mode.GUIDED)
+    assert tuple(after(supervisor_in(mode=mode)) for mode in chosen) == chosen
 
 
 def test_robot_that_detects_its_motors_is_disarmed_where_it_never_had_a_pose_and_holds_where_it_has_one() -> None:
