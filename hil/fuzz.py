@@ -9,9 +9,8 @@ import numpy as np
 
 from firmware_py.app.firmware import compose
 from firmware_py.bus.codec import Codec, Frame, MessageCodec, Receiver
-from firmware_py.core.guidance_modes import NEUTRAL
 from firmware_py.core.transitions import ARMED
-from firmware_py.core.types import Action, Mode, Outputs, Request
+from firmware_py.core.types import Action, Mode, Outputs, Request, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle
 from hil.bench import fleet_of
@@ -19,6 +18,7 @@ from hil.nodes import make_nodes
 from hil.plant.draw import stream
 from hil.scenario import MODES, load_scenario, make_world
 
+NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 STOPPING = 0.0002
 """Share of the frames with ids of ESTOP and SYNC: they stop the robot, so they are few."""
 LOWEST_OTHER_ID = 0x040

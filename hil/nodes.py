@@ -21,6 +21,10 @@ TIMEOUT_NS = 100_000_000
 """A half of THRUSTER_CMD that is older commands zero."""
 RELEASE_NS = 200_000_000
 """An e-stop may be released when none came for so long."""
+PUSH_NS = 2_000_000_000
+"""A magnet that pushes goes off when DOCK_CMD is older; one that pulls holds a joint, and stays."""
+OFF, REVERSE = 0, 2
+"""Relay states."""
 VERSION = 1
 CABIN_PA = 101325.0
 CABIN_C = 30.0
@@ -44,7 +48,7 @@ class Mcu:
         self.number, self.module = number, module
         self.stopped = False
         self.timed_out = False
-        self.relays = world.docks.relays[module].tolist()
+        self.relays: list[int] = world.docks.relays[module].tolist()
         self.errors = 0
         self._world, self._spec = world, spec
         self._sensors = Sensors(spec, world.spec, world.seed, module)
@@ -54,6 +58,7 @@ class Mcu:
         self._accepted_ns: list[int | None] = [None, None]
         self._applied = [0.0] * 8
         self._last_estop_ns = 0
+        self._docked_ns = 0
         self._power = Noise(stream(world.seed, "power", module), 2)
         self._rpm = Noise(stream(world.seed, "rpm", module), 8)
         self._dock = Noise(stream(world.seed, "dock", module), 6)
@@ -85,17 +90,21 @@ class Mcu:
             if values[4] == 0 and time_ns - self._last_estop_ns >= RELEASE_NS:
                 self.stopped = False
         elif name == "DOCK_CMD":
-            self.relays = [int(v) for v in values[:6]]
-            self._world.set_relays(self.module, self.relays)
+            self._docked_ns = time_ns
+            barred = REVERSE if self.stopped else None
+            self._switch([OFF if v == barred else int(v) for v in values[:6]])
 
     def estop(self, time_ns: int) -> None:
-        """An ESTOP frame came: thrust ends at once, without waiting for SYNC."""
+        """An ESTOP frame came: thrust ends at once, without waiting for SYNC, and magnets no longer push."""
         self.stopped = True
         self._last_estop_ns = time_ns
         self._apply([0.0] * 8)
+        self._end_push()
 
     def watch(self, time_ns: int) -> None:
-        """The MCU's own clock: each half of the command that has grown old ends, SYNC or not."""
+        """The MCU's own clock: each half of the command that has grown old ends, SYNC or not, and so does pushing."""
+        if time_ns - self._docked_ns > PUSH_NS:
+            self._end_push()
         for half, accepted in enumerate(self._accepted_ns):
             if accepted is None or time_ns - accepted > TIMEOUT_NS:
                 self._armed[half] = False
@@ -132,6 +141,14 @@ class Mcu:
     def _apply(self, command: list[float]) -> None:
         self._applied = command
         self._world.set_command(self.module, command[: self._thrusters], True)
+
+    def _switch(self, relays: list[int]) -> None:
+        self.relays = relays
+        self._world.set_relays(self.module, relays)
+
+    def _end_push(self) -> None:
+        if REVERSE in self.relays:
+            self._switch([OFF if relay == REVERSE else relay for relay in self.relays])
 
     def _state(self, disarmed: bool) -> int:
         if self.stopped:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -12,11 +13,13 @@ from typing import TYPE_CHECKING
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import Summary, recording_times, summary_of
 from firmware_py.app.firmware import BusFrame, Firmware, compose, vehicles_of
-from firmware_py.app.last_flight import modules_in_flight
+from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight
 from firmware_py.app.live_view import LiveView
 from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import open_loop
 from firmware_py.app.service import reporting
+from firmware_py.core.body import Body
+from firmware_py.core.docking import joints_of
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet
@@ -52,6 +55,10 @@ MISUSED = (FileExistsError, NotADirectoryError, PermissionError)
 """A folder for logs that is none, or not ours: whoever starts the vehicle is told. What else a disk may fail in, it flies without."""
 STOPPED_BY = frozenset({Action.DISARM, Action.ESTOP})
 """Requests of a person after which nothing is armed but by a person."""
+TAKEN_BY = frozenset({Action.SET_MODE, Action.ARM, Action.MOTOR_TEST})
+"""Requests of a person after which their body is not armed but by a person."""
+REARM_S = RECENT_NS / 1e9
+"""How long REARM tries: then the flight before says nothing of where the vehicle is, as a log that is so old."""
 
 
 @dataclass(slots=True)
@@ -61,6 +68,9 @@ class Operator:
     rate_hz: int
     to_arm: set[int] = field(default_factory=set)
     """Fleet indices of modules that are still to be armed. A body goes by its leader; who was armed once, by whomever, leaves."""
+    limit_s: float = math.inf
+    """How long, by the loop's ticks, `to_arm` is meant."""
+    say: Callable[[str], None] = write_line
     stopping: bool = False
     farewell: int = 0
     _ticks: int = 0
@@ -76,6 +86,7 @@ class Operator:
         if not self.to_arm or last is None:
             return []
         self._strike_out(last)
+        self._expire()
         ready = [record.body for record in last.records if record.body in self.to_arm and record.estimate.ready]
         if not ready or self._ticks < self._next_try:
             return []
@@ -87,6 +98,12 @@ class Operator:
         self.to_arm.difference_update(index for index, command in enumerate(last.modules) if command.armed)
         if any(record.state == State.ESTOP for record in last.records):
             self.to_arm.clear()
+
+    def _expire(self) -> None:
+        """Whoever could not be armed for too long may be in somebody's hands by now."""
+        if self.to_arm and self._ticks >= self.limit_s * self.rate_hz:
+            self.to_arm.clear()
+            self.say(f"not armed again: the vehicle could not within {self.limit_s:g} s (REARM)")
 
     def is_done(self, tick: int, outputs: Outputs) -> bool:
         """Whether every module has been told for long enough."""
@@ -125,7 +142,7 @@ def run_vehicle(
         if line := stored_line(parameters, laid, store):
             teller.say(line)
         firmware = compose(fleet, laid, worker=worker)
-        operator = Operator(fleet.rate_hz, _to_arm(firmware, hold, out, teller.say))
+        operator = Operator(fleet.rate_hz, _to_arm(firmware, hold, out, teller.say), math.inf if hold else REARM_S, teller.say)
         observers: list[Observer] = []
         recorder = _open_recorder(stack, firmware, out, live, teller.say)
         if recorder is not None:
@@ -141,7 +158,7 @@ def run_vehicle(
             # Like the recorder's and the live view's, its threads start before this one takes its priority, which they would inherit.
             side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY, started=parameters))
             observers.append(side.observe)
-            requests = with_ground(operator, side)
+            requests = with_ground(operator, side, lambda: firmware.pipeline.bodies)
         for line in stack.enter_context(real_time()):
             teller.say(f"warning: {line}")
         loop = open_loop(stack, firmware, requests)
@@ -159,15 +176,31 @@ def run_vehicle(
 
 
 def _to_arm(firmware: Firmware, hold: bool, out: Path | None, say: Callable[[str], None]) -> set[int]:
-    """Modules that are armed without a person: all with `hold`; with REARM, those in whose flight the process before was killed."""
+    """Modules that are armed without a person: all with `hold`; with REARM, those in whose flight the process before was killed.
+
+    With REARM nobody is where modules were docked in flight: the fleet file has them apart, and its relays let go of them.
+    """
+    fleet = firmware.fleet
+    before = last_flight(out, fleet, firmware.codec, unix_ns()) if out is not None else LastFlight()
+    docked = sorted({module for module, _ in before.pulling - _joined_faces(firmware)})
+    if docked:
+        say(
+            f"warning: modules {', '.join(map(fleet.label, docked))} were docked, or about to be, and their magnets let go: "
+            "the fleet file has to say so (body, cell) before they fly as one or REARM arms them"
+        )
     if hold:
-        return set(range(len(firmware.fleet.module)))
-    if out is None or not firmware.parameters.supervision.rearm:
+        return set(range(len(fleet.module)))
+    if docked or not firmware.parameters.supervision.rearm:
         return set()
-    flying = modules_in_flight(out, firmware.fleet, firmware.codec, unix_ns())
-    if flying:
+    if before.armed:
         say("the process before ended in flight: holding as soon as the vehicle may (REARM)")
-    return flying
+    return set(before.armed)
+
+
+def _joined_faces(firmware: Firmware) -> set[tuple[int, int]]:
+    """Fleet index and face of both sides of every joint that the fleet file has."""
+    joints = [joint.request for body in firmware.pipeline.bodies for joint in joints_of(body)]
+    return {face for joint in joints for face in ((joint.module, joint.face), (joint.target_module, joint.target_face))}
 
 
 def _open_recorder(
@@ -221,10 +254,12 @@ def _watching(
         yield reporting(notifier, keeper, rate_hz)
 
 
-def with_ground(operator: Operator, side: GroundSide) -> Callable[[int, Outputs | None], list[Request]]:
+def with_ground(
+    operator: Operator, side: GroundSide, bodies: Callable[[], Sequence[Body]]
+) -> Callable[[int, Outputs | None], list[Request]]:
     """The operator's requests and those of ground stations; a reboot that was asked for ends the process, the service starts it anew.
 
-    Once a ground station disarms or stops the vehicle, the operator arms nobody any more.
+    Once a ground station disarms or stops the vehicle, the operator arms nobody any more; whom it arms, tests or gives a mode is its own.
     """
 
     def requests(time_ns: int, last: Outputs | None) -> list[Request]:
@@ -232,6 +267,8 @@ def with_ground(operator: Operator, side: GroundSide) -> Callable[[int, Outputs 
         asked = side.requests()
         if any(request.action in STOPPED_BY for request in asked):
             operator.to_arm.clear()
+        taken = {request.body for request in asked if request.action in TAKEN_BY}
+        operator.to_arm.difference_update(taken, *(body.modules for body in bodies() if body.index in taken))
         return [*operator.requests(time_ns, last), *asked]
 
     return requests

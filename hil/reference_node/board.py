@@ -54,7 +54,7 @@ class Board(Mcu):
 
     def drive(self, outputs: Outputs) -> None:
         """The node's outputs take effect."""
-        self.relays = [int(relay) for relay in outputs.relay]
+        self._switch([int(relay) for relay in outputs.relay])
         self._apply(list(outputs.thruster))
 
     def sample(self, due: int, readings: Readings) -> None:

@@ -9,6 +9,7 @@
 enum { STATE_DISARMED = 1, STATE_ARMED = 2, STATE_TIMEOUT = 3, STATE_ESTOP = 4 };
 enum { ERROR_CRC = 1, ERROR_COUNTER = 2, ERROR_LENGTH = 4, ERROR_TIMEOUT = 8, ERROR_SENSOR = 16 };
 enum { SENSOR_FAULT = 15 };
+enum { RELAY_OFF = MODCUBE_DOCK_CMD_RELAY_A_OFF_CHOICE, RELAY_REVERSE = MODCUBE_DOCK_CMD_RELAY_A_REVERSE_CHOICE };
 
 size_t node_size(void)
 {
@@ -69,15 +70,29 @@ static void take_command_b(struct node *node, const uint8_t *data, int64_t now_n
     take_command(node, 1, (int16_t[]){c.thruster5, c.thruster6, c.thruster7, c.thruster8}, c.mode, now_ns);
 }
 
-static void take_dock(struct node *node, const uint8_t *data)
+static void take_dock(struct node *node, const uint8_t *data, int64_t now_ns)
 {
     struct modcube_dock_cmd_t c;
     modcube_dock_cmd_unpack(&c, data, MODCUBE_DOCK_CMD_LENGTH);
     const uint8_t relays[NODE_FACES] = {c.relay_a, c.relay_b, c.relay_c, c.relay_d, c.relay_e, c.relay_f};
     for (int i = 0; i < NODE_FACES; i++) {
-        node->applied.relay[i] = relays[i];
+        node->applied.relay[i] = node->stopped && relays[i] == RELAY_REVERSE ? RELAY_OFF : relays[i];
     }
+    node->docked_ns = now_ns;
     node->hardware.apply(node->hardware.context, &node->applied);
+}
+
+/* Magnets that push go off; those that pull hold joints, and stay. Returns whether there were any. */
+static bool end_push(struct node *node)
+{
+    bool pushed = false;
+    for (int i = 0; i < NODE_FACES; i++) {
+        if (node->applied.relay[i] == RELAY_REVERSE) {
+            node->applied.relay[i] = RELAY_OFF;
+            pushed = true;
+        }
+    }
+    return pushed;
 }
 
 /* Three scaled axes and a status; GYRO and ACCEL have one layout and factors of their own. */
@@ -250,12 +265,13 @@ void node_take(struct node *node, uint16_t id, const uint8_t *data, size_t lengt
     case MODCUBE_ESTOP:
         node->stopped = true;
         node->stopped_ns = now_ns;
+        end_push(node);
         apply(node, ZERO);
         break;
     case MODCUBE_SYNC: take_sync(node, data, now_ns); break;
     case MODCUBE_THRUSTER_CMD_A: take_command_a(node, data, now_ns); break;
     case MODCUBE_THRUSTER_CMD_B: take_command_b(node, data, now_ns); break;
-    case MODCUBE_DOCK_CMD: take_dock(node, data); break;
+    case MODCUBE_DOCK_CMD: take_dock(node, data, now_ns); break;
     case MODCUBE_DROPPED:
         if ((id & MODCUBE_NUMBER_MASK) == node->receiver.number) {
             blame(node, before);
@@ -268,7 +284,7 @@ void node_take(struct node *node, uint16_t id, const uint8_t *data, size_t lengt
 void node_watch(struct node *node, int64_t now_ns)
 {
     double thruster[NODE_THRUSTERS];
-    bool ends = false;
+    bool ends = now_ns - node->docked_ns > NODE_PUSH_NS && end_push(node);
     for (int i = 0; i < NODE_THRUSTERS; i++) {
         bool live = is_live(node, i / 4, now_ns);
         if (!live) {

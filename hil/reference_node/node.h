@@ -1,6 +1,6 @@
 /* Reference node: what the microcontroller of one module does on the bus, without its hardware. SYNC in, status and
- * sensors out, zero thrust after 100 ms of silence. No allocation, no clock, no global state: the caller gives the time
- * and three functions of the hardware. can_dbc/README.md says the rules. */
+ * sensors out, zero thrust after 100 ms of silence, no magnet that pushes after 2 s. No allocation, no clock, no global
+ * state: the caller gives the time and three functions of the hardware. can_dbc/README.md says the rules. */
 #ifndef MODCUBE_NODE_H
 #define MODCUBE_NODE_H
 
@@ -12,6 +12,7 @@
 #define NODE_VERSION (1u)
 #define NODE_TIMEOUT_NS (100000000)  /* a half of THRUSTER_CMD that is older commands zero */
 #define NODE_RELEASE_NS (200000000)  /* an e-stop may be released when none came for so long */
+#define NODE_PUSH_NS (2000000000)  /* a magnet that pushes goes off when DOCK_CMD is older; one that pulls stays */
 
 /* What the hardware does. */
 struct node_outputs {
@@ -50,6 +51,7 @@ struct node {
     int64_t accepted_ns[2];
     bool stopped;
     int64_t stopped_ns;
+    int64_t docked_ns;
     uint8_t errors;
     uint8_t counters[NODE_SLOW];
 };

@@ -18,7 +18,7 @@ from firmware_py.bus.codec import Codec, Frame
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from hil.bench import Bench, open_bench
-from hil.nodes import make_nodes
+from hil.nodes import Nodes, make_nodes
 from hil.reference_node import CNodes, load_library
 from hil.scenario import make_world
 from tests.closed_loop.flights import shortened
@@ -128,6 +128,53 @@ def test_estop_ends_thrust_at_once_and_only_a_disarmed_command_after_200_ms_of_n
     assert status(nodes.step([sync(30)]))[2] == 4
     nodes.step(command(0.0, 14, mode=0))
     assert status(nodes.step([sync(31)]))[2] == 1
+
+
+PUSHES, REST = (1, 0, 2, 0, 0, 2), (1, 0, 0, 0, 0, 0)
+
+
+def dock(relays: Sequence[int], counter: int) -> Frame:
+    return CODEC.message("DOCK_CMD").encode(NUMBER, relays, counter)
+
+
+def magnets(nodes: CNodes | Nodes) -> tuple[int, ...]:
+    """The relays of the module, in the world."""
+    return tuple(nodes.world.docks.relays[0].tolist())
+
+
+def test_magnet_that_pushes_goes_off_after_2_s_without_dock_cmd_and_one_that_pulls_stays(nodes: CNodes) -> None:
+    nodes.step([dock(PUSHES, 1)])
+    for _ in range(200):
+        nodes.step([])
+        assert magnets(nodes) == PUSHES
+    nodes.step([])
+    assert magnets(nodes) == REST
+
+
+def test_estop_ends_pushing_at_once_and_until_it_is_released(nodes: CNodes) -> None:
+    nodes.step([dock(PUSHES, 1), sync(1)])
+    nodes.step([Frame(0x01E, b"")])
+    assert magnets(nodes) == REST
+    for counter in range(2, 32):
+        nodes.step([dock(PUSHES, counter)])
+        assert magnets(nodes) == REST
+    nodes.step([*command(0.0, 1, mode=0), dock(PUSHES, 32)])
+    assert magnets(nodes) == PUSHES
+
+
+def test_c_node_switches_its_magnets_as_the_plants_own_does_frame_for_frame(nodes: CNodes) -> None:
+    """Frames come, stay away, and come again around the 2 s and an e-stop."""
+    scenario = shortened("hover", 1.0)
+    own = make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, {NUMBER: 0}, scenario)
+    stop, release = [Frame(0x000, b"")], command(0.0, 2, mode=0)
+    script = {1: [dock(PUSHES, 1)], 203: [dock(PUSHES, 2)], 300: stop, 310: [dock(PUSHES, 3)], 330: release, 340: [dock(PUSHES, 4)]}
+    pushed = []
+    for tick in range(1, 560):
+        frames = [sync(tick), *script.get(tick, [])]
+        assert nodes.step(frames) == own.step(frames)
+        assert magnets(nodes) == magnets(own)
+        pushed += [tick] if magnets(own) == PUSHES else []
+    assert pushed == [*range(1, 202), *range(203, 300), *range(340, 541)]
 
 
 def test_node_reports_bad_frames_once_in_its_next_status(nodes: CNodes) -> None:

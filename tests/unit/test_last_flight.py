@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.app.last_flight import RECENT_NS, TAIL_BYTES, modules_in_flight
+from firmware_py.app.last_flight import RECENT_NS, TAIL_BYTES, LastFlight, last_flight
 from firmware_py.bus.codec import Codec
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.runtime.recorder import CAN_LOG, candump_lines
@@ -16,6 +16,7 @@ FLEET = Fleet(module=(Module(number=1), Module(number=2), Module(number=1, bus=1
 PERIOD_NS = 10_000_000
 WRITTEN_NS = 1_700_000_000_000_000_000
 NOW_NS = WRITTEN_NS + 2_000_000_000
+TAIL = TAIL_BYTES * len(FLEET.module)
 
 
 def lines_of(armed: Sequence[bool], tick: int = 1) -> str:
@@ -38,8 +39,18 @@ def write(folder: Path, text: str, written_ns: int = WRITTEN_NS) -> None:
     os.utime(folder / CAN_LOG, ns=(written_ns, written_ns))
 
 
-def in_flight(out: Path, now_ns: int = NOW_NS) -> set[int]:
-    return modules_in_flight(out, FLEET, CODEC, now_ns)
+def dock_line(index: int, relays: Sequence[int], tick: int = 1, direction: str = "T") -> str:
+    """What a tick writes in which the relays of a module are due."""
+    module = FLEET.module[index]
+    return candump_lines(tick * PERIOD_NS, module.bus, direction, [CODEC.message("DOCK_CMD").encode(module.number, relays, tick)])
+
+
+def found(out: Path, now_ns: int = NOW_NS) -> LastFlight:
+    return last_flight(out, FLEET, CODEC, now_ns)
+
+
+def in_flight(out: Path, now_ns: int = NOW_NS) -> frozenset[int]:
+    return found(out, now_ns).armed
 
 
 def test_modules_that_were_told_armed_last_were_in_flight(tmp_path: Path) -> None:
@@ -70,10 +81,10 @@ def test_only_the_end_of_a_long_log_is_read_and_lines_that_hold_no_frame_are_pas
     filler = "(0000000000.010000) can0 zzz#zz T\n\xff\n".encode("latin-1")
     write(tmp_path, lines_of([False] * 3))
     with (tmp_path / CAN_LOG).open("ab") as file:
-        file.write(filler * (TAIL_BYTES // len(filler)) + lines_of([True] * 3, 2).encode())
+        file.write(filler * (TAIL // len(filler)) + lines_of([True] * 3, 2).encode())
     os.utime(tmp_path / CAN_LOG, ns=(WRITTEN_NS, WRITTEN_NS))
     assert in_flight(tmp_path) == {0, 1, 2}
-    write(tmp_path, lines_of([True] * 3) + "x" * TAIL_BYTES)
+    write(tmp_path, lines_of([True] * 3) + "x" * TAIL)
     assert in_flight(tmp_path) == set()
 
 
@@ -99,3 +110,26 @@ def test_missing_or_unreadable_log_says_nothing(tmp_path: Path) -> None:
     (tmp_path / CAN_LOG).mkdir()
     assert in_flight(tmp_path) == set()
     assert in_flight(Path(__file__)) == set()
+
+
+def test_magnets_that_were_told_to_pull_last_pulled(tmp_path: Path) -> None:
+    text = dock_line(0, (1, 2, 0, 0, 0, 1)) + dock_line(1, (0, 1, 0, 0, 0, 0)) + dock_line(2, (0, 0, 0, 1, 0, 0))
+    write(tmp_path, text + lines_of([True] * 3) + dock_line(1, (0, 2, 0, 0, 0, 0), 2) + dock_line(0, (0,) * 6, 2, "R"))
+    assert found(tmp_path).pulling == {(0, 0), (0, 5), (2, 3)}
+    write(tmp_path, text + dock_line(0, (0,) * 6, 2)[:-1])
+    assert found(tmp_path).pulling == {(0, 0), (0, 5), (1, 1), (2, 3)}  # a torn line is left out
+
+
+def test_log_that_is_old_says_nothing_of_magnets(tmp_path: Path) -> None:
+    write(tmp_path, dock_line(0, (1,) * 6))
+    assert len(found(tmp_path, WRITTEN_NS + RECENT_NS - 1).pulling) == 6
+    assert found(tmp_path, WRITTEN_NS + RECENT_NS) == LastFlight()
+
+
+@pytest.mark.parametrize("rate_hz", [100, 400])
+def test_end_of_the_log_holds_a_dock_cmd_of_every_module(tmp_path: Path, rate_hz: int) -> None:
+    """DOCK_CMD comes ten times a second; the busiest tick of a module is 14 frames of 45 bytes."""
+    every = rate_hz // 10
+    tick = lines_of([True] * 3) + "(0000000000.010000) can0 0C1#0011223344556677 R\n" * 14
+    write(tmp_path, "".join(dock_line(i, (1,) * 6) for i in range(3)) + tick * every)
+    assert len(found(tmp_path).pulling) == 18

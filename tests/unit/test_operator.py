@@ -1,28 +1,41 @@
-"""`modcube run --hold` arms each body once: whoever disarms or stops it afterwards has the last word."""
+"""`modcube run --hold` and REARM arm each body once: whoever takes it over, disarms or stops it has the last word."""
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from firmware_py.app.vehicle import ARM_EVERY_S, Operator, with_ground
+from firmware_py.app.vehicle import ARM_EVERY_S, REARM_S, Operator, with_ground
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, Outputs, Request
+from firmware_py.core.types import Action, BodyRecord, Mode, Outputs, Request
 from tests.unit.ground_world import Robot
 
 RATE_HZ = 100
 SECOND = round(ARM_EVERY_S * RATE_HZ)
+MINUTE = round(REARM_S * RATE_HZ)
+
+
+class Waiting(Robot):
+    """A robot whose pose may not be known yet."""
+
+    ready = True
+
+    def _record(self, body: int) -> BodyRecord:
+        record = super()._record(body)
+        return record._replace(estimate=record.estimate._replace(ready=self.ready))
 
 
 class Flight:
     """A robot, its operator, and a ground station that asks for what `asks` holds, each once."""
 
-    def __init__(self, modules: int = 1, to_arm: set[int] | None = None) -> None:
-        self.robot = Robot(modules)
-        self.operator = Operator(RATE_HZ, set(range(modules)) if to_arm is None else to_arm)
+    def __init__(self, modules: int = 1, to_arm: set[int] | None = None, limit_s: float = math.inf) -> None:
+        self.robot = Waiting(modules)
+        self.said: list[str] = []
+        self.operator = Operator(RATE_HZ, set(range(modules)) if to_arm is None else to_arm, limit_s, self.said.append)
         self.asks: list[Request] = []
         side: Any = SimpleNamespace(reboot_asked=False, requests=self._asked)
-        self._requests = with_ground(self.operator, side)
+        self._requests = with_ground(self.operator, side, lambda: self.robot.bodies)
         self.last: Outputs | None = None
 
     def _asked(self) -> list[Request]:
@@ -33,8 +46,8 @@ class Flight:
         for _ in range(ticks):
             _, self.last = self.robot.step(self._requests(self.robot.tick, self.last))
 
-    def ask(self, action: Action, body: int = 0) -> None:
-        self.asks.append(Request(action, body))
+    def ask(self, action: Action, body: int = 0, argument: object = None) -> None:
+        self.asks.append(Request(action, body, argument))
         self.run(1)
 
     @property
@@ -132,3 +145,63 @@ def test_only_the_bodies_that_were_meant_are_armed() -> None:
     flight = Flight(modules=3, to_arm={1})
     flight.run(10 * SECOND)
     assert flight.arms == [1]
+
+
+@pytest.mark.parametrize(("ticks", "arms"), [(MINUTE - 1, [0]), (MINUTE, [])])
+def test_flight_that_was_broken_off_is_taken_up_within_a_minute_or_never(ticks: int, arms: list[int]) -> None:
+    """An hour later, a camera that sees the first tag may see it in somebody's hands."""
+    flight = Flight(limit_s=REARM_S)
+    flight.robot.ready = False
+    flight.run(ticks - 2)
+    flight.robot.ready = True
+    flight.run(2 * MINUTE)
+    assert flight.arms == arms
+    assert flight.said == ([] if arms else ["not armed again: the vehicle could not within 60 s (REARM)"])
+
+
+def test_flight_that_may_not_be_taken_up_is_tried_for_a_minute() -> None:
+    flight = Flight(limit_s=REARM_S)
+    flight.robot.refuse[Action.ARM] = "leak"
+    flight.run(2 * MINUTE)
+    assert len(flight.arms) == MINUTE // SECOND
+    assert len(flight.said) == 1
+
+
+def test_order_to_hold_stays_without_limit() -> None:
+    flight = Flight()
+    flight.robot.ready = False
+    flight.run(2 * MINUTE)
+    flight.robot.ready = True
+    flight.run(2)
+    assert flight.arms == [0]
+    assert flight.said == []
+
+
+TAKES = [(Action.SET_MODE, Mode.MANUAL), (Action.ARM, False), (Action.MOTOR_TEST, (1, 0.1, 1.0))]
+
+
+@pytest.mark.parametrize(("action", "argument"), TAKES)
+@pytest.mark.parametrize("limit_s", [math.inf, REARM_S])
+def test_body_that_a_person_takes_over_is_the_persons_to_arm_and_the_others_are_not(
+    action: Action, argument: object, limit_s: float
+) -> None:
+    flight = Flight(modules=2, limit_s=limit_s)
+    flight.robot.refuse[Action.ARM] = "no pose"
+    flight.asks = [Request(action, 1, argument)]  # in the very tick in which the operator would arm
+    flight.run(10)
+    flight.robot.refuse.clear()
+    flight.robot.asked.clear()
+    flight.run(2 * SECOND)
+    assert flight.arms == [0]
+    assert flight.robot.state == [State.ARMED, State.DISARMED]
+
+
+def test_modules_of_a_body_that_a_person_takes_over_are_the_persons_when_it_parts() -> None:
+    flight = Flight(modules=2)
+    flight.robot.dock()
+    flight.robot.refuse[Action.ARM] = "no pose"
+    flight.ask(Action.SET_MODE, argument=Mode.MANUAL)
+    flight.robot.refuse.clear()
+    flight.robot.bodies = Robot(2).bodies
+    flight.run(2 * SECOND)
+    assert flight.arms == []

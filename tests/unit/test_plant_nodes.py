@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -215,6 +216,57 @@ def test_relays_are_echoed() -> None:
         frames += nodes.step([sync(tick)])
     assert named(frames, "DOCK_CURRENT_ABC").values[3:] == (1, 0, 2)
     assert named(frames, "DOCK_CURRENT_DEF").values[3:] == (0, 0, 1)
+
+
+PUSHES, REST = (1, 0, 2, 0, 0, 2), (1, 0, 0, 0, 0, 0)
+"""Face A pulls throughout: a joint may hang on it."""
+
+
+def dock(relays: Sequence[int], counter: int) -> Frame:
+    return CODEC.message("DOCK_CMD").encode(1, relays, counter)
+
+
+def magnets(nodes: Nodes) -> tuple[int, ...]:
+    """The relays of the one module, in the world."""
+    return tuple(nodes.world.docks.relays[0].tolist())
+
+
+def test_magnet_that_pushes_goes_off_after_2_s_without_dock_cmd_and_one_that_pulls_stays() -> None:
+    nodes, answers = nodes_of(calm()), []
+    nodes.step([dock(PUSHES, 1)])
+    for _ in range(200):
+        nodes.step([])
+        assert magnets(nodes) == PUSHES
+    nodes.step([])
+    assert magnets(nodes) == REST
+    for tick in range(1, 9):
+        answers += nodes.step([sync(tick)])
+    assert named(answers, "DOCK_CURRENT_ABC").values[3:] == REST[:3]
+    assert named(answers, "DOCK_CURRENT_DEF").values[3:] == REST[3:]
+
+
+def test_magnet_pushes_on_while_dock_cmd_is_accepted_and_no_other_frame_counts() -> None:
+    nodes = nodes_of(calm())
+    for counter in range(4):
+        nodes.step([dock(PUSHES, counter)])
+        for tick in range(199):
+            nodes.step([sync(tick)])
+        assert magnets(nodes) == PUSHES
+    for counter in range(4):
+        nodes.step([dock(PUSHES, 3), *thrust(0.1, ARMED, counter), sync(counter)])  # a repeated counter is not accepted
+    assert magnets(nodes) == REST
+
+
+def test_estop_ends_pushing_at_once_and_until_it_is_released() -> None:
+    nodes = nodes_of(calm())
+    nodes.step([*thrust(0.0, ARMED, 0), dock(PUSHES, 1), sync(0)])
+    nodes.step([Frame(0x01E, b"")])
+    assert magnets(nodes) == REST
+    for tick in range(1, 31):
+        nodes.step([*thrust(0.0, ARMED, tick), dock(PUSHES, tick + 1), sync(tick)])
+        assert magnets(nodes) == REST
+    nodes.step([*thrust(0.0, DISARMED, 31), dock(PUSHES, 32), sync(31)])
+    assert magnets(nodes) == PUSHES
 
 
 def test_frames_for_other_numbers_move_nothing() -> None:

@@ -1,5 +1,6 @@
 """The vehicle's process on a bus where nobody answers: what it says, where it logs, how it starts and ends."""
 
+import dataclasses
 import errno
 import os
 import signal
@@ -13,13 +14,13 @@ import pytest
 from firmware_py.app.vehicle import recording, run_vehicle
 from firmware_py.bus.port import PortError
 from firmware_py.core.types import Event, Inputs, ModuleCommand, Outputs
-from firmware_py.description.fleet import Fleet, single
+from firmware_py.description.fleet import Fleet, Module, single
 from firmware_py.description.parameters import Parameters, Supervision
 from firmware_py.runtime import teller
 from firmware_py.runtime.flight_log import FlightLog
 from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
-from tests.unit.test_last_flight import FLEET, lines_of
+from tests.unit.test_last_flight import FLEET, dock_line, lines_of
 
 REARM = Parameters(supervision=Supervision(rearm=1))
 HOLDS = "the process before ended in flight: holding as soon as the vehicle may (REARM)"
@@ -140,11 +141,11 @@ def test_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
         assert refused.value.filename is not None  # the command line makes one line and status 2 of it
 
 
-def in_flight(tmp_path: Path) -> Fleet:
+def in_flight(tmp_path: Path, more: str = "", modules: tuple[Module, ...] = FLEET.module) -> Fleet:
     """Leaves the log of a process that was killed in flight just now."""
     tmp_path.joinpath("log").mkdir()
-    tmp_path.joinpath("log", CAN_LOG).write_text(lines_of([True] * 3))
-    return Fleet(module=FLEET.module, buses=(bus_of(tmp_path), f"{bus_of(tmp_path)}-b"))
+    tmp_path.joinpath("log", CAN_LOG).write_text(lines_of([True] * 3) + more)
+    return Fleet(module=modules, buses=(bus_of(tmp_path), f"{bus_of(tmp_path)}-b"))
 
 
 def test_process_killed_in_flight_holds_again_where_a_parameter_says_so(tmp_path: Path) -> None:
@@ -158,6 +159,41 @@ def test_process_killed_in_flight_waits_to_be_armed_otherwise(tmp_path: Path) ->
     fleet = in_flight(tmp_path)
     assert HOLDS not in fly(tmp_path, None, parameters=REARM, fleet=fleet)
     assert HOLDS not in fly(tmp_path, tmp_path / "log", fleet=fleet)
+
+
+PAIR = dock_line(0, (1, 0, 0, 0, 0, 0)) + dock_line(1, (0, 1, 0, 0, 0, 0))
+"""Face A of the first module and face B of the second pull."""
+APART = (
+    "warning: modules 1 on {bus}, 2 on {bus} were docked, or about to be, and their magnets let go: "
+    "the fleet file has to say so (body, cell) before they fly as one or REARM arms them"
+)
+
+
+def docked(first: int, second: int) -> tuple[Module, ...]:
+    """The fleet's modules, of which two start docked."""
+    modules = list(FLEET.module)
+    for x, index in enumerate((first, second)):
+        modules[index] = dataclasses.replace(modules[index], body=0, cell=np.array([x, 0, 0]))
+    return tuple(modules)
+
+
+@pytest.mark.parametrize("parameters", [REARM, Parameters()])
+def test_modules_that_docked_in_flight_are_named_and_not_armed_again(tmp_path: Path, parameters: Parameters) -> None:
+    said = fly(tmp_path, tmp_path / "log", parameters=parameters, fleet=in_flight(tmp_path, PAIR))
+    assert said[0] == APART.format(bus=bus_of(tmp_path))
+    assert HOLDS not in said
+    assert any(line.startswith("running at") for line in said)  # the start refuses nothing
+
+
+def test_modules_that_the_fleet_file_has_docked_hold_again(tmp_path: Path) -> None:
+    said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, PAIR, docked(0, 1)))
+    assert said[0] == HOLDS
+
+
+def test_dock_at_another_face_than_the_fleet_files_is_none_of_its_joints(tmp_path: Path) -> None:
+    said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, PAIR, docked(1, 0)))
+    assert said[0] == APART.format(bus=bus_of(tmp_path))
+    assert HOLDS not in said
 
 
 class Tape(Recorder):
