@@ -35,6 +35,7 @@ from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import MonotonicClock, unix_ns
 from firmware_py.runtime.rate_keeper import RateKeeper
 from firmware_py.runtime.realtime import die_with, use_priority
+from firmware_py.runtime.teller import Teller, write_line
 
 _AFTER = 0.1
 """Share of a period that ticks may differ in length before the thread comes too early for one."""
@@ -78,6 +79,7 @@ class GroundSide:
         unix_now_ns: the time of day, for signing.
         priority: SCHED_FIFO priority of the thread, beside a loop that has one; 0: an ordinary thread.
         started: parameters before the stored ones were laid over them; None: the firmware's.
+        say: told in one line what ended the thread, by a thread of its own.
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class GroundSide:
         unix_now_ns: Callable[[], int] = unix_ns,
         priority: int = 0,
         started: Parameters | None = None,
+        say: Callable[[str], None] = write_line,
     ) -> None:
         """Opens the links. Raises DescriptionError for a link, key file or parameter file that is wrong."""
         self._config, self._pipeline, self._unix_now_ns = config, firmware.pipeline, unix_now_ns
@@ -105,6 +108,7 @@ class GroundSide:
         self._clock = MonotonicClock()
         self._handed_over_ns = 0
         self._priority = priority
+        self._say = say
         self._stopping = False
         self._saved_ns = 0
         self._switch_s = 0.0
@@ -157,7 +161,7 @@ class GroundSide:
             self._executor.submit(_plan_mission, _NOTHING, None)
         self._switch_s = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
-        self._thread = threading.Thread(target=self._run, name="ground", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(Teller(self._say),), name="ground", daemon=True)
         self._thread.start()
         return self
 
@@ -177,7 +181,7 @@ class GroundSide:
         if isinstance(self._executor, ProcessPoolExecutor):
             self._executor.shutdown(wait=True, cancel_futures=True)
 
-    def _run(self) -> None:
+    def _run(self, teller: Teller) -> None:
         if self._priority:
             use_priority(self._priority)  # where the system refuses it, the loop has said so
         try:
@@ -186,6 +190,8 @@ class GroundSide:
                 self.pump()
         except Exception as error:  # the flight is worth more than its telemetry
             self.error = error
+            teller.say(f"warning: no ground station is heard any more: {type(error).__name__}: {error}")
+        teller.close()
 
     def _rest_s(self) -> float:
         """Until shortly after the next tick; when it is overdue, half as long again as it is already waited for."""

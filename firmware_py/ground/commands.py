@@ -21,6 +21,7 @@ _FORCED = (21196, 2989)
 """Second parameter of a forced arm or disarm: MAVLink's, and ArduPilot's for arming."""
 _FACES = 6
 
+SET_MODE, TERMINATE, ARM = 176, 185, 400
 DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
 """User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
 
@@ -47,16 +48,16 @@ class CommandService:
         self._table: dict[int, Callable[[Command], Answer]] = {
             20: self._surface,  # NAV_RETURN_TO_LAUNCH
             21: self._surface,  # NAV_LAND
-            176: self._set_mode,
+            SET_MODE: self._set_mode,
             178: self._change_speed,
-            185: self._terminate,
+            TERMINATE: self._terminate,
             192: self._reposition,
             193: self._pause,
             209: self._motor_test,
             224: self._set_current,
             246: self._reboot,
             300: lambda c: self._start_mission(c, max(0, int(c.get(1)))),
-            400: self._arm,
+            ARM: self._arm,
             DOCK: lambda c: self._dock(c, Action.DOCK),
             UNDOCK: lambda c: self._dock(c, Action.UNDOCK),
             ESTOP: self._estop,
@@ -75,7 +76,7 @@ class CommandService:
                 self._finish(pending, DENIED)
 
     def step(self, time_ns: int) -> None:
-        """Answer what is decided by now."""
+        """Answer what is decided by now, also when the body is gone."""
         for pending in list(self._pending):
             if pending.is_done():
                 self._finish(pending, ACCEPTED)
@@ -97,9 +98,17 @@ class CommandService:
 
     def _run(self, command: Command) -> None:
         handler = self._table.get(command.number)
-        answer = UNSUPPORTED if handler is None else handler(command)
+        if not self._system.body_is_known and not _stops(command):
+            answer: Answer = self._refuse(command)
+        else:
+            answer = UNSUPPORTED if handler is None else handler(command)
         if answer is not None:
             self._acknowledge(command, answer)
+
+    def _refuse(self, command: Command) -> Answer:
+        """The body is gone."""
+        self._system.refuse(command.arrival.time_ns)
+        return TEMPORARILY_REJECTED
 
     def _acknowledge(self, command: Command, result: int) -> None:
         values = {"command": command.number, "result": result, **command.arrival.sender}
@@ -120,7 +129,7 @@ class CommandService:
         subject = self._system.subject
         forced = int(command.get(2)) in _FORCED
         if command.get(1) < 0.5:
-            return self._ask(command, Action.DISARM, forced, lambda: not subject.armed)
+            return self._ask(command, Action.DISARM, forced, lambda: not subject.picture.is_armed(subject.leader))
         return self._ask(command, Action.ARM, forced, lambda: subject.armed)
 
     def _set_mode(self, command: Command) -> Answer:
@@ -134,8 +143,9 @@ class CommandService:
     def _set_mode_message(self, arrival: Arrival) -> None:
         """The old message, which has no acknowledgement of its own."""
         custom = arrival.message["custom_mode"]
-        command = Command(176, (1.0, *[math.nan] * 6), arrival)
-        answer = self._enter(command, self._system.subject.identity.mode(custom), custom)
+        command = Command(SET_MODE, (1.0, *[math.nan] * 6), arrival)
+        mode = self._system.subject.identity.mode(custom)
+        answer = self._enter(command, mode, custom) if self._system.body_is_known else self._refuse(command)
         if answer is not None:
             self._acknowledge(command, answer)
 
@@ -192,7 +202,7 @@ class CommandService:
 
     def _estop(self, command: Command) -> Answer:
         s = self._system.subject
-        return self._ask(command, Action.ESTOP, None, lambda: s.picture.is_stopped(s.body))
+        return self._ask(command, Action.ESTOP, None, lambda: s.picture.is_stopped(s.leader))
 
     def _clear_estop(self, command: Command) -> Answer:
         s = self._system.subject
@@ -232,3 +242,9 @@ class CommandService:
         s = self._system.subject
         is_turning = lambda: s.picture.mode(s.body) == Mode.MOTOR_DETECT and s.armed  # noqa: E731
         return self._ask(command, Action.MOTOR_TEST, (thruster, share, seconds), is_turning)
+
+
+def _stops(command: Command) -> bool:
+    """E-stop, termination and disarm: they are taken whoever leads the body."""
+    raised = command.get(1) >= 0.5
+    return command.number == ESTOP or (command.number, raised) in ((TERMINATE, True), (ARM, False))

@@ -39,6 +39,10 @@ class GroundConfig:
         if wrong := [face for face in self.dock_button[1::2] if face >= len(FACE_NAMES)]:
             raise DescriptionError(f"dock_button names face {wrong[0]}; faces are 0 to {len(FACE_NAMES) - 1}: {', '.join(FACE_NAMES)}")
 
+    def watches(self, system: int, component: int) -> bool:
+        """Whether a ground station may be the one that must not be lost, and steer."""
+        return self.watch_system in (0, system) and self.watch_component in (0, component)
+
     @property
     def encoding(self) -> Identity:
         """Of modes."""

@@ -1,6 +1,7 @@
 """Missions in the water: from items to legs, a plan asked of whoever can plan, and where on it the body is.
 
-Planning takes a second and happens elsewhere: a PlanJob goes out, a Plan comes back, and the body tracks it.
+Planning takes a second and happens elsewhere: a PlanJob goes out, a Plan comes back, and the body tracks it. Whoever takes the body for
+something else until then ends the flight.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ NONE, READY, ACTIVE, PAUSED, DONE = 1, 2, 3, 4, 5
 """MISSION_STATE."""
 _SETTLE_TICKS = 3
 """Ticks from asking for a hold to reading where it is held."""
+_HOLD_TICKS = 100
+"""Ticks from asking for a hold until it must be there: those that were queued while the loop took the request count too."""
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
 _INFORMATION, _WARNING = 6, 4
 _GO_TO = -1
@@ -68,6 +71,10 @@ class _Flight:
 
     legs: tuple[Leg, ...]
     arrivals_s: tuple[float, ...] = ()
+    taken: int = 0
+    """System.taken when it began."""
+    holds: bool = False
+    """The hold in which it waits for its plan was there."""
     started_ns: int | None = None
     reached: int = 0
 
@@ -83,6 +90,8 @@ class MissionFlight:
         self._serial = 0
         self._flight: _Flight | None = None
         self._plan_at_tick: int | None = None
+        """None once it is asked for."""
+        self._hold_by_tick = 0
         self._speed: float | None = None
         self._repeat: list[tuple[int, int]] = []
 
@@ -99,6 +108,7 @@ class MissionFlight:
     def start(self, first: int | None) -> str:
         """Fly from item `first`, or go on where it stopped. Returns why not, or nothing."""
         s = self._system.subject
+        self._end_if_taken()
         if not self.items:
             return "there is none"
         if not s.armed:
@@ -121,6 +131,7 @@ class MissionFlight:
         """Go on at item `index`. Returns why not, or nothing."""
         if index not in range(len(self.items)):
             return f"item {index} of {len(self.items)} does not exist"
+        self._end_if_taken()
         p = self._system.subject.progress
         if p.state == ACTIVE:
             return self.start(index)
@@ -149,7 +160,8 @@ class MissionFlight:
     # ------------------------------------------------------------ what happens
 
     def planned(self, plan: Plan) -> None:
-        """A plan came back."""
+        """A plan came back; nothing is asked of a body that does something else by now."""
+        self._end_if_taken()
         if plan.serial != self._serial or self._flight is None:
             return
         if plan.trajectory is None:
@@ -166,6 +178,7 @@ class MissionFlight:
 
     def step(self, time_ns: int) -> None:
         """Follow the body along its legs."""
+        self._end_if_taken()
         self._ask_for_plan()
         flight, s = self._flight, self._system.subject
         if flight is not None and flight.arrivals_s:
@@ -176,13 +189,34 @@ class MissionFlight:
                 self._advance(flight, time_ns)
                 if not tracking and self._flight is flight:
                     self._end(PAUSED)
-        elif flight is not None and not s.armed:
-            self._end(PAUSED)
         self._tell_again(time_ns)
+
+    def _end_if_taken(self) -> None:
+        """End a flight that did not begin when the body no longer waits for it."""
+        flight = self._flight
+        if flight is None or flight.started_ns is not None:
+            return
+        reason = self._against_waiting(flight)
+        if reason:
+            self._system.say(_WARNING, f"flight ended before it began: {reason}")
+            self._end(PAUSED)
+
+    def _against_waiting(self, flight: _Flight) -> str:
+        """Why a flight is not waited for any more; empty while it is."""
+        s = self._system.subject
+        mode = s.picture.mode(s.body)
+        flight.holds = flight.holds or mode == Mode.POSHOLD
+        if not s.armed:
+            return "the vehicle is disarmed"
+        if self._system.taken != flight.taken:
+            return "paused, or something else was asked for"
+        if mode == Mode.POSHOLD or (mode == Mode.AUTO and flight.arrivals_s):
+            return ""
+        return f"the mode is {mode.name}" if flight.holds or s.picture.ticks > self._hold_by_tick else ""
 
     def _ask_for_plan(self) -> None:
         s = self._system.subject
-        if self._plan_at_tick is None or s.picture.ticks < self._plan_at_tick or self._flight is None:
+        if self._plan_at_tick is None or s.picture.ticks < self._plan_at_tick or self._flight is None or not self._flight.holds:
             return
         self._plan_at_tick = None
         at, ground = s.record.setpoint, self._parameters().ground
@@ -216,13 +250,14 @@ class MissionFlight:
 
     def _begin(self, legs: Sequence[Leg]) -> None:
         s = self._system.subject
-        self._flight = _Flight(tuple(legs))
         self._serial += 1  # a plan that is still being made is no longer wanted
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
-        self._plan_at_tick = s.picture.ticks + _SETTLE_TICKS
+        self._flight = _Flight(tuple(legs), taken=self._system.taken)
+        self._plan_at_tick, self._hold_by_tick = s.picture.ticks + _SETTLE_TICKS, s.picture.ticks + _HOLD_TICKS
 
     def _end(self, state: int) -> None:
         flight, self._flight, self._plan_at_tick = self._flight, None, None
+        self.jobs.clear()
         if flight is not None and flight.legs[0].sequence != _GO_TO:
             self._system.subject.progress.state = state
 

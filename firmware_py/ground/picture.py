@@ -104,6 +104,10 @@ class Picture:
         """Fleet indices of a body's modules."""
         return self.bodies[body].modules if body in self.bodies else (body,)
 
+    def leader(self, module: int) -> int:
+        """Number of the body that holds a module; the module's own when no tick has told."""
+        return next((body.index for body in self.bodies.values() if module in body.modules), module)
+
     def is_armed(self, body: int) -> bool:
         """Whether its thrusters may turn."""
         record = self.records.get(body)

@@ -48,11 +48,7 @@ class Presence:
         """A heartbeat counts when system, component and type are exactly those that are watched."""
         m = arrival.message
         station: Station = (m.system, m.component, m["type"])
-        if m["type"] != TYPE_GROUND_STATION:
-            return
-        if self._config.watch_system and m.system != self._config.watch_system:
-            return
-        if self._config.watch_component and m.component != self._config.watch_component:
+        if m["type"] != TYPE_GROUND_STATION or not self._config.watches(m.system, m.component):
             return
         patience_ns = self._parameters().ground.watch_s * NS_PER_S
         if self.watched is None or arrival.time_ns - self._heard_ns > patience_ns:
@@ -79,6 +75,9 @@ class Presence:
         m = arrival.message
         if self._system.subject.picture.any_armed or not arrival.trusted:
             self._system.say(_WARNING, "signing refused: only disarmed, and on a trusted link")
+            return
+        if self._signing.is_ahead(m["initial_timestamp"]):
+            self._system.say(_WARNING, "signing refused: its time stamp is more than a minute ahead of the clock here")
             return
         key = bytes(m["secret_key"])
         if len(key) == KEY_BYTES:

@@ -21,10 +21,13 @@ EPOCH_S = 1_420_070_400
 _UNITS_PER_S = 100_000
 _NEW_STREAM_UNITS = 60 * _UNITS_PER_S
 """A stream that was never heard may be a minute behind."""
+_AHEAD_UNITS = 60 * _UNITS_PER_S
+"""A stamp may be a minute ahead of the clock."""
 _FLOOR_MARGIN = _UNITS_PER_S
 """The stored time stamp is that much ahead, as long as the interval at which it is stored."""
 _MOST_STREAMS = 256
-_TIME_MASK = (1 << 48) - 1
+_LATEST = (1 << 48) - 1
+"""The last time stamp that there is."""
 RADIO_STATUS = 109
 """The one message that is believed unsigned: radios inject it and have no key."""
 
@@ -44,29 +47,37 @@ class Signing:
     key: bytes | None = None
     timestamp: int = 0
     """Of the next frame that goes out; at least that of every believed frame."""
+    clock: int = 0
+    """The time of day when it was told last; 0: never."""
     floor: int = 0
     """New streams start above this: nothing from before the last start is believed again."""
     streams: dict[Stream, int] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
-    """Frames by what became of them: good, unsigned, bad, replayed, old, full."""
+    """Frames by what became of them: good, unsigned, bad, ahead, replayed, old, full."""
     changed: bool = False
     """There is something to store."""
 
     def advance(self, unix_ns: int) -> None:
-        """Follow the clock; never goes back."""
-        self.timestamp = max(self.timestamp, units_of(unix_ns))
+        """Follow the clock; the time stamp never goes back."""
+        self.clock = units_of(unix_ns)
+        self.timestamp = max(self.timestamp, self.clock)
+
+    def is_ahead(self, stamp: int) -> bool:
+        """Whether a time stamp is of a time to come. A clock that was not set, or is behind what is stored, cannot tell."""
+        is_set = self.clock > max(0, self.floor - _AHEAD_UNITS - _FLOOR_MARGIN)
+        return is_set and stamp > self.clock + _AHEAD_UNITS
 
     def adopt(self, key: bytes, timestamp: int) -> None:
         """Take a new key; all zeros turn signing off."""
         self.key = key if any(key) else None
-        self.timestamp = max(self.timestamp, timestamp & _TIME_MASK)
+        self.timestamp = max(self.timestamp, min(timestamp, _LATEST))
         self.streams.clear()
         self.changed = True
 
     def sign(self, frame: bytes, link: int) -> bytes:
         """The 13 bytes that follow `frame`."""
         assert self.key is not None
-        self.timestamp += 1
+        self.timestamp = min(self.timestamp + 1, _LATEST)
         tail = bytes([link & 0xFF]) + self.timestamp.to_bytes(6, "little")
         return tail + _digest(self.key, frame + tail)
 
@@ -85,7 +96,9 @@ class Signing:
     def _is_new(self, stamp: int, stream: Stream) -> bool:
         newest = self.streams.get(stream)
         verdict = "good"
-        if newest is not None and stamp <= newest:
+        if self.is_ahead(stamp):
+            verdict = "ahead"
+        elif newest is not None and stamp <= newest:
             verdict = "replayed"
         elif newest is None and (stamp <= self.floor or stamp < self.timestamp - _NEW_STREAM_UNITS):
             verdict = "old"

@@ -29,6 +29,8 @@ from firmware_py.ground.telemetry import Subject
 from firmware_py.ground.wire import Framer, Packet
 
 _SYSTEMS = 256
+_MAY_STOP = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE", "MANUAL_CONTROL")
+"""They go to services that know what stops."""
 _NEVER_FORWARDED = ("SETUP_SIGNING", "RADIO_STATUS")
 
 
@@ -40,7 +42,7 @@ class Services:
         self.system = system
         self.flight = MissionFlight(system, lambda: store.values)
         self.missions = MissionService(system, self.flight)
-        self.steering = Steering(system, lambda: store.values, _dock_of(config))
+        self.steering = Steering(system, lambda: store.values, _dock_of(config), config.watches)
         self.presence = Presence(system, config, lambda: store.values, station.signing)
         self.logs = LogService(system, Path(config.logs) if config.logs else None)
         self.parameters = ParameterService(system, store, station.present)
@@ -50,11 +52,24 @@ class Services:
         }
         self.commands = CommandService(system, self.flight, self.steering, MessageRequests(system, extra))
         parts = (self.commands, self.parameters, self.missions, self.steering, self.presence, self.logs)
-        self.handlers = {name: handler for part in parts for name, handler in part.handlers().items()}
+        self._handlers = {name: handler for part in parts for name, handler in part.handlers().items()}
+
+    def take(self, arrival: Arrival, addressed: bool) -> None:
+        """A message for this system, `addressed`, or for all. A system whose body is gone hears what may stop it; the rest it refuses."""
+        name = arrival.message.name
+        handler = self._handlers.get(name)
+        if handler is None:
+            return
+        if self.system.body_is_known or (addressed and name in _MAY_STOP):
+            handler(arrival)
+        elif addressed:
+            self.system.refuse(arrival.time_ns)
 
     def step(self, time_ns: int) -> None:
         """Move on what takes longer than one message."""
         self.commands.step(time_ns)
+        if not self.system.body_is_known:
+            return
         self.parameters.step()
         self.missions.step(time_ns)
         self.flight.step(time_ns)
@@ -92,13 +107,12 @@ class GroundStation:
         self.picture.observe(inputs, outputs, bodies)
         for event in outputs.events:
             for services in self.services.values():
-                if event.body in (None, services.system.body):
+                if event.body in (None, services.system.body, services.system.subject.leader):
                     services.commands.hear(event)
                     services.flight.hear(event)
         self._tell()
         for services in self.services.values():
-            if services.system.body_is_known:
-                services.step(outputs.time_ns)
+            services.step(outputs.time_ns)
 
     def _tell(self) -> None:
         """Events as texts of the body that they are about; the first one tells what is about no body."""
@@ -193,10 +207,8 @@ class GroundStation:
         if target and component not in (0, 1):
             return
         for number, services in self.services.items():
-            if target in (0, number) and services.system.body_is_known:
-                handler = services.handlers.get(message.name)
-                if handler is not None:
-                    handler(arrival)
+            if target in (0, number):
+                services.take(arrival, target == number)
 
     def _forward(self, packet: Packet, target: int, channel: int) -> None:
         """To whom it is for, where that system was heard; to everybody else what is for all."""

@@ -15,7 +15,8 @@ import numpy as np
 from firmware_py.core.rotations import from_euler, multiply, normalise, rotate, to_euler
 from firmware_py.core.types import Action, DockRequest, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
-from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
+from firmware_py.ground.pilots import Pilots
+from firmware_py.ground.system import NS_PER_S, STOPPING, Arrival, Handler, System
 
 _FULL, _MIDDLE_UP = 1000.0, 500.0
 _ABSENT = 0x7FFF
@@ -77,13 +78,13 @@ class Steering:
         system: System,
         parameters: Callable[[], Parameters],
         dock: DockRequest | None,
+        may_steer: Callable[[int, int], bool],
         buttons: Sequence[str] = BUTTONS,
     ) -> None:
-        """`dock` is what the buttons `dock` and `undock` ask for."""
+        """`dock` is what the buttons `dock` and `undock` ask for; `may_steer`: whose sticks are taken, by system and component."""
         self._system, self._parameters, self._dock, self._buttons = system, parameters, dock, buttons
-        self._pressed = 0
+        self._pilots = Pilots(system, may_steer, lambda: parameters().steering.stick_timeout_s)
         self._sticks = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        self._sticks_ns: int | None = None
         self._setpoint_ns: int | None = None
         self._setpoint: Setpoint | None = None
 
@@ -98,10 +99,8 @@ class Steering:
 
     def is_neutral(self, time_ns: int) -> bool:
         """Whether nobody holds a stick."""
-        steering = self._parameters().steering
-        if self._sticks_ns is None or time_ns - self._sticks_ns > steering.stick_timeout_s * NS_PER_S:
-            return True
-        return max(map(abs, (*self._sticks.force, *self._sticks.moment))) <= steering.stick_dead
+        deflection = max(map(abs, (*self._sticks.force, *self._sticks.moment)))
+        return self._pilots.are_silent(time_ns) or deflection <= self._parameters().steering.stick_dead
 
     def has_setpoint(self, time_ns: int) -> bool:
         """Whether set-points stream in."""
@@ -131,8 +130,11 @@ class Steering:
             _axis(m["s"]) if extensions & 1 else 0.0,
             _axis(m["r"]),
         )
-        self._steer(Sticks(force, moment), arrival.time_ns)
-        self._press(m["buttons"] | m["buttons2"] << 16)
+        fresh = self._pilots.freshly_pressed(arrival, m["buttons"] | m["buttons2"] << 16)
+        steers = self._steer(Sticks(force, moment), arrival)
+        for number, name in enumerate(self._buttons):
+            if fresh >> number & 1 and (steers or _BUTTON_ACTIONS.get(name) in STOPPING):
+                self._do(name)
 
     def _up(self, z: float) -> float:
         if z == _ABSENT:
@@ -142,21 +144,22 @@ class Steering:
         return min(max((z - _MIDDLE_UP) / _MIDDLE_UP, -1.0), 1.0)
 
     def _override(self, arrival: Arrival) -> None:
-        """ArduSub's channels: 1 pitch, 2 roll, 3 up, 4 yaw, 5 forward, 6 right."""
-        m = arrival.message
-        pitch, roll, up, yaw, forward, right = (_channel(m[f"chan{i}_raw"]) for i in range(1, 7))
-        self._steer(Sticks((forward, right, -up), (roll, pitch, yaw)), arrival.time_ns)
+        """ArduSub's channels: 1 pitch, 2 roll, 3 up, 4 yaw, 5 forward, 6 right. One that overrides none of them is nothing."""
+        channels = [arrival.message[f"chan{i}_raw"] for i in range(1, 7)]
+        if any(map(_is_overridden, channels)):
+            pitch, roll, up, yaw, forward, right = map(_channel, channels)
+            self._steer(Sticks((forward, right, -up), (roll, pitch, yaw)), arrival)
 
-    def _steer(self, sticks: Sticks, time_ns: int) -> None:
-        self._sticks, self._sticks_ns = sticks, time_ns
-        self._system.ask(Action.STICKS, sticks)
-
-    def _press(self, buttons: int) -> None:
-        fresh = buttons & ~self._pressed
-        self._pressed = buttons
-        for number, name in enumerate(self._buttons):
-            if fresh >> number & 1:
-                self._do(name)
+    def _steer(self, sticks: Sticks, arrival: Arrival) -> bool:
+        """Take the sticks of who has them. Returns whether it was the sender."""
+        if not self._system.body_is_known:
+            self._system.refuse(arrival.time_ns)
+            return False
+        steers = self._pilots.steers(arrival)
+        if steers:
+            self._sticks = sticks
+            self._system.ask(Action.STICKS, sticks)
+        return steers
 
     def _do(self, name: str) -> None:
         if name in _BUTTON_MODES:
@@ -249,9 +252,11 @@ def _axis(value: float) -> float:
 
 
 def _channel(pwm: int) -> float:
-    if not _PWM_LOW <= pwm <= _PWM_HIGH:
-        return 0.0  # 0 and 65535: not overridden
-    return min(max((pwm - _PWM_MIDDLE) / _PWM_HALF, -1.0), 1.0)
+    return min(max((pwm - _PWM_MIDDLE) / _PWM_HALF, -1.0), 1.0) if _is_overridden(pwm) else 0.0
+
+
+def _is_overridden(pwm: int) -> bool:
+    return _PWM_LOW <= pwm <= _PWM_HIGH  # neither 0 nor 65535
 
 
 def _vector(message: Any, *names: str) -> np.ndarray:

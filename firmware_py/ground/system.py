@@ -14,6 +14,13 @@ from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS, Subject
 NS_PER_S = 1_000_000_000
 _TEXT = 50
 """Characters of one STATUSTEXT."""
+_SELDOM_NS = 5 * NS_PER_S
+"""Between two texts about what streams in."""
+_WARNING = 4
+STOPPING = frozenset({Action.ESTOP, Action.DISARM})
+"""What reaches a module whichever body it is part of."""
+STEERING = STOPPING | {Action.SET_MODE, Action.HOLD, Action.DOCK, Action.UNDOCK, Action.MOTOR_TEST}
+"""By which somebody takes the body for something else."""
 
 
 class Arrival(NamedTuple):
@@ -44,7 +51,10 @@ class System:
     """Everybody who is there, with the rates that they want."""
     requests: list[Request] = field(default_factory=list)
     """For the next tick."""
+    taken: int = 0
+    """How often somebody asked the body for something else than what it does."""
     _text_number: int = 0
+    _refused_ns: int = -_SELDOM_NS
 
     @property
     def body(self) -> int:
@@ -73,7 +83,18 @@ class System:
 
     def ask(self, action: Action, argument: Any = None) -> None:
         """Put a request to the next tick."""
-        self.requests.append(Request(action, self.body, argument))
+        self.taken += action in STEERING
+        body = self.subject.leader if action in STOPPING else self.body
+        self.requests.append(Request(action, body, argument))
+
+    def refuse(self, time_ns: int) -> None:
+        """Say who leads the body that is gone; what streams in is told of seldom."""
+        if time_ns - self._refused_ns < _SELDOM_NS:
+            return
+        self._refused_ns = time_ns
+        own, leader = self.outbox.system, self.outbox.system - self.body + self.subject.leader
+        why = f"docked, system {leader} leads it now" if leader != own else "no tick has told of its body"
+        self.say(_WARNING, f"system {own} is not steered: {why}")
 
     def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
         """To one channel."""

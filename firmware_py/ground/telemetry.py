@@ -61,6 +61,11 @@ class Subject:
         return [self.picture.modules[m] for m in self.picture.members(self.body)]
 
     @property
+    def leader(self) -> int:
+        """Number of the body that its leader's module is part of: its own, but while it is docked into another."""
+        return self.picture.leader(self.body)
+
+    @property
     def time_ms(self) -> int:
         """Since start."""
         return (self.picture.time_ns - self.boot_ns) // 1_000_000

@@ -82,3 +82,82 @@ def test_parted_bodies_are_two_systems_again(world: World, client: Client) -> No
     client.clear()
     world.run(101)
     assert {m.get_srcSystem() for m in client.all("HEARTBEAT")} == {1, 2}
+
+
+@pytest.fixture
+def docked(world: World, client: Client) -> World:
+    """Both armed, then one body, which system 1 leads."""
+    for target in (1, 2):
+        client.command(400, 1, target=target)
+    world.run(3)
+    world.robot.dock()
+    world.run(3)
+    world.robot.asked.clear()
+    client.clear()
+    return world
+
+
+def asked_of(world: World) -> list[tuple[Action, int]]:
+    return [(request.action, request.body) for request in world.robot.asked]
+
+
+def answers(client: Client) -> list[tuple[int, int, int]]:
+    return [(ack.get_srcSystem(), ack.command, ack.result) for ack in client.all("COMMAND_ACK")]
+
+
+@pytest.mark.parametrize(("number", "parameter", "action"), [(31012, 0, Action.ESTOP), (185, 1, Action.ESTOP), (400, 0, Action.DISARM)])
+def test_what_stops_a_docked_system_reaches_the_body_that_holds_its_module(
+    docked: World, client: Client, number: int, parameter: float, action: Action
+) -> None:
+    client.command(number, parameter, target=2)
+    docked.run(5)
+    assert asked_of(docked) == [(action, 0)]
+    assert answers(client) == [(2, number, 0)]
+    assert docked.robot.state[0] != State.ARMED
+
+
+@pytest.mark.parametrize(("button", "action"), [(4, Action.DISARM), (7, Action.ESTOP)])
+def test_stopping_buttons_of_a_docked_system_act_and_its_sticks_do_not(docked: World, client: Client, button: int, action: Action) -> None:
+    client.send("MANUAL_CONTROL", 2, 500, 0, 500, 0, 1 << button | 1 << 6 | 1 << 1)
+    docked.run(2)
+    assert asked_of(docked) == [(action, 0)]
+
+
+def test_refused_disarming_of_a_docked_system_is_answered_by_it(docked: World, client: Client) -> None:
+    docked.robot.refuse[Action.DISARM] = "it moves"
+    client.command(400, 0, target=2)
+    docked.run(3)
+    assert answers(client) == [(2, 400, 2)]
+
+
+@pytest.mark.parametrize(("number", "parameter"), [(400, 1), (176, 1), (185, 0), (31013, 0), (300, 0), (2000, 0)])
+def test_every_other_command_to_a_docked_system_is_refused_with_the_name_of_its_leader(
+    docked: World, client: Client, number: int, parameter: float
+) -> None:
+    client.command(number, parameter, 1, target=2)
+    docked.run(2)
+    assert answers(client) == [(2, number, 1)]
+    assert client.texts == "system 2 is not steered: docked, system 1 leads it now"
+    assert not asked_of(docked)
+
+
+def test_old_mode_message_to_a_docked_system_is_refused_too(docked: World, client: Client) -> None:
+    client.send("SET_MODE", 2, 1, 1 << 16)
+    docked.run(2)
+    assert answers(client) == [(2, 176, 1)] and not asked_of(docked)
+
+
+def test_streams_to_a_docked_system_are_told_of_once_in_five_seconds(docked: World, client: Client) -> None:
+    for _ in range(100):
+        client.send("MANUAL_CONTROL", 2, 500, 0, 500, 0, 0)
+        client.send("RC_CHANNELS_OVERRIDE", 2, 1, *[1600] * 8)
+        client.send("PARAM_SET", 2, 1, b"STICK_Z", 1.0, 9)
+        docked.run(9)
+    assert client.texts.count("system 1 leads it now") == 2
+    assert not asked_of(docked) and docked.station.store.values.ground.stick_z == 0
+
+
+def test_what_is_for_all_is_not_refused_by_a_docked_system(docked: World, client: Client) -> None:
+    client.command(410, target=0)
+    docked.run(2)
+    assert answers(client) == [(1, 410, 0)] and not client.texts

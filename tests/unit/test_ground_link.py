@@ -5,8 +5,10 @@ import pty
 import re
 import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
+from queue import Queue
 from types import SimpleNamespace
 from typing import Any
 
@@ -224,6 +226,17 @@ def test_a_tick_only_hands_over_its_results() -> None:
             side.requests()
         assert (time.perf_counter() - start) / 10_000 < 50e-6
         assert len(side._ticks) == 200
+
+
+def test_ground_side_that_ends_says_so_and_the_vehicle_goes_on() -> None:
+    firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
+    said: Queue[str] = Queue()
+    config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",))
+    with GroundSide(config, firmware, ThreadPoolExecutor(1), unix_now_ns=lambda: 1 // 0, say=said.put) as side:
+        line = said.get(timeout=PATIENCE_S)
+        assert "no ground station is heard any more: ZeroDivisionError" in line and "\n" not in line
+        assert side.requests() == []
+    assert isinstance(side.error, ZeroDivisionError)
 
 
 def test_logs_are_listed_and_fetched(tmp_path: Path) -> None:

@@ -174,3 +174,49 @@ def test_the_watched_station_is_exactly_one() -> None:
     other.heartbeat()
     world.run(1)
     assert world.station.services[1].presence.watched == (254, 190, 6)
+
+
+LAST = 2**48 - 1
+MINUTE = 60 * 100_000
+
+
+def test_the_last_time_stamp_is_the_last_one() -> None:
+    signing = Signing(key=KEY, timestamp=LAST)
+    assert [signing.sign(b"frame", 0)[1:7] for _ in range(2)] == [b"\xff" * 6] * 2
+    signing.adopt(KEY, 2**64 - 1)
+    assert signing.timestamp == LAST
+
+
+@pytest.mark.parametrize(("stamp", "is_taken"), [(NOW + MINUTE, True), (NOW + MINUTE + 1, False), (LAST, False), (2**64 - 1, False)])
+def test_key_from_more_than_a_minute_ahead_is_refused(stamp: int, is_taken: bool) -> None:
+    signing = Signing()
+    signing.advance(NOW_NS)
+    world = World(trusted=True, signing=signing)
+    client = world.client()
+    client.send("SETUP_SIGNING", 1, 1, list(KEY), stamp)
+    world.run(1)
+    assert (signing.key == KEY, signing.timestamp < NOW + 2 * MINUTE) == (is_taken, True)
+    assert ("more than a minute ahead" in client.texts) == (not is_taken)
+
+
+@pytest.mark.parametrize("stamp", [NOW + MINUTE + 1000, LAST - 10])
+def test_signed_frames_from_more_than_a_minute_ahead_are_refused_and_the_station_goes_on(stamp: int) -> None:
+    world = keyed_world()
+    real, ahead = with_key(world.client()), with_key(world.client(), at=stamp, link=1)
+    assert not armed(world, ahead)
+    assert world.station.signing.counts["ahead"] == 1 and world.station.signing.timestamp < NOW + MINUTE
+    assert armed(world, real)
+
+
+def test_a_stream_that_is_known_does_not_leap_ahead_either() -> None:
+    world = keyed_world()
+    client = with_key(world.client())
+    client.heartbeat()
+    assert not armed(world, with_key(client, at=NOW + 2 * MINUTE))
+
+
+def test_a_clock_that_is_behind_what_is_stored_locks_nobody_out() -> None:
+    signing = Signing(key=KEY, timestamp=NOW, floor=NOW)
+    signing.advance(NOW_NS - 3_600 * 1_000_000_000)
+    world = World(signing=signing)
+    assert armed(world, with_key(world.client(), at=NOW + 10 * MINUTE))

@@ -1,0 +1,108 @@
+"""Several who send sticks: one has them at a time, and what stops is taken from everybody."""
+
+import pytest
+
+from firmware_py.core.types import Action
+from firmware_py.ground.config import GroundConfig
+from tests.unit.ground_world import Client, World
+
+
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+@pytest.fixture
+def client(world: World) -> Client:
+    return world.client()
+
+ARM_BUTTON, DISARM_BUTTON, ESTOP_BUTTON = 1 << 6, 1 << 4, 1 << 7
+
+
+def sticks(world: World) -> list[float]:
+    """Forward stick of everything that was taken."""
+    return [r.argument.force[0] for r in world.robot.asked if r.action == Action.STICKS]
+
+
+def buttons(world: World) -> list[Action]:
+    return [r.action for r in world.robot.asked if r.action != Action.STICKS]
+
+
+@pytest.mark.parametrize("watched", [0, 255])
+def test_two_streams_do_not_mix(watched: int) -> None:
+    world = World(config=GroundConfig(watch_system=watched))
+    pilot, other = world.client(255), world.client(77)
+    for _ in range(100):
+        pilot.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, ARM_BUTTON)
+        other.send("MANUAL_CONTROL", 1, 0, 0, 500, 0, 1 << 1)
+        world.run(1)
+    assert sticks(world) == [1.0] * 100 and buttons(world) == [Action.ARM]
+
+
+def test_two_senders_of_one_system_do_not_mix_either() -> None:
+    world = World(config=GroundConfig(watch_system=255))
+    pilot, other = world.client(255, 190), world.client(255, 191)
+    for client, stick in ((pilot, 1000), (other, 0), (pilot, 1000)):
+        client.send("MANUAL_CONTROL", 1, stick, 0, 500, 0, ARM_BUTTON if stick else 0)
+    world.run(1)
+    assert sticks(world) == [1.0, 1.0] and buttons(world) == [Action.ARM]
+
+
+def test_sticks_of_another_than_the_watched_station_are_never_taken() -> None:
+    world = World(config=GroundConfig(watch_system=255))
+    other = world.client(77)
+    other.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, ARM_BUTTON)
+    other.send("RC_CHANNELS_OVERRIDE", 1, 1, *[1600] * 8)
+    world.run(100)
+    other.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, ARM_BUTTON)
+    world.run(1)
+    assert not world.robot.asked
+
+
+def test_sticks_pass_to_another_only_after_the_timeout() -> None:
+    world = World()
+    pilot, other = world.client(255), world.client(77)
+    pilot.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, 0)
+    ticks = round(world.parameters.steering.stick_timeout_s * 100)
+    for _ in range(ticks):
+        world.run(1)
+        other.send("RC_CHANNELS_OVERRIDE", 1, 1, 1500, 1500, 1500, 1500, 1300, 1500, 0, 0)
+    assert sticks(world) == [1.0]
+    world.run(1)
+    other.send("RC_CHANNELS_OVERRIDE", 1, 1, 1500, 1500, 1500, 1500, 1300, 1500, 0, 0)
+    pilot.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, 0)
+    world.run(1)
+    assert sticks(world) == [1.0, -0.5]
+    assert "ground station 77/190 has the sticks" in other.texts
+
+
+def test_button_that_was_held_before_the_sticks_passed_is_not_pressed_by_that() -> None:
+    world = World()
+    pilot, other = world.client(255), world.client(77)
+    pilot.send("MANUAL_CONTROL", 1, 0, 0, 500, 0, 0)
+    for _ in range(100):
+        other.send("MANUAL_CONTROL", 1, 0, 0, 500, 0, ARM_BUTTON)
+        world.run(1)
+    assert len(sticks(world)) > 40 and not buttons(world)
+
+
+@pytest.mark.parametrize("watched", [0, 255])
+def test_estop_and_disarm_buttons_are_taken_from_everybody(watched: int) -> None:
+    world = World(config=GroundConfig(watch_system=watched))
+    pilot, other = world.client(255), world.client(77)
+    for _ in range(3):
+        pilot.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, 0)
+        other.send("MANUAL_CONTROL", 1, 0, 0, 500, 0, ESTOP_BUTTON | DISARM_BUTTON | ARM_BUTTON)
+        world.run(1)
+    assert sticks(world) == [1.0] * 3 and buttons(world) == [Action.DISARM, Action.ESTOP]
+
+
+@pytest.mark.parametrize("raw", [0, 65535])
+def test_override_of_no_channel_is_nothing(world: World, client: Client, raw: int) -> None:
+    other = world.client(77)
+    client.send("RC_CHANNELS_OVERRIDE", 1, 1, *[raw] * 8)
+    world.run(1)
+    assert not world.robot.asked
+    other.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, 0)
+    world.run(1)
+    assert sticks(world) == [1.0], "nobody had the sticks"
