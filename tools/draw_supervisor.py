@@ -20,6 +20,7 @@ from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "supervisor.md"
+PILOT = "A pilot is missing who was heard and fell silent. Where none was ever heard, the sticks are neutral, and the first that come count."
 WHILE_TESTED = """\
 In MOTOR_DETECT a body is disarmed instead, whatever the action, where a motor test has armed it or where it never had a pose: it may lie
 on a bench. A cause that comes back before its fail-safe is over acts again when it has lasted its delay. A body that is disarmed or stopped
@@ -69,7 +70,7 @@ def modes() -> list[str]:
         (row.mode.name, str(int(row.mode)), ", ".join(words(n.name) for n in sorted(row.needs)), "yes" if row.by_pilot else "")
         for row in MODE_TABLE
     ]
-    return table(("mode", "number", "needs", "a pilot may always take it"), rows)
+    return [*table(("mode", "number", "needs", "a pilot may always take it"), rows), PILOT, ""]
 
 
 def arming() -> list[str]:

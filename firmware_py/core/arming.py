@@ -149,6 +149,6 @@ def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:
         reasons.append(f"no tag for {health.tag_age_s:.1f} s")
     if Need.DEPTH in needs and min(health.depth_age_s, health.tag_age_s) > limits.depth_unknown_limit:
         reasons.append("depth unknown")
-    if Need.PILOT in needs and not health.pilot_age_s <= limits.pilot_lost_limit:  # a NaN is not
-        reasons.append("no pilot input yet" if math.isnan(health.pilot_age_s) else "pilot input lost")
+    if Need.PILOT in needs and health.pilot_age_s > limits.pilot_lost_limit:  # one who was never heard is no cause: sticks are neutral
+        reasons.append("pilot input lost")
     return reasons
