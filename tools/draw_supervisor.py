@@ -20,7 +20,7 @@ from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "supervisor.md"
-PILOT = "A pilot is missing who was heard and fell silent. Where none was ever heard, the sticks are neutral, and the first that come count."
+PILOT = "A pilot is missing who was heard and fell silent. Where none was ever heard, sticks are neutral, and the first that come count."
 WHILE_TESTED = """\
 In MOTOR_DETECT a body is disarmed instead, whatever the action, where a motor test has armed it or where it never had a pose: it may lie
 on a bench. A cause that comes back before its fail-safe is over acts again when it has lasted its delay. A body that is disarmed or stopped
