@@ -158,6 +158,11 @@ class DockingStage:
         """Bodies that a dock steers."""
         return frozenset(dock.active for dock in self._docks)
 
+    @property
+    def under_way(self) -> bool:
+        """Whether any dock or undock is."""
+        return bool(self._docks or self._undocks)
+
     def forget(self, bodies: Collection[int]) -> list[int]:
         """Ends every dock that one of these takes part in, bodies that there are no more; returns the active ones."""
         ended = [dock for dock in self._docks if dock.active in bodies or dock.target in bodies]

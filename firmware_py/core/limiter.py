@@ -58,7 +58,7 @@ class Limiter:
         )  # fmt: skip
         self._step_n = parameters.slew_n_per_s * self._dt_s
         for magnets in self.magnets:
-            magnets.parameters = parameters
+            magnets.retune(parameters)
 
     def ease(self, force_n: np.ndarray) -> None:
         """Goes on from the forces (n,) of the bodies before, whose thrusters these were, and changes them slowly at first."""
@@ -147,22 +147,30 @@ class MagnetLimiter:
     """
 
     def __init__(self, parameters: LimiterParameters, dt_s: float) -> None:
-        self.parameters, self._dt_s = parameters, dt_s
+        self._dt_s = dt_s
         self._left_s = [parameters.relay_on_s] * FACES
         self._resting = [False] * FACES
         self.states = (OFF,) * FACES
         """Relay states of the last tick."""
         self.power_w = 0.0
         """What the magnets that are on take, W."""
+        self.retune(parameters)
+
+    def retune(self, parameters: LimiterParameters) -> None:
+        """Takes other limits from this tick on; accounts stay."""
+        self._p, self._is_cold = parameters, False
 
     def step(self, wanted: Sequence[int]) -> tuple[int, ...]:
         """The relay states that are permitted in this tick; a state that does not exist is off. To be called in every tick."""
-        full, duty = self.parameters.relay_on_s, self.parameters.relay_duty
+        if self._is_cold and not any(wanted):
+            return self.states
+        full, duty = self._p.relay_on_s, self._p.relay_duty
         on = [state in (FORWARD, REVERSE) and not resting for state, resting in zip(wanted, self._resting, strict=True)]
         for face in range(FACES):
             left_s = min(full, self._left_s[face] + self._dt_s * (duty - on[face]))
             self._resting[face] = left_s < 0.5 * full if self._resting[face] else left_s <= 0.0
             self._left_s[face] = left_s
-        self.power_w = sum(on) * self.parameters.relay_w
+        self._is_cold = not any(on) and min(self._left_s) >= full
+        self.power_w = sum(on) * self._p.relay_w
         self.states = tuple(state if lit else OFF for state, lit in zip(wanted, on, strict=True))
         return self.states

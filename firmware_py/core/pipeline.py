@@ -237,7 +237,8 @@ class Pipeline:
             outputs.preparations += chain.decide(inputs, estimates[chain.body.index], requests)
             outputs.events += [event._replace(body=chain.body.index) for event in chain.supervisor.events]
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
-            self._leave_docks(chain, inputs.time_ns, outputs)
+            if self.docking.under_way:
+                self._leave_docks(chain, inputs.time_ns, outputs)
         wanted, due = self.docking.relays, self.docking.due(inputs.time_ns)
         for chain in self._chains:
             relays = chain.magnets(wanted, due)
