@@ -170,7 +170,7 @@ class MagnetLimiter:
             left_s = min(full, self._left_s[face] + self._dt_s * (duty - on[face]))
             self._resting[face] = left_s < 0.5 * full if self._resting[face] else left_s <= 0.0
             self._left_s[face] = left_s
-        self._is_cold = not any(on) and min(self._left_s) >= full
+        self._is_cold = not any(on) and self._left_s == [full] * FACES
         self.power_w = sum(on) * self._p.relay_w
         self.states = tuple(state if lit else OFF for state, lit in zip(wanted, on, strict=True))
         return self.states

@@ -344,6 +344,17 @@ def test_relay_state_that_does_not_exist_is_off() -> None:
     assert MagnetLimiter(MAGNETS, 0.25).step((3, -1, 1, 7, 2, 0)) == (0, 0, 1, 0, 2, 0)
 
 
+def test_magnet_that_may_stay_on_for_longer_may_so_once_its_account_is_full() -> None:
+    magnets = MagnetLimiter(MAGNETS, 0.25)
+    for _ in range(4):
+        magnets.step((0,) * 6)
+    magnets.retune(parameters.Limiter(relay_on_s=4.0, relay_duty=0.25, relay_w=6.0))
+    for _ in range(32):
+        magnets.step((0,) * 6)
+    lit = [magnets.step((1, 0, 0, 0, 0, 0))[0] for _ in range(40)]
+    assert lit.index(0) == pytest.approx(4.0 / 0.75 / 0.25, abs=1)
+
+
 def test_magnets_that_are_on_take_their_power() -> None:
     magnets = MagnetLimiter(MAGNETS, 0.25)
     assert magnets.power_w == 0.0
