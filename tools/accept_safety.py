@@ -107,6 +107,7 @@ def replayed(folder: Path) -> Values:
     base = load_scenario("hover")
     task = dataclasses.replace(base.task, duration_s=LOGGED_S - base.task.settle_s)
     shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     fly_scenario(dataclasses.replace(base, task=task), 0, Parameters(), folder, "virtual:replayed")
     began_s = time.perf_counter()
     outcome = replay(folder)
