@@ -80,11 +80,13 @@ class Body:
         supply_power_w: (m,) what each module's supply gives to its thrusters and magnets.
         reach_m: no point of its hulls is farther from the centre of mass, m.
         cells: (m, 3) lattice cells; name: for people.
+        faces: of each module, what its six faces are, a letter each, as in the vehicle file (P probe, D drogue).
     """
 
     name: str
     modules: tuple[int, ...]
     cells: np.ndarray
+    faces: tuple[str, ...]
     r_bm: np.ndarray
     q_bm: np.ndarray
     r_bi: np.ndarray

@@ -133,6 +133,7 @@ def _body(
         name=name,
         modules=modules,
         cells=np.array([p.cell for p in placements], dtype=np.int64),
+        faces=tuple(p.vehicle.faces for p in placements),
         r_bm=r_bm,
         q_bm=q_bm,
         r_bi=r_bm.copy(),

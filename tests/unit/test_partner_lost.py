@@ -1,11 +1,13 @@
 """A docked partner that is lost or let go in flight: what is believed, who is told, and that every module is flown by just one body."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from firmware_py.app.preparation import prepare
 from firmware_py.core.body import Body
-from firmware_py.core.docking import CHANGED, Prepared
+from firmware_py.core.docking import CHANGED, Prepared, joints_of
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockFeedback, DockRequest, Inputs, Mode, ModuleInputs, Outputs, Request
@@ -95,6 +97,13 @@ def test_current_alone_is_reported_and_parts_nothing_that_pictures_show_in_its_p
     assert tank.when(LOST)
     assert tank.shape == [(0, 1)]
     assert (outputs.records[0].state, outputs.records[0].mode) == (State.ARMED, Mode.POSHOLD)
+
+
+def test_neighbours_that_turn_two_probes_to_each_other_are_no_joint_that_could_be_lost() -> None:
+    """Random shapes have such neighbours: a joint that was believed there kept the robot from arming."""
+    ring = Docked(RING).pipeline.bodies[0]
+    assert len(joints_of(ring)) == 4
+    assert len(joints_of(replace(ring, faces=(*ring.faces[:3], "PPPPPP")))) == 2
 
 
 def test_silent_magnets_lose_nobody() -> None:
