@@ -199,8 +199,10 @@ class Failsafes:
         alarms = []
         for watch in self._watches:
             cause = watch.beyond(health) and watch.counts(mode, forced, armed)
+            if not cause and watch.rests:
+                continue
             was_active = watch.active
-            if (cause or not watch.rests) and watch.step(health.time_ns, cause, armed):
+            if watch.step(health.time_ns, cause, armed):
                 again = was_active and watch.active
                 alarms.append(Alarm(watch.row.name, watch.words(health), watch.level, watch.active, again))
                 watch.began = alarms[-1].words if watch.active else watch.began

@@ -134,10 +134,11 @@ class HealthMonitor:
                 self._heard_ns[i], self._answered_ns[i] = other._heard_ns[j], other._answered_ns[j]
                 self._leak[i], self._wet[i], self._wet_ns[i] = other._leak[j], other._wet[j], other._wet_ns[j]
                 for mine, theirs in zip(self._readings, other._readings, strict=True):
-                    mine.update({i: theirs[j]} if j in theirs else {})
+                    if j in theirs:
+                        mine[i] = theirs[j]
                 for channel, thruster in self._thruster_at[i].items():
                     self._esc_ns[thruster] = other._esc_ns[other._thruster_at[j][channel]]
-        self._depth_ns, self._imu_ns = (max(other._depth_ns for other in before), max(other._imu_ns for other in before))
+        self._depth_ns, self._imu_ns = max(other._depth_ns for other in before), max(other._imu_ns for other in before)
         self._time_ns = max((other._time_ns for other in before if other._time_ns is not None), default=None)
         self._ground_ns = max((other._ground_ns for other in before if other._ground_ns is not None), default=None)
         self._pilot_ns = max((other._pilot_ns for other in before if other._pilot_ns is not None), default=None)

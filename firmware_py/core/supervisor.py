@@ -186,9 +186,8 @@ class Supervisor:
     def take_over(self, before: Sequence[Supervisor]) -> None:
         """Goes on from the bodies that this one is made of, or was part of: armed when all were, stopped when one was.
 
-        Fail-safes that were on stay on.
-        It holds its place. Where a fail-safe had taken one of them, it goes on in that one's mode, the gravest; else, where one of them
-        was in a mode that needs no place, in the first such mode.
+        It holds its place, and fail-safes that were on stay on. Where one of these had taken one of them, it goes on in that one's mode,
+        the gravest; else, where one of them was in a mode that needs no place, in the first such mode.
         """
         states = {other.state for other in before}
         self.state = State.ESTOP if State.ESTOP in states else State.DISARMED if State.DISARMED in states else State.ARMED

@@ -17,11 +17,6 @@ def world() -> World:
     return World(modules=2)
 
 
-@pytest.fixture
-def client(world: World) -> Client:
-    return world.client()
-
-
 @pytest.mark.parametrize("name", FIELDS)
 def test_each_fail_safe_is_told_by_the_system_of_its_body(world: World, client: Client, name: str) -> None:
     supervisor = Supervisor(replace(Parameters(), failsafes=quick(name)))

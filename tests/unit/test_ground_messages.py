@@ -25,16 +25,6 @@ from tests.unit.ground_world import Client, World
 NAN = float("nan")
 
 
-@pytest.fixture
-def world() -> World:
-    return World()
-
-
-@pytest.fixture
-def client(world: World) -> Client:
-    return world.client()
-
-
 def acknowledged(world: World, client: Client, number: int) -> int:
     """The result of the last acknowledgement of a command, waited for."""
     world.run_until(lambda: any(a.command == number for a in client.all("COMMAND_ACK")))

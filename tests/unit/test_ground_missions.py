@@ -26,16 +26,6 @@ class Path:
         return Setpoint(zero, np.array([1.0, 0, 0, 0]), zero, zero, zero, zero)
 
 
-@pytest.fixture
-def world() -> World:
-    return World()
-
-
-@pytest.fixture
-def client(world: World) -> Client:
-    return world.client()
-
-
 def item(
     sequence: int,
     place: tuple[int, int, float],

@@ -23,11 +23,6 @@ def world(tmp_path: Path) -> World:
     return World(config=GroundConfig(store=str(tmp_path)))
 
 
-@pytest.fixture
-def client(world: World) -> Client:
-    return world.client()
-
-
 def put(world: World, client: Client, name: str, value: float, kind: int = 9) -> float:
     """Set one and return what was echoed."""
     client.clear()

@@ -6,16 +6,6 @@ from firmware_py.core.types import Action
 from firmware_py.ground.config import GroundConfig
 from tests.unit.ground_world import Client, World
 
-
-@pytest.fixture
-def world() -> World:
-    return World()
-
-
-@pytest.fixture
-def client(world: World) -> Client:
-    return world.client()
-
 ARM_BUTTON, DISARM_BUTTON, ESTOP_BUTTON = 1 << 6, 1 << 4, 1 << 7
 
 
