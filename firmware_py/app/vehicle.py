@@ -19,7 +19,7 @@ from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import open_loop
 from firmware_py.app.service import reporting
 from firmware_py.core.body import Body
-from firmware_py.core.docking import joints_of
+from firmware_py.core.docking import joints_of, sides
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet
@@ -199,8 +199,7 @@ def _to_arm(firmware: Firmware, hold: bool, out: Path | None, say: Callable[[str
 
 def _joined_faces(firmware: Firmware) -> set[tuple[int, int]]:
     """Fleet index and face of both sides of every joint that the fleet file has."""
-    joints = [joint.request for body in firmware.pipeline.bodies for joint in joints_of(body)]
-    return {face for joint in joints for face in ((joint.module, joint.face), (joint.target_module, joint.target_face))}
+    return {side for body in firmware.pipeline.bodies for joint in joints_of(body) for side in sides(joint.request)}
 
 
 def _open_recorder(

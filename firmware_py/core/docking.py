@@ -325,7 +325,7 @@ class DockingStage:
         return _modules(undock.prepared.request) in [_modules(joint.request) for joint in self._watched]
 
     def _set_relays(self, request: DockRequest, relay: int) -> None:
-        for module, face in _sides(request):
+        for module, face in sides(request):
             if self._relays[module, face] != relay:
                 self._relays[module, face], self._due_ns[module] = relay, NEVER_NS
 
@@ -333,8 +333,8 @@ class DockingStage:
         self.events.append(Event(severity, text))
 
 
-def _sides(request: DockRequest) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Module and face of both sides."""
+def sides(request: DockRequest) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Module and face of each side: fleet index, and 0 to 5 for A to F."""
     return (request.module, request.face), (request.target_module, request.target_face)
 
 
@@ -346,7 +346,7 @@ def joints_of(body: Body) -> list[Joint]:
         neighbours = (at.get(tuple(place), -1) for place in (cell + FACE_NORMALS).tolist())
         joints += [_joint(body, i, j) for j in sorted(neighbours) if j > i]
     faces = dict(zip(body.modules, body.faces, strict=True))
-    return [joint for joint in joints if {faces[m][f] for m, f in _sides(joint.request)} == {"P", "D"}]
+    return [joint for joint in joints if {faces[m][f] for m, f in sides(joint.request)} == {"P", "D"}]
 
 
 def _joint(body: Body, i: int, j: int) -> Joint:
