@@ -289,8 +289,7 @@ class DockingStage:
             reason = f": {dock.sequence.reason}" if dock.sequence.reason and stage > Stage.DOCKED else ""
             self._say(WARNING if stage > Stage.DOCKED else INFORMATION, f"dock {before.name} -> {stage.name}{reason}")
         if stage == Stage.DOCKED:
-            decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))
-            self._docks.remove(dock)
+            self._join(dock, decisions)
         elif stage in (Stage.ABORTED, Stage.FAILED) and steering.is_apart:
             decisions.ended.append(dock.active)
             self._docks.remove(dock)
@@ -298,6 +297,13 @@ class DockingStage:
             decisions.setpoints[dock.active] = steering.active
         if steering.meets is not None:
             decisions.meets[dock.target] = steering.meets
+
+    def _join(self, dock: _Dock, decisions: Decisions) -> None:
+        """One join a tick and body: a dock that comes second finds its bodies gone, and `forget` ends it."""
+        joining = {body for join in decisions.joins for body in (join.active, join.target)}
+        if joining.isdisjoint((dock.active, dock.target)):
+            decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))
+            self._docks.remove(dock)
 
     def _release(self, undock: _Undock, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions) -> None:
         plan = undock.prepared.plan

@@ -309,12 +309,7 @@ class Pipeline:
                 chain.dock_over = True
 
     def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
-        before = self._made_of([joined.chain])
-        if before is None or len(before) != 2:  # another dock to the same body was first, in this tick
-            for chain in self._chains:
-                chain.dock_over = chain.dock_over or chain.body.index == joined.active
-            return
-        before.sort(key=lambda chain: chain.body.index != joined.target)
+        before = [chain for number in (joined.target, joined.active) for chain in self._chains if chain.body.index == number]
         estimate = self._begin(joined.chain, before, time_ns)
         self._swap(before, [joined.chain], estimates, [estimate])
 

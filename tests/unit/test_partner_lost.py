@@ -9,6 +9,7 @@ from firmware_py.app.preparation import prepare
 from firmware_py.core.body import Body
 from firmware_py.core.docking import CHANGED, Prepared, joints_of
 from firmware_py.core.docking_sequence import Stage
+from firmware_py.core.rotations import from_euler
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockFeedback, DockRequest, Inputs, Mode, ModuleInputs, Outputs, Request
 from firmware_py.description.parameters import Parameters
@@ -309,3 +310,22 @@ def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str
     outputs = tank.run(5.0)
     assert (outputs.records[1].state, outputs.records[1].mode) == (State.ARMED, Mode.POSHOLD)
     assert np.linalg.norm(tank.states[1][:3] - before) < 0.02
+
+
+def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], apart=True)
+    for state, side in zip(tank.states, (0.0, PITCH_M, -PITCH_M), strict=True):
+        state[:7] = [1.0, side, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
+    wanted = DockRequest(1, 3, 0, 2), DockRequest(2, 2, 0, 3)
+    tank.run(0.03, *(Request(Action.DOCK, request.module, request) for request in wanted))
+    assert len(tank.pipeline.docking._docks) == 2
+    for dock in tank.pipeline.docking._docks:
+        dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if they had just come
+    outputs = tank.run(2.0)
+    assert [record.stage for outputs in tank.outputs for record in outputs.docks].count(Stage.DOCKED) == 2
+    assert tank.shape == [(0, 1), (2,)]
+    assert tank.pipeline.docking.relays == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
+    assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
+    assert tank.when(f"dock ended: {CHANGED}")
