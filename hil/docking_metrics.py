@@ -93,7 +93,7 @@ def _failure(docks: Columns, signals: Mapping[str, Columns]) -> int:
         return UNSTABLE
     if docks["jams"][-1] > 0:
         return JAMMED
-    return REFUSED if any("DOCK refused" in text or "-> ABORTED" in text for text in said) else GAVE_UP
+    return REFUSED if any("dock refused" in text.lower() or "-> ABORTED" in text for text in said) else GAVE_UP
 
 
 def _off_attitude(signals: Mapping[str, Columns]) -> float:

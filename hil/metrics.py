@@ -154,7 +154,7 @@ def flight_metrics(
         "thrust_rate_rms_n_s": rate_rms(firmware["commanded_n"], period_s),
         "supply_power_w": float(np.nansum(flight.truth["power_w"], axis=1).mean()),
         "wrench_margin_min": float(np.fmin.reduce(firmware["wrench_margin"])),
-        "tags_rejected": float(firmware["rejected"][-1] - firmware["rejected"][0]),
+        "tags_rejected": float(np.maximum(np.diff(firmware["rejected"]), 0).sum()),  # a body that joins or parts counts anew
         "warnings": float(warnings(flight.events["severity"], flight.events["text"])),
         "duration_s": duration_s,
         "real_time_factor": duration_s / wall_s if wall_s > 0.0 else 0.0,

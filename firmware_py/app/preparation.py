@@ -38,7 +38,7 @@ def _prepare_part(request: PartRequest, bodies: Bodies, pipeline: Pipeline, vehi
         if whole is not bodies[joint.target_module]:
             continue
         try:
-            plan = plan_undock(joint, whole, vehicles, pitch_m, also_open=request.joints)
+            plan = plan_undock(joint, whole, vehicles, pitch_m, lost=request.joints)
         except DescriptionError as error:
             refusal = str(error)
             continue
@@ -47,7 +47,7 @@ def _prepare_part(request: PartRequest, bodies: Bodies, pipeline: Pipeline, vehi
 
 
 def _parting(plan: UndockPlan, pipeline: Pipeline) -> Prepared:
-    return Prepared(plan.request, plan, (pipeline.chain_of(plan.stays), pipeline.chain_of(plan.leaves)))
+    return Prepared(plan.opens[0], plan, (pipeline.chain_of(plan.stays), pipeline.chain_of(plan.leaves)))
 
 
 def _prepare_dock(request: DockRequest, bodies: Bodies, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:

@@ -21,8 +21,10 @@ from firmware_py.core.docking_sequence import (
     DockPlan,
     Stage,
     UndockPlan,
+    nearest_pass,
 )
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back, to_matrix
+from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRecord, DockRequest, Estimate, Event, Inputs, Setpoint
 from firmware_py.description.parameters import Docking
 from firmware_py.description.vehicle import FACE_NORMALS
@@ -65,7 +67,7 @@ class Part(NamedTuple):
 class Decisions(NamedTuple):
     """What the stage wants of the pipeline."""
 
-    setpoints: dict[int, Setpoint]
+    setpoints: dict[int, Setpoint | Wish]
     """By body: steers it in this tick."""
     joins: list[Join]
     parts: list[Part]
@@ -98,12 +100,12 @@ class Joint(NamedTuple):
         return FacePair(self.request.target_module, self.request.target_face, self.request.module, self.request.face, self.offset)
 
 
-class _Undock:
-    """An undock under way: magnets push until the body parts, which is at once where the joint is open already."""
+class _Undock(NamedTuple):
+    """An undock under way: magnets push until the body parts, which is at once where every joint is open already."""
 
-    def __init__(self, prepared: Prepared, until_ns: int) -> None:
-        self.prepared = prepared
-        self.until_ns = until_ns
+    plan: UndockPlan
+    chains: tuple[Any, ...]
+    until_ns: int
 
 
 class DockingStage:
@@ -131,7 +133,7 @@ class DockingStage:
         self._watched = joints
         self._joints = PairBank([joint.pair for joint in joints], self._p, self._joints)
         for joint in joints:
-            self._set_relays(joint.request, RELAY_PULL)
+            self._set_relays(RELAY_PULL, joint.request)
 
     def open_joints(self, least: int) -> list[DockRequest]:
         """Joints that are `least` LOOSE or APART though they should hold, as requests that name their faces. Those that are being
@@ -140,7 +142,7 @@ class DockingStage:
         if not self._joints.rows.size:
             return []
         rows = self._joints.rows[self._joints.rows["open"] >= least]
-        parting = [_modules(undock.prepared.request) for undock in self._undocks]
+        parting = [_modules(joint) for undock in self._undocks for joint in undock.plan.opens]
         found = [
             DockRequest(module, face, target, target_face)
             for (target, module), (target_face, face) in zip(rows["module"].tolist(), rows["face"].tolist(), strict=True)
@@ -168,7 +170,7 @@ class DockingStage:
         ended = [dock for dock in self._docks if dock.active in bodies or dock.target in bodies]
         for dock in ended:
             self._docks.remove(dock)
-            self._set_relays(dock.prepared.request, RELAY_OFF)
+            self._set_relays(RELAY_OFF, dock.prepared.request)
             self._say(WARNING, f"dock ended: {CHANGED}")
         return [dock.active for dock in ended]
 
@@ -184,13 +186,13 @@ class DockingStage:
         An open joint is parted all the same: that its modules are apart is no wish.
         """
         left: list[tuple[str, DockRequest]] = []
-        for undock in [each for each in self._undocks if each.prepared.request.module in body.modules and self._holds(each)]:
+        for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._holds(each.plan)]:
             self._undocks.remove(undock)
-            self._set_relays(undock.prepared.request, RELAY_PULL)
-            left.append(("undock", undock.prepared.request))
+            self._set_relays(RELAY_PULL, *undock.plan.opens)
+            left.append(("undock", undock.plan.opens[0]))
         for dock in [each for each in self._docks if each.active == body.index and not armed]:
             self._docks.remove(dock)
-            self._set_relays(dock.prepared.request, RELAY_OFF)
+            self._set_relays(RELAY_OFF, dock.prepared.request)
             left.append(("dock", dock.prepared.request))
         return [Event(WARNING, f"{what} of module {request.module} ended: {NO_LONGER}") for what, request in left]
 
@@ -242,25 +244,48 @@ class DockingStage:
         holding: Collection[int],
         decisions: Decisions,
     ) -> None:
-        request = prepared.request
-        if prepared.plan is None:
-            self._say(WARNING, f"dock refused: {prepared.refusal}")
-            decisions.ended.append(_body_of(request.module, estimates))
-        elif not _fits(prepared.plan, estimates):
-            self._say(WARNING, f"dock refused: {CHANGED}")
-            decisions.ended.append(_body_of(request.module, estimates))
-        elif isinstance(prepared.plan, UndockPlan):
-            holds = _modules(request) not in [_modules(joint) for joint in self.open_joints(APART)]
-            self._undocks.append(_Undock(prepared, time_ns + (round(self._p.release_s * 1e9) if holds else 0)))
-            self._say(INFORMATION, f"undocking module {request.module} from {request.target_module}")
+        request, plan = prepared.request, prepared.plan
+        mine = _body_of(request.module, estimates)
+        under_way = next((dock for dock in self._docks if dock.active == mine), None)
+        if under_way is not None and under_way.prepared.request == request:
+            return
+        refusal = prepared.refusal if plan is None else "" if _fits(plan, estimates) else CHANGED
+        if isinstance(plan, DockPlan) and not refusal and self._p.approach == "staged":
+            refusal = _in_the_way(plan, *estimates[mine], *estimates[_body_of(request.target_module, estimates)], self._p.standoff_m)
+        if under_way is not None and not isinstance(plan, UndockPlan):
+            self._docks.remove(under_way)
+            self._set_relays(RELAY_OFF, under_way.prepared.request)
+            self._say(WARNING, f"dock of module {under_way.prepared.request.module} ended: another was asked for")
+        if plan is None or refusal:
+            self._say(WARNING, f"dock refused: {refusal}")
+            decisions.ended.append(mine)
+        elif isinstance(plan, UndockPlan):
+            self._begin_undock(plan, prepared.chains, time_ns)
         else:
-            active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
-            taken = any(target in (dock.active, dock.target) for dock in self._docks)
-            comes = (request.both_approach or self._p.approach == "straight") and target in holding and not taken
-            sequence = DockingSequence(prepared.plan, estimates[active][0], estimates[target][0], self._p, time_ns, comes)
-            pair = FacePair(request.target_module, request.target_face, request.module, request.face, prepared.plan.place_t)
-            self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared))
-            self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
+            self._begin_dock(prepared, plan, time_ns, estimates, holding)
+
+    def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
+        apart = [_modules(joint) for joint in self.open_joints(APART)]
+        holds = any(_modules(joint) not in apart for joint in plan.opens)
+        self._undocks.append(_Undock(plan, chains, time_ns + (round(self._p.release_s * 1e9) if holds else 0)))
+        self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
+
+    def _begin_dock(
+        self,
+        prepared: Prepared,
+        plan: DockPlan,
+        time_ns: int,
+        estimates: Mapping[int, tuple[Body, Estimate]],
+        holding: Collection[int],
+    ) -> None:
+        request = prepared.request
+        active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
+        taken = any(target in (dock.active, dock.target) for dock in self._docks)
+        comes = (request.both_approach or self._p.approach == "straight") and target in holding and not taken
+        sequence = DockingSequence(plan, estimates[active][0], estimates[target][0], self._p, time_ns, comes)
+        pair = FacePair(request.target_module, request.target_face, request.module, request.face, plan.place_t)
+        self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared))
+        self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
 
     # ------------------------------------------------------------ each tick
 
@@ -277,7 +302,7 @@ class DockingStage:
         before = dock.sequence.stage
         steering = dock.sequence.step(inputs.time_ns, active, target, status)
         stage = dock.sequence.stage
-        self._set_relays(dock.prepared.request, steering.relay)
+        self._set_relays(steering.relay, dock.prepared.request)
         errors, pair = dock.sequence.errors(active, target), dock.detector.pair
         self.records.append(
             DockRecord(
@@ -306,32 +331,31 @@ class DockingStage:
             self._docks.remove(dock)
 
     def _release(self, undock: _Undock, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions) -> None:
-        plan = undock.prepared.plan
-        assert isinstance(plan, UndockPlan)
-        request = plan.request
+        plan, request = undock.plan, undock.plan.opens[0]
         if not _fits(plan, estimates):
             self._undocks.remove(undock)
-            self._set_relays(request, RELAY_PULL if self._holds(undock) else RELAY_OFF)
+            self._set_relays(RELAY_PULL if self._holds(plan) else RELAY_OFF, *plan.opens)
             self._say(WARNING, f"undock ended: {CHANGED}")
             return
-        self._set_relays(request, RELAY_PUSH)
-        if time_ns < undock.until_ns:
-            return
-        self._set_relays(request, RELAY_OFF)
+        self._set_relays(RELAY_PUSH, *plan.opens)
         whole = _body_of(request.module, estimates)
+        if time_ns < undock.until_ns or whole in [part.whole for part in decisions.parts]:  # which has no such body in the next tick
+            return
+        self._set_relays(RELAY_OFF, *plan.opens)
         estimate = estimates[whole][1]
         away_w = rotate(estimate.q_wb, plan.axis_b) * self._p.standoff_m
-        stays, leaves = undock.prepared.chains
+        stays, leaves = undock.chains
         decisions.parts.append(Part(whole, stays, leaves, away_w))
         self._undocks.remove(undock)
         self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
 
-    def _holds(self, undock: _Undock) -> bool:
+    def _holds(self, plan: UndockPlan) -> bool:
         """Whether there still is a joint to be undone."""
-        return _modules(undock.prepared.request) in [_modules(joint.request) for joint in self._watched]
+        watched = [_modules(joint.request) for joint in self._watched]
+        return any(_modules(joint) in watched for joint in plan.opens)
 
-    def _set_relays(self, request: DockRequest, relay: int) -> None:
-        for module, face in sides(request):
+    def _set_relays(self, relay: int, *joints: DockRequest) -> None:
+        for module, face in (side for joint in joints for side in sides(joint)):
             if self._relays[module, face] != relay:
                 self._relays[module, face], self._due_ns[module] = relay, NEVER_NS
 
@@ -376,6 +400,14 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
             q_tm = multiply(conjugate(np.ascontiguousarray(body.q_bt[k])), q_bm)
             table[body.modules[i], int(tag)] = np.concatenate([r_mt, q_tm])
     return table
+
+
+def _in_the_way(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, standoff_m: float) -> str:
+    """Why the straight way to the stand-off is none; empty: it is free, or nobody knows, which is for the sequence to say."""
+    if not (at.ready and target_at.ready):
+        return ""
+    module = nearest_pass(plan, active, at, target, target_at, standoff_m)
+    return "" if module is None else f"on its way it would come too near to module {module}: bring it before that face first"
 
 
 CHANGED = "the bodies are others than those that it was planned for"

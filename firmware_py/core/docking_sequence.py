@@ -14,7 +14,8 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
-from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, rotate_back
+from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, rotate_back, to_matrix
+from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRequest, Estimate, Setpoint
 from firmware_py.description.parameters import Docking
 
@@ -27,6 +28,14 @@ RETREAT_M_S = 0.04
 """Fastest growth of the gap when backing off."""
 CONE = 1.5
 """The approach waits while the lateral error is above this many times the alignment limit, or the angle."""
+
+
+WAY_SAMPLES = 33
+"""Places on the way to the stand-off that are looked at."""
+WAY_SLACK_M = 0.01
+"""Nearer by so little is noise."""
+CUBE_DIAGONAL = 3.0**0.5
+"""Centres of two cubes of edge 1 that are so far apart do not touch, however they are turned."""
 
 
 class Stage(IntEnum):
@@ -85,14 +94,13 @@ class DockPlan(NamedTuple):
 class UndockPlan(NamedTuple):
     """An undock, prepared: the two bodies that there will be."""
 
-    request: DockRequest
+    opens: tuple[DockRequest, ...]
+    """Every joint between the two, the one that was asked for first; `module` is the side that leaves."""
     stays: Body
     """The one with the target module."""
     leaves: Body
     axis_b: np.ndarray
-    """(3,) from the target module to the other, frame of the whole body."""
-    offset_near: np.ndarray
-    """(3,) the other module's centre in the target module's frame while they are docked, m."""
+    """(3,) unit vector, the way that it leaves, frame of the whole body."""
 
 
 class Errors(NamedTuple):
@@ -106,7 +114,8 @@ class Errors(NamedTuple):
 class Steering(NamedTuple):
     """What the sequence wants in one tick."""
 
-    active: Setpoint
+    active: Setpoint | Wish
+    """Where the active body is to be in this tick; while it is far, where it is to glide."""
     relay: int
     is_apart: bool
     """As far from the target as a dock that failed leaves it."""
@@ -266,7 +275,7 @@ class DockingSequence:
             return RETREAT_M_S if self._gap_m < p.standoff_m else 0.0
         return 0.0
 
-    def _setpoint(self, target: Estimate, speed: float) -> Setpoint:
+    def _setpoint(self, target: Estimate, speed: float) -> Setpoint | Wish:
         """The active body's centre of mass such that its module is at the wanted gap before the target's face, moving with it."""
         p_t, q_t = _pose_of(target, self._r_t, self._q_t)
         q_module = normalise(multiply(q_t, self._q_wanted()))
@@ -274,8 +283,10 @@ class DockingSequence:
         axis_w = rotate(q_t, self._line_t if self._gap_m > 0.0 else self.plan.axis_t)
         p_module = p_t + rotate(q_t, self.plan.place_t) + axis_w * self._gap_m
         v_w = rotate(target.q_wb, target.nu[:3].copy()) + axis_w * speed
-        zero = np.zeros(3)
-        return Setpoint(p_module - rotate(q_wb, self._r_a), q_wb, v_w, zero, zero, zero)
+        p_wb, zero = np.asarray(p_module - rotate(q_wb, self._r_a)), np.zeros(3)
+        if self.stage == Stage.PRE_APPROACH:
+            return Wish(np.asarray(v_w), zero, p_wb, q_wb)
+        return Setpoint(p_wb, q_wb, v_w, zero, zero, zero)
 
     def _q_wanted(self) -> np.ndarray:
         """(4,) active module to target module, turned a little about the axis after a jam."""
@@ -294,6 +305,27 @@ NEXT = {
 """What follows a stage that has done its work."""
 TURNED = frozenset({Stage.APPROACH, Stage.PUSH, Stage.VERIFY, Stage.ALIGN})
 """Stages that use the small turn."""
+
+
+def nearest_pass(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, standoff_m: float) -> int | None:
+    """Module of the target that the active body would come too near to on the straight way to the stand-off; None: none.
+
+    Too near is nearer than at both ends of the way, and near enough for two cubes to touch however they are turned.
+    """
+    r_a, q_a = _module_in(active, plan.request.module)
+    p_t, q_t = _pose_of(target_at, *_module_in(target, plan.request.target_module))
+    q_end = normalise(multiply(multiply(q_t, plan.q_ta), conjugate(q_a)))
+    p_end = p_t + rotate(q_t, plan.place_t + plan.axis_t * standoff_m) - rotate(q_end, r_a)
+    turn = difference(q_end, at.q_wb)
+    others = target_at.p_wb + target.r_bm @ to_matrix(target_at.q_wb).T
+    gaps = np.empty((WAY_SAMPLES, len(active.modules), len(target.modules)))
+    for k, share in enumerate(np.linspace(0.0, 1.0, WAY_SAMPLES)):
+        rotation = to_matrix(multiply(at.q_wb, exp(share * turn)))
+        mine = at.p_wb + share * (p_end - at.p_wb) + active.r_bm @ rotation.T
+        gaps[k] = np.linalg.norm(mine[:, None] - others, axis=2)
+    least = gaps.min(axis=0)
+    touching = (least < np.minimum(gaps[0], gaps[-1]) - WAY_SLACK_M) & (least < CUBE_DIAGONAL * np.linalg.norm(plan.place_t))
+    return target.modules[int(np.argmax(touching.any(axis=0)))] if touching.any() else None
 
 
 def _module_in(body: Body, module: int) -> tuple[np.ndarray, np.ndarray]:

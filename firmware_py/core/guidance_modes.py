@@ -66,7 +66,7 @@ class Guidance:
         self._start_ns: int | None = None
         self._goal: Wish | None = None
         self._point: tuple[int, Setpoint] | None = None
-        self._docking: Setpoint | None = None
+        self._docking: Setpoint | Wish | None = None
         self._sticks, self._sticks_ns = NEUTRAL, 0
         self._time_ns: int | None = None
         self._offset, self._offset_ns = np.zeros(6), 0
@@ -125,9 +125,9 @@ class Guidance:
         """AUTO's next trajectory."""
         self._trajectory, self._start_ns = trajectory, None
 
-    def dock(self, setpoint: Setpoint) -> None:
-        """Where the docking sequence wants the body in this tick."""
-        self._docking = setpoint
+    def dock(self, where: Setpoint | Wish) -> None:
+        """Where the docking sequence wants the body in this tick: just there, or on its way there."""
+        self._docking = where
 
     def move_by(self, by_w: np.ndarray) -> None:
         """POSHOLD's place, or the one that it is on its way to, moves by so much (3,), world, m."""
@@ -159,7 +159,7 @@ class Guidance:
         self._time_ns = time_ns
         if self.mode == Mode.AUTO and self._trajectory is not None and self._joined(self._trajectory, time_ns):
             return self._sample(self._trajectory, time_ns)
-        if self.mode == Mode.DOCK and self._docking is not None:
+        if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):
             self._glider.put(self._docking)
             return self._docking, ahead_of(self._docking, self._lead_s)
         now = self._glider.step(self._wish(time_ns, estimate, health), dt_s)
@@ -195,7 +195,7 @@ class Guidance:
             up = -p.surface_speed_m_s if at.p_wb[2] > p.surface_depth_m else 0.0
             return Wish(np.array([0.0, 0.0, up]), ZERO, None, heading(at.q_wb))
         if self.mode in (Mode.AUTO, Mode.DOCK):
-            return Wish(ZERO, ZERO)
+            return self._docking if isinstance(self._docking, Wish) else Wish(ZERO, ZERO)
         sticks = self._read_sticks(time_ns)
         rate = p.rate_rad_s * np.array(sticks.moment)
         if any(sticks.force) or any(sticks.moment):

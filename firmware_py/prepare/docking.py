@@ -8,13 +8,14 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
+from firmware_py.core.docking import joints_of
 from firmware_py.core.docking_sequence import DockPlan, UndockPlan
 from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS, Vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.drag_cache import DragCache
-from firmware_py.prepare.lattice import MATRICES, QUATERNIONS, face_towards, nearest
+from firmware_py.prepare.lattice import MATRICES, QUATERNIONS, nearest
 
 
 def plan_dock(
@@ -67,26 +68,33 @@ def plan_undock(
     vehicles: Sequence[Vehicle],
     pitch_m: float = PITCH_M,
     cache: DragCache | None = None,
-    also_open: Sequence[DockRequest] = (),
+    lost: Sequence[DockRequest] = (),
 ) -> UndockPlan:
     """The plan of parting at the joint between two modules of one body.
 
+    Where other joints hold the two together as well, as in a ring, the module leaves alone, by all of its joints.
+
     Args:
-        also_open: joints of it that hold nothing any longer.
+        lost: where a body has come apart, its open joints: then no other is opened.
 
     Raises:
-        DescriptionError: the two are not neighbours, or something else still holds the pieces together.
+        DescriptionError: there is no such joint, or something else still holds the pieces together.
     """
     near, far = request.target_module, request.module
-    step = _cell_of(whole, far) - _cell_of(whole, near)
-    if int(np.abs(step).sum()) != 1:
+    joints = [joint.request for joint in joints_of(whole)]
+    wanted, pairs = {near, far}, [_modules(joint) for joint in joints]
+    if wanted not in pairs:
         raise DescriptionError(f"modules {near} and {far} are not docked to each other")
-    cuts = [{joint.module, joint.target_module} for joint in (request, *also_open)]
-    piece = _reachable(whole, far, cuts)
-    if near in piece:
+    opened = [wanted, *(_modules(joint) for joint in lost)]
+    piece = _reachable(far, [pair for pair in pairs if pair not in opened])
+    if near in piece and not lost:
+        piece = {far}
+    stays = [m for m in whole.modules if m not in piece]
+    if near in piece or _reachable(near, [pair for pair in pairs if not pair & piece]) != set(stays):
         raise DescriptionError(f"modules {near} and {far} are also held together by other modules: undock those first")
-    halves = ([m for m in whole.modules if m not in piece], [m for m in whole.modules if m in piece])
-    stays, leaves = (
+    opens = [_leaving(joint, piece) for joint in joints if len(_modules(joint) & piece) == 1]
+    opens.sort(key=lambda joint: _modules(joint) != wanted)
+    rest, leaves = (
         assemble(
             np.array([_cell_of(whole, m) for m in half]),
             [nearest(_turn_of(whole, m)) for m in half],
@@ -95,18 +103,30 @@ def plan_undock(
             pitch_m,
             cache,
         )
-        for half in halves
+        for half in (stays, [m for m in whole.modules if m in piece])
     )
-    normal = tuple(int(c) for c in step)
-    face_near = face_towards(nearest(_turn_of(whole, near)), (normal[0], normal[1], normal[2]))
-    face_far = face_towards(nearest(_turn_of(whole, far)), (-normal[0], -normal[1], -normal[2]))
-    return UndockPlan(
-        request=DockRequest(far, face_far, near, face_near),
-        stays=stays,
-        leaves=leaves,
-        axis_b=step.astype(float),
-        offset_near=FACE_NORMALS[face_near] * pitch_m,
-    )
+    steps = [_cell_of(whole, joint.module) - _cell_of(whole, joint.target_module) for joint in opens]
+    return UndockPlan(tuple(opens), rest, leaves, _away(whole, piece, steps))
+
+
+def _away(whole: Body, piece: set[int], steps: Sequence[np.ndarray]) -> np.ndarray:
+    """(3,) unit vector, the way that a piece leaves: along its joints, or from the middle of the rest where these cancel out."""
+    way = np.sum(steps, axis=0).astype(float)
+    if not way.any():
+        inside = np.array([m in piece for m in whole.modules])
+        way = whole.cells[inside].mean(axis=0) - whole.cells[~inside].mean(axis=0)
+    return np.asarray(way / np.linalg.norm(way))
+
+
+def _leaving(joint: DockRequest, piece: set[int]) -> DockRequest:
+    """The joint, told from the side of the piece."""
+    if joint.module in piece:
+        return joint
+    return DockRequest(joint.target_module, joint.target_face, joint.module, joint.face)
+
+
+def _modules(joint: DockRequest) -> set[int]:
+    return {joint.module, joint.target_module}
 
 
 def _mated(turn_t: np.ndarray, request: DockRequest, normal: np.ndarray) -> np.ndarray:
@@ -119,16 +139,12 @@ def _mated(turn_t: np.ndarray, request: DockRequest, normal: np.ndarray) -> np.n
     return np.asarray(MATRICES[nearest(quarter @ least)])
 
 
-def _reachable(body: Body, start: int, cuts: Sequence[set[int]]) -> set[int]:
-    """Modules that hang together with `start` when the joints between the pairs of `cuts` are open."""
-    reached, ends = {start}, [start]
-    while ends:
-        here = ends.pop()
-        for other in body.modules:
-            apart = int(np.abs(_cell_of(body, other) - _cell_of(body, here)).sum())
-            if apart == 1 and other not in reached and {here, other} not in cuts:
-                reached.add(other)
-                ends.append(other)
+def _reachable(start: int, joints: Sequence[set[int]]) -> set[int]:
+    """Modules that hang together with `start` by these joints."""
+    reached, before = {start}, set[int]()
+    while reached != before:
+        before = reached
+        reached = reached.union(*(joint for joint in joints if joint & reached))
     return reached
 
 

@@ -313,7 +313,7 @@ def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str
 
 
 def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], apart=True)
+    tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], Parameters().replace("docking.push_m", 0.0), apart=True)
     for state, side in zip(tank.states, (0.0, PITCH_M, -PITCH_M), strict=True):
         state[:7] = [1.0, side, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -329,3 +329,82 @@ def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
     assert tank.pipeline.docking.relays == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
     assert tank.when(f"dock ended: {CHANGED}")
+
+
+# ---------------------------------------------------------------- what was asked for
+
+
+def before_each_other(y_m: float) -> Docked:
+    """Two armed modules in one line; no magnet draws current."""
+    tank = Docked([(0, 0, 0), (0, 1, 0)], apart=True)
+    tank.weak = {0, 1}
+    for state, y in zip(tank.states, (0.0, y_m), strict=True):
+        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
+    return tank
+
+
+def test_dock_from_afar_glides_to_the_stand_off_and_keeps_it() -> None:
+    tank, near, fastest = before_each_other(2.0), [], []
+    first = len(tank.outputs)
+    tank.run(0.03, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    while tank.outputs[-1].docks[0].stage == Stage.PRE_APPROACH:
+        tank.run(0.01)
+        near.append(tank.states[1][1] - tank.states[0][1])
+        fastest.append(np.linalg.norm(tank.states[1][7:10]))
+    places = np.array([outputs.records[1].setpoint.p_wb for outputs in tank.outputs[first:]])
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert steps[:-1].max() < 0.0035, "a speed of 0.3 m/s"
+    assert steps[-1] < 5 * Parameters().docking.align_m, "near enough to be aligned"
+    assert max(fastest) < 0.35
+    assert min(near) > PITCH_M + 0.9 * Parameters().docking.standoff_m
+    assert len(tank.outputs) - first < 2000
+
+
+def test_dock_whose_way_leads_through_the_target_is_refused() -> None:
+    tank = before_each_other(2.0)
+    outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
+    assert tank.when("dock refused: on its way it would come too near to module 0")
+    assert outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
+
+
+def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], apart=True)
+    tank.weak = {0, 1, 2}
+    for state, y in zip(tank.states, (0.0, 0.6, 1.2), strict=True):
+        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    while tank.outputs[-1].docks[0].stage != Stage.APPROACH:
+        tank.run(0.01)
+    tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    assert [dock.stage for dock in tank.outputs[-1].docks] == [Stage.APPROACH]
+    outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 2, 3)))
+    assert [(dock.module_a, dock.module_b) for dock in outputs.docks] == [(2, 1)]
+    assert tank.when("dock of module 1 ended: another was asked for")
+    assert tank.pipeline.docking.relays[0] == [0] * 6
+    assert outputs.records[1].mode == Mode.DOCK
+
+
+def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_holds() -> None:
+    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
+    tank.fly()
+    tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)), Request(Action.UNDOCK, 0, DockRequest(2, 1, 1, 0)))
+    assert tank.shape == [(0,), (1, 2)]
+    assert not any("is undocked from 1" in text for _, text in tank.said)
+    assert tank.when("undock of module 2 ended")
+    assert tank.pipeline.docking.relays == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
+
+
+def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> None:
+    tank = Docked(RING)
+    tank.fly()
+    tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
+    assert [sum(state == 2 for state in states) for states in tank.pipeline.docking.relays] == [0, 1, 1, 2]
+    outputs = tank.run(5.0)
+    assert tank.shape == [(0, 1, 2), (3,)]
+    rest, corner = (chain.guidance._glider.at.p_wb for chain in tank.pipeline._chains)
+    assert outputs.records[1].mode == Mode.POSHOLD and np.linalg.norm(corner - rest) > 0.3
+    assert [max(states) for states in tank.pipeline.docking.relays] == [1, 1, 1, 0]
