@@ -6,7 +6,7 @@ Paper, "Trajectory Planning for RS-ModCubes" (Mellinger and Kumar 2011), with co
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from firmware_py.core.body import Body
 from firmware_py.prepare.piecewise import CHANNELS, Piecewise
 from firmware_py.prepare.snap_limits import InfeasibleError, Limits, planes, solve_limited, worst
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
-from firmware_py.prepare.snap_thrust import usage, wrenches
+from firmware_py.prepare.snap_thrust import divide, usage
 
 __all__ = ["InfeasibleError", "Limits", "Waypoint", "plan"]
 
@@ -26,12 +26,21 @@ ATTITUDE_LEVER_M = 0.5
 FIRST_SPEED = 0.1
 """m/s from which free durations start; what comes out does not depend on it."""
 
+MOST_LEAN = 0.2
+"""rad by which a body may lean to leave a moment to buoyancy; a fifth of a force along one axis then goes into another."""
+
 _CHECK_POINTS = 16
 """Points of each piece at which attitude rates and thrusters are checked."""
 
 _LONGEST_STRETCH = 1024.0
 _STRETCH_TOLERANCE = 2e-3
 _SHORTEST_QUATERNION = 0.3
+_SAME = 1e-9
+"""m, and of a quaternion, below which waypoints do not differ."""
+
+
+class _UnreachableError(InfeasibleError):
+    """However slow the path is, its body cannot fly it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +50,7 @@ class Waypoint:
     Attributes:
         p_wb: (3,) m, world.
         q_wb: (4,) attitude; None keeps that of the waypoint before.
-        velocity_w: (3,) m/s to pass it with; None leaves it free.
+        velocity_w: (3,) m/s to pass it with; None leaves it free. The first and the last waypoint are at rest.
         stop: come to rest there.
     """
 
@@ -64,12 +73,13 @@ def plan(
         waypoints: two or more.
         durations_s: of each piece; or their sum, divided for least snap; or None: as short as limits and body allow.
         limits: what the path may do.
-        body: whose thrusters must be able to fly it, in still water.
+        body: whose thrusters must be able to fly it, in still water, with the axes that they do not span left to buoyancy.
         stretch: lengthen the durations until everything fits; False takes them as they are.
 
     Raises:
         InfeasibleError: which limit cannot be kept, and where.
-        ValueError: too few waypoints, durations that do not match, or free durations without anything that bounds them.
+        ValueError: too few waypoints, a velocity where the path rests, durations that do not match, or free durations without
+            anything that bounds them.
     """
     limits = limits or Limits()
     request = _Request.of(waypoints, limits, body)
@@ -77,8 +87,11 @@ def plan(
     if durations_s is not None and not stretch:
         return request.attempt(base)
     request.check_standing()
-    if durations_s is None and body is None and not request.bounds_speed():
-        raise ValueError("free durations need a limit on velocity or acceleration, or a body")
+    if durations_s is None and not request.bounds_speed():
+        raise ValueError(
+            "free durations need a limit that this path meets, on velocity or acceleration where it moves, "
+            "on angular rate or acceleration where it turns; or a body, and a path that moves or turns"
+        )
     return _fit(request, base, free=durations_s is None)
 
 
@@ -126,6 +139,9 @@ class _Request:
         position = Knots.at_rest(value)
         attitude = Knots.at_rest(_continuous(waypoints))
         for k, waypoint in enumerate(waypoints):
+            rests = waypoint.stop or k in (0, len(waypoints) - 1)
+            if rests and waypoint.velocity_w is not None and np.any(waypoint.velocity_w):
+                raise ValueError(f"waypoint {k} has a velocity, but the path rests there")
             if waypoint.stop:
                 position.fixed[k], attitude.fixed[k] = True, True
             elif waypoint.velocity_w is not None:
@@ -134,9 +150,20 @@ class _Request:
         return _Request(position, attitude, limits, body)
 
     def bounds_speed(self) -> bool:
-        """Whether some limit keeps the duration from vanishing."""
-        chosen = (self.limits.velocity, self.limits.acceleration, self.limits.angular_rate)
-        return any(x is not None for x in (*chosen, self.limits.angular_acceleration))
+        """Whether some limit, or the body, keeps the duration of this path from vanishing."""
+        limits, knots = self.limits, self.position
+        moves = np.ptp(knots.value, axis=0) > _SAME
+        pushed = moves | np.any(knots.derivative[:, 0] != 0.0, axis=0)
+        turns = np.any(np.ptp(self.attitude.value, axis=0) > _SAME)
+        if self.body is not None:
+            return bool(np.any(pushed) or turns)
+        bounds = (
+            (limits.velocity, moves),
+            (limits.acceleration, pushed),
+            (limits.angular_rate, turns),
+            (limits.angular_acceleration, turns),
+        )
+        return any(bound is not None and bool(np.any(np.isfinite(bound) & where)) for bound, where in bounds)
 
     def durations(self, asked: Sequence[float] | float | None) -> np.ndarray:
         """(n - 1,) s to start from."""
@@ -157,10 +184,12 @@ class _Request:
         return divide_time(knots, total, np.ones(CHANNELS))
 
     def try_stretch(self, base: np.ndarray, factor: float) -> Piecewise | None:
-        """The trajectory at `factor` times the durations, or None where it breaks something."""
+        """The trajectory at `factor` times the durations, or None where it breaks something that longer ones may mend."""
         try:
             return replace(self.attempt(base * factor), stretch=factor)
-        except InfeasibleError:
+        except InfeasibleError as error:
+            if isinstance(error, _UnreachableError) and factor >= 1.0:
+                raise
             return None
 
     def attempt(self, durations: np.ndarray) -> Piecewise:
@@ -194,10 +223,8 @@ class _Request:
                 raise InfeasibleError(f"turning takes {size.max():.3g} {unit} of at most {bound:g} {unit} {where}")
 
     def _check_thrusters(self, found: Piecewise, body: Body) -> None:
-        motion = found.grid(_CHECK_POINTS)[..., :19]
-        share, k = usage(body, wrenches(body, motion.reshape(-1, 19)))
-        if share > self.limits.thruster_share:
-            raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, _place(found, k)))
+        motion = found.grid(_CHECK_POINTS)[..., :19].reshape(-1, 19)
+        self._check_motion(body, motion, lambda k: _place(found, k))
 
     def check_standing(self) -> None:
         """Refuse attitudes that the body cannot even hold. Raises InfeasibleError."""
@@ -205,9 +232,25 @@ class _Request:
             return
         still = np.zeros((len(self.attitude.value), 19))
         still[:, 3:7] = self.attitude.value
-        share, k = usage(self.body, wrenches(self.body, still))
+        self._check_motion(self.body, still, lambda k: f"to stand still at waypoint {k}")
+
+    def _check_motion(self, body: Body, motion: np.ndarray, place: Callable[[int], str]) -> None:
+        """Refuse (k, 19) motion that takes more than thrusters and buoyancy give; `place` tells in words where row k is."""
+        part = divide(body, motion)
+        flat = int(np.argmax(np.abs(part.lacking)))
+        k, axis = divmod(flat, 6)
+        if lacking := abs(float(part.lacking[k, axis])):
+            what = f"{lacking:.2g} {'N along' if axis < 3 else 'N m about'} the robot's {'xyz'[axis % 3]}"
+            raise _UnreachableError(f"neither thrusters nor buoyancy give {what}, which it takes {place(k)}")
+        k = int(np.argmax(part.lean))
+        if (lean := float(part.lean[k])) == math.inf:
+            raise InfeasibleError(f"neither thrusters nor buoyancy keep the robot from falling over {place(k)}")
+        if lean > MOST_LEAN:
+            degrees = f"{math.degrees(lean):.1f} deg, of at most {math.degrees(MOST_LEAN):.1f} deg"
+            raise InfeasibleError(f"the robot would lean by {degrees}, for a moment that its thrusters do not give, {place(k)}")
+        share, k = usage(body, part.thrust)
         if share > self.limits.thruster_share:
-            raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, f"to stand still at waypoint {k}"))
+            raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, place(k)))
 
 
 def _thrust_message(share: float, limit: float, where: str) -> str:

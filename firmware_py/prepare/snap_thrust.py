@@ -1,6 +1,10 @@
-"""Whether a body's thrusters can fly a path: the wrench that it asks for, and how much of their range that takes."""
+"""Whether a body can fly a path: the wrench that it asks for, the share of the thrusters' range that this takes, and how far
+the body leans where a moment is left to buoyancy.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
@@ -13,6 +17,34 @@ from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
 
 _MOST_PROGRAMS = 60
 """Points, the worst by the pseudo-inverse, whose usage is found exactly."""
+
+RANK_TOLERANCE = 1e-6
+"""Share of the largest singular value below which an axis is outside the thrusters' span."""
+_OUTSIDE = 1e-6
+"""Share of a wrench that may be outside by rounding."""
+_NOTHING = 1e-9
+"""N and N m that nothing has to give."""
+
+_LEAN_STEP = 1e-4
+"""rad by which attitudes are turned to see what leaning changes."""
+_NO_STIFFNESS = 1e-6
+"""N m/rad that does not hold a body."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Division:
+    """What k states of motion take, divided between thrusters and leaning.
+
+    Attributes:
+        thrust: (k, 6) wrench that is left to the thrusters, within their span, N and N m.
+        lean: (k,) rad by which the body leans from the wanted attitude until it needs no more than that; infinite where
+            nothing keeps it from falling over.
+        lacking: (k, 6) wrench that neither gives; zero in all that the body can fly.
+    """
+
+    thrust: np.ndarray
+    lean: np.ndarray
+    lacking: np.ndarray
 
 
 def wrenches(body: Body, motion: np.ndarray) -> np.ndarray:
@@ -36,11 +68,57 @@ def wrenches(body: Body, motion: np.ndarray) -> np.ndarray:
     return out
 
 
+def divide(body: Body, motion: np.ndarray) -> Division:
+    """What thrusters that span fewer than six axes leave to buoyancy and water; with all six it is nothing.
+
+    The body leans about the moments N outside the span, by N s: from W + dW/ds s in the span follows K s = -N' W with the
+    stiffness K = N' dW/ds. Buoyancy makes it positive; the moment of the added mass on a body under way (Munk) may undo that.
+
+    Args:
+        body: its thrusters, masses, drag, righting moment.
+        motion: (k, 19) as for `wrenches`.
+    """
+    wanted = wrenches(body, motion)
+    left, sizes, _ = np.linalg.svd(body.thrusters.matrix)
+    outside = left[:, int(np.sum(sizes > RANK_TOLERANCE * sizes[0])) :]
+    if not outside.size:
+        return Division(wanted, np.zeros(len(wanted)), np.zeros_like(wanted))
+    slope = np.stack([_change_by_lean(body, motion, axis) for axis in outside[3:].T], axis=2)
+    stiffness = outside.T @ slope
+    stiffness[np.abs(stiffness).max(axis=(1, 2)) < _NO_STIFFNESS] = 0.0
+    s = -(np.linalg.pinv(stiffness, rcond=RANK_TOLERANCE) @ (wanted @ outside)[..., None])
+    thrust = wanted + (slope @ s)[..., 0]
+    lacking = thrust @ outside @ outside.T
+    thrust -= lacking
+    lacking[~_matters(lacking, wanted)] = 0.0
+    lean = np.linalg.norm((outside[3:] @ s)[..., 0], axis=1)
+    lean[np.linalg.eigvalsh(stiffness + np.swapaxes(stiffness, 1, 2)).min(axis=1) < -_NO_STIFFNESS] = np.inf
+    return Division(thrust, lean, lacking)
+
+
+def _change_by_lean(body: Body, motion: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """(k, 6) by how much the wrenches change, a radian that the body leans about `axis` (3,), body frame."""
+    ends = []
+    for step in (_LEAN_STEP, -_LEAN_STEP):
+        by, leant = rotations.exp(step * axis), motion.copy()
+        for row in leant:
+            row[3:7] = rotations.multiply(row[3:7].copy(), by)
+            row[10:13], row[16:19] = rotations.rotate_back(by, row[10:13].copy()), rotations.rotate_back(by, row[16:19].copy())
+        ends.append(wrenches(body, leant))
+    return np.asarray((ends[0] - ends[1]) / (2.0 * _LEAN_STEP))
+
+
+def _matters(part: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """(k,) whether a part (k, 6) of the wrenches (k, 6) is more than rounding."""
+    return np.asarray(np.linalg.norm(part, axis=1) > _OUTSIDE * np.linalg.norm(wanted, axis=1) + _NOTHING)
+
+
 def usage(body: Body, wanted: np.ndarray) -> tuple[float, int]:
     """Largest share of the thrusters' range that any of the wrenches takes, and which one it is.
 
     The share of one wrench w is the least s for which forces f with J f = w and s f_min <= f <= s f_max exist. The
-    pseudo-inverse bounds it from above; where that exceeds what any lower bound allows, a linear program finds it.
+    pseudo-inverse bounds it from above; where that exceeds what any lower bound allows, a linear program finds it. The share
+    of a wrench outside the thrusters' span is infinite.
 
     Args:
         body: its thrusters.
@@ -49,6 +127,7 @@ def usage(body: Body, wanted: np.ndarray) -> tuple[float, int]:
     thrusters = body.thrusters
     forces = wanted @ thrusters.pinv.T
     above = np.maximum(forces / thrusters.f_max, forces / thrusters.f_min).max(axis=1)
+    above[_matters(wanted - forces @ thrusters.matrix.T, wanted)] = np.inf
     order = np.argsort(-above, kind="stable")[:_MOST_PROGRAMS]
     best, where = 0.0, int(order[0])
     for k in order:

@@ -273,6 +273,43 @@ def test_meaningless_request_is_refused(waypoints: list[Waypoint], times: object
         plan(waypoints, times)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    "limits",
+    [
+        Limits(angular_rate=0.5),
+        Limits(angular_acceleration=0.5, corridor_m=0.1),
+        Limits(velocity=np.array([math.inf, math.inf, 0.1])),
+        Limits(acceleration=np.array([math.inf, math.inf, 0.1])),
+    ],
+)
+def test_free_durations_of_a_path_that_meets_no_limit_are_refused(limits: Limits) -> None:
+    waypoints = [Waypoint(np.zeros(3)), Waypoint(np.array([1.0, 0, 0])), Waypoint(np.array([1.0, 1, 0]))]
+    with pytest.raises(ValueError, match="free durations need a limit that this path meets"):
+        plan(waypoints, None, limits)
+
+
+def test_free_durations_of_a_robot_that_stays_are_refused(one: Body) -> None:
+    for limits, body in ((Limits(velocity=np.ones(3), angular_rate=0.5), None), (None, one)):
+        with pytest.raises(ValueError, match="free durations"):
+            plan([Waypoint(np.ones(3))] * 3, None, limits, body)
+
+
+def test_turning_alone_bounds_the_time_of_a_path_that_moves_too() -> None:
+    waypoints = [Waypoint(np.zeros(3)), Waypoint(np.array([1.0, 0, 0]), rotations.from_euler(0, 0, 1.0))]
+    grid = plan(waypoints, None, Limits(angular_rate=0.5)).grid(50)
+    assert np.linalg.norm(grid[..., 10:13], axis=-1).max() == pytest.approx(0.5, rel=0.01)
+
+
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_velocity_where_the_path_rests_is_refused(k: int) -> None:
+    waypoints = [Waypoint(np.array([float(i), 0, 0]), stop=i == 1) for i in range(3)]
+    waypoints[k] = dataclasses.replace(waypoints[k], velocity_w=np.array([0.3, 0, 0]))
+    with pytest.raises(ValueError, match=f"waypoint {k} has a velocity, but the path rests there"):
+        plan(waypoints, 10.0)
+    waypoints[k] = dataclasses.replace(waypoints[k], velocity_w=np.zeros(3))
+    assert plan(waypoints, 10.0).duration_s == pytest.approx(10.0)
+
+
 # ---------------------------------------------------------------- what the thrusters can do
 
 

@@ -1,0 +1,161 @@
+"""What a body can fly whose thrusters span fewer than six axes: the rest is left to buoyancy, within bounds."""
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+
+from firmware_py.app.mission_plan import plan_mission
+from firmware_py.core import propagation, rotations
+from firmware_py.core.allocator import Allocator
+from firmware_py.core.body import Body
+from firmware_py.core.controller import Controller
+from firmware_py.core.setpoint import Trajectory
+from firmware_py.core.types import Estimate
+from firmware_py.description.parameters import Allocation, Control
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.ground.mission_flight import Leg, Plan, PlanJob
+from firmware_py.prepare.assembly import assemble_vehicle
+from firmware_py.prepare.minimum_snap import MOST_LEAN, InfeasibleError, Limits, Waypoint, plan
+from firmware_py.prepare.snap_thrust import divide, usage, wrenches
+
+START, NORTH, EAST = np.array([0.0, 0.0, 2.0]), np.array([2.0, 0.0, 2.0]), np.array([0.0, 2.0, 2.0])
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def bluerov2() -> Body:
+    return assemble_vehicle(load_vehicle("bluerov2"))
+
+
+@pytest.fixture(params=["bluerov2", "girona500"])
+def passive(request: pytest.FixtureRequest) -> Body:
+    """A vehicle that leaves an axis to buoyancy: pitch, roll."""
+    return assemble_vehicle(load_vehicle(request.param))
+
+
+def job(*places: np.ndarray, yaw: float | None = None, q_wb: np.ndarray = LEVEL, speed_m_s: float = 0.3) -> PlanJob:
+    return PlanJob(0, 1, START, q_wb, tuple(Leg(k, p, yaw, 0.0, speed_m_s) for k, p in enumerate(places)), 0.2, 1.0)
+
+
+def flown(found: Plan) -> Trajectory:
+    assert found.trajectory is not None, found
+    return found.trajectory
+
+
+def without_sway(body: Body) -> Body:
+    """The same with thrusters that push nothing sideways."""
+    matrix = body.thrusters.matrix.copy()
+    matrix[1] = 0.0
+    return dataclasses.replace(body, thrusters=dataclasses.replace(body.thrusters, matrix=matrix, pinv=np.linalg.pinv(matrix)))
+
+
+def believed(x: np.ndarray) -> Estimate:
+    zero = np.zeros(3)
+    return Estimate(x[:3].copy(), x[3:7].copy(), x[7:13].copy(), zero, zero, zero, zero, 0, math.nan, 0, 0, True)
+
+
+@pytest.mark.parametrize("yaw", [None, 0.785])
+@pytest.mark.parametrize("place", [NORTH, EAST, NORTH + EAST - START], ids=["north", "east", "north-east"])
+def test_vehicle_that_leaves_an_axis_to_buoyancy_has_its_missions_planned(passive: Body, place: np.ndarray, yaw: float | None) -> None:
+    six = assemble_vehicle(load_vehicle("bluerov2_heavy"))
+    expected = flown(plan_mission(job(place, yaw=yaw), six)).duration_s
+    assert flown(plan_mission(job(place, yaw=yaw), passive)).duration_s == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("place", [NORTH, EAST, 5.0 * NORTH], ids=["north", "east", "far and deep"])
+def test_mission_of_such_a_vehicle_is_flown_and_it_leans_no_more_than_planned(passive: Body, place: np.ndarray) -> None:
+    """As fast as it can: the moment of the added mass, which tips a body under way, counts beside buoyancy."""
+    drag, period_s = passive.drag, 0.01
+    plant = (passive.mass, passive.mass_inv, passive.righting, drag.nodes, drag.rotational, drag.linear)
+    path = flown(plan_mission(job(place, speed_m_s=1.5), passive))
+    controller, allocator = Controller(passive, Control()), Allocator(passive, Allocation())
+    x = np.zeros(propagation.STATES)
+    x[:3], x[3:7] = START, LEVEL
+    planned = leant = error = 0.0
+    for k in range(round(path.duration_s / period_s)):
+        wanted = path.sample(k * period_s)
+        planned = max(planned, float(divide(passive, np.concatenate(list(wanted))[None]).lean[0]))
+        leant = max(leant, float(np.linalg.norm(rotations.difference(wanted.q_wb.copy(), x[3:7].copy()))))
+        error = max(error, float(np.linalg.norm(wanted.p_wb - x[:3])))
+        x = propagation.step(x, allocator.step(controller.step(wanted, wanted, believed(x))).achieved, period_s, *plant)
+    assert planned <= 1.01 * MOST_LEAN
+    assert leant <= 1.1 * planned + 0.01
+    assert error < 0.01
+
+
+def test_lean_is_the_angle_at_which_buoyancy_gives_the_moment(bluerov2: Body) -> None:
+    """Held at a pitch that no thruster gives, it stays level: as far off as it was to be pitched, by the tangent."""
+    motion = np.zeros((2, 19))
+    motion[0, 3:7], motion[1, 3:7] = rotations.from_euler(0.0, 0.15, 0.4), rotations.from_euler(0.3, 0.0, -1.0)
+    found = divide(bluerov2, motion)
+    np.testing.assert_allclose(found.lean, [math.tan(0.15), 0.0], atol=1e-6)
+    np.testing.assert_array_equal(found.lacking, 0.0)
+    righting = float(np.linalg.norm(bluerov2.righting))
+    np.testing.assert_allclose(found.thrust[1, 3:], [righting * math.sin(0.3), 0.0, 0.0], atol=1e-6)
+
+
+def test_what_is_left_to_thrusters_is_within_their_span(passive: Body) -> None:
+    motion = flown(plan_mission(job(NORTH + EAST, yaw=0.7), passive)).parts[0][1].grid(16)[..., :19].reshape(-1, 19)  # type: ignore[attr-defined]
+    found, thrusters = divide(passive, motion), passive.thrusters
+    np.testing.assert_allclose(found.thrust @ thrusters.pinv.T @ thrusters.matrix.T, found.thrust, atol=1e-9)
+    assert usage(passive, found.thrust)[0] < 0.6
+    assert found.lean.max() > 1e-3
+
+
+def test_vehicle_with_all_six_axes_leaves_nothing_to_buoyancy() -> None:
+    body = assemble_vehicle(load_vehicle("modcube"))
+    motion = np.random.default_rng(1).normal(size=(20, 19))
+    motion[:, 3:7] /= np.linalg.norm(motion[:, 3:7], axis=1, keepdims=True)
+    found = divide(body, motion)
+    np.testing.assert_array_equal(found.thrust, wrenches(body, motion))
+    assert not found.lean.any() and not found.lacking.any()
+
+
+@pytest.mark.parametrize(
+    ("q_wb", "message"),
+    [
+        (rotations.from_euler(0.0, 0.5, 0.0), r"lean by 31.3 deg, of at most 11.5 deg, .* to stand still at waypoint 0"),
+        (rotations.from_euler(math.pi, 0.0, 0.0), "keep the robot from falling over to stand still at waypoint 0"),
+        (rotations.from_euler(math.pi, 0.1, 0.0), "keep the robot from falling over to stand still at waypoint 0"),
+    ],
+    ids=["pitched", "on its head", "nearly on its head"],
+)
+def test_attitude_that_neither_thrusters_nor_buoyancy_hold_is_refused(bluerov2: Body, q_wb: np.ndarray, message: str) -> None:
+    found = plan_mission(job(NORTH, q_wb=q_wb), bluerov2)
+    assert found.trajectory is None
+    assert re.search(message, found.reason)
+
+
+def test_push_along_an_axis_without_thrusters_is_refused_at_any_speed(bluerov2: Body) -> None:
+    """Buoyancy does not push sideways; what needs no such push is planned."""
+    body = without_sway(bluerov2)
+    assert plan_mission(job(NORTH), body).trajectory is not None
+    found = plan_mission(job(EAST), body)
+    assert found.trajectory is None
+    assert re.search(r"give [\d.]+ N along the robot's y, which it takes between waypoints 0 and 1", found.reason)
+    with pytest.raises(InfeasibleError, match="along the robot's y"):
+        plan([Waypoint(START), Waypoint(EAST)], 1e4, body=body)
+
+
+def test_vehicle_that_nothing_rights_is_refused(bluerov2: Body) -> None:
+    found = plan_mission(job(NORTH), dataclasses.replace(bluerov2, righting=np.zeros(3)))
+    assert found.trajectory is None
+    assert re.search("neither thrusters nor buoyancy", found.reason)
+
+
+def test_path_is_stretched_until_the_vehicle_leans_little_enough(bluerov2: Body) -> None:
+    waypoints = [Waypoint(START), Waypoint(NORTH)]
+    with pytest.raises(InfeasibleError, match=r"lean by [\d.]+ deg, of at most 11.5 deg|falling over"):
+        plan(waypoints, 4.0, Limits(thruster_share=1.0), bluerov2, stretch=False)
+    found = plan(waypoints, 4.0, Limits(thruster_share=1.0), bluerov2)
+    assert divide(bluerov2, found.grid(16)[..., :19].reshape(-1, 19)).lean.max() == pytest.approx(MOST_LEAN, rel=0.03)
+
+
+@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
+def test_wrench_outside_the_span_is_used_infinitely_whatever_the_pseudo_inverse_says(bluerov2: Body, order: list[int]) -> None:
+    wanted = np.zeros((2, 6))
+    wanted[0, 3] = wanted[1, 4] = 2.0
+    assert usage(bluerov2, wanted[order]) == (math.inf, order.index(1))
