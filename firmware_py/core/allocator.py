@@ -1,8 +1,8 @@
 """Stage 6 of a tick: from a wrench to the force of each thruster (paper, Eq. 5), within limits.
 
 Where the pseudo-inverse (plus the preload) stays within limits it is the answer. Otherwise a box-constrained
-least-squares problem (box_program) keeps the directions of force and moment and gives way in the force first. Mode
-`least_power` moves an answer within limits to where the thrusters draw the least.
+least-squares problem (box_program) keeps the directions of force and moment and gives way in the force first, and so does
+a body whose supplies cannot feed the answer. Mode `least_power` moves an answer within limits to where the thrusters draw the least.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from firmware_py.core.body import Body
 from firmware_py.core.box_program import nearest
 from firmware_py.core.least_power import LeastPower
 from firmware_py.core.preload import preload
-from firmware_py.core.types import Thrust
+from firmware_py.core.thruster import module_power
+from firmware_py.core.types import Room, Thrust
 from firmware_py.description.parameters import Allocation
 
 MOMENT_PRIORITY = 100.0
@@ -23,8 +24,13 @@ SHARE_WEIGHT = 1e3
 """Cost of losing the whole force against all thrusters at their limits: high enough that feasible force is not given away."""
 BEYOND = 2.0
 """A wrench above this many times what all thrusters together could give is scaled down first, so that the problem stays well scaled."""
+HALVINGS = 8
+"""Bisections of the share that the supplies can feed."""
 LEFT = 1e-3
 """Largest difference from the directions of force and moment, N and N m, that is taken; a hundred thousand times what is usual."""
+
+
+IS_FORCE = np.r_[np.ones(3), np.zeros(3)]
 
 
 @njit("float64(float64[::1],float64[::1],float64[::1])", cache=True)
@@ -43,7 +49,7 @@ def are_within(force, f_min, f_max):  # type: ignore[no-untyped-def]
 
 
 class Allocator:
-    """Allocates for one body. `alive` leaves thrusters out of the problem at once."""
+    """Allocates for one body, within its thrusters' nominal limits until `confine` tells others."""
 
     def __init__(self, body: Body, parameters: Allocation) -> None:
         self.parameters = parameters
@@ -57,26 +63,65 @@ class Allocator:
         self._most = np.array([np.linalg.norm(body.thrusters.matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
         self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
         self._preloaded: tuple[np.ndarray, np.ndarray] | None = None
+        self._room = Room(body.thrusters.f_min, body.thrusters.f_max, np.full(len(body.modules), np.inf))
         self._set(np.ones(n, dtype=bool), body.thrusters.pinv)
 
     def set_alive(self, alive: np.ndarray) -> None:
         """(n,) bool: thrusters that may be used from now on."""
         self._set(alive, np.linalg.pinv(self._thrusters.matrix * alive))
 
+    def confine(self, room: Room) -> None:
+        """Keeps within `room` from now on."""
+        if room is not self._room:
+            self._room = room
+            self._set_limits()
+
     def _set(self, alive: np.ndarray, pinv: np.ndarray) -> None:
         t = self._thrusters
         self._matrix = np.ascontiguousarray(t.matrix * alive)
         self._pinv = np.ascontiguousarray(pinv)
-        self._f_min, self._f_max = t.f_min * alive, t.f_max * alive
+        self._alive = alive
         self._preload = preload(t, alive, self._smallest_n, self._preloaded)
         self._preloaded = (alive.copy(), self._preload)
         self._rows = np.vstack([self._matrix.T, np.zeros((2, 6))])
         self._goal = np.r_[self._preload, 1.0, 1.0]
-        self._low, self._high = np.r_[self._f_min, 0.0, 0.0], np.r_[self._f_max, 1.0, 1.0]
         self._cheaper = LeastPower(t, alive) if self._least_power else None
+        self._set_limits()
+
+    def _set_limits(self) -> None:
+        self._f_min, self._f_max = self._room.low_n * self._alive, self._room.high_n * self._alive
+        self._low, self._high = np.r_[self._f_min, 0.0, 0.0], np.r_[self._f_max, 1.0, 1.0]
 
     def step(self, wrench: np.ndarray) -> Thrust:
         """The thruster forces for a wanted (6,) wrench, body frame."""
+        thrust = self._within(wrench)
+        if self._clip_only or self._is_fed(thrust):
+            return thrust
+        force, moment = wrench * IS_FORCE, wrench * (1.0 - IS_FORCE)
+        force_share, thrust = self._fed(force, beside=moment)
+        if self._is_fed(thrust):
+            return thrust._replace(scale=(force_share * thrust.scale[0], thrust.scale[1]))
+        moment_share, thrust = self._fed(moment, beside=np.zeros(6))
+        return thrust._replace(scale=(0.0, moment_share * thrust.scale[1]))
+
+    def _is_fed(self, thrust: Thrust) -> bool:
+        """Whether every module's supply is enough; for forces that are no numbers the limiter has the last word."""
+        t, supply_w = self._thrusters, self._room.supply_w
+        power_w = module_power(thrust.force_n, t.power_forward, t.power_reverse, t.module, supply_w.size)
+        return not bool(np.any(power_w > supply_w))
+
+    def _fed(self, wrench: np.ndarray, beside: np.ndarray) -> tuple[float, Thrust]:
+        """Largest share of a wrench that is fed beside another, and the forces; where there is none, those for the other alone."""
+        share, step, found = 0.0, 1.0, self._within(beside)
+        for _ in range(HALVINGS):
+            step *= 0.5
+            thrust = self._within(beside + (share + step) * wrench)
+            if self._is_fed(thrust):
+                share, found = share + step, thrust
+        return share, found
+
+    def _within(self, wrench: np.ndarray) -> Thrust:
+        """The forces within the thrusters' limits."""
         force = self._preload + self._pinv @ wrench
         if are_within(force, self._f_min, self._f_max):
             return self._thrust(self._cheaper.step(force) if self._cheaper else force, (1.0, 1.0))
@@ -85,8 +130,7 @@ class Allocator:
         return self._saturated(wrench)
 
     def _thrust(self, force: np.ndarray, kept: tuple[float, float]) -> Thrust:
-        t = self._thrusters
-        return Thrust(force, self._matrix @ force, kept, 1.0 - busiest(force, t.f_min, t.f_max))
+        return Thrust(force, self._matrix @ force, kept, 1.0 - busiest(force, self._room.low_n, self._room.high_n))
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
         """min |f - f_preload|^2 + w_f (1 - a)^2 + w_m (1 - b)^2, J f = [a F; b M], f within limits, 0 <= a, b <= 1."""

@@ -108,7 +108,7 @@ class HealthMonitor:
         self._pilot_ns: int | None = None
         self._stick = 0.0
         self._nis_ratio, self._rejected_share = 1.0, 0.0
-        self._rejected = 0
+        self._rejected, self._tag_ns = 0, NEVER_NS
         self._errors, self._error_rate = 0, 0.0
         self._time_ns: int | None = None
         self._missed_rate = 0.0
@@ -235,8 +235,11 @@ class HealthMonitor:
         missed = max(0, round(dt_s * 1e9 / self._period_ns) - 1)
         self._missed_rate = keep * self._missed_rate + missed / MEAN_S
         refused, self._rejected = estimate.rejected - self._rejected, estimate.rejected
+        before_ns, self._tag_ns = self._tag_ns, inputs.time_ns - estimate.tag_age_ns
+        taken = estimate.ready and refused == 0 and self._tag_ns > before_ns  # the paper's estimator tells of no innovations
         if estimate.nis_dof:
             self._nis_ratio += TAG_SHARE * (estimate.nis / estimate.nis_dof - self._nis_ratio)
+        if estimate.nis_dof or taken:
             self._rejected_share -= TAG_SHARE * self._rejected_share
         if refused > 0:
             self._rejected_share += TAG_SHARE * (1.0 - self._rejected_share)

@@ -13,6 +13,7 @@ from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.thruster import commands, module_power, polynomial, total_power
+from firmware_py.core.types import Room
 from firmware_py.description.parameters import Limiter as LimiterParameters
 
 VOLTAGE_EXPONENT = 1.2
@@ -44,6 +45,8 @@ class Limiter:
         self._full, self._all = np.ones(t.f_max.size), np.ones(t.f_max.size, dtype=bool)
         self._nominal_v = np.array([t.voltage_v[i[0]] for i in self._of_module])
         self._scale, self._scaled_for = self._full, b""
+        self._room: Room | None = None
+        self._room_for: tuple[object, ...] = ()
         self.magnets = [MagnetLimiter(parameters, dt_s) for _ in body.modules]
         """One for each module."""
         self.force_n = np.zeros(t.f_max.size)
@@ -57,8 +60,19 @@ class Limiter:
             -np.array([polynomial(curve, 1.0) for curve in t.reverse]), np.array([polynomial(curve, 1.0) for curve in t.forward]),
         )  # fmt: skip
         self._step_n = parameters.slew_n_per_s * self._dt_s
+        self._room = None
         for magnets in self.magnets:
             magnets.retune(parameters)
+
+    def room(self, voltage_v: np.ndarray) -> Room:
+        """What passes at this supply (m,), beside the magnets that are on; the same object for as long as it is the same."""
+        scale, magnets_w = self._voltage_scale(voltage_v), [magnets.power_w for magnets in self.magnets]
+        if self._room is None or self._room_for != (self._scaled_for, magnets_w):
+            low, high, full_low, full_high = self._limits
+            supply_w = np.array(self._supply) - magnets_w
+            self._room = Room(np.maximum(low, full_low * scale), np.minimum(high, full_high * scale), supply_w)
+            self._room_for = (self._scaled_for, magnets_w)
+        return self._room
 
     def ease(self, force_n: np.ndarray) -> None:
         """Goes on from the forces (n,) of the bodies before, whose thrusters these were, and changes them slowly at first."""

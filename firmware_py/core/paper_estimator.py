@@ -9,7 +9,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.estimator import NEVER_NS, READY_AFTER, RESET_AFTER
 from firmware_py.core.propagation import ERRORS, STATES
-from firmware_py.core.rotations import conjugate, exp, log, multiply, rotate
+from firmware_py.core.rotations import conjugate, exp, log, multiply, rotate, to_matrix
 from firmware_py.core.topology import Motion
 from firmware_py.core.types import BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
@@ -20,6 +20,8 @@ PAPER_ALPHA_DENSITY = 0.5
 """Angular likewise, rad/s^2/sqrt(Hz); synthetic."""
 PAPER_FLIP_RAD = 0.5
 """A tag that jumps further than this is a flip; any working tag tracker refuses it, and begins anew where it stays so."""
+PLACED, TURNED = (np.ix_([*range(i, i + 3), *range(i + 6, i + 9)], [*range(i, i + 3), *range(i + 6, i + 9)]) for i in (0, 3))
+"""Where position with velocity, and attitude with rate, stand in a covariance (25, 25)."""
 
 
 class TagOnlyEstimator:
@@ -61,14 +63,17 @@ class TagOnlyEstimator:
 
     @property
     def motion(self) -> Motion:
-        """State and covariance now, for a body that joins or parts."""
+        """State and covariance now, for a body that joins or parts. Biases and disturbance, which it does not know, are zero
+        without variance.
+        """
         x = np.zeros(STATES)
         x[:3], x[3:7] = self._position[:3], self._q_wb
         x[7:10] = rotate(conjugate(self._q_wb), self._position[3:].copy())
         x[10:13] = self._rate_b
-        variance = np.full(ERRORS, 1e-4)
-        variance[:3], variance[3:6] = self._p_position.diagonal()[:3], self._p_attitude.diagonal()[:3]
-        return Motion(x, np.diag(variance), self._accepted, self._last_tag_ns)
+        covariance = np.zeros((ERRORS, ERRORS))
+        covariance[PLACED] = _turned(self._p_position, to_matrix(self._q_wb).T)
+        covariance[TURNED] = self._p_attitude
+        return Motion(x, covariance, self._accepted, self._last_tag_ns)
 
     def restart(self, time_ns: int, motion: Motion) -> Estimate:
         """Goes on from `motion` at `time_ns`; returns the estimate of the same tick."""
@@ -76,7 +81,10 @@ class TagOnlyEstimator:
         self._q_wb = x[3:7].copy()
         self._position = np.concatenate([x[:3], rotate(self._q_wb, x[7:10].copy())])
         self._rate_b = x[10:13].copy()
+        self._p_position = _turned(motion.covariance[PLACED], to_matrix(self._q_wb))
+        self._p_attitude = motion.covariance[TURNED].copy()
         self._accepted, self._last_tag_ns = motion.accepted, motion.tag_ns
+        self._refused_in_row = 0
         return self._estimate(time_ns)
 
     def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:
@@ -106,23 +114,23 @@ class TagOnlyEstimator:
             ready=self._accepted >= READY_AFTER,
         )
 
-    def _start(self, p_wb: np.ndarray, q_wb: np.ndarray) -> None:
+    def _start(self, p_wb: np.ndarray, q_wb: np.ndarray, capture_ns: int) -> None:
         self._position, self._q_wb, self._rate_b = np.concatenate([p_wb, np.zeros(3)]), q_wb, np.zeros(3)
         self._p_position, self._p_attitude = np.eye(6), np.eye(6)
         self._accepted, self._refused_in_row = 1, 0
+        self._last_tag_ns = capture_ns
 
     def _fuse(self, pose: BodyPose) -> None:
         p_wb = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
-        self._last_tag_ns = pose.capture_ns
         if not self._accepted:
-            self._start(p_wb, pose.q_wb)
+            self._start(p_wb, pose.q_wb, pose.capture_ns)
             return
         turn = log(multiply(conjugate(self._q_wb), pose.q_wb))
         if float(np.linalg.norm(turn)) > PAPER_FLIP_RAD and self._accepted > READY_AFTER:
             self._rejected += 1
             self._refused_in_row += 1
             if self._refused_in_row >= RESET_AFTER:
-                self._start(p_wb, pose.q_wb)
+                self._start(p_wb, pose.q_wb, pose.capture_ns)
             return
         self._refused_in_row = 0
         along, angle = self._p.tag_sigma_axis_m, self._p.tag_sigma_rad
@@ -132,3 +140,11 @@ class TagOnlyEstimator:
         self._q_wb = multiply(self._q_wb, exp(error[:3].copy()))
         self._rate_b = self._rate_b + error[3:]
         self._accepted += 1
+        self._last_tag_ns = pose.capture_ns
+
+
+def _turned(covariance: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """(6, 6) covariance of position and velocity, the velocity in other axes by `turn` (3, 3)."""
+    whole = np.eye(6)
+    whole[3:, 3:] = turn
+    return np.asarray(whole @ covariance @ whole.T)

@@ -58,7 +58,7 @@ class BodyPipeline:
     def __init__(self, body: Body, parameters: Parameters, period_ns: int) -> None:
         self.body, self.parameters = body, parameters
         self.joints = joints_of(body)
-        self.measurements = Measurements(body)
+        self.measurements = Measurements(body, period_ns)
         self.imus = ImuWatch(body.modules)
         self.estimator = ESTIMATORS[parameters.estimation.kind](body, parameters.estimation, period_ns)
         self.faults = FaultDetector(body, parameters.faults, period_ns)
@@ -143,6 +143,7 @@ class BodyPipeline:
         setpoint, ahead = self.guidance.step(time_ns, estimate, health)
         wrench = self.controller.step(setpoint, ahead, estimate)
         wrench = self.guidance.mix(wrench, time_ns, estimate, health)
+        self.allocator.confine(self.limiter.room(self.supply.voltage_v))
         thrust = self._allocate(wrench, time_ns)
         armed, alive = self.supervisor.armed, self.faults.now.alive
         force, command = self.limiter.step(thrust.force_n, armed, self.supply.voltage_v, alive)

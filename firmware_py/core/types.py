@@ -195,7 +195,7 @@ class Measured(NamedTuple):
     gyro: Array | None
     """(3,) rad/s."""
     accel: Array | None
-    """(3,) specific force at the centre of mass, m/s^2."""
+    """(3,) specific force at the centre of mass, m/s^2; where the IMUs heard stand beside it, angular acceleration by the gyro."""
     depth_m: float | None
     """Depth of the centre of mass by pressure, without the datum's bias."""
     tags: list[BodyPose]
@@ -255,6 +255,17 @@ class Setpoint(NamedTuple):
     """(3,) acceleration, world."""
     alpha_b: Array
     """(3,) angular acceleration, wanted body frame."""
+
+
+class Room(NamedTuple):
+    """What passes the limiter for as long as one likes: the allocation's limits."""
+
+    low_n: Array
+    """(n,) of each thruster, N, in reverse: negative."""
+    high_n: Array
+    """(n,) forward."""
+    supply_w: Array
+    """(m,) what each module's supply has for thrusters, W."""
 
 
 class Thrust(NamedTuple):

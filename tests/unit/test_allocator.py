@@ -12,7 +12,7 @@ from scipy.optimize import linprog, lsq_linear
 from firmware_py.core.allocator import MOMENT_PRIORITY, SHARE_WEIGHT, Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.preload import preload
-from firmware_py.core.types import Thrust
+from firmware_py.core.types import Room, Thrust
 from firmware_py.description.parameters import Allocation
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -307,3 +307,56 @@ def test_preload_does_not_depend_on_how_the_processor_turns_the_null_space(
     turned[6:, 6:] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     monkeypatch.setattr(np.linalg, "svd", lambda matrix: (*(parts := svd(matrix))[:2], turned @ parts[2]))
     np.testing.assert_allclose(preload(single.thrusters, alive, 0.6), force, rtol=1e-12)
+
+
+# ---------------------------------------------------------------- what the limiter will let pass
+
+
+def power_w(body: Body, thrust: Thrust) -> np.ndarray:
+    """(m,) electrical power of each module's thrusters."""
+    t = body.thrusters
+    rows = np.where(thrust.force_n[:, None] > 0, t.power_forward, t.power_reverse)
+    each = [np.polyval(np.r_[row[::-1], 0.0], abs(force)) for row, force in zip(rows, thrust.force_n, strict=True)]
+    return np.bincount(t.module, each)
+
+
+def test_other_limits_count_at_once_and_are_kept_when_a_thruster_dies(single: Body) -> None:
+    allocator = Allocator(single, PLAIN)
+    room = Room(0.4 * single.thrusters.f_min, 0.5 * single.thrusters.f_max, np.array([1e6]))
+    allocator.confine(room)
+    allocator.set_alive(np.arange(8) != 7)
+    for wrench in wrenches(single, 20, 2.0):
+        thrust = allocator.step(wrench)
+        assert np.all(thrust.force_n <= room.high_n) and np.all(thrust.force_n >= room.low_n) and thrust.force_n[7] == 0.0
+        assert thrust.margin == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
+def test_body_that_cannot_be_fed_gives_way_in_the_force_and_keeps_the_moment(body: Body, size: float) -> None:
+    """Direction kept, moment first, and no module above its supply; what is left unused is less than a step of the bisection."""
+    plenty, allocator = Allocator(body, PLAIN), Allocator(body, PLAIN)
+    fed_less = 0
+    for wrench in wrenches(body, 30, size) * np.repeat([1.0, 0.2], 3):
+        supply_w = 0.5 * power_w(body, plenty.step(wrench))
+        allocator.confine(Room(body.thrusters.f_min, body.thrusters.f_max, supply_w))
+        thrust = allocator.step(wrench)
+        assert np.all(power_w(body, thrust) <= supply_w)
+        moment_alone = plenty.step(wrench * np.r_[np.zeros(3), np.ones(3)])
+        np.testing.assert_allclose(thrust.achieved[:3], thrust.scale[0] * wrench[:3], atol=1e-3)
+        np.testing.assert_allclose(thrust.achieved[3:], thrust.scale[1] * wrench[3:], atol=1e-3)
+        if np.all(power_w(body, moment_alone) <= supply_w):
+            fed_less += 1
+            assert thrust.scale[1] == pytest.approx(moment_alone.scale[1], abs=2e-2)
+            assert 0.0 < thrust.scale[0] < 1.0
+            assert np.max(power_w(body, thrust) / supply_w) > 0.95
+        else:
+            assert thrust.scale[0] == 0.0 and 0.0 < thrust.scale[1] < 1.0
+    assert fed_less > 5
+
+
+def test_paper_s_allocation_leaves_the_supply_to_the_limiter(single: Body) -> None:
+    allocator = Allocator(single, replace(PLAIN, mode="pseudo_inverse"))
+    wrench = np.array([15.0, 0.0, 0.0, 0.0, 0.4, 0.0])
+    before = allocator.step(wrench)
+    allocator.confine(Room(single.thrusters.f_min, single.thrusters.f_max, np.array([1.0])))
+    np.testing.assert_array_equal(allocator.step(wrench).force_n, before.force_n)

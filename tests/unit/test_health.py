@@ -8,7 +8,9 @@ import pytest
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults
 from firmware_py.core.health import NEVER_S, Health, HealthMonitor, is_sticks, outside
-from firmware_py.core.types import Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
+from firmware_py.core.paper_estimator import TagOnlyEstimator
+from firmware_py.core.rotations import exp
+from firmware_py.core.types import Action, BodyPose, EscFeedback, Estimate, Inputs, Measured, ModuleInputs, Request, Sticks
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
@@ -192,6 +194,30 @@ def test_innovations_and_refusals_are_means_of_a_second() -> None:
     for n in range(1, 300):
         health = ear.hear(rejected=n, nis=math.nan, nis_dof=0)  # type: ignore[arg-type]
     assert health.rejected_share > 0.98
+
+
+def test_tags_that_the_papers_estimator_accepts_count_though_it_tells_no_innovations() -> None:
+    """One that is newer, in a tick without a refusal; none in a tick says nothing, as of the other estimator."""
+    ear = Ear()
+    silence = {"nis": math.nan, "nis_dof": 0}
+    for n in range(1, 301):
+        ear.hear(rejected=n, tag_age_ns=n * TICK_NS, **silence)  # type: ignore[arg-type]
+    for n in range(301, 401):
+        health = ear.hear(rejected=300, tag_age_ns=n * TICK_NS, **silence)  # type: ignore[arg-type]
+    assert health.rejected_share > 0.98
+    health = ear.wait(6.0, rejected=300, **silence)
+    assert health.rejected_share < 0.01 and health.nis_ratio == 1.0
+
+
+def test_few_flips_in_a_long_flight_of_the_papers_estimator_stay_few() -> None:
+    estimator, ear = TagOnlyEstimator(BODY, Parameters().estimation, TICK_NS), Ear()
+    flip, worst = exp(np.array([0.8, 0.0, 0.0])), 0.0
+    for k in range(1, 3001):
+        q_wb = flip if k % 50 == 0 else np.array([1.0, 0.0, 0.0, 0.0])
+        pose = BodyPose(k * TICK_NS, np.zeros(3), np.zeros(3), q_wb, 1.0)
+        estimate = estimator.step(k * TICK_NS, Measured(None, None, None, [pose]), np.zeros(6))
+        worst = max(worst, ear.hear(**estimate._asdict()).rejected_share)
+    assert estimate.rejected == 60 and 0.01 < worst < 0.05
 
 
 def test_fence_is_a_box() -> None:

@@ -375,6 +375,39 @@ def test_thrusters_have_what_the_magnets_leave(body: Body, magnets_w: float) -> 
     assert len(limiter.magnets) == 2
 
 
+# ---------------------------------------------------------------- what passes, for the allocation
+
+
+@pytest.mark.parametrize("volts", [8.0, 9.7, 11.99, 12.0, 14.0, np.nan])
+@pytest.mark.parametrize("share", [0.5, 0.9, 1.0])
+def test_room_is_what_passes_when_all_is_asked_for(rich: Body, volts: float, share: float) -> None:
+    limiter = Limiter(rich, replace(QUICK, force_share=share), 1.0)
+    voltage = np.array([volts, 12.0])
+    room = limiter.room(voltage)
+    for wanted, bound in ((-100.0, room.low_n), (100.0, room.high_n)):
+        force, _ = limiter.step(np.full(16, wanted), True, voltage)
+        np.testing.assert_array_equal(force, bound)
+
+
+def test_room_has_what_the_magnets_leave_of_each_supply(body: Body) -> None:
+    limiter = Limiter(replace(body, supply_power_w=np.array([40.0, 50.0])), QUICK, 1.0)
+    np.testing.assert_array_equal(limiter.room(NOMINAL).supply_w, [40.0, 50.0])
+    limiter.magnets[1].power_w = 6.0
+    np.testing.assert_array_equal(limiter.room(NOMINAL).supply_w, [40.0, 44.0])
+
+
+def test_room_is_made_anew_when_something_has_changed_and_only_then(body: Body) -> None:
+    limiter = Limiter(body, QUICK, 1.0)
+    first = limiter.room(NOMINAL)
+    assert limiter.room(NOMINAL.copy()) is first
+    sagged = limiter.room(np.array([9.0, 12.0]))
+    assert sagged is not first and np.all(sagged.high_n[:8] < first.high_n[:8])
+    limiter.step(np.zeros(16), True, NOMINAL)
+    np.testing.assert_array_equal(limiter.room(NOMINAL).high_n, first.high_n)
+    limiter.retune(replace(QUICK, force_share=0.5))
+    np.testing.assert_array_equal(limiter.room(NOMINAL).high_n, 0.5 * first.high_n)
+
+
 def test_limits_are_made_of_these_numbers() -> None:
     assert (VOLTAGE_EXPONENT, VOLTAGE_RANGE, FACES) == (1.2, (0.6, 1.4), 6)
     assert (OFF, FORWARD, REVERSE) == (0, 1, 2)

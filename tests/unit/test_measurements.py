@@ -1,13 +1,15 @@
 """Sensors of several modules, each turned and displaced in its body, become one measurement of the body."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body
-from firmware_py.core.measurements import Measurements
+from firmware_py.core.measurements import SECOND_HAND, SECOND_HAND_WEIGHT, Measurements
 from firmware_py.core.rotations import difference, exp, from_euler, multiply, to_matrix
-from firmware_py.core.types import BodyPose, ModuleInputs, TagObservation
+from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservation
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.lattice import MATRICES
@@ -21,6 +23,9 @@ P_WB = np.array([1.0, -2.0, 0.7])
 R_WB = Rotation.from_quat(Q_WB[[1, 2, 3, 0]])
 ORIGINS_B = 0.21 * (CELLS - CELLS.mean(axis=0))
 """Equal modules: their common centre of mass is the mean."""
+PERIOD = 10_000_000
+GYRO_SIGMA, ACCEL_SIGMA = 0.002, 0.05
+SUBSETS = [(0,), (1,), (2,), (0, 2), (0, 1, 2)]
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +113,44 @@ def test_noise_of_a_degree_is_not_a_flip(measurements: Measurements) -> None:
     assert np.linalg.norm(difference(pose.q_wb, Q_WB)) < 0.03
 
 
+@pytest.mark.parametrize("second_hand", [0, 1])
+def test_tag_told_through_another_one_pulls_by_its_weight(measurements: Measurements, second_hand: int) -> None:
+    """Wherever it stands in the picture: place, lever and attitude."""
+    off, turn = np.array([0.03, -0.02, 0.05]), np.array([0.0, 0.1, -0.05])
+    far = tag_seen(2, 0, turn=turn)
+    far = far._replace(quality=SECOND_HAND, p_wt=far.p_wt + off)
+    near = tag_seen(0, 5)
+    seen = [(2, far), (0, near)] if second_hand == 0 else [(0, near), (2, far)]
+    (pose,) = fuse_tags(measurements, *seen)
+    share = SECOND_HAND_WEIGHT / (1.0 + SECOND_HAND_WEIGHT)
+    assert pose.tags == pytest.approx(1.0 + SECOND_HAND_WEIGHT)
+    np.testing.assert_allclose(pose.p_wt, near.p_wt + share * (far.p_wt - near.p_wt), atol=1e-12)
+    np.testing.assert_allclose(pose.p_wt - R_WB.apply(pose.lever_b) - P_WB, share * off, atol=1e-12)
+    assert np.linalg.norm(difference(pose.q_wb, Q_WB)) == pytest.approx(share * np.linalg.norm(turn), rel=1e-6)
+
+
+def test_picture_is_as_exact_as_it_says(measurements: Measurements) -> None:
+    """The spread of a full and a second-hand tag's mean is that of one tag over the root of what it says to be worth."""
+    rng, sigma = np.random.default_rng(0), 0.002
+    near, far = tag_seen(0, 5), tag_seen(0, 4)._replace(quality=SECOND_HAND)
+    off = []
+    for _ in range(1500):
+        noisy = [t._replace(p_wt=t.p_wt + rng.normal(0, k * sigma, 3)) for t, k in ((near, 1.0), (far, SECOND_HAND_WEIGHT**-0.5))]
+        (pose,) = fuse_tags(measurements, *((0, tag) for tag in noisy))
+        off.append(pose.p_wt - R_WB.apply(pose.lever_b) - P_WB)
+    assert np.std(off) == pytest.approx(sigma / pose.tags**0.5, rel=0.04)
+
+
+def test_tags_of_one_worth_are_averaged_alike_to_the_last_bit(measurements: Measurements) -> None:
+    rng = np.random.default_rng(5)
+    seen = [(m, tag_seen(m, f, turn=rng.normal(scale=0.02, size=3))) for m in range(3) for f in (4, 5, 0)]
+    (full,) = fuse_tags(measurements, *seen)
+    (second,) = fuse_tags(measurements, *((m, tag._replace(quality=SECOND_HAND)) for m, tag in seen))
+    for one, other in zip(full[1:4], second[1:4], strict=True):
+        assert np.array_equal(one, other)
+    np.testing.assert_array_equal(full.p_wt, sum(tag.p_wt / 9 for _, tag in seen))
+
+
 def test_tag_that_the_vehicle_does_not_carry_is_not_believed(measurements: Measurements) -> None:
     stranger = tag_seen(0, 5)._replace(tag_id=14)
     assert fuse_tags(measurements, (0, stranger)) == []
@@ -126,8 +169,8 @@ def in_module(module: int, vector_b: np.ndarray) -> np.ndarray:
     return MATRICES[ROTATIONS[module]].T @ vector_b
 
 
-@pytest.mark.parametrize("heard", [(0,), (1,), (2,), (0, 2), (0, 1, 2)])
-def test_rates_are_turned_into_the_body_and_averaged_over_those_heard(
+@pytest.mark.parametrize("heard", SUBSETS)
+def test_rates_and_forces_are_turned_into_the_body_and_averaged_over_those_heard_at_its_centre_of_mass(
     measurements: Measurements, heard: tuple[int, ...]
 ) -> None:
     rate, force = np.array([0.1, -0.4, 0.9]), np.array([1.0, 2.0, -9.0])
@@ -135,11 +178,83 @@ def test_rates_are_turned_into_the_body_and_averaged_over_those_heard(
     spread = np.linspace(-0.01, 0.01, len(heard)) if len(heard) > 1 else [0.0]
     for module, offset in zip(heard, spread, strict=True):
         modules[FLEET_INDEX[module]].gyro = in_module(module, rate + offset)
-        modules[FLEET_INDEX[module]].accel = in_module(module, force + offset)
+        felt = force + np.cross(rate, np.cross(rate, ORIGINS_B[module]))
+        modules[FLEET_INDEX[module]].accel = in_module(module, felt + offset)
     measured = measurements.fuse(modules, Q_WB)
     assert measured.gyro is not None and measured.accel is not None
     np.testing.assert_allclose(measured.gyro, rate, atol=1e-14)
-    np.testing.assert_allclose(measured.accel, force, atol=1e-14)
+    np.testing.assert_allclose(measured.accel, force, atol=1e-13)
+
+
+def turning(
+    measurements: Measurements, heard: tuple[int, ...], rate: np.ndarray, alpha: np.ndarray, rng: np.random.Generator | None = None
+) -> Measured:
+    """Measurements of the modules `heard` of a body that turns at `rate` (3,), which grows by `alpha` (3,), and is pushed."""
+    modules = silent()
+    for module in heard:
+        noise = np.zeros(6) if rng is None else rng.normal(size=6)
+        lever = ORIGINS_B[module]
+        force = PUSHED + np.cross(alpha, lever) + np.cross(rate, np.cross(rate, lever))
+        modules[FLEET_INDEX[module]].gyro = in_module(module, rate + GYRO_SIGMA * noise[:3])
+        modules[FLEET_INDEX[module]].accel = in_module(module, force + ACCEL_SIGMA * noise[3:])
+    return measurements.fuse(modules, Q_WB)
+
+
+PUSHED = np.array([1.0, 2.0, -9.0])
+RATE, ALPHA = np.array([0.1, -0.4, 0.9]), np.array([1.0, 0.5, -0.7])
+
+
+@pytest.mark.parametrize("heard", SUBSETS)
+@pytest.mark.parametrize("period_ns", [2_500_000, PERIOD, 20_000_000])
+def test_specific_force_of_a_turn_that_quickens_is_that_of_the_centre_of_mass(body: Body, heard: tuple[int, ...], period_ns: int) -> None:
+    """At any rate of ticks, a quarter of a second into it."""
+    measurements = Measurements(body, period_ns)
+    for k in range(round(0.25e9) // period_ns):
+        measured = turning(measurements, heard, RATE + ALPHA * k * period_ns * 1e-9, ALPHA)
+    assert measured.accel is not None
+    np.testing.assert_allclose(measured.accel, PUSHED, atol=1e-3)
+
+
+def test_imus_around_the_centre_of_mass_are_averaged_and_nothing_else(body: Body) -> None:
+    """To the last bit: as if no gyro had told of the turn."""
+    measurements, deaf = Measurements(body, PERIOD), Measurements(body, PERIOD)
+    for k in range(20):
+        modules = silent()
+        for i, module in enumerate(modules):
+            module.accel = np.array([0.1 * i, 1e-9, -9.0])
+        expected = deaf.fuse(modules, Q_WB).accel
+        for module in modules:
+            module.gyro = np.array([0.3, 0.01 * k, -0.7])
+        turned = measurements.fuse(modules, Q_WB).accel
+        assert turned is not None and expected is not None
+        assert turned.tobytes() == expected.tobytes()
+
+
+def test_noise_of_the_gyro_hardly_reaches_the_specific_force_of_a_body_at_rest(body: Body) -> None:
+    measurements, rng = Measurements(body, PERIOD), np.random.default_rng(8)
+    accel = [turning(measurements, (1,), np.zeros(3), np.zeros(3), rng).accel for _ in range(2000)]
+    assert np.std(np.array(accel) - PUSHED) == pytest.approx(ACCEL_SIGMA, rel=0.04)
+
+
+def test_angular_acceleration_is_not_carried_over_a_gap(body: Body) -> None:
+    measurements = Measurements(body, PERIOD)
+    for k in range(20):
+        turning(measurements, (1,), ALPHA * k * 0.01, ALPHA)
+    turning(measurements, (), RATE, ALPHA)
+    for _ in range(3):
+        measured = turning(measurements, (1,), RATE, np.zeros(3))
+        assert measured.accel is not None
+        np.testing.assert_allclose(measured.accel, PUSHED, atol=1e-12)
+
+
+def test_imu_beside_the_centre_of_mass_of_a_lone_module_is_told_apart() -> None:
+    heavy = replace(load_vehicle("modcube"), inertial=replace(load_vehicle("modcube").inertial, com_m=np.array([0.02, 0.0, 0.01])))
+    lone = Measurements(assemble([(0, 0, 0)], [0], [heavy], [0]), PERIOD)
+    lever = -np.array([0.02, 0.0, 0.01])
+    felt = PUSHED + np.cross(RATE, np.cross(RATE, lever))
+    measured = lone.fuse([ModuleInputs(gyro=RATE, accel=felt)], Q_WB)
+    assert measured.accel is not None
+    np.testing.assert_allclose(measured.accel, PUSHED, atol=1e-12)
 
 
 @pytest.mark.parametrize("heard", [(0,), (1,), (2,), (1, 2), (0, 1, 2)])

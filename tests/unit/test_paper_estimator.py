@@ -9,7 +9,9 @@ from scipy.spatial.transform import Rotation
 from firmware_py.core.body import Body
 from firmware_py.core.estimator import READY_AFTER, RESET_AFTER
 from firmware_py.core.paper_estimator import TagOnlyEstimator
+from firmware_py.core.propagation import ERRORS
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
+from firmware_py.core.topology import part_of
 from firmware_py.core.types import BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 from firmware_py.description.vehicle import load_vehicle
@@ -107,3 +109,75 @@ def test_paper_estimator_begins_anew_where_tags_stay_elsewhere_and_forgives_flip
         estimate = estimator.step(k * PERIOD, seen(k * PERIOD, P_WB, turned), np.zeros(6))
     np.testing.assert_allclose(difference(estimate.q_wb, turned), 0.0, atol=1e-3)
     assert estimate.ready
+
+
+# ---------------------------------------------------------------- joining and parting
+
+
+def noisy(k: int, rng: np.random.Generator) -> Measured:
+    """Two tags in three ticks of a robot that runs and turns."""
+    if k % 3 == 2:
+        return NOTHING
+    q = multiply(Q_WB, exp(np.array([0.0, 0.3, 0.1]) * k * 0.01 + rng.normal(0.0, 0.009, 3)))
+    return seen(k * PERIOD, P_WB + np.array([0.1, -0.2, 0.05]) * k * 0.01 + rng.normal(0.0, [0.002, 0.002, 0.004]), q)
+
+
+def settled(body: Body, rng: np.random.Generator) -> TagOnlyEstimator:
+    """After five seconds."""
+    estimator = TagOnlyEstimator(body, PAPER, PERIOD)
+    for k in range(500):
+        estimator.step(k * PERIOD, noisy(k, rng), np.zeros(6))
+    return estimator
+
+
+def test_paper_estimator_that_goes_on_in_another_estimates_the_same(body: Body) -> None:
+    rng = np.random.default_rng(3)
+    estimator = settled(body, rng)
+    other = TagOnlyEstimator(body, PAPER, PERIOD)
+    other.restart(499 * PERIOD, estimator.motion)
+    for k in range(500, 600):
+        measured = noisy(k, rng)
+        stays, goes_on = (e.step(k * PERIOD, measured, np.zeros(6)) for e in (estimator, other))
+        for name in ("p_wb", "q_wb", "nu", "sigma_p", "sigma_q"):
+            np.testing.assert_allclose(getattr(goes_on, name), getattr(stays, name), atol=1e-10)
+
+
+def test_paper_estimator_of_a_parted_body_hardly_jumps(body: Body) -> None:
+    """The play of the faces and the shock are added to what the filter knew, not a metre."""
+    peaks = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        estimator = settled(body, rng)
+        other = TagOnlyEstimator(body, PAPER, PERIOD)
+        other.restart(499 * PERIOD, part_of(body, estimator.motion, body))
+        after = [other.step(k * PERIOD, noisy(k, rng), np.zeros(6)) for k in range(500, 540)]
+        truth_w = np.array([0.1, -0.2, 0.05])
+        peaks.append(max(np.abs(Rotation.from_quat(e.q_wb[[1, 2, 3, 0]]).apply(e.nu[:3]) - truth_w).max() for e in after))
+    assert np.mean(peaks) < 0.06
+
+
+def test_paper_estimators_covariance_stands_where_that_of_a_body_belongs(body: Body) -> None:
+    """Velocity in the body's axes: the world's down, which tags tell worst, is where the robot has it."""
+    estimator = settled(body, np.random.default_rng(3))
+    covariance = estimator.motion.covariance
+    assert covariance.shape == (ERRORS, ERRORS)
+    np.testing.assert_allclose(covariance, covariance.T, atol=1e-15)
+    turn = Rotation.from_quat(estimator.q_wb[[1, 2, 3, 0]]).as_matrix()
+    velocity_w = turn @ covariance[6:9, 6:9] @ turn.T
+    assert np.sqrt(velocity_w.diagonal()) == pytest.approx([0.0143, 0.0143, 0.0169], rel=0.5)
+    np.testing.assert_allclose(velocity_w, np.diag(velocity_w.diagonal()), atol=1e-12)
+    assert velocity_w[2, 2] > 1.1 * velocity_w[0, 0]
+    assert 0.05**2 < covariance[9:12, 9:12].diagonal().max() < 0.2**2 and not covariance[12:].any()
+
+
+def test_flip_is_no_news_to_the_paper_estimator(body: Body) -> None:
+    """The age is that of the newest accepted tag."""
+    estimator = TagOnlyEstimator(body, PAPER, PERIOD)
+    assert estimator.step(0, seen(0), np.zeros(6)).tag_age_ns == 0
+    for k in range(1, 50):
+        assert estimator.step(k * PERIOD, seen((k - 3) * PERIOD), np.zeros(6)).tag_age_ns == 3 * PERIOD
+    turned = multiply(Q_WB, exp(np.array([0.8, 0.0, 0.0])))
+    for k in range(50, 50 + RESET_AFTER - 1):
+        estimate = estimator.step(k * PERIOD, seen(k * PERIOD, P_WB, turned), np.zeros(6))
+        assert (estimate.rejected, estimate.tag_age_ns) == (k - 49, (k - 46) * PERIOD)
+    assert estimator.step(90 * PERIOD, seen(90 * PERIOD, P_WB, turned), np.zeros(6)).tag_age_ns == 0, "begun anew"
