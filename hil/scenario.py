@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.core import rotations
-from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, quantity, read_toml
 from firmware_py.description.vehicle import FACE_NAMES, load_vehicle
 from hil.plant.build import nominal_centre
 from hil.plant.dock_spec import DockSpec, JamRule
@@ -101,10 +101,10 @@ class Task:
     """What the robot is to do."""
 
     kind: str = quantity(
-        choices=("hover", "spiral", "moebius", "lissajous", "dock", "force", "mode"),
+        choices=("hover", "spiral", "moebius", "lissajous", "waypoints", "dock", "force", "mode"),
         help="hover: hold the place; spiral: climb on a cylinder; moebius: along the rim of a Moebius strip; "
-        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns; dock: the [[step]]s; force: a stick on a load cell; "
-        "mode: stays in `mode`",
+        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns; waypoints: through those in `file`; "
+        "dock: the [[step]]s; force: a stick on a load cell; mode: stays in `mode`",
     )
     mode: str = quantity("POSHOLD", choices=MODES, help="mode: which one")
     pilot_until_s: float = quantity(1e6, unit="s", low=0, high=1e6, help="mode: sticks and set-points stream so long")
@@ -120,6 +120,8 @@ class Task:
     frequency: np.ndarray = quantity([1, 2, 1], low=0, high=100, shape=(3,), help="lissajous: of each axis")
     yaw_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of yaw a turn of u")
     roll_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of roll a turn of u")
+    file: str = quantity("", help="waypoints: CSV or TOML file of waypoints (prepare/waypoints.py), from the scenario's folder")
+    file_text: str = quantity("", help="what is in `file`, read with the scenario, which then flies where the file is not")
     centre_m: np.ndarray = quantity(
         [0, 0, 0],
         unit="m",
@@ -295,4 +297,16 @@ def load_scenario(name: str) -> Scenario:
     scenario: Scenario = build(Scenario, table, source)
     if (mistake := next(mistakes(scenario), None)) is not None:
         raise source.error(*mistake)
-    return scenario
+    return _with_file_text(scenario, path.parent, source)
+
+
+def _with_file_text(scenario: Scenario, folder: Path, source: Source) -> Scenario:
+    """The same with the text of the file that its task names. Raises DescriptionError."""
+    if not scenario.task.file:
+        return scenario
+    path = folder / scenario.task.file
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise source.error(("task", "file"), f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    return dataclasses.replace(scenario, task=dataclasses.replace(scenario.task, file_text=text))

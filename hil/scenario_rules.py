@@ -18,7 +18,7 @@ Mistake = tuple[tuple[str | int, ...], str]
 
 def mistakes(scenario: Scenario) -> Iterator[Mistake]:
     """Everything that is wrong with a scenario as its file has it."""
-    for rule in (_in_name, _in_numbers, _in_polycube, _in_steps, _in_bodies, _in_mentions, _in_faults, _in_checks):
+    for rule in (_in_name, _in_numbers, _in_polycube, _in_steps, _in_file, _in_bodies, _in_mentions, _in_faults, _in_checks):
         yield from rule(scenario)
 
 
@@ -68,6 +68,17 @@ def _in_steps(scenario: Scenario) -> Iterator[Mistake]:
         yield ("step", 0), f"a task of the kind {kind} runs no steps; only dock does"
     if kind == "dock" and not scenario.step:
         yield ("task", "kind"), "dock runs the [[step]]s, and there are none"
+
+
+def _in_file(scenario: Scenario) -> Iterator[Mistake]:
+    """What the file itself holds is the script's to judge, which plans the path."""
+    task = scenario.task
+    if task.kind == "waypoints" and not task.file:
+        yield ("task", "kind"), "waypoints flies a file, and there is none; give file"
+    if task.kind != "waypoints" and task.file:
+        yield ("task", "file"), f"a task of the kind {task.kind} flies no file; only waypoints does"
+    if task.file_text:
+        yield ("task", "file_text"), "is read from `file`; give that alone"
 
 
 def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:

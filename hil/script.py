@@ -4,15 +4,20 @@ alone.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from firmware_py.core import rotations
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import ARMED
-from firmware_py.core.types import Action, Outputs, Request
+from firmware_py.core.types import Action, Outputs, Request, Setpoint
 from firmware_py.description.fleet import Fleet
+from firmware_py.description.schema import DescriptionError, frozen_array
 from firmware_py.prepare import paths
+from firmware_py.prepare.waypoints import Mission, read_mission
 from hil.scenario import Scenario, Task
 
 ARM_FROM_S = 1.0
@@ -21,17 +26,21 @@ MOEBIUS_RAMP_SHARE = 0.25
 """Share of the time over which the speed rises, and falls again: 0.25 keeps the peak at 4/3 of the mean, so drag errors stay small."""
 ARM_EVERY_S = 0.5
 """Then again so often until it is granted."""
+APART_M, APART_DEG = 0.01, 1.0
+"""Between the first waypoint and the start: what a spreadsheet may round, and no move of its own before the task."""
+LONGER_S = 1e-6
+"""By which rounding may make a path longer than its task."""
 
 
 class Script:
-    """The requests of one run."""
+    """The requests of one run. Raises DescriptionError for a file of waypoints that cannot be flown."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         self._fleet = fleet
         self._task = scenario.task
         start = scenario.module[0].start
         self.start_pose = rest_at(np.array(start.p_wm, dtype=float), np.array(start.q_wm, dtype=float))
-        self.trajectory = TASKS[scenario.task.kind](scenario.task, self.start_pose.q_wb)
+        self.trajectory = TASKS[scenario.task.kind](scenario.task, self.start_pose)
         self.begin_ns = round(scenario.task.settle_s * 1e9)
         self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
         self.ticks = self.end_ns // fleet.period_ns
@@ -56,21 +65,21 @@ class Script:
         return False
 
 
-def _hover(task: Task, q_wb: np.ndarray) -> paths.Trajectory:
-    return paths.hold(paths.at_rest(task.centre_m, q_wb), task.duration_s)
+def _hover(task: Task, start: Setpoint) -> paths.Trajectory:
+    return paths.hold(paths.at_rest(task.centre_m, start.q_wb), task.duration_s)
 
 
-def _spiral(task: Task, q_wb: np.ndarray) -> paths.Trajectory:
-    return paths.spiral(task.centre_m, task.radius_m, task.climb_m, task.turns, task.duration_s, attitude=q_wb)
+def _spiral(task: Task, start: Setpoint) -> paths.Trajectory:
+    return paths.spiral(task.centre_m, task.radius_m, task.climb_m, task.turns, task.duration_s, attitude=start.q_wb)
 
 
-def _moebius(task: Task, q_wb: np.ndarray) -> paths.Trajectory:
+def _moebius(task: Task, start: Setpoint) -> paths.Trajectory:
     return paths.moebius(
         task.centre_m, task.duration_s, task.radius_m, task.half_width_m, task.turns, ramp_share=MOEBIUS_RAMP_SHARE
     )
 
 
-def _lissajous(task: Task, q_wb: np.ndarray) -> paths.Trajectory:
+def _lissajous(task: Task, start: Setpoint) -> paths.Trajectory:
     turning = (task.yaw_turns, task.roll_turns)
     return paths.lissajous(
         task.centre_m,
@@ -78,15 +87,43 @@ def _lissajous(task: Task, q_wb: np.ndarray) -> paths.Trajectory:
         task.frequency,
         task.duration_s,
         turns=task.turns,
-        attitude=q_wb,
+        attitude=start.q_wb,
         turning=turning,
     )
 
 
-TASKS: dict[str, Callable[[Task, np.ndarray], paths.Trajectory]] = {
+def _waypoints(task: Task, start: Setpoint) -> paths.Trajectory:
+    """The path of the file as it is: what does not fit its limits, its task or the start is refused, not stretched."""
+    mission = _from_start(read_mission(task.file_text, task.file), start)
+    try:
+        path = mission.plan(stretch=False)
+    except ValueError as error:
+        raise DescriptionError(f"{task.file}: {error}") from None
+    first = path.sample(0.0)
+    apart_m = float(np.linalg.norm(first.p_wb - start.p_wb))
+    apart_deg = math.degrees(float(np.linalg.norm(rotations.difference(start.q_wb, first.q_wb))))
+    if apart_m > APART_M or apart_deg > APART_DEG:
+        where = f"{apart_m:.3g} m and {apart_deg:.3g} deg away from the robot's start at {start.p_wb.tolist()} m"
+        raise DescriptionError(f"{task.file}: the path begins {where}; the two must be one pose")
+    if path.duration_s > task.duration_s + LONGER_S:
+        raise DescriptionError(f"{task.file}: the path takes {path.duration_s:.7g} s, longer than task.duration_s, {task.duration_s:g} s")
+    return path
+
+
+def _from_start(mission: Mission, start: Setpoint) -> Mission:
+    """The same with the attitude of the start where its first waypoint has none."""
+    first, *others = mission.waypoint
+    if len(first.quaternion):
+        return mission
+    first = dataclasses.replace(first, quaternion=frozen_array(start.q_wb))
+    return dataclasses.replace(mission, waypoint=(first, *others))
+
+
+TASKS: dict[str, Callable[[Task, Setpoint], paths.Trajectory]] = {
     "hover": _hover,
     "lissajous": _lissajous,
     "moebius": _moebius,
     "spiral": _spiral,
+    "waypoints": _waypoints,
 }
 """Trajectory of each kind of task."""

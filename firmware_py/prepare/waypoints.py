@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import csv
 import io
+import tomllib
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.description.schema import DescriptionError, Source, build, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, Source, build, quantity
 from firmware_py.prepare.minimum_snap import Limits, Waypoint, plan
 from firmware_py.prepare.piecewise import Piecewise
 
@@ -101,26 +101,26 @@ class Mission:
         return plan(points, durations, self.limits.limits(), body, stretch)
 
 
-def load_mission(path: Path) -> Mission:
-    """The waypoint file in `path`, .csv or .toml.
+def read_mission(text: str, name: str) -> Mission:
+    """The mission in the text of the file called `name`, .csv or .toml.
 
     Raises:
         DescriptionError: one line with file, line and what would be right.
     """
-    if path.suffix.lower() == ".csv":
-        return _load_csv(path)
-    if path.suffix.lower() != ".toml":
-        raise DescriptionError(f"{path}: a waypoint file ends in .csv or .toml")
-    table, source = read_toml(path)
-    mission: Mission = build(Mission, table, source)
+    if name.lower().endswith(".csv"):
+        return _read_csv(text, name)
+    if not name.lower().endswith(".toml"):
+        raise DescriptionError(f"{name}: a waypoint file ends in .csv or .toml")
+    try:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DescriptionError(f"{name}: not valid TOML: {error}") from None
+    mission: Mission = build(Mission, table, Source(name, text))
     return mission
 
 
-def _load_csv(path: Path) -> Mission:
-    try:
-        reader = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig")), skipinitialspace=True)
-    except (OSError, UnicodeDecodeError) as error:
-        raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+def _read_csv(text: str, path: str) -> Mission:
+    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True, restkey="")
     header = [name.strip() for name in reader.fieldnames or []]
     reader.fieldnames = header
     unknown = [name for name in header if name not in _COLUMNS]
@@ -137,6 +137,8 @@ def _load_csv(path: Path) -> Mission:
 
 def _waypoint(row: dict[str, str], place: str) -> WaypointTable:
     table: dict[str, object] = {}
+    if "" in row:
+        raise DescriptionError(f"{place}: has more columns than the header; decimals need a point")
     for key, names in (("position_m", _POSITION), ("quaternion", _ATTITUDE), ("velocity_m_s", _VELOCITY)):
         present = [n for n in names if (row.get(n) or "").strip()]
         if present and len(present) != len(names):

@@ -1,19 +1,25 @@
 """A mistake in a scenario's file is refused when it is loaded, with the file, the line, and what would be right."""
 
 import dataclasses
+import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from firmware_py.core.types import Outputs
+from firmware_py.core.types import Outputs, Setpoint
+from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from hil.bench import fleet_of
+from hil.bench import fleet_of, script_of
+from hil.campaign import identity
 from hil.dock_script import AFTERWARDS_NS, DockScript
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN
 from hil.scenario import Scenario, load_scenario, scenario_names
 from hil.scenario_rules import metric_names
+from hil.script import Script
 
 FOLDER = Path(load_scenario.__code__.co_filename).parent / "scenarios"
 Load = Callable[..., Scenario]
@@ -58,6 +64,11 @@ def load(tmp_path: Path) -> Load:
         ("hover", "[[camera]]", "[[camera]]\nmodule = 3", "camera[0].module: no module has the number 3"),
         ("hover-blind", "until_s = 17.0", "until_s = 11.0", "fault[0].until_s: 11 s is not after at_s, 12 s"),
         ("hover", "", '[[step]]\ndo = "wait"', "step[0]: a task of the kind hover runs no steps"),
+        ("hover", 'kind = "hover"', 'kind = "hover"\nfile = "none.csv"', "task.file: a task of the kind hover flies no file"),
+        ("waypoints", 'file = "waypoints.csv"', "", "task.kind: waypoints flies a file, and there is none"),
+        ("waypoints", 'file = "', 'file = "no-', "no-waypoints.csv: cannot be read: No such file or directory"),
+        ("waypoints", 'file = "waypoints.csv"', 'file = "."', "cannot be read: Is a directory"),
+        ("waypoints", 'file = "', 'file_text = "x_m"\nfile = "', "task.file_text: is read from `file`"),
         ("hover", 'name = "hover"', 'name = "../hover"', "name: '../hover' cannot be the name of a folder"),
         ("hover", 'name = "hover"', 'name = ""', "name: '' cannot be the name of a folder"),
         ("hover", 'name = "hover"', 'name = ".."', "name: '..' cannot be the name of a folder"),
@@ -101,3 +112,95 @@ def test_every_kind_of_run_has_metrics_of_its_own() -> None:
     assert metric_names(load_scenario("dock")) == list(SHOWN)
     assert not set(DOCKING) & set(metric_names(load_scenario("hover")))
     assert set(force_names([1, 2])) < set(metric_names(load_scenario("force-tracking")))
+
+
+# ---------------------------------------------------------------- a path from a file
+
+PATH = "x_m,y_m,z_m,qw,qx,qy,qz,duration_s\n-0.3,-0.25,0.55,,,,,\n0.1,-0.2,0.5,,,,,20\n0.2,0.1,0.4,0.7071068,0,0,0.7071068,24\n"
+PATH_TOML = """
+[limits]
+velocity_m_s = [0.05, 0.05, 0.05]
+[[waypoint]]
+position_m = [-0.3, -0.25, 0.55]
+[[waypoint]]
+position_m = [0.2, 0.1, 0.4]
+"""
+
+
+def waypoints(folder: Path, text: str, name: str = "path.csv", euler_deg: str = "[0, 0, 0]") -> Scenario:
+    """The shipped scenario with `text` as its file, out of `folder`, its module turned."""
+    folder.mkdir(exist_ok=True)
+    (folder / name).write_text(text, encoding="utf-8")
+    scenario = (FOLDER / "waypoints.toml").read_text(encoding="utf-8").replace("waypoints.csv", name)
+    (folder / "waypoints.toml").write_text(scenario.replace("[[module]]", f"[[module]]\neuler_deg = {euler_deg}"), encoding="utf-8")
+    return load_scenario(str(folder / "waypoints.toml"))
+
+
+def flown(scenario: Scenario) -> Script:
+    script = script_of(scenario, fleet_of(scenario, "virtual:waypoints", 100))
+    assert isinstance(script, Script)
+    return script
+
+
+def sampled(scenario: Scenario) -> list[Setpoint]:
+    return [flown(scenario).trajectory.sample(t) for t in np.linspace(0.0, scenario.task.duration_s, 12)]
+
+
+def test_path_of_a_file_leads_from_the_start_through_its_points_and_rests_at_the_last(tmp_path: Path) -> None:
+    path = flown(waypoints(tmp_path, PATH)).trajectory
+    assert path.duration_s == 44.0
+    for t, place in ((0.0, [-0.3, -0.25, 0.55]), (20.0, [0.1, -0.2, 0.5]), (44.0, [0.2, 0.1, 0.4]), (50.0, [0.2, 0.1, 0.4])):
+        np.testing.assert_allclose(path.sample(t).p_wb, place, atol=1e-9)
+    np.testing.assert_allclose(path.sample(20.0).q_wb, [1, 0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(path.sample(44.0).q_wb, np.array([1, 0, 0, 1]) / np.sqrt(2.0), atol=1e-6)
+
+
+def test_path_without_an_attitude_keeps_that_of_the_start(tmp_path: Path) -> None:
+    turned = waypoints(tmp_path, PATH_TOML, "path.toml", "[0, 0, 90]")
+    for point in sampled(turned):
+        np.testing.assert_allclose(point.q_wb, np.array([1, 0, 0, 1]) / np.sqrt(2.0), atol=1e-9)
+
+
+def test_free_durations_are_as_short_as_the_limits_allow_and_the_rest_of_the_task_is_held(tmp_path: Path) -> None:
+    path = flown(waypoints(tmp_path, PATH_TOML, "path.toml")).trajectory
+    assert 10.0 < path.duration_s < 44.0
+    fastest = max(float(np.abs(path.sample(t).v_w).max()) for t in np.linspace(0.0, path.duration_s, 400))
+    assert fastest == pytest.approx(0.05, rel=0.01)
+
+
+def test_scenario_flies_the_same_path_where_its_file_is_not(tmp_path: Path) -> None:
+    """As on the workers of a cluster; and its campaign goes on only with the same points."""
+    here, parameters = waypoints(tmp_path / "here", PATH), Parameters()
+    there = waypoints(tmp_path / "there", PATH)
+    assert identity(here, parameters) == identity(there, parameters)
+    assert identity(waypoints(tmp_path / "there", PATH.replace("0.4,", "0.41,")), parameters) != identity(here, parameters)
+    shutil.rmtree(tmp_path / "here")
+    for sent, known in zip(sampled(pickle.loads(pickle.dumps(here))), sampled(there), strict=True):
+        np.testing.assert_array_equal(np.concatenate(list(sent)), np.concatenate(list(known)))
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "refusal"),
+    [
+        ("path.csv", "-0.3,", "-0.28,", "path.csv: the path begins 0.02 m and 0 deg away from the robot's start at [-0.3, -0.25, 0.55] m"),
+        ("path.csv", "0.55,,,,,", "0.55,0.9990482,0,0,0.0436194,", "the path begins 0 m and 5 deg away"),
+        ("path.csv", ",24", ",24.1", "path.csv: the path takes 44.1 s, longer than task.duration_s, 44 s"),
+        ("path.csv", "0.1,-0.2", "0.1,north", "path.csv:3: y_m: 'north' is not a number"),
+        ("path.csv", ",20", ",", "path.csv: waypoint 1 lacks duration_s"),
+        ("path.csv", "0.5,,,,,20", "0.5,,,,,20,3", "path.csv:3: has more columns than the header"),
+        ("path.toml", "[limits]\nvelocity_m_s = [0.05, 0.05, 0.05]", "", "path.toml: free durations need a limit"),
+        ("path.toml", "\n[limits]", "duration_s = 9.0\n[limits]", "path.toml: no trajectory in 9.00 s keeps the velocity along x within"),
+        ("path.toml", "0.05]", "0.05", "path.toml: not valid TOML: "),
+        ("path.toml", "position_m = [0.2", "place_m = [0.2", "path.toml:7: waypoint[1].place_m: unknown key"),
+        ("path.txt", "x", "x", "path.txt: a waypoint file ends in .csv or .toml"),
+    ],
+)
+def test_path_that_does_not_fit_is_refused_before_the_flight(tmp_path: Path, name: str, old: str, new: str, refusal: str) -> None:
+    text = PATH_TOML if name.endswith("toml") else PATH
+    assert old in text
+    scenario = waypoints(tmp_path, text.replace(old, new, 1), name)
+    with pytest.raises(DescriptionError) as refused:
+        flown(scenario)
+    assert refusal in str(refused.value)
+    assert str(refused.value).startswith(name)
+    assert "\n" not in str(refused.value)
