@@ -32,8 +32,8 @@ CONE = 1.5
 
 WAY_SAMPLES = 33
 """Places on the way to the stand-off that are looked at."""
-WAY_SLACK_M = 0.01
-"""Nearer by so little is noise."""
+WAY_SLACK = 0.25
+"""Nearer by this share of the stand-off leaves level cubes apart: their edges clear each other 0.3 m from centre to centre."""
 CUBE_DIAGONAL = 3.0**0.5
 """Centres of two cubes of edge 1 that are so far apart do not touch, however they are turned."""
 
@@ -308,9 +308,9 @@ TURNED = frozenset({Stage.APPROACH, Stage.PUSH, Stage.VERIFY, Stage.ALIGN})
 
 
 def nearest_pass(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, standoff_m: float) -> int | None:
-    """Module of the target that the active body would come too near to on the straight way to the stand-off; None: none.
+    """Module of the target that the active body would come nearest to, and too near, on the straight way to the stand-off; None: none.
 
-    Too near is nearer than at both ends of the way, and near enough for two cubes to touch however they are turned.
+    Too near is nearer than at both ends of the way by WAY_SLACK, and near enough for two cubes to touch in some attitude.
     """
     r_a, q_a = _module_in(active, plan.request.module)
     p_t, q_t = _pose_of(target_at, *_module_in(target, plan.request.target_module))
@@ -324,8 +324,8 @@ def nearest_pass(plan: DockPlan, active: Body, at: Estimate, target: Body, targe
         mine = at.p_wb + share * (p_end - at.p_wb) + active.r_bm @ rotation.T
         gaps[k] = np.linalg.norm(mine[:, None] - others, axis=2)
     least = gaps.min(axis=0)
-    touching = (least < np.minimum(gaps[0], gaps[-1]) - WAY_SLACK_M) & (least < CUBE_DIAGONAL * np.linalg.norm(plan.place_t))
-    return target.modules[int(np.argmax(touching.any(axis=0)))] if touching.any() else None
+    touching = (least < np.minimum(gaps[0], gaps[-1]) - WAY_SLACK * standoff_m) & (least < CUBE_DIAGONAL * np.linalg.norm(plan.place_t))
+    return target.modules[int(np.where(touching, least, np.inf).min(axis=0).argmin())] if touching.any() else None
 
 
 def _module_in(body: Body, module: int) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from firmware_py.core.docking_detector import PairStatus
-from firmware_py.core.docking_sequence import DockingSequence, Stage
+from firmware_py.core.docking_sequence import DockingSequence, Stage, nearest_pass
+from firmware_py.core.rotations import from_euler, rotate
 from firmware_py.core.types import DockRequest, Estimate
 from firmware_py.description.parameters import PAPER, Docking
 from firmware_py.description.vehicle import load_vehicle
@@ -73,3 +74,40 @@ def test_dock_that_is_aborted_at_once_moves_nobody() -> None:
     steering = sequence.step(TICK_NS, estimate(p_a, sigma_m=0.02), estimate(p_t), NEITHER)
     assert sequence.stage == Stage.ABORTED
     assert steering.meets is None
+
+
+# ---------------------------------------------------------------- the way to the stand-off
+
+
+@pytest.mark.parametrize(
+    ("start", "is_free"),
+    [
+        ((0.8, 0.3, 0.1), True),
+        ((0.1, 0.8, 0.0), True),  # past the corner, 0.32 m from centre to centre
+        ((0.25, 0.0, 0.0), True),  # from nearer than the stand-off, straight back
+        ((0.33, 0.0, 0.0), True),
+        ((0.0, 0.5, 0.0), False),  # along the edge, 0.28 m
+        ((-0.6, 0.0, 0.0), False),  # through it
+        ((-0.6, 0.0, 1.5), False),
+        ((-0.6, 3.0, 0.0), True),  # around it, wide enough
+    ],
+)
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_way_to_the_stand_off_is_free_where_it_keeps_clear_of_the_target(start: tuple[float, ...], is_free: bool, yaw: float) -> None:
+    """The whole scene turned by `yaw` is the same scene."""
+    target, active = (assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [m]) for m in (0, 1))
+    plan = plan_dock(DockRequest(1, 1, 0, 0), active, target, [load_vehicle("modcube")] * 2)
+    q_wb = from_euler(0.0, 0.0, yaw)
+    at, there = (estimate(rotate(q_wb, np.array(p)))._replace(q_wb=q_wb) for p in (start, (0.0, 0.0, 0.0)))
+    found = nearest_pass(plan, active, at, target, there, 0.12)
+    assert found == (None if is_free else 0)
+
+
+def test_module_beside_the_one_that_is_docked_to_may_be_in_the_way() -> None:
+    """A bar of two along y, docked to at its first module's +x face: the way from behind leads past the second."""
+    vehicles = [load_vehicle("modcube")] * 3
+    bar, active = assemble([(0, 0, 0), (0, 1, 0)], [0, 0], vehicles[:2], [0, 1]), assemble([(0, 0, 0)], [0], vehicles[:1], [2])
+    plan = plan_dock(DockRequest(2, 1, 0, 0), active, bar, vehicles)
+    before = np.array([0.33, 0.0, 0.0]) + bar.r_bm[0]
+    assert nearest_pass(plan, active, estimate(before + np.array([0.3, 0.3, 0.0])), bar, estimate(np.zeros(3)), 0.12) is None
+    assert nearest_pass(plan, active, estimate(before + np.array([-0.5, 0.6, 0.0])), bar, estimate(np.zeros(3)), 0.12) == 1
