@@ -31,9 +31,10 @@ Bodies = Mapping[int, Body]
 
 
 def _prepare_part(request: PartRequest, bodies: Bodies, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
-    """At the first joint where the body has come apart."""
+    """At the first joint where the body has come apart into two that are each whole, whichever side of it then leaves."""
     refusal = "they are apart already"
-    for joint in request.joints:
+    turned = [DockRequest(joint.target_module, joint.target_face, joint.module, joint.face) for joint in request.joints]
+    for joint in (*request.joints, *turned):
         whole = bodies[joint.module]
         if whole is not bodies[joint.target_module]:
             continue

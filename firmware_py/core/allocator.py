@@ -91,18 +91,24 @@ class Allocator:
     def _set_limits(self) -> None:
         self._f_min, self._f_max = self._room.low_n * self._alive, self._room.high_n * self._alive
         self._low, self._high = np.r_[self._f_min, 0.0, 0.0], np.r_[self._f_max, 1.0, 1.0]
+        if self._cheaper:
+            self._cheaper.confine(self._f_min, self._f_max)
 
     def step(self, wrench: np.ndarray) -> Thrust:
         """The thruster forces for a wanted (6,) wrench, body frame."""
         thrust = self._within(wrench)
-        if self._clip_only or self._is_fed(thrust):
-            return thrust
+        if self._cheaper and thrust.scale == (1.0, 1.0):
+            thrust = self._thrust(self._cheaper.step(thrust.force_n), thrust.scale)
+        return thrust if self._clip_only or self._is_fed(thrust) else self._fed(wrench, thrust)
+
+    def _fed(self, wrench: np.ndarray, unfed: Thrust) -> Thrust:
+        """What the supplies can feed; where that is not even the preload, `unfed`, of which the limiter takes each module's share."""
         force, moment = wrench * IS_FORCE, wrench * (1.0 - IS_FORCE)
-        force_share, thrust = self._fed(force, beside=moment)
+        force_share, thrust = self._largest_share(force, beside=moment)
         if self._is_fed(thrust):
             return thrust._replace(scale=(force_share * thrust.scale[0], thrust.scale[1]))
-        moment_share, thrust = self._fed(moment, beside=np.zeros(6))
-        return thrust._replace(scale=(0.0, moment_share * thrust.scale[1]))
+        moment_share, thrust = self._largest_share(moment, beside=np.zeros(6))
+        return thrust._replace(scale=(0.0, moment_share * thrust.scale[1])) if self._is_fed(thrust) else unfed
 
     def _is_fed(self, thrust: Thrust) -> bool:
         """Whether every module's supply is enough; for forces that are no numbers the limiter has the last word."""
@@ -110,8 +116,8 @@ class Allocator:
         power_w = module_power(thrust.force_n, t.power_forward, t.power_reverse, t.module, supply_w.size)
         return not bool(np.any(power_w > supply_w))
 
-    def _fed(self, wrench: np.ndarray, beside: np.ndarray) -> tuple[float, Thrust]:
-        """Largest share of a wrench that is fed beside another, and the forces; where there is none, those for the other alone."""
+    def _largest_share(self, wrench: np.ndarray, beside: np.ndarray) -> tuple[float, Thrust]:
+        """Largest share of a wrench that is fed beside another, and the forces; 0, and those for the other alone, where none is."""
         share, step, found = 0.0, 1.0, self._within(beside)
         for _ in range(HALVINGS):
             step *= 0.5
@@ -124,7 +130,7 @@ class Allocator:
         """The forces within the thrusters' limits."""
         force = self._preload + self._pinv @ wrench
         if are_within(force, self._f_min, self._f_max):
-            return self._thrust(self._cheaper.step(force) if self._cheaper else force, (1.0, 1.0))
+            return self._thrust(force, (1.0, 1.0))
         if self._clip_only:
             return self._thrust(np.clip(force, self._f_min, self._f_max), (1.0, 1.0))
         return self._saturated(wrench)

@@ -14,6 +14,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_sequence import (
+    ENDED,
     RELAY_OFF,
     RELAY_PULL,
     RELAY_PUSH,
@@ -75,6 +76,15 @@ class Decisions(NamedTuple):
     """Bodies whose dock is over without a join: they hold where they are."""
     meets: dict[int, np.ndarray]
     """By body: (3,) how far it comes to meet the other, world, m, from where it holds."""
+
+    @property
+    def joining(self) -> set[int]:
+        """Bodies that take part in a join of this tick."""
+        return {body for join in self.joins for body in (join.active, join.target)}
+
+    def move(self, body: int, by_w: np.ndarray) -> None:
+        """Adds to what a body comes."""
+        self.meets[body] = self.meets.get(body, 0.0) + by_w
 
 
 class _Dock(NamedTuple):
@@ -247,22 +257,29 @@ class DockingStage:
         request, plan = prepared.request, prepared.plan
         mine = _body_of(request.module, estimates)
         under_way = next((dock for dock in self._docks if dock.active == mine), None)
-        if under_way is not None and under_way.prepared.request == request:
+        if under_way is not None and under_way.prepared.request == request and under_way.sequence.stage not in ENDED:
             return
         refusal = prepared.refusal if plan is None else "" if _fits(plan, estimates) else CHANGED
         if isinstance(plan, DockPlan) and not refusal and self._p.approach == "staged":
             refusal = _in_the_way(plan, *estimates[mine], *estimates[_body_of(request.target_module, estimates)], self._p.standoff_m)
-        if under_way is not None and not isinstance(plan, UndockPlan):
-            self._docks.remove(under_way)
-            self._set_relays(RELAY_OFF, under_way.prepared.request)
-            self._say(WARNING, f"dock of module {under_way.prepared.request.module} ended: another was asked for")
         if plan is None or refusal:
             self._say(WARNING, f"dock refused: {refusal}")
-            decisions.ended.append(mine)
+            if under_way is None:
+                decisions.ended.append(mine)
         elif isinstance(plan, UndockPlan):
             self._begin_undock(plan, prepared.chains, time_ns)
         else:
+            if under_way is not None:
+                self._give_up(under_way, holding, decisions)
             self._begin_dock(prepared, plan, time_ns, estimates, holding)
+
+    def _give_up(self, dock: _Dock, holding: Collection[int], decisions: Decisions) -> None:
+        """Ends a dock in whose place another begins; a target that was coming goes back to where it held."""
+        self._docks.remove(dock)
+        self._set_relays(RELAY_OFF, dock.prepared.request)
+        self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: another was asked for")
+        if dock.target in holding:
+            decisions.move(dock.target, -dock.sequence.met_w)
 
     def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
         apart = [_modules(joint) for joint in self.open_joints(APART)]
@@ -321,12 +338,11 @@ class DockingStage:
         else:
             decisions.setpoints[dock.active] = steering.active
         if steering.meets is not None:
-            decisions.meets[dock.target] = steering.meets
+            decisions.move(dock.target, steering.meets)
 
     def _join(self, dock: _Dock, decisions: Decisions) -> None:
         """One join a tick and body: a dock that comes second finds its bodies gone, and `forget` ends it."""
-        joining = {body for join in decisions.joins for body in (join.active, join.target)}
-        if joining.isdisjoint((dock.active, dock.target)):
+        if decisions.joining.isdisjoint((dock.active, dock.target)):
             decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))
             self._docks.remove(dock)
 
@@ -339,7 +355,8 @@ class DockingStage:
             return
         self._set_relays(RELAY_PUSH, *plan.opens)
         whole = _body_of(request.module, estimates)
-        if time_ns < undock.until_ns or whole in [part.whole for part in decisions.parts]:  # which has no such body in the next tick
+        changes = whole in decisions.joining or whole in [part.whole for part in decisions.parts]
+        if time_ns < undock.until_ns or changes:  # the next tick has no such body, and ends this
             return
         self._set_relays(RELAY_OFF, *plan.opens)
         estimate = estimates[whole][1]

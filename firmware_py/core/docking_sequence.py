@@ -7,6 +7,7 @@ between the two faces; lateral and angle error are those of the active module ag
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -30,12 +31,12 @@ CONE = 1.5
 """The approach waits while the lateral error is above this many times the alignment limit, or the angle."""
 
 
-WAY_SAMPLES = 33
-"""Places on the way to the stand-off that are looked at."""
-WAY_SLACK = 0.25
-"""Nearer by this share of the stand-off leaves level cubes apart: their edges clear each other 0.3 m from centre to centre."""
-CUBE_DIAGONAL = 3.0**0.5
-"""Centres of two cubes of edge 1 that are so far apart do not touch, however they are turned."""
+WAY_SAMPLES = 65
+"""Places on the way to the stand-off that are looked at, where the bodies are near each other."""
+WAY_NOISE_M = 0.005
+"""Nearer by so little is not nearer."""
+SQUARE_DIAGONAL, CUBE_DIAGONAL = 2.0**0.5, 3.0**0.5
+"""Centres of two cubes of edge 1 that are so far apart do not touch: level cubes side by side; and however they are turned."""
 
 
 class Stage(IntEnum):
@@ -139,6 +140,8 @@ class DockingSequence:
         self._fixed: Estimate | None = None
         """Where the target is to be met, at rest, for an approach that does not look at it again."""
         self._under_way = False
+        self.met_w = np.zeros(3)
+        """How far the target was told to come, world, m."""
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
@@ -188,7 +191,8 @@ class DockingSequence:
         straight = self._p.approach == "straight"
         off, (_, q_t) = self._offset(active, target), _pose_of(target, self._r_t, self._q_t)
         left = 0.0 if straight else self._p.standoff_m
-        meets = 0.5 * rotate(q_t, off - left * self.plan.axis_t) if self._comes else None
+        meets = np.asarray(0.5 * rotate(q_t, off - left * self.plan.axis_t)) if self._comes else None
+        self.met_w = np.zeros(3) if meets is None else meets
         if straight:
             self._fixed = target._replace(p_wb=target.p_wb + (0.0 if meets is None else meets), nu=np.zeros(6))
             off = self._offset(active, self._fixed)
@@ -220,7 +224,8 @@ class DockingSequence:
     def _is_done(self, time_ns: int, errors: Errors, status: PairStatus) -> bool:
         p = self._p
         if self.stage == Stage.PRE_APPROACH:
-            return abs(errors.gap_m - p.standoff_m) < 5 * p.align_m and errors.lateral_m < 5 * p.align_m
+            placed = abs(errors.gap_m - p.standoff_m) < 5 * p.align_m and errors.lateral_m < 5 * p.align_m
+            return placed and errors.angle_rad < 5 * p.align_rad
         if self.stage == Stage.ALIGN:
             return self._good_for(p.align_s, errors.lateral_m < p.align_m and errors.angle_rad < p.align_rad, time_ns)
         if self.stage == Stage.APPROACH:
@@ -310,7 +315,8 @@ TURNED = frozenset({Stage.APPROACH, Stage.PUSH, Stage.VERIFY, Stage.ALIGN})
 def nearest_pass(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, standoff_m: float) -> int | None:
     """Module of the target that the active body would come nearest to, and too near, on the straight way to the stand-off; None: none.
 
-    Too near is nearer than at both ends of the way by WAY_SLACK, and near enough for two cubes to touch in some attitude.
+    Too near is nearer than at both ends of the way, and near enough for level cubes to touch; or for cubes in any attitude, and nearer by
+    a quarter of the stand-off.
     """
     r_a, q_a = _module_in(active, plan.request.module)
     p_t, q_t = _pose_of(target_at, *_module_in(target, plan.request.target_module))
@@ -318,14 +324,26 @@ def nearest_pass(plan: DockPlan, active: Body, at: Estimate, target: Body, targe
     p_end = p_t + rotate(q_t, plan.place_t + plan.axis_t * standoff_m) - rotate(q_end, r_a)
     turn = difference(q_end, at.q_wb)
     others = target_at.p_wb + target.r_bm @ to_matrix(target_at.q_wb).T
-    gaps = np.empty((WAY_SAMPLES, len(active.modules), len(target.modules)))
-    for k, share in enumerate(np.linspace(0.0, 1.0, WAY_SAMPLES)):
+    shares = _near_part(at.p_wb - target_at.p_wb, p_end - at.p_wb, active.reach_m + target.reach_m)
+    gaps = np.empty((shares.size, len(active.modules), len(target.modules)))
+    for k, share in enumerate(shares):
         rotation = to_matrix(multiply(at.q_wb, exp(share * turn)))
         mine = at.p_wb + share * (p_end - at.p_wb) + active.r_bm @ rotation.T
         gaps[k] = np.linalg.norm(mine[:, None] - others, axis=2)
     least = gaps.min(axis=0)
-    touching = (least < np.minimum(gaps[0], gaps[-1]) - WAY_SLACK * standoff_m) & (least < CUBE_DIAGONAL * np.linalg.norm(plan.place_t))
+    ends, pitch_m = np.minimum(gaps[0], gaps[-1]), float(np.linalg.norm(plan.place_t))
+    near = np.minimum(CUBE_DIAGONAL * pitch_m, np.maximum(ends - 0.25 * standoff_m, SQUARE_DIAGONAL * pitch_m))
+    touching = (least < ends - WAY_NOISE_M) & (least < near)
     return target.modules[int(np.where(touching, least, np.inf).min(axis=0).argmin())] if touching.any() else None
+
+
+def _near_part(begin: np.ndarray, way: np.ndarray, reach_m: float) -> np.ndarray:
+    """Shares of a way (3,) that begins at `begin` (3,) off a place: its ends, and WAY_SAMPLES of where it is within reach of the place."""
+    length2 = max(float(way @ way), 1e-12)
+    middle = -float(begin @ way) / length2
+    half = math.sqrt(max(0.0, reach_m**2 - float(begin @ begin) + middle**2 * length2) / length2)
+    first, last = (min(max(share, 0.0), 1.0) for share in (middle - half, middle + half))
+    return np.concatenate([[0.0], np.linspace(first, last, WAY_SAMPLES), [1.0]])
 
 
 def _module_in(body: Body, module: int) -> tuple[np.ndarray, np.ndarray]:

@@ -46,9 +46,14 @@ class LeastPower:
     def __init__(self, thrusters: ThrusterSet, alive: np.ndarray) -> None:
         """`alive`: (n,) bool, thrusters that may be used."""
         self._t = thrusters
+        self._f_min, self._f_max = thrusters.f_min, thrusters.f_max
         self._used = np.flatnonzero(alive)
         self._free = _null_space(thrusters.matrix[:, self._used])
         self._slope, self._bend = np.zeros(alive.size), np.zeros(alive.size)
+
+    def confine(self, f_min: np.ndarray, f_max: np.ndarray) -> None:
+        """Keeps within these limits (n,), N, from now on."""
+        self._f_min, self._f_max = f_min, f_max
 
     def step(self, base: np.ndarray) -> np.ndarray:
         """(n,) forces, N, of the same wrench and within the same limits as `base`, and of no more power."""
@@ -56,8 +61,8 @@ class LeastPower:
             return base
         t = self._t
         forward = base > 0.0
-        low = np.where(forward, np.minimum(base, t.deadband_n), t.f_min) - base
-        high = np.where(forward, t.f_max, np.maximum(base, -t.deadband_n)) - base
+        low = np.where(forward, np.minimum(base, t.deadband_n), self._f_min) - base
+        high = np.where(forward, self._f_max, np.maximum(base, -t.deadband_n)) - base
         low, high = low[self._used], high[self._used]
         force = base
         for _ in range(PASSES):

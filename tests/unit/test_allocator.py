@@ -360,3 +360,22 @@ def test_paper_s_allocation_leaves_the_supply_to_the_limiter(single: Body) -> No
     before = allocator.step(wrench)
     allocator.confine(Room(single.thrusters.f_min, single.thrusters.f_max, np.array([1.0])))
     np.testing.assert_array_equal(allocator.step(wrench).force_n, before.force_n)
+
+
+def test_body_whose_supply_cannot_feed_the_preload_leaves_it_to_the_limiter() -> None:
+    """Or one weak module would still the whole body."""
+    pair = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
+    allocator, wrench = Allocator(pair, Allocation()), np.array([3.0, 0.0, 0.0, 0.0, 0.1, 0.0])
+    before = allocator.step(wrench)
+    preload_w = power_w(pair, allocator.step(np.zeros(6)))
+    allocator.confine(Room(pair.thrusters.f_min, pair.thrusters.f_max, preload_w * [0.9, 100.0]))
+    np.testing.assert_array_equal(allocator.step(wrench).force_n, before.force_n)
+
+
+def test_least_power_keeps_within_the_room(single: Body) -> None:
+    allocator = Allocator(single, replace(Allocation(), mode="least_power"))
+    room = Room(0.3 * single.thrusters.f_min, 0.3 * single.thrusters.f_max, np.array([1e6]))
+    allocator.confine(room)
+    for wrench in wrenches(single, 30, 0.3):
+        thrust = allocator.step(wrench)
+        assert np.all(thrust.force_n <= room.high_n + 1e-12) and np.all(thrust.force_n >= room.low_n - 1e-12)

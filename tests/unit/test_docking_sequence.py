@@ -8,6 +8,7 @@ import pytest
 from firmware_py.core.docking_detector import PairStatus
 from firmware_py.core.docking_sequence import DockingSequence, Stage, nearest_pass
 from firmware_py.core.rotations import from_euler, rotate
+from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRequest, Estimate
 from firmware_py.description.parameters import PAPER, Docking
 from firmware_py.description.vehicle import load_vehicle
@@ -90,6 +91,8 @@ def test_dock_that_is_aborted_at_once_moves_nobody() -> None:
         ((-0.6, 0.0, 0.0), False),  # through it
         ((-0.6, 0.0, 1.5), False),
         ((-0.6, 3.0, 0.0), True),  # around it, wide enough
+        ((-30.0, 0.0, 0.0), False),  # through it, from far
+        ((0.0, 0.22, -0.05), False),  # from beside it, over its edge
     ],
 )
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
@@ -111,3 +114,13 @@ def test_module_beside_the_one_that_is_docked_to_may_be_in_the_way() -> None:
     before = np.array([0.33, 0.0, 0.0]) + bar.r_bm[0]
     assert nearest_pass(plan, active, estimate(before + np.array([0.3, 0.3, 0.0])), bar, estimate(np.zeros(3)), 0.12) is None
     assert nearest_pass(plan, active, estimate(before + np.array([-0.5, 0.6, 0.0])), bar, estimate(np.zeros(3)), 0.12) == 1
+
+
+def test_body_that_is_turned_is_turned_before_it_is_aligned() -> None:
+    sequence, p_t, p_a = begin(Docking(), Docking().standoff_m)
+    turned = estimate(p_a)._replace(q_wb=from_euler(0.0, 0.0, 1.5))
+    for tick in range(1, 100):
+        steering = sequence.step(tick * TICK_NS, turned, estimate(p_t), NEITHER)
+    assert sequence.stage == Stage.PRE_APPROACH and isinstance(steering.active, Wish)
+    sequence.step(100 * TICK_NS, estimate(p_a), estimate(p_t), NEITHER)
+    assert sequence.stage == Stage.ALIGN

@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.app.preparation import prepare
 from firmware_py.core.body import Body
-from firmware_py.core.docking import CHANGED, Prepared, joints_of
+from firmware_py.core.docking import CHANGED, Decisions, Join, Prepared, joints_of
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.transitions import State
@@ -408,3 +408,54 @@ def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> 
     rest, corner = (chain.guidance._glider.at.p_wb for chain in tank.pipeline._chains)
     assert outputs.records[1].mode == Mode.POSHOLD and np.linalg.norm(corner - rest) > 0.3
     assert [max(states) for states in tank.pipeline.docking.relays] == [1, 1, 1, 0]
+
+
+def test_dock_that_is_asked_for_again_while_it_ends_begins_anew() -> None:
+    tank, wanted = before_each_other(0.6), Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
+    tank.run(0.1, wanted)
+    while tank.outputs[-1].docks[0].stage != Stage.APPROACH:
+        tank.run(0.01)
+    tank.run(1.5)
+    tank.run(0.05, Request(Action.SET_MODE, 1, Mode.POSHOLD))
+    assert tank.outputs[-1].docks[0].stage == Stage.ABORTED
+    outputs = tank.run(0.2, wanted)
+    assert [dock.stage for dock in outputs.docks] == [Stage.PRE_APPROACH] and outputs.records[1].mode == Mode.DOCK
+
+
+def test_dock_that_is_refused_leaves_the_one_under_way_alone() -> None:
+    tank = before_each_other(0.6)
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
+    assert tank.when("dock refused: on its way")
+    assert [(dock.face_a, dock.face_b) for dock in outputs.docks] == [(2, 3)] and outputs.records[1].mode == Mode.DOCK
+
+
+def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
+    tank = before_each_other(2.0)
+    for turns in (0, 1, 0, 1):
+        tank.run(0.2, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, turns, True)))
+    goal = tank.pipeline._chains[0].guidance._goal
+    assert goal is not None and goal.p_wb is not None
+    assert 0.6 < goal.p_wb[1] < 0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m) + 0.01
+
+
+def test_undock_that_ends_in_the_tick_of_a_join_is_not_said_to_be_done() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], Parameters().replace("docking.push_m", 0.0))
+    tank.fly()
+    stage = tank.pipeline.docking
+    tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 3, 0, 2)))
+    (undock,) = stage._undocks
+    decisions = Decisions({}, [Join(0, 7, None)], [], [], {})
+    estimates = {0: (tank.pipeline.bodies[0], tank.outputs[-1].records[0].estimate)}
+    stage._release(undock, undock.until_ns, estimates, decisions)
+    assert decisions.parts == [] and stage._undocks == [undock]
+    assert not any("is undocked" in event.text for event in stage.events)
+
+
+@pytest.mark.parametrize("cells", [[(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 0, 0), (2, 0, 0), (1, 0, 0)], [(1, 0, 0), (0, 0, 0), (1, 1, 0)]])
+def test_three_that_have_all_come_apart_are_three_however_they_are_numbered(cells: list[tuple[int, int, int]]) -> None:
+    tank = Docked(cells)
+    tank.fly()
+    tank.lose(0, 1, 2)
+    tank.run(3.0)
+    assert tank.shape == [(0,), (1,), (2,)]
