@@ -376,6 +376,6 @@ def test_least_power_keeps_within_the_room(single: Body) -> None:
     allocator = Allocator(single, replace(Allocation(), mode="least_power"))
     room = Room(0.3 * single.thrusters.f_min, 0.3 * single.thrusters.f_max, np.array([1e6]))
     allocator.confine(room)
-    for wrench in wrenches(single, 30, 0.3):
+    for wrench in wrenches(single, 60, 0.15):
         thrust = allocator.step(wrench)
         assert np.all(thrust.force_n <= room.high_n + 1e-12) and np.all(thrust.force_n >= room.low_n - 1e-12)
