@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from firmware_py.core.body import Body
-from firmware_py.core.docking import Prepared
+from firmware_py.core.docking import Prepared, turned
 from firmware_py.core.docking_sequence import UndockPlan
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.types import DockRequest, PartRequest
@@ -33,8 +33,7 @@ Bodies = Mapping[int, Body]
 def _prepare_part(request: PartRequest, bodies: Bodies, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
     """At the first joint where the body has come apart into two that are each whole, whichever side of it then leaves."""
     refusal = "they are apart already"
-    turned = [DockRequest(joint.target_module, joint.target_face, joint.module, joint.face) for joint in request.joints]
-    for joint in (*request.joints, *turned):
+    for joint in (*request.joints, *map(turned, request.joints)):
         whole = bodies[joint.module]
         if whole is not bodies[joint.target_module]:
             continue

@@ -152,12 +152,12 @@ class DockingStage:
         if not self._joints.rows.size:
             return []
         rows = self._joints.rows[self._joints.rows["open"] >= least]
-        parting = [_modules(joint) for undock in self._undocks for joint in undock.plan.opens]
+        parting = [modules_of(joint) for undock in self._undocks for joint in undock.plan.opens]
         found = [
             DockRequest(module, face, target, target_face)
             for (target, module), (target_face, face) in zip(rows["module"].tolist(), rows["face"].tolist(), strict=True)
         ]
-        return [joint for joint in found if _modules(joint) not in parting]
+        return [joint for joint in found if modules_of(joint) not in parting]
 
     @property
     def joints(self) -> np.ndarray:
@@ -179,8 +179,7 @@ class DockingStage:
         """Ends every dock that one of these takes part in, bodies that there are no more; returns the active ones."""
         ended = [dock for dock in self._docks if dock.active in bodies or dock.target in bodies]
         for dock in ended:
-            self._docks.remove(dock)
-            self._set_relays(RELAY_OFF, dock.prepared.request)
+            self._drop(dock)
             self._say(WARNING, f"dock ended: {CHANGED}")
         return [dock.active for dock in ended]
 
@@ -201,8 +200,7 @@ class DockingStage:
             self._set_relays(RELAY_PULL, *undock.plan.opens)
             left.append(("undock", undock.plan.opens[0]))
         for dock in [each for each in self._docks if each.active == body.index and not armed]:
-            self._docks.remove(dock)
-            self._set_relays(RELAY_OFF, dock.prepared.request)
+            self._drop(dock)
             left.append(("dock", dock.prepared.request))
         return [Event(WARNING, f"{what} of module {request.module} ended: {NO_LONGER}") for what, request in left]
 
@@ -259,9 +257,7 @@ class DockingStage:
         under_way = next((dock for dock in self._docks if dock.active == mine), None)
         if under_way is not None and under_way.prepared.request == request and under_way.sequence.stage not in ENDED:
             return
-        refusal = prepared.refusal if plan is None else "" if _fits(plan, estimates) else CHANGED
-        if isinstance(plan, DockPlan) and not refusal and self._p.approach == "staged":
-            refusal = _in_the_way(plan, *estimates[mine], *estimates[_body_of(request.target_module, estimates)], self._p.standoff_m)
+        refusal = self._refusal(prepared, estimates)
         if plan is None or refusal:
             self._say(WARNING, f"dock refused: {refusal}")
             if under_way is None:
@@ -273,17 +269,33 @@ class DockingStage:
                 self._give_up(under_way, holding, decisions)
             self._begin_dock(prepared, plan, time_ns, estimates, holding)
 
-    def _give_up(self, dock: _Dock, holding: Collection[int], decisions: Decisions) -> None:
-        """Ends a dock in whose place another begins; a target that was coming goes back to where it held."""
+    def _refusal(self, prepared: Prepared, estimates: Mapping[int, tuple[Body, Estimate]]) -> str:
+        """Why a plan is not begun; empty: it is."""
+        plan = prepared.plan
+        if plan is None:
+            return prepared.refusal
+        if not _fits(plan, estimates):
+            return CHANGED
+        if isinstance(plan, UndockPlan) or self._p.approach == "straight":
+            return ""
+        active, target = (estimates[_body_of(module, estimates)] for module in (plan.request.module, plan.request.target_module))
+        return _in_the_way(plan, *active, *target, self._p.standoff_m)
+
+    def _drop(self, dock: _Dock) -> None:
+        """It is no longer under way, and its magnets let go."""
         self._docks.remove(dock)
         self._set_relays(RELAY_OFF, dock.prepared.request)
+
+    def _give_up(self, dock: _Dock, holding: Collection[int], decisions: Decisions) -> None:
+        """Ends a dock in whose place another begins; a target that was coming goes back to where it held."""
+        self._drop(dock)
         self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: another was asked for")
         if dock.target in holding:
             decisions.move(dock.target, -dock.sequence.met_w)
 
     def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
-        apart = [_modules(joint) for joint in self.open_joints(APART)]
-        holds = any(_modules(joint) not in apart for joint in plan.opens)
+        apart = [modules_of(joint) for joint in self.open_joints(APART)]
+        holds = any(modules_of(joint) not in apart for joint in plan.opens)
         self._undocks.append(_Undock(plan, chains, time_ns + (round(self._p.release_s * 1e9) if holds else 0)))
         self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
 
@@ -368,8 +380,8 @@ class DockingStage:
 
     def _holds(self, plan: UndockPlan) -> bool:
         """Whether there still is a joint to be undone."""
-        watched = [_modules(joint.request) for joint in self._watched]
-        return any(_modules(joint) in watched for joint in plan.opens)
+        watched = [modules_of(joint.request) for joint in self._watched]
+        return any(modules_of(joint) in watched for joint in plan.opens)
 
     def _set_relays(self, relay: int, *joints: DockRequest) -> None:
         for module, face in (side for joint in joints for side in sides(joint)):
@@ -383,6 +395,16 @@ class DockingStage:
 def sides(request: DockRequest) -> tuple[tuple[int, int], tuple[int, int]]:
     """Module and face of each side: fleet index, and 0 to 5 for A to F."""
     return (request.module, request.face), (request.target_module, request.target_face)
+
+
+def turned(request: DockRequest) -> DockRequest:
+    """The same joint, told from its other side."""
+    return DockRequest(request.target_module, request.target_face, request.module, request.face)
+
+
+def modules_of(request: DockRequest) -> frozenset[int]:
+    """Fleet indices of the modules of both sides."""
+    return frozenset((request.module, request.target_module))
 
 
 def joints_of(body: Body) -> list[Joint]:
@@ -440,10 +462,6 @@ def _fits(plan: DockPlan | UndockPlan, estimates: Mapping[int, tuple[Body, Estim
     mine = {module: body for body in bodies for module in body}
     active, target = mine[request.module], mine[request.target_module]
     return active != target and active | target == merged
-
-
-def _modules(request: DockRequest) -> frozenset[int]:
-    return frozenset((request.module, request.target_module))
 
 
 def _body_of(module: int, estimates: Mapping[int, tuple[Body, Estimate]]) -> int:

@@ -33,6 +33,8 @@ CONE = 1.5
 
 WAY_SAMPLES = 65
 """Places on the way to the stand-off that are looked at, where the bodies are near each other."""
+WAY_SLACK = 0.25
+"""Share of the stand-off by which cubes that would clear each other level may come nearer than at the ends of the way."""
 WAY_NOISE_M = 0.005
 """Nearer by so little is not nearer."""
 SQUARE_DIAGONAL, CUBE_DIAGONAL = 2.0**0.5, 3.0**0.5
@@ -316,7 +318,11 @@ def nearest_pass(plan: DockPlan, active: Body, at: Estimate, target: Body, targe
     """Module of the target that the active body would come nearest to, and too near, on the straight way to the stand-off; None: none.
 
     Too near is nearer than at both ends of the way, and near enough for level cubes to touch; or for cubes in any attitude, and nearer by
-    a quarter of the stand-off.
+    WAY_SLACK.
+
+    Args:
+        active, target: the two bodies; at, target_at: where they are.
+        standoff_m: gap at which the way ends, m.
     """
     r_a, q_a = _module_in(active, plan.request.module)
     p_t, q_t = _pose_of(target_at, *_module_in(target, plan.request.target_module))
@@ -332,7 +338,7 @@ def nearest_pass(plan: DockPlan, active: Body, at: Estimate, target: Body, targe
         gaps[k] = np.linalg.norm(mine[:, None] - others, axis=2)
     least = gaps.min(axis=0)
     ends, pitch_m = np.minimum(gaps[0], gaps[-1]), float(np.linalg.norm(plan.place_t))
-    near = np.minimum(CUBE_DIAGONAL * pitch_m, np.maximum(ends - 0.25 * standoff_m, SQUARE_DIAGONAL * pitch_m))
+    near = np.minimum(CUBE_DIAGONAL * pitch_m, np.maximum(ends - WAY_SLACK * standoff_m, SQUARE_DIAGONAL * pitch_m))
     touching = (least < ends - WAY_NOISE_M) & (least < near)
     return target.modules[int(np.where(touching, least, np.inf).min(axis=0).argmin())] if touching.any() else None
 

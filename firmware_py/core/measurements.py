@@ -90,8 +90,6 @@ class Measurements:
 
     def _follow(self, gyro: np.ndarray | None) -> None:
         """Angular acceleration by the gyro's differences, averaged; from zero after a tick without."""
-        if gyro is not None and not np.isfinite(gyro).all():
-            gyro = None
         if gyro is None or self._last_gyro is None:
             self._alpha = np.zeros(3)
         else:

@@ -310,15 +310,13 @@ class Pipeline:
                 chain.dock_over = True
 
     def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
-        before = [chain for number in (joined.target, joined.active) for chain in self._chains if chain.body.index == number]
+        before = self._chains_of(joined.target, joined.active)
         estimate = self._begin(joined.chain, before, time_ns)
         self._swap(before, [joined.chain], estimates, [estimate])
 
     def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
         after = [parted.stays, parted.leaves]
-        before = self._made_of(after)
-        if before is None or len(before) != 1:
-            return
+        before = self._chains_of(parted.whole)
         found = [self._begin(chain, before, time_ns) for chain in after]
         parted.leaves.guidance.move_by(parted.away_w)
         self._swap(before, after, estimates, found)
@@ -329,11 +327,9 @@ class Pipeline:
             chain.retune(self.parameters)
         return chain.take_over(before, time_ns)
 
-    def _made_of(self, after: Sequence[BodyPipeline]) -> list[BodyPipeline] | None:
-        """The bodies whose modules these are made of; None where that is no longer so: another join or part of this tick was first."""
-        modules = {module for chain in after for module in chain.body.modules}
-        before = [chain for chain in self._chains if not modules.isdisjoint(chain.body.modules)]
-        return before if modules == {module for chain in before for module in chain.body.modules} else None
+    def _chains_of(self, *bodies: int) -> list[BodyPipeline]:
+        """Of these bodies, by their numbers, in this order. No body joins or parts twice in a tick."""
+        return [chain for number in bodies for chain in self._chains if chain.body.index == number]
 
     def _swap(
         self, before: Sequence[BodyPipeline], after: Sequence[BodyPipeline], estimates: dict[int, Estimate], found: Sequence[Estimate]

@@ -8,7 +8,7 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
-from firmware_py.core.docking import joints_of
+from firmware_py.core.docking import joints_of, modules_of, turned
 from firmware_py.core.docking_sequence import DockPlan, UndockPlan
 from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
@@ -82,18 +82,18 @@ def plan_undock(
     """
     near, far = request.target_module, request.module
     joints = [joint.request for joint in joints_of(whole)]
-    wanted, pairs = {near, far}, [_modules(joint) for joint in joints]
+    wanted, pairs = modules_of(request), [modules_of(joint) for joint in joints]
     if wanted not in pairs:
         raise DescriptionError(f"modules {near} and {far} are not docked to each other")
-    opened = [wanted, *(_modules(joint) for joint in lost)]
+    opened = [wanted, *(modules_of(joint) for joint in lost)]
     piece = _reachable(far, [pair for pair in pairs if pair not in opened])
     if near in piece and not lost:
         piece = {far}
     stays = [m for m in whole.modules if m not in piece]
     if near in piece or _reachable(near, [pair for pair in pairs if not pair & piece]) != set(stays):
         raise DescriptionError(f"modules {near} and {far} are also held together by other modules: undock those first")
-    opens = [_leaving(joint, piece) for joint in joints if len(_modules(joint) & piece) == 1]
-    opens.sort(key=lambda joint: _modules(joint) != wanted)
+    opens = [joint if joint.module in piece else turned(joint) for joint in joints if len(modules_of(joint) & piece) == 1]
+    opens.sort(key=lambda joint: modules_of(joint) != wanted)
     rest, leaves = (
         assemble(
             np.array([_cell_of(whole, m) for m in half]),
@@ -118,17 +118,6 @@ def _away(whole: Body, piece: set[int], steps: Sequence[np.ndarray]) -> np.ndarr
     return np.asarray(way / np.linalg.norm(way))
 
 
-def _leaving(joint: DockRequest, piece: set[int]) -> DockRequest:
-    """The joint, told from the side of the piece."""
-    if joint.module in piece:
-        return joint
-    return DockRequest(joint.target_module, joint.target_face, joint.module, joint.face)
-
-
-def _modules(joint: DockRequest) -> set[int]:
-    return {joint.module, joint.target_module}
-
-
 def _mated(turn_t: np.ndarray, request: DockRequest, normal: np.ndarray) -> np.ndarray:
     """(3, 3) rotation of the active module in the target's lattice, its face against the target's."""
     fits = [m for m in MATRICES if np.array_equal(_rounded(m @ FACE_NORMALS[request.face]), -normal)]
@@ -139,7 +128,7 @@ def _mated(turn_t: np.ndarray, request: DockRequest, normal: np.ndarray) -> np.n
     return np.asarray(MATRICES[nearest(quarter @ least)])
 
 
-def _reachable(start: int, joints: Sequence[set[int]]) -> set[int]:
+def _reachable(start: int, joints: Sequence[frozenset[int]]) -> set[int]:
     """Modules that hang together with `start` by these joints."""
     reached, before = {start}, set[int]()
     while reached != before:

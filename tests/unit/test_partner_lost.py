@@ -2,14 +2,11 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from firmware_py.app.preparation import prepare
 from firmware_py.core.body import Body
-from firmware_py.core.docking import CHANGED, Decisions, Join, Prepared, joints_of
-from firmware_py.core.docking_sequence import Stage
-from firmware_py.core.rotations import from_euler
+from firmware_py.core.docking import CHANGED, Prepared, joints_of
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockFeedback, DockRequest, Inputs, Mode, ModuleInputs, Outputs, Request
 from firmware_py.description.parameters import Parameters
@@ -209,6 +206,15 @@ def test_estimate_of_a_part_is_as_old_as_that_of_the_whole() -> None:
     assert not fresh.estimator.restart(5_000_000_000, motion._replace(accepted=0)).ready
 
 
+@pytest.mark.parametrize("cells", [[(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 0, 0), (2, 0, 0), (1, 0, 0)], [(1, 0, 0), (0, 0, 0), (1, 1, 0)]])
+def test_three_that_have_all_come_apart_are_three_however_they_are_numbered(cells: list[tuple[int, int, int]]) -> None:
+    tank = Docked(cells)
+    tank.fly()
+    tank.lose(0, 1, 2)
+    tank.run(3.0)
+    assert tank.shape == [(0,), (1,), (2,)]
+
+
 # ---------------------------------------------------------------- what is known is not forgotten
 
 
@@ -268,194 +274,3 @@ def test_parted_modules_magnets_keep_their_accounts() -> None:
     tank.run(1.0)
     after = [list(chain.limiter.magnets[0]._left_s) for chain in tank.pipeline._chains]
     assert min(before[0]) < 59.0 and min(after[0]) < min(before[0]) and min(after[1]) < min(before[1])
-
-
-# ---------------------------------------------------------------- an undock that is over
-
-
-@pytest.mark.parametrize("stop", ["e-stop", "DISARM", "mode"])
-def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
-    tank = Docked(RING[:2])
-    tank.fly()
-    tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
-    assert any(2 in states for states in tank.pipeline.docking.relays), "magnets push"
-    request = Request(Action.SET_MODE, 0, Mode.POSHOLD) if stop == "mode" else Request(Action.DISARM, 0)
-    tank.run(0.02, *([] if stop == "e-stop" else [request]), estop=stop == "e-stop")
-    outputs = tank.run(3.0)
-    assert tank.shape == [(0, 1)] and tank.when("undock of module 1 ended")
-    assert [max(states) for states in tank.pipeline.docking.relays] == [1, 1], "and pull again"
-    assert outputs.records[0].mode == Mode.POSHOLD
-
-
-@pytest.mark.parametrize("stop", ["e-stop", "DISARM"])
-def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str) -> None:
-    tank = Docked(RING[:2], apart=True)
-    tank.weak = {0, 1}
-    tank.states[1][1] = 0.6
-    tank.run(2.0)
-    tank.run(3.0, Request(Action.ARM, 0), Request(Action.ARM, 1))
-    outputs = tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, False)))
-    while not (outputs.docks and outputs.docks[0].stage == Stage.APPROACH):
-        outputs = tank.run(0.01)
-    outputs = tank.run(1.0)
-    assert outputs.records[1].mode == Mode.DOCK and any(any(states) for states in tank.pipeline.docking.relays)
-    stopping = [] if stop == "e-stop" else [Request(Action.DISARM, 0), Request(Action.DISARM, 1)]
-    tank.run(0.02, *stopping, estop=stop == "e-stop")
-    outputs = tank.run(5.0)
-    assert outputs.docks == [] and not any(any(states) for states in tank.pipeline.docking.relays)
-    assert tank.when("dock of module 1 ended")
-    tank.run(0.1, Request(Action.CLEAR_ESTOP, 1))
-    outputs = tank.run(0.1, Request(Action.ARM, 1))
-    before = tank.states[1][:3].copy()
-    outputs = tank.run(5.0)
-    assert (outputs.records[1].state, outputs.records[1].mode) == (State.ARMED, Mode.POSHOLD)
-    assert np.linalg.norm(tank.states[1][:3] - before) < 0.02
-
-
-def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], Parameters().replace("docking.push_m", 0.0), apart=True)
-    for state, side in zip(tank.states, (0.0, PITCH_M, -PITCH_M), strict=True):
-        state[:7] = [1.0, side, 0.8, *from_euler(0.0, 0.02, 0.0)]
-    tank.run(2.0)
-    tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
-    wanted = DockRequest(1, 3, 0, 2), DockRequest(2, 2, 0, 3)
-    tank.run(0.03, *(Request(Action.DOCK, request.module, request) for request in wanted))
-    assert len(tank.pipeline.docking._docks) == 2
-    for dock in tank.pipeline.docking._docks:
-        dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if they had just come
-    outputs = tank.run(2.0)
-    assert [record.stage for outputs in tank.outputs for record in outputs.docks].count(Stage.DOCKED) == 2
-    assert tank.shape == [(0, 1), (2,)]
-    assert tank.pipeline.docking.relays == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
-    assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
-    assert tank.when(f"dock ended: {CHANGED}")
-
-
-# ---------------------------------------------------------------- what was asked for
-
-
-def before_each_other(y_m: float) -> Docked:
-    """Two armed modules in one line; no magnet draws current."""
-    tank = Docked([(0, 0, 0), (0, 1, 0)], apart=True)
-    tank.weak = {0, 1}
-    for state, y in zip(tank.states, (0.0, y_m), strict=True):
-        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
-    tank.run(2.0)
-    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
-    return tank
-
-
-def test_dock_from_afar_glides_to_the_stand_off_and_keeps_it() -> None:
-    tank, near, fastest = before_each_other(2.0), [], []
-    first = len(tank.outputs)
-    tank.run(0.03, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
-    while tank.outputs[-1].docks[0].stage == Stage.PRE_APPROACH:
-        tank.run(0.01)
-        near.append(tank.states[1][1] - tank.states[0][1])
-        fastest.append(np.linalg.norm(tank.states[1][7:10]))
-    places = np.array([outputs.records[1].setpoint.p_wb for outputs in tank.outputs[first:]])
-    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    assert steps[:-1].max() < 0.0035, "a speed of 0.3 m/s"
-    assert steps[-1] < 5 * Parameters().docking.align_m, "near enough to be aligned"
-    assert max(fastest) < 0.35
-    assert min(near) > PITCH_M + 0.9 * Parameters().docking.standoff_m
-    assert len(tank.outputs) - first < 2000
-
-
-def test_dock_whose_way_leads_through_the_target_is_refused() -> None:
-    tank = before_each_other(2.0)
-    outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
-    assert tank.when("dock refused: on its way it would come too near to module 0")
-    assert outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
-
-
-def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], apart=True)
-    tank.weak = {0, 1, 2}
-    for state, y in zip(tank.states, (0.0, 0.6, 1.2), strict=True):
-        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
-    tank.run(2.0)
-    tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
-    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
-    while tank.outputs[-1].docks[0].stage != Stage.APPROACH:
-        tank.run(0.01)
-    tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
-    assert [dock.stage for dock in tank.outputs[-1].docks] == [Stage.APPROACH]
-    outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 2, 3)))
-    assert [(dock.module_a, dock.module_b) for dock in outputs.docks] == [(2, 1)]
-    assert tank.when("dock of module 1 ended: another was asked for")
-    assert tank.pipeline.docking.relays[0] == [0] * 6
-    assert outputs.records[1].mode == Mode.DOCK
-
-
-def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_holds() -> None:
-    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
-    tank.fly()
-    tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)), Request(Action.UNDOCK, 0, DockRequest(2, 1, 1, 0)))
-    assert tank.shape == [(0,), (1, 2)]
-    assert not any("is undocked from 1" in text for _, text in tank.said)
-    assert tank.when("undock of module 2 ended")
-    assert tank.pipeline.docking.relays == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
-
-
-def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> None:
-    tank = Docked(RING)
-    tank.fly()
-    tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
-    assert [sum(state == 2 for state in states) for states in tank.pipeline.docking.relays] == [0, 1, 1, 2]
-    outputs = tank.run(5.0)
-    assert tank.shape == [(0, 1, 2), (3,)]
-    rest, corner = (chain.guidance._glider.at.p_wb for chain in tank.pipeline._chains)
-    assert outputs.records[1].mode == Mode.POSHOLD and np.linalg.norm(corner - rest) > 0.3
-    assert [max(states) for states in tank.pipeline.docking.relays] == [1, 1, 1, 0]
-
-
-def test_dock_that_is_asked_for_again_while_it_ends_begins_anew() -> None:
-    tank, wanted = before_each_other(0.6), Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
-    tank.run(0.1, wanted)
-    while tank.outputs[-1].docks[0].stage != Stage.APPROACH:
-        tank.run(0.01)
-    tank.run(1.5)
-    tank.run(0.05, Request(Action.SET_MODE, 1, Mode.POSHOLD))
-    assert tank.outputs[-1].docks[0].stage == Stage.ABORTED
-    outputs = tank.run(0.2, wanted)
-    assert [dock.stage for dock in outputs.docks] == [Stage.PRE_APPROACH] and outputs.records[1].mode == Mode.DOCK
-
-
-def test_dock_that_is_refused_leaves_the_one_under_way_alone() -> None:
-    tank = before_each_other(0.6)
-    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
-    outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
-    assert tank.when("dock refused: on its way")
-    assert [(dock.face_a, dock.face_b) for dock in outputs.docks] == [(2, 3)] and outputs.records[1].mode == Mode.DOCK
-
-
-def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
-    tank = before_each_other(2.0)
-    for turns in (0, 1, 0, 1):
-        tank.run(0.2, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, turns, True)))
-    goal = tank.pipeline._chains[0].guidance._goal
-    assert goal is not None and goal.p_wb is not None
-    assert 0.6 < goal.p_wb[1] < 0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m) + 0.01
-
-
-def test_undock_that_ends_in_the_tick_of_a_join_is_not_said_to_be_done() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], Parameters().replace("docking.push_m", 0.0))
-    tank.fly()
-    stage = tank.pipeline.docking
-    tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 3, 0, 2)))
-    (undock,) = stage._undocks
-    decisions = Decisions({}, [Join(0, 7, None)], [], [], {})
-    estimates = {0: (tank.pipeline.bodies[0], tank.outputs[-1].records[0].estimate)}
-    stage._release(undock, undock.until_ns, estimates, decisions)
-    assert decisions.parts == [] and stage._undocks == [undock]
-    assert not any("is undocked" in event.text for event in stage.events)
-
-
-@pytest.mark.parametrize("cells", [[(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 0, 0), (2, 0, 0), (1, 0, 0)], [(1, 0, 0), (0, 0, 0), (1, 1, 0)]])
-def test_three_that_have_all_come_apart_are_three_however_they_are_numbered(cells: list[tuple[int, int, int]]) -> None:
-    tank = Docked(cells)
-    tank.fly()
-    tank.lose(0, 1, 2)
-    tank.run(3.0)
-    assert tank.shape == [(0,), (1,), (2,)]
