@@ -19,7 +19,7 @@ from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import open_loop
 from firmware_py.app.service import reporting
 from firmware_py.core.body import Body
-from firmware_py.core.docking import joints_of, sides
+from firmware_py.core.joints import joints_of, sides
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet

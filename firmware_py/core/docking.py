@@ -24,13 +24,15 @@ from firmware_py.core.docking_sequence import (
     UndockPlan,
     nearest_pass,
 )
-from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back, to_matrix
+from firmware_py.core.joints import Joint, modules_of, sides
+from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRecord, DockRequest, Estimate, Event, Inputs, Setpoint
 from firmware_py.description.parameters import Docking
-from firmware_py.description.vehicle import FACE_NORMALS
 
 WARNING, INFORMATION = 4, 6
+CHANGED = "the bodies are others than those that it was planned for"
+NO_LONGER = "its body is no longer in DOCK"
 NEVER_NS = -(1 << 60)
 RELAY_PERIOD_NS = 100_000_000
 """DOCK_CMD goes out at 10 Hz, and at once when a relay changes."""
@@ -95,19 +97,6 @@ class _Dock(NamedTuple):
     active: int
     target: int
     prepared: Prepared
-
-
-class Joint(NamedTuple):
-    """Two faces that hold modules of one body together."""
-
-    request: DockRequest
-    offset: np.ndarray
-    """(3,) centre of its module in the frame of the target module, m."""
-
-    @property
-    def pair(self) -> FacePair:
-        """What the detector watches."""
-        return FacePair(self.request.target_module, self.request.target_face, self.request.module, self.request.face, self.offset)
 
 
 class _Undock(NamedTuple):
@@ -392,42 +381,6 @@ class DockingStage:
         self.events.append(Event(severity, text))
 
 
-def sides(request: DockRequest) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Module and face of each side: fleet index, and 0 to 5 for A to F."""
-    return (request.module, request.face), (request.target_module, request.target_face)
-
-
-def turned(request: DockRequest) -> DockRequest:
-    """The same joint, told from its other side."""
-    return DockRequest(request.target_module, request.target_face, request.module, request.face)
-
-
-def modules_of(request: DockRequest) -> frozenset[int]:
-    """Fleet indices of the modules of both sides."""
-    return frozenset((request.module, request.target_module))
-
-
-def joints_of(body: Body) -> list[Joint]:
-    """Every joint of a body, in the order of its modules: neighbours of which one turns a probe and the other a drogue to the other."""
-    joints: list[Joint] = []
-    at = {tuple(cell): i for i, cell in enumerate(body.cells.tolist())}
-    for i, cell in enumerate(body.cells):
-        neighbours = (at.get(tuple(place), -1) for place in (cell + FACE_NORMALS).tolist())
-        joints += [_joint(body, i, j) for j in sorted(neighbours) if j > i]
-    faces = dict(zip(body.modules, body.faces, strict=True))
-    return [joint for joint in joints if {faces[m][f] for m, f in sides(joint.request)} == {"P", "D"}]
-
-
-def _joint(body: Body, i: int, j: int) -> Joint:
-    """Between the modules i and j of the body, which are neighbours."""
-    step = (body.cells[j] - body.cells[i]).astype(np.float64)
-    turn_i, turn_j = (to_matrix(np.ascontiguousarray(body.q_bm[k])) for k in (i, j))
-    near = int(np.argmax(FACE_NORMALS @ (turn_i.T @ step)))
-    far = int(np.argmax(FACE_NORMALS @ (turn_j.T @ -step)))
-    offset = rotate_back(np.ascontiguousarray(body.q_bm[i]), body.r_bm[j] - body.r_bm[i])
-    return Joint(DockRequest(body.modules[j], far, body.modules[i], near), offset)
-
-
 def tag_table(bodies: Sequence[Body]) -> TagTable:
     """Tags of every module in its own frame."""
     table: TagTable = {}
@@ -447,10 +400,6 @@ def _in_the_way(plan: DockPlan, active: Body, at: Estimate, target: Body, target
         return ""
     module = nearest_pass(plan, active, at, target, target_at, standoff_m)
     return "" if module is None else f"on its way it would come too near to module {module}: bring it before that face first"
-
-
-CHANGED = "the bodies are others than those that it was planned for"
-NO_LONGER = "its body is no longer in DOCK"
 
 
 def _fits(plan: DockPlan | UndockPlan, estimates: Mapping[int, tuple[Body, Estimate]]) -> bool:

@@ -12,13 +12,14 @@ import numpy as np
 from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.controller import Controller
-from firmware_py.core.docking import Decisions, DockingStage, Join, Part, joints_of, tag_table
+from firmware_py.core.docking import Decisions, DockingStage, Join, Part, tag_table
 from firmware_py.core.docking_pairs import APART, LOOSE
 from firmware_py.core.estimator import Estimator
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import HealthMonitor
 from firmware_py.core.imu_watch import ImuWatch
+from firmware_py.core.joints import joints_of
 from firmware_py.core.limiter import Limiter
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.motor_test import MotorTest

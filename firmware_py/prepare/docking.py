@@ -8,8 +8,8 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
-from firmware_py.core.docking import joints_of, modules_of, turned
 from firmware_py.core.docking_sequence import DockPlan, UndockPlan
+from firmware_py.core.joints import joints_of, modules_of, turned
 from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS, Vehicle

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from firmware_py.core.docking import joints_of
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, PairStatus, TagTable
+from firmware_py.core.joints import joints_of
 from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
 from firmware_py.core.types import DockFeedback, ModuleInputs, TagObservation
 from firmware_py.description.parameters import Docking

@@ -1,0 +1,62 @@
+"""Joints: pairs of faces, a probe on a drogue, by which the modules of a body hold each other."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.docking_detector import FacePair
+from firmware_py.core.rotations import rotate_back, to_matrix
+from firmware_py.core.types import DockRequest
+from firmware_py.description.vehicle import FACE_NORMALS
+
+
+class Joint(NamedTuple):
+    """Two faces that hold modules of one body together."""
+
+    request: DockRequest
+    offset: np.ndarray
+    """(3,) centre of its module in the frame of the target module, m."""
+
+    @property
+    def pair(self) -> FacePair:
+        """What the detector watches."""
+        return FacePair(self.request.target_module, self.request.target_face, self.request.module, self.request.face, self.offset)
+
+
+def sides(request: DockRequest) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Module and face of each side: fleet index, and 0 to 5 for A to F."""
+    return (request.module, request.face), (request.target_module, request.target_face)
+
+
+def turned(request: DockRequest) -> DockRequest:
+    """The same joint, told from its other side."""
+    return DockRequest(request.target_module, request.target_face, request.module, request.face)
+
+
+def modules_of(request: DockRequest) -> frozenset[int]:
+    """Fleet indices of the modules of both sides."""
+    return frozenset((request.module, request.target_module))
+
+
+def joints_of(body: Body) -> list[Joint]:
+    """Every joint of a body, in the order of its modules: neighbours of which one turns a probe and the other a drogue to the other."""
+    joints: list[Joint] = []
+    at = {tuple(cell): i for i, cell in enumerate(body.cells.tolist())}
+    for i, cell in enumerate(body.cells):
+        neighbours = (at.get(tuple(place), -1) for place in (cell + FACE_NORMALS).tolist())
+        joints += [_joint(body, i, j) for j in sorted(neighbours) if j > i]
+    faces = dict(zip(body.modules, body.faces, strict=True))
+    return [joint for joint in joints if {faces[m][f] for m, f in sides(joint.request)} == {"P", "D"}]
+
+
+def _joint(body: Body, i: int, j: int) -> Joint:
+    """Between the modules i and j of the body, which are neighbours."""
+    step = (body.cells[j] - body.cells[i]).astype(np.float64)
+    turn_i, turn_j = (to_matrix(np.ascontiguousarray(body.q_bm[k])) for k in (i, j))
+    near = int(np.argmax(FACE_NORMALS @ (turn_i.T @ step)))
+    far = int(np.argmax(FACE_NORMALS @ (turn_j.T @ -step)))
+    offset = rotate_back(np.ascontiguousarray(body.q_bm[i]), body.r_bm[j] - body.r_bm[i])
+    return Joint(DockRequest(body.modules[j], far, body.modules[i], near), offset)
