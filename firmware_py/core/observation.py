@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from firmware_py.core.propagation import ERRORS, PLANT, STATE, carry, inertial_acceleration, inject, predict
+from firmware_py.core.propagation import ERRORS, PLANT, STATE, carry, inertial_acceleration, inject, predict, squared_speeds
 from firmware_py.core.rotations import M, V, difference, rotate_back, skew, to_matrix
 
 GRAVITY = 9.80665
@@ -115,13 +115,14 @@ def update(x, covariance, residual, h, variance, shared, gate):  # type: ignore[
 
 @njit(cache=True)
 def fuse_inertial(  # type: ignore[no-untyped-def]
-    x, covariance, tau, gyro, accel, depth, elapsed, dt, density, sigma, mass, mass_inv, righting, nodes, rotational, linear
+    x, covariance, tau, gyro, accel, depth, elapsed, dt, density, under_way, sigma, mass, mass_inv, righting, nodes, rotational, linear
 ):  # fmt: skip
     """State and covariance after one sample of gyro, accelerometer and depth, each NaN where it did not come.
 
     The acceleration that no model foresaw (white, `density` (25,) per second) has moved the body over the `elapsed` seconds of the last
     prediction, and the accelerometer has felt it: so the velocity follows what was felt, not what was commanded. What it says of a part
-    of its `dt` seconds counts for that part.
+    of its `dt` seconds counts for that part. A body under way feels more than its model tells (`under_way`, as `predict`): mass and drag are not
+    as believed.
     """
     moved = inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, linear)
     mobility = np.ascontiguousarray(mass_inv[:3, :3])
@@ -129,9 +130,11 @@ def fuse_inertial(  # type: ignore[no-untyped-def]
     shared = np.zeros((residual.size, ERRORS))
     if not math.isnan(accel[0]) and elapsed > 0.0:
         first = 0 if math.isnan(gyro[0]) else 3
+        speed, rate = squared_speeds(x)
+        moving = under_way[3] ** 2 * speed + under_way[4] ** 2 * rate
         for i in range(3):
             shared[first + i, 6 + i] = density[6 + i]
-            variance[first + i] = (variance[first + i] * dt + density[6 + i]) / elapsed
+            variance[first + i] = ((variance[first + i] + moving) * dt + density[6 + i]) / elapsed
     _, x_after, after = update(x, covariance, residual, h, variance, shared, ANY_NIS)
     return x_after, after
 
@@ -152,14 +155,14 @@ def advance(  # type: ignore[no-untyped-def]
         tau, elapsed = taus[i].copy(), first if i == 0 else dt
         x, covariance = predict(x, covariance, tau, elapsed, density, under_way, mass, mass_inv, righting, nodes, rotational, linear)
         x, covariance = fuse_inertial(
-            x, covariance, tau, gyros[i].copy(), others[i, :3].copy(), others[i, 3], elapsed, dt, density, sigma,
+            x, covariance, tau, gyros[i].copy(), others[i, :3].copy(), others[i, 3], elapsed, dt, density, under_way, sigma,
             mass, mass_inv, righting, nodes, rotational, linear,
         )  # fmt: skip
     if rest > 0.0:
         tau = taus[count].copy()
         x, covariance = predict(x, covariance, tau, rest, density, under_way, mass, mass_inv, righting, nodes, rotational, linear)
         x, covariance = fuse_inertial(
-            x, covariance, tau, np.full(3, math.nan), others[count, :3].copy(), math.nan, rest, dt, density, sigma,
+            x, covariance, tau, np.full(3, math.nan), others[count, :3].copy(), math.nan, rest, dt, density, under_way, sigma,
             mass, mass_inv, righting, nodes, rotational, linear,
         )  # fmt: skip
     return x, covariance

@@ -148,13 +148,20 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
 
 
 @njit(cache=True)
+def squared_speeds(x):  # type: ignore[no-untyped-def]
+    """Squares of the speed, m^2/s^2, and of the rate of turning, rad^2/s^2, of state x."""
+    return x[7] ** 2 + x[8] ** 2 + x[9] ** 2, x[10] ** 2 + x[11] ** 2 + x[12] ** 2
+
+
+@njit(cache=True)
 def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
     """State (26,) and covariance (25, 25) after dt seconds: F P F^T + Q dt.
 
     Args:
         density: (25,) process noise of a body at rest, per second.
-        under_way: (3,) what motion adds, as what is not as believed of current and drag is felt in proportion to it: to the random walk
-            of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz) for each rad/s.
+        under_way: (5,) what motion adds, as what is not as believed of current, drag and mass is felt in proportion to it: to the random
+            walk of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz) for each
+            rad/s; to the noise of the accelerometer (`observation.fuse_inertial`) m/s^2 for each m/s and for each rad/s.
     """
     f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
     moved = f @ covariance
@@ -167,7 +174,7 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
             out[i, j] = out[j, i] = moved[i, j]
     for i in range(ERRORS):
         out[i, i] += density[i] * dt
-    speed, rate = x[7] ** 2 + x[8] ** 2 + x[9] ** 2, x[10] ** 2 + x[11] ** 2 + x[12] ** 2
+    speed, rate = squared_speeds(x)
     for i in range(3):
         out[9 + i, 9 + i] += under_way[2] ** 2 * rate * dt
         out[18 + i, 18 + i] += (under_way[0] ** 2 * speed + under_way[1] ** 2 * rate) * dt

@@ -23,16 +23,16 @@ class Control:
         "model", choices=("model", "paper"), help="model: desired velocity in drag and Coriolis; paper: measured"
     )
     position_bandwidth: float = quantity(
-        3.63, unit="rad/s", low=0.1, high=10, help="of the position loop", mavlink="POS_BW"
+        3.45, unit="rad/s", low=0.1, high=10, help="of the position loop", mavlink="POS_BW"
     )
     position_damping: float = quantity(
         1.16, low=0.1, high=5, help="damping ratio of the position loop", mavlink="POS_DAMP"
     )
     attitude_bandwidth: float = quantity(
-        2.45, unit="rad/s", low=0.1, high=20, help="of the attitude loop", mavlink="ATT_BW"
+        2.5, unit="rad/s", low=0.1, high=20, help="of the attitude loop", mavlink="ATT_BW"
     )
     attitude_damping: float = quantity(
-        1.16, low=0.1, high=5, help="damping ratio of the attitude loop", mavlink="ATT_DAMP"
+        1.18, low=0.1, high=5, help="damping ratio of the attitude loop", mavlink="ATT_DAMP"
     )
     drag_feedforward: float = quantity(
         1.0, low=-2, high=2, help="share of the modelled drag fed forward", mavlink="FF_DRAG"
@@ -59,15 +59,18 @@ class Estimation:
         0.0042, unit="m", low=1e-5, high=1, help="along the camera axis", mavlink="TAG_AXIS_SD"
     )
     tag_sigma_rad: float = quantity(
-        0.0090, unit="rad", low=1e-5, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
+        0.0096, unit="rad", low=1e-5, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
     )
     tag_gate: float = quantity(5.0, low=1, high=50, help="innovation gate in standard deviations", mavlink="TAG_GATE")
     gyro_sigma: float = quantity(0.0022, unit="rad/s", low=1e-6, high=1, help="gyro noise per sample", mavlink="GYRO_SD")
     gyro_bias_walk: float = quantity(
-        2e-5, unit="rad/s/sqrt(s)", low=0, high=1, help="gyro bias random walk", mavlink="GYRO_WALK"
+        2.2e-5, unit="rad/s/sqrt(s)", low=0, high=1, help="gyro bias random walk", mavlink="GYRO_WALK"
     )
     accel_sigma: float = quantity(
-        0.073, unit="m/s^2", low=1e-4, high=10, help="accelerometer noise, and what its place makes it feel", mavlink="ACC_SD"
+        0.036, unit="m/s^2", low=1e-4, high=10, help="accelerometer noise, and what its place makes it feel", mavlink="ACC_SD"
+    )
+    accel_under_way: float = quantity(
+        0.33, unit="m/s^2/(m/s)", low=0, high=10, help="what motion adds to that: mass and drag are not as believed", mavlink="ACC_SD_WAY"
     )
     accel_bias_walk: float = quantity(
         1e-4, unit="m/s^2/sqrt(s)", low=0, high=1, help="accelerometer bias random walk", mavlink="ACC_WALK"
@@ -77,19 +80,19 @@ class Estimation:
         2e-4, unit="m/sqrt(s)", low=0, high=1, help="depth bias random walk", mavlink="DEPTH_WALK"
     )
     force_walk: float = quantity(
-        0.004, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass, of a body at rest", mavlink="DIST_F_WALK"
+        0.0021, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass, of a body at rest", mavlink="DIST_F_WALK"
     )
     current_walk: float = quantity(
-        0.072, unit="m/s/sqrt(s)", low=0, high=1, help="water's speed, felt by the drag of a body under way", mavlink="DIST_C_WALK"
+        0.086, unit="m/s/sqrt(s)", low=0, high=1, help="water's speed, felt by the drag of a body under way", mavlink="DIST_C_WALK"
     )
     moment_walk: float = quantity(
-        0.037, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia", mavlink="DIST_M_WALK"
+        0.035, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia", mavlink="DIST_M_WALK"
     )
     accel_process: float = quantity(
-        0.013, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC"
+        0.0107, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC"
     )
     alpha_process: float = quantity(
-        0.029,
+        0.026,
         unit="rad/s^2/sqrt(Hz)",
         low=0,
         high=10,

@@ -40,12 +40,12 @@ def tag_of(x: np.ndarray, capture_ns: int, noise: np.ndarray | None = None, leve
     return BodyPose(capture_ns, p_wt, lever, multiply(x[3:7].copy(), exp(e[3:].copy())), 1)
 
 
-def inertial_of(x: np.ndarray, moved: np.ndarray, rng: np.random.Generator | None = None) -> Measured:
+def inertial_of(x: np.ndarray, moved: np.ndarray, rng: np.random.Generator | None = None, accel_noise: float = 0.0) -> Measured:
     """What gyro, accelerometer and pressure sensor say of a robot in state `x` that accelerates by `moved` (3,)."""
     down = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, 1.0])
     noise = np.zeros(7) if rng is None else rng.normal(size=7)
     gyro = x[10:13] + x[13:16] + P.gyro_sigma * noise[:3]
-    accel = x[16:19] + moved - 9.80665 * down + P.accel_sigma * noise[3:6]
+    accel = x[16:19] + moved - 9.80665 * down + accel_noise * noise[3:6]
     return Measured(gyro, accel, float(x[2] + x[25] + P.depth_sigma_m * noise[6]), [])
 
 
@@ -86,15 +86,21 @@ def process_sigma(body: Body, p: Estimation, x: np.ndarray) -> np.ndarray:
     return np.array([0.0] * 6 + [p.accel_process] * 3 + [alpha] * 3 + walks + [p.depth_bias_walk])
 
 
+def accel_sigma(body: Body, p: Estimation, x: np.ndarray) -> float:
+    """Noise of the accelerometer of a robot in state x, from the parameters' own words."""
+    fastest = np.hypot(np.linalg.norm(x[7:10]), body.reach_m * np.linalg.norm(x[10:13]))
+    return float(np.hypot(p.accel_sigma, p.accel_under_way * fastest))
+
+
 def fly(
-    body: Body, seconds: float, seed: int, delay_ms: Callable[[int], float], push: float = 1.0, tag_ms: float = 17.0
+    body: Body, seconds: float, seed: int, delay_ms: Callable[[int], float], push: float = 1.0, tag_ms: float = 17.0, p: Estimation = P
 ) -> Flight:
     """A robot pushed about by slow sines, drawn from the estimator's own model; tags between and on the ticks."""
     rng = np.random.default_rng(seed)
     flight = Flight()
     x = start_state()
     x[13:16], x[16:19], x[25] = rng.normal(scale=0.02, size=3), rng.normal(scale=0.1, size=3), 0.03
-    tag_sigma = np.repeat([P.tag_sigma_m, P.tag_sigma_axis_m, P.tag_sigma_rad], [2, 1, 3])
+    tag_sigma = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3])
     count = round(seconds / DT)
     arriving: dict[int, list[BodyPose]] = {}
     pictures, taken = [round(n * tag_ms * 1e6) for n in range(int(seconds * 1e3 / tag_ms))], 0
@@ -104,7 +110,7 @@ def fly(
         tau *= k > 0
         before, surprise = x, np.zeros(ERRORS)
         if k:
-            surprise = process_sigma(body, P, x) * np.sqrt(DT) * rng.normal(size=ERRORS)
+            surprise = process_sigma(body, p, x) * np.sqrt(DT) * rng.normal(size=ERRORS)
             x = propagation.inject(propagation.step(x, tau, DT, *plant(body)), surprise)
         while taken < len(pictures) and pictures[taken] <= t:
             capture = pictures[taken]
@@ -116,7 +122,7 @@ def fly(
         flight.truth.append(x)
         flight.tau.append(tau)
         moved = propagation.inertial_acceleration(x, tau, *plant(body)) + surprise[6:9] / DT  # felt, though no model foresaw it
-        flight.measured.append(inertial_of(x, moved, rng)._replace(tags=arriving.pop(k, [])))
+        flight.measured.append(inertial_of(x, moved, rng, accel_sigma(body, p, x))._replace(tags=arriving.pop(k, [])))
     return flight
 
 
@@ -180,7 +186,7 @@ class InOrder:
             return np.r_[measured.gyro - expected.gyro, felt, measured.depth_m - expected.depth_m] if whole else felt
 
         p = self.p
-        felt = [(p.accel_sigma**2 * DT + p.accel_process**2) / elapsed] * 3
+        felt = [(accel_sigma(self.body, p, self.x) ** 2 * DT + p.accel_process**2) / elapsed] * 3
         noise = np.r_[[p.gyro_sigma**2] * 3, felt, p.depth_sigma_m**2] if whole else np.array(felt)
         shared = np.zeros((ERRORS, len(noise)))
         for i in range(3):
@@ -312,11 +318,12 @@ def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
 
     With the shipped figures, which believe the accelerometer more than the model, it keeps its place and takes the drag for a disturbance.
     """
-    flight = fly(body, 3.0, 1, lambda n: 45.0, push=6.0)
     pushed = replace(body, drag=replace(body.drag, nodes=-body.drag.nodes))
     believing = replace(P, accel_process=0.012, force_walk=0.015, current_walk=0.0, alpha_turning=0.0)
+    flight = fly(body, 3.0, 1, lambda n: 45.0, push=6.0, p=believing)
     assert run(body, flight, believing)[1][-1].rejected == 0
     assert run(pushed, flight, believing)[1][-1].rejected > 10
+    flight = fly(body, 3.0, 1, lambda n: 45.0, push=6.0)
     right, wrong = (run(each, flight)[1] for each in (body, pushed))
     assert right[-1].rejected == 0
     forces = [np.mean([np.linalg.norm(e.force_w) for e in each]) for each in (right, wrong)]
