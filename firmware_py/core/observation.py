@@ -121,8 +121,8 @@ def fuse_inertial(  # type: ignore[no-untyped-def]
 
     The acceleration that no model foresaw (white, `density` (25,) per second) has moved the body over the `elapsed` seconds of the last
     prediction, and the accelerometer has felt it: so the velocity follows what was felt, not what was commanded. What it says of a part
-    of its `dt` seconds counts for that part. A body under way feels more than its model tells (`under_way`, as `predict`): mass and drag are not
-    as believed.
+    of its `dt` seconds counts for that part. Under way it feels more than the model tells (`under_way`, as `predict`): mass and drag are
+    not as believed.
     """
     moved = inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, linear)
     mobility = np.ascontiguousarray(mass_inv[:3, :3])
