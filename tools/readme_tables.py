@@ -53,13 +53,15 @@ def accept_table(entries: Entries, groups: Sequence[str], old: str) -> str:
     return new if whole else "".join((rows_by_name(old) | rows_by_name(new)).values())
 
 
-def rows_by_name(table: str) -> dict[tuple[str, str], str]:
-    """The lines of a table by what they say first, and by what `the same` in it means."""
-    found, meant = {}, ""
+def rows_by_name(table: str) -> dict[tuple[str, str, str], str]:
+    """The lines of a table by their command, by what `the same` means among the figures of that command, and by name."""
+    found, meant, before = {}, "", ""
     for line in table.splitlines(keepends=True):
-        name = line.split("|")[1].strip()
-        meant = meant if name.startswith("the same") else name
-        found[meant, name] = line
+        _, name, *_, command, _ = (cell.strip() for cell in line.split("|"))
+        if command != before or not name.startswith("the same"):
+            meant = "" if name.startswith("the same") else name
+        found[command, meant, name] = line
+        before = command
     return found
 
 
