@@ -58,8 +58,10 @@ def rows_by_name(table: str) -> dict[tuple[str, str, str], str]:
     found, meant, before = {}, "", ""
     for line in table.splitlines(keepends=True):
         _, name, *_, command, _ = (cell.strip() for cell in line.split("|"))
-        if command != before or not name.startswith("the same"):
-            meant = "" if name.startswith("the same") else name
+        if not name.startswith("the same"):
+            meant = name
+        elif command != before:  # a figure that has a command of its own
+            meant = ""
         found[command, meant, name] = line
         before = command
     return found

@@ -29,8 +29,6 @@ RETREAT_M_S = 0.04
 """Fastest growth of the gap when backing off."""
 CONE = 1.5
 """The approach waits while the lateral error is above this many times the alignment limit, or the angle."""
-
-
 WAY_SAMPLES = 65
 """Places on the way to the stand-off that are looked at, where the bodies are near each other."""
 WAY_SLACK = 0.25

@@ -75,14 +75,14 @@ def test_figure_that_was_not_measured_stays_as_it_is_while_others_of_its_table_a
         command = "fly blind" if group == "blind" else "fly"
         return {"name": name, "value": value, "unit": "mm", "limit": "", "passed": True, "command": command, "group": group}
 
-    both = [("hover", "hover: RMSE"), ("hover", "the same: worst"), ("spiral", "spiral: RMSE"), ("spiral", "the same: worst")]
-    both.append(("blind", "the same without tags"))
+    hover, spiral = (((group, f"{group}: RMSE"), (group, "the same: worst")) for group in ("hover", "spiral"))
+    blind = ("blind", "the same without tags")
     text = "<!-- table: accept hover spiral blind -->\n<!-- end -->\n"
-    first = readme_tables.filled(text, {"accept": [entry(*figure, 1.0 + n) for n, figure in enumerate(both)]})
+    first = readme_tables.filled(text, {"accept": [entry(*figure, 1.0 + n) for n, figure in enumerate((*hover, *spiral, blind))]})
     assert re.findall(r"(\d) mm", first) == ["1", "2", "3", "4", "5"]
-    again = readme_tables.filled(first, {"accept": [entry(*figure, 8.0) for figure in both[2:]]})
+    again = readme_tables.filled(first, {"accept": [entry(*figure, 8.0) for figure in (*spiral, blind)]})
     assert re.findall(r"(\d) mm", again) == ["1", "2", "8", "8", "8"]
-    alone = readme_tables.filled(first, {"accept": [entry(*both[4], 9.0)]})
+    alone = readme_tables.filled(first, {"accept": [entry(*blind, 9.0)]})
     assert re.findall(r"(\d) mm", alone) == ["1", "2", "3", "4", "9"], "whatever row it follows"
     assert [line for line in again.splitlines() if "hover: RMSE" in line] == [line for line in first.splitlines() if "hover: RMSE" in line]
 
