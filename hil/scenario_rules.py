@@ -18,7 +18,7 @@ Mistake = tuple[tuple[str | int, ...], str]
 
 def mistakes(scenario: Scenario) -> Iterator[Mistake]:
     """Everything that is wrong with a scenario as its file has it."""
-    for rule in (_in_name, _in_numbers, _in_polycube, _in_steps, _in_file, _in_bodies, _in_mentions, _in_faults, _in_checks):
+    for rule in RULES:
         yield from rule(scenario)
 
 
@@ -90,6 +90,17 @@ def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:
         yield ("task", "kind"), f"force compares a module alone with two docked ones; the bodies here have {found} modules"
 
 
+def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
+    """Where bodies start and where they are sent; whether a whole path stays in the tank is the script's to judge."""
+    places: list[tuple[str, int]] = [("module", members[0]) for members in scenario.groups]
+    places += [("step", i) for i, step in enumerate(scenario.step) if step.do == "move"]
+    for table, i in places:
+        place = getattr(scenario, table)[i].position_m
+        if not scenario.tank.holds(place):
+            where = f"{place.tolist()} m is outside the tank, a {scenario.tank}"
+            yield (table, i, "position_m"), f"{where} with its surface's centre at [0, 0, 0]"
+
+
 def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:
     """Of modules that are not there."""
     numbers = module_numbers(scenario)
@@ -117,3 +128,9 @@ def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
             yield ("check", i, "metric"), f"{check.metric!r} is unknown; a run of the kind {scenario.task.kind} has {', '.join(names)}"
         if check.low > check.high:
             yield ("check", i, "low"), f"{check.low:g} is above high, {check.high:g}; no value would pass"
+
+
+RULES = (
+    _in_name, _in_numbers, _in_polycube, _in_steps, _in_file, _in_bodies, _in_tank, _in_mentions, _in_faults, _in_checks
+)  # fmt: skip
+"""The first that finds a mistake is heard first."""

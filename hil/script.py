@@ -28,12 +28,14 @@ ARM_EVERY_S = 0.5
 """Then again so often until it is granted."""
 APART_M, APART_DEG = 0.01, 1.0
 """Between the first waypoint and the start: what a spreadsheet may round, and no move of its own before the task."""
+LOOKS = 500
+"""Places of a path that are looked at: every 3 cm of the longest that is flown here."""
 LONGER_S = 1e-6
 """By which rounding may make a path longer than its task."""
 
 
 class Script:
-    """The requests of one run. Raises DescriptionError for a file of waypoints that cannot be flown."""
+    """The requests of one run. Raises DescriptionError for a path that leaves the tank and a file of waypoints that cannot be flown."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -41,6 +43,7 @@ class Script:
         start = scenario.module[0].start
         self.start_pose = rest_at(np.array(start.p_wm, dtype=float), np.array(start.q_wm, dtype=float))
         self.trajectory = TASKS[scenario.task.kind](scenario.task, self.start_pose)
+        _refuse_outside(self.trajectory, scenario)
         self.begin_ns = round(scenario.task.settle_s * 1e9)
         self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
         self.ticks = self.end_ns // fleet.period_ns
@@ -63,6 +66,16 @@ class Script:
     def is_over(self, time_ns: int) -> bool:
         """Whether the run may end before its time; a trajectory is flown to its end."""
         return False
+
+
+def _refuse_outside(path: paths.Trajectory, scenario: Scenario) -> None:
+    """Raises DescriptionError where the body's centre would have to leave the tank."""
+    for time_s in np.linspace(0.0, path.duration_s, LOOKS).tolist():
+        place = path.sample(time_s).p_wb
+        if not scenario.tank.holds(place):
+            where = f"after {time_s:.3g} s, at {place.round(3).tolist()} m"
+            what = scenario.task.file or f"{scenario.name}: task"
+            raise DescriptionError(f"{what}: the path leaves the tank, a {scenario.tank}, {where}; keep it inside")
 
 
 def _hover(task: Task, start: Setpoint) -> paths.Trajectory:

@@ -6,6 +6,7 @@ marked (synthetic) in its help.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,6 +137,19 @@ class Tank:
     )
     radius_m: float = quantity(3.5, unit="m", low=0.1, high=1000, help="cylinder: radius")
     depth_m: float = quantity(3.0, unit="m", low=0.1, high=1000, help="cylinder: depth")
+
+    def holds(self, p_wm: np.ndarray) -> bool:
+        """Whether a place (3,), world, m, lies between walls, surface and bottom."""
+        x, y, z = p_wm.tolist()
+        if self.kind == "box":
+            length, width, depth = self.size_m.tolist()
+            return abs(x) <= 0.5 * length and abs(y) <= 0.5 * width and 0.0 <= z <= depth
+        return math.hypot(x, y) <= self.radius_m and 0.0 <= z <= self.depth_m
+
+    def __str__(self) -> str:
+        if self.kind == "box":
+            return "box of {:g} x {:g} x {:g} m".format(*self.size_m)
+        return f"cylinder of {self.radius_m:g} m radius and {self.depth_m:g} m depth"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

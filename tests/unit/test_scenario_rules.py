@@ -54,6 +54,9 @@ def load(tmp_path: Path) -> Load:
         ("hover", 'kind = "hover"', 'kind = "force"', "force compares a module alone with two docked ones"),
         ("polycube", "number = 1", "number = 25", "module[0].number: 25 and 7 more go up to 32; the bus has numbers to 29, so it is 22"),
         ("polycube", "[polycube]", "[[module]]\nnumber = 9\n[polycube]", "module[1]: a [polycube] takes the place of all modules"),
+        ("hover", "[0.0, 0.0, 0.38]", "[0.0, 0.61, 0.38]", "[0.0, 0.61, 0.38] m is outside the tank, a box of 1.3 x 1.2 x 0.76 m"),
+        ("mobius-1", "[1.3, 0.0, 1.5]", "[2.5, 2.5, 1.5]", "is outside the tank, a cylinder of 3.5 m radius and 3 m depth"),
+        ("dock-moving", "[-0.3, 0.25, 0.38]", "[-0.3, 0.25, 0.8]", "step[0].position_m: [-0.3, 0.25, 0.8] m is outside the tank"),
         ("dock", "number = 2", "number = 1", "module[1].number: 1 is the number of another module too"),
         ("hover", "position_rmse_m", "position_rsme_m", "check[0].metric: 'position_rsme_m' is unknown; a run of the kind hover has pos"),
         ("hover", "position_rmse_m", "docked", "'docked' is unknown; a run of the kind hover has position_rmse_m, "),
@@ -184,6 +187,7 @@ def test_scenario_flies_the_same_path_where_its_file_is_not(tmp_path: Path) -> N
     [
         ("path.csv", "-0.3,", "-0.28,", "path.csv: the path begins 0.02 m and 0 deg away from the robot's start at [-0.3, -0.25, 0.55] m"),
         ("path.csv", "0.55,,,,,", "0.55,0.9990482,0,0,0.0436194,", "the path begins 0 m and 5 deg away"),
+        ("path.csv", "0.2,0.1,0.4", "0.2,0.7,0.4", "path.csv: the path leaves the tank, a box of 1.3 x 1.2 x 0.76 m, after "),
         ("path.csv", ",24", ",24.1", "path.csv: the path takes 44.1 s, longer than task.duration_s, 44 s"),
         ("path.csv", "0.1,-0.2", "0.1,north", "path.csv:3: y_m: 'north' is not a number"),
         ("path.csv", ",20", ",", "path.csv: waypoint 1 lacks duration_s"),
