@@ -30,6 +30,8 @@ class LastFlight(NamedTuple):
     """Fleet indices."""
     pulling: frozenset[tuple[int, int]] = frozenset()
     """Fleet index and face of every magnet that pulled."""
+    let_go: frozenset[tuple[int, int]] = frozenset()
+    """Those of every magnet that did not."""
 
 
 def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int) -> LastFlight:
@@ -49,8 +51,9 @@ def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int) -> LastFligh
             armed[index] = dict(zip(message.fields, message.decode(frame.data), strict=True))["Mode"] == _ARMED
         elif message.name == "DOCK_CMD":
             relays[index] = message.decode(frame.data)
-    pulling = ((index, face) for index, states in relays.items() for face, state in enumerate(states) if state == _PULLS)
-    return LastFlight(frozenset(index for index, on in armed.items() if on), frozenset(pulling))
+    told = {(index, face): state == _PULLS for index, states in relays.items() for face, state in enumerate(states)}
+    pulling = frozenset(side for side, pulls in told.items() if pulls)
+    return LastFlight(frozenset(index for index, on in armed.items() if on), pulling, frozenset(told) - pulling)
 
 
 def _last_sent(out: Path, now_ns: int, most_bytes: int) -> Iterator[LoggedFrame]:

@@ -60,6 +60,15 @@ TAKEN_BY = frozenset({Action.SET_MODE, Action.ARM, Action.MOTOR_TEST})
 REARM_S = RECENT_NS / 1e9
 """How long REARM tries: then the flight before says nothing of where the vehicle is, as a log that is so old."""
 
+DOCKED_SINCE = (
+    "were docked, or about to be, and their magnets let go: "
+    "the fleet file has to say so (body, cell) before they fly as one or REARM arms them"
+)
+PARTED_SINCE = (
+    "were told to let go of joints that the fleet file has: "
+    "where they are apart it has to say so (body, cell); nobody is armed without a person"
+)
+
 
 @dataclass(slots=True)
 class Operator:
@@ -178,19 +187,20 @@ def run_vehicle(
 def _to_arm(firmware: Firmware, hold: bool, out: Path | None, say: Callable[[str], None]) -> set[int]:
     """Modules that are armed without a person: all with `hold`; with REARM, those in whose flight the process before was killed.
 
-    With REARM nobody is where modules were docked in flight: the fleet file has them apart, and its relays let go of them.
+    With REARM nobody is where modules were docked in flight: the fleet file has them apart, and its relays let go of them. Nobody at all is
+    where they were undocked: the fleet file has them as one body, which they no longer are.
     """
     fleet = firmware.fleet
     before = last_flight(out, fleet, firmware.codec, unix_ns()) if out is not None else LastFlight()
-    docked = sorted({module for module, _ in before.pulling - _joined_faces(firmware)})
-    if docked:
-        say(
-            f"warning: modules {', '.join(map(fleet.label, docked))} were docked, or about to be, and their magnets let go: "
-            "the fleet file has to say so (body, cell) before they fly as one or REARM arms them"
-        )
-    if hold:
+    joined = _joined_faces(firmware)
+    docked, parted = before.pulling - joined, before.let_go & joined
+    for faces, what in ((docked, DOCKED_SINCE), (parted, PARTED_SINCE)):
+        if faces:
+            modules = ", ".join(map(fleet.label, sorted({module for module, _ in faces})))
+            say(f"warning: modules {modules} {what}")
+    if hold and not parted:
         return set(range(len(fleet.module)))
-    if docked or not firmware.parameters.supervision.rearm:
+    if docked or parted or not firmware.parameters.supervision.rearm:
         return set()
     if before.armed:
         say("the process before ended in flight: holding as soon as the vehicle may (REARM)")

@@ -56,6 +56,7 @@ def in_flight(out: Path, now_ns: int = NOW_NS) -> frozenset[int]:
 def test_modules_that_were_told_armed_last_were_in_flight(tmp_path: Path) -> None:
     write(tmp_path, lines_of([False] * 3) + lines_of([True, False, True], 2))
     assert in_flight(tmp_path) == {0, 2}
+    assert found(tmp_path) == LastFlight(frozenset({0, 2}))  # of magnets nothing was said
 
 
 def test_process_that_disarmed_before_it_ended_was_not(tmp_path: Path) -> None:
@@ -116,6 +117,7 @@ def test_magnets_that_were_told_to_pull_last_pulled(tmp_path: Path) -> None:
     text = dock_line(0, (1, 2, 0, 0, 0, 1)) + dock_line(1, (0, 1, 0, 0, 0, 0)) + dock_line(2, (0, 0, 0, 1, 0, 0))
     write(tmp_path, text + lines_of([True] * 3) + dock_line(1, (0, 2, 0, 0, 0, 0), 2) + dock_line(0, (0,) * 6, 2, "R"))
     assert found(tmp_path).pulling == {(0, 0), (0, 5), (2, 3)}
+    assert found(tmp_path).let_go == {(module, face) for module in range(3) for face in range(6)} - found(tmp_path).pulling
     write(tmp_path, text + dock_line(0, (0,) * 6, 2)[:-1])
     assert found(tmp_path).pulling == {(0, 0), (0, 5), (1, 1), (2, 3)}  # a torn line is left out
 

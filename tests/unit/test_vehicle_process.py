@@ -7,11 +7,13 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from firmware_py.app.vehicle import recording, run_vehicle
+from firmware_py.app import vehicle
+from firmware_py.app.vehicle import Operator, recording, run_vehicle
 from firmware_py.bus.port import PortError
 from firmware_py.core.types import Event, Inputs, ModuleCommand, Outputs
 from firmware_py.description.fleet import Fleet, Module, single
@@ -34,7 +36,7 @@ def bus_of(path: Path) -> str:
 
 def fly(
     tmp_path: Path, out: Path | None = None, then: Callable[[], None] = lambda: None, parameters: Parameters | None = None,
-    fleet: Fleet | None = None,
+    fleet: Fleet | None = None, hold: bool = False,
 ) -> list[str]:  # fmt: skip
     """Starts, and asks for the end in the first tick. `then` is done by whoever says so. Returns what was said."""
     said: list[str] = []
@@ -45,7 +47,7 @@ def fly(
             os.kill(os.getpid(), signal.SIGTERM)
             then()
 
-    run_vehicle(fleet or single(bus=bus_of(tmp_path)), parameters or Parameters(), out=out, say=say)
+    run_vehicle(fleet or single(bus=bus_of(tmp_path)), parameters or Parameters(), hold=hold, out=out, say=say)
     return said
 
 
@@ -194,6 +196,32 @@ def test_dock_at_another_face_than_the_fleet_files_is_none_of_its_joints(tmp_pat
     said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, PAIR, docked(1, 0)))
     assert said[0] == APART.format(bus=bus_of(tmp_path))
     assert HOLDS not in said
+
+
+UNDOCKED = dock_line(0, (0,) * 6) + dock_line(1, (0,) * 6)
+
+
+@pytest.mark.parametrize("hold", [True, False])
+def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
+    tmp_path: Path, hold: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    to_arm: list[set[int]] = []
+
+    def operator(rate_hz: int, modules: set[int], *others: Any) -> Operator:
+        to_arm.append(set(modules))
+        return Operator(rate_hz, modules, *others)
+
+    monkeypatch.setattr(vehicle, "Operator", operator)
+    fleet = in_flight(tmp_path, PAIR + UNDOCKED, docked(0, 1))
+    said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet, hold=hold)
+    bus = bus_of(tmp_path)
+    assert said[0].startswith(f"warning: modules 1 on {bus}, 2 on {bus} were told to let go of joints that the fleet file has: ")
+    assert to_arm == [set()]
+    assert HOLDS not in said
+
+
+def test_relays_of_single_modules_are_no_undock(tmp_path: Path) -> None:
+    assert fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, UNDOCKED))[0] == HOLDS
 
 
 class Tape(Recorder):
