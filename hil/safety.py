@@ -6,6 +6,7 @@ Used by the tests and, over all seeds, by `make accept`. Every figure comes from
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import tempfile
 from collections.abc import Sequence
@@ -111,10 +112,27 @@ class BlindFlight(NamedTuple):
     """North and east error of the estimate at the end, over its own sigma."""
 
 
-def hover_blind(seed: int) -> BlindFlight:
-    """Hovers, and loses the tags for a while."""
-    scenario = load_scenario("hover-blind")
-    flight = flown(scenario, seed).between(round(scenario.task.settle_s * 1e9), round(scenario.duration_s * 1e9))
+class Imu(NamedTuple):
+    """Noise per sample of an IMU at 100 Hz."""
+
+    gyro_sigma: float
+    """rad/s."""
+    accel_sigma: float
+    """m/s^2."""
+
+
+ICM_20602 = Imu(math.radians(0.004) * math.sqrt(50.0), 100e-6 * 9.81 * math.sqrt(50.0))
+"""One of many autopilots: 0.004 deg/s and 100 ug per root of Hz (TDK InvenSense DS-000176), over the 50 Hz of 100 samples a second."""
+
+
+def hover_blind(seed: int, imu: Imu | None = None) -> BlindFlight:
+    """Hovers, and loses the tags for a while; with another IMU the filter is told of its noise in the proportion of the shipped figures."""
+    scenario, parameters = load_scenario("hover-blind"), Parameters()
+    for name, sigma in imu._asdict().items() if imu is not None else ():
+        told = getattr(parameters.estimation, name) / getattr(scenario.sensors, name)
+        parameters = parameters.replace(f"estimation.{name}", told * sigma)
+        scenario = dataclasses.replace(scenario, sensors=dataclasses.replace(scenario.sensors, **{name: sigma}))
+    flight = flown(scenario, seed, parameters).between(round(scenario.task.settle_s * 1e9), round(scenario.duration_s * 1e9))
     off = np.linalg.norm((flight.p_wb - flight.firmware["setpoint_p_wb"])[:, :2], axis=1)
     wrong = (flight.firmware["p_wb"] - flight.p_wb)[-1, :2] / flight.firmware["sigma_p"][-1, :2]
     return BlindFlight(float(off.max()), float(np.sqrt(np.mean(off**2))), (float(wrong[0]), float(wrong[1])))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import shutil
 import subprocess
@@ -22,7 +23,16 @@ from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.bench import fly_scenario
 from hil.fuzz import fuzz_flight
-from hil.safety import ThrusterFlight, command_outlives_frames_ms, fly_to_estop, hover_blind, spiral_through_loss, spiral_with
+from hil.safety import (
+    ICM_20602,
+    Imu,
+    ThrusterFlight,
+    command_outlives_frames_ms,
+    fly_to_estop,
+    hover_blind,
+    spiral_through_loss,
+    spiral_with,
+)  # fmt: skip
 from hil.scenario import load_scenario
 from hil.workers import processes
 
@@ -79,9 +89,9 @@ def stopped(folder: Path) -> Values:
     return {"violations": sum(f.violations for f in flights), "armed": sum(f.was_armed for f in flights)}
 
 
-def blind(folder: Path) -> Values:
+def blind(folder: Path, imu: Imu | None = None) -> Values:
     """Five seconds without tags."""
-    flights = _all(hover_blind, BLIND)
+    flights = _all(functools.partial(hover_blind, imu=imu), BLIND)
     errors, rmse, normalised = (np.array(values) for values in zip(*flights, strict=True))
     return {
         "median": float(np.median(errors)), "p95": float(np.quantile(errors, 0.95)), "rmse_median": float(np.median(rmse)),
@@ -158,6 +168,14 @@ SAFETY: tuple[Group, ...] = (
             Figure("the same: RMSE, 95 %", "rmse_p95", unit="mm", scale=1e3),
             Figure("the same: error of the estimate, worst, in its own sigmas", "sigmas", high=MOST_SIGMAS),
             Figure("the same: mean square of them (1: consistent)", "square", low=SQUARES[0], high=SQUARES[1]),
+        ),
+    ),
+    Group(
+        "blind-quiet-imu", 7, "make accept ONLY=blind-quiet-imu", functools.partial(blind, imu=ICM_20602),
+        (
+            Figure("hover, 5 s without tags, an ICM-20602, 50 seeds: largest horizontal error, median", "median", unit="mm", scale=1e3),
+            Figure("the same: 95 %", "p95", unit="mm", scale=1e3),
+            Figure("the same: error of the estimate, worst, in its own sigmas", "sigmas", high=MOST_SIGMAS),
         ),
     ),
     Group(
