@@ -31,6 +31,7 @@ from firmware_py.ground.link import Links
 from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.signing import Signing, load_signing
 from firmware_py.ground.station import GroundStation
+from firmware_py.ground.system import STOPPING
 from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import MonotonicClock, unix_ns
 from firmware_py.runtime.rate_keeper import RateKeeper
@@ -46,6 +47,7 @@ _SWITCH_S = 50e-6
 _MOST_TICKS = 200
 """Ticks that may wait for the thread; the oldest go."""
 _MOST_REQUESTS = 256
+"""That may wait for a tick."""
 _SAVE_EVERY_NS = 1_000_000_000
 """How often the signing time stamp is stored; the store is that much ahead."""
 
@@ -103,7 +105,7 @@ class GroundSide:
         self._executor = executor
         self._plans: list[tuple[PlanJob, Future[Plan]]] = []
         self._ticks: deque[tuple[Inputs, Outputs]] = deque(maxlen=_MOST_TICKS)
-        self._requests: deque[Request] = deque(maxlen=_MOST_REQUESTS)
+        self._requests: deque[Request] = deque()
         self._thread: threading.Thread | None = None
         self._clock = MonotonicClock()
         self._handed_over_ns = 0
@@ -131,23 +133,32 @@ class GroundSide:
         station = self.station
         if self.keeper is not None:
             station.picture.times = times_of(self.keeper)
+        station.busy = self.links.busy()
         while self._ticks:
             inputs, outputs = self._ticks.popleft()
             station.observe(inputs, outputs, self._pipeline.bodies)
         now_ns = station.picture.time_ns
         station.signing.advance(self._unix_now_ns())
         for got in self.links.receive():
-            station.take(got.channel, got.data, now_ns, got.datagram, self.links.channels[got.channel].trusted)
+            if station.take(got.channel, got.data, now_ns, got.datagram, got.trusted):
+                self.links.believe(got.channel)
         for number in self.links.channels:
             station.join(number, now_ns)
         for number in self.links.take_gone():
             station.leave(number)
         self._plan()
-        self._requests += station.requests()
+        self._hand_over(station.requests())
         for channel, frame in station.frames(now_ns):
             self.links.send(channel, frame)
         self.links.flush()
         self._save(now_ns)
+
+    def _hand_over(self, requests: Sequence[Request]) -> None:
+        """To the next tick, in order. Of too many nothing but a stop is taken."""
+        for request in requests:
+            room = _MOST_REQUESTS * (2 if request.action in STOPPING else 1)
+            if len(self._requests) < room:
+                self._requests.append(request)
 
     @property
     def reboot_asked(self) -> bool:

@@ -150,7 +150,8 @@ class BodyPipeline:
         force, command = self.limiter.step(thrust.force_n, armed, self.supply.voltage_v, alive)
         self.lag.command(force)
         state, mode = self.supervisor.state, self.supervisor.mode
-        record = BodyRecord(self.body.index, state, mode, estimate, setpoint, wrench, thrust, force)
+        may_arm = self.supervisor.may_arm(health)
+        record = BodyRecord(self.body.index, state, mode, estimate, setpoint, wrench, thrust, force, may_arm)
         return record, command
 
     def magnets(self, wanted: Sequence[Sequence[int]], due: Collection[int]) -> dict[int, tuple[int, ...]]:

@@ -67,6 +67,10 @@ class Supervisor:
         """What its mode is worth as a fail-safe."""
         return max(self.level, MODE_LEVEL.get(self.mode, Level.NONE))
 
+    def may_arm(self, health: Health) -> bool:
+        """Whether ARM would be granted now."""
+        return self.state == State.DISARMED and not self._reasons(Guard.ARMING_CHECKS, self.mode, health)
+
     def is_on(self, failsafe: str) -> bool:
         """Whether the fail-safe of that name is on."""
         return self._failsafes.is_on(failsafe)

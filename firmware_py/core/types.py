@@ -319,6 +319,8 @@ class BodyRecord(NamedTuple):
     thrust: Thrust
     commanded_n: Array
     """(n,) force of each thruster after the limiter."""
+    may_arm: bool
+    """Disarmed, and every arming check holds."""
 
 
 class DockRecord(NamedTuple):

@@ -9,9 +9,11 @@ from typing import Any
 
 from firmware_py.core.types import Action, DockRequest, Event, Mode
 from firmware_py.ground.command import ACCEPTED, DENIED, FAILED, TEMPORARILY_REJECTED, UNSUPPORTED, Answer, Command
+from firmware_py.ground.dialect import Message
 from firmware_py.ground.identity import SETTABLE
 from firmware_py.ground.message_requests import MessageRequests
 from firmware_py.ground.mission_flight import MissionFlight
+from firmware_py.ground.mission_items import ABSOLUTE, RELATIVE
 from firmware_py.ground.steering import Steering
 from firmware_py.ground.system import Arrival, Handler, System
 
@@ -21,7 +23,7 @@ _FORCED = (21196, 2989)
 """Second parameter of a forced arm or disarm: MAVLink's, and ArduPilot's for arming."""
 _FACES = 6
 
-SET_MODE, TERMINATE, ARM = 176, 185, 400
+SET_MODE, TERMINATE, REPOSITION, ARM = 176, 185, 192, 400
 DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
 """User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
 
@@ -51,7 +53,7 @@ class CommandService:
             SET_MODE: self._set_mode,
             178: self._change_speed,
             TERMINATE: self._terminate,
-            192: self._reposition,
+            REPOSITION: self._reposition,
             193: self._pause,
             209: self._motor_test,
             224: self._set_current,
@@ -70,10 +72,10 @@ class CommandService:
         return {"COMMAND_LONG": self._long, "COMMAND_INT": self._int, "SET_MODE": self._set_mode_message}
 
     def hear(self, event: Event) -> None:
-        """An event of the tick: it may be a refusal of what is pending."""
-        for pending in list(self._pending):
-            if event.text.startswith(f"{pending.action.name} refused"):
-                self._finish(pending, DENIED)
+        """An event of the tick: it may refuse what is pending, of several the first whose wish is not there, else the newest."""
+        asked = [pending for pending in self._pending if event.text.startswith(f"{pending.action.name} refused")]
+        if asked:
+            self._finish(next((pending for pending in asked if not pending.is_done()), asked[-1]), DENIED)
 
     def step(self, time_ns: int) -> None:
         """Answer what is decided by now, also when the body is gone."""
@@ -92,9 +94,16 @@ class CommandService:
         self._run(Command(m["command"], tuple(m[f"param{i}"] for i in range(1, 8)), arrival))
 
     def _int(self, arrival: Arrival) -> None:
+        """Only a place is in 1e-7 deg and has a frame; in other commands x and y are the parameters 5 and 6."""
         m = arrival.message
-        parameters = (*(m[f"param{i}"] for i in range(1, 5)), m["x"] * 1e-7, m["y"] * 1e-7, m["z"])
-        self._run(Command(m["command"], parameters, arrival))
+        five, six, seven = self._place(m) if m["command"] == REPOSITION else (m["x"], m["y"], m["z"])
+        self._run(Command(m["command"], (*(m[f"param{i}"] for i in range(1, 5)), five, six, seven), arrival))
+
+    def _place(self, m: Message) -> tuple[float, float, float]:
+        """Latitude and longitude, deg, and altitude above the sea, m; NaN where the message has no place."""
+        known = m["frame"] in (*ABSOLUTE, *RELATIVE) and abs(m["x"]) <= 900_000_000 and abs(m["y"]) <= 1_800_000_000
+        above_m = self._system.subject.origin.altitude_m if m["frame"] in RELATIVE else 0.0
+        return (m["x"] * 1e-7, m["y"] * 1e-7, m["z"] + above_m) if known else (math.nan,) * 3
 
     def _run(self, command: Command) -> None:
         handler = self._table.get(command.number)
@@ -214,7 +223,7 @@ class CommandService:
     def _reboot(self, command: Command) -> Answer:
         if int(command.get(1)) not in (1, 3):
             return UNSUPPORTED
-        if self._system.subject.armed:
+        if self._system.subject.picture.any_armed:  # it is one process for all of them
             return DENIED
         self.reboot_asked = True
         return ACCEPTED

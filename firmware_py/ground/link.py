@@ -16,6 +16,7 @@ TRUSTED = "+trusted"
 """Ending of an address whose link may set the signing key."""
 _QUEUE_FRAMES = 256
 _MOST_PEERS = 16
+_BUSY_FRAMES = 4
 
 
 class Received(NamedTuple):
@@ -25,6 +26,8 @@ class Received(NamedTuple):
     data: bytes
     datagram: bool
     """Frames do not go on in what comes next."""
+    trusted: bool
+    """Its link may set the signing key."""
 
 
 @dataclass(slots=True)
@@ -35,6 +38,8 @@ class Channel:
     link: Link
     peer: Any
     trusted: bool
+    believed: bool = False
+    """A frame of it was taken for true: strangers do not take its place."""
     queue: deque[bytes] = field(default_factory=lambda: deque(maxlen=_QUEUE_FRAMES))
     dropped: int = 0
     """Frames that gave way to newer ones."""
@@ -77,12 +82,21 @@ class Links:
             except OSError:
                 self.counts["receive"] += 1
                 continue
+            if not link.datagram:
+                self._meet(index, link.peers())
             for peer, data in got:
                 if data:
-                    received.append(Received(self._channel(index, peer), data, link.datagram))
-                elif not link.datagram:
-                    self._forget(index, peer)
+                    received.append(Received(self._channel(index, peer), data, link.datagram, self._trusted[index]))
         return received
+
+    def believe(self, channel: int) -> None:
+        """A frame that came on it was taken for true."""
+        if channel in self.channels:
+            self.channels[channel].believed = True
+
+    def busy(self) -> set[int]:
+        """Channels that take their time: what can wait is not sent to them now."""
+        return {number for number, channel in self.channels.items() if len(channel.queue) > _BUSY_FRAMES}
 
     def send(self, channel: int | None, frame: bytes) -> None:
         """Queue a frame for one channel, or for all of them with None."""
@@ -116,15 +130,24 @@ class Links:
         for link in self.links:
             link.close()
 
+    def _meet(self, index: int, there: Sequence[Any]) -> None:
+        """Who has connected is a channel before it says anything, and who has left is none any more."""
+        for key in [key for key in self._by_peer if key[0] == index and key[1] not in there]:
+            self._forget(*key)
+        for peer in there:
+            if (index, peer) not in self._by_peer:
+                self._channel(index, peer)
+
     def _channel(self, index: int, peer: Any) -> int:
-        """Number of a peer; the one that was silent longest gives way to a new one."""
+        """Number of a peer; a new one takes the place of who was silent longest, a stranger before anybody who was believed."""
         key = (index, peer)
         if key in self._by_peer:
             self._by_peer[key] = self._by_peer.pop(key)
         else:
             same = [k for k in self._by_peer if k[0] == index]
             if len(same) >= _MOST_PEERS:
-                self._forget(*same[0])
+                strangers = [k for k in same if not self.channels[self._by_peer[k]].believed]
+                self._forget(*(strangers or same)[0])
             self._by_peer[key] = self._next
             self.channels[self._next] = Channel(self._next, self.links[index], peer, self._trusted[index])
             self._next += 1
@@ -135,4 +158,5 @@ class Links:
         if number is not None:
             self.counts["gone"] += 1
             self._gone.append(number)
+            self.links[index].leave(peer)
             self.counts["dropped"] += self.channels.pop(number).dropped

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from firmware_py.ground.system import Arrival, Handler, System
 
 _PIECE = 90
-_PIECES_AT_ONCE = 40
-"""Pieces sent in one round, so that telemetry keeps its place in the queue."""
+_PIECES_AT_ONCE = 20
+"""Pieces sent in one round: 0.4 s of a radio of 57,600 Bd, for which an answer waits at the most."""
+_ENTRIES_AT_ONCE = 10
 _MOST_LOGS = 100
 _SUFFIXES = (".mcap", ".log")
 
@@ -23,12 +25,24 @@ class _Transfer:
     left: int
 
 
-class LogService:
-    """The logs of one process, oldest first, numbered from 1."""
+@dataclass(slots=True)
+class _Listing:
+    arrival: Arrival
+    next: int
+    last: int
 
-    def __init__(self, system: System, folder: Path | None) -> None:
-        self._system, self._folder = system, folder
+
+class LogService:
+    """The logs of one process, oldest first, numbered from 1. They go out where nothing else waits to be sent.
+
+    Args of the constructor:
+        is_busy: whether a channel has enough to do.
+    """
+
+    def __init__(self, system: System, folder: Path | None, is_busy: Callable[[int], bool]) -> None:
+        self._system, self._folder, self._is_busy = system, folder, is_busy
         self._transfer: _Transfer | None = None
+        self._listing: _Listing | None = None
         self._files: list[Path] = []
 
     def handlers(self) -> dict[str, Handler]:
@@ -41,10 +55,13 @@ class LogService:
         }
 
     def step(self) -> None:
-        """Send the next pieces of what is being fetched."""
-        t = self._transfer
-        if t is None:
-            return
+        """Send the next entries and pieces of what is asked for."""
+        if self._listing is not None and not self._is_busy(self._listing.arrival.channel):
+            self._tell(self._listing)
+        if self._transfer is not None and not self._is_busy(self._transfer.arrival.channel):
+            self._carry(self._transfer)
+
+    def _carry(self, t: _Transfer) -> None:
         try:
             with t.path.open("rb") as file:
                 file.seek(t.at)
@@ -65,11 +82,20 @@ class LogService:
         t.left -= len(data)
 
     def _list(self, arrival: Arrival) -> None:
-        self._files = self._find()
-        first, last = max(arrival.message["start"], 1), min(arrival.message["end"], len(self._files))
-        if not self._files:
-            self._system.send(arrival.channel, "LOG_ENTRY", {})
-        for number in range(first, last + 1):
+        self._listing = _Listing(arrival, 0, arrival.message["end"])
+
+    def _tell(self, listing: _Listing) -> None:
+        """The folder is looked at once for a list, not for each request of a flood."""
+        arrival = listing.arrival
+        if listing.next == 0:
+            self._files = self._find()
+            listing.next, listing.last = max(arrival.message["start"], 1), min(listing.last, len(self._files))
+            if not self._files:
+                self._system.send(arrival.channel, "LOG_ENTRY", {})
+        first, listing.next = listing.next, listing.next + _ENTRIES_AT_ONCE
+        if listing.next > listing.last:
+            self._listing = None
+        for number in range(first, min(listing.next - 1, listing.last) + 1):
             try:
                 status = self._files[number - 1].stat()
             except OSError:

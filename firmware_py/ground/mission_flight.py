@@ -77,6 +77,8 @@ class _Flight:
     """The hold in which it waits for its plan was there."""
     started_ns: int | None = None
     reached: int = 0
+    replaced: bool = False
+    """It is of the mission before: of the one that is there now nothing is flown."""
 
 
 class MissionFlight:
@@ -98,12 +100,13 @@ class MissionFlight:
     # ------------------------------------------------------------ what is asked
 
     def replace(self, items: tuple[Item, ...]) -> None:
-        """A new mission. What flies goes on."""
+        """A new mission, ready to be started. What flies goes on, of the old one."""
         self.items = items
         p = self._system.subject.progress
-        p.total, p.current = len(items), min(self._first, max(len(items) - 1, 0))
-        if p.state != ACTIVE:
-            p.state = READY if items else NONE
+        p.total, p.current = max(len(items) - self._first, 0), min(self._first, max(len(items) - 1, 0))
+        p.state = READY if items else NONE
+        if self._flight is not None:
+            self._flight.replaced = True
 
     def start(self, first: int | None) -> str:
         """Fly from item `first`, or go on where it stopped. Returns why not, or nothing."""
@@ -234,7 +237,7 @@ class MissionFlight:
         while flight.reached < len(flight.legs) and t >= flight.arrivals_s[flight.reached]:
             sequence = flight.legs[flight.reached].sequence
             flight.reached += 1
-            if sequence != _GO_TO:
+            if sequence != _GO_TO and not flight.replaced:
                 self._repeat = [(sequence, time_ns + n * _REACHED_EVERY_NS) for n in range(_REACHED_REPEATS)]
                 if flight.reached < len(flight.legs):
                     p.current = flight.legs[flight.reached].sequence
@@ -258,7 +261,7 @@ class MissionFlight:
     def _end(self, state: int) -> None:
         flight, self._flight, self._plan_at_tick = self._flight, None, None
         self.jobs.clear()
-        if flight is not None and flight.legs[0].sequence != _GO_TO:
+        if flight is not None and flight.legs[0].sequence != _GO_TO and not flight.replaced:
             self._system.subject.progress.state = state
 
     @property

@@ -17,8 +17,8 @@ from firmware_py.ground.geodesy import Origin
 WAYPOINT, LOITER_UNLIMITED, LOITER_TIME, LAST_SPLINE, DELAY, JUMP, CHANGE_SPEED = 16, 17, 19, 82, 93, 177, 178
 PLACES = (WAYPOINT, LOITER_UNLIMITED, LOITER_TIME, LAST_SPLINE)
 _COMMANDS = (*PLACES, DELAY, JUMP, CHANGE_SPEED)
-_GLOBAL, _RELATIVE, _MISSION_FRAME = (0, 5), (3, 6), 2
-"""MAV_FRAME of absolute and relative altitude, and of items that have no place."""
+ABSOLUTE, RELATIVE = (0, 5), (3, 6)
+"""MAV_FRAME of absolute altitude, and of altitude relative to home."""
 UNSUPPORTED_FRAME, UNSUPPORTED, INVALID_1, INVALID_X, INVALID_Z = 2, 3, 6, 10, 12
 """MAV_MISSION_RESULT; the invalid parameters count on from INVALID_1."""
 _MOST_STEPS = 1000
@@ -75,7 +75,7 @@ class Item(NamedTuple):
         """(3,) NED, m; None for an item without a place."""
         if not self.is_place:
             return None
-        altitude = self.z + (origin.altitude_m if self.frame in _RELATIVE else 0.0)
+        altitude = self.z + (origin.altitude_m if self.frame in RELATIVE else 0.0)
         return origin.local(self.x * 1e-7, self.y * 1e-7, altitude)
 
 
@@ -95,7 +95,7 @@ def _fault(item: Item) -> int:
     if item.command not in _COMMANDS:
         return UNSUPPORTED
     if item.is_place:
-        if item.frame not in (*_GLOBAL, *_RELATIVE):
+        if item.frame not in (*ABSOLUTE, *RELATIVE):
             return UNSUPPORTED_FRAME
         if abs(item.x) > 900_000_000 or abs(item.y) > 1_800_000_000:
             return INVALID_X

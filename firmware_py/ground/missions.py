@@ -24,8 +24,11 @@ class _Upload:
 
     arrival: Arrival
     count: int
+    """Of items with those that stay before them."""
     kind: int
     items: list[Item] = field(default_factory=list)
+    rest: tuple[Item, ...] = ()
+    """Those that stay behind them."""
     asked_ns: int = 0
     asked: int = 0
 
@@ -41,6 +44,8 @@ class MissionService:
         """By message name."""
         return {
             "MISSION_COUNT": self._count,
+            "MISSION_WRITE_PARTIAL_LIST": self._write_part,
+            "MISSION_REQUEST_PARTIAL_LIST": lambda a: self._acknowledge(a, _UNSUPPORTED, a.message["mission_type"]),
             "MISSION_ITEM_INT": self._item,
             "MISSION_ITEM": self._item,
             "MISSION_REQUEST_LIST": self._list,
@@ -84,6 +89,18 @@ class MissionService:
         self._upload = _Upload(arrival, count, kind)
         self._ask(self._upload, arrival.time_ns)
 
+    def _write_part(self, arrival: Arrival) -> None:
+        """Items that take the place of others: those before and behind them stay."""
+        first, last, kind = (arrival.message[name] for name in ("start_index", "end_index", "mission_type"))
+        known = self._flight.items
+        if kind != _MISSION or not 0 <= first <= last < len(known):
+            self._acknowledge(arrival, _UNSUPPORTED if kind != _MISSION else _INVALID_SEQUENCE, kind)
+        elif self._upload is not None and not _same(self._upload.arrival, arrival):
+            self._acknowledge(arrival, _DENIED, kind)
+        else:
+            self._upload = _Upload(arrival, last + 1, kind, list(known[:first]), known[last + 1 :])
+            self._ask(self._upload, arrival.time_ns)
+
     def _ask(self, upload: _Upload, time_ns: int) -> None:
         upload.asked, upload.asked_ns = upload.asked + 1, time_ns
         values = {"seq": len(upload.items), "mission_type": upload.kind, **upload.arrival.sender}
@@ -108,7 +125,7 @@ class MissionService:
             self._ask(upload, arrival.time_ns)
             return
         self._upload = None
-        self._flight.replace(tuple(upload.items))
+        self._flight.replace((*upload.items, *upload.rest))
         self._acknowledge(arrival, _ACCEPTED, upload.kind)
 
     def _clear(self, arrival: Arrival) -> None:

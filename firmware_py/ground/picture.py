@@ -138,9 +138,6 @@ class Picture:
         return record.estimate.tag_age_ns <= self._supervision.tag_fresh_ms * 1e6
 
     def may_arm(self, body: int) -> bool:
-        """Whether ARM would be granted, as far as can be seen from here."""
+        """Whether ARM would be granted."""
         record = self.records.get(body)
-        if record is None or self.is_stopped(body) or not self.pose_is_fresh(body):
-            return False
-        answered = all(self.modules[m].answered_ns == self.time_ns for m in self.members(body))
-        return answered and float(np.max(record.estimate.sigma_p)) <= self._supervision.arm_sigma_m
+        return record is not None and record.may_arm and not self.estop

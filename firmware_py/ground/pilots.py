@@ -31,7 +31,7 @@ class Pilots:
 
     def steers(self, arrival: Arrival) -> bool:
         """Whether a sender of sticks has them, now that it was heard."""
-        sender = _sender(arrival)
+        sender = sender_of(arrival)
         if not self._may_steer(*sender) or (sender != self._pilot and not self.are_silent(arrival.time_ns)):
             return False
         if self._pilot not in (None, sender):
@@ -41,11 +41,12 @@ class Pilots:
 
     def freshly_pressed(self, arrival: Arrival, buttons: int) -> int:
         """The buttons that the sender did not hold in its message before."""
-        sender = _sender(arrival)
+        sender = sender_of(arrival)
         fresh = buttons & ~self._pressed.get(sender, 0)
         self._pressed[sender] = buttons
         return fresh
 
 
-def _sender(arrival: Arrival) -> Sender:
+def sender_of(arrival: Arrival) -> Sender:
+    """Who sent a message."""
     return arrival.message.system, arrival.message.component

@@ -10,6 +10,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.types import DockRequest, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.commands import CommandService
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.dialect import load_dialect
@@ -29,6 +30,8 @@ from firmware_py.ground.telemetry import Subject
 from firmware_py.ground.wire import Framer, Packet
 
 _SYSTEMS = 256
+_LAST_SYSTEM = 254
+"""255 is what ground stations take."""
 _MAY_STOP = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE", "MANUAL_CONTROL")
 """They go to services that know what stops."""
 _NEVER_FORWARDED = ("SETUP_SIGNING", "RADIO_STATUS")
@@ -44,7 +47,7 @@ class Services:
         self.missions = MissionService(system, self.flight)
         self.steering = Steering(system, lambda: store.values, _dock_of(config), config.watches)
         self.presence = Presence(system, config, lambda: store.values, station.signing)
-        self.logs = LogService(system, Path(config.logs) if config.logs else None)
+        self.logs = LogService(system, Path(config.logs) if config.logs else None, lambda channel: channel in station.busy)
         self.parameters = ParameterService(system, store, station.present)
         extra = {
             "AUTOPILOT_VERSION": self.presence.autopilot_version,
@@ -83,13 +86,19 @@ class GroundStation:
     def __init__(
         self, config: GroundConfig, fleet: Fleet, parameters: Parameters, signing: Signing | None = None
     ) -> None:
-        """Raises DescriptionError when the stored parameters are wrong."""
+        """Raises DescriptionError when the stored parameters are wrong, or there are more bodies than system ids."""
+        last = config.first_system + len(fleet.module) - 1
+        if last > _LAST_SYSTEM:
+            most = _LAST_SYSTEM - len(fleet.module) + 1
+            raise DescriptionError(f"first_system {config.first_system}: {len(fleet.module)} modules lead to {last}; it is {most} at most")
         self.config = config
         self.signing = signing if signing is not None else Signing()
         self.store = ParameterStore(parameters, config.parameter_file)
         self.counts: Counter[str] = Counter()
         self.picture = Picture(len(fleet.module), self.store.values.supervision)
         self._dialect = load_dialect()
+        self.busy: set[int] = set()
+        """Channels that take no more than they must."""
         self._frames: list[Outgoing] = []
         self._framers: dict[int, Framer] = {}
         self._routes: dict[int, int] = {}
@@ -134,15 +143,17 @@ class GroundStation:
         for services in self.services.values():
             services.system.remove_channel(channel)
 
-    def take(self, channel: int, data: bytes, time_ns: int, datagram: bool = True, trusted: bool = False) -> None:
-        """Bytes that came on a channel. Never raises on what is in them."""
+    def take(self, channel: int, data: bytes, time_ns: int, datagram: bool = True, trusted: bool = False) -> bool:
+        """Bytes that came on a channel; whether a frame in them was believed. Never raises on what is in them."""
         framer = self._framers.get(channel)
         if framer is None:
             framer = self._framers[channel] = Framer(self._dialect, self.signing, self.counts)
-        for packet in framer.feed(data):
+        packets = framer.feed(data)
+        for packet in packets:
             self._take_packet(packet, channel, time_ns, trusted)
         if datagram:
             framer.end()
+        return bool(packets)
 
     def planned(self, body: int, plan: Plan) -> None:
         """The plan of a job came back."""

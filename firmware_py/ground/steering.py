@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from firmware_py.core.rotations import from_euler, multiply, normalise, rotate, to_euler
 from firmware_py.core.types import Action, DockRequest, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
-from firmware_py.ground.pilots import Pilots
+from firmware_py.ground.dialect import Message
+from firmware_py.ground.pilots import Pilots, Sender, sender_of
 from firmware_py.ground.system import NS_PER_S, STOPPING, Arrival, Handler, System
 
 _FULL, _MIDDLE_UP = 1000.0, 500.0
@@ -23,8 +24,11 @@ _ABSENT = 0x7FFF
 _PWM_MIDDLE, _PWM_HALF, _PWM_LOW, _PWM_HIGH = 1500.0, 400.0, 800, 2200
 _FRAMES_WORLD, _FRAMES_BODY = (1, 7), (8, 9, 12)
 """MAV_FRAME: LOCAL_NED, LOCAL_OFFSET_NED; BODY_NED, BODY_OFFSET_NED, BODY_FRD."""
-_FRAME_OFFSETS = (7, 8, 9)
-_NO_POSITION, _NO_VELOCITY, _NO_ACCELERATION, _NO_YAW, _NO_YAW_RATE = 0x007, 0x038, 0x1C0, 0x400, 0x800
+_FRAME_OFFSETS = (7, 8, 9, 12)
+_POSITION_BIT, _VELOCITY_BIT, _ACCELERATION_BIT, _NO_YAW, _NO_YAW_RATE = 0, 3, 6, 0x400, 0x800
+"""The first of three bits, one for each axis that is left out; and POSITION_TARGET_TYPEMASK's last two."""
+_RC_IGNORED = 0xFFFF
+"""A channel of RC_CHANNELS_OVERRIDE that stays as it is; 0 lets it go."""
 _WARNING, _NOTICE = 4, 5
 BUTTONS: tuple[str, ...] = (
     "hold", "manual", "stabilize", "depth", "disarm", "", "arm", "estop", "clear_estop", "dock", "undock", "surface",
@@ -40,10 +44,22 @@ _BUTTON_ACTIONS = {
 }  # fmt: skip
 
 
+class _Override(NamedTuple):
+    """One channel as it was overridden last."""
+
+    pwm: int
+    at_ns: int
+
+
+_LET_GO = _Override(0, 0)
+_ALL_LET_GO = [_LET_GO] * 6
+
+
 class _Wanted(NamedTuple):
-    """What a streamed set-point gives; None where its mask leaves it out."""
+    """What a streamed set-point gives; None where its mask leaves it out. What is given and no number is infinite."""
 
     position: np.ndarray | None
+    """NaN on axes that are left out."""
     velocity: np.ndarray | None
     acceleration: np.ndarray | None
     yaw: float | None
@@ -54,7 +70,7 @@ class _Wanted(NamedTuple):
         """Whether everything in it is a number, and it says where to go."""
         vectors = [v for v in (self.position, self.velocity, self.acceleration) if v is not None]
         numbers = [self.rate, 0.0 if self.yaw is None else self.yaw]
-        finite = all(np.all(np.isfinite(v)) for v in vectors) and all(map(math.isfinite, numbers))
+        finite = not any(np.isinf(v).any() for v in vectors) and all(map(math.isfinite, numbers))
         return finite and (self.position is not None or self.velocity is not None)
 
     def turned(self, yaw: float) -> _Wanted:
@@ -65,8 +81,8 @@ class _Wanted(NamedTuple):
             return None if v is None else np.asarray(rotate(turn, v))
 
         return _Wanted(
-            to_world(self.position), to_world(self.velocity), to_world(self.acceleration),
-            None if self.yaw is None else self.yaw + yaw, self.rate,
+            None if self.position is None else _turned_where_given(self.position, turn),
+            to_world(self.velocity), to_world(self.acceleration), None if self.yaw is None else self.yaw + yaw, self.rate,
         )  # fmt: skip
 
 
@@ -85,6 +101,7 @@ class Steering:
         self._system, self._parameters, self._dock, self._buttons = system, parameters, dock, buttons
         self._pilots = Pilots(system, may_steer, lambda: parameters().steering.stick_timeout_s)
         self._sticks = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self._overrides: dict[Sender, list[_Override]] = {}
         self._setpoint_ns: int | None = None
         self._setpoint: Setpoint | None = None
 
@@ -144,11 +161,21 @@ class Steering:
         return min(max((z - _MIDDLE_UP) / _MIDDLE_UP, -1.0), 1.0)
 
     def _override(self, arrival: Arrival) -> None:
-        """ArduSub's channels: 1 pitch, 2 roll, 3 up, 4 yaw, 5 forward, 6 right. One that overrides none of them is nothing."""
+        """ArduSub's channels: 1 pitch, 2 roll, 3 up, 4 yaw, 5 forward, 6 right. One that neither overrides nor lets go is nothing.
+
+        A channel that a message leaves out stays as its sender had it, for as long as sticks count.
+        """
+        now, oldest_ns = arrival.time_ns, arrival.time_ns - self._parameters().steering.stick_timeout_s * NS_PER_S
+        fresh = ((who, [o if o.at_ns >= oldest_ns else _LET_GO for o in kept]) for who, kept in self._overrides.items())
+        self._overrides = {who: kept for who, kept in fresh if kept != _ALL_LET_GO}
+        before = self._overrides.get(sender_of(arrival), _ALL_LET_GO)
         channels = [arrival.message[f"chan{i}_raw"] for i in range(1, 7)]
-        if any(map(_is_overridden, channels)):
-            pitch, roll, up, yaw, forward, right = map(_channel, channels)
-            self._steer(Sticks((forward, right, -up), (roll, pitch, yaw)), arrival)
+        after = [old if pwm == _RC_IGNORED else _Override(pwm, now) for old, pwm in zip(before, channels, strict=True)]
+        if not any(_is_overridden(o.pwm) for o in (*before, *after)) or all(pwm == _RC_IGNORED for pwm in channels):
+            return
+        pitch, roll, up, yaw, forward, right = (_channel(o.pwm) for o in after)
+        if self._steer(Sticks((forward, right, -up), (roll, pitch, yaw)), arrival):
+            self._overrides[sender_of(arrival)] = after
 
     def _steer(self, sticks: Sticks, arrival: Arrival) -> bool:
         """Take the sticks of who has them. Returns whether it was the sender."""
@@ -182,9 +209,9 @@ class Steering:
             return
         mask = m["type_mask"]
         wanted = _Wanted(
-            position=None if mask & _NO_POSITION == _NO_POSITION else _vector(m, "x", "y", "z"),
-            velocity=None if mask & _NO_VELOCITY == _NO_VELOCITY else _vector(m, "vx", "vy", "vz"),
-            acceleration=None if mask & _NO_ACCELERATION == _NO_ACCELERATION else _vector(m, "afx", "afy", "afz"),
+            position=_vector(m, ("x", "y", "z"), mask >> _POSITION_BIT, math.nan),
+            velocity=_vector(m, ("vx", "vy", "vz"), mask >> _VELOCITY_BIT, 0.0),
+            acceleration=_vector(m, ("afx", "afy", "afz"), mask >> _ACCELERATION_BIT, 0.0),
             yaw=None if mask & _NO_YAW else m["yaw"],
             rate=0.0 if mask & _NO_YAW_RATE else m["yaw_rate"],
         )
@@ -205,12 +232,11 @@ class Steering:
     def _place(
         self, now: np.ndarray, position: np.ndarray | None, velocity: np.ndarray | None, time_ns: int
     ) -> np.ndarray:
-        """Where to be: as asked for, or further along a velocity that came without a place."""
-        if position is not None:
-            return np.ascontiguousarray(position)
-        assert velocity is not None
+        """Where to be: as asked for; on an axis without a place further along its velocity, or as before."""
         start, elapsed_s = self._before(time_ns)
-        return np.asarray((now if start is None else start.p_wb) + velocity * elapsed_s)
+        before = now if start is None else start.p_wb
+        moved = before if velocity is None else before + velocity * elapsed_s
+        return np.asarray(moved if position is None else np.where(np.isnan(position), moved, position))
 
     def _attitude(self, now: np.ndarray, yaw: float | None, rate: float, time_ns: int) -> np.ndarray:
         """Level at the given yaw; without one as before, turned on by the rate."""
@@ -259,5 +285,16 @@ def _is_overridden(pwm: int) -> bool:
     return _PWM_LOW <= pwm <= _PWM_HIGH  # neither 0 nor 65535
 
 
-def _vector(message: Any, *names: str) -> np.ndarray:
-    return np.array([message[name] for name in names], dtype=float)
+def _vector(message: Message, names: Sequence[str], left_out: int, instead: float) -> np.ndarray | None:
+    """(3,) as given, with `instead` on the axes whose bits of `left_out` are set; None when all are. What is no number is infinite."""
+    if left_out & 7 == 7:
+        return None
+    given = (message[name] if math.isfinite(message[name]) else math.inf for name in names)
+    return np.array([instead if left_out >> axis & 1 else value for axis, value in enumerate(given)])
+
+
+def _turned_where_given(p_b: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """An offset (3,) turned about the vertical. Of ahead and sideways one alone that is left out is no offset there."""
+    left_out = np.isnan(p_b)
+    left_out[:2] = left_out[:2].all()
+    return np.where(left_out, math.nan, rotate(turn, np.nan_to_num(p_b)))

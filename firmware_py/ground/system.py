@@ -110,6 +110,8 @@ class System:
         pieces = [text[i : i + _TEXT] for i in range(0, len(text), _TEXT)] or [""]
         self._text_number = self._text_number % 0xFFFF + 1
         number = self._text_number if len(pieces) > 1 else 0
+        if number and len(pieces[-1]) == _TEXT:
+            pieces.append("")  # by a text that is not full a client knows the last
         for i, piece in enumerate(pieces):
             self.broadcast("STATUSTEXT", {"severity": severity, "text": piece, "id": number, "chunk_seq": i})
 

@@ -67,8 +67,8 @@ class Subject:
 
     @property
     def time_ms(self) -> int:
-        """Since start."""
-        return (self.picture.time_ns - self.boot_ns) // 1_000_000
+        """Since start, in 32 bits: it begins anew after 49.7 days."""
+        return (self.picture.time_ns - self.boot_ns) // 1_000_000 & 0xFFFFFFFF
 
     @property
     def time_us(self) -> int:

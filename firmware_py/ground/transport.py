@@ -29,7 +29,7 @@ class Link(Protocol):
     datagram: bool
 
     def receive(self) -> list[tuple[Any, bytes]]:
-        """What came, with the peer it came from. An empty text ends a peer."""
+        """What came, with the peer it came from."""
         ...
 
     def send(self, peer: Any, frame: bytes) -> bool:
@@ -38,6 +38,10 @@ class Link(Protocol):
 
     def peers(self) -> Sequence[Any]:
         """Those who are there before they have said anything."""
+        ...
+
+    def leave(self, peer: Any) -> None:
+        """A peer is not talked to any more."""
         ...
 
     def close(self) -> None:
@@ -90,6 +94,9 @@ class UdpLink:
     def peers(self) -> Sequence[Any]:
         return [] if self._listen else [None]
 
+    def leave(self, peer: Any) -> None:
+        """Nothing is kept of it."""
+
     def close(self) -> None:
         self._socket.close()
 
@@ -118,7 +125,7 @@ class TcpLink:
         got = [(peer, data) for peer in list(self._left) if (data := self._read(peer)) is not None]
         for peer, data in got:
             if not data:
-                self._end(peer)
+                self.leave(peer)
         return got
 
     def _read(self, peer: socket.socket) -> bytes | None:
@@ -142,10 +149,10 @@ class TcpLink:
         except BlockingIOError:
             return False
         except OSError:
-            self._end(peer)
+            self.leave(peer)
         return True
 
-    def _end(self, peer: socket.socket) -> None:
+    def leave(self, peer: socket.socket) -> None:
         self._left.pop(peer, None)
         peer.close()
 
@@ -154,7 +161,7 @@ class TcpLink:
 
     def close(self) -> None:
         for peer in list(self._left):
-            self._end(peer)
+            self.leave(peer)
         self._server.close()
 
 
@@ -197,19 +204,26 @@ class SerialLink:
         if self._serial is None:
             return True
         try:
-            self._left = self._left[self._serial.write(self._left) :] if self._left else b""
+            self._left = self._left[self._write(self._left) :] if self._left else b""
             if self._left:
                 return False
-            self._left = frame[self._serial.write(frame) :]
-        except serial.SerialTimeoutException:
+            self._left = frame[self._write(frame) :]
+        except BlockingIOError:
             return False
         except OSError:
             self._pulled()
             raise
         return True
 
+    def _write(self, data: bytes) -> int:
+        """Bytes that the device takes now. Not pyserial's write, which turns in a loop while it takes none."""
+        return os.write(self._serial.fileno(), data)
+
     def peers(self) -> Sequence[Any]:
         return [None]
+
+    def leave(self, peer: Any) -> None:
+        """The device stays open."""
 
     def close(self) -> None:
         if self._serial is not None:

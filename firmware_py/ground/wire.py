@@ -22,6 +22,8 @@ _MAGIC = re.compile(b"[\xfd\xfe]")
 _SIGNED = 0x01
 _HEADER_1, _HEADER_2 = struct.Struct("<BBBBBB"), struct.Struct("<BBBBBBBHB")
 _CRC = struct.Struct("<H")
+_MOST_FALSE = 256
+"""Starts that begin no frame, in what comes at once: what is behind so many is garbage too, and a flood of them takes a millisecond."""
 
 
 class Packet(NamedTuple):
@@ -44,7 +46,7 @@ class Framer:
         """The believed messages that `data` completes."""
         self._buffer += data
         packets: list[Packet] = []
-        at = 0
+        at = false = 0
         while (start := self._next_magic(at)) is not None:
             self.counts["garbage"] += start - at
             at = start
@@ -54,7 +56,12 @@ class Framer:
             packet = self._frame(bytes(self._buffer[at : at + size]))
             if packet is None:
                 at += 1  # what looked like a frame may hold a real one
-                continue
+                false += 1
+                if false < _MOST_FALSE:
+                    continue
+                self.counts["garbage"] += len(self._buffer) - at
+                at = len(self._buffer)
+                break
             at += size
             if packet.message.name:
                 packets.append(packet)

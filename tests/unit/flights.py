@@ -77,7 +77,7 @@ def write_flight(
             wrench = np.r_[0.4 * np.sin(at), 0.4 * np.cos(at), -0.4, zero]
             result = Thrust(thrust[tick], wrench, (1.0, 1.0), MARGIN)
             setpoint = Setpoint(wanted, LEVEL, speed, zero, zero, zero)
-            record = BodyRecord(0, 1, 3 if at >= 0 else 16, estimate, setpoint, wrench, result, thrust[tick])
+            record = BodyRecord(0, 1, 3 if at >= 0 else 16, estimate, setpoint, wrench, result, thrust[tick], False)
             events = [Event(6, "tracking the spiral")] if time_ns == START_NS else []
             recorder.record(Inputs(tick, time_ns, []), Outputs(tick, time_ns, [], False, events, [record]))
             if tick % 50 == 49:

@@ -37,8 +37,8 @@ PERIOD_NS = 10_000_000
 ZERO = np.zeros(3)
 
 
-def fleet_of(modules: int) -> Fleet:
-    return Fleet(module=tuple(Module(number=n + 1) for n in range(modules)))
+def fleet_of(modules: int, altitude_m: float = 0.0) -> Fleet:
+    return Fleet(module=tuple(Module(number=n + 1) for n in range(modules)), altitude_m=altitude_m)
 
 
 class Robot:
@@ -51,7 +51,7 @@ class Robot:
         self.p_wb = [np.array([0.1 * n, 0.2, 0.5]) for n in range(modules)]
         self.q_wb = [from_euler(0.1, -0.2, 0.3) for _ in range(modules)]
         self.nu = np.array([0.05, 0.0, -0.02, 0.01, 0.02, 0.03])
-        self.tag_age_ns = 30_000_000
+        self.tag_age_ns, self.may_arm = 30_000_000, True
         self.refuse: dict[Action, str] = {}
         """Reason for each action that is refused."""
         self.asked: list[Request] = []
@@ -113,7 +113,7 @@ class Robot:
         thrust = Thrust(np.zeros(8), np.zeros(6), (1.0, 1.0), 0.75)
         values = {
             "body": body, "state": self.state[body], "estimate": estimate, "setpoint": setpoint, "wrench": np.zeros(6),
-            "thrust": thrust, "commanded_n": np.zeros(8), "mode": self.mode[body],
+            "thrust": thrust, "commanded_n": np.zeros(8), "mode": self.mode[body], "may_arm": self.may_arm,
         }  # fmt: skip
         return BodyRecord(**{name: values.get(name) for name in BodyRecord._fields})
 
@@ -173,11 +173,12 @@ class World:
         config: GroundConfig | None = None,
         signing: Signing | None = None,
         trusted: bool = False,
+        altitude_m: float = 0.0,
     ) -> None:
         self.robot = Robot(modules)
         self.config = config or GroundConfig()
         self.parameters = Parameters()
-        self.station = GroundStation(self.config, fleet_of(modules), self.parameters, signing)
+        self.station = GroundStation(self.config, fleet_of(modules, altitude_m), self.parameters, signing)
         self.clients: list[Client] = []
         self.trusted = trusted
         self.run(1)

@@ -1,8 +1,13 @@
 """Packets from an enemy or a bad radio: few here; with MODCUBE_FULL=1 a million, and a hundred thousand forged ones."""
 
+from collections import Counter
+
 from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.transitions import State
+from firmware_py.ground.dialect import load_dialect
+from firmware_py.ground.signing import Signing
+from firmware_py.ground.wire import Framer
 from tests.figures import at_length, figure
 from tests.unit.ground_attack import Attack, forge
 from tests.unit.ground_world import Client, World
@@ -36,3 +41,14 @@ def test_forged_and_replayed_packets_are_refused_and_the_real_station_stays_in_c
     assert_in_control(world, real)
     figure("packets forged or replayed on a keyed link, the real station in control after them", count)
     figure("packets forged or replayed: believed", believed)
+
+
+def test_flood_of_false_starts_is_given_up_after_a_while() -> None:
+    """65,000 bytes that all look like the start of a frame would cost 0.2 s, before any signature."""
+    counts: Counter[str] = Counter()
+    framer = Framer(load_dialect(), Signing(), counts)
+    assert framer.feed(b"\xfe" * 65_000) == []
+    assert counts["checksum"] + counts["unknown"] <= 256
+    assert counts["garbage"] > 60_000
+    message = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(mavlink.MAVLink(None, srcSystem=255, srcComponent=190))
+    assert [packet.message.name for packet in framer.feed(bytes(message))] == ["HEARTBEAT"]

@@ -5,8 +5,11 @@ from pathlib import Path
 import pytest
 
 from firmware_py.cli import ground_config
+from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.ground.config import check_store
+from firmware_py.ground.config import GroundConfig, check_store
+from firmware_py.ground.station import GroundStation
+from tests.unit.ground_world import fleet_of
 
 FILE = """links = ["udpin::14550+trusted"]
 identity = "ardusub"
@@ -87,3 +90,10 @@ def test_store_that_is_a_file_is_refused(inside: str, file: Path) -> None:
 def test_store_that_can_be_made_is_taken_and_not_made_yet(tmp_path: Path) -> None:
     check_store(str(tmp_path / "deeper" / "still"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_fleet_that_has_more_bodies_than_system_ids_is_refused() -> None:
+    fleet = fleet_of(64)
+    with pytest.raises(DescriptionError, match=r"first_system 200: 64 modules lead to 263; it is 191 at most"):
+        GroundStation(GroundConfig(first_system=200), fleet, Parameters())
+    GroundStation(GroundConfig(first_system=191), fleet, Parameters())

@@ -4,6 +4,8 @@ import os
 import pty
 import re
 import socket
+import struct
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -16,9 +18,11 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.app.ground_station import GroundSide
+from firmware_py.core.types import Action, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.link import Channel, Links
+from firmware_py.ground.logs import LogService
 from firmware_py.ground.transport import LinkError, open_link
 from tests.unit.ground_world import Robot, World, fleet_of
 from tests.unit.test_ground_walk import free_port
@@ -116,6 +120,118 @@ def test_a_client_that_does_not_read_loses_the_oldest_and_delays_nobody() -> Non
         assert links.dropped > 1000
         assert time.monotonic() - start < PATIENCE_S
         assert len(links.channels[got.channel].queue) <= 256
+
+
+def side_on(*links: str) -> GroundSide:
+    """A ground side without a thread: the test pumps."""
+    firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
+    return GroundSide(GroundConfig(links=links), firmware, ThreadPoolExecutor(1))
+
+
+def pump(side: GroundSide, robot: Robot, ticks: int = 1) -> list[Request]:
+    """What is asked meanwhile."""
+    asked = []
+    for _ in range(ticks):
+        requests = side.requests()
+        side.observe([], [], *robot.step(requests))
+        side.pump()
+        asked += requests
+    return asked + side.requests()
+
+
+def test_strangers_neither_end_the_ground_side_nor_take_the_place_of_a_station_that_is_believed() -> None:
+    port = free_port()
+    with closing(side_on(f"udpin:127.0.0.1:{port}")) as side, closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as station:
+        robot = Robot()
+        station.settimeout(PATIENCE_S)
+        station.sendto(heartbeat(), ("127.0.0.1", port))
+        while not any(channel.believed for channel in side.links.channels.values()):
+            pump(side, robot)
+        (known,) = side.links.channels
+        strangers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(40)]
+        for stranger in strangers:
+            stranger.sendto(b"x", ("127.0.0.1", port))
+            stranger.close()
+        pump(side, robot, 3)
+        assert known in side.links.channels and len(side.links.channels) == 16
+        assert station.recv(300)
+
+
+def test_radio_that_takes_nothing_holds_up_nobody() -> None:
+    """pyserial's own write would turn in a loop."""
+    ours, theirs = pty.openpty()
+    port = free_port()
+    with (
+        closing(side_on(f"{os.ttyname(theirs)},57600", f"udpin:127.0.0.1:{port}")) as side,
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as station,
+    ):
+        robot = Robot()
+        done = threading.Thread(target=pump, args=(side, robot, 600), daemon=True)
+        done.start()
+        done.join(4 * PATIENCE_S)
+        assert not done.is_alive(), "it hangs in the write"
+        mav = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        stop = mavlink.MAVLink_command_long_message(1, 1, 31012, 0, 0, 0, 0, 0, 0, 0, 0).pack(mav)
+        station.sendto(bytes(stop), ("127.0.0.1", port))
+        assert Action.ESTOP in [request.action for request in pump(side, robot, 3)]
+    os.close(ours)
+
+
+def test_tcp_client_is_spoken_to_before_it_has_said_anything() -> None:
+    port = free_port()
+    side = side_on(f"tcpin:127.0.0.1:{port}")
+    with closing(side), closing(socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)) as client:
+        pump(side, Robot(), 150)
+        assert client.recv(300)[0] == 0xFD
+
+
+def test_tcp_client_that_breaks_off_is_no_channel_any_more() -> None:
+    port = free_port()
+    with closing(side_on(f"tcpin:127.0.0.1:{port}")) as side:
+        client, robot = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S), Robot()
+        pump(side, robot, 2)
+        assert side.links.channels
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        client.close()
+        side.links.send(None, b"x")
+        side.links.flush()  # it is found here to be gone
+        pump(side, robot, 2)
+        assert not side.links.channels
+
+
+def test_stop_is_handed_over_however_much_else_is_asked() -> None:
+    side = side_on(f"udpin:127.0.0.1:{free_port()}")
+    with closing(side):
+        pump(side, Robot())
+        system = side.station.services[1].system
+        for action in [*[Action.SET_POINT] * 300, Action.ESTOP, *[Action.SET_POINT] * 300]:
+            system.ask(action)
+        side.pump()
+        asked = [request.action for request in side.requests()]
+        assert Action.ESTOP in asked and len(asked) == 257
+
+
+def test_answers_find_their_way_while_a_log_is_fetched_over_a_radio(tmp_path: Path) -> None:
+    (tmp_path / "can.log").write_bytes(bytes(1_000_000))
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    client = world.client()
+    client.send("LOG_REQUEST_DATA", 1, 1, 1, 0, 0xFFFFFFFF)
+    world.station.busy = {client.channel}
+    world.run(50)
+    assert not client.all("LOG_DATA") and client.all("HEARTBEAT")
+    world.station.busy = set()
+    world.run(2)
+    assert len(client.all("LOG_DATA")) == 40
+
+
+def test_flood_of_requests_for_the_list_of_logs_looks_at_the_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    client, looks = world.client(), []
+    monkeypatch.setattr(LogService, "_find", lambda service: looks.append(1) or [])
+    for _ in range(100):
+        client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(2)
+    assert len(looks) == 1
 
 
 def test_queue_keeps_the_newest() -> None:

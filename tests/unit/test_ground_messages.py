@@ -11,7 +11,7 @@ from pymavlink.generator import mavgen
 
 from firmware_py.app.deadlines import times_of
 from firmware_py.core.rotations import rotate
-from firmware_py.core.types import Action, DockRequest, Mode
+from firmware_py.core.types import Action, DockRequest, Event, Mode
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.identity import px4
@@ -93,6 +93,9 @@ def test_system_status_tells_of_health_and_of_readiness_to_arm(world: World, cli
     vision, prearm = mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION, mavlink.MAV_SYS_STATUS_PREARM_CHECK
     assert client.last("SYS_STATUS").onboard_control_sensors_health & vision
     assert client.last("SYS_STATUS").onboard_control_sensors_health & prearm
+    world.robot.may_arm = False
+    world.run(100)
+    assert client.last("SYS_STATUS").onboard_control_sensors_health & (vision | prearm) == vision
     world.robot.tag_age_ns = 2_000_000_000
     world.run(100)
     assert not client.last("SYS_STATUS").onboard_control_sensors_health & (vision | prearm)
@@ -328,6 +331,54 @@ def test_reboot_only_while_disarmed(world: World, client: Client) -> None:
     assert world.station.reboot_asked
 
 
+def test_reboot_is_denied_while_any_body_of_the_process_is_armed() -> None:
+    world = World(modules=2)
+    client = world.client()
+    client.command(400, 1, target=1)
+    world.run(3)
+    client.clear()
+    client.command(246, 1, target=2)
+    world.run(3)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_DENIED and not world.station.reboot_asked
+
+
+def test_one_refusal_answers_one_command(world: World, client: Client) -> None:
+    other = world.client(system=200)
+    client.command(176, 1, 1)
+    other.command(176, 1, 7)
+    world.robot.mode[0] = Mode.MANUAL
+    world.robot.refuse[Action.SET_MODE] = "no"
+    world.station.services[1].system.requests.clear()
+    world.robot.events = [Event(4, "SET_MODE refused: no", 0)]
+    world.run(3)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+    assert other.last("COMMAND_ACK").result == mavlink.MAV_RESULT_DENIED
+
+
+def test_parameters_of_a_command_without_a_place_are_plain_in_command_int() -> None:
+    world = World(modules=2)
+    client = world.client()
+    client.send("COMMAND_INT", 1, 1, 0, 31010, 0, 0, 0, 0, 1, 1, 2, 1, 0)
+    world.run(2)
+    assert world.robot.asked[-1].argument == DockRequest(0, 0, 1, 1, 2, True)
+
+
+@pytest.mark.parametrize("text", ["x" * length for length in (1, 49, 50, 51, 99, 100, 150)])
+def test_client_knows_where_a_text_ends(world: World, client: Client, text: str) -> None:
+    """MAVLink: the last chunk of a text is one that is not full."""
+    world.station.say(text)
+    world.run(1)
+    chunks = [m for m in client.all("STATUSTEXT") if m.text.startswith("x") or m.id]
+    assert "".join(m.text for m in chunks) == text
+    assert len(chunks) == 1 if len(text) <= 50 else (len(chunks[-1].text) < 50 and [m.chunk_seq for m in chunks] == [*range(len(chunks))])
+
+
+def test_time_since_boot_begins_anew_after_49_days(world: World, client: Client) -> None:
+    world.robot.tick += (2**32 + 5_000) // 10
+    world.run(2)
+    assert world.station.services[1].system.subject.time_ms < 6_000
+
+
 def test_motor_test_asks_for_one_thruster(world: World, client: Client) -> None:
     client.command(209, 3, 0, 20, 2.0)
     world.run(2)
@@ -420,6 +471,25 @@ def test_rc_override_has_ardusubs_channels(world: World, client: Client) -> None
     assert sticks.force == pytest.approx((0.25, 0, -1.0)) and sticks.moment == pytest.approx((0.5, 0, -0.5))
 
 
+def test_rc_channel_that_is_left_out_stays_until_it_is_let_go_or_old(world: World, client: Client) -> None:
+    """As a script does that sends one channel at a time: UINT16_MAX ignores, 0 releases (MAVLink, RC_CHANNELS_OVERRIDE)."""
+
+    def force(channel: int, pwm: int) -> tuple[float, ...]:
+        channels = [65535] * 8
+        channels[channel - 1] = pwm
+        client.send("RC_CHANNELS_OVERRIDE", 1, 1, *channels)
+        world.run(10)
+        return tuple(world.robot.asked[-1].argument.force)
+
+    assert force(5, 1700) == (0.5, 0, 0)
+    assert force(3, 1600) == (0.5, 0, -0.25)
+    assert force(5, 0) == (0, 0, -0.25)
+    world.run(round(100 * world.parameters.steering.stick_timeout_s) - 25)
+    assert force(6, 1900) == (0, 1, -0.25)
+    world.run(20)
+    assert force(6, 1900) == (0, 1, 0)
+
+
 def send_target(client: Client, mask: int, frame: int = 1, **values: float) -> None:
     names = ("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
     client.send("SET_POSITION_TARGET_LOCAL_NED", 0, 1, 1, frame, mask, *(values.get(name, 0.0) for name in names))
@@ -467,6 +537,39 @@ def test_body_frame_setpoints_turn_with_the_body(world: World, client: Client) -
     world.run(1)
     p = world.robot.asked[-1].argument.p_wb - world.robot.p_wb[0]
     assert p == pytest.approx([0.1 * math.cos(0.3), 0.1 * math.sin(0.3), 0], abs=1e-6)
+
+
+@pytest.mark.parametrize("frame", [8, 9, 12])
+def test_offsets_from_the_body_are_added_to_its_place_in_every_body_frame(world: World, client: Client, frame: int) -> None:
+    send_target(client, 0xDF8, frame=frame, x=0.1)
+    world.run(1)
+    assert world.robot.asked[-1].argument.p_wb[2] == pytest.approx(world.robot.p_wb[0][2])
+    assert np.linalg.norm(world.robot.asked[-1].argument.p_wb - world.robot.p_wb[0]) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("frame", "mask", "place"), [
+    (1, 0xDF8 | 4, [0.5, 0.3, 0.5]), (1, 0xDF8 | 3, [0.0, 0.2, 0.1]), (1, 0xDF8 | 1, [0.0, 0.3, 0.1]),
+    (7, 0xDF8 | 4, [0.5, 0.5, 0.5]), (9, 0xDF8 | 7 - 4, [0.0, 0.2, 0.6]),
+])  # fmt: skip
+def test_axes_that_are_left_out_of_a_set_point_stay(
+    world: World, client: Client, frame: int, mask: int, place: list[float]
+) -> None:
+    send_target(client, mask, frame=frame, x=0.5, y=0.3, z=0.1)
+    world.run(1)
+    assert world.robot.asked[-1].argument.p_wb == pytest.approx(place)
+
+
+def test_axis_without_a_place_goes_on_at_its_speed(world: World, client: Client) -> None:
+    ask(world, client, 400, 1)
+    mask = 0xC00 | 0x1C0 | 0x18 | 0x4  # x, y and the vertical speed are given
+    send_target(client, mask, x=0.2, y=0.1, vz=-0.1)
+    ask(world, client, 176, 1, 6)
+    for _ in range(10):
+        send_target(client, mask, x=0.2, y=0.1, vz=-0.1)
+        world.run(10)
+    p_wb = next(r.argument for r in reversed(world.robot.asked) if r.action == Action.SET_POINT).p_wb
+    assert p_wb[:2] == pytest.approx([0.2, 0.1])
+    assert p_wb[2] - world.robot.p_wb[0][2] == pytest.approx(-0.09, abs=0.02)
 
 
 def test_attitude_target_holds_any_attitude(world: World, client: Client) -> None:

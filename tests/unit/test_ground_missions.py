@@ -293,6 +293,68 @@ def test_reposition_plans_one_leg(world: World, client: Client) -> None:
     assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
 
 
+@pytest.mark.parametrize(("frame", "above", "z"), [(0, 0.0, 0.4), (5, 0.0, 0.4), (3, 400.0, 0.4), (6, 400.0, 0.4)])
+def test_reposition_reads_the_altitude_by_its_frame(frame: int, above: float, z: float) -> None:
+    world = World(altitude_m=400.0)
+    client = world.client()
+    client.command(400, 1)
+    world.run(3)
+    client.send("COMMAND_INT", 1, 1, frame, 192, 0, 0, -1, 1, 0, NAN, 302084000, 1201614000, 400.0 - above - z)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert job.legs[0].p_wb[2] == pytest.approx(z, abs=1e-3)
+
+
+@pytest.mark.parametrize(("frame", "x", "y"), [(1, 0, 0), (10, 302084000, 1201614000), (6, 2**31 - 1, 2**31 - 1)])
+def test_reposition_to_no_place_is_denied(world: World, client: Client, frame: int, x: int, y: int) -> None:
+    client.command(400, 1)
+    world.run(3)
+    client.clear()
+    client.send("COMMAND_INT", 1, 1, frame, 192, 0, 0, -1, 1, 0, NAN, x, y, -0.4)
+    world.run(3)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_DENIED
+    assert not world.station.jobs()
+
+
+def test_mission_that_came_while_another_flew_is_started_from_its_beginning(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    world.run(1100)
+    upload(world, client, [item(i, place) for i, place in enumerate(reversed(PLACES[:2]))])
+    world.run(1000)  # the old one goes on past the new one's end
+    client.clear()
+    world.run(110)
+    now = client.last("MISSION_CURRENT")
+    assert (now.seq, now.total, now.mission_state) == (0, 2, mavlink.MISSION_STATE_NOT_STARTED)
+    assert not client.all("MISSION_ITEM_REACHED")
+    client.command(193, 0)
+    world.run(20)
+    client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [0, 1]
+
+
+def test_part_of_a_mission_is_written_over(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    before = world.station.services[1].flight.items
+    client.clear()
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 1, 1, 0)
+    world.run(2)
+    assert client.last("MISSION_REQUEST_INT").seq == 1
+    client.send("MISSION_ITEM_INT", *item(1, (PLACES[1][0], PLACES[1][1], -0.123)), 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_ACCEPTED
+    after = world.station.services[1].flight.items
+    assert (after[0], after[2]) == (before[0], before[2]) and after[1].z == pytest.approx(-0.123)
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 3, 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_INVALID_SEQUENCE
+    client.send("MISSION_REQUEST_PARTIAL_LIST", 1, 1, 0, 1, 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_UNSUPPORTED
+
+
 def planning(world: World, client: Client) -> PlanJob:
     """Armed, the mission started, its plan under way."""
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])

@@ -542,6 +542,18 @@ def test_robot_that_a_pilot_steers_is_steered_by_him_when_it_joins_or_parts(mode
         assert (body.mode, body.level) == (mode, Level.NONE)
 
 
+@pytest.mark.parametrize(("state", "mode", "health", "may"), [
+    (State.DISARMED, Mode.POSHOLD, GOOD, True), (State.DISARMED, Mode.POSHOLD, GOOD._replace(esc_missing=(3,)), False),
+    (State.DISARMED, Mode.POSHOLD, BLIND, False), (State.DISARMED, Mode.MANUAL, BLIND, True),
+    (State.ARMED, Mode.POSHOLD, GOOD, False), (State.ESTOP, Mode.POSHOLD, GOOD, False),
+])  # fmt: skip
+def test_robot_that_may_arm_is_disarmed_and_passes_every_check_of_its_mode(state: State, mode: Mode, health: Health, may: bool) -> None:
+    supervisor = supervisor_in(state, mode)
+    assert supervisor.may_arm(health) is may
+    assert supervisor.state == state
+    assert supervisor.events == []
+
+
 def test_severities_are_those_of_syslog() -> None:
     assert (CRITICAL, WARNING, INFORMATION) == (2, 4, 6)
 
