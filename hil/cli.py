@@ -43,9 +43,9 @@ def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
     return scenario.with_vehicle(vehicle) if vehicle else scenario
 
 
-def check_reaches_others(bus: str, who: str) -> None:
-    """Raises DescriptionError where a bus ends with its process, and `who` needs another process at its other end."""
-    if bus.startswith("virtual:"):
+def check_reaches_others(bus: str, who: str, kinds: tuple[str, ...] = ("virtual:",)) -> None:
+    """Raises DescriptionError where a bus of those kinds ends with its process, and `who` needs another process at its other end."""
+    if bus.startswith(kinds):
         raise DescriptionError(f"bus {bus!r} does not reach another process; {who} needs udp:GROUP:PORT or socketcan:IFACE")
 
 
@@ -70,7 +70,7 @@ def run(
     parameters = parameters_of(controller)
     folder = out if out is not None else Path("runs") / chosen.name
     if realtime:
-        check_reaches_others(bus, "--realtime")
+        check_reaches_others(bus, "--realtime", ("virtual:", "slcan:"))  # an adapter serves one process
     with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:
         result = fly_and_judge(chosen, seed, parameters, folder, bus, rate_hz, progress, realtime)
     report = illustrate(chosen, result, folder) if plots else None

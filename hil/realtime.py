@@ -81,6 +81,7 @@ def fly_in_real_time(
     ready, stop = context.Event(), context.Event()
     arguments = (scenario, seed, bus, rate_hz, out, ready, stop)
     plant = context.Process(target=serve, args=arguments, name="plant", daemon=True)
+    open_port(bus).close()  # one that cannot be opened is told of here, before there are two processes to tell of it
     with ExitStack() as stack:
         plant.start()
         stack.callback(plant.join)

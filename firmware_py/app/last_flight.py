@@ -1,18 +1,22 @@
-"""How the process before this one ended, by the log that it left: which modules were in flight, and which magnets pulled."""
+"""How the process before this one ended, by the log that it left: who was in flight, which magnets pulled; and who is armed for that."""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from firmware_py.app.firmware import Firmware
 from firmware_py.bus.codec import Codec
+from firmware_py.core.joints import joints_of, sides
 from firmware_py.description.fleet import Fleet
+from firmware_py.description.signals import read_attachment
 from firmware_py.runtime.flight_log import LoggedFrame, frame_of
-from firmware_py.runtime.log_folder import newest_log_folder
-from firmware_py.runtime.recorder import CAN_LOG
+from firmware_py.runtime.log_folder import log_folders
+from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG
 
 RECENT_NS = 60_000_000_000
 """A log that was last written longer ago says nothing of now: the vehicle may be out of the water, in somebody's hands."""
@@ -22,48 +26,113 @@ _THRUSTERS = ("THRUSTER_CMD_A", "THRUSTER_CMD_B")
 _ARMED = 1
 _PULLS = 1
 
+DOCKED_SINCE = (
+    "were docked, or about to be, and their magnets let go: "
+    "the fleet file has to say so (body, cell) before they fly as one or REARM arms them"
+)
+PARTED_SINCE = (
+    "were told to let go of joints that the fleet file has: "
+    "where they are apart it has to say so (body, cell); nobody is armed without a person"
+)
+
+Face = tuple[int, int]
+"""Fleet index and face."""
+
 
 class LastFlight(NamedTuple):
     """What the process before told its modules last."""
 
     armed: frozenset[int] = frozenset()
-    """Fleet indices."""
-    pulling: frozenset[tuple[int, int]] = frozenset()
-    """Fleet index and face of every magnet that pulled."""
-    let_go: frozenset[tuple[int, int]] = frozenset()
-    """Those of every magnet that did not."""
+    """Fleet indices; none where the machine was started anew since then: no clock says how long ago that was."""
+    pulling: frozenset[Face] = frozenset()
+    """Every magnet that pulled."""
+    let_go: frozenset[Face] = frozenset()
+    """Every magnet that did not; and those of joints that were open before that process, which nobody flew as one."""
+
+    def docked(self, firmware: Firmware) -> frozenset[Face]:
+        """Faces that are joined and of no joint of the fleet file."""
+        return self.pulling - _joined_faces(firmware)
+
+    def apart(self, firmware: Firmware) -> frozenset[Face]:
+        """Faces of joints of the fleet file that were undone."""
+        return self.let_go & _joined_faces(firmware)
 
 
-def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int) -> LastFlight:
-    """How the newest log under `out` ends. A log that is missing, unreadable or old says nothing.
+def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -> LastFlight:
+    """How the newest log under `out` ends in which anything was sent. Logs that are missing, unreadable or old say nothing.
 
     Args:
         now_ns: the time of day, to compare with that of the file.
+        boot: of this start of the machine, to compare with the log's.
     """
+    for folder in log_folders(out):
+        sent = _last_sent(folder, now_ns, TAIL_BYTES * len(fleet.module))
+        if sent:
+            return _told(sent, _notes_of(folder), fleet, codec, boot)
+    return LastFlight()
+
+
+def to_arm(before: LastFlight, firmware: Firmware, hold: bool, say: Callable[[str], None]) -> set[int]:
+    """Modules that are armed without a person: all with `hold`; with REARM, those in whose flight the process before was killed.
+
+    With REARM nobody is where modules were docked in flight: the fleet file has them apart, and its relays let go of them. Nobody at all is
+    where they were undocked: the fleet file has them as one body, which they no longer are.
+    """
+    fleet, docked, apart = firmware.fleet, before.docked(firmware), before.apart(firmware)
+    for faces, what in ((docked, DOCKED_SINCE), (apart, PARTED_SINCE)):
+        if faces:
+            modules = ", ".join(map(fleet.label, sorted({module for module, _ in faces})))
+            say(f"warning: modules {modules} {what}")
+    if hold and not apart:
+        return set(range(len(fleet.module)))
+    if docked or apart or not firmware.parameters.supervision.rearm:
+        return set()
+    if before.armed:
+        say("the process before ended in flight: holding as soon as the vehicle may (REARM)")
+    return set(before.armed)
+
+
+def _told(sent: Sequence[LoggedFrame], notes: dict[str, Any], fleet: Fleet, codec: Codec, boot: str) -> LastFlight:
     indices = {(module.bus, module.number): index for index, module in enumerate(fleet.module)}
     armed: dict[int, bool] = {}
-    relays: dict[int, tuple[float, ...]] = {}
-    for frame in _last_sent(out, now_ns, TAIL_BYTES * len(indices)):
+    pulls: dict[Face, bool] = {}
+    for frame in sent:
         message, index = codec.by_id(frame.id), indices.get((frame.bus, frame.id & 31))
         if message is None or index is None:
             continue
         if message.name in _THRUSTERS:
             armed[index] = dict(zip(message.fields, message.decode(frame.data), strict=True))["Mode"] == _ARMED
         elif message.name == "DOCK_CMD":
-            relays[index] = message.decode(frame.data)
-    told = {(index, face): state == _PULLS for index, states in relays.items() for face, state in enumerate(states)}
-    pulling = frozenset(side for side, pulls in told.items() if pulls)
-    return LastFlight(frozenset(index for index, on in armed.items() if on), pulling, frozenset(told) - pulling)
+            pulls.update({(index, face): state == _PULLS for face, state in enumerate(message.decode(frame.data))})
+    flown = frozenset(index for index, on in armed.items() if on)
+    pulling = frozenset(face for face, on in pulls.items() if on)
+    open_before = frozenset() if flown else frozenset((module, face) for module, face in notes.get("apart", ()))
+    return LastFlight(flown if boot and notes.get("boot") == boot else frozenset(), pulling, frozenset(pulls) - pulling | open_before)
 
 
-def _last_sent(out: Path, now_ns: int, most_bytes: int) -> Iterator[LoggedFrame]:
-    """The frames that the end of the newest log says were sent; half a line at either end is left out."""
-    with suppress(OSError), (newest_log_folder(out) / CAN_LOG).open("rb") as file:
+def _joined_faces(firmware: Firmware) -> frozenset[Face]:
+    """Both sides of every joint that the fleet file has."""
+    return frozenset(side for body in firmware.pipeline.bodies for joint in joints_of(body) for side in sides(joint.request))
+
+
+def _notes_of(folder: Path) -> dict[str, Any]:
+    """What a log says of its run; nothing where it was torn before that."""
+    with suppress(OSError, ValueError):
+        found = json.loads(read_attachment(folder / SIGNAL_LOG, CONFIGURATION) or b"{}")
+        return found if isinstance(found, dict) else {}
+    return {}
+
+
+def _last_sent(folder: Path, now_ns: int, most_bytes: int) -> list[LoggedFrame]:
+    """The frames that the end of a log says were sent; half a line at either end is left out."""
+    sent = []
+    with suppress(OSError), (folder / CAN_LOG).open("rb") as file:
         status = os.fstat(file.fileno())
         if not 0 <= now_ns - status.st_mtime_ns < RECENT_NS:
-            return
+            return []
         file.seek(max(0, status.st_size - most_bytes))
         for line in file.read().decode("ascii", errors="replace").splitlines(keepends=True):
             with suppress(ValueError):
                 if line.endswith(" T\n"):
-                    yield frame_of(line)
+                    sent.append(frame_of(line))
+    return sent

@@ -33,17 +33,20 @@ def reporting(notifier: Notifier, keeper: RateKeeper, rate_hz: int) -> Observer:
     alive_every = max(1, round(ALIVE_EVERY_S * rate_hz))
     status_every = max(1, round(STATUS_EVERY_S * rate_hz))
     ready_at = round(READY_S * rate_hz)
+    said_ready = False
 
     def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        nonlocal said_ready
         tick = outputs.tick
-        if tick % alive_every or not notifier.is_heard:
+        status, ready = tick % status_every == 0, tick >= ready_at and not said_ready
+        if not (tick % alive_every == 0 or status or ready) or not notifier.is_heard:
             return
         text = "WATCHDOG=1"
-        if tick % status_every == 0:
+        if status:
             answered = sum(module.answered for module in inputs.modules)
             text += f"\nSTATUS={status_text(tick, rate_hz, answered, len(inputs.modules), keeper)}"
-        if tick == ready_at:
-            text += "\nREADY=1"
+        if ready:
+            text, said_ready = f"{text}\nREADY=1", True
         notifier.send(text)
 
     return observe

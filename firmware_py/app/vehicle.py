@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import math
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import Summary, recording_times, summary_of
 from firmware_py.app.firmware import BusFrame, Firmware, compose, vehicles_of
-from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight
+from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight, to_arm
 from firmware_py.app.live_view import LiveView
 from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import open_loop
 from firmware_py.app.service import reporting
 from firmware_py.core.body import Body
-from firmware_py.core.joints import joints_of, sides
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.stored_parameters import laid_over, stored_line
-from firmware_py.runtime.clock import unix_ns
+from firmware_py.runtime.clock import boot_id, unix_ns
 from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.rate_keeper import RateKeeper
@@ -59,15 +58,6 @@ TAKEN_BY = frozenset({Action.SET_MODE, Action.ARM, Action.MOTOR_TEST})
 """Requests of a person after which their body is not armed but by a person."""
 REARM_S = RECENT_NS / 1e9
 """How long REARM tries: then the flight before says nothing of where the vehicle is, as a log that is so old."""
-
-DOCKED_SINCE = (
-    "were docked, or about to be, and their magnets let go: "
-    "the fleet file has to say so (body, cell) before they fly as one or REARM arms them"
-)
-PARTED_SINCE = (
-    "were told to let go of joints that the fleet file has: "
-    "where they are apart it has to say so (body, cell); nobody is armed without a person"
-)
 
 
 @dataclass(slots=True)
@@ -151,9 +141,12 @@ def run_vehicle(
         if line := stored_line(parameters, laid, store):
             teller.say(line)
         firmware = compose(fleet, laid, worker=worker)
-        operator = Operator(fleet.rate_hz, _to_arm(firmware, hold, out, teller.say), math.inf if hold else REARM_S, teller.say)
+        boot = boot_id()
+        before = last_flight(out, fleet, firmware.codec, unix_ns(), boot) if out is not None else LastFlight()
+        operator = Operator(fleet.rate_hz, to_arm(before, firmware, hold, teller.say), math.inf if hold else REARM_S, teller.say)
         observers: list[Observer] = []
-        recorder = _open_recorder(stack, firmware, out, live, teller.say)
+        notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
+        recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
         if recorder is not None:
             observers.append(recording(recorder, fleet.rate_hz))
         if live is not None:
@@ -184,42 +177,14 @@ def run_vehicle(
         return summary_of(loop)
 
 
-def _to_arm(firmware: Firmware, hold: bool, out: Path | None, say: Callable[[str], None]) -> set[int]:
-    """Modules that are armed without a person: all with `hold`; with REARM, those in whose flight the process before was killed.
-
-    With REARM nobody is where modules were docked in flight: the fleet file has them apart, and its relays let go of them. Nobody at all is
-    where they were undocked: the fleet file has them as one body, which they no longer are.
-    """
-    fleet = firmware.fleet
-    before = last_flight(out, fleet, firmware.codec, unix_ns()) if out is not None else LastFlight()
-    joined = _joined_faces(firmware)
-    docked, parted = before.pulling - joined, before.let_go & joined
-    for faces, what in ((docked, DOCKED_SINCE), (parted, PARTED_SINCE)):
-        if faces:
-            modules = ", ".join(map(fleet.label, sorted({module for module, _ in faces})))
-            say(f"warning: modules {modules} {what}")
-    if hold and not parted:
-        return set(range(len(fleet.module)))
-    if docked or parted or not firmware.parameters.supervision.rearm:
-        return set()
-    if before.armed:
-        say("the process before ended in flight: holding as soon as the vehicle may (REARM)")
-    return set(before.armed)
-
-
-def _joined_faces(firmware: Firmware) -> set[tuple[int, int]]:
-    """Fleet index and face of both sides of every joint that the fleet file has."""
-    return {side for body in firmware.pipeline.bodies for joint in joints_of(body) for side in sides(joint.request)}
-
-
 def _open_recorder(
-    stack: ExitStack, firmware: Firmware, out: Path | None, live: LiveView | None, say: Callable[[str], None]
-) -> Recorder | None:
+    stack: ExitStack, configuration: Mapping[str, Any], firmware: Firmware, out: Path | None, live: LiveView | None,
+    say: Callable[[str], None],
+) -> Recorder | None:  # fmt: skip
     """The recorder for a folder, for viewers, or for both."""
     folder = _log_folder(out, say) if out is not None else None
     if folder is None and live is None:
         return None
-    configuration = configuration_of(firmware, rate_hz=firmware.fleet.rate_hz)
     recorder = Recorder(folder, configuration, live.context if live is not None else None, queued=True)
     if folder is not None:
         stack.callback(_forget_failed_start, recorder, folder, out)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Protocol
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 class Clock(Protocol):
@@ -46,6 +49,14 @@ class MonotonicClock:
     def now_ns(self) -> int:
         """Nanoseconds since the origin."""
         return time.clock_gettime_ns(time.CLOCK_MONOTONIC) - self.origin_ns
+
+
+def boot_id() -> str:
+    """Of this start of the machine, which the time of day does not tell from the one before; empty where the system has none."""
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
 
 
 def unix_ns() -> int:

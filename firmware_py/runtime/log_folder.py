@@ -21,9 +21,12 @@ def make_log_folder(out: Path) -> Path:
     return folder
 
 
-def newest_log_folder(out: Path) -> Path:
-    """The folder of the last log under `out`; `out` where there is none. Raises OSError."""
-    return _folder(out, max(_numbers(out), default=_FIRST))
+def log_folders(out: Path) -> list[Path]:
+    """The folders of the logs under `out`, the newest first; none where it cannot be read."""
+    try:
+        return [_folder(out, number) for number in sorted(set(_numbers(out)), reverse=True)]
+    except OSError:
+        return []
 
 
 def _numbers(out: Path) -> list[int]:

@@ -8,6 +8,8 @@ import socket
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -178,6 +180,20 @@ def test_service_tells_that_it_is_ready_alive_and_how_it_fares(tmp_path: Path) -
     assert alive == list(range(10, 301, 10))
     reports = [text for _, text in heard if "STATUS=" in text]
     assert "tick=300" in reports[-1] and "answered=1/1" in reports[-1]
+
+
+def test_service_is_ready_once_after_a_second_at_every_rate() -> None:
+    """One that never says so is killed by systemd after 90 s, in flight."""
+    keeper = RateKeeper(PERIOD_NS, ManualClock(), lambda deadline_ns: None)
+    for rate_hz in range(50, 401):
+        said: list[str] = []
+        notifier: Any = SimpleNamespace(is_heard=True, send=said.append)
+        observe = reporting(notifier, keeper, rate_hz)
+        for tick in range(1, 3 * rate_hz):
+            observe([], [], Inputs(tick, 0, [], [], False, 0, False), outputs(tick))
+        ready = [text for text in said if "READY=1" in text]
+        assert len(ready) == 1 and f"tick={rate_hz} " in ready[0], rate_hz
+        assert len([text for text in said if "STATUS=" in text]) == 2, rate_hz
 
 
 def outputs(tick: int) -> Outputs:

@@ -50,6 +50,19 @@ def test_matrix_of_faults_takes_the_others(flown: list[object], tmp_path: Path, 
     assert flown == [(3, tmp_path, 5)]
 
 
+@pytest.mark.parametrize(("bus", "why"), [
+    ("socketcan:can9", "there is no such interface"), ("slcan:/dev/ttyNO", "does not reach another process"),
+    ("virtual:x", "does not reach another process"),
+])  # fmt: skip
+def test_flight_in_two_processes_refuses_a_bus_that_is_none_in_one_line(
+    bus: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert status_of(["run", "hover", "--realtime", "--bus", bus, "--out", str(tmp_path)], monkeypatch) == 2
+    line = capsys.readouterr().err
+    assert bus in line and why in line
+    assert line.count("\n") == 1
+
+
 def test_plant_alone_refuses_a_bus_that_nobody_else_reaches(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     served: list[object] = []
     monkeypatch.setattr(hil.plant_process, "serve_until_signal", lambda *arguments: served.append(arguments))

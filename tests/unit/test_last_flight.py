@@ -3,16 +3,18 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from firmware_py.app.last_flight import RECENT_NS, TAIL_BYTES, LastFlight, last_flight
 from firmware_py.bus.codec import Codec
 from firmware_py.description.fleet import Fleet, Module
-from firmware_py.runtime.recorder import CAN_LOG, candump_lines
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder, candump_lines
 
 CODEC = Codec.load()
 FLEET = Fleet(module=(Module(number=1), Module(number=2), Module(number=1, bus=1)), buses=("virtual:a", "virtual:b"))
+BOOT = "a-start-of-the-machine"
 PERIOD_NS = 10_000_000
 WRITTEN_NS = 1_700_000_000_000_000_000
 NOW_NS = WRITTEN_NS + 2_000_000_000
@@ -33,8 +35,9 @@ def lines_of(armed: Sequence[bool], tick: int = 1) -> str:
     return text
 
 
-def write(folder: Path, text: str, written_ns: int = WRITTEN_NS) -> None:
+def write(folder: Path, text: str, written_ns: int = WRITTEN_NS, **notes: Any) -> None:
     folder.mkdir(exist_ok=True)
+    Recorder(folder, {"boot": BOOT, **notes}).close()
     (folder / CAN_LOG).write_text(text)
     os.utime(folder / CAN_LOG, ns=(written_ns, written_ns))
 
@@ -46,7 +49,7 @@ def dock_line(index: int, relays: Sequence[int], tick: int = 1, direction: str =
 
 
 def found(out: Path, now_ns: int = NOW_NS) -> LastFlight:
-    return last_flight(out, FLEET, CODEC, now_ns)
+    return last_flight(out, FLEET, CODEC, now_ns, BOOT)
 
 
 def in_flight(out: Path, now_ns: int = NOW_NS) -> frozenset[int]:
@@ -101,8 +104,38 @@ def test_newest_log_counts(tmp_path: Path) -> None:
     assert in_flight(tmp_path) == set()
     write(tmp_path / "0010", lines_of([True] * 3))
     assert in_flight(tmp_path) == {0, 1, 2}
-    (tmp_path / "0011").mkdir()
-    assert in_flight(tmp_path) == set()
+
+
+def test_log_of_a_process_that_sent_nothing_says_nothing_and_the_one_before_counts(tmp_path: Path) -> None:
+    """Such as one that was stopped while it started."""
+    write(tmp_path, lines_of([True] * 3))
+    (tmp_path / "0002").mkdir()
+    write(tmp_path / "0003", "")
+    write(tmp_path / "0004", lines_of([False] * 3).replace(" T\n", " R\n"))
+    assert in_flight(tmp_path) == {0, 1, 2}
+
+
+@pytest.mark.parametrize("boot", ["another-start", ""])
+def test_flight_before_the_machine_was_started_anew_arms_nobody(tmp_path: Path, boot: str) -> None:
+    """A clock without a battery says that seconds have passed, and the vehicle may be on a bench by now."""
+    write(tmp_path, lines_of([True] * 3) + dock_line(0, (1, 0, 0, 0, 0, 0)), boot=boot)
+    for now in (BOOT, boot):
+        then = last_flight(tmp_path, FLEET, CODEC, NOW_NS, now)
+        assert then.armed == (frozenset({0, 1, 2}) if now == boot and boot else frozenset())
+        assert then.pulling == {(0, 0)}
+
+
+def test_joint_that_was_open_at_the_start_is_open_until_somebody_flew_it(tmp_path: Path) -> None:
+    write(tmp_path, lines_of([False] * 3) + dock_line(0, (1, 0, 0, 0, 0, 0)), apart=[[0, 0], [1, 1]])
+    assert {(0, 0), (1, 1)} <= found(tmp_path).let_go
+    write(tmp_path, lines_of([True] * 3) + dock_line(0, (1, 0, 0, 0, 0, 0)), apart=[[0, 0], [1, 1]])
+    assert not {(0, 0), (1, 1)} & found(tmp_path).let_go
+
+
+def test_log_whose_signals_are_torn_arms_nobody(tmp_path: Path) -> None:
+    write(tmp_path, lines_of([True] * 3) + dock_line(0, (1, 0, 0, 0, 0, 0)))
+    (tmp_path / SIGNAL_LOG).write_bytes((tmp_path / SIGNAL_LOG).read_bytes()[:20])
+    assert found(tmp_path).armed == frozenset() and found(tmp_path).pulling == {(0, 0)}
 
 
 def test_missing_or_unreadable_log_says_nothing(tmp_path: Path) -> None:

@@ -1,8 +1,11 @@
 """One suite for every kind of bus (tests/vcan runs it on real SocketCAN), then what a port does when its bus fails."""
 
 import errno
+import functools
 import os
 import select
+import subprocess
+import sys
 import threading
 import time
 import tty
@@ -10,10 +13,11 @@ from collections import deque
 
 import can
 import pytest
+import serial
 
 from firmware_py.bus.codec import Frame
 from firmware_py.bus.port import Port, PortError, open_port
-from firmware_py.bus.port.links import WAITING_FRAMES, Link
+from firmware_py.bus.port.links import WAITING_FRAMES, Link, SlcanLink
 
 UDP = f"udp:239.74.163.2:{40_000 + os.getpid() % 20_000}"
 """A port of its own for each process: test processes run side by side."""
@@ -241,6 +245,29 @@ class TestSlcan(PortSuite):
     @pytest.fixture
     def address_pair(self, cable):
         return cable.addresses
+
+    def test_adapter_serves_one_process_and_the_next_one_when_it_is_done(self, pair, cable):
+        """Another would switch the channel off on opening, and an adapter does not echo: no foreign SYNC is heard."""
+        one, other = pair
+        script = f"from firmware_py.bus.port import open_port; open_port({cable.addresses[0]!r})"
+        run = functools.partial(subprocess.run, [sys.executable, "-c", script], capture_output=True, text=True, check=False)
+        refused = run()
+        assert "PortError" in refused.stderr and "another process uses it" in refused.stderr
+        assert one.send(FRAMES[1])
+        assert receive(other, 1) == [FRAMES[1]]
+        one.close()
+        assert run().returncode == 0
+
+    def test_silent_adapter_is_waited_for_asleep(self, cable, monkeypatch):
+        """python-can's own wait reads in a loop: at real-time priority nothing else would run on that processor."""
+        link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))
+        bus, reads = link.open(), []
+        try:
+            monkeypatch.setattr(serial.Serial, "read", lambda device, size=1: reads.append(size) or b"")
+            assert link.read(bus, 0.05) is None
+        finally:
+            link.close(bus)
+        assert len(reads) == 0
 
     def test_adapter_that_is_plugged_in_again_works_again(self, pair, cable, tmp_path):
         one, other = pair

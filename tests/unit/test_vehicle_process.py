@@ -19,6 +19,7 @@ from firmware_py.core.types import Event, Inputs, ModuleCommand, Outputs
 from firmware_py.description.fleet import Fleet, Module, single
 from firmware_py.description.parameters import Parameters, Supervision
 from firmware_py.runtime import teller
+from firmware_py.runtime.clock import boot_id
 from firmware_py.runtime.flight_log import FlightLog
 from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
@@ -146,6 +147,7 @@ def test_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
 def in_flight(tmp_path: Path, more: str = "", modules: tuple[Module, ...] = FLEET.module) -> Fleet:
     """Leaves the log of a process that was killed in flight just now."""
     tmp_path.joinpath("log").mkdir()
+    Recorder(tmp_path / "log", {"boot": boot_id()}).close()
     tmp_path.joinpath("log", CAN_LOG).write_text(lines_of([True] * 3) + more)
     return Fleet(module=modules, buses=(bus_of(tmp_path), f"{bus_of(tmp_path)}-b"))
 
@@ -218,6 +220,9 @@ def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
     assert said[0].startswith(f"warning: modules 1 on {bus}, 2 on {bus} were told to let go of joints that the fleet file has: ")
     assert to_arm == [set()]
     assert HOLDS not in said
+    again = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet, hold=hold)
+    assert again[0] == said[0], "it is as true at the second restart"
+    assert to_arm == [set(), set()]
 
 
 def test_relays_of_single_modules_are_no_undock(tmp_path: Path) -> None:

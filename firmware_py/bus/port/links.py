@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import ipaddress
 import os
 import select
@@ -235,14 +236,36 @@ class SlcanLink(Link):
         super().__init__(address)
         self._rest = b""
         """What the device did not take of the last line: another one cannot begin before it is through."""
+        self._lock: int | None = None
+        """A descriptor that holds the device for this process: another one would switch the channel off, and hears no foreign SYNC."""
 
     def open(self) -> can.BusABC:
         self._rest = b""
         try:
+            self._take()
             return can.Bus(interface="slcan", channel=self.address, bitrate=BIT_RATE, sleep_after_open=0.0, timeout=0.0)
+        except BlockingIOError:
+            raise PortError(f"slcan:{self.address}: another process uses it; one adapter serves one process") from None
         except (OSError, ValueError, can.CanError) as error:
+            self._give_back()
             hint = "it takes a serial device, slcan:/dev/ttyACM0"
             raise PortError(f"slcan:{self.address}: {_reason(error)}; {hint}") from None
+
+    def _take(self) -> None:
+        """Raises BlockingIOError where another has it, before anything is sent to it."""
+        lock = os.open(self.address, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(lock)
+            raise
+        self._give_back()
+        self._lock = lock
+
+    def _give_back(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def close(self, bus: Any) -> None:
         """python-can leaves the device open when it is gone and its last command fails."""
@@ -250,6 +273,7 @@ class SlcanLink(Link):
             bus.shutdown()
         finally:
             bus.serialPortOrig.close()
+            self._give_back()
 
     def send(self, bus: Any, frame: Frame) -> None:
         """Hands over what the device takes at once.
@@ -265,9 +289,11 @@ class SlcanLink(Link):
         self._rest = line[os.write(device, line) :]
 
     def read(self, bus: Any, timeout_s: float) -> Frame | can.Message | None:
-        """python-can keeps a line that is not text and would stumble over it for ever."""
+        """python-can turns in a loop while it waits, and keeps a line that is not text: it would stumble over it for ever."""
+        if timeout_s > 0.0 and not select.select((bus.fileno(),), (), (), timeout_s)[0]:
+            return None
         try:
-            return super().read(bus, timeout_s)
+            return super().read(bus, 0.0)
         except can.CanOperationError as error:
             if isinstance(error.__cause__, UnicodeDecodeError):
                 bus.flush()
