@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ WORST = 5
 QUANTILES = {"min": 0.0, "q05": 0.05, "median": 0.5, "q95": 0.95, "max": 1.0}
 LEAST_TRIALS = 10
 """Fewer say nothing of what a metric depends on."""
+NEARLY_ONE = 1.0 - 1e-12
+"""The largest correlation that Fisher's transform takes."""
 
 Trial = Mapping[str, Any]
 """`seed`, `passed`, `outcome`, `metrics` and `world`: names to numbers, None where there was none."""
@@ -92,9 +95,25 @@ def sensitivities(trials: Sequence[Trial]) -> dict[str, dict[str, dict[str, floa
 
 def _rank_correlation(pairs: np.ndarray) -> dict[str, float]:
     rho = float(scipy.stats.spearmanr(pairs[:, 0], pairs[:, 1]).statistic)
-    half = float(scipy.stats.norm.ppf(0.5 + 0.5 * CONFIDENCE)) * math.sqrt((1.0 + 0.5 * rho * rho) / (len(pairs) - 3))
-    z = math.atanh(max(-1.0 + 1e-12, min(1.0 - 1e-12, rho)))
+    half = _deviations(CONFIDENCE) * math.sqrt((1.0 + 0.5 * rho * rho) / (len(pairs) - 3))
+    z = math.atanh(max(-NEARLY_ONE, min(NEARLY_ONE, rho)))
     return {"rho": rho, "low": math.tanh(z - half), "high": math.tanh(z + half)}
+
+
+def surely_not_zero(correlation: Mapping[str, float], pairs: int) -> bool:
+    """Whether a correlation of `sensitivities` is not zero, where `pairs` of them are looked at together.
+
+    Of many pairs one is outside its own 95 % interval by chance: Bonferroni's has a `pairs`-th of the chance to miss.
+    """
+    rho = correlation["rho"]
+    z, nearer = (math.atanh(max(-NEARLY_ONE, min(NEARLY_ONE, r))) for r in (rho, correlation["low" if rho > 0.0 else "high"]))
+    wider = _deviations(1.0 - (1.0 - CONFIDENCE) / pairs) / _deviations(CONFIDENCE)
+    return abs(z) > wider * abs(z - nearer)
+
+
+def _deviations(confidence: float) -> float:
+    """Standard deviations of a normal variable on either side of its mean that hold that share of it."""
+    return NormalDist().inv_cdf(0.5 + 0.5 * confidence)
 
 
 def table_of(trials: Sequence[Trial]) -> str:

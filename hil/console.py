@@ -13,8 +13,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 from rich.text import Text
 
+from hil.campaign_summary import surely_not_zero
 from hil.checks import Result
 from hil.metrics import SHOWN, metric_order, shown_limit, shown_value
+
+TOLD = ("position_rmse_m", "attitude_rmse_rad")
+"""Metrics of a campaign for which it is said what they go with."""
 
 
 class Advance(Protocol):
@@ -97,14 +101,20 @@ def print_campaign(summary: Mapping[str, Any], console: Console | None = None) -
     if failures:
         console.print(f"FAILED: {', '.join(failures)}", style="bold red", highlight=False)
     console.print(f"worst seeds: {', '.join(str(seed) for seed in summary['worst_seeds'])}", highlight=False)
-    for metric in ("position_rmse_m", "attitude_rmse_rad"):
-        if words := what_matters(summary["sensitivities"].get(metric, {})):
+    looked_at = {metric: summary["sensitivities"].get(metric, {}) for metric in TOLD}
+    pairs = sum(len(correlations) for correlations in looked_at.values())
+    for metric, correlations in looked_at.items():
+        if words := what_matters(correlations, pairs):
             console.print(f"{SHOWN[metric].label} goes with: {words}", highlight=False)
 
 
-def what_matters(correlations: Mapping[str, Mapping[str, float]]) -> str:
-    """Parameters of the world whose rank correlation is surely not zero, strongest first: `mass_factor 0.61 (0.24 to 0.83)`."""
-    sure = {name: c for name, c in correlations.items() if c["low"] * c["high"] > 0.0}
+def what_matters(correlations: Mapping[str, Mapping[str, float]], pairs: int = 0) -> str:
+    """Parameters of the world whose rank correlation is surely not zero, strongest first: `mass_factor 0.61 (0.24 to 0.83)`.
+
+    With 95 % confidence none of the `pairs` that are looked at together is named wrongly; left out, they are those given. The
+    interval shown is that of the pair by itself.
+    """
+    sure = {name: c for name, c in correlations.items() if surely_not_zero(c, max(pairs, len(correlations)))}
     ordered = sorted(sure.items(), key=lambda item: -abs(item[1]["rho"]))
     return ", ".join(f"{name} {c['rho']:.2f} ({c['low']:.2f} to {c['high']:.2f})" for name, c in ordered[:3])
 

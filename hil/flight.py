@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import load_vehicle
 from hil.bench import DEFAULT_BUS, fly_scenario
 from hil.checks import Result, judge, write_result
 from hil.dock_plot import write_dock_plot
@@ -75,14 +75,15 @@ def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
     """Writes plots and report.html of the run in `folder`; returns the report's path."""
     flight = read_flight(folder)
     scenario = scenario.for_seed(result.seed)
-    vehicle = load_vehicle(scenario.module[0].vehicle)
-    scene = _scene(scenario, vehicle, flight)
+    scene = _scene(scenario, flight)
     plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm)
     plots += write_dock_plot(folder, start_of(flight))
     return write_report(folder, result, flight, scene, plots)
 
 
-def _scene(scenario: Scenario, vehicle: Vehicle, flight: Flight) -> Scene:
+def _scene(scenario: Scenario, flight: Flight) -> Scene:
+    vehicles = tuple(load_vehicle(module.vehicle) for module in scenario.module)
+    vehicle = vehicles[0]
     first_s = float(flight.firmware["time_ns"][0] - start_of(flight)) * 1e-9
     begin_s = scenario.task.settle_s - first_s
     return Scene(
@@ -90,9 +91,7 @@ def _scene(scenario: Scenario, vehicle: Vehicle, flight: Flight) -> Scene:
         description=scenario.help,
         tank=scenario.tank.kind,
         tank_m=tank_corners(scenario.tank),
-        hull_m=vehicle.hull.size_m,
-        thruster_position_m=vehicle.positions,
-        thruster_direction=vehicle.directions,
+        modules=vehicles,
         force_limits_n=np.array([vehicle.force_min_n, vehicle.force_max_n]),
         window=Window(begin_s, begin_s + scenario.task.duration_s),
         paper_rmse_mm=PAPER_RMSE_MM.get(scenario.task.kind),

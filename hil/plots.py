@@ -117,6 +117,8 @@ def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray, inside: np.ndarray) 
     wanted = flight.firmware["setpoint_p_wb"][inside]
     axes.plot(*wanted.T, color=REFERENCE, linestyle="--", linewidth=1.1, label="reference")
     axes.plot(*flight.p_wb.T, color=TRUTH, linewidth=1.6, label="truth")
+    for index, path in enumerate(_apart(flight)):
+        axes.plot(*path.T, color=COMMAND, linewidth=1.2, label=None if index else "truth, another module")
     axes.scatter(*flight.p_wb[0], color=TRUTH, s=28, label="start")
     for which, text in (("x", "north x (m)"), ("y", "east y (m)"), ("z", "down z (m)")):
         getattr(axes, f"set_{which}label")(text, labelpad=7)
@@ -127,6 +129,14 @@ def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray, inside: np.ndarray) 
     axes.view_init(elev=22, azim=-58)
     axes.set_title("Path in the tank")
     axes.legend(loc="upper left", fontsize=9)
+
+
+def _apart(flight: Flight) -> list[np.ndarray]:
+    """(k, 3) paths of the modules that are not in the body all the time; NaN while they are."""
+    if "member" not in flight.truth:
+        return []
+    outside = flight.truth["member"] == 0.0
+    return [np.where(outside[:, [m]], module["p_wm"], np.nan) for m, module in enumerate(flight.modules) if outside[:, m].any()]
 
 
 def position(flight: Flight, window: Window) -> Any:
@@ -223,7 +233,7 @@ def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray) -> Any
     rows = -(-commanded.shape[1] // 2)
     figure = _figure(11.0, 1.0 + 1.45 * rows)
     cells = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
-    widest = 1.15 * max(1.0, float(np.abs(commanded).max()), float(np.abs(given).max()))
+    widest = 1.15 * max(1.0, *(float(np.nanmax(np.abs(force))) for force in (commanded, given)))  # NaN: not yet in this body
     for i in range(commanded.shape[1]):
         cell = cells.flat[i]
         cell.plot(flight.time_s, commanded[:, i], color=COMMAND, linewidth=2.4, alpha=0.6, label="command")

@@ -187,7 +187,8 @@ class Flight:
     """One body over the ticks that both logs hold, row by row; `unmatched` ticks of the firmware have no truth.
 
     `truth` has the columns of the body's leading module (its `force_n` and `power_w` those of all its modules), and with them
-    `member`, `p_wb`, `q_wb`, `v_wb`, `w_bb` of the body where the log has them.
+    `member`, `p_wb`, `q_wb`, `v_wb`, `w_bb` of the body where the log has them. `modules` has `p_wm`, `q_wm` and `force_n` of
+    every module of the fleet, in its order, whichever body it is in.
     """
 
     firmware: Columns
@@ -195,6 +196,7 @@ class Flight:
     events: Columns
     ticks: Columns
     unmatched: int
+    modules: tuple[Columns, ...] = ()
 
     @property
     def time_s(self) -> np.ndarray:
@@ -220,7 +222,8 @@ class Flight:
         keep = (time_ns >= start_ns) & (time_ns <= end_ns)
         pick = {name: column[keep] for name, column in self.firmware.items()}
         truth = {name: column[keep] for name, column in self.truth.items()}
-        return Flight(pick, truth, self.events, self.ticks, self.unmatched)
+        modules = tuple({name: column[keep] for name, column in module.items()} for module in self.modules)
+        return Flight(pick, truth, self.events, self.ticks, self.unmatched, modules)
 
 
 def read_flight(folder: Path, body: int = 0, module: int = 0) -> Flight:
@@ -248,7 +251,15 @@ def read_flight(folder: Path, body: int = 0, module: int = 0) -> Flight:
         signals.get("/events", nothing),
         signals.get("/firmware/ticks", {}),
         len(firmware["tick"]) - len(mine),
+        _fleet(truths, true["tick"]),
     )
+
+
+def _fleet(truths: Mapping[str, Columns], ticks: np.ndarray) -> tuple[Columns, ...]:
+    """Pose and forces of every module at these ticks, in the order of the fleet."""
+    count = sum(name.startswith("/plant/module") for name in truths)
+    modules = [truths[f"/plant/module{m}"] for m in range(count)]
+    return tuple({name: _at(module, ticks, name) for name in ("p_wm", "q_wm", "force_n")} for module in modules)
 
 
 def _joined(module: Columns, body: Columns | None, truths: Mapping[str, Columns]) -> Columns:

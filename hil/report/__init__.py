@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from firmware_py.description.signals import Columns
+from firmware_py.description.vehicle import Vehicle
 from hil.checks import Result
 from hil.metrics import SHOWN, metric_order, rotation_vectors, shown_limit, shown_value
 from hil.plots import Window
@@ -21,6 +23,8 @@ from hil.signals import Flight
 REPORT_FILE = "report.html"
 FRAMES_HZ = 25.0
 """Samples of the animation a second; it interpolates between them."""
+REGROUPED_M = 0.001
+"""By how much the lever from the leader's hull to the body's centre of mass changes, at least, when modules join or part."""
 CAPTIONS = {
     "overview": "The whole flight. Grey: before and after the judged part.",
     "position": "Position per axis: reference, truth and estimate, and what they are off by.",
@@ -28,6 +32,7 @@ CAPTIONS = {
     "estimate": "Does the filter know how wrong it is? Its error inside three of its own standard deviations.",
     "thrusters": "Each thruster: what the firmware commanded after its limiter, and the force that the plant's gave.",
     "disturbance": "Unmodelled force and moment by the filter, the force that was asked for, and the water's velocity.",
+    "docking": "The dock: relay currents of both faces, the gap between them, the two conditions, and the stages of each try.",
 }
 TILES = (
     "attitude_rmse_rad",
@@ -51,7 +56,7 @@ class Scene:
     Attributes:
         title: heading, such as `Spiral`; description: one sentence under it.
         tank: `box` or `cylinder`; tank_m: (2, 3) its lowest and highest corner, world, m.
-        hull_m: (3,) edges of the module. thruster_position_m, thruster_direction: (n, 3) in the module frame.
+        modules: what each module of the fleet is, in its order.
         force_limits_n: (2,) reverse and forward limit of each thruster.
         window: the judged part, s since the flight's first tick.
         paper_rmse_mm: what the paper measured in the same task, or None.
@@ -62,9 +67,7 @@ class Scene:
     description: str = ""
     tank: str = "box"
     tank_m: np.ndarray
-    hull_m: np.ndarray
-    thruster_position_m: np.ndarray
-    thruster_direction: np.ndarray
+    modules: tuple[Vehicle, ...]
     force_limits_n: np.ndarray
     window: Window
     paper_rmse_mm: float | None = None
@@ -98,32 +101,52 @@ def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plo
 
 
 def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
-    """What the viewer needs: the scene, and the flight thinned to `FRAMES_HZ`."""
+    """What the viewer needs: the scene, and the flight thinned to `FRAMES_HZ`.
+
+    `p`, `q`, `ref_p` and `ref_q` are of the body that was flown; `modules` are all there are, in whichever body.
+    """
     time_s = flight.time_s
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
     keep = slice(None, None, max(1, round(1.0 / (FRAMES_HZ * period_s))))
-    truth, firmware = flight.truth, flight.firmware
+    firmware = flight.firmware
+    member = flight.truth.get("member", np.ones((len(time_s), len(flight.modules))))
     error_mm = 1e3 * np.linalg.norm(flight.p_wb - firmware["setpoint_p_wb"], axis=1)
     angle = np.degrees(np.linalg.norm(rotation_vectors(flight.q_wb, firmware["setpoint_q_wb"]), axis=1))
     return {
         "tank": {"kind": scene.tank, "low": _short(scene.tank_m[0], 3), "high": _short(scene.tank_m[1], 3)},
-        "hull": _short(scene.hull_m, 4),
-        "thrusters": {
-            "p": _short(scene.thruster_position_m, 4),
-            "d": _short(scene.thruster_direction, 4),
-            "limits": _short(scene.force_limits_n, 2),
-        },
         "window": list(scene.window),
         "paper_mm": scene.paper_rmse_mm,
         "t": _short(time_s[keep], 3),
-        "p": _short(truth["p_wm"][keep], 5),
-        "q": _short(truth["q_wm"][keep], 5),
+        "p": _short(flight.p_wb[keep], 5),
+        "q": _short(flight.q_wb[keep], 5),
         "ref_p": _short(firmware["setpoint_p_wb"][keep], 5),
         "ref_q": _short(firmware["setpoint_q_wb"][keep], 5),
-        "force": _short(truth["force_n"][keep], 2),
         "error_mm": _short(error_mm[keep], 3),
         "angle_deg": _short(angle[keep], 3),
+        "cuts": _cuts(flight, keep),
+        "modules": [
+            _module(vehicle, truth, member[:, m], keep)
+            for m, (vehicle, truth) in enumerate(zip(scene.modules, flight.modules, strict=True))
+        ],
     }
+
+
+def _module(vehicle: Vehicle, truth: Columns, member: np.ndarray, keep: slice) -> dict[str, Any]:
+    """What a module is, where it was, what its thrusters gave, and when it was in the body that was flown."""
+    return {
+        "hull": _short(vehicle.hull.size_m, 4),
+        "thrusters": {"p": _short(vehicle.positions, 4), "d": _short(vehicle.directions, 4)},
+        "member": (member[keep] > 0.0).astype(int).tolist(),
+        "p": _short(truth["p_wm"][keep], 5),
+        "q": _short(truth["q_wm"][keep], 5),
+        "force": _short(truth["force_n"][keep], 2),
+    }
+
+
+def _cuts(flight: Flight, keep: slice) -> list[int]:
+    """Frames at which the body's centre of mass, and the reference with it, is another point: modules joined or parted."""
+    lever_m = np.linalg.norm(flight.p_wb[keep] - flight.truth["p_wm"][keep], axis=1)
+    return (1 + np.flatnonzero(np.abs(np.diff(lever_m)) > REGROUPED_M)).tolist()
 
 
 def _short(values: np.ndarray, digits: int) -> Any:

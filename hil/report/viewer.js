@@ -25,6 +25,13 @@
       v[2] + w * t[2] + x * t[1] - y * t[0],
     ];
   };
+  const times = (a, b) => [
+    a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+    a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+    a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+    a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+  ];
+  const inverse = (q) => [q[0], -q[1], -q[2], -q[3]];
   const add = (a, b, k = 1) => [a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2]];
   const between = (a, b, s) => a.map((value, i) => value + s * (b[i] - value));
   const slerp = (a, b, s) => {
@@ -56,15 +63,26 @@
     return a;
   };
   const judged = (i) => data.t[i] >= data.window[0] && data.t[i] <= data.window[1];
-  const reference = data.ref_p.filter((_, i) => judged(i));  // before the task there may be no reference yet
+  const cuts = new Set(data.cuts);  // modules joined or parted: what is followed is another point, and its line begins anew
+  const cut = (p, i) => (cuts.has(i) ? [null, p] : [p]);
+  const reference = data.ref_p.flatMap((p, i) => (judged(i) ? cut(p, i) : []));  // before the task there may be none yet
   const magnified = (i) => (judged(i) ? between(data.ref_p[i], data.p[i], state.magnify) : data.p[i]);
+  const guests = [...data.modules.keys()].filter((m) => data.modules[m].member.includes(0));  // not in the body all the time
+  const moduleAt = (m, i) => {  // the body's error moves all of its modules, and no other
+    const p = data.modules[m].p[i];
+    return judged(i) && data.modules[m].member[i] ? add(p, add(data.p[i], data.ref_p[i], -1), state.magnify - 1) : p;
+  };
   const sample = (t) => {
     const i = indexAt(t), j = Math.min(i + 1, data.t.length - 1);
     const s = j > i ? Math.min(1, (t - data.t[i]) / (data.t[j] - data.t[i])) : 0;
     const mix = (name) => between(data[name][i], data[name][j], s);
     return {
       i, p: between(magnified(i), magnified(j), s), q: slerp(data.q[i], data.q[j], s), truth: mix("p"),
-      refP: mix("ref_p"), refQ: slerp(data.ref_q[i], data.ref_q[j], s), force: mix("force"),
+      refP: mix("ref_p"), refQ: slerp(data.ref_q[i], data.ref_q[j], s),
+      modules: data.modules.map((module, m) => ({
+        member: module.member[i], faces: faces[m], thrusters: module.thrusters, force: between(module.force[i], module.force[j], s),
+        p: between(moduleAt(m, i), moduleAt(m, j), s), q: slerp(module.q[i], module.q[j], s),
+      })),
       error: data.error_mm[i] + s * (data.error_mm[j] - data.error_mm[i]),
       angle: data.angle_deg[i] + s * (data.angle_deg[j] - data.angle_deg[i]),
     };
@@ -75,7 +93,11 @@
   let g = stage.getContext("2d");
   const path = (points, colour, thickness, dash = []) => {
     g.beginPath();
-    points.forEach((p, i) => { const [x, y] = project(p); if (i) g.lineTo(x, y); else g.moveTo(x, y); });
+    points.forEach((p, i) => {  // a line begins after each null
+      if (!p) return;
+      const [x, y] = project(p);
+      if (i && points[i - 1]) g.lineTo(x, y); else g.moveTo(x, y);
+    });
     g.strokeStyle = colour; g.lineWidth = thickness; g.setLineDash(dash); g.lineJoin = g.lineCap = "round";
     g.stroke(); g.setLineDash([]);
   };
@@ -134,49 +156,53 @@
     text(left[0], "surface", [-30, -8]);
   };
 
-  const half = data.hull.map((value) => value / 2);
-  const FACES = [[0, 1], [0, -1], [1, 1], [1, -1], [2, 1], [2, -1]].map(([axis, sign]) => {
+  const facesOf = (half) => [[0, 1], [0, -1], [1, 1], [1, -1], [2, 1], [2, -1]].map(([axis, sign]) => {
     const a = (axis + 1) % 3, b = (axis + 2) % 3;
     const corners = [[1, 1], [-1, 1], [-1, -1], [1, -1]].map(([u, v]) => {
       const corner = [0, 0, 0];
       corner[axis] = sign * half[axis]; corner[a] = u * half[a]; corner[b] = v * half[b];
       return corner;
     });
-    const normal = [0, 0, 0];
-    normal[axis] = sign;
-    return { corners, normal, top: axis === 2 && sign < 0, front: axis === 0 && sign > 0 };
+    const normal = [0, 0, 0], middle = [0, 0, 0];
+    normal[axis] = sign; middle[axis] = sign * half[axis];
+    return { corners, normal, middle, top: axis === 2 && sign < 0, front: axis === 0 && sign > 0 };
   });
-  const drawCube = (p, q) => {
-    const eye = FACES.map((face) => {
+  const faces = data.modules.map((module) => facesOf(module.hull.map((value) => value / 2)));
+  const drawHulls = (modules) => {
+    const eye = modules.flatMap(({ p, q, faces }) => faces.map((face) => {
       const corners = face.corners.map((corner) => add(p, turn(q, corner)));
-      const middle = add(p, turn(q, face.normal.map((value, i) => value * half[i])));
-      return { face, corners, near: project(middle)[2] - project(p)[2] };
-    });
-    eye.sort((a, b) => b.near - a.near);
-    for (const { face, corners, near } of eye) {
+      const middle = add(p, turn(q, face.middle)), depth = project(middle)[2];
+      return { q, face, corners, middle, depth, near: depth - project(p)[2] };
+    }));
+    eye.sort((a, b) => b.depth - a.depth);
+    for (const { q, face, corners, middle, near } of eye) {
       const light = 0.62 - 0.30 * turn(q, face.normal)[2];  // from above
       const base = face.front ? [255, 196, 92] : [122, 180, 226];
       const colour = base.map((value) => Math.round(value * Math.min(1, light))).join(",");
       polygon(corners, `rgba(${colour},${near < 0 ? 0.62 : 0.35})`, "rgba(235,245,255,0.85)");
       if (face.top && near < 0) {  // the tag
-        polygon(corners.map((corner) => between(add(p, turn(q, [0, 0, -half[2]])), corner, 0.45)), "rgba(12,24,38,0.8)", "rgba(255,255,255,0.9)");
+        polygon(corners.map((corner) => between(middle, corner, 0.45)), "rgba(12,24,38,0.8)", "rgba(255,255,255,0.9)");
       }
     }
   };
-  const drawGhost = (p, q) => {
-    for (const face of FACES) {
-      const corners = face.corners.map((corner) => add(p, turn(q, corner)));
-      path([...corners, corners[0]], "rgba(255,255,255,0.35)", 1, [3, 4]);
+  const drawGhost = (now) => {  // the body's modules where they would be without its error
+    const back = times(now.refQ, inverse(now.q));
+    for (const { p, q, faces } of now.modules.filter((module) => module.member)) {
+      const place = add(now.refP, turn(back, add(p, now.p, -1))), attitude = times(back, q);
+      for (const face of faces) {
+        const corners = face.corners.map((corner) => add(place, turn(attitude, corner)));
+        path([...corners, corners[0]], "rgba(255,255,255,0.35)", 1, [3, 4]);
+      }
     }
   };
-  const drawArrows = (p, q, force) => {
-    data.thrusters.p.forEach((position, i) => {
+  const drawArrows = ({ p, q, thrusters, force }) => {
+    thrusters.p.forEach((position, i) => {
       const newton = force[i];
       const [x, y] = project(add(p, turn(q, position)));
       g.beginPath(); g.arc(x, y, 2.6, 0, 7); g.fillStyle = "rgba(255,255,255,0.9)"; g.fill();
       if (newton === undefined || Math.abs(newton) < SMALLEST_ARROW_N) return;
       const from = add(p, turn(q, position));
-      const to = add(from, turn(q, data.thrusters.d[i]), newton * METRES_PER_NEWTON);
+      const to = add(from, turn(q, thrusters.d[i]), newton * METRES_PER_NEWTON);
       const colour = newton > 0 ? "#5fe0a6" : "#ffb454";
       path([from, to], colour, 2.6);
       const [x0, y0] = project(from), [x1, y1] = project(to);
@@ -193,16 +219,23 @@
     g.clearRect(0, 0, width, height);
     drawTank();
     const trail = [];
-    for (let i = 0; i <= now.i; i++) trail.push(magnified(i));
+    for (let i = 0; i <= now.i; i++) trail.push(...cut(magnified(i), i));
     trail.push(now.p);
+    const others = guests.map((m) => {
+      const { p, member } = data.modules[m];
+      return [...p.slice(0, now.i + 1).map((at, i) => (member[i] ? null : at)), now.modules[m].member ? null : now.modules[m].p];
+    });
     path([now.p, [now.p[0], now.p[1], high[2]]], "rgba(255,255,255,0.25)", 1, [2, 4]);
-    polygon(FACES[4].corners.map((corner) => { const c = add(now.p, turn(now.q, corner)); return [c[0], c[1], high[2]]; }), "rgba(3,12,22,0.35)");
+    for (const { p, q, faces } of now.modules) {
+      polygon(faces[4].corners.map((corner) => { const c = add(p, turn(q, corner)); return [c[0], c[1], high[2]]; }), "rgba(3,12,22,0.35)");
+    }
     path(reference, "rgba(255,255,255,0.75)", 1.4, [6, 6]);
     path(trail, "rgba(88,183,255,0.25)", 6);
     path(trail, "#58b7ff", 2.2);
-    if (state.magnify > 1 && judged(now.i)) drawGhost(now.refP, now.refQ);
-    drawCube(now.p, now.q);
-    drawArrows(now.p, now.q, now.force);
+    for (const other of others) path(other, "rgba(88,183,255,0.6)", 1.2);
+    if (state.magnify > 1 && judged(now.i)) drawGhost(now);
+    drawHulls(now.modules);
+    now.modules.forEach(drawArrows);
     drawSurface();
   };
 
@@ -241,7 +274,9 @@
     byId("hud-error").textContent = `${now.error.toFixed(1)} mm`;
     byId("hud-angle").textContent = `${now.angle.toFixed(2)} deg`;
     byId("hud-depth").textContent = `${now.truth[2].toFixed(3)} m`;
-    byId("hud-scale").textContent = state.magnify > 1 ? `the error is drawn ${state.magnify} times its size; dashed cube: reference` : "";
+    const apart = now.modules.every((module) => module.member) ? "" : "; other bodies are drawn as they are";
+    const scale = `the error is drawn ${state.magnify} times its size; dashed: reference${apart}`;
+    byId("hud-scale").textContent = state.magnify > 1 ? scale : "";
     byId("scrub").value = String(Math.round(1000 * state.t / end));
     byId("play").textContent = state.playing ? "Pause" : "Play";
   };

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.core.rotations import exp, multiply
+from firmware_py.core.rotations import exp, multiply, rotate
 from firmware_py.core.types import BodyRecord, Estimate, Event, Inputs, Outputs, Setpoint, Thrust
 from firmware_py.runtime.recorder import Recorder
 from hil.signals import TruthRecorder
@@ -82,4 +82,31 @@ def write_flight(
             recorder.record(Inputs(tick, time_ns, []), Outputs(tick, time_ns, [], False, events, [record]))
             if tick % 50 == 49:
                 recorder.flush()
+    recorder.close()
+
+
+def write_pair(folder: Path, *, ticks: int, joined_from: int, known_from: int, offset_m: tuple[float, float, float]) -> None:
+    """Write the two logs of a body of two modules, turning on its way, whose truth is `offset_m` off the reference.
+
+    Before tick `joined_from` its leader is alone and the other module comes nearer, 0.1 mm a tick; before `known_from` the
+    firmware steers the leader's hull.
+    """
+    zero, lever = np.zeros(3), np.array([0.105, 0.0, 0.0])
+    recorder = Recorder(folder)
+    with TruthRecorder(folder, (8, 8)) as truth:
+        for tick in range(ticks):
+            time_ns, joined, count = tick * PERIOD_NS, tick >= joined_from, 8 + 8 * (tick >= known_from)
+            q = exp(np.array([0.0, 0.0, 0.002 * tick]))
+            p_wb = spiral(0.01 * tick, 0.01 * ticks)
+            leader, other = p_wb - rotate(q, lever), p_wb + rotate(q, (1.0 + max(0, joined_from - tick) * 1e-4 / 0.105) * lever)
+            for m, p_wm in enumerate((leader, other)):
+                truth.record(tick, time_ns, m, p_wm, q, zero, zero, np.full(8, 2.0 + m), zero, POWER_W)
+            for members, at in (((0, 1), p_wb),) if joined else (((0,), leader), ((1,), other)):
+                truth.record_body(tick, time_ns, members, at, q, zero, zero)
+            steered = p_wb if count > 8 else leader
+            estimate = Estimate(steered, q, np.zeros(6), zero, zero, np.full(3, 1e-3), np.full(3, 2e-3), 0, np.nan, 0, 0, True)
+            setpoint = Setpoint(steered - np.array(offset_m), multiply(q, exp(np.full(3, 0.01))), zero, zero, zero, zero)
+            thrust = Thrust(np.full(count, 2.0), np.zeros(6), (1.0, 1.0), MARGIN)
+            record = BodyRecord(0, 1, 3, estimate, setpoint, np.zeros(6), thrust, thrust.force_n, False)
+            recorder.record(Inputs(tick, time_ns, []), Outputs(tick, time_ns, [], False, [], [record]))
     recorder.close()

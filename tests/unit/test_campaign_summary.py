@@ -66,6 +66,27 @@ def test_people_read_what_a_metric_goes_with() -> None:
     assert "Position RMSE, truth against reference goes with: mass_factor 1.00 (" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
+def test_noise_goes_with_nothing_and_a_true_cause_is_still_named() -> None:
+    rng = np.random.default_rng(0)
+    named = {"noise": 0, "cause": 0}
+    for _ in range(60):
+        world = rng.standard_normal((40, 13))
+        for kind, share in (("noise", 0.0), ("cause", 1.0)):
+            errors = share * world[:, 3:4] + rng.standard_normal((40, 2))
+            trials = [
+                {
+                    **trial(i, 0.0),
+                    "metrics": {"position_rmse_m": position, "attitude_rmse_rad": attitude},
+                    "world": {f"w{k}": value for k, value in enumerate(world[i])},
+                }
+                for i, (position, attitude) in enumerate(errors)
+            ]
+            said = io.StringIO()
+            print_campaign(summarise("spiral", trials), Console(file=said, width=160))
+            named[kind] += ("goes with:" if kind == "noise" else "goes with: w3 ") in said.getvalue()
+    assert named["noise"] <= 6 and named["cause"] >= 57
+
+
 def test_table_of_a_campaign_shows_units_failures_and_worst_seeds() -> None:
     console = Console(file=io.StringIO(), width=120)
     print_campaign(summarise("spiral", TRIALS), console)

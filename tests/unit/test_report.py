@@ -7,18 +7,20 @@ import math
 import re
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from rich.console import Console
 
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import Limit, Result, judge
 from hil.console import flight_progress, print_result
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown_limit, shown_value
-from hil.plots import Window, write_plots
+from hil.plots import STYLE, Window, overview, thrusters, write_plots
 from hil.report import CAPTIONS, Scene, animation, write_report
 from hil.signals import Flight, read_flight
-from tests.unit.flights import START_NS, write_flight
+from tests.unit.flights import START_NS, write_flight, write_pair
 
 TANK_M = np.array([[-0.65, -0.60, 0.0], [0.65, 0.60, 0.76]])
 WINDOW = Window(4.0, 8.0)
@@ -37,14 +39,20 @@ def result(flight: Flight) -> Result:
     return judge("spiral", 7, flight_metrics(flight.between(START_NS, START_NS + 4_000_000_000)), LIMITS)
 
 
-def scene(title: str = "Spiral") -> Scene:
+@pytest.fixture(scope="module")
+def dock(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """Two modules that lock in tick 100."""
+    folder = tmp_path_factory.mktemp("dock")
+    write_pair(folder, ticks=200, joined_from=100, known_from=112, offset_m=(0.003, 0.0, -0.004))
+    return read_flight(folder)
+
+
+def scene(title: str = "Spiral", modules: int = 1) -> Scene:
     vehicle = load_vehicle("modcube")
     return Scene(
         title=title,
         tank_m=TANK_M,
-        hull_m=vehicle.hull.size_m,
-        thruster_position_m=vehicle.positions,
-        thruster_direction=vehicle.directions,
+        modules=(vehicle,) * modules,
         force_limits_n=np.array([vehicle.force_min_n, vehicle.force_max_n]),
         window=WINDOW,
         paper_rmse_mm=20.92,
@@ -91,10 +99,54 @@ def test_markup_in_a_title_stays_text(flight: Flight, result: Result, tmp_path: 
 
 def test_animation_follows_the_true_robot(flight: Flight) -> None:
     shown = animation(flight, scene())
-    assert len(shown["t"]) == len(shown["p"]) == len(shown["force"]) == 201
+    (module,) = shown["modules"]
+    assert len(shown["t"]) == len(shown["p"]) == len(module["p"]) == len(module["force"]) == 201
     np.testing.assert_allclose(shown["p"], flight.truth["p_wm"][::4], atol=6e-6)
+    assert (module["p"], module["q"], set(module["member"]), shown["cuts"]) == (shown["p"], shown["q"], {1}, [])
     np.testing.assert_allclose(np.diff(shown["t"]), 0.04, atol=1e-9)
     json.dumps(shown, allow_nan=False)
+
+
+def test_animation_of_two_docked_modules_is_as_far_off_its_reference_as_the_metric_says(tmp_path: Path) -> None:
+    write_pair(tmp_path, ticks=200, joined_from=0, known_from=0, offset_m=(0.003, 0.0, -0.004))
+    flight = read_flight(tmp_path)
+    shown = animation(flight, scene(modules=2))
+    off_m = np.linalg.norm(np.subtract(shown["p"], shown["ref_p"]), axis=1)
+    np.testing.assert_allclose(off_m, flight_metrics(flight)["position_rmse_m"], atol=2e-5)
+    np.testing.assert_allclose(off_m, 0.005, atol=2e-5)
+    for module in shown["modules"]:
+        np.testing.assert_allclose(np.linalg.norm(np.subtract(module["p"], shown["p"]), axis=1), 0.105, atol=2e-5)
+        assert np.shape(module["force"]) == (50, len(module["thrusters"]["p"])) == (50, 8)
+    assert [module["force"][0][0] for module in shown["modules"]] == [2.0, 3.0]
+
+
+def test_animation_of_a_dock_has_both_modules_and_neither_jumps_when_they_join(dock: Flight) -> None:
+    shown = animation(dock, scene(modules=2))
+    json.dumps(shown, allow_nan=False)  # the page's parser takes no NaN
+    leader, other = (np.array(module["p"]) for module in shown["modules"])
+    gap_m = np.linalg.norm(leader - other, axis=1)
+    np.testing.assert_allclose([gap_m[0], gap_m[-1]], [0.22, 0.21], atol=2e-5)
+    assert np.abs(np.diff(gap_m)).max() < 5e-4
+    off_m = np.linalg.norm(np.subtract(shown["p"], shown["ref_p"]), axis=1)
+    np.testing.assert_allclose(off_m, 0.005, atol=2e-5)
+    assert shown["modules"][1]["member"] == [0] * 25 + [1] * 25
+    assert shown["cuts"] == [28]  # the firmware knows of the joint three frames after the faces locked
+
+
+def test_overview_of_a_dock_shows_the_other_module_until_it_joins(dock: Flight) -> None:
+    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+        figure = overview(dock, Window(0.0, 2.0), TANK_M, None)
+    (line,) = (line for line in figure.axes[0].lines if line.get_label() == "truth, another module")
+    seen = np.isfinite(line.get_data_3d()[0])
+    assert seen.tolist() == [True] * 100 + [False] * 100
+    pyplot.close(figure)
+
+
+def test_thrusters_that_joined_later_stay_inside_their_axes(dock: Flight) -> None:
+    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+        figure = thrusters(dock, Window(0.0, 2.0), np.array([-8.0, 10.0]))
+    assert all(axes.get_ylim() == pytest.approx((-3.45, 3.45)) for axes in figure.axes)
+    pyplot.close(figure)
 
 
 def test_values_are_shown_in_units_that_people_read() -> None:
