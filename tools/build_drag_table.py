@@ -15,6 +15,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -45,6 +46,9 @@ SPEED_M_S = 1.0
 SMALLEST_MOMENT_NM = 5e-4
 """Moments below it are not printed."""
 
+WIDTH = 100
+"""Characters of a table that does not go to a terminal."""
+
 RANDOM_SEED = 0
 METHODS = {
     "exact": areas_and_centroids,
@@ -63,6 +67,14 @@ def parse_cells(text: str) -> list[Cell]:
     if not cells or any(len(c) != 3 for c in cells):
         raise DescriptionError(f"cells {text!r}: write whole numbers x,y,z with spaces between modules, as 0,0,0 1,0,0")
     return [(c[0], c[1], c[2]) for c in cells]
+
+
+def shapes_of(text: str) -> dict[str, list[Cell]]:
+    """The shape that was asked for, or the paper's. Raises DescriptionError."""
+    if not text:
+        return PAPER_SHAPES
+    cells = parse_cells(text)
+    return {f"{len(cells)} module{'s' if len(cells) > 1 else ''}": cells}
 
 
 def table_of(vehicle: Vehicle, cells: Sequence[Cell], mode: str, cache: DragCache | None) -> DragTable:
@@ -90,7 +102,7 @@ def fibonacci(n: int) -> np.ndarray:
 
 def print_forces(console: Console, tables: dict[str, dict[str, DragTable]]) -> None:
     """Force, and moment about the centre of mass, in the seven flow directions."""
-    view = Table(title=f"drag at {SPEED_M_S:g} m/s")
+    view = Table(title=f"drag at {SPEED_M_S:g} m/s", title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=0)
     for heading in ("shape", "mode", "", *("(" + ",".join(map(str, flow)) + ")" for flow in FLOWS)):
         view.add_column(heading, justify="left" if len(view.columns) < 3 else "right", no_wrap=True)
     for shape, modes in tables.items():
@@ -123,7 +135,7 @@ def print_comparison(console: Console, vehicle: Vehicle, shapes: dict[str, list[
 
 
 def draw(path: Path, tables: dict[str, DragTable]) -> None:
-    """The drag spaces: in each direction of motion, a point at the size of the force."""
+    """The drag spaces: in each direction of motion, a point at the size of the force. Raises DescriptionError."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -140,13 +152,25 @@ def draw(path: Path, tables: dict[str, DragTable]) -> None:
         surface = np.moveaxis(force[..., None] * d, -1, 0)
         axes.plot_surface(*surface, facecolors=colours, rstride=1, cstride=1, shade=False)
         limit = float(force.max())
-        axes.set(xlim=(-limit, limit), ylim=(-limit, limit), zlim=(limit, -limit))
+        axes.set(xlim=(-limit, limit), ylim=(limit, -limit), zlim=(limit, -limit))  # FRD: z down, y then the other way
         axes.set(xlabel="x N", ylabel="y N", zlabel="z N")
-        axes.set_box_aspect((1, 1, 1))
-        axes.set_title(f"{name}: {force.min():.1f} to {force.max():.1f} N at {SPEED_M_S:g} m/s")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+        axes.set_box_aspect((1, 1, 1), zoom=0.92)  # room for the label of z
+        axes.set_title(f"{name}: {force.min():.1f} to {force.max():.1f} N at {SPEED_M_S:g} m/s", y=1.0)  # left to itself it is cut
+    try:
+        figure.savefig(path, dpi=110, format=path.suffix[1:] or "png")
+    except (OSError, ValueError) as error:  # ValueError: no such format
+        raise DescriptionError(f"--out {path}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
     plt.close(figure)
+
+
+def make_room(path: Path) -> None:
+    """Makes the picture's folder, before the minutes that its contents may take. Raises DescriptionError."""
+    if path.is_dir():
+        raise DescriptionError(f"--out {path}: is a folder; a file is needed")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DescriptionError(f"--out {path}: cannot be written: {error.strerror}") from None
 
 
 @app.command()
@@ -161,25 +185,27 @@ def main(
 ) -> None:
     """Build drag tables, print the force in the paper's seven flow directions, draw the drag spaces."""
     console = Console(highlight=False)
+    console = console if console.is_terminal else Console(highlight=False, width=WIDTH)
     store = DragCache(cache or default_folder(os.environ, Path.home()))
     try:
         if mode not in METHODS:
             raise DescriptionError(f"mode {mode!r} is unknown; there are {', '.join(METHODS)}")
         description = load_vehicle(vehicle)
-        shapes = {f"{len(parse_cells(cells))} modules": parse_cells(cells)} if cells else PAPER_SHAPES
+        shapes = shapes_of(cells)
+        make_room(out)
         modes = list(METHODS) if compare else [mode]
         tables = {
             shape: {m: table_of(description, placed, m, store) for m in modes} for shape, placed in shapes.items()
         }
+        if description.assumption:
+            console.print(f"assumed: {description.assumption}")
+        print_forces(console, tables)
+        if compare:
+            print_comparison(console, description, shapes, directions)
+        draw(out, {shape: by_mode[modes[0]] for shape, by_mode in tables.items()})
     except DescriptionError as error:
         Console(stderr=True, highlight=False).print(str(error), soft_wrap=True)
         raise typer.Exit(2) from None
-    if description.assumption:
-        console.print(f"assumed: {description.assumption}")
-    print_forces(console, tables)
-    if compare:
-        print_comparison(console, description, shapes, directions)
-    draw(out, {shape: by_mode[modes[0]] for shape, by_mode in tables.items()})
     console.print(f"drag spaces: {out}; outlines kept in {store.folder}", soft_wrap=True)
 
 

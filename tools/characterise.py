@@ -102,7 +102,7 @@ def run(given: argparse.Namespace) -> None:
     else:
         layouts = [of_vehicle(load_vehicle(name)) for name in given.vehicle]
         layouts += _assemblies(given.assembly, load_vehicle(given.module)) if given.assembly is not None else []
-        found = _all({layout.name: layout for layout in layouts}, settings, given.jobs)
+        found = _all(_by_name(layouts), settings, given.jobs)
         _print(found)
         if given.out:
             _write(given.out, "capability", found, table.rows_of(found), {name: name for name in found})
@@ -119,6 +119,14 @@ def _assemblies(shape: str, module: Vehicle) -> list[Layout]:
         return _fleet(Path(shape))
     cells = _cells(shape)
     return [of_modules(cells, [0] * len(cells), [module] * len(cells), name=f"{module.name} {shape}")]
+
+
+def _by_name(layouts: Sequence[Layout]) -> dict[str, Layout]:
+    """The columns. Raises DescriptionError where two would be one."""
+    names = [layout.name for layout in layouts]
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise DescriptionError(f"{names.count(twice[0])} vehicles have the name {twice[0]!r}; give each file another `name`")
+    return dict(zip(names, layouts, strict=True))
 
 
 def _fleet(path: Path) -> list[Layout]:

@@ -12,7 +12,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from characterise_surfaces import SPACES, Picture, pictures
+from characterise_surfaces import FLAT, SPACES, Picture, pictures
 from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -68,6 +68,11 @@ def _row_title(figure: Any, cell: Any, text: str, width: float) -> None:
 
 
 def _solid(axes: Any, picture: Picture, limit: float) -> None:
+    axes.set_title(picture.caption, fontsize=8, pad=0)
+    if picture.limit == 0.0:
+        axes.set(xticks=[], yticks=[], zticks=[])
+        axes.text2D(0.5, 0.5, "degenerate", transform=axes.transAxes, ha="center", va="center", fontsize=9)
+        return
     colour = _DECLARED if picture.declared else _SURFACE[picture.space]
     edge = "#00000030" if picture.space == "power" else "#000000a0"
     for polygons, face, alpha, line in (
@@ -86,7 +91,6 @@ def _solid(axes: Any, picture: Picture, limit: float) -> None:
         axis.set_tick_params(labelsize=7, pad=-2)
         axis.labelpad = -6
         axis.set_label_text(f"{name}, {picture.unit}")
-    axes.set_title(picture.caption, fontsize=8, pad=0)
 
 
 def _tick(limit: float) -> float:
@@ -96,7 +100,9 @@ def _tick(limit: float) -> float:
 
 
 def _violins(figure: Any, grid: Any, row: int, frame: str, found: Mapping[str, Capability]) -> None:
-    limit = max(float(np.abs(c.power[frame].forces).max()) for c in found.values()) * 1.05
+    widest = {each: 1.05 * max(float(np.abs(c.power[each].forces).max()) for c in found.values()) for each in UNITS}
+    is_flat = widest[frame] <= FLAT * max(widest.values())
+    limit = 1.0 if is_flat else widest[frame]
     first: Any = None
     for column, result in enumerate(found.values()):
         power, count = result.power[frame], result.layout.count
@@ -110,6 +116,9 @@ def _violins(figure: Any, grid: Any, row: int, frame: str, found: Mapping[str, C
         axes.set_xticks(range(0, count, 1 if count <= _MOST_MARKED else 4))
         axes.tick_params(labelsize=7)
         axes.grid(axis="y", alpha=0.3)
+        if is_flat:
+            axes.set_yticks([])
+            axes.text(0.5, 0.5, "degenerate", transform=axes.transAxes, ha="center", va="center", fontsize=9)
         axes.set_title(f"variance {power.variance:.3g} N$^2$", fontsize=8, pad=2)
         axes.set_xlabel("thruster", fontsize=8, labelpad=1)
         if column == 0:

@@ -33,7 +33,7 @@ def write_report(path: Path, found: Mapping[str, Capability], titles: Mapping[st
             {
                 "title": next(iter(parts.values())).title,
                 "axes": ["surge", "sway", "heave"] if key[1] == "force" else ["roll", "pitch", "yaw"],
-                "limit": max(part.limit for part in parts.values()),
+                "limit": max(part.limit for part in parts.values()) or 1.0,  # where all are degenerate
                 "kind": key[0],
                 "unit": "W" if key[0] == "power" else UNITS[key[1]],
                 "panels": [_panel(titles[name], part) for name, part in parts.items()],

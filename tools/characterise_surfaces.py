@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ from firmware_py.prepare.capability.wrench import embed
 SPACES = (("power", "force"), ("power", "torque"), ("wrench", "force"), ("wrench", "torque"))
 NORMALISATION = "equal_total_thrust"
 """Drawn, so that vehicles of any size can be seen on one scale."""
+FLAT = 1e-6
+"""Share of the other frame's extent below which a space is what rounding left of none."""
 _POLAR, _AZIMUTH, _ELLIPSOID = 33, 65, (13, 25)
 _TURN = 120
 
@@ -31,7 +34,7 @@ class Picture:
         polygons: (k, 3) corners in order, of a closed surface or of one flat piece; none where nothing can be reached.
         ellipsoid: likewise.
         declared: the passive degree of freedom is declared.
-        limit: largest coordinate, for a common scale.
+        limit: largest coordinate, for a common scale; 0: degenerate, nothing can be drawn.
     """
 
     space: str
@@ -47,7 +50,12 @@ class Picture:
 
 def pictures(result: Capability) -> dict[tuple[str, str], Picture]:
     """All four spaces of one vehicle."""
-    return {(s, f): _power(result, f) if s == "power" else _wrench(result, f) for s, f in SPACES}
+    found = {(s, f): _power(result, f) if s == "power" else _wrench(result, f) for s, f in SPACES}
+    for space, frame in SPACES:
+        picture, other = found[space, frame], found[space, "torque" if frame == "force" else "force"]
+        if picture.limit <= FLAT * other.limit:
+            found[space, frame] = dataclasses.replace(picture, polygons=[], ellipsoid=[], limit=0.0)
+    return found
 
 
 def _power(result: Capability, frame: str) -> Picture:
@@ -74,7 +82,7 @@ def _wrench(result: Capability, frame: str) -> Picture:
     if declared:
         reach = result.declared[frame][NORMALISATION]
     if reach.section is None or reach.ellipsoid is None:
-        return Picture("wrench", frame, unit, title, "degenerate: V = 0", [], [], False, 1e-9)
+        return Picture("wrench", frame, unit, title, "degenerate: V = 0", [], [], False, 0.0)
     polygons, ellipsoid = _outline(reach)
     limit = max(float(np.abs(polygon).max()) for polygon in polygons)
     size = f"({unit})$^{len(reach.section.components)}$" if " " in unit else f"{unit}$^{len(reach.section.components)}$"

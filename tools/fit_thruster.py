@@ -3,9 +3,10 @@
 
     .venv/bin/python tools/fit_thruster.py bench.csv --voltage 12 --out curve.toml
 
-The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w, above 0 wherever it pushes. The force is
-brought to one voltage by its square. Written are the fields of a vehicle file's [curve], for it or for tools/identify.py --curve; what
-was not measured (power, lag, speed) is --vehicle's.
+The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w, above 0 wherever it pushes. Force is brought
+to one voltage by its square, power by its cube. Power measured at the command nearest zero, where nothing pushes, is the electronics',
+which a vehicle file counts apart (idle_w): it is taken off first. Written are the fields of a vehicle file's [curve], for it or for
+tools/identify.py --curve; what was not measured (power, lag, speed) is --vehicle's.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: flo
     """The curve, and the root mean square of what is left of the forces beyond the deadband, N. Raises DescriptionError.
 
     Args:
-        points: columns of `read_points`. like: what was not measured. voltage_v: to which forces are brought.
+        points: columns of `read_points`. like: what was not measured. voltage_v: to which force and power are brought.
         zero_n: size of a force that counts as none.
     """
     if not VOLTAGE.low <= voltage_v <= VOLTAGE.high:
@@ -114,14 +115,32 @@ def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: flo
         between = 0.5 * (float(x.min()) + float(idle.max())) if idle.size else 0.0
         edges.append(float(between**powers @ changed[side]) if idle.size else 0.0)
         if "power_w" in points:
-            power = points["power_w"][works]
-            if np.any(power <= 0.0):
-                raise DescriptionError(f"{side}: power_w {power.min():g} with a force; it must be above 0 wherever the thruster pushes")
+            power = _propeller_power(points, works, voltage_v, idle_power(points, zero_n) or 0.0, side)
             changed[f"power_{side}"] = rising_polynomial(y, power, float(np.sum(changed[side])))
     curve = dataclasses.replace(
         like, voltage_v=voltage_v, deadband_n=float(np.mean(edges)), **{name: frozen_array(c) for name, c in changed.items()}
     )
     return curve, float(np.sqrt(np.mean(np.square(np.concatenate(left)))))
+
+
+def idle_power(points: dict[str, np.ndarray], zero_n: float) -> float | None:
+    """The electronics': power at the command nearest zero, W; None where it was not measured or something pushes there."""
+    size = np.abs(points["command"])
+    nearest = size == size.min()
+    if "power_w" not in points or np.any(np.abs(points["force_n"][nearest]) > zero_n):
+        return None
+    return float(np.mean(points["power_w"][nearest]))
+
+
+def _propeller_power(points: dict[str, np.ndarray], works: np.ndarray, voltage_v: float, idle_w: float, side: str) -> np.ndarray:
+    """Power above idle at the points that push, brought to `voltage_v`, W. Raises DescriptionError."""
+    power = points["power_w"][works]
+    if np.any(power <= 0.0):
+        raise DescriptionError(f"{side}: power_w {power.min():g} with a force; it must be above 0 wherever the thruster pushes")
+    if power.max() <= idle_w:
+        raise DescriptionError(f"{side}: power_w {power.max():g} at the most is not above the {idle_w:g} at zero command")
+    # At one command the speed goes with the voltage, force with the speed's square, power with its cube.
+    return np.asarray((power - idle_w) * ((voltage_v / points["voltage_v"][works]) ** 3 if "voltage_v" in points else 1.0))
 
 
 def _number(text: str | None, path: Path, line: int) -> float:
@@ -153,13 +172,18 @@ def main() -> int:
     try:
         like = load_vehicle(given.vehicle).curve
         voltage_v = like.voltage_v if given.voltage is None else given.voltage
-        curve, left_n = fit_curve(read_points(given.csv), like, voltage_v, given.zero)
+        points = read_points(given.csv)
+        curve, left_n = fit_curve(points, like, voltage_v, given.zero)
         given.out.write_text(checked_toml(curve, given.out), encoding="utf-8")
     except (DescriptionError, OSError) as error:
         print(f"fit_thruster: {error}", file=sys.stderr)
         return 2
     print(f"{given.out}: {np.sum(curve.forward):.3g} N forward, {np.sum(curve.reverse):.3g} N reverse at {curve.voltage_v:g} V;", end=" ")
     print(f"deadband {curve.deadband_n:.2g} N; residual {left_n:.2g} N RMS")
+    if "power_w" in points:
+        idle_w = idle_power(points, given.zero)
+        taken = "none was measured at zero command: nothing taken off" if idle_w is None else f"{idle_w:.3g} W at zero command taken off"
+        print(f"power: {taken} for the electronics, which the vehicle file's idle_w counts")
     return 0
 
 

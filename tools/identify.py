@@ -3,7 +3,7 @@
 
     .venv/bin/python tools/identify.py runs/shaken                                  # no reference: ratios only
     .venv/bin/python tools/identify.py runs/shaken --curve curve.toml --thruster 1 --accuracy 2
-    .venv/bin/python tools/identify.py runs/shaken --weight 2.0:0.22:60:120
+    .venv/bin/python tools/identify.py runs/shaken --weight 2.0:0.22:60:120 --hung-at 0 0 0.105
     .venv/bin/python tools/identify.py --excitation shake.toml                      # the flight to begin with
 
 A log is the folder that `modcube run --out` or `modcube hil run --out` left; can.log and signals.mcap are read, truth.mcap is not.
@@ -33,6 +33,9 @@ from rich.table import Table
 from firmware_py.description.schema import DescriptionError, build, read_toml, to_toml
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
+FARTHEST_M = 10.0
+"""From the hull's middle, as the vehicle file permits of its parts."""
+
 
 def read_curve(path: Path) -> ThrusterCurve:
     """A curve that tools/fit_thruster.py wrote. Raises DescriptionError."""
@@ -41,17 +44,19 @@ def read_curve(path: Path) -> ThrusterCurve:
     return curve
 
 
-def parse_weight(text: str) -> Weight:
-    """NEWTON:KG:FROM:UNTIL. Raises DescriptionError."""
+def parse_weight(text: str, at_m: Sequence[float] | None = None) -> Weight:
+    """NEWTON:KG:FROM:UNTIL, and where it hung. Raises DescriptionError."""
     try:
-        weight = Weight(*(float(word) for word in text.split(":")))
-    except (ValueError, TypeError):
+        newton, kg, from_s, until_s = (float(word) for word in text.split(":"))
+    except ValueError:
         raise DescriptionError(
             f"--weight {text!r} is not NEWTON:KG:FROM:UNTIL, such as 2.0:0.22:60:120 (weight in water, mass in air, seconds of the log)"
         ) from None
-    if not all(map(math.isfinite, weight)) or weight.newton == 0.0 or weight.kg < 0.0 or not 0.0 <= weight.from_s < weight.until_s:
+    if not all(map(math.isfinite, (newton, kg, from_s, until_s))) or newton == 0.0 or kg < 0.0 or not 0.0 <= from_s < until_s:
         raise DescriptionError(f"--weight {text!r}: a weight other than 0, a mass of 0 or more, and a beginning before its end are needed")
-    return weight
+    if at_m is not None and not all(abs(m) <= FARTHEST_M for m in at_m):
+        raise DescriptionError(f"--hung-at {' '.join(f'{m:g}' for m in at_m)}: three distances of {FARTHEST_M:g} m at most are needed")
+    return Weight(newton, kg, from_s, until_s, None if at_m is None else (at_m[0], at_m[1], at_m[2]))
 
 
 def check_hung(weight: Weight, flight: Equations) -> None:
@@ -94,7 +99,9 @@ def identify(given: argparse.Namespace) -> int:
         given.excitation.write_text(excitation(list(MOTIONS), given.vehicle, given.space), encoding="utf-8")
         print(f"fly it: modcube hil run {given.excitation}")
         return 0
-    weight = parse_weight(given.weight) if given.weight else None
+    if given.hung_at and not given.weight:
+        raise DescriptionError("--hung-at says where a weight hung; give --weight with it")
+    weight = parse_weight(given.weight, given.hung_at) if given.weight else None
     if weight is not None and len(given.logs) > 1:
         raise DescriptionError("--weight says when the weight hung in one log; give one LOG with it")
     recordings = [read_recording(Path(log)) for log in given.logs]
@@ -137,7 +144,8 @@ def main() -> int:
     parser.add_argument("--curve", type=Path, metavar="FILE", help="curve of one thruster, from tools/fit_thruster.py")
     parser.add_argument("--thruster", type=int, default=1, help="which thruster that was, 1 the first")
     parser.add_argument("--accuracy", type=float, default=2.0, metavar="PERCENT", help="bounds of the load cell's scale")
-    parser.add_argument("--weight", metavar="NEWTON:KG:FROM:UNTIL", default="", help="a known weight hung below the middle so long")
+    parser.add_argument("--weight", metavar="NEWTON:KG:FROM:UNTIL", default="", help="a known weight hung on so long")
+    parser.add_argument("--hung-at", type=float, nargs=3, metavar="M", help="where, x y z of the body; else the middle of its bottom")
     parser.add_argument("--excitation", type=Path, metavar="FILE", help="where the scenario of the missing motions goes")
     parser.add_argument("--space", type=float, nargs=3, metavar="M", default=list(SPACE_M), help="room to either side, world x y z")
     parser.add_argument("--vehicle", default="modcube", help="of the flight to begin with")

@@ -7,8 +7,9 @@ Newton and Euler about the centre of mass, body frame, motion relative to the wa
 
 a is what the accelerometer feels plus gravity, w' the derivative of the gyro; F_i is the thruster's curve over the commands that went
 out, behind a first-order lag, at the measured voltage; v the velocity less the current's; s the first moment of mass about where the
-file has the centre. M, I, s, D, n, arm and k have one factor in common that no motion shows. Both sides are seen through one window
-of 11 ticks: that of a straight line's slope through the gyro.
+file has the centre. A known weight adds its force, less its mass times a, to the first, and the moment of that where it hangs to the
+second. M, I, s, D, n, arm and k have one factor in common that no motion shows. Both sides are seen through one window of 11 ticks:
+that of a straight line's slope through the gyro.
 """
 
 from __future__ import annotations
@@ -87,6 +88,8 @@ class Weight(NamedTuple):
     """In air."""
     from_s: float
     until_s: float
+    at_m: tuple[float, float, float] | None = None
+    """Where, module frame as in the vehicle file; None: the middle of the hull's bottom."""
 
 
 def beginning(vehicle: Vehicle) -> dict[str, np.ndarray]:
@@ -135,6 +138,7 @@ class Equations:
         self._nodes = _drag_nodes(vehicle)
         self._loaded = _share(self.time_s, weight)
         self._load = weight or Weight(0.0, 0.0, 0.0, 0.0)
+        self._hung = recording.body.r_bm[0] + hung_at(self._load, vehicle)
         self._kept: dict[object, tuple[bytes, object]] = {}
 
     def predict(self, x: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -152,7 +156,8 @@ class Equations:
         speed = np.abs(v)
         damping = x["rotational"] * np.linalg.norm(w, axis=1, keepdims=True) + x["crossflow"] * (speed.sum(axis=1, keepdims=True) - speed)
         moment = tau[:, 3:] - damping * w - _cross(x["arm"], self._down) - _cross(s, a) - _cross(w, inertia * w)
-        moment = moment - _cross(v, mass * v)
+        load = self._loaded[:, None] * (self._load.newton * self._down - self._load.kg * a)
+        moment = moment - _cross(v, mass * v) + _cross(self._hung, load)
         return np.hstack([force / (mass + self._load.kg * self._loaded[:, None]) + x["bias"], moment / inertia])
 
     def _once(self, key: object, at: np.ndarray, compute):  # type: ignore[no-untyped-def]
@@ -225,6 +230,11 @@ def _drag_nodes(vehicle: Vehicle) -> list[np.ndarray]:
     """Drag tables for face and edge coefficients of (1, 0) and (0, 1)."""
     pairs = [dataclasses.replace(vehicle.drag, cd_face=face, cd_edge=1.0 - face) for face in (1.0, 0.0)]
     return [assemble_vehicle(dataclasses.replace(vehicle, drag=drag)).drag.nodes for drag in pairs]
+
+
+def hung_at(weight: Weight, vehicle: Vehicle) -> np.ndarray:
+    """(3,) where a weight hung, module frame, m."""
+    return np.array(weight.at_m) if weight.at_m is not None else 0.5 * vehicle.hull.size_m * DOWN
 
 
 def _share(time_s: np.ndarray, weight: Weight | None) -> np.ndarray:

@@ -50,6 +50,10 @@ SHAKE = np.repeat([0.01, 0.02], 3)
 """Acceleration of one sine, m/s^2 and rad/s^2: all together stay far from the thrusters' limits."""
 MOST_STRAY = 0.05
 """Stable loops have up to 0.015, by the beat of tags and ticks; those that swing 0.14 and more (measured)."""
+LEAST_SHARE = 0.1
+"""Of a force or moment asked for along one axis, what the thrusters must give of it for the axis to be controlled. The shares add up to
+the rank, so one axis always is. Layout.unreachable is stricter: it has the surge of a BlueROV2, which tilts it a little, beside its pitch.
+"""
 HEIGHT_M = 1.5
 HOME = rest_at(np.array([0.0, 0.0, HEIGHT_M]), np.array([1.0, 0.0, 0.0, 0.0]))
 STEP = np.repeat([0.05, math.radians(5.0)], 3)
@@ -86,6 +90,8 @@ class Response(NamedTuple):
     loop: np.ndarray
     stray: float = 0.0
     """Share of what the controller gives that is beside the sines: a loop that swings by itself has much of it."""
+    controlled: bool = True
+    """Whether the thrusters can push along the axis."""
 
 
 class Loop:
@@ -174,6 +180,11 @@ def _world(body: Body, vehicles: Sequence[Vehicle], lag_s: float) -> World:
     )  # fmt: skip
 
 
+def controlled(body: Body) -> np.ndarray:
+    """(6,) whether the thrusters can push along each axis."""
+    return np.asarray(np.diag(body.thrusters.matrix @ body.thrusters.pinv) >= LEAST_SHARE)
+
+
 def lines() -> np.ndarray:
     """(6, LINES) whole numbers of periods in the record, all different: the sines of each axis."""
     span_s = RECORD_TICKS * PERIOD_NS * 1e-9
@@ -200,7 +211,8 @@ def measure(modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicl
     base = 2.0 * math.pi / (RECORD_TICKS * PERIOD_NS * 1e-9)
     power = np.square(np.abs(u[1:]))
     beside = np.delete(power, chosen.ravel() - 1, axis=0).sum(axis=0) / np.maximum(power.sum(axis=0), 1e-300)
-    return [Response(base * n, -u[n, axis] / p[n, axis], float(beside[axis])) for axis, n in enumerate(chosen)]
+    pushed = controlled(loop.body)
+    return [Response(base * n, -u[n, axis] / p[n, axis], float(beside[axis]), bool(pushed[axis])) for axis, n in enumerate(chosen)]
 
 
 def step_responses(parameters: Parameters, axes: Sequence[int], vehicle: str = "modcube") -> np.ndarray:
@@ -234,27 +246,27 @@ class Margins(NamedTuple):
 
 
 def margins(response: Response) -> Margins:
-    """Margins of one loop, interpolated over the logarithm of the frequency; infinite where nothing is crossed.
+    """Margins of one loop, interpolated over the logarithm of the frequency; infinite where an axis is not controlled.
 
-    A loop that swings by itself has none. Where the phase reaches -180 degrees above the last frequency, the gain there counts: it is
-    not more by then.
+    A loop that swings by itself has none, and none can be stated of one that does not cross 0 dB at the frequencies measured. Where the
+    phase reaches -180 degrees above the last frequency, the gain there counts: it is not more by then.
     """
+    if not response.controlled:
+        return Margins(math.inf, math.inf, math.nan)
     if response.stray > MOST_STRAY or np.isnan(response.loop).any():
         return Margins(0.0, 0.0, math.nan)
     x = np.log(response.frequency)
-    gain_db = 20.0 * np.log10(np.abs(response.loop))
+    gain_db = 20.0 * np.log10(np.maximum(np.abs(response.loop), 1e-300))
+    crossovers = _crossings(x, gain_db)
+    if not crossovers:
+        return Margins(0.0, 0.0, math.nan)
     phase = np.unwrap(np.angle(response.loop))
     phase += -2.0 * math.pi * round((phase[int(np.argmin(np.abs(gain_db)))] + math.pi) / (2.0 * math.pi))  # near -180 at crossover
     turns = math.pi * np.array([-3.0, -1.0, 1.0])
     gains = [np.interp(c, x, gain_db) for turn in turns for c in _crossings(x, phase - turn)]
     gains += [gain_db[-1]] if phase[-1] > -math.pi else []
-    crossovers = _crossings(x, gain_db)
     phases = [abs((math.degrees(np.interp(c, x, phase)) + 360.0) % 360.0 - 180.0) for c in crossovers]
-    return Margins(
-        min((abs(g) for g in gains), default=math.inf),
-        min(phases, default=math.inf),
-        math.exp(max(crossovers)) if crossovers else math.nan,
-    )
+    return Margins(min((abs(g) for g in gains), default=math.inf), min(phases), math.exp(max(crossovers)))
 
 
 def _crossings(x: np.ndarray, y: np.ndarray) -> list[float]:

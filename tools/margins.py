@@ -5,7 +5,8 @@ margins.py                                     # the shipped gains, bodies of 1,
 margins.py --controller runs/tune/parameters.toml --modules 1
 margins.py --vehicle bluerov2_heavy --modules 1 --out runs/margins
 
-Status 1 where a margin is under its bar. In DIR: margins.json and margins.png, the Bode plot.
+Status 1 where a margin is under its bar, or a controlled axis swings or never crosses 0 dB. An axis that the thrusters cannot push is
+named and does not count. In DIR: margins.json and margins.png, the Bode plot.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from argument_types import whole
 from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure
 from rich import box
 from rich.console import Console
@@ -61,7 +63,8 @@ def rows(found: Found) -> list[dict[str, Any]]:
                 by_gain, by_phase = (min(worlds, key=lambda s, k=k: each[s][k]) for k in (0, 1))  # type: ignore[misc]
                 found_margins = Margins(each[by_gain].gain_db, each[by_phase].phase_deg, each[by_phase].crossover_rad_s)
                 passed = all(value >= bar for value, bar in zip(found_margins[:2], BARS[kind], strict=True))
-                result.append({"modules": modules, "axis": name, "kind": kind, **found_margins._asdict(), "passed": passed, "at": by_phase})
+                row = {"modules": modules, "axis": name, "kind": kind, "controlled": responses[NOMINAL][axis].controlled}
+                result.append(row | found_margins._asdict() | {"passed": passed or not row["controlled"], "at": by_phase})
     return result
 
 
@@ -71,9 +74,14 @@ def print_table(table_rows: Sequence[dict[str, Any]]) -> None:
     for column in ("modules", "axis", "crossover", "gain", "phase", "gain, worst", "phase, worst", "worst at mass, inertia, lag", ""):
         table.add_column(column, justify="left" if column in ("axis", "") else "right")
     for nominal, worst in zip(table_rows[::2], table_rows[1::2], strict=True):
+        if not nominal["controlled"]:
+            table.add_row(str(nominal["modules"]), nominal["axis"], *["-"] * 6, "not controlled")
+            continue
         verdict = "" if nominal["passed"] and worst["passed"] else "FAILED"
+        if math.isnan(worst["crossover_rad_s"]):
+            verdict += ": no crossover"
         table.add_row(
-            str(nominal["modules"]), nominal["axis"], f"{nominal['crossover_rad_s']:.1f} rad/s",
+            str(nominal["modules"]), nominal["axis"], f"{nominal['crossover_rad_s']:.1f} rad/s".replace("nan rad/s", "none"),
             *(f"{row[key]:.1f} {unit}" for row in (nominal, worst) for key, unit in (("gain_db", "dB"), ("phase_deg", "deg"))),
             ", ".join(f"{v:g}" for v in worst["at"]), verdict,
         )  # fmt: skip
@@ -93,6 +101,8 @@ def draw(path: Path, found: Found) -> None:
     figure, panels = plt.subplots(2, len(columns), figsize=(4.1 * len(columns), 6.4), sharex=True, sharey="row", squeeze=False)
     for (modules, first), (gain, phase) in zip(columns, panels.T, strict=True):
         for axis, colour in zip(range(first, first + 3), COLOURS, strict=True):
+            if not found[modules][NOMINAL][axis].controlled:
+                continue
             curves = [bode(r[axis]) for r in found[modules].values()]
             w = found[modules][NOMINAL][axis].frequency
             for panel, part in ((gain, 0), (phase, 1)):
@@ -102,7 +112,8 @@ def draw(path: Path, found: Found) -> None:
         gain.axhline(0.0, color="#30363d", linewidth=0.8)
         phase.axhline(-180.0, color="#30363d", linewidth=0.8)
         gain.set_title(f"{modules} module{'s' if modules > 1 else ''}")
-        gain.legend(frameon=False, loc="upper right")
+        if gain.get_legend_handles_labels()[0]:
+            gain.legend(frameon=False, loc="upper right")
         phase.set_xlabel("frequency, rad/s")
     panels[0, 0].set(xscale="log", ylabel="loop gain, dB", ylim=(-40, 45))
     panels[1, 0].set(ylabel="phase, deg", ylim=(-400, -80), yticks=range(-360, -80, 45))
@@ -127,7 +138,7 @@ def main() -> int:
     parser.add_argument("--modules", type=int, nargs="+", choices=list(BODIES), default=list(BODIES), help="sizes of body")
     parser.add_argument("--controller", default="modcube", help=f"{', '.join(CONTROLLERS)}, or a file of parameters")
     parser.add_argument("--vehicle", default="modcube", help="vehicle of every module")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
     parser.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/margins"), help="for margins.json and margins.png")
     given = parser.parse_args()
     try:

@@ -59,20 +59,32 @@ class Typist:
 
 
 def proposals(now: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]) -> Iterator[tuple[str, float]]:
-    """Steps without end, until all are too small: name and value, one parameter after the other. `now` is read anew for each."""
+    """Steps without end, until all are too small: name and value, one parameter after the other. `now` is read anew for each.
+
+    What did not change `now` is not proposed again.
+    """
     factor = FACTOR
+    refused: set[tuple[str, float]] = set()
     while factor > SMALLEST_FACTOR:
         helped = False
         for name in bounds:
             for way in (factor, 1.0 / factor):
                 before = now[name]
-                value = min(max(before * way, bounds[name][0]), bounds[name][1])
-                if value != before:
-                    yield name, float(str(np.float32(value)))
+                value = float(str(np.float32(_stepped(before, way, bounds[name]))))
+                if np.float32(value) == np.float32(before) or (name, value) in refused:
+                    continue
+                yield name, value
                 if now[name] != before:
                     helped = True
                     break
+                refused.add((name, value))
         factor = factor if helped else factor**0.5
+
+
+def _stepped(before: float, way: float, bounds: tuple[float, float]) -> float:
+    """`before` times `way` within the bounds; from outside as far as that towards them, and away from them not at all."""
+    least, most = sorted((before, before * way))
+    return min(max(min(max(before * way, bounds[0]), bounds[1]), least), most)
 
 
 def tune_live(objective: Objective, live: str, steps: int, seconds: float, out: Path) -> int:
@@ -169,6 +181,10 @@ def _steps(
     seconds: float,
 ) -> bool:
     """The steps; whether the person keeps what was found. `now` follows."""
+    for name, (low, high) in bounds.items():
+        if not np.float32(low) <= np.float32(now[name]) <= np.float32(high):
+            leads = f"by a factor of {FACTOR:g} a step at most" if now[name] * (low + high) > 0.0 else "by no factor, so it stays"
+            print(f"{name} {now[name]:g} is outside the objective's {low:g} to {high:g}: it moves there {leads}", flush=True)
     best = _cost(objective, vehicle.look(seconds))
     print(f"as it is: {best:.4f}", flush=True)
     for number, (name, value) in zip(range(1, steps + 1), proposals(now, bounds), strict=False):

@@ -1,6 +1,7 @@
 """Choice of shape: the list of shapes, tasks, ranking, and the command line of tools/characterise.py."""
 
 import csv
+import dataclasses
 import importlib
 import json
 import re
@@ -10,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
+from firmware_py.prepare.capability import summary
 from firmware_py.prepare.capability.choice import fitness, rank
 from firmware_py.prepare.capability.layout import of_modules
 from firmware_py.prepare.capability.polycubes import canonical, polycubes, poses
@@ -147,6 +150,7 @@ def characterise(*arguments: str) -> subprocess.CompletedProcess[str]:
         ("no_such_file.toml",),
         ("--assembly", "2x0x1"),
         ("--assembly", "0,0,0 2,0,0"),
+        ("modcube", "modcube"),
         ("modcube", "--directions", "many"),
         ("--choose", "3"),
         ("--choose", "9", "--task", "no_such_file.toml"),
@@ -162,6 +166,36 @@ def test_wrong_command_line_is_answered_in_one_line(
     shown = capsys.readouterr()
     assert stopped.value.code == 2
     assert shown.out == "" and shown.err.count("\n") == 1, shown.err
+
+
+def test_two_vehicles_of_one_name_are_not_one_column(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "lighter.toml"
+    copy.write_text((ROOT / "firmware_py" / "vehicles" / "modcube.toml").read_text().replace("dry_kg = 2.6", "dry_kg = 2.5"))
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    monkeypatch.setattr(sys, "argv", ["characterise.py", "modcube", str(copy)])
+    with pytest.raises(SystemExit) as stopped:
+        importlib.import_module("characterise").main()
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err == "2 vehicles have the name 'modcube'; give each file another `name`\n"
+
+
+def test_space_that_rounding_left_of_none_is_called_degenerate_and_has_no_ticks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three thrusters that pass the centre of mass by a tenth of a nanometre: all force, no torque."""
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    drawing = importlib.import_module("characterise_draw")
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure))
+    module = of_modules([(0, 0, 0)], [0], [load_vehicle("modcube")]).without(range(3, 8))
+    layout = dataclasses.replace(module, matrix=np.vstack([np.eye(3), 1e-10 * np.eye(3)[::-1]]))
+    drawing.draw(tmp_path / "three.png", {"three": summary.characterise(layout, count=121)}, {"three": "three"})
+    panels = drawn[0].axes
+    written = ["degenerate" in [text.get_text() for text in panel.texts] for panel in panels]
+    assert written == [False, True, True, True, False, True]  # power and wrench, each by force and torque; forces for both
+    assert [panel.get_yticks().size == 0 for panel in panels] == written
 
 
 @pytest.mark.slow

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import Result
+from matplotlib.figure import Figure
+from typer.testing import CliRunner
 
 from firmware_py.core import drag_lookup
 from firmware_py.core.body import DragTable
@@ -18,6 +21,7 @@ from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from firmware_py.prepare.drag_cache import DragCache, default_folder
 from firmware_py.prepare.joints import Placement
 from firmware_py.prepare.projected_area import areas_and_centroids
+from tools import build_drag_table
 
 PITCH = 0.21
 ELBOW = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
@@ -273,3 +277,36 @@ def test_cache_is_where_the_user_s_environment_says() -> None:
     assert default_folder({"XDG_CACHE_HOME": "/elsewhere"}, home) == Path("/elsewhere/modcube/drag")
     assert default_folder({}, home) == home / ".cache" / "modcube" / "drag"
     assert default_folder({"XDG_CACHE_HOME": "relative"}, home) == home / ".cache" / "modcube" / "drag"
+
+
+# ---------------------------------------------------------------- tools/build_drag_table.py
+
+
+def drag_tool(*arguments: str) -> Result:
+    return CliRunner().invoke(build_drag_table.app, arguments)
+
+
+@pytest.mark.parametrize("place", ["folder", "file/spaces.png", "spaces.none"])
+def test_picture_that_cannot_be_written_is_refused_in_one_line(place: str, tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    given = drag_tool("--cells", "0,0,0", "--cache", str(tmp_path / "drag"), "--out", str(tmp_path / place))
+    assert given.exit_code == 2 and isinstance(given.exception, SystemExit)
+    assert given.stderr.count("\n") == 1 and f"--out {tmp_path / place}: " in given.stderr
+    assert not (tmp_path / "folder.png").exists()
+
+
+def test_picture_is_right_handed_with_z_down_and_its_table_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    given = drag_tool("--cells", "0,0,0 0,1,0 1,0,0", "--cache", str(tmp_path / "drag"), "--out", str(tmp_path / "spaces.png"))
+    assert given.exit_code == 0, given.stderr
+    limits = [np.diff(getattr(drawn[0].axes[0], f"get_{axis}lim")())[0] for axis in "xyz"]
+    assert np.prod(limits) > 0.0 > limits[2]
+    table = given.stdout[given.stdout.index("shape") :]
+    assert all(f"({','.join(map(str, flow))})" in table for flow in build_drag_table.FLOWS)
+    assert max(map(len, table.splitlines()[:4])) <= 80 and "\u2026" not in table
+
+
+def test_one_module_is_not_several() -> None:
+    assert [list(build_drag_table.shapes_of(cells)) for cells in ("0,0,0", "0,0,0 1,0,0")] == [["1 module"], ["2 modules"]]

@@ -16,14 +16,15 @@ LIKE = load_vehicle("modcube").curve
 POWERS = np.arange(1, 6)
 
 
-def measured(noise_n: float = 0.0, voltage_v: float = 12.0) -> dict[str, np.ndarray]:
-    """41 points of the vehicle's own curve, measured at another voltage."""
+def measured(noise_n: float = 0.0, voltage_v: float = 12.0, idle_w: float = 0.0) -> dict[str, np.ndarray]:
+    """41 points of the vehicle's own curve, measured at another voltage, electronics included."""
     u = np.linspace(-1.0, 1.0, 41)
     force = np.where(u > 0.0, np.abs(u)[:, None] ** POWERS @ LIKE.forward, -(np.abs(u)[:, None] ** POWERS @ LIKE.reverse))
     force[np.abs(force) < LIKE.deadband_n] = 0.0
     force += noise_n * np.random.default_rng(0).standard_normal(len(u)) * (force != 0.0)
     side = np.where((force > 0.0)[:, None], LIKE.power_forward, LIKE.power_reverse)
     power = np.sum(np.abs(force)[:, None] ** POWERS * side, axis=1)
+    power = power * (voltage_v / 12.0) ** 3 + idle_w
     return {"command": u, "force_n": force * (voltage_v / 12.0) ** 2, "voltage_v": np.full(len(u), voltage_v), "power_w": power}
 
 
@@ -33,15 +34,24 @@ def write_csv(path: Path, points: dict[str, np.ndarray]) -> Path:
     return path
 
 
-@pytest.mark.parametrize("voltage_v", [12.0, 10.5])
-def test_curve_that_was_measured_is_found_whatever_the_voltage(voltage_v: float) -> None:
-    curve, left_n = tool.fit_curve(measured(voltage_v=voltage_v), LIKE, 12.0, 0.05)
+@pytest.mark.parametrize(("voltage_v", "idle_w"), [(12.0, 0.0), (10.5, 0.0), (16.0, 0.0), (12.0, 5.0), (16.0, 5.0)])
+def test_curve_that_was_measured_is_found_whatever_voltage_and_electronics(voltage_v: float, idle_w: float) -> None:
+    curve, left_n = tool.fit_curve(measured(voltage_v=voltage_v, idle_w=idle_w), LIKE, 12.0, 0.05)
     assert left_n < 1e-6
     for name in ("forward", "reverse"):
         assert getattr(curve, name) == pytest.approx(getattr(LIKE, name), abs=1e-4)
     assert curve.deadband_n == pytest.approx(LIKE.deadband_n, abs=0.1)  # the points are 0.05 of full command apart
     f = np.linspace(0.5, 7.0, 9)[:, None] ** POWERS
     assert f @ curve.power_forward == pytest.approx(f @ LIKE.power_forward, rel=1e-3)
+    assert f @ curve.power_reverse == pytest.approx(f @ LIKE.power_reverse, rel=1e-3)
+
+
+def test_power_without_a_point_at_rest_is_taken_as_it_is() -> None:
+    points = measured(idle_w=5.0)
+    pushing = {name: column[np.abs(points["force_n"]) > 0.05] for name, column in points.items()}
+    assert tool.idle_power(points, 0.05) == pytest.approx(5.0)
+    assert tool.idle_power(pushing, 0.05) is None
+    assert tool.fit_curve(pushing, LIKE, 12.0, 0.05)[0].power_forward.sum() > LIKE.power_forward.sum() + 1.0
 
 
 def test_noise_does_not_make_the_curve_fall() -> None:
@@ -56,11 +66,14 @@ def test_noise_does_not_make_the_curve_fall() -> None:
 
 
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])  # a spreadsheet's
-def test_file_that_is_written_is_a_vehicle_files_curve(mark: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, out = write_csv(tmp_path / "bench.csv", measured(0.02)), tmp_path / "curve.toml"
+def test_file_that_is_written_is_a_vehicle_files_curve(
+    mark: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = write_csv(tmp_path / "bench.csv", measured(0.02, idle_w=1.5)), tmp_path / "curve.toml"
     source.write_bytes(mark + source.read_bytes())
     monkeypatch.setattr(sys, "argv", ["fit_thruster", str(source), "--out", str(out)])
     assert tool.main() == 0
+    assert "1.5 W at zero command taken off" in capsys.readouterr().out
     table, where = read_toml(out)
     curve = build(ThrusterCurve, table, where)
     assert np.sum(curve.forward) == pytest.approx(np.sum(LIKE.forward), rel=0.01)
@@ -128,6 +141,13 @@ def refused(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     said = capsys.readouterr().err
     assert complaint in said and said.count("\n") == 1
     assert not (folder / "curve.toml").exists()
+
+
+def test_power_that_electronics_alone_draw_is_refused() -> None:
+    points = measured(idle_w=5.0)
+    points["power_w"][:] = 5.0
+    with pytest.raises(DescriptionError, match="forward: power_w 5 at the most is not above the 5 at zero command"):
+        tool.fit_curve(points, LIKE, 12.0, 0.05)
 
 
 def test_thruster_that_pushes_against_its_command_is_refused() -> None:

@@ -1,5 +1,6 @@
 """Parts of tools/identify.py on made-up data: no flight."""
 
+import dataclasses
 import importlib
 import sys
 from pathlib import Path
@@ -8,8 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from firmware_py.description.schema import DescriptionError, build, read_toml, to_toml
+from firmware_py.core.rotations import exp
+from firmware_py.description.schema import DescriptionError, build, frozen_array, read_toml, to_toml
 from firmware_py.description.vehicle import Vehicle, load_vehicle, vehicle_names
+from firmware_py.prepare.assembly import assemble_vehicle
 from hil.scenario import load_scenario
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
@@ -93,13 +96,60 @@ def test_motion_that_needs_no_room_along_x_takes_none(motion: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "2.0", "2.0:0.2:60", "a:b:c:d", "0:0.2:60:120", "2:0.2:120:60", "nan:0.2:60:120", "inf:0.2:60:120", "2:nan:60:120",
-        "2:inf:60:120", "2:0.2:60:inf",
+        "2.0", "2.0:0.2:60", "2:0.2:60:120:1", "a:b:c:d", "0:0.2:60:120", "2:0.2:120:60", "nan:0.2:60:120", "inf:0.2:60:120",
+        "2:nan:60:120", "2:inf:60:120", "2:0.2:60:inf",
     ],
 )  # fmt: skip
 def test_weight_that_makes_no_sense_is_refused(text: str) -> None:
     with pytest.raises(DescriptionError, match="--weight"):
         tool.parse_weight(text)
+
+
+def made_up(weight: model.Weight, com_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> model.Equations:
+    """Half a minute of tumbling at random commands; nothing is measured yet."""
+    vehicle, count, dt = load_vehicle("modcube"), 3001, 0.01
+    vehicle = dataclasses.replace(vehicle, inertial=dataclasses.replace(vehicle.inertial, com_m=frozen_array(com_m)))
+    body, t, rng = assemble_vehicle(vehicle), np.arange(count) * dt, np.random.default_rng(0)
+    turned = np.array([exp(angle) for angle in np.sin(np.outer(t, [0.7, 0.9, 1.1]))])
+    command = np.repeat(rng.uniform(-1.0, 1.0, (count // 50 + 1, len(vehicle.thruster))), 50, axis=0)[:count]
+    swum = 0.1 * np.sin(np.outer(t, [1.3, 1.7, 2.1]))
+    recording = SimpleNamespace(
+        vehicle=vehicle, body=body, name="made-up", period_s=dt, time_ns=np.arange(count) * 10_000_000, armed=np.ones(count),
+        accel=np.zeros((count, 3)), command=command, voltage_v=np.full(count, 12.0),
+    )  # fmt: skip
+    return model.Equations(recording, motion.Motion(swum, swum, turned, 0.5 * swum), vehicle.curve, weight)
+
+
+def hang(flight: model.Equations, x: dict[str, np.ndarray], lever: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """(n, 6) what is measured with the weight at `lever` from the centre of mass; `flight` has it there without one."""
+    flight.measured = flight.predict(x) + noise
+    pull = flight._loaded[:, None] * (2.0 * flight._down - 0.22 * flight.measured[:, :3])
+    moved = flight.predict(x) + noise
+    moved[:, 3:] += np.cross(lever, pull) / np.exp(x["inertia"])
+    return np.asarray(moved)
+
+
+@pytest.mark.parametrize("at_m", [None, (0.0, 0.0, 0.0), (0.1, -0.05, 0.03)])
+def test_weight_that_pulls_at_an_arm_is_not_taken_for_righting(at_m: tuple[float, float, float] | None) -> None:
+    com = (0.01, 0.0, 0.02)
+    weight = model.Weight(2.0, 0.22, 10.0, 20.0)
+    place = at_m or (0.0, 0.0, 0.105)  # half the hull's height below its middle
+    flight, centred = made_up(weight._replace(at_m=at_m), com), made_up(weight._replace(at_m=com), com)
+    x = model.beginning(flight.vehicle) | {"current": np.zeros(3), "bias": np.zeros(3)}
+    x["mass"], x["gain"] = x["mass"] + 0.1, 1.1 * x["gain"]
+    noise = np.random.default_rng(1).standard_normal(flight.measured.shape) * np.repeat([0.001, 0.003], 3)
+    flight.measured = hang(centred, x, np.array(place) - com, noise)
+    found = fit.fit([flight], has_weight=True)
+    assert found.value("arm") == pytest.approx(x["arm"], abs=0.005)
+    assert np.exp(found.value("mass") - x["mass"]) == pytest.approx(np.ones(3), abs=0.01)
+    assert np.exp(found.value("inertia") - x["inertia"]) == pytest.approx(np.ones(3), abs=0.02)
+
+
+@pytest.mark.parametrize("at", [("nan", "0", "0"), ("0", "0", "11"), ("0", "inf", "0")])
+def test_weight_that_hung_nowhere_near_is_refused(at: tuple[str, ...]) -> None:
+    with pytest.raises(DescriptionError, match=r"--hung-at .*: three distances of 10 m at most are needed"):
+        tool.parse_weight("2:0.2:60:120", [float(word) for word in at])
+    assert tool.parse_weight("2:0.2:60:120", [0.0, 0.1, -0.2]).at_m == (0.0, 0.1, -0.2)
 
 
 @pytest.mark.parametrize(
@@ -120,6 +170,7 @@ def test_weight_that_neither_came_nor_went_is_refused(from_s: float, until_s: fl
         ([], "no LOG was given"),
         (["nowhere"], "no can.log"),
         (["a", "b", "--weight", "2:0.2:1:2"], "give one LOG"),
+        (["a", "--hung-at", "0", "0", "-0.1"], "--hung-at says where a weight hung; give --weight with it"),
         (["--excitation", "shake.toml", "--space", "nan", "nan", "nan"], "--space nan nan nan: three distances of 0 m or more"),
         (["--excitation", "shake.toml", "--space", "0.6", "-0.5", "0.3"], "--space 0.6 -0.5 0.3: three distances of 0 m or more"),
         (["--excitation", "shake.toml", "--space", "0.6", "0.5", "inf"], "--space 0.6 0.5 inf: three distances of 0 m or more"),

@@ -1,12 +1,17 @@
 """The measured open loop against what it says of the closed one, and margins of loops that are known."""
 
+import importlib
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from tools.loop_response import AXES, LINES, Loop, Response, Scale, corners, lines, margins, measure
+from tools.loop_response import AXES, LINES, Loop, Response, Scale, body_of, controlled, corners, lines, margins, measure
 
+ROOT = Path(__file__).resolve().parents[2]
 SURGE = 0
 
 
@@ -30,6 +35,43 @@ def test_loop_that_may_also_lose_gain_shows_the_nearer_margin() -> None:
     loop = 4.0 * (s + 1.0) ** 2 / s**3
     found = margins(Response(w, loop))
     assert found.gain_db == pytest.approx(20.0 * np.log10(8.0), abs=0.05)  # Routh: stable above a gain of 1/2
+
+
+@pytest.mark.parametrize("gain", [1e-3, 1e3])
+def test_loop_that_crosses_nowhere_has_no_margins_to_state(gain: float) -> None:
+    never = ideal(gain, 0.01)
+    assert margins(never) == pytest.approx((0.0, 0.0, np.nan), nan_ok=True)
+    assert margins(never._replace(controlled=False))[:2] == (np.inf, np.inf)
+
+
+def test_axis_that_no_thruster_pushes_is_not_controlled() -> None:
+    assert [name for name, pushed in zip(AXES, controlled(body_of(1, "bluerov2")), strict=True) if not pushed] == ["pitch"]
+    assert controlled(body_of(1, "bluerov2_heavy")).all() and controlled(body_of(2, "modcube")).all()
+
+
+def judged(monkeypatch: pytest.MonkeyPatch, pitch: Response) -> list[dict[str, Any]]:
+    """What tools/margins.py says of good loops and that one, nominal and worst."""
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    tool = importlib.import_module("margins")
+    loops = [pitch if name == "pitch" else ideal(2.0, 0.2) for name in AXES]
+    rows: list[dict[str, Any]] = tool.rows({1: {tool.NOMINAL: loops}})
+    tool.print_table(rows)
+    return rows
+
+
+def test_axis_that_is_not_controlled_is_named_and_left_out_of_the_verdict(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    silent = Response(np.geomspace(0.3, 30.0, 20), np.zeros(20, complex), controlled=False)
+    assert all(row["passed"] for row in judged(monkeypatch, silent))
+    line = next(line for line in capsys.readouterr().out.splitlines() if "pitch" in line)
+    assert "not controlled" in line and "inf" not in line
+
+
+def test_controlled_axis_that_never_reaches_0_db_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = judged(monkeypatch, ideal(1e-3, 0.01))
+    assert [row["axis"] for row in rows if not row["passed"]] == ["pitch", "pitch"]
+    assert "FAILED: no crossover" in capsys.readouterr().out
 
 
 def test_every_sine_is_one_of_its_own() -> None:

@@ -50,6 +50,7 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
         ("bench", ["--quick"], "unrecognized arguments: --quick"),
         ("readme_tables", ["README.md"], "unrecognized arguments: README.md"),
         ("identify_plants", ["--plants", "0"], "--plants: '0' is not a whole number above zero"),
+        ("margins", ["--jobs", "0"], "--jobs: '0' is not a whole number above zero"),
         ("identify_plants", ["--jobs", "0"], "--jobs: '0' is not a whole number above zero"),
         ("identify_plants", ["--seed", "-1"], "--seed: '-1' is not a whole number from 0 on"),
         ("identify_plants", ["--seconds", "nan"], "--seconds: 'nan' is not a number above zero"),

@@ -1,5 +1,6 @@
 """The search for gains: what a trial costs, that it stops early what is worse, that it goes on where it was killed, and when it refuses."""
 
+import itertools
 import json
 import os
 import re
@@ -8,6 +9,7 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from firmware_py.description.parameters import Parameters
@@ -213,6 +215,54 @@ def test_detuned_gains_are_off_by_up_to_three_and_within_the_bounds(tools: tuple
         assert objective.start(wrong) == values
         factors += [value / tools[0].value_of(Parameters(), name) for name, value in values.items()]
     assert 1 / 3 <= min(factors) < 0.4 and 2.5 < max(factors) <= 3.0
+
+
+@pytest.mark.parametrize("before", [0.5, 1.5, 1.6, 2.5, 4.4, 4.5, 9.0])
+def test_refused_live_step_does_not_come_twice(tools: tuple[Any, Any], before: float) -> None:
+    import tune_live
+
+    steps = [value for _, value in tune_live.proposals({"POS_BW": before}, {"POS_BW": (1.5, 4.5)})]
+    assert steps and len(set(steps)) == len(steps) and before not in steps
+    assert before / 1.25 - 1e-6 <= min(steps) and max(steps) <= before * 1.25 + 1e-6
+
+
+@pytest.mark.parametrize("before", [0.5, 9.0])
+def test_live_value_outside_the_bounds_comes_back_to_them_without_a_leap(tools: tuple[Any, Any], before: float) -> None:
+    import tune_live
+
+    now, way = {"POS_BW": before}, [before]
+    for name, value in itertools.islice(tune_live.proposals(now, {"POS_BW": (1.5, 4.5)}), 30):
+        if not 1.5 <= now[name] <= 4.5:
+            now[name] = value
+            way.append(value)
+    factors = np.array(way[1:]) / way[:-1]
+    assert np.all(factors == pytest.approx(1.25)) or np.all(factors == pytest.approx(0.8))
+    assert 1.5 <= way[-1] <= 4.5
+
+
+def test_live_step_of_single_precision_is_not_the_value_it_has(tools: tuple[Any, Any]) -> None:
+    import tune_live
+
+    here = float(np.float32(0.1))
+    steps = [value for _, value in tune_live.proposals({"POS_BW": here}, {"POS_BW": (0.05, 0.1)})]
+    assert steps == pytest.approx([here / 1.25, here / 1.25**0.5, here / 1.25**0.25])
+    assert not list(tune_live.proposals({"POS_BW": 0.0}, {"POS_BW": (0.05, 0.1)}))
+
+
+def test_detuned_gains_are_set_against_the_tuned_on_seeds_that_neither_saw(
+    tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import accept_tuning
+
+    def tune(command: list[Any], **_: Any) -> None:
+        out = Path(command[-1])
+        out.mkdir(parents=True)
+        unseen = {name: {"objective": value} for name, value in (("start", 12.0), ("shipped", 4.0), ("tuned", 3.0))}
+        (out / "tuning.json").write_text(json.dumps({"start_value": 9.0, "best_value": 1.0, "unseen": unseen}))
+
+    monkeypatch.setattr(accept_tuning.subprocess, "run", tune)
+    found = accept_tuning.tuned(tmp_path)
+    assert (found["ratio"], found["start"]) == (0.75, 4.0)
 
 
 def test_answers_typed_at_once_are_taken_one_by_one_and_the_end_of_the_input_ends_it(tools: tuple[Any, Any]) -> None:
