@@ -10,7 +10,7 @@ service to it, waits for its health report, and goes back to the release before 
     tools/flash.py USER@HOST --status     what is installed and how it runs
     tools/flash.py USER@HOST --rollback   back to the release before
 
-Exit status: 0 done, 1 the new release was not healthy (the old one runs again), 2 cannot run (nothing was changed).
+Exit status: 0 done, 1 switched in vain (the old release runs again) or out of sight, 2 cannot run (nothing was changed).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import NamedTuple, NoReturn
@@ -132,13 +132,18 @@ def flash(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[str], None
         return 0
     ship(vehicle, target, payload, say)
     say("4/4 switch, restart, wait for the health report")
+    return switch(vehicle, say, "activate", {"release": payload.release})
+
+
+def switch(vehicle: Vehicle, say: Callable[[str], None], command: str, given: Mapping[str, str] | None = None) -> int:
+    """Has the vehicle activate or roll back; returns the exit status: nobody can say any more that nothing was changed."""
     try:
-        vehicle.device("activate", {"release": payload.release})
+        release = vehicle.device(command, given)
     except LostError as error:
         return refuse(f"{error}; the vehicle goes on by itself: see --status", 1)
     except VehicleError as error:
         return refuse(str(error), 1)
-    say(f"{vehicle.host} runs {payload.release}")
+    say(f"{vehicle.host} runs {release}")
     return 0
 
 
@@ -163,8 +168,10 @@ def look_or_go_back(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[
         for line in status_lines(vehicle):
             say(line)
         return 0
-    say(f"{vehicle.host} runs {vehicle.device('rollback')}")
-    return 0
+    found = vehicle.device("status")
+    if not found["previous"] and not found["trial"]:
+        raise FlashError(f"{vehicle.host}: there is no earlier release to go back to")
+    return switch(vehicle, say, "rollback")
 
 
 class OneLineParser(argparse.ArgumentParser):

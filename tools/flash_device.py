@@ -6,10 +6,11 @@ Layout of the root folder (say /opt/modcube):
     wheels/            every wheel ever shipped and still used, checked by SHA-256
     releases/ID/       one release: its own environment, `bin/modcube`, `release.json`; ID.partial while it is made
     current, previous  links to releases; the service starts `current/bin/modcube`
-    trial.json         while a new release has not proved itself: what to go back to, and who is watching
+    trial.json         while a new release has not proved itself: what to go back to, units included, and who is watching
 
-Whatever is interrupted, and wherever: before the switch `current` is untouched; from the switch on, a release that is
-on trial without its watcher is taken back by `boot`, which the service runs before every start. Standard library alone.
+Whatever is interrupted, and wherever: before the switch `current` is untouched; from the switch on, a release that is on
+trial without its watcher is taken back by `boot`, which a unit of its own (flash_units.py) runs before every start of the
+service, or by the next flash. Standard library alone.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ import contextlib
 import fcntl
 import json
 import os
-import pwd
 import shutil
 import signal
 import sys
@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from flash_files import RefusedError, carry_compiled, file_digest, remove, run, sync_folder, unpack, watcher, watches, write_whole
+from flash_units import GUARD, as_root, guard_unit, installed_units, release_units
 
 SERVICE = "modcube.service"
 UNIT_FOLDER = Path("/etc/systemd/system")
@@ -141,49 +142,87 @@ class Device:
         target = self.releases / release
         if not (target / "release.json").is_file():
             raise RefusedError(f"there is no release {release}; there are {', '.join(self.names()) or 'none'}")
-        old = self.linked(self.current)
-        if old == release and not self.trial.exists():
-            self._install_units(release)
+        self._settle()
+        self._install_units(guard_unit(self.root), GUARD)
+        units = release_units(target, self.root)
+        old = None if self.trial.exists() else self.linked(self.current)  # never one that has not proved itself
+        if old == release:
+            self._install_units(units, SERVICE)
             self._start_and_wait(release)
             return
         self._step("trial")
-        write_whole(self.trial, json.dumps({"release": release, "old": old, **watcher()}))
+        trial = {"release": release, "old": old, "units": installed_units(units, UNIT_FOLDER), **watcher()}
+        write_whole(self.trial, json.dumps(trial))
         try:
             self._switch(self.current, release)
-            self._install_units(release)
+            self._install_units(units, SERVICE)
             self._start_and_wait(release)
-        except RefusedError as error:
-            raise RefusedError(f"{release}: {error}; {self._go_back(old)}") from None
-        if old is not None and old != release:
-            self._switch(self.previous, old)
+            if old is not None:
+                self._switch(self.previous, old)
+        except (RefusedError, OSError) as error:
+            raise RefusedError(f"{release}: {error}; {self._go_back(trial)}") from None
         self._step("confirm")
         remove(self.trial)
         self.prune()
 
     def roll_back(self) -> str:
         """Activates the release before this one; returns its name. Raises RefusedError."""
-        old = self.linked(self.previous)
-        if old is None:
+        tried = self.linked(self.current)
+        self._settle()
+        now, earlier = self.linked(self.current), self.linked(self.previous)
+        if now is not None and now != tried:  # this one was on trial still, and is taken back already
+            self._start_and_wait(now)
+            return now
+        if earlier is None:
             raise RefusedError("there is no earlier release to go back to")
-        self.activate(old)
-        return old
+        self.activate(earlier)
+        return earlier
 
     def boot(self) -> str:
         """Before the service starts: takes back a release on trial whose watcher is gone. Returns what it did."""
-        if not self.trial.is_file():
+        trial = self._on_trial()
+        if trial is None or watches(trial):
             return ""
+        said = self._settle()
+        if said:
+            with contextlib.suppress(RefusedError):  # if systemd refused the unit on trial, nobody has asked for the service
+                self._run([*as_root(), "systemctl", "--no-block", "restart", SERVICE])
+        return said
+
+    def _on_trial(self) -> dict[str, Any] | None:
+        """What trial.json says: nothing if it is torn, None if there is none."""
+        if not self.trial.is_file():
+            return None
         try:
             trial = json.loads(self.trial.read_text())
-            if watches(trial):
-                return ""
-            old = trial["old"]
-        except (ValueError, KeyError):
+        except ValueError:
+            return {}
+        return trial if isinstance(trial, dict) else {}
+
+    def _settle(self) -> str:
+        """Takes back a trial that nobody watches: whoever has the lock may be sure of that. Returns what it did.
+
+        A vehicle's first release has none to go back to: it may run, and stays on trial until the next flash.
+        """
+        trial = self._on_trial()
+        if trial is None or trial.get("old", "") is None:
+            return ""
+        if "old" not in trial:
             remove(self.trial)  # torn while it was written: the switch had not come yet
             return "removed a torn trial.json"
-        if old is not None and (self.releases / old / "release.json").is_file():
+        self._take_back(trial)
+        return f"release {trial.get('release')} had not proved itself: back to {self.linked(self.current)}"
+
+    def _take_back(self, trial: dict[str, Any]) -> None:
+        """`current` and units as they were before a trial; it is over when both are. Raises RefusedError."""
+        old = trial["old"]
+        if old is None:
+            remove(self.current)
+        elif (self.releases / old / "release.json").is_file():
             self._switch(self.current, old)
+        self._install_units(trial.get("units", {}), SERVICE)
+        self._step("end trial")
         remove(self.trial)
-        return f"release {trial['release']} had not proved itself: back to {old}"
 
     def status(self) -> dict[str, object]:
         """What is installed and how the service is."""
@@ -240,26 +279,26 @@ class Device:
         os.replace(fresh, link)
         sync_folder(self.root)
 
-    def _install_units(self, release: str) -> None:
-        """The release's systemd units, where they differ from those that are installed."""
+    def _install_units(self, units: dict[str, str], enabled: str) -> None:
+        """Lets systemd have `units` (name -> text), and starts one of them at every boot from now on. Raises RefusedError."""
         self._step("units")
-        found = list((self.releases / release / "lib").glob("python*/site-packages/firmware_py/deploy/*.service"))
-        changed = False
-        for unit in found:
-            text = unit.read_text()
-            for word, value in unit_words(self.root).items():
-                text = text.replace(word, value)
-            installed = UNIT_FOLDER / unit.name
-            if installed.is_file() and installed.read_text() == text:
-                continue
-            rendered = self.root / f"{unit.name}.new"
-            write_whole(rendered, text)
-            self._run([*as_root(), "install", "-m", "644", str(rendered), str(installed)])
-            rendered.unlink()
-            changed = True
-        if changed:
+        there = installed_units(units, UNIT_FOLDER)
+        for name, text in units.items():
+            if there.get(name) != text:
+                self._install_unit(name, text)
+        if units:  # every time: an interrupted flash may have left the files, and no more
             self._run([*as_root(), "systemctl", "daemon-reload"])
-            self._run([*as_root(), "systemctl", "enable", "--quiet", SERVICE])
+            self._run([*as_root(), "systemctl", "enable", "--quiet", enabled])
+
+    def _install_unit(self, name: str, text: str) -> None:
+        """One unit in systemd's folder, there with all of its text or as it was before."""
+        rendered, fresh = self.root / f"{name}.new", str(UNIT_FOLDER / f"{name}.new")
+        write_whole(rendered, text)
+        self._run([*as_root(), "install", "-m", "644", str(rendered), fresh])
+        self._run([*as_root(), "sync", fresh])
+        self._run([*as_root(), "mv", "-T", fresh, str(UNIT_FOLDER / name)])
+        self._run([*as_root(), "sync", str(UNIT_FOLDER)])
+        rendered.unlink()
 
     def _start_and_wait(self, release: str) -> None:
         """Restarts the service and waits until it has run well for HEALTHY_S. Raises RefusedError."""
@@ -286,22 +325,21 @@ class Device:
             waited += POLL_S
         raise RefusedError(f"no health report within {HEALTH_LIMIT_S:.0f} s")
 
-    def _go_back(self, old: str | None) -> str:
+    def _go_back(self, trial: dict[str, Any]) -> str:
         """After a release that was not healthy; returns what became of the service."""
+        old = trial["old"]
+        try:
+            self._take_back(trial)
+        except (RefusedError, OSError) as error:
+            return f"not yet taken back: {error}; the service's next start tries again"
         if old is None:
             with contextlib.suppress(RefusedError):
                 self._run([*as_root(), "systemctl", "stop", SERVICE])
-            remove(self.current)
-            remove(self.trial)
             return "there was no earlier release; the service is stopped"
-        self._switch(self.current, old)
-        self._install_units(old)
         try:
             self._start_and_wait(old)
         except RefusedError as error:
-            remove(self.trial)
             return f"rolled back to {old}, which is not healthy either: {error}"
-        remove(self.trial)
         return f"rolled back to {old}, which runs"
 
 
@@ -314,22 +352,6 @@ def ticks(status: dict[str, str]) -> int | None:
 def made_by(wheels: dict[str, str], name: str) -> str:
     """The file name of a distribution's wheel; empty where there is none."""
     return next((wheel for wheel in wheels if wheel.startswith(f"{name}-")), "")
-
-
-def unit_words(root: Path) -> dict[str, str]:
-    """What stands between @ signs in the units: where releases are, whose they are, which processors may run them."""
-    count = os.cpu_count() or 1
-    return {
-        "@ROOT@": str(root),
-        "@USER@": pwd.getpwuid(os.getuid()).pw_name,
-        "@PYTHON@": sys.executable,
-        "@CPUS@": f"1-{count - 1}" if count > 2 else f"0-{count - 1}",  # the first has the interrupts
-    }
-
-
-def as_root() -> list[str]:
-    """What goes before a command that only root may run."""
-    return [] if os.geteuid() == 0 else ["sudo", "-n"]
 
 
 def main(words: Sequence[str]) -> int:
@@ -363,7 +385,7 @@ def perform(device: Device, command: str, given: dict[str, Any]) -> object:
         return None
     if command == "activate":
         device.activate(given["release"])
-        return None
+        return given["release"]
     if command == "rollback":
         return device.roll_back()
     return device.boot() if command == "boot" else device.status()

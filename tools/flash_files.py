@@ -107,7 +107,7 @@ def watcher() -> dict[str, object]:
 def watches(trial: dict[str, object]) -> bool:
     """Whether the process that began the trial still runs."""
     pid = trial.get("pid")
-    return isinstance(pid, int) and trial["boot"] == boot_id() and trial["started"] == start_time(pid) != ""
+    return isinstance(pid, int) and trial.get("boot") == boot_id() and trial.get("started") == start_time(pid) != ""
 
 
 def boot_id() -> str:

@@ -15,7 +15,7 @@ CONNECT_TIMEOUT_S = 10
 OPTIONS = (
     "BatchMode=yes", f"ConnectTimeout={CONNECT_TIMEOUT_S}", "ServerAliveInterval=5", "ServerAliveCountMax=4",
 )  # fmt: skip
-DEVICE_FILES = ("flash_device.py", "flash_files.py")
+DEVICE_FILES = ("flash_device.py", "flash_files.py", "flash_units.py")
 LOST = 255
 """ssh's own exit status."""
 REASONS = (

@@ -72,6 +72,11 @@ def report(guest: Guest) -> str:
     return guest.run("systemctl show modcube -p ActiveState -p StatusText --value", check=False).stdout
 
 
+def description(guest: Guest) -> str:
+    """Of the service, as systemd has read its unit."""
+    return guest.run("systemctl show modcube -p Description --value", check=False).stdout.strip()
+
+
 def wait_for(guest: Guest, words: str) -> str:
     end = time.monotonic() + WAIT_S
     while words not in (text := report(guest)) and time.monotonic() < end:
@@ -103,20 +108,26 @@ def test_broken_release_is_rolled_back_by_the_machine_itself(guest: Guest, tmp_p
 
 def test_power_cut_half_way_through_a_flash_brings_the_old_release_up(guest: Guest, tmp_path: Path) -> None:
     before = current(guest)
-    words = guest.flash_words(sys.executable, checkout(tmp_path, "interrupted"))
+    source = checkout(tmp_path, "interrupted")
+    unit = source / "firmware_py" / "deploy" / "modcube.service"
+    unit.write_text(unit.read_text().replace("Description=modcube", "Description=interrupted modcube", 1))
+    words = guest.flash_words(sys.executable, source)
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as flashing:
         assert flashing.stdout is not None
         for line in flashing.stdout:
             if line.startswith("4/4"):
                 break
         end = time.monotonic() + WAIT_S
-        while current(guest) == before and time.monotonic() < end:
+        while "interrupted" not in description(guest) and time.monotonic() < end:  # switched, and its unit installed and read
             time.sleep(0.2)
+        assert current(guest) != before
         guest.cut_power()
         flashing.kill()
     guest.boot()
     assert "tick=" in wait_for(guest, "tick=")
     assert current(guest) == before
+    assert description(guest) == "modcube vehicle controller"
+    assert "interrupted" not in guest.run("cat /etc/systemd/system/modcube.service").stdout
     assert guest.run("ls /opt/modcube/trial.json", check=False).returncode != 0
     assert "on trial" not in flash(guest, ROOT, "--status").stdout
     figure("flashed Debian machine: power cuts survived", 1)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
+import shutil
 import stat
+import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Sequence
@@ -20,6 +24,7 @@ import flash  # noqa: E402
 import flash_device  # noqa: E402
 import flash_files  # noqa: E402
 import flash_payload  # noqa: E402
+import flash_units  # noqa: E402
 from flash_device import Device  # noqa: E402
 from flash_files import RefusedError  # noqa: E402
 from flash_payload import Payload, PayloadError  # noqa: E402
@@ -59,6 +64,11 @@ case $* in
 esac
 exit 0
 """
+# systemd's folder is one of the pretended vehicle.
+ELSEWHERE = """#!/bin/sh
+for word; do shift; set -- "$@" "$(echo "$word" | sed "s|^/etc/systemd/system|$FAKE/etc|")"; done
+exec {real} "$@"
+"""
 
 
 def wheel(folder: Path, release: str) -> Path:
@@ -67,6 +77,7 @@ def wheel(folder: Path, release: str) -> Path:
     files = {
         "firmware_py/__init__.py": "",
         "firmware_py/cli.py": f"def main():\n    print({release!r})\n    return 0\n" + "#" * 2000,
+        "firmware_py/deploy/modcube.service": unit_of(release),
         "modcube-1.data/purelib/extra.py": "",
         "modcube-1.data/scripts/left_out": "",
     }
@@ -74,6 +85,11 @@ def wheel(folder: Path, release: str) -> Path:
         for name, text in {**files, **({"broken": ""} if "broken" in release else {})}.items():
             archive.writestr(zipfile.ZipInfo(name), text)
     return path
+
+
+def unit_of(release: str) -> str:
+    """The service's unit, another one in every release."""
+    return f"[Service]\nExecStart=modcube run --of {release}\n"
 
 
 @pytest.fixture
@@ -84,7 +100,9 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "sitecustomize.py").write_text("import time\ntime.sleep = lambda seconds: None\n")
     python = PYTHON.format(real=sys.executable)
     programs = {"ssh": SSH, "sudo": SUDO, "uname": UNAME, "id": ID, "df": DF, "python3.11": python, "python3": python}
-    for name, text in {**programs, "python3.12": python, "systemctl": SYSTEMCTL}.items():
+    (tmp_path / "etc").mkdir()
+    elsewhere = {name: ELSEWHERE.format(real=shutil.which(name)) for name in ("install", "mv", "sync")}
+    for name, text in {**programs, **elsewhere, "python3.12": python, "systemctl": SYSTEMCTL}.items():
         (shims / name).write_text(text)
         (shims / name).chmod(stat.S_IRWXU)
     monkeypatch.setenv("FAKE", str(tmp_path))
@@ -107,8 +125,8 @@ def put(fake: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
     return put
 
 
-def current(fake: Path) -> str | None:
-    return Device(fake / "root", flash_files.run).linked(fake / "root" / "current")
+def current(fake: Path, root: str = "root") -> str | None:
+    return Device(fake / root, flash_files.run).linked(fake / root / "current")
 
 
 def test_release_is_installed_started_and_runs_its_own_code(put: Callable[..., int], fake: Path) -> None:
@@ -118,6 +136,8 @@ def test_release_is_installed_started_and_runs_its_own_code(put: Callable[..., i
     assert (fake / "restarts").read_text().count("restarted") == 1
     packages = next((fake / "root/current/lib").glob("python*/site-packages"))
     assert (packages / "extra.py").exists() and not list(packages.glob("**/left_out"))
+    assert sorted(path.name for path in (fake / "etc").iterdir()) == [flash_units.GUARD, flash_device.SERVICE]
+    assert f"{fake}/root/flash/flash_device.py {fake}/root boot" in (fake / "etc" / flash_units.GUARD).read_text()
 
 
 def test_second_flash_keeps_the_first_to_go_back_to(
@@ -130,6 +150,46 @@ def test_second_flash_keeps_the_first_to_go_back_to(
     assert f"previous  {GOOD}" in shown and "active running" in shown and "tick=" in shown
     assert put(BETTER, "--rollback") == 0
     assert current(fake) == GOOD
+    assert f"robot@sub runs {GOOD}" in capsys.readouterr().out
+
+
+def test_rollback_without_an_earlier_release_changes_nothing(
+    put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert put(GOOD) == 0
+    assert put(GOOD, "--rollback") == 2
+    assert "there is no earlier release to go back to" in capsys.readouterr().err
+    assert current(fake) == GOOD
+
+
+def test_rollback_to_a_release_without_health_is_told_as_what_it_is(
+    put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert put(GOOD) == put(BETTER) == 0
+    next((fake / "root/previous/lib").glob("python*/site-packages")).joinpath("broken").touch()
+    assert put(BETTER, "--rollback") == 1
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1 and f"rolled back to {BETTER}, which runs" in error
+    assert current(fake) == BETTER
+
+
+def test_connection_lost_in_a_rollback_says_that_the_vehicle_goes_on(
+    put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert put(GOOD) == put(BETTER) == 0
+    assert put(BETTER, "--rollback", die="4:after") == 1
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1 and "goes on by itself: see --status" in error
+    assert current(fake) == GOOD
+
+
+def test_python_in_the_home_of_the_vehicle_is_found(put: Callable[..., int], fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """docs/jetson.md: quoted, so that it is the vehicle's shell that knows whose home it is."""
+    monkeypatch.setenv("HOME", str(fake))
+    (fake / "old_python").touch()
+    (fake / "python3.12").symlink_to(sys.executable)
+    assert put(GOOD) == 2
+    assert put(GOOD, "--python", "~/python3.12") == 0
 
 
 def test_release_without_health_is_taken_back_and_the_old_one_runs(
@@ -252,22 +312,52 @@ class Machine:
         self.left: int | None = None
         self.steps: list[str] = []
         self.tick = 0
+        self.dies_in = ""
+        self.fills_in = ""
+        self.sick: set[str] = set()
+        self.enabled: set[str] = set()
+        self.loaded: dict[str, str] = {}
+        """Units as systemd read them last."""
 
     def step(self, name: str) -> None:
         self.steps.append(name)
+        if name == self.dies_in:
+            raise PowerCut(name)
+        if name == self.fills_in:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         if self.left is not None:
             if self.left == 0:
                 raise PowerCut(name)
             self.left -= 1
 
     def run(self, command: Sequence[str]) -> str:
-        words = list(command)
+        words = [word for word in command if word not in ("sudo", "-n")]
         if "show" not in words:
-            if "restart" in words and "broken" in os.readlink(self.root / "current"):
-                raise RefusedError("systemctl restart: failed")
+            if words[0] == "install":
+                Path(words[-1]).write_text("")  # as it stands when the power goes amid it
+            self.step(" ".join(words[:2]))
+            self.obey(words)
             return ""
         self.tick += 1
-        return f"ActiveState=active\nMainPID=1\nNRestarts=0\nStatusText=tick={self.tick}\n"
+        state = "failed" if self.device().linked(self.root / "current") in self.sick else "active"
+        return f"ActiveState={state}\nMainPID=1\nNRestarts=0\nStatusText=tick={self.tick}\n"
+
+    def obey(self, words: list[str]) -> None:
+        """What a command does here."""
+        if words[0] == "install":
+            Path(words[-1]).write_text(Path(words[-2]).read_text())
+        elif words[0] == "mv":
+            os.replace(words[-2], words[-1])
+        elif "daemon-reload" in words:
+            self.loaded = self.units()
+        elif "enable" in words:
+            self.enabled.add(words[-1])
+        elif "restart" in words and "broken" in os.readlink(self.root / "current"):
+            raise RefusedError("systemctl restart: failed")
+
+    def units(self) -> dict[str, str]:
+        """Texts by name in systemd's folder."""
+        return {path.name: path.read_text() for path in flash_device.UNIT_FOLDER.glob("*.service")}
 
     def device(self) -> Device:
         return Device(self.root, self.run, sleep=lambda seconds: None, step=self.step)
@@ -282,16 +372,30 @@ class Machine:
         device.activate(release)
 
 
+@pytest.fixture(autouse=True)
+def etc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Systemd's folder of the vehicle in this process."""
+    folder = tmp_path / "systemd"
+    folder.mkdir()
+    monkeypatch.setattr(flash_device, "UNIT_FOLDER", folder)
+    return folder
+
+
+def boot_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    """The power is back: systemd reads its units, and the guard runs before the service."""
+    after = f"after {flash_files.boot_id()}"
+    monkeypatch.setattr(flash_files, "boot_id", lambda: after)
+    machine = Machine(root)
+    machine.loaded = machine.units()
+    machine.device().boot()
+    return machine
+
+
 @pytest.mark.parametrize("release", [BETTER, BROKEN])
 def test_power_cut_at_any_step_brings_a_release_up_that_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, release: str
 ) -> None:
-    boots = iter(range(10_000))
-    monkeypatch.setattr(flash_device, "UNIT_FOLDER", tmp_path)
-    plain = Machine(tmp_path)
-    plain.install_and_activate(GOOD)
-    counted = Machine(tmp_path)
-    counted.left = None
+    Machine(tmp_path).install_and_activate(GOOD)
     for cut in range(200):
         machine = Machine(tmp_path)
         machine.left = cut
@@ -304,18 +408,117 @@ def test_power_cut_at_any_step_brings_a_release_up_that_runs(
             break
         else:
             break
-        boot = f"boot {next(boots)}"
-        monkeypatch.setattr(flash_files, "boot_id", lambda boot=boot: boot)
-        again = Machine(tmp_path).device()
-        again.boot()
-        confirmed = again.linked(again.current)
+        again = boot_again(tmp_path, monkeypatch)
+        device = again.device()
+        confirmed = device.linked(device.current)
         assert confirmed is not None
         assert "broken" not in confirmed
         assert confirmed == GOOD or machine.steps[-1] == "prune", machine.steps[-1]
-        assert not again.trial.exists()
+        assert again.loaded[flash_device.SERVICE] == unit_of(confirmed), machine.steps[-1]
+        assert not device.trial.exists()
         if confirmed != GOOD:
-            again.activate(GOOD)
-    assert cut >= 12  # every step of a whole flash was cut
+            device.activate(GOOD)
+    assert cut >= 25  # every step of a whole flash was cut, and every command that the vehicle ran
+
+
+def test_power_cut_at_any_step_of_going_back_is_made_good_by_the_next_boot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Machine(tmp_path).install_and_activate(GOOD)
+    for cut in range(20):
+        abandon(tmp_path, f"{BETTER}{cut}")
+        machine = Machine(tmp_path)
+        machine.left = cut
+        with contextlib.suppress(PowerCut):
+            machine.device().boot()
+            break
+        again = boot_again(tmp_path, monkeypatch)
+        assert current(tmp_path, ".") == GOOD and not again.device().trial.exists()
+        assert again.loaded[flash_device.SERVICE] == unit_of(GOOD), machine.steps[-1]
+    assert cut >= 8
+
+
+def test_first_flash_cut_at_any_step_is_made_whole_by_the_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A unit that is there already, and neither read by systemd nor enabled, is no reason to do less."""
+    for cut in range(200):
+        root = tmp_path / str(cut)
+        monkeypatch.setattr(flash_device, "UNIT_FOLDER", root / "systemd")
+        flash_device.UNIT_FOLDER.mkdir(parents=True)
+        machine = Machine(root)
+        machine.left = cut
+        try:
+            machine.install_and_activate(GOOD)
+            break
+        except PowerCut:
+            again = boot_again(root, monkeypatch)
+        again.enabled = machine.enabled
+        again.install_and_activate(GOOD)
+        assert again.enabled == {flash_units.GUARD, flash_device.SERVICE}, machine.steps[-1]
+        assert again.loaded == again.units() and again.loaded[flash_device.SERVICE] == unit_of(GOOD), machine.steps[-1]
+    assert cut >= 25
+
+
+def test_units_are_back_before_the_service_is_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may be that systemd refused the unit on trial and has not so much as queued the service."""
+    Machine(tmp_path).install_and_activate(GOOD)
+    abandon(tmp_path, BETTER)
+    steps = boot_again(tmp_path, monkeypatch).steps
+    assert steps.index("systemctl daemon-reload") < steps.index("systemctl --no-block") == len(steps) - 1
+
+
+def abandon(root: Path, release: str) -> None:
+    """A flash whose process was killed while it waited for the health report."""
+    machine = Machine(root)
+    machine.dies_in = "health"
+    with pytest.raises(PowerCut):
+        machine.install_and_activate(release)
+    device = machine.device()
+    flash_files.write_whole(device.trial, json.dumps({**json.loads(device.trial.read_text()), "started": "1"}))
+
+
+@pytest.mark.parametrize("release", [BETTER, f"{BETTER}-2"])
+def test_release_whose_watcher_died_is_never_what_the_next_flash_goes_back_to(tmp_path: Path, release: str) -> None:
+    Machine(tmp_path).install_and_activate(GOOD)
+    abandon(tmp_path, BETTER)
+    machine = Machine(tmp_path)
+    machine.sick = {BETTER, release}
+    with pytest.raises(RefusedError, match=f"rolled back to {GOOD}, which runs"):
+        machine.install_and_activate(release)
+    assert current(tmp_path, ".") == GOOD
+    assert machine.loaded[flash_device.SERVICE] == unit_of(GOOD)
+
+
+def test_first_release_whose_watcher_died_is_not_taken_for_a_proven_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    abandon(tmp_path, GOOD)
+    device = boot_again(tmp_path, monkeypatch).device()
+    assert device.linked(device.current) == GOOD and device.status()["trial"]  # there is nothing better
+    with pytest.raises(RefusedError, match="there is no earlier release to go back to"):
+        device.roll_back()
+    machine = Machine(tmp_path)
+    machine.sick = {GOOD}
+    with pytest.raises(RefusedError, match="there was no earlier release; the service is stopped"):
+        machine.install_and_activate(GOOD)
+
+
+def test_roll_back_of_a_release_whose_watcher_died_leads_to_the_one_before(tmp_path: Path) -> None:
+    Machine(tmp_path).install_and_activate(GOOD)
+    abandon(tmp_path, BETTER)
+    machine = Machine(tmp_path)
+    assert machine.device().roll_back() == GOOD
+    assert current(tmp_path, ".") == GOOD and not machine.device().trial.exists()
+    assert machine.loaded[flash_device.SERVICE] == unit_of(GOOD) and "restart" in machine.steps
+
+
+def test_disk_that_fills_up_after_the_switch_takes_the_release_back(tmp_path: Path) -> None:
+    Machine(tmp_path).install_and_activate(GOOD)
+    machine = Machine(tmp_path)
+    machine.fills_in = "switch previous"
+    with pytest.raises(RefusedError, match=f"No space left on device; rolled back to {GOOD}, which runs"):
+        machine.install_and_activate(BETTER)
+    assert current(tmp_path, ".") == GOOD and not machine.device().trial.exists()
+    assert machine.units()[flash_device.SERVICE] == unit_of(GOOD)
 
 
 def test_service_that_starts_while_its_release_is_watched_is_left_alone(tmp_path: Path) -> None:
@@ -396,3 +599,26 @@ def test_wheel_carries_the_wire_the_vehicles_the_dialect_and_the_units(tmp_path:
     package = flash_payload.ROOT / "firmware_py"
     data = {str(path.relative_to(flash_payload.ROOT)) for path in package.rglob("*.*") if path.suffix in DATA_SUFFIXES}
     assert data | {"can_dbc/modcube.dbc", "firmware_py/deploy/modcube.service"} <= names
+
+
+def test_guard_is_a_unit_that_systemd_understands(tmp_path: Path) -> None:
+    (guard,) = flash_units.guard_unit(tmp_path).items()
+    assert "@" not in guard[1]
+    (tmp_path / guard[0]).write_text(guard[1])
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is missing")
+    words = ["systemd-analyze", "verify", str(tmp_path / guard[0])]
+    said = subprocess.run(words, capture_output=True, text=True, check=False).stderr
+    assert "Unknown" not in said and f"{guard[0]}:" not in said, said
+
+
+def test_enabled_interface_is_set_up_at_boot_and_whenever_it_is_plugged_in(tmp_path: Path) -> None:
+    if shutil.which("systemctl") is None:
+        pytest.skip("systemctl is missing")
+    folder = tmp_path / "etc" / "systemd" / "system"
+    shutil.copytree(flash_payload.ROOT / "firmware_py" / "deploy", folder)
+    for unit in ("modcube-can@can1", "modcube"):  # as docs/jetson.md has it, and as a flash does
+        subprocess.run(["systemctl", f"--root={tmp_path}", "enable", "--quiet", unit], check=True)
+    for name in ("can0", "can1"):
+        for wanting in ("multi-user.target", f"sys-subsystem-net-devices-{name}.device"):
+            assert (folder / f"{wanting}.wants" / f"modcube-can@{name}.service").is_symlink(), wanting
