@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from scipy.spatial.transform import Rotation
 
 from firmware_py.description.signals import Columns, Layout, Signal, read_signals
 
@@ -287,9 +288,26 @@ def _at(columns: Columns, ticks: np.ndarray, name: str) -> np.ndarray:
 
 
 def _tell_of_same_body(firmware: Columns, truth: Columns, thrusters: int) -> None:
-    """Between the moment two faces lock and that in which the firmware knows, it steers the module: so is the truth told."""
-    if "member" in truth:
-        alone = np.isfinite(firmware["commanded_n"]).sum(axis=1) == thrusters
-        early = alone & (truth["member"].sum(axis=1) > 1)
-        for body, module in (("p_wb", "p_wm"), ("q_wb", "q_wm")):
-            truth[body] = np.where(early[:, None], truth[module], truth[body])
+    """While faces have locked or opened and the firmware does not know yet, the truth is told of the body that it steers.
+
+    That is the leading module and what hung rigidly on it: as its body was when it last had that many modules, or next has.
+    """
+    if "member" not in truth:
+        return
+    believed = np.isfinite(firmware["commanded_n"]).sum(axis=1) // thrusters
+    actual = (truth["member"] > 0.0).sum(axis=1)
+    hull, body = _rotation(truth["q_wm"]), _rotation(truth["q_wb"])
+    p_wb, q_wb = truth["p_wb"].copy(), truth["q_wb"].copy()
+    for tick in np.flatnonzero(believed != actual):
+        known = np.flatnonzero((actual == believed[tick]) & (believed == actual))
+        if not len(known):
+            continue
+        then = max(known[known < tick], default=known[0])
+        lever_m = hull[then].inv().apply(truth["p_wb"][then] - truth["p_wm"][then])
+        p_wb[tick] = truth["p_wm"][tick] + hull[tick].apply(lever_m)
+        q_wb[tick] = np.roll((hull[tick] * hull[then].inv() * body[then]).as_quat(), 1)
+    truth["p_wb"], truth["q_wb"] = p_wb, q_wb
+
+
+def _rotation(q: np.ndarray) -> Rotation:
+    return Rotation.from_quat(np.roll(q, -1, axis=1))  # scipy's scalar is the last

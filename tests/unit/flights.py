@@ -85,20 +85,24 @@ def write_flight(
     recorder.close()
 
 
-def write_pair(folder: Path, *, ticks: int, joined_from: int, known_from: int, offset_m: tuple[float, float, float]) -> None:
+def write_pair(
+    folder: Path, *, ticks: int, joined_from: int, known_from: int, offset_m: tuple[float, float, float],
+    parted_from: int = 10**6, parted_known_from: int = 10**6,
+) -> None:  # fmt: skip
     """Write the two logs of a body of two modules, turning on its way, whose truth is `offset_m` off the reference.
 
     Before tick `joined_from` its leader is alone and the other module comes nearer, 0.1 mm a tick; before `known_from` the
-    firmware steers the leader's hull.
+    firmware steers the leader's hull. So it is again from `parted_from`, which the firmware knows from `parted_known_from` on.
     """
     zero, lever = np.zeros(3), np.array([0.105, 0.0, 0.0])
     recorder = Recorder(folder)
     with TruthRecorder(folder, (8, 8)) as truth:
         for tick in range(ticks):
-            time_ns, joined, count = tick * PERIOD_NS, tick >= joined_from, 8 + 8 * (tick >= known_from)
+            time_ns, joined, count = tick * PERIOD_NS, joined_from <= tick < parted_from, 8 + 8 * (known_from <= tick < parted_known_from)
             q = exp(np.array([0.0, 0.0, 0.002 * tick]))
             p_wb = spiral(0.01 * tick, 0.01 * ticks)
-            leader, other = p_wb - rotate(q, lever), p_wb + rotate(q, (1.0 + max(0, joined_from - tick) * 1e-4 / 0.105) * lever)
+            away_m = 1e-4 * max(0, joined_from - tick, tick - parted_from)
+            leader, other = p_wb - rotate(q, lever), p_wb + rotate(q, (1.0 + away_m / 0.105) * lever)
             for m, p_wm in enumerate((leader, other)):
                 truth.record(tick, time_ns, m, p_wm, q, zero, zero, np.full(8, 2.0 + m), zero, POWER_W)
             for members, at in (((0, 1), p_wb),) if joined else (((0,), leader), ((1,), other)):

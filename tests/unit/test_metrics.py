@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hil.checks import Limit, check_metrics, judge, write_result
 from hil.metrics import body_positions, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
 from hil.signals import Flight, read_flight
-from tests.unit.flights import MARGIN, POWER_W, START_NS, write_flight
+from tests.unit.flights import MARGIN, POWER_W, START_NS, write_flight, write_pair
 
 LIMITS = (Limit("position_rmse_m", high=0.005), Limit("nis_mean", 0.7, 1.4))
 
@@ -133,3 +133,14 @@ def test_every_warning_counts_but_waiting_for_the_first_tags() -> None:
     texts = np.array(["ARM refused: no pose yet", "armed", "thruster 1 does not push as it says: left out", "leak"])
     assert warnings(np.array([4, 6, 4, 2]), texts) == 2
     assert warnings(np.zeros(0, np.int64), np.zeros(0, str)) == 0
+
+
+def test_truth_is_told_of_the_body_that_the_firmware_steers(tmp_path: Path) -> None:
+    """Faces lock before it knows, and open before it knows: the way of other modules is no error of what it steers."""
+    times = {"joined_from": 40, "known_from": 60, "parted_from": 120, "parted_known_from": 150}
+    write_pair(tmp_path, ticks=200, offset_m=(0.003, 0.0, -0.004), **times)
+    flight = read_flight(tmp_path)
+    off_m = np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
+    np.testing.assert_allclose(off_m, 0.005, atol=1e-9)
+    turned = rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"])
+    np.testing.assert_allclose(turned, np.full((200, 3), -0.01), atol=1e-9)
