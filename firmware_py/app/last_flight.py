@@ -106,8 +106,17 @@ def _told(sent: Sequence[LoggedFrame], notes: dict[str, Any], fleet: Fleet, code
             pulls.update({(index, face): state == _PULLS for face, state in enumerate(message.decode(frame.data))})
     flown = frozenset(index for index, on in armed.items() if on)
     pulling = frozenset(face for face, on in pulls.items() if on)
-    open_before = frozenset() if flown else frozenset((module, face) for module, face in notes.get("apart", ()))
-    return LastFlight(flown if boot and notes.get("boot") == boot else frozenset(), pulling, frozenset(pulls) - pulling | open_before)
+    open_before = frozenset((module, face) for module, face in notes.get("apart", ()) if module not in flown)
+    let_go = frozenset() if _magnets_rest(notes) else frozenset(pulls) - pulling
+    return LastFlight(flown if boot and notes.get("boot") == boot else frozenset(), pulling, let_go | open_before)
+
+
+def _magnets_rest(notes: dict[str, Any]) -> bool:
+    """Whether the limiter switched magnets of joints off in turns: one that is off was not told to let go then."""
+    try:
+        return float(notes["parameters"]["limiter"]["relay_duty"]) < 1.0
+    except (KeyError, TypeError, ValueError):
+        return False
 
 
 def _joined_faces(firmware: Firmware) -> frozenset[Face]:

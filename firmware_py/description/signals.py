@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -174,9 +174,10 @@ def is_closed(path: Path) -> bool:
 
 
 def read_attachment(path: Path, name: str) -> bytes | None:
-    """The attachment called `name` of an MCAP log, or None. Raises OSError."""
-    attachments = (record for record in log_records(path) if isinstance(record, Attachment))
-    return next((bytes(attachment.data) for attachment in attachments if attachment.name == name), None)
+    """The attachment called `name` of an MCAP log, or None; what is behind it is not read. Raises OSError."""
+    with path.open("rb") as file:
+        attachments = (record for record in _records_of(file) if isinstance(record, Attachment))
+        return next((bytes(attachment.data) for attachment in attachments if attachment.name == name), None)
 
 
 def read_signals(path: Path) -> dict[str, Columns]:
@@ -208,8 +209,12 @@ def read_signals(path: Path) -> dict[str, Columns]:
 
 def log_records(path: Path) -> Iterator[Any]:
     """The records of an MCAP log (mcap.records), up to its end or to where it is torn. Raises OSError."""
+    yield from _records_of(BytesIO(path.read_bytes()))
+
+
+def _records_of(log: IO[bytes]) -> Iterator[Any]:
     try:
-        yield from StreamReader(BytesIO(path.read_bytes()), validate_crcs=True).records
+        yield from StreamReader(log, validate_crcs=True).records
     except (McapError, EOFError, ValueError, struct.error):
         return  # torn: what came before it stands
 

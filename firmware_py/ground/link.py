@@ -6,7 +6,7 @@ Everyone at the other end is a channel with a number of its own. Runs beside the
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -73,9 +73,8 @@ class Links:
             for peer in link.peers():
                 self._channel(index, peer)
 
-    def receive(self) -> list[Received]:
-        """What came on all links, without waiting."""
-        received = []
+    def receive(self) -> Iterator[Received]:
+        """What came on all links, without waiting. Who is believed by what it sent keeps its place before the next stranger is met."""
         for index, link in enumerate(self.links):
             try:
                 got = link.receive()
@@ -85,9 +84,8 @@ class Links:
             if not link.datagram:
                 self._meet(index, link.peers())
             for peer, data in got:
-                if data:
-                    received.append(Received(self._channel(index, peer), data, link.datagram, self._trusted[index]))
-        return received
+                if data and (link.datagram or (index, peer) in self._by_peer):  # one that has left, or was one too many
+                    yield Received(self._channel(index, peer), data, link.datagram, self._trusted[index])
 
     def believe(self, channel: int) -> None:
         """A frame that came on it was taken for true."""
@@ -135,8 +133,20 @@ class Links:
         for key in [key for key in self._by_peer if key[0] == index and key[1] not in there]:
             self._forget(*key)
         for peer in there:
-            if (index, peer) not in self._by_peer:
+            if (index, peer) in self._by_peer:
+                continue
+            full = len(self._same(index)) >= _MOST_PEERS
+            if full and not self._strangers(index):
+                self.links[index].leave(peer)
+            else:
                 self._channel(index, peer)
+
+    def _same(self, index: int) -> list[tuple[int, Any]]:
+        """Who is at the other end of a link, who was silent longest first."""
+        return [key for key in self._by_peer if key[0] == index]
+
+    def _strangers(self, index: int) -> list[tuple[int, Any]]:
+        return [key for key in self._same(index) if not self.channels[self._by_peer[key]].believed]
 
     def _channel(self, index: int, peer: Any) -> int:
         """Number of a peer; a new one takes the place of who was silent longest, a stranger before anybody who was believed."""
@@ -144,10 +154,9 @@ class Links:
         if key in self._by_peer:
             self._by_peer[key] = self._by_peer.pop(key)
         else:
-            same = [k for k in self._by_peer if k[0] == index]
+            same = self._same(index)
             if len(same) >= _MOST_PEERS:
-                strangers = [k for k in same if not self.channels[self._by_peer[k]].believed]
-                self._forget(*(strangers or same)[0])
+                self._forget(*(self._strangers(index) or same)[0])
             self._by_peer[key] = self._next
             self.channels[self._next] = Channel(self._next, self.links[index], peer, self._trusted[index])
             self._next += 1

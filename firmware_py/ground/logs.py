@@ -42,7 +42,8 @@ class LogService:
     def __init__(self, system: System, folder: Path | None, is_busy: Callable[[int], bool]) -> None:
         self._system, self._folder, self._is_busy = system, folder, is_busy
         self._transfer: _Transfer | None = None
-        self._listing: _Listing | None = None
+        self._listings: dict[int, _Listing] = {}
+        """By channel."""
         self._files: list[Path] = []
 
     def handlers(self) -> dict[str, Handler]:
@@ -56,8 +57,11 @@ class LogService:
 
     def step(self) -> None:
         """Send the next entries and pieces of what is asked for."""
-        if self._listing is not None and not self._is_busy(self._listing.arrival.channel):
-            self._tell(self._listing)
+        for channel, listing in list(self._listings.items()):
+            if channel not in self._system.channels:
+                del self._listings[channel]
+            elif not self._is_busy(channel):
+                self._tell(listing)
         if self._transfer is not None and not self._is_busy(self._transfer.arrival.channel):
             self._carry(self._transfer)
 
@@ -82,7 +86,7 @@ class LogService:
         t.left -= len(data)
 
     def _list(self, arrival: Arrival) -> None:
-        self._listing = _Listing(arrival, 0, arrival.message["end"])
+        self._listings[arrival.channel] = _Listing(arrival, 0, arrival.message["end"])
 
     def _tell(self, listing: _Listing) -> None:
         """The folder is looked at once for a list, not for each request of a flood."""
@@ -94,7 +98,7 @@ class LogService:
                 self._system.send(arrival.channel, "LOG_ENTRY", {})
         first, listing.next = listing.next, listing.next + _ENTRIES_AT_ONCE
         if listing.next > listing.last:
-            self._listing = None
+            del self._listings[arrival.channel]
         for number in range(first, min(listing.next - 1, listing.last) + 1):
             try:
                 status = self._files[number - 1].stat()

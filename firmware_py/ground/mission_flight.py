@@ -108,6 +108,15 @@ class MissionFlight:
         if self._flight is not None:
             self._flight.replaced = True
 
+    def amend(self, items: tuple[Item, ...]) -> None:
+        """The same mission with other items in it, while it does not fly: it goes on where it is."""
+        self.items = items
+
+    @property
+    def flies(self) -> bool:
+        """Whether the mission that is there is under way."""
+        return self._system.subject.progress.state == ACTIVE
+
     def start(self, first: int | None) -> str:
         """Fly from item `first`, or go on where it stopped. Returns why not, or nothing."""
         s = self._system.subject
@@ -136,7 +145,7 @@ class MissionFlight:
             return f"item {index} of {len(self.items)} does not exist"
         self._end_if_taken()
         p = self._system.subject.progress
-        if p.state == ACTIVE:
+        if p.state == ACTIVE or (self._flight is not None and self._flight.replaced):
             return self.start(index)
         p.current, p.state = index, PAUSED
         return ""

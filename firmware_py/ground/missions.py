@@ -29,6 +29,7 @@ class _Upload:
     items: list[Item] = field(default_factory=list)
     rest: tuple[Item, ...] = ()
     """Those that stay behind them."""
+    in_part: bool = False
     asked_ns: int = 0
     asked: int = 0
 
@@ -90,15 +91,15 @@ class MissionService:
         self._ask(self._upload, arrival.time_ns)
 
     def _write_part(self, arrival: Arrival) -> None:
-        """Items that take the place of others: those before and behind them stay."""
+        """Items that take the place of others, in a mission that does not fly: those before and behind them stay."""
         first, last, kind = (arrival.message[name] for name in ("start_index", "end_index", "mission_type"))
         known = self._flight.items
         if kind != _MISSION or not 0 <= first <= last < len(known):
             self._acknowledge(arrival, _UNSUPPORTED if kind != _MISSION else _INVALID_SEQUENCE, kind)
-        elif self._upload is not None and not _same(self._upload.arrival, arrival):
+        elif self._flight.flies or (self._upload is not None and not _same(self._upload.arrival, arrival)):
             self._acknowledge(arrival, _DENIED, kind)
         else:
-            self._upload = _Upload(arrival, last + 1, kind, list(known[:first]), known[last + 1 :])
+            self._upload = _Upload(arrival, last + 1, kind, list(known[:first]), known[last + 1 :], in_part=True)
             self._ask(self._upload, arrival.time_ns)
 
     def _ask(self, upload: _Upload, time_ns: int) -> None:
@@ -125,7 +126,7 @@ class MissionService:
             self._ask(upload, arrival.time_ns)
             return
         self._upload = None
-        self._flight.replace((*upload.items, *upload.rest))
+        (self._flight.amend if upload.in_part else self._flight.replace)((*upload.items, *upload.rest))
         self._acknowledge(arrival, _ACCEPTED, upload.kind)
 
     def _clear(self, arrival: Arrival) -> None:

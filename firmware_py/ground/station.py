@@ -34,7 +34,9 @@ _LAST_SYSTEM = 254
 """255 is what ground stations take."""
 _MAY_STOP = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE", "MANUAL_CONTROL")
 """They go to services that know what stops."""
-_NEVER_FORWARDED = ("SETUP_SIGNING", "RADIO_STATUS")
+_NEVER_SIGNED = ("RADIO_STATUS",)
+"""Taken from everybody, also with a key."""
+_NEVER_FORWARDED = ("SETUP_SIGNING", *_NEVER_SIGNED)
 
 
 class Services:
@@ -153,7 +155,7 @@ class GroundStation:
             self._take_packet(packet, channel, time_ns, trusted)
         if datagram:
             framer.end()
-        return bool(packets)
+        return any(packet.message.name not in _NEVER_SIGNED for packet in packets)
 
     def planned(self, body: int, plan: Plan) -> None:
         """The plan of a job came back."""

@@ -8,7 +8,7 @@ import struct
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
@@ -77,7 +77,7 @@ def test_udpout_speaks_first_and_survives_that_nobody_listens() -> None:
         for _ in range(5):
             links.send(None, b"anybody?")
             links.flush()
-            links.receive()
+            list(links.receive())
         with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as client:
             client.bind(("127.0.0.1", port))
             client.settimeout(PATIENCE_S)
@@ -103,7 +103,7 @@ def test_tcp_clients_come_and_go() -> None:
         client.close()
         end = time.monotonic() + PATIENCE_S
         while links.channels and time.monotonic() < end:
-            links.receive()
+            list(links.receive())
         assert links.take_gone() == [got.channel] and not links.channels
 
 
@@ -183,6 +183,49 @@ def test_tcp_client_is_spoken_to_before_it_has_said_anything() -> None:
     with closing(side), closing(socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)) as client:
         pump(side, Robot(), 150)
         assert client.recv(300)[0] == 0xFD
+
+
+def test_newcomer_to_a_full_tcp_link_ends_nobody_who_was_believed_and_one_stranger_at_the_most() -> None:
+    port = free_port()
+    with closing(side_on(f"tcpin:127.0.0.1:{port}")) as side, ExitStack() as stack:
+        robot, clients = Robot(), []
+
+        def connect(says: bytes) -> None:
+            clients.append(stack.enter_context(closing(socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S))))
+            clients[-1].sendall(says)
+            pump(side, robot, 2)
+
+        for _ in range(15):
+            connect(heartbeat())
+        believed = set(side.links.channels)
+        connect(b"x")
+        for _ in range(3):
+            for client in clients[:16]:
+                with suppress(OSError):
+                    client.sendall(b"x")
+            connect(heartbeat())
+        assert believed < set(side.links.channels)
+        assert len(side.links.channels) == 16
+        assert all(channel.believed for channel in side.links.channels.values())
+
+
+def test_radio_status_makes_nobody_believed() -> None:
+    """It is taken unsigned from everybody."""
+    station = World().station
+    mav = mavlink.MAVLink(None, srcSystem=51, srcComponent=68)
+    assert not station.take(3, bytes(mavlink.MAVLink_radio_status_message(0, 0, 0, 0, 0, 0, 0).pack(mav)), 0)
+    assert station.take(3, heartbeat(), 0)
+
+
+def test_each_of_two_clients_has_its_list_of_logs(tmp_path: Path) -> None:
+    for number in range(25):
+        (tmp_path / f"{number}.log").touch()
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    clients = [world.client(), world.client(200)]
+    for client in clients:
+        client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(5)
+    assert [len(client.all("LOG_ENTRY")) for client in clients] == [25, 25]
 
 
 def test_tcp_client_that_breaks_off_is_no_channel_any_more() -> None:
@@ -276,10 +319,10 @@ def test_radio_that_is_pulled_and_plugged_in_again_is_taken_up_again(tmp_path: P
         for _ in range(3):  # the first finds out
             links.send(None, b"to nobody")
             links.flush()
-            assert links.receive() == []
+            assert list(links.receive()) == []
         assert links.counts["send"] + links.counts["receive"] == 1
         radio = Radio(name)
-        assert links.receive() == []  # opens it
+        assert list(links.receive()) == []  # opens it
         os.write(radio.ours, heartbeat())
         assert b"".join(r.data for r in received(links, 1)) == heartbeat()
         links.send(None, b"answer")

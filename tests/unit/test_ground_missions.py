@@ -335,6 +335,36 @@ def test_mission_that_came_while_another_flew_is_started_from_its_beginning(worl
     assert [leg.sequence for leg in job.legs] == [0, 1]
 
 
+def test_jump_after_an_upload_in_flight_goes_on_in_the_new_mission(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    upload(world, client, [item(i, place) for i, place in enumerate(reversed(PLACES))])
+    client.send("MISSION_SET_CURRENT", 1, 1, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [1, 2]
+
+
+def test_mission_that_flies_is_not_written_over_in_part_and_a_paused_one_goes_on_where_it_was(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    world.run(1100)
+    client.clear()
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 2, 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_DENIED
+    client.command(193, 0)
+    world.run(120)
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 2, 0)
+    world.run(2)
+    client.send("MISSION_ITEM_INT", *item(2, PLACES[0]), 0)
+    world.run(2)
+    client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [1, 2]
+
+
 def test_part_of_a_mission_is_written_over(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     before = world.station.services[1].flight.items

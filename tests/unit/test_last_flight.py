@@ -130,6 +130,14 @@ def test_joint_that_was_open_at_the_start_is_open_until_somebody_flew_it(tmp_pat
     assert {(0, 0), (1, 1)} <= found(tmp_path).let_go
     write(tmp_path, lines_of([True] * 3) + dock_line(0, (1, 0, 0, 0, 0, 0)), apart=[[0, 0], [1, 1]])
     assert not {(0, 0), (1, 1)} & found(tmp_path).let_go
+    write(tmp_path, lines_of([False, False, True]) + dock_line(0, (1, 0, 0, 0, 0, 0)), apart=[[0, 0], [1, 1]])
+    assert {(0, 0), (1, 1)} <= found(tmp_path).let_go, "it was another body that flew"
+
+
+@pytest.mark.parametrize(("duty", "let_go"), [(1.0, 6), (0.5, 0)])
+def test_magnet_that_rests_between_its_turns_was_not_told_to_let_go(tmp_path: Path, duty: float, let_go: int) -> None:
+    write(tmp_path, lines_of([True] * 3) + dock_line(0, (0,) * 6), parameters={"limiter": {"relay_duty": duty}})
+    assert len(found(tmp_path).let_go) == let_go
 
 
 def test_log_whose_signals_are_torn_arms_nobody(tmp_path: Path) -> None:

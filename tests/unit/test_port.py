@@ -258,6 +258,16 @@ class TestSlcan(PortSuite):
         one.close()
         assert run().returncode == 0
 
+    def test_adapter_whose_device_fails_to_close_can_be_opened_again(self, cable, monkeypatch):
+        link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))
+        bus = link.open()
+        with monkeypatch.context() as broken:
+            broken.setattr(bus.serialPortOrig, "close", lambda: 1 // 0)
+            with pytest.raises(ZeroDivisionError):
+                link.close(bus)
+        bus.serialPortOrig.close()
+        link.close(link.open())
+
     def test_silent_adapter_is_waited_for_asleep(self, cable, monkeypatch):
         """python-can's own wait reads in a loop: at real-time priority nothing else would run on that processor."""
         link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))

@@ -244,10 +244,12 @@ class SlcanLink(Link):
         try:
             self._take()
             return can.Bus(interface="slcan", channel=self.address, bitrate=BIT_RATE, sleep_after_open=0.0, timeout=0.0)
-        except BlockingIOError:
-            raise PortError(f"slcan:{self.address}: another process uses it; one adapter serves one process") from None
-        except (OSError, ValueError, can.CanError) as error:
+        except Exception as error:
+            if isinstance(error, BlockingIOError) and self._lock is None:
+                raise PortError(f"slcan:{self.address}: another process uses it; one adapter serves one process") from None
             self._give_back()
+            if not isinstance(error, (OSError, ValueError, can.CanError)):
+                raise
             hint = "it takes a serial device, slcan:/dev/ttyACM0"
             raise PortError(f"slcan:{self.address}: {_reason(error)}; {hint}") from None
 
@@ -272,8 +274,10 @@ class SlcanLink(Link):
         try:
             bus.shutdown()
         finally:
-            bus.serialPortOrig.close()
-            self._give_back()
+            try:
+                bus.serialPortOrig.close()
+            finally:
+                self._give_back()
 
     def send(self, bus: Any, frame: Frame) -> None:
         """Hands over what the device takes at once.
