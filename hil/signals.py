@@ -296,17 +296,17 @@ def _tell_of_same_body(firmware: Columns, truth: Columns, thrusters: int) -> Non
         return
     believed = np.isfinite(firmware["commanded_n"]).sum(axis=1) // thrusters
     actual = (truth["member"] > 0.0).sum(axis=1)
-    hull, body = _rotation(truth["q_wm"]), _rotation(truth["q_wb"])
-    p_wb, q_wb = truth["p_wb"].copy(), truth["q_wb"].copy()
-    for tick in np.flatnonzero(believed != actual):
-        known = np.flatnonzero((actual == believed[tick]) & (believed == actual))
+    for count in np.unique(believed[believed != actual]):
+        unknown = np.flatnonzero((believed == count) & (actual != count))
+        known = np.flatnonzero((believed == count) & (actual == count))
         if not len(known):
             continue
-        then = max(known[known < tick], default=known[0])
-        lever_m = hull[then].inv().apply(truth["p_wb"][then] - truth["p_wm"][then])
-        p_wb[tick] = truth["p_wm"][tick] + hull[tick].apply(lever_m)
-        q_wb[tick] = np.roll((hull[tick] * hull[then].inv() * body[then]).as_quat(), 1)
-    truth["p_wb"], truth["q_wb"] = p_wb, q_wb
+        then = known[np.maximum(np.searchsorted(known, unknown) - 1, 0)]
+        hull_then, hull = _rotation(truth["q_wm"][then]), _rotation(truth["q_wm"][unknown])
+        lever_m = hull_then.inv().apply(truth["p_wb"][then] - truth["p_wm"][then])
+        body = hull * hull_then.inv() * _rotation(truth["q_wb"][then])
+        truth["p_wb"][unknown] = truth["p_wm"][unknown] + hull.apply(lever_m)
+        truth["q_wb"][unknown] = np.roll(body.as_quat(), 1, axis=1)
 
 
 def _rotation(q: np.ndarray) -> Rotation:

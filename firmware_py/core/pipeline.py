@@ -29,7 +29,7 @@ from firmware_py.core.supervisor import WARNING, Decision, Supervisor
 from firmware_py.core.supply import SupplyMeter
 from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.topology import in_both, join, part_of
-from firmware_py.core.transitions import DOCKING, Effect, Trigger
+from firmware_py.core.transitions import DOCKING, Effect, State, Trigger
 from firmware_py.core.types import (
     Action,
     BodyRecord,
@@ -49,6 +49,8 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 
 ESTIMATORS: dict[str, type[Estimator] | type[TagOnlyEstimator]] = {"full": Estimator, "paper": TagOnlyEstimator}
+ARMING_EVERY_NS = 100_000_000
+"""Between two times that the arming checks are asked for what a record says of them."""
 CHANNELS = 8
 """Thruster commands that one module's frames carry."""
 
@@ -68,6 +70,7 @@ class BodyPipeline:
         self.guidance = Guidance(body, parameters)
         self.motor_test = MotorTest(body, parameters.steering)
         self.dock_over = False
+        self._asked_ns, self._may = -ARMING_EVERY_NS, False
         self.parting: list[DockRequest] = []
         """Open joints for which a plan was last asked."""
         self.controller = Controller(body, parameters.control)
@@ -150,9 +153,14 @@ class BodyPipeline:
         force, command = self.limiter.step(thrust.force_n, armed, self.supply.voltage_v, alive)
         self.lag.command(force)
         state, mode = self.supervisor.state, self.supervisor.mode
-        may_arm = self.supervisor.may_arm(health)
-        record = BodyRecord(self.body.index, state, mode, estimate, setpoint, wrench, thrust, force, may_arm)
+        record = BodyRecord(self.body.index, state, mode, estimate, setpoint, wrench, thrust, force, self._may_arm(time_ns))
         return record, command
+
+    def _may_arm(self, time_ns: int) -> bool:
+        """Whether ARM would be granted, asked ten times a second: it takes every check, and people look at it."""
+        if time_ns - self._asked_ns >= ARMING_EVERY_NS:
+            self._asked_ns, self._may = time_ns, self.supervisor.may_arm(self.health.now)
+        return self._may and self.supervisor.state == State.DISARMED
 
     def magnets(self, wanted: Sequence[Sequence[int]], due: Collection[int]) -> dict[int, tuple[int, ...]]:
         """Relay states that are wanted -> those that may be. Returns what is to be sent, by module: what is due, and what changed.

@@ -320,7 +320,7 @@ class BodyRecord(NamedTuple):
     commanded_n: Array
     """(n,) force of each thruster after the limiter."""
     may_arm: bool
-    """Disarmed, and every arming check holds."""
+    """Disarmed, and every arming check held when they were asked last, at most 0.1 s ago."""
 
 
 class DockRecord(NamedTuple):

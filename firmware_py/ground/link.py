@@ -17,6 +17,7 @@ TRUSTED = "+trusted"
 _QUEUE_FRAMES = 256
 _MOST_PEERS = 16
 _BUSY_FRAMES = 4
+"""More that wait: a link that takes what it is given has none left after a round."""
 
 
 class Received(NamedTuple):

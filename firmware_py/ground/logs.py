@@ -12,6 +12,7 @@ _PIECE = 90
 _PIECES_AT_ONCE = 20
 """Pieces sent in one round: 0.4 s of a radio of 57,600 Bd, for which an answer waits at the most."""
 _ENTRIES_AT_ONCE = 10
+"""Of a list: half as many frames as pieces, each with a look at its file."""
 _MOST_LOGS = 100
 _SUFFIXES = (".mcap", ".log")
 

@@ -145,7 +145,7 @@ class MissionFlight:
             return f"item {index} of {len(self.items)} does not exist"
         self._end_if_taken()
         p = self._system.subject.progress
-        if p.state == ACTIVE or (self._flight is not None and self._flight.replaced):
+        if self.flies or (self._flight is not None and self._flight.replaced):
             return self.start(index)
         p.current, p.state = index, PAUSED
         return ""

@@ -165,12 +165,12 @@ class Steering:
 
         A channel that a message leaves out stays as its sender had it, for as long as sticks count.
         """
-        now, oldest_ns = arrival.time_ns, arrival.time_ns - self._parameters().steering.stick_timeout_s * NS_PER_S
+        now_ns, oldest_ns = arrival.time_ns, arrival.time_ns - self._parameters().steering.stick_timeout_s * NS_PER_S
         fresh = ((who, [o if o.at_ns >= oldest_ns else _LET_GO for o in kept]) for who, kept in self._overrides.items())
         self._overrides = {who: kept for who, kept in fresh if kept != _ALL_LET_GO}
         before = self._overrides.get(sender_of(arrival), _ALL_LET_GO)
         channels = [arrival.message[f"chan{i}_raw"] for i in range(1, 7)]
-        after = [old if pwm == _RC_IGNORED else _Override(pwm, now) for old, pwm in zip(before, channels, strict=True)]
+        after = [old if pwm == _RC_IGNORED else _Override(pwm, now_ns) for old, pwm in zip(before, channels, strict=True)]
         if not any(_is_overridden(o.pwm) for o in (*before, *after)) or all(pwm == _RC_IGNORED for pwm in channels):
             return
         pitch, roll, up, yaw, forward, right = (_channel(o.pwm) for o in after)

@@ -47,7 +47,7 @@ class Framer:
         self._buffer += data
         packets: list[Packet] = []
         at = false = 0
-        while (start := self._next_magic(at)) is not None:
+        while false < _MOST_FALSE and (start := self._next_magic(at)) is not None:
             self.counts["garbage"] += start - at
             at = start
             size = self._frame_size(at)
@@ -57,11 +57,7 @@ class Framer:
             if packet is None:
                 at += 1  # what looked like a frame may hold a real one
                 false += 1
-                if false < _MOST_FALSE:
-                    continue
-                self.counts["garbage"] += len(self._buffer) - at
-                at = len(self._buffer)
-                break
+                continue
             at += size
             if packet.message.name:
                 packets.append(packet)

@@ -23,8 +23,6 @@ from hil.signals import Flight
 REPORT_FILE = "report.html"
 FRAMES_HZ = 25.0
 """Samples of the animation a second; it interpolates between them."""
-REGROUPED_M = 0.001
-"""By how much the lever from the leader's hull to the body's centre of mass changes, at least, when modules join or part."""
 CAPTIONS = {
     "overview": "The whole flight. Grey: before and after the judged part.",
     "position": "Position per axis: reference, truth and estimate, and what they are off by.",
@@ -144,9 +142,9 @@ def _module(vehicle: Vehicle, truth: Columns, member: np.ndarray, keep: slice) -
 
 
 def _cuts(flight: Flight, keep: slice) -> list[int]:
-    """Frames at which the body's centre of mass, and the reference with it, is another point: modules joined or parted."""
-    lever_m = np.linalg.norm(flight.p_wb[keep] - flight.truth["p_wm"][keep], axis=1)
-    return (1 + np.flatnonzero(np.abs(np.diff(lever_m)) > REGROUPED_M)).tolist()
+    """Frames at which the body that is steered, and the reference with it, is another one: it has more or fewer thrusters."""
+    thrusters = np.isfinite(flight.firmware["commanded_n"][keep]).sum(axis=1)
+    return (1 + np.flatnonzero(np.diff(thrusters))).tolist()
 
 
 def _short(values: np.ndarray, digits: int) -> Any:

@@ -65,6 +65,14 @@ def fly(world: World, client: Client, first_arrival_s: float = 10.0) -> PlanJob:
     return job
 
 
+def continued(world: World, client: Client) -> list[int]:
+    """Items that are planned when the mission is continued."""
+    client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    return [leg.sequence for leg in job.legs]
+
+
 def test_mission_goes_up_and_comes_down_the_same(world: World, client: Client) -> None:
     items = [item(i, place) for i, place in enumerate(PLACES)]
     assert upload(world, client, items) == mavlink.MAV_MISSION_ACCEPTED
@@ -175,10 +183,7 @@ def test_pause_and_resume_go_on_at_the_same_item(world: World, client: Client) -
     client.command(193, 0)
     world.run(120)
     assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_PAUSED
-    client.command(193, 1)
-    world.run(10)
-    (job,) = world.station.jobs()
-    assert [leg.sequence for leg in job.legs] == [1, 2]
+    assert continued(world, client) == [1, 2]
 
 
 def test_jump_replans_from_where_the_body_is(world: World, client: Client) -> None:
@@ -329,10 +334,7 @@ def test_mission_that_came_while_another_flew_is_started_from_its_beginning(worl
     assert not client.all("MISSION_ITEM_REACHED")
     client.command(193, 0)
     world.run(20)
-    client.command(193, 1)
-    world.run(10)
-    (job,) = world.station.jobs()
-    assert [leg.sequence for leg in job.legs] == [0, 1]
+    assert continued(world, client) == [0, 1]
 
 
 def test_jump_after_an_upload_in_flight_goes_on_in_the_new_mission(world: World, client: Client) -> None:
@@ -359,10 +361,7 @@ def test_mission_that_flies_is_not_written_over_in_part_and_a_paused_one_goes_on
     world.run(2)
     client.send("MISSION_ITEM_INT", *item(2, PLACES[0]), 0)
     world.run(2)
-    client.command(193, 1)
-    world.run(10)
-    (job,) = world.station.jobs()
-    assert [leg.sequence for leg in job.legs] == [1, 2]
+    assert continued(world, client) == [1, 2]
 
 
 def test_part_of_a_mission_is_written_over(world: World, client: Client) -> None:

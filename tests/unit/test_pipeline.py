@@ -155,6 +155,17 @@ def test_robot_that_may_not_arm_says_why(tank: Tank) -> None:
     assert any(event.text.startswith("ARM refused: ") for event in outputs.events)
 
 
+def test_record_says_whether_arm_would_be_granted(tank: Tank) -> None:
+    assert not tank.run(DT).records[0].may_arm, "it has seen nothing yet"
+    assert tank.run(0.5).records[0].may_arm
+    assert not tank.run(DT, estop=True).records[0].may_arm, "not for one tick more"
+    tank.run(1.0)
+    assert tank.run(0.2, Request(Action.CLEAR_ESTOP)).records[0].may_arm
+    armed = tank.run(DT, Request(Action.ARM))
+    assert armed.modules[0].armed
+    assert not armed.records[0].may_arm
+
+
 def test_armed_robot_holds_the_place_where_it_armed(tank: Tank) -> None:
     tank.run(0.5)
     armed = tank.run(DT, Request(Action.ARM))
