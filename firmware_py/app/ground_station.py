@@ -133,7 +133,7 @@ class GroundSide:
         station = self.station
         if self.keeper is not None:
             station.picture.times = times_of(self.keeper)
-        station.busy = self.links.busy()
+        station.spare(self.links.busy())
         while self._ticks:
             inputs, outputs = self._ticks.popleft()
             station.observe(inputs, outputs, self._pipeline.bodies)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,14 +33,10 @@ class _Listing:
 
 
 class LogService:
-    """The logs of one process, oldest first, numbered from 1. They go out where nothing else waits to be sent.
+    """The logs of one process, oldest first, numbered from 1. They go out where nothing else waits to be sent."""
 
-    Args of the constructor:
-        is_busy: whether a channel has enough to do.
-    """
-
-    def __init__(self, system: System, folder: Path | None, is_busy: Callable[[int], bool]) -> None:
-        self._system, self._folder, self._is_busy = system, folder, is_busy
+    def __init__(self, system: System, folder: Path | None) -> None:
+        self._system, self._folder = system, folder
         self._transfer: _Transfer | None = None
         self._listings: dict[int, _Listing] = {}
         """By channel."""
@@ -61,9 +56,9 @@ class LogService:
         for channel, listing in list(self._listings.items()):
             if channel not in self._system.channels:
                 del self._listings[channel]
-            elif not self._is_busy(channel):
+            elif channel not in self._system.busy:
                 self._tell(listing)
-        if self._transfer is not None and not self._is_busy(self._transfer.arrival.channel):
+        if self._transfer is not None and self._transfer.arrival.channel not in self._system.busy:
             self._carry(self._transfer)
 
     def _carry(self, t: _Transfer) -> None:

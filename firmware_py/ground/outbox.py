@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any, NamedTuple
 
 from firmware_py.ground.dialect import Dialect
@@ -36,9 +36,9 @@ class Rates:
             self.intervals_ns[name] = interval_ns
             self._next_ns[name] = now_ns
 
-    def due(self, now_ns: int) -> list[str]:
-        """What is to be sent now; what was missed is not made up."""
-        names = [name for name, next_ns in self._next_ns.items() if next_ns <= now_ns]
+    def due(self, now_ns: int, among: Container[str]) -> list[str]:
+        """What is to be sent now; what was missed is not made up. What is not `among` these waits for the next call."""
+        names = [name for name, next_ns in self._next_ns.items() if next_ns <= now_ns and name in among]
         for name in names:
             interval = self.intervals_ns[name]
             self._next_ns[name] += interval * ((now_ns - self._next_ns[name]) // interval + 1)

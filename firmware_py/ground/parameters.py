@@ -80,8 +80,10 @@ class ParameterService:
         self._to_send[arrival.channel] = 0
 
     def step(self) -> None:
-        """Send the next few to everybody who asked for all."""
+        """Send the next few to everybody who asked for all, where nothing else waits to be sent."""
         for channel, first in list(self._to_send.items()):
+            if channel in self._system.busy:
+                continue
             for name in self._store.order[first : first + _AT_ONCE]:
                 self._system.send(channel, "PARAM_VALUE", self._value(name))
             if first + _AT_ONCE >= len(self._store.order) or channel not in self._system.channels:

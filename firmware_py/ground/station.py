@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 
 from firmware_py.core.body import Body
@@ -49,7 +49,7 @@ class Services:
         self.missions = MissionService(system, self.flight)
         self.steering = Steering(system, lambda: store.values, _dock_of(config), config.watches)
         self.presence = Presence(system, config, lambda: store.values, station.signing)
-        self.logs = LogService(system, Path(config.logs) if config.logs else None, lambda channel: channel in station.busy)
+        self.logs = LogService(system, Path(config.logs) if config.logs else None)
         self.parameters = ParameterService(system, store, station.present)
         extra = {
             "AUTOPILOT_VERSION": self.presence.autopilot_version,
@@ -99,8 +99,7 @@ class GroundStation:
         self.counts: Counter[str] = Counter()
         self.picture = Picture(len(fleet.module), self.store.values.supervision)
         self._dialect = load_dialect()
-        self.busy: set[int] = set()
-        """Channels that take no more than they must."""
+        self._busy: set[int] = set()
         self._frames: list[Outgoing] = []
         self._framers: dict[int, Framer] = {}
         self._routes: dict[int, int] = {}
@@ -109,7 +108,7 @@ class GroundStation:
         for body in range(len(fleet.module)):
             number = config.first_system + body
             outbox = Outbox(self._dialect, self.signing, number, self._frames)
-            self.services[number] = Services(self, System(Subject(body, self.picture, config.encoding, origin), outbox))
+            self.services[number] = Services(self, System(Subject(body, self.picture, config.encoding, origin), outbox, self._busy))
 
     # ------------------------------------------------------------ in
 
@@ -132,6 +131,11 @@ class GroundStation:
             event = self.picture.events.popleft()
             speaker = present.get(event.body, next(iter(present.values())))
             speaker.say(event.severity, event.text)
+
+    def spare(self, busy: Set[int]) -> None:
+        """These channels have enough to send, until the next call."""
+        self._busy.clear()
+        self._busy.update(busy)
 
     def join(self, channel: int, time_ns: int) -> None:
         """A channel is there; it gets the default telemetry."""

@@ -17,6 +17,8 @@ _TEXT = 50
 _SELDOM_NS = 5 * NS_PER_S
 """Between two texts about what streams in."""
 _WARNING = 4
+_NEVER_WAITS = ("HEARTBEAT",)
+"""Without it clients lose the vehicle."""
 STOPPING = frozenset({Action.ESTOP, Action.DISARM})
 """What reaches a module whichever body it is part of."""
 STEERING = STOPPING | {Action.SET_MODE, Action.HOLD, Action.DOCK, Action.UNDOCK, Action.MOTOR_TEST}
@@ -47,6 +49,8 @@ class System:
 
     subject: Subject
     outbox: Outbox
+    busy: set[int] = field(default_factory=set)
+    """Channels that take their time: what can wait is not sent to them now. One set for all systems."""
     channels: dict[int, Rates] = field(default_factory=dict)
     """Everybody who is there, with the rates that they want."""
     requests: list[Request] = field(default_factory=list)
@@ -116,10 +120,10 @@ class System:
             self.broadcast("STATUSTEXT", {"severity": severity, "text": piece, "id": number, "chunk_seq": i})
 
     def stream(self, time_ns: int) -> None:
-        """Send what is due on every channel; each message is made once."""
+        """Send what is due on every channel; each message is made once. A slow link gets fewer of all kinds, and every heartbeat."""
         made: dict[str, list[bytes]] = {}
         for channel, rates in self.channels.items():
-            for name in rates.due(time_ns):
+            for name in rates.due(time_ns, _NEVER_WAITS if channel in self.busy else STREAMS):
                 if name not in made:
                     made[name] = [self.outbox.payload(name, values) for values in STREAMS[name](self.subject)]
                 for payload in made[name]:

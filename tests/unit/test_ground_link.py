@@ -7,6 +7,7 @@ import socket
 import struct
 import threading
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
@@ -18,11 +19,12 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.app.ground_station import GroundSide
-from firmware_py.core.types import Action, Request
+from firmware_py.core.types import Action, Event, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.link import Channel, Links
 from firmware_py.ground.logs import LogService
+from firmware_py.ground.telemetry import DEFAULT_HZ
 from firmware_py.ground.transport import LinkError, open_link
 from tests.unit.ground_world import Robot, World, fleet_of
 from tests.unit.test_ground_walk import free_port
@@ -122,9 +124,10 @@ def test_a_client_that_does_not_read_loses_the_oldest_and_delays_nobody() -> Non
         assert len(links.channels[got.channel].queue) <= 256
 
 
-def side_on(*links: str) -> GroundSide:
+def side_on(*links: str, modules: int = 1) -> GroundSide:
     """A ground side without a thread: the test pumps."""
-    firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
+    pipeline = SimpleNamespace(bodies=Robot(modules).bodies)
+    firmware: Any = SimpleNamespace(pipeline=pipeline, fleet=fleet_of(modules), parameters=Parameters())
     return GroundSide(GroundConfig(links=links), firmware, ThreadPoolExecutor(1))
 
 
@@ -259,12 +262,61 @@ def test_answers_find_their_way_while_a_log_is_fetched_over_a_radio(tmp_path: Pa
     world = World(config=GroundConfig(logs=str(tmp_path)))
     client = world.client()
     client.send("LOG_REQUEST_DATA", 1, 1, 1, 0, 0xFFFFFFFF)
-    world.station.busy = {client.channel}
+    world.station.spare({client.channel})
     world.run(50)
     assert not client.all("LOG_DATA") and client.all("HEARTBEAT")
-    world.station.busy = set()
+    world.station.spare(set())
     world.run(2)
     assert len(client.all("LOG_DATA")) == 40
+
+
+class SlowLink:
+    """A radio that carries so many bytes a tick."""
+
+    datagram = False
+
+    def __init__(self, bytes_per_tick: float) -> None:
+        self.bytes_per_tick, self.room, self.frames = bytes_per_tick, 0.0, list[bytes]()
+
+    def receive(self) -> list[tuple[Any, bytes]]:
+        """Once in a tick."""
+        self.room = min(self.room + self.bytes_per_tick, 300.0)
+        return []
+
+    def send(self, peer: Any, frame: bytes) -> bool:
+        if self.room < len(frame):
+            return False
+        self.room -= len(frame)
+        self.frames.append(frame)
+        return True
+
+    def peers(self) -> list[None]:
+        return [None]
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+def test_radio_slower_than_what_streams_gets_less_of_everything_and_every_heartbeat_and_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    radio, robot = SlowLink(57.6), Robot(modules=4)  # 57,600 Bd at 100 Hz
+    monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address: radio)
+    with closing(side_on("radio", modules=4)) as side:
+        for second in range(20):
+            pump(side, robot, 99)
+            robot.events.append(Event(6, f"second {second}", 0))
+            pump(side, robot, 1)
+            side.station.services[1].parameters._list(SimpleNamespace(channel=0))  # type: ignore[arg-type]
+        pump(side, robot, 300)
+        assert not side.links.dropped
+    parser = mavlink.MAVLink(None)
+    got = Counter((m.get_srcSystem(), m.get_type()) for frame in radio.frames for m in parser.parse_buffer(frame))
+    names = {name for name, hz in DEFAULT_HZ.items() if hz >= 1} - {"ESC_STATUS"}  # pymavlink here knows none
+    for system in (1, 2, 3, 4):
+        assert 21 <= got[system, "HEARTBEAT"] <= 24
+        assert all(got[system, name] >= 3 for name in names)
+        assert got[system, "ATTITUDE"] < 100  # of 230
+    assert got[1, "STATUSTEXT"] == 20
+    assert got[1, "PARAM_VALUE"] >= 20
 
 
 def test_flood_of_requests_for_the_list_of_logs_looks_at_the_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
