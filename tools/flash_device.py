@@ -6,7 +6,7 @@ Layout of the root folder (say /opt/modcube):
     wheels/            every wheel ever shipped and still used, checked by SHA-256
     releases/ID/       one release: its own environment, `bin/modcube`, `release.json`; ID.partial while it is made
     current, previous  links to releases; the service starts `current/bin/modcube`
-    trial.json         while a new release has not proved itself: what to go back to, units included, and who is watching
+    trial.json         while a new release has not proved itself: links and units to go back to, and who is watching
 
 Whatever is interrupted, and wherever: before the switch `current` is untouched; from the switch on, a release that is on
 trial without its watcher is taken back by `boot`, which a unit of its own (flash_units.py) runs before every start of the
@@ -151,7 +151,8 @@ class Device:
             self._start_and_wait(release)
             return
         self._step("trial")
-        trial = {"release": release, "old": old, "units": installed_units(units, UNIT_FOLDER), **watcher()}
+        before = {"old": old, "previous": self.linked(self.previous), "units": installed_units(units, UNIT_FOLDER)}
+        trial = {"release": release, **before, **watcher()}
         write_whole(self.trial, json.dumps(trial))
         try:
             self._switch(self.current, release)
@@ -214,12 +215,12 @@ class Device:
         return f"release {trial.get('release')} had not proved itself: back to {self.linked(self.current)}"
 
     def _take_back(self, trial: dict[str, Any]) -> None:
-        """`current` and units as they were before a trial; it is over when both are. Raises RefusedError."""
-        old = trial["old"]
-        if old is None:
-            remove(self.current)
-        elif (self.releases / old / "release.json").is_file():
-            self._switch(self.current, old)
+        """Links and units as they were before a trial; it is over when all are. Raises RefusedError."""
+        for link, release in ((self.current, trial["old"]), (self.previous, trial.get("previous"))):
+            if release is None:
+                remove(link)
+            elif (self.releases / release / "release.json").is_file():
+                self._switch(link, release)
         self._install_units(trial.get("units", {}), SERVICE)
         self._step("end trial")
         remove(self.trial)

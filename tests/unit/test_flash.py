@@ -414,6 +414,7 @@ def test_power_cut_at_any_step_brings_a_release_up_that_runs(
         assert confirmed is not None
         assert "broken" not in confirmed
         assert confirmed == GOOD or machine.steps[-1] == "prune", machine.steps[-1]
+        assert device.linked(device.previous) != confirmed, machine.steps[-1]
         assert again.loaded[flash_device.SERVICE] == unit_of(confirmed), machine.steps[-1]
         assert not device.trial.exists()
         if confirmed != GOOD:
