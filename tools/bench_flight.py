@@ -97,7 +97,7 @@ def measure_flight(seed: int, detailed: bool = False) -> FlightTimes:
 def _watch_stages(watch: Stopwatch, scenario: Scenario) -> list[str]:
     """Wraps the stages of the pipeline and all else that takes time; returns the labels within pipeline.step."""
     firmware = compose(fleet_of(scenario, "virtual:bench", 100), Parameters())
-    chain = next(each for each in vars(firmware.pipeline)["_chains"] if isinstance(each, BodyPipeline))
+    chain = next(each for each in firmware.pipeline.formation.chains if isinstance(each, BodyPipeline))
     stages = []
     for name, part in vars(chain).items():
         for method in STAGE_METHODS:

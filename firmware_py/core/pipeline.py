@@ -12,10 +12,10 @@ import numpy as np
 from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.controller import Controller
-from firmware_py.core.docking import Decisions, DockingStage, Join, Part, tag_table
-from firmware_py.core.docking_pairs import APART, LOOSE
+from firmware_py.core.docking import DockingStage, tag_table
 from firmware_py.core.estimator import Estimator
 from firmware_py.core.faults import FaultDetector
+from firmware_py.core.formation import Formation
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import HealthMonitor
 from firmware_py.core.imu_watch import ImuWatch
@@ -28,7 +28,6 @@ from firmware_py.core.requests import FOR_ALL, sift
 from firmware_py.core.supervisor import WARNING, Decision, Supervisor
 from firmware_py.core.supply import SupplyMeter
 from firmware_py.core.thruster import ThrusterLag
-from firmware_py.core.topology import in_both, join, part_of
 from firmware_py.core.transitions import DOCKING, Effect, State, Trigger
 from firmware_py.core.types import (
     Action,
@@ -41,7 +40,6 @@ from firmware_py.core.types import (
     Mode,
     ModuleCommand,
     Outputs,
-    PartRequest,
     Request,
     Thrust,
 )  # fmt: skip
@@ -183,38 +181,6 @@ class BodyPipeline:
             return Thrust(force, self.body.thrusters.matrix @ force, (1.0, 1.0))
         return self.allocator.step(self.faults.now.keep @ wrench if self.faults.now.lost_axes else wrench)
 
-    def take_over(self, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
-        """Goes on from the bodies that this one is made of, or was part of: motion, forces, health, arm state. Returns its estimate."""
-        if len(before) == 1:
-            motion = part_of(before[0].body, before[0].estimator.motion, self.body)
-        else:
-            motion = join([(chain.body, chain.estimator.motion) for chain in before], self.body)
-        for chain in before:
-            self._take_forces(chain)
-        self.imus.take_over([chain.imus for chain in before])
-        self.faults.take_over([chain.faults for chain in before])
-        self.allocator.set_alive(self.faults.now.alive)
-        self.health.take_over([chain.health for chain in before])
-        self.supervisor.take_over([chain.supervisor for chain in before])
-        estimate = self.estimator.restart(time_ns, motion)
-        self.guidance.take_over(self.supervisor.mode, estimate, self.body.thrusters.matrix @ self.limiter.force_n)
-        return estimate
-
-    def _take_forces(self, other: BodyPipeline) -> None:
-        """Thrusters keep the forces they have, so that no command jumps; magnets keep the time that they may still be on."""
-        mine, theirs = self.body, other.body
-        forces = [array.copy() for array in self.lag.forces]
-        limited = self.limiter.force_n.copy()
-        for i, j in in_both(mine.modules, theirs.modules):
-            here, there = mine.thrusters.module == i, theirs.thrusters.module == j
-            for array, source in zip(forces, other.lag.forces, strict=True):
-                array[here] = source[there]
-            limited[here] = other.limiter.force_n[there]
-            self.limiter.magnets[i] = other.limiter.magnets[j]
-            self.supply.voltage_v[i] = other.supply.voltage_v[j]
-        self.lag.restart(*forces)
-        self.limiter.ease(limited)
-
 
 class Pipeline:
     """All bodies of one firmware process."""
@@ -222,15 +188,14 @@ class Pipeline:
     def __init__(self, bodies: list[Body], parameters: Parameters, period_ns: int) -> None:
         self.parameters = parameters
         self._period_ns = period_ns
-        self._chains = [self.chain_of(body) for body in bodies]
         self._modules = 1 + max(module for body in bodies for module in body.modules)
-        self.docking = DockingStage(parameters.docking, tag_table(bodies), self._modules)
-        self._watch_joints()
+        docking = DockingStage(parameters.docking, tag_table(bodies), self._modules)
+        self.formation = Formation([self.chain_of(body) for body in bodies], docking, parameters)
 
     @property
     def bodies(self) -> list[Body]:
         """The bodies as they are docked now."""
-        return [chain.body for chain in self._chains]
+        return self.formation.bodies
 
     def chain_of(self, body: Body) -> BodyPipeline:
         """The stages of a body that is not there yet: made beside the loop, swapped in by a join or part."""
@@ -239,33 +204,25 @@ class Pipeline:
     def step(self, inputs: Inputs) -> Outputs:
         """One tick."""
         outputs = Outputs(inputs.tick, inputs.time_ns, [IDLE] * self._modules, False, [], [])
-        estimates = {chain.body.index: chain.measure(inputs) for chain in self._chains}
-        self._dock(inputs, estimates, outputs)
-        requests, refusals = sift(inputs.requests, {chain.body.index: chain.body for chain in self._chains})
+        formation, docking = self.formation, self.formation.docking
+        estimates = {chain.body.index: chain.measure(inputs) for chain in formation.chains}
+        formation.step(inputs, estimates, outputs)
+        requests, refusals = sift(inputs.requests, {body.index: body for body in formation.bodies})
         outputs.events += refusals
         self._retune(requests, outputs)
-        for chain in self._chains:
+        for chain in formation.chains:
             outputs.preparations += chain.decide(inputs, estimates[chain.body.index], requests)
             outputs.events += [event._replace(body=chain.body.index) for event in chain.supervisor.events]
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
-            if self.docking.under_way:
-                self._leave_docks(chain, inputs.time_ns, outputs)
-        wanted, due = self.docking.relays, self.docking.due(inputs.time_ns)
-        for chain in self._chains:
+            if docking.under_way:
+                formation.leave(chain, inputs.time_ns, outputs)
+        wanted, due = docking.relays, docking.due(inputs.time_ns)
+        for chain in formation.chains:
             relays = chain.magnets(wanted, due)
             record, command = chain.control(inputs.time_ns, estimates[chain.body.index])
             outputs.records.append(record)
             _command(chain, command, relays, outputs)
         return outputs
-
-    def _leave_docks(self, chain: BodyPipeline, time_ns: int, outputs: Outputs) -> None:
-        """Docks and undocks go on in the mode DOCK alone: an armed body backs off from one, any other lets go at once."""
-        index, supervisor = chain.body.index, chain.supervisor
-        if supervisor.mode == Mode.DOCK:
-            return
-        if supervisor.armed and index in self.docking.busy:
-            self.docking.abort(index, time_ns, "the mode was changed")
-        outputs.events += [event._replace(body=index) for event in self.docking.leave(chain.body, supervisor.armed)]
 
     def _retune(self, requests: Sequence[Request], outputs: Outputs) -> None:
         """Parameters that were set since the last tick. What a ground station's registry let through still may be refused here."""
@@ -277,95 +234,7 @@ class Pipeline:
                 self.parameters = self.parameters.replace(name, value)
             except DescriptionError as error:
                 outputs.events.append(Event(WARNING, str(error)))
-        for chain in self._chains:
-            chain.retune(self.parameters)
-        self.docking.retune(self.parameters.docking)
-
-    def _dock(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
-        """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
-        held = [c for c in self._chains if c.supervisor.armed and c.supervisor.mode == Mode.POSHOLD] if inputs.prepared else []
-        bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self._chains}
-        decisions = self.docking.step(inputs, bodies, [c.body.index for c in held])
-        self._miss_partners(outputs)
-        outputs.docks += self.docking.records
-        outputs.joints = self.docking.joints
-        self._steer(decisions)
-        for joined in decisions.joins:
-            self._join(joined, inputs.time_ns, estimates)
-        for parted in decisions.parts:
-            self._part(parted, inputs.time_ns, estimates)
-        outputs.events += self.docking.events
-
-    def _miss_partners(self, outputs: Outputs) -> None:
-        """Joints that are open though nobody asked: tells the bodies, and parts those that have come apart once their fail-safe is on."""
-        loose = self.docking.open_joints(LOOSE)
-        apart = self.docking.open_joints(APART) if loose else []
-        for chain in self._chains:
-            if not chain.joints:
-                continue
-            chain.health.topology = _words_of([joint for joint in loose if joint.module in chain.body.modules])
-            gone = [joint for joint in apart if joint.module in chain.body.modules]
-            if gone and gone != chain.parting and chain.supervisor.armed and chain.supervisor.is_on("partner_lost"):
-                chain.parting = gone
-                outputs.preparations.append(PartRequest(tuple(gone)))
-
-    def _steer(self, decisions: Decisions) -> None:
-        for chain in self._chains:
-            number = chain.body.index
-            if number in decisions.meets:
-                chain.guidance.move_by(decisions.meets[number])
-            if number in decisions.setpoints:
-                chain.guidance.dock(decisions.setpoints[number])
-            elif number in decisions.ended:
-                chain.dock_over = True
-
-    def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
-        before = self._chains_of(joined.target, joined.active)
-        estimate = self._begin(joined.chain, before, time_ns)
-        self._swap(before, [joined.chain], estimates, [estimate])
-
-    def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
-        after = [parted.stays, parted.leaves]
-        before = self._chains_of(parted.whole)
-        found = [self._begin(chain, before, time_ns) for chain in after]
-        parted.leaves.guidance.move_by(parted.away_w)
-        self._swap(before, after, estimates, found)
-
-    def _begin(self, chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
-        """A body that was prepared takes over, with the parameters of now. Returns its estimate."""
-        if chain.parameters is not self.parameters:
-            chain.retune(self.parameters)
-        return chain.take_over(before, time_ns)
-
-    def _chains_of(self, *bodies: int) -> list[BodyPipeline]:
-        """Of these bodies, by their numbers, in this order. No body joins or parts twice in a tick."""
-        return [chain for number in bodies for chain in self._chains if chain.body.index == number]
-
-    def _swap(
-        self, before: Sequence[BodyPipeline], after: Sequence[BodyPipeline], estimates: dict[int, Estimate], found: Sequence[Estimate]
-    ) -> None:
-        for chain in before:
-            del estimates[chain.body.index]
-        for chain, estimate in zip(after, found, strict=True):
-            estimates[chain.body.index] = estimate
-        kept = [chain for chain in self._chains if chain not in before]
-        self._chains = sorted([*kept, *after], key=lambda chain: chain.body.index)
-        ended = self.docking.forget([chain.body.index for chain in before])
-        for chain in kept:
-            chain.dock_over = chain.dock_over or chain.body.index in ended
-        self._watch_joints()
-
-    def _watch_joints(self) -> None:
-        self.docking.watch_joints([joint for chain in self._chains for joint in chain.joints])
-
-
-def _words_of(open_joints: Sequence[DockRequest]) -> str:
-    """The first of them, for people; empty: none is."""
-    if not open_joints:
-        return ""
-    first, more = open_joints[0], len(open_joints) - 1
-    others = f", and {more} more pairs" if more else ""
-    return f"modules {first.target_module} and {first.module} do not hold together{others}"
+        self.formation.retune(self.parameters)
 
 
 IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)

@@ -20,12 +20,12 @@ def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
     tank = Docked(RING[:2])
     tank.fly()
     tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
-    assert any(2 in states for states in tank.pipeline.docking.relays), "magnets push"
+    assert any(2 in states for states in tank.pipeline.formation.docking.relays), "magnets push"
     request = Request(Action.SET_MODE, 0, Mode.POSHOLD) if stop == "mode" else Request(Action.DISARM, 0)
     tank.run(0.02, *([] if stop == "e-stop" else [request]), estop=stop == "e-stop")
     outputs = tank.run(3.0)
     assert tank.shape == [(0, 1)] and tank.when("undock of module 1 ended")
-    assert [max(states) for states in tank.pipeline.docking.relays] == [1, 1], "and pull again"
+    assert [max(states) for states in tank.pipeline.formation.docking.relays] == [1, 1], "and pull again"
     assert outputs.records[0].mode == Mode.POSHOLD
 
 
@@ -40,11 +40,11 @@ def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str
     while not (outputs.docks and outputs.docks[0].stage == Stage.APPROACH):
         outputs = tank.run(0.01)
     outputs = tank.run(1.0)
-    assert outputs.records[1].mode == Mode.DOCK and any(any(states) for states in tank.pipeline.docking.relays)
+    assert outputs.records[1].mode == Mode.DOCK and any(any(states) for states in tank.pipeline.formation.docking.relays)
     stopping = [] if stop == "e-stop" else [Request(Action.DISARM, 0), Request(Action.DISARM, 1)]
     tank.run(0.02, *stopping, estop=stop == "e-stop")
     outputs = tank.run(5.0)
-    assert outputs.docks == [] and not any(any(states) for states in tank.pipeline.docking.relays)
+    assert outputs.docks == [] and not any(any(states) for states in tank.pipeline.formation.docking.relays)
     assert tank.when("dock of module 1 ended")
     tank.run(0.1, Request(Action.CLEAR_ESTOP, 1))
     outputs = tank.run(0.1, Request(Action.ARM, 1))
@@ -62,13 +62,13 @@ def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
     tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
     wanted = DockRequest(1, 3, 0, 2), DockRequest(2, 2, 0, 3)
     tank.run(0.03, *(Request(Action.DOCK, request.module, request) for request in wanted))
-    assert len(tank.pipeline.docking._docks) == 2
-    for dock in tank.pipeline.docking._docks:
+    assert len(tank.pipeline.formation.docking._docks) == 2
+    for dock in tank.pipeline.formation.docking._docks:
         dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if they had just come
     outputs = tank.run(2.0)
     assert [record.stage for outputs in tank.outputs for record in outputs.docks].count(Stage.DOCKED) == 2
     assert tank.shape == [(0, 1), (2,)]
-    assert tank.pipeline.docking.relays == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
+    assert tank.pipeline.formation.docking.relays == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
     assert tank.when(f"dock ended: {CHANGED}")
 
@@ -126,7 +126,7 @@ def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> N
     outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 2, 3)))
     assert [(dock.module_a, dock.module_b) for dock in outputs.docks] == [(2, 1)]
     assert tank.when("dock of module 1 ended: another was asked for")
-    assert tank.pipeline.docking.relays[0] == [0] * 6
+    assert tank.pipeline.formation.docking.relays[0] == [0] * 6
     assert outputs.records[1].mode == Mode.DOCK
 
 
@@ -137,19 +137,19 @@ def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_ho
     assert tank.shape == [(0,), (1, 2)]
     assert not any("is undocked from 1" in text for _, text in tank.said)
     assert tank.when("undock of module 2 ended")
-    assert tank.pipeline.docking.relays == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
+    assert tank.pipeline.formation.docking.relays == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
 
 
 def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> None:
     tank = Docked(RING)
     tank.fly()
     tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
-    assert [sum(state == 2 for state in states) for states in tank.pipeline.docking.relays] == [0, 1, 1, 2]
+    assert [sum(state == 2 for state in states) for states in tank.pipeline.formation.docking.relays] == [0, 1, 1, 2]
     outputs = tank.run(5.0)
     assert tank.shape == [(0, 1, 2), (3,)]
-    rest, corner = (chain.guidance._glider.at.p_wb for chain in tank.pipeline._chains)
+    rest, corner = (chain.guidance._glider.at.p_wb for chain in tank.pipeline.formation.chains)
     assert outputs.records[1].mode == Mode.POSHOLD and np.linalg.norm(corner - rest) > 0.3
-    assert [max(states) for states in tank.pipeline.docking.relays] == [1, 1, 1, 0]
+    assert [max(states) for states in tank.pipeline.formation.docking.relays] == [1, 1, 1, 0]
 
 
 def test_dock_that_is_asked_for_again_while_it_ends_begins_anew() -> None:
@@ -176,7 +176,7 @@ def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
     tank = before_each_other(2.0)
     for turns in (0, 1, 0, 1):
         tank.run(0.2, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, turns, True)))
-    goal = tank.pipeline._chains[0].guidance._goal
+    goal = tank.pipeline.formation.chains[0].guidance._goal
     assert goal is not None and goal.p_wb is not None
     assert 0.6 < goal.p_wb[1] < 0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m) + 0.01
 
@@ -184,7 +184,7 @@ def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
 def test_undock_that_ends_in_the_tick_of_a_join_is_not_said_to_be_done() -> None:
     tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], Parameters().replace("docking.push_m", 0.0))
     tank.fly()
-    stage = tank.pipeline.docking
+    stage = tank.pipeline.formation.docking
     tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 3, 0, 2)))
     (undock,) = stage._undocks
     decisions = Decisions({}, [Join(0, 7, None)], [], [], {})

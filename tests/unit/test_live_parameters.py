@@ -53,7 +53,7 @@ def test_value_out_of_range_is_refused_in_words_and_changes_nothing(flying: Pipe
 
 def test_limits_set_in_flight_are_those_of_every_stage_from_that_tick_on(flying: Pipeline) -> None:
     """A step that only kept what it was built with would fly on by the old ones."""
-    chain = flying._chains[0]
+    chain = flying.formation.chains[0]
     wanted = {
         "limiter.force_share": 0.2, "limiter.slew_n_per_s": 20.0, "fence.east_m": 0.1, "failsafes.ground_lost_limit": 0.5,
         "failsafes.leak_action": 5, "supervision.arm_sigma_m": 0.5, "steering.speed_m_s": 0.07, "faults.dead_count": 9,

@@ -171,7 +171,7 @@ def test_ring_with_one_open_joint_is_still_one_body_and_asks_once() -> None:
     tank = Docked(RING)
     tank.fly()
     tank.hidden |= {0, 1}
-    tank.pipeline.docking.open_joints = lambda least: [DockRequest(1, 1, 0, 0)]  # type: ignore[method-assign]
+    tank.pipeline.formation.docking.open_joints = lambda least: [DockRequest(1, 1, 0, 0)]  # type: ignore[method-assign]
     tank.run(1.5)
     assert tank.shape == [(0, 1, 2, 3)]
     assert sum("also held together" in text for _, text in tank.said) == 1
@@ -199,7 +199,7 @@ def test_undock_that_is_asked_for_while_the_partner_is_being_lost_parts_once() -
 def test_estimate_of_a_part_is_as_old_as_that_of_the_whole() -> None:
     tank = Docked(RING[:2])
     tank.fly()
-    (chain,) = tank.pipeline._chains
+    (chain,) = tank.pipeline.formation.chains
     fresh = tank.pipeline.chain_of(chain.body)
     motion = chain.estimator.motion
     old = fresh.estimator.restart(5_000_000_000, motion._replace(tag_ns=2_000_000_000))
@@ -224,7 +224,7 @@ def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
     tank = Docked(RING[:2])
     tank.run(0.5)
     tank.run(1.0, Request(Action.GROUND_ALIVE), Request(Action.ARM))
-    whole = tank.pipeline._chains[0]
+    whole = tank.pipeline.formation.chains[0]
     whole.faults._lose(3, "stands still")
     whole.allocator.set_alive(whole.faults.now.alive)
     tank.cabin_pa[0] = 130e3
@@ -232,7 +232,7 @@ def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
     tank.lose(1)
     tank.run(1.0)
     assert tank.shape == [(0,), (1,)]
-    hurt, sound = tank.pipeline._chains
+    hurt, sound = tank.pipeline.formation.chains
     assert hurt.faults.now.dead == (3,) and sound.faults.now.dead == ()
     assert hurt.health.now.cabin_change_pa == 130e3 - 101_325.0 and sound.health.now.cabin_change_pa == 0.0
     assert all(chain.supervisor.is_on("cabin_pressure") and chain.supervisor.mode == Mode.SURFACE for chain in (hurt, sound))
@@ -251,27 +251,27 @@ def test_body_that_was_prepared_with_other_gains_flies_with_those_of_now() -> No
     tank.run(0.05, Request(Action.SET_PARAMETER, 0, ("control.position_bandwidth", 1.5)))
     tank.run(0.6)
     assert tank.shape == [(0,), (1,)]
-    assert all(chain.parameters.control.position_bandwidth == 1.5 for chain in tank.pipeline._chains)
+    assert all(chain.parameters.control.position_bandwidth == 1.5 for chain in tank.pipeline.formation.chains)
 
 
 def test_magnets_of_a_joint_rest_when_their_account_is_empty_and_take_power_while_they_pull() -> None:
     parameters = Parameters().replace("limiter.relay_on_s", 2.0).replace("limiter.relay_duty", 0.25)
     tank = Docked(RING[:2], parameters)
     tank.run(1.0)
-    assert [magnets.power_w for magnets in tank.pipeline._chains[0].limiter.magnets] == [6.0, 6.0]
+    assert [magnets.power_w for magnets in tank.pipeline.formation.chains[0].limiter.magnets] == [6.0, 6.0]
     tank.run(3.0)
     sent = [(tick, outputs.modules[0].relays) for tick, outputs in enumerate(tank.outputs) if outputs.modules[0].relays is not None]
     pulling = {tick for tick, states in sent if any(states)}
     resting = sorted({tick for tick, states in sent if not any(states)})
     assert resting and resting[0] == pytest.approx(2.0 / 0.75 / 0.01, abs=2), "sent at once, not with the next tenth of a second"
-    assert not pulling & set(resting) and tank.pipeline._chains[0].limiter.magnets[0].power_w == 0.0
+    assert not pulling & set(resting) and tank.pipeline.formation.chains[0].limiter.magnets[0].power_w == 0.0
 
 
 def test_parted_modules_magnets_keep_their_accounts() -> None:
     tank = Docked(RING[:2], Parameters().replace("limiter.relay_on_s", 60.0).replace("limiter.relay_duty", 0.01))
     tank.fly()
-    before = [list(magnets._left_s) for magnets in tank.pipeline._chains[0].limiter.magnets]
+    before = [list(magnets._left_s) for magnets in tank.pipeline.formation.chains[0].limiter.magnets]
     tank.lose(1)
     tank.run(1.0)
-    after = [list(chain.limiter.magnets[0]._left_s) for chain in tank.pipeline._chains]
+    after = [list(chain.limiter.magnets[0]._left_s) for chain in tank.pipeline.formation.chains]
     assert min(before[0]) < 59.0 and min(after[0]) < min(before[0]) and min(after[1]) < min(before[1])

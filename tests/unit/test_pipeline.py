@@ -246,7 +246,7 @@ def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(
     """What no longer turns is found again within half a second of flying."""
     tank.run(0.5)
     tank.run(0.5, Request(Action.ARM))
-    chain = tank.pipeline._chains[0]
+    chain = tank.pipeline.formation.chains[0]
     for thruster in (4, 7):
         chain.faults._lose(thruster, "stands still")
     chain.allocator.set_alive(chain.faults.now.alive)
@@ -292,7 +292,7 @@ def test_battery_reading_of_nothing_changes_no_command(tank: Tank) -> None:
     """Neither at once nor by way of the mean."""
     tank.run(0.5)
     tank.run(1.0, Request(Action.ARM))
-    before = tank.pipeline._chains[0].supply.voltage_v.copy()
+    before = tank.pipeline.formation.chains[0].supply.voltage_v.copy()
     hear = tank._hear
 
     def broken(tick: int) -> list[ModuleInputs]:
@@ -302,7 +302,7 @@ def test_battery_reading_of_nothing_changes_no_command(tank: Tank) -> None:
 
     tank._hear = broken  # type: ignore[method-assign]
     tank.run(0.3)
-    np.testing.assert_array_equal(tank.pipeline._chains[0].supply.voltage_v, before)
+    np.testing.assert_array_equal(tank.pipeline.formation.chains[0].supply.voltage_v, before)
 
 
 # ---------------------------------------------------------------- fleets

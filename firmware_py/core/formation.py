@@ -1,0 +1,166 @@
+"""Which bodies there are: steers those that dock, joins and parts them within a tick, and hands over what goes on: nothing jumps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from firmware_py.core.body import Body
+from firmware_py.core.docking import Decisions, DockingStage, Join, Part
+from firmware_py.core.docking_pairs import APART, LOOSE
+from firmware_py.core.topology import in_both, join, part_of
+from firmware_py.core.types import DockRequest, Estimate, Inputs, Mode, Outputs, PartRequest
+from firmware_py.description.parameters import Parameters
+
+if TYPE_CHECKING:
+    from firmware_py.core.pipeline import BodyPipeline
+
+
+class Formation:
+    """The bodies of a fleet as they are docked now, each with its stages."""
+
+    def __init__(self, chains: list[BodyPipeline], docking: DockingStage, parameters: Parameters) -> None:
+        self.chains, self.docking = chains, docking
+        self._parameters = parameters
+        self._watch_joints()
+
+    @property
+    def bodies(self) -> list[Body]:
+        """In the order of their numbers."""
+        return [chain.body for chain in self.chains]
+
+    def retune(self, parameters: Parameters) -> None:
+        """Takes other parameters from this tick on, for bodies that are still prepared too."""
+        self._parameters = parameters
+        for chain in self.chains:
+            chain.retune(parameters)
+        self.docking.retune(parameters.docking)
+
+    def step(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
+        """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
+        held = [c for c in self.chains if c.supervisor.armed and c.supervisor.mode == Mode.POSHOLD] if inputs.prepared else []
+        bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.chains}
+        decisions = self.docking.step(inputs, bodies, [c.body.index for c in held])
+        self._miss_partners(outputs)
+        outputs.docks += self.docking.records
+        outputs.joints = self.docking.joints
+        self._steer(decisions)
+        for joined in decisions.joins:
+            self._join(joined, inputs.time_ns, estimates)
+        for parted in decisions.parts:
+            self._part(parted, inputs.time_ns, estimates)
+        outputs.events += self.docking.events
+
+    def leave(self, chain: BodyPipeline, time_ns: int, outputs: Outputs) -> None:
+        """Docks and undocks go on in the mode DOCK alone: an armed body backs off from one, any other lets go at once."""
+        index, supervisor = chain.body.index, chain.supervisor
+        if supervisor.mode == Mode.DOCK:
+            return
+        if supervisor.armed and index in self.docking.busy:
+            self.docking.abort(index, time_ns, "the mode was changed")
+        outputs.events += [event._replace(body=index) for event in self.docking.leave(chain.body, supervisor.armed)]
+
+    def _miss_partners(self, outputs: Outputs) -> None:
+        """Joints that are open though nobody asked: tells the bodies, and parts those that have come apart once their fail-safe is on."""
+        loose = self.docking.open_joints(LOOSE)
+        apart = self.docking.open_joints(APART) if loose else []
+        for chain in self.chains:
+            if not chain.joints:
+                continue
+            chain.health.topology = _words_of([joint for joint in loose if joint.module in chain.body.modules])
+            gone = [joint for joint in apart if joint.module in chain.body.modules]
+            if gone and gone != chain.parting and chain.supervisor.armed and chain.supervisor.is_on("partner_lost"):
+                chain.parting = gone
+                outputs.preparations.append(PartRequest(tuple(gone)))
+
+    def _steer(self, decisions: Decisions) -> None:
+        for chain in self.chains:
+            number = chain.body.index
+            if number in decisions.meets:
+                chain.guidance.move_by(decisions.meets[number])
+            if number in decisions.setpoints:
+                chain.guidance.dock(decisions.setpoints[number])
+            elif number in decisions.ended:
+                chain.dock_over = True
+
+    def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
+        before = self._chains_of(joined.target, joined.active)
+        estimate = self._begin(joined.chain, before, time_ns)
+        self._swap(before, [joined.chain], estimates, [estimate])
+
+    def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
+        after = [parted.stays, parted.leaves]
+        before = self._chains_of(parted.whole)
+        found = [self._begin(chain, before, time_ns) for chain in after]
+        parted.leaves.guidance.move_by(parted.away_w)
+        self._swap(before, after, estimates, found)
+
+    def _begin(self, chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
+        """A body that was prepared takes over, with the parameters of now. Returns its estimate."""
+        if chain.parameters is not self._parameters:
+            chain.retune(self._parameters)
+        return take_over(chain, before, time_ns)
+
+    def _chains_of(self, *bodies: int) -> list[BodyPipeline]:
+        """Of these bodies, by their numbers, in this order. No body joins or parts twice in a tick."""
+        return [chain for number in bodies for chain in self.chains if chain.body.index == number]
+
+    def _swap(
+        self, before: Sequence[BodyPipeline], after: Sequence[BodyPipeline], estimates: dict[int, Estimate], found: Sequence[Estimate]
+    ) -> None:
+        for chain in before:
+            del estimates[chain.body.index]
+        for chain, estimate in zip(after, found, strict=True):
+            estimates[chain.body.index] = estimate
+        kept = [chain for chain in self.chains if chain not in before]
+        self.chains = sorted([*kept, *after], key=lambda chain: chain.body.index)
+        ended = self.docking.forget([chain.body.index for chain in before])
+        for chain in kept:
+            chain.dock_over = chain.dock_over or chain.body.index in ended
+        self._watch_joints()
+
+    def _watch_joints(self) -> None:
+        self.docking.watch_joints([joint for chain in self.chains for joint in chain.joints])
+
+
+def take_over(chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
+    """`chain` goes on from the bodies that its own is made of, or was part of: motion, forces, health, arm state. Returns its estimate."""
+    if len(before) == 1:
+        motion = part_of(before[0].body, before[0].estimator.motion, chain.body)
+    else:
+        motion = join([(other.body, other.estimator.motion) for other in before], chain.body)
+    for other in before:
+        _take_forces(chain, other)
+    chain.imus.take_over([other.imus for other in before])
+    chain.faults.take_over([other.faults for other in before])
+    chain.allocator.set_alive(chain.faults.now.alive)
+    chain.health.take_over([other.health for other in before])
+    chain.supervisor.take_over([other.supervisor for other in before])
+    estimate = chain.estimator.restart(time_ns, motion)
+    chain.guidance.take_over(chain.supervisor.mode, estimate, chain.body.thrusters.matrix @ chain.limiter.force_n)
+    return estimate
+
+
+def _take_forces(chain: BodyPipeline, other: BodyPipeline) -> None:
+    """Thrusters keep the forces they have, so that no command jumps; magnets keep the time that they may still be on."""
+    mine, theirs = chain.body, other.body
+    forces = [array.copy() for array in chain.lag.forces]
+    limited = chain.limiter.force_n.copy()
+    for i, j in in_both(mine.modules, theirs.modules):
+        here, there = mine.thrusters.module == i, theirs.thrusters.module == j
+        for array, source in zip(forces, other.lag.forces, strict=True):
+            array[here] = source[there]
+        limited[here] = other.limiter.force_n[there]
+        chain.limiter.magnets[i] = other.limiter.magnets[j]
+        chain.supply.voltage_v[i] = other.supply.voltage_v[j]
+    chain.lag.restart(*forces)
+    chain.limiter.ease(limited)
+
+
+def _words_of(open_joints: Sequence[DockRequest]) -> str:
+    """The first of them, for people; empty: none is."""
+    if not open_joints:
+        return ""
+    first, more = open_joints[0], len(open_joints) - 1
+    others = f", and {more} more pairs" if more else ""
+    return f"modules {first.target_module} and {first.module} do not hold together{others}"
