@@ -58,7 +58,8 @@ def fly_by(seed: int) -> Pass:
     collector, encoder = InputCollector(fleet, codec), OutputEncoder(fleet, codec)
     bodies = assemble_fleet(fleet, {vehicle.name: vehicle})
     detector = PairDetector(
-        FacePair(0, FACE_NAMES.index("+x"), 1, FACE_NAMES.index("-x"), np.array([PITCH_M, 0.0, 0.0])), Parameters().docking
+        FacePair(0, FACE_NAMES.index("+x"), 1, FACE_NAMES.index("-x"), np.array([PITCH_M, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])),
+        Parameters().docking,
     )
     world.set_motion(1, velocity, np.zeros(3))
     tags, seen = tag_table(bodies), (False, False, False)

@@ -301,7 +301,7 @@ class DockingStage:
         taken = any(target in (dock.active, dock.target) for dock in self._docks)
         comes = (request.both_approach or self._p.approach == "straight") and target in holding and not taken
         sequence = DockingSequence(plan, estimates[active][0], estimates[target][0], self._p, time_ns, comes)
-        pair = FacePair(request.target_module, request.target_face, request.module, request.face, plan.place_t)
+        pair = FacePair(request.target_module, request.target_face, request.module, request.face, plan.place_t, plan.q_ta)
         self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared))
         self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.docking_pairs import NEVER_NS, PAIR, PICTURES, Limits, place_modules, watch
+from firmware_py.core.rotations import to_matrix
 from firmware_py.core.types import ModuleInputs
 from firmware_py.description.parameters import Docking
 
@@ -21,13 +22,16 @@ FACES = 6
 
 
 class FacePair(NamedTuple):
-    """Two faces that may meet. Indices of modules in the fleet; `offset_a` where the centre of b should be in the frame of a, m."""
+    """Two faces that may meet. Indices of modules in the fleet; where the centre of b should be in the frame of a, m, and how turned."""
 
     module_a: int
     face_a: int
     module_b: int
     face_b: int
     offset_a: np.ndarray
+    """(3,)"""
+    q_ab: np.ndarray
+    """(4,) frame of b to frame of a."""
 
 
 class PairStatus(NamedTuple):
@@ -66,7 +70,7 @@ class PairBank:
         self._rings = np.zeros((len(pairs), PICTURES, 3))
         for row, pair in zip(self.rows, pairs, strict=True):
             row["module"], row["face"] = (pair.module_a, pair.module_b), (pair.face_a, pair.face_b)
-            row["offset_a"] = pair.offset_a
+            row["offset_a"], row["turn_a"] = pair.offset_a, to_matrix(pair.q_ab).ravel()
         for time in ("since_ns", "candidate_ns", "current_ns", "picture_ns"):
             self.rows[time] = NEVER_NS
         for figure in ("current_ma", "margin_ma", "error_m", "spread_m"):

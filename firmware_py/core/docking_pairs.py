@@ -17,8 +17,8 @@ from firmware_py.core.rotations import multiply, to_matrix
 NEVER_NS = -(1 << 60)
 PICTURES = 32
 """Relative positions kept of each pair: their mean tells a locked pair from one that jammed 4 mm short of it."""
-TURNED_COS = math.cos(math.radians(15.0))
-"""Modules that meet are turned by quarter turns against each other; farther off, a tag of one of them was read flipped."""
+TURNED_TRACE = 1.0 + 2.0 * math.cos(math.radians(15.0))
+"""Of the rotation between modules as they are and as they are when docked; farther off, a tag of one of them was read flipped."""
 CURRENT, POSITION = 0, 1
 """The two conditions, as columns of a pair's row."""
 
@@ -30,6 +30,7 @@ PAIR = np.dtype(
         ("module", np.int64, 2),  # fleet index of module a, of module b; sides a and b in `face` and the currents too
         ("face", np.int64, 2),
         ("offset_a", np.float64, 3),  # where the centre of b should be in the frame of a, m
+        ("turn_a", np.float64, 9),  # attitude that b should have in the frame of a: rotation matrix, row by row
         ("holds", np.int64, 2),  # each condition, debounced
         ("since_ns", np.int64, 2),  # since when each has been as it is
         ("candidate_ns", np.int64, 2),  # since when the opposite has been seen; NEVER_NS: it is not
@@ -136,25 +137,24 @@ def _judge_ring(row, ring):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _on_lattice(poses, i, j):  # type: ignore[no-untyped-def]
-    """Whether two sightings are turned against each other by quarter turns: each axis of one is along an axis of the other."""
+def _as_turned(row, poses, i, j):  # type: ignore[no-untyped-def]
+    """Whether two sightings are turned against each other as the modules should be.
+
+    A tag that is seen from 45 degrees and read flipped is off by a quarter turn, and so fits the lattice.
+    """
+    trace = 0.0
     for a in range(3):
-        along = 0.0
         for b in range(3):
-            cosine = 0.0
             for k in range(3):
-                cosine += poses[i, 3 + 3 * k + a] * poses[j, 3 + 3 * k + b]
-            along = max(along, abs(cosine))
-        if along < TURNED_COS:
-            return False
-    return True
+                trace += row.turn_a[3 * a + b] * poses[i, 3 + 3 * k + a] * poses[j, 3 + 3 * k + b]
+    return trace > TURNED_TRACE
 
 
 @njit(cache=True)
 def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[no-untyped-def]
     """Condition 2 by the pictures of this tick; whether those known are fresh."""
     i, j = _same_picture(first, seen, row.module[0], row.module[1])
-    if i >= 0 and _on_lattice(poses, i, j):
+    if i >= 0 and _as_turned(row, poses, i, j):
         here = ring[row.pictures % PICTURES]
         for axis in range(3):
             here[axis] = 0.0

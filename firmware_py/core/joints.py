@@ -8,7 +8,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import FacePair
-from firmware_py.core.rotations import rotate_back, to_matrix
+from firmware_py.core.rotations import conjugate, multiply, rotate_back, to_matrix
 from firmware_py.core.types import DockRequest
 from firmware_py.description.vehicle import FACE_NORMALS
 
@@ -19,11 +19,14 @@ class Joint(NamedTuple):
     request: DockRequest
     offset: np.ndarray
     """(3,) centre of its module in the frame of the target module, m."""
+    q_ta: np.ndarray
+    """(4,) frame of its module to frame of the target module."""
 
     @property
     def pair(self) -> FacePair:
         """What the detector watches."""
-        return FacePair(self.request.target_module, self.request.target_face, self.request.module, self.request.face, self.offset)
+        r = self.request
+        return FacePair(r.target_module, r.target_face, r.module, r.face, self.offset, self.q_ta)
 
 
 def sides(request: DockRequest) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -58,5 +61,6 @@ def _joint(body: Body, i: int, j: int) -> Joint:
     turn_i, turn_j = (to_matrix(np.ascontiguousarray(body.q_bm[k])) for k in (i, j))
     near = int(np.argmax(FACE_NORMALS @ (turn_i.T @ step)))
     far = int(np.argmax(FACE_NORMALS @ (turn_j.T @ -step)))
-    offset = rotate_back(np.ascontiguousarray(body.q_bm[i]), body.r_bm[j] - body.r_bm[i])
-    return Joint(DockRequest(body.modules[j], far, body.modules[i], near), offset)
+    q_bi, q_bj = (np.ascontiguousarray(body.q_bm[k]) for k in (i, j))
+    offset = rotate_back(q_bi, body.r_bm[j] - body.r_bm[i])
+    return Joint(DockRequest(body.modules[j], far, body.modules[i], near), offset, multiply(conjugate(q_bi), q_bj))

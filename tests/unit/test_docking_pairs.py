@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, PairStatus, TagTable
+from firmware_py.core.docking_pairs import CLOSED
 from firmware_py.core.joints import joints_of
 from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
 from firmware_py.core.types import DockFeedback, ModuleInputs, TagObservation
@@ -20,7 +21,7 @@ TAG = 5
 LEVER, TURN = np.array([0.02, -0.01, -0.1]), from_euler(0.3, -0.2, 1.0)
 """Of every module's one tag: its place in the module, and module frame to tag frame."""
 TAGS: TagTable = {(m, TAG): np.r_[LEVER, TURN] for m in range(4)}
-ROW = [FacePair(m, 0, m + 1, 1, np.array([PITCH_M, 0.0, 0.0])) for m in range(3)]
+ROW = [FacePair(m, 0, m + 1, 1, np.array([PITCH_M, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])) for m in range(3)]
 """Four modules in a row, the +x face of each against the -x face of the next."""
 
 
@@ -164,6 +165,29 @@ def test_locked_pair_is_found_in_noise_and_through_flipped_tags(row: Row) -> Non
         assert n < 100 or bank.status(0).docked
 
 
+def test_flipped_tag_that_is_off_by_a_quarter_turn_opens_no_joint(row: Row) -> None:
+    """Seen from 45 degrees; its module would be seventy millimetres off, one picture in five."""
+    bank = PairBank(ROW[:1], P)
+    for n in range(400):
+        time_ns, modules = row.hear()
+        if n % 10 == 0:
+            modules[1].tags = [t._replace(q_wt=multiply(t.q_wt, from_euler(math.pi / 2, 0.0, 0.0))) for t in modules[1].tags]
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        assert n < 100 or (bank.status(0).docked and bank.rows["open"][0] == CLOSED)
+
+
+@pytest.mark.parametrize("turn", [from_euler(0.0, 0.0, math.pi / 2), from_euler(math.pi, 0.0, 0.0)])
+def test_modules_that_are_docked_turned_are_found_so(row: Row, turn: np.ndarray) -> None:
+    """As the pair says that they are turned, and no other way."""
+    tags: TagTable = {(0, TAG): TAGS[0, TAG], (1, TAG): np.r_[rotate(conjugate(turn), LEVER), multiply(TURN, turn)]}
+    for q_ab, found in ((turn, True), (np.array([1.0, 0.0, 0.0, 0.0]), False)):
+        bank = PairBank([ROW[0]._replace(q_ab=q_ab)], P)
+        for _ in range(100):
+            time_ns, modules = row.hear()
+            bank.step(time_ns, modules, ModulePoses(modules, tags))
+        assert bank.status(0).position == found
+
+
 def test_tag_that_the_vehicle_does_not_carry_places_nobody(row: Row) -> None:
     bank = PairBank(ROW[:1], P)
     for _ in range(100):
@@ -206,7 +230,8 @@ def test_body_has_a_joint_between_every_two_neighbours() -> None:
     cells = [(x, y, z) for x in range(4) for y in range(4) for z in range(4)]
     joints = joints_of(assemble(cells, [0] * 64, [load_vehicle("modcube")] * 64))
     assert len(joints) == 3 * 4 * 4 * 3
-    for request, offset in joints:
+    for request, offset, q_ta in joints:
+        np.testing.assert_array_equal(q_ta, [1.0, 0.0, 0.0, 0.0])
         step = np.subtract(cells[request.module], cells[request.target_module])
         np.testing.assert_allclose(offset, PITCH_M * step, atol=1e-12)
         assert {request.target_face, request.face} in ({0, 1}, {2, 3}, {4, 5})
