@@ -32,7 +32,7 @@ def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
     outcomes: dict[str, int] = {}
     for trial in trials:
         outcomes[trial["outcome"]] = outcomes.get(trial["outcome"], 0) + 1
-    worst = sorted(trials, key=lambda trial: (bool(trial["passed"]), -(trial["metrics"].get("position_rmse_m") or 0.0)))[:WORST]
+    worst = sorted(trials, key=_goodness)[:WORST]
     return {
         "scenario": scenario,
         "trials": len(trials),
@@ -44,6 +44,12 @@ def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
         "worst_seeds": [trial["seed"] for trial in worst],
         "seeds": [trial["seed"] for trial in trials],
     }
+
+
+def _goodness(trial: Trial) -> tuple[bool, float]:
+    """Failed ones first, those with the largest error before the others; the worst is one that has no figure."""
+    error_m = trial["metrics"].get("position_rmse_m")
+    return bool(trial["passed"]), -math.inf if error_m is None else -error_m
 
 
 def _names(trials: Sequence[Trial], part: str) -> list[str]:

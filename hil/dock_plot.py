@@ -18,6 +18,7 @@ HOLDS = "#2e8b57"
 MARK = "#555f6b"
 STAGES = ("pre-approach", "align", "approach", "push", "verify", "docked", "release", "back off", "aborted", "failed")
 """By the number that the log has."""
+DOCK_PLOT = "docking.png"
 LAST_S = 0.3
 """How long the last tick of a dock is drawn."""
 
@@ -35,7 +36,7 @@ def write_dock_plot(folder: Path, start_ns: int) -> list[Path]:
         from matplotlib import pyplot
 
         figure = docking(docks, truth, start_ns)
-        path = folder / "docking.png"
+        path = folder / DOCK_PLOT
         figure.savefig(path, metadata={"Software": None})
         pyplot.close(figure)
     return [path]

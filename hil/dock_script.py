@@ -14,6 +14,7 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare import paths
 from hil.scenario import Scenario, Step
+from hil.script import refuse_outside
 
 ARM_FROM_S = 1.0
 ARM_EVERY_S = 0.5
@@ -26,9 +27,12 @@ AFTERWARDS_NS = 3_000_000_000
 
 
 class DockScript:
-    """The requests of one run with [[step]]s."""
+    """The requests of one run with [[step]]s. Raises DescriptionError for a strip that leaves the tank."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
+        for step in scenario.step:
+            if step.do == "moebius":
+                refuse_outside(_strip(step, scenario), scenario)
         self._scenario = scenario
         self._fleet = fleet
         self._groups = [list(g) for g in scenario.groups]
@@ -143,5 +147,9 @@ def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) ->
     here = rest_at(np.array(p_wb), np.array(q_wb))
     if step.do == "move":
         return paths.line(here, rest_at(np.array(step.position_m), np.array(q_wb)), step.duration_s)
+    return _strip(step, scenario)
+
+
+def _strip(step: Step, scenario: Scenario) -> paths.Trajectory:
     task = scenario.task
     return paths.moebius(task.centre_m, step.duration_s, task.radius_m, task.half_width_m, task.turns)

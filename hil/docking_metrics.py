@@ -8,24 +8,33 @@ from pathlib import Path
 
 import numpy as np
 
+from firmware_py.core.rotations import rotate
 from firmware_py.description.signals import Columns, read_signals
-from hil.scenario import Scenario
+from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS
+from hil.dock_plot import STAGES
+from hil.scenario import Scenario, Step
 from hil.signals import SIGNAL_LOG, TRUTH_LOG
 
 OUTCOMES = ("docked", "jammed", "unstable control", "refused", "gave up")
 """What the metric `outcome` counts."""
 DOCKED, JAMMED, UNSTABLE, REFUSED, GAVE_UP = range(len(OUTCOMES))
+DECLARED = STAGES.index("docked")
+"""Stage of a dock in the tick in which the firmware takes two bodies for one."""
+FACING = math.cos(math.radians(30.0))
+"""Between the normals of faces that meet and the way from centre to centre."""
+REACHED_M = 0.03
+"""From where a move leads."""
 UNSTABLE_RAD, KEPT_UP_TICKS = math.radians(30.0), 200
 """A module that stays so far from the attitude that it was bound for is out of control."""
 
 
-def expected_pairs(scenario: Scenario) -> dict[tuple[int, int], bool]:
-    """Pairs of modules (fleet indices) that the steps leave docked (True) or apart."""
-    pairs: dict[tuple[int, int], bool] = {}
+def wishes_of(scenario: Scenario) -> dict[tuple[int, int], list[Step]]:
+    """Docks and undocks of each pair of modules (fleet indices, the lower first), in their order."""
+    pairs: dict[tuple[int, int], list[Step]] = {}
     for step in scenario.step:
         if step.do in ("dock", "undock"):
-            pair = sorted((scenario.index_of(step.module), scenario.index_of(step.target_module)))
-            pairs[pair[0], pair[1]] = step.do == "dock"
+            low, high = sorted(map(scenario.index_of, step.modules))
+            pairs.setdefault((low, high), []).append(step)
     return pairs
 
 
@@ -33,7 +42,7 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
     """What came of a run with [[step]]s.
 
     Returns:
-        docked: everything is together or apart as the steps want; tries: meetings of a probe and a funnel; jams; outcome:
+        docked: modules went, came together and came apart as the steps want; tries: meetings of a probe and a funnel; jams; outcome:
         index into OUTCOMES; false_declarations: bodies that the firmware joined and that were not; join_jump_n: largest step
         of a thruster's commanded force in a tick in which bodies were joined, N; docked_rmse_m: position of all joined bodies
         against their set-points.
@@ -45,8 +54,7 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
     docks = truths.get("/plant/docks")
     if docks is None:
         raise ValueError(f"{folder}: no truth of docks in the logs")
-    together = _together(truths, int(docks["tick"][-1]))
-    docked = all(together[pair] == wanted for pair, wanted in expected_pairs(scenario).items())
+    docked = is_as_asked(scenario, truths)
     outcome = DOCKED if docked else _failure(docks, signals)
     return {
         "docked": float(docked),
@@ -59,16 +67,62 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
     }
 
 
-def _together(truths: Mapping[str, Columns], tick: int) -> Mapping[tuple[int, int], bool]:
-    """Whether two modules share a body in that tick."""
-    rows = [c["member"][c["tick"] == tick] for name, c in truths.items() if name.startswith("/plant/body")]
-    count = rows[0].shape[1]
-    found = {(i, j): False for i in range(count) for j in range(i + 1, count)}
-    for row in rows:
-        for member in row:
-            inside = np.flatnonzero(member)
-            found |= {(int(i), int(j)): True for i in inside for j in inside if i < j}
+def _together(truths: Mapping[str, Columns], ticks: np.ndarray) -> np.ndarray:
+    """(k, m, m) whether two modules share a body in each of these ticks."""
+    bodies = [columns for name, columns in truths.items() if name.startswith("/plant/body")]
+    count = bodies[0]["member"].shape[1]
+    found = np.zeros((len(ticks), count, count), dtype=bool)
+    for columns in bodies:
+        inside = columns["member"] > 0.0
+        found[np.searchsorted(ticks, columns["tick"])] |= inside[:, :, None] & inside[:, None, :]
     return found
+
+
+def is_obeyed(wishes: Sequence[bool], together: np.ndarray) -> bool:
+    """Whether two modules came together (True) and apart as was wished, one after the other, and are so at the end.
+
+    Args:
+        wishes: of them, at least one.
+        together: (k,) whether they were, over the run.
+    """
+    changes = iter(together[np.append(True, together[1:] != together[:-1])])
+    return all(wish in changes for wish in wishes) and bool(together[-1]) == wishes[-1]
+
+
+def _meet(scenario: Scenario, step: Step, truths: Mapping[str, Columns]) -> bool:
+    """Whether the faces of a dock are those that meet at the end of the run."""
+    active, target = (truths[f"/plant/module{scenario.index_of(number)}"] for number in step.modules)
+    way = target["p_wm"][-1] - active["p_wm"][-1]
+    way = way / np.linalg.norm(way)
+    return all(
+        rotate(module["q_wm"][-1], FACE_NORMALS[FACE_NAMES.index(face)].astype(float)) @ along > FACING
+        for module, face, along in ((active, step.face, way), (target, step.target_face, -way))
+    )
+
+
+def _came_m(scenario: Scenario, step: Step, truths: Mapping[str, Columns]) -> float:
+    """How near the body of a move came to its place, m."""
+    module = scenario.index_of(step.module)
+    bodies = [columns for name, columns in truths.items() if name.startswith("/plant/body")]
+    ways = [body["p_wb"][body["member"][:, module] > 0.0] - step.position_m for body in bodies]
+    return float(np.linalg.norm(np.concatenate(ways), axis=1).min())
+
+
+def is_as_asked(scenario: Scenario, truths: Mapping[str, Columns]) -> bool:
+    """Whether moves led to their places, and docks and undocks were obeyed, each in its turn, with the faces that they name.
+
+    Without any of these nothing joined or parted.
+    """
+    together, pairs = _together(truths, truths["/plant/docks"]["tick"]), wishes_of(scenario)
+    if not all(_came_m(scenario, step, truths) < REACHED_M for step in scenario.step if step.do == "move"):
+        return False
+    if not pairs:
+        return bool((together == together[0]).all())
+    return all(
+        is_obeyed([step.do == "dock" for step in steps], together[:, i, j])
+        and (steps[-1].do == "undock" or _meet(scenario, steps[-1], truths))
+        for (i, j), steps in pairs.items()
+    )
 
 
 def _bodies(channels: Mapping[str, Columns], prefix: str, ticks: np.ndarray) -> np.ndarray:
@@ -81,10 +135,18 @@ def _bodies(channels: Mapping[str, Columns], prefix: str, ticks: np.ndarray) -> 
 
 
 def _false_declarations(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> int:
+    """By those that hang together, and by how many bodies there are, which knows of joins that no dock declared."""
     ticks = truths["/plant/docks"]["tick"]
     believed, real = _bodies(signals, "/firmware/body", ticks), _bodies(truths, "/plant/body", ticks)
     joined = np.diff(believed, prepend=believed[:1]) < 0
-    return int((joined & (believed > 0) & (believed < real)).sum())
+    too_few = int((joined & (believed > 0) & (believed < real)).sum())
+    docks = signals.get("/firmware/docks")
+    if docks is None:
+        return too_few
+    declared = (docks["stage"] == DECLARED) & np.isin(docks["tick"], ticks)
+    at = np.searchsorted(ticks, docks["tick"][declared])
+    true = _together(truths, ticks)[at, docks["module_a"][declared], docks["module_b"][declared]]
+    return max(too_few, int((~true).sum()))
 
 
 def _failure(docks: Columns, signals: Mapping[str, Columns]) -> int:

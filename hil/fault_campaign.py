@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 import tempfile
 from collections.abc import Callable, Sequence
@@ -73,14 +74,16 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Any) -> Cell:
     error_m, angle_deg = errors(after, names)
     commanded = after.firmware["commanded_n"]
     still = np.array([name in ("DISARMED", "ESTOP") for name in names])
-    blamed = {found[1] for text, _ in told for found in BLAMED.finditer(text)} - {NUMBER.split()[1]}
+    blamed = {f"thruster {found[1]}" for text, _ in told for found in BLAMED.finditer(text)} - ({NUMBER} if row.leaves_out else set())
     broken = {
+        f"was in {names[0]} when it began": names[0] != mode,
+        f"left {mode} for {next((name for name in names if name != mode), '')}": wanted == mode and bool(changes),
         f"ended in {names[-1]}, not {wanted}": names[-1] != wanted,
         f"took {reached_s:.2f} s": wanted != mode and reached_s > row.within_s,
         f"{error_m * 1e3:.0f} mm off": error_m > row.error_m,
         f"{angle_deg:.0f} deg off": angle_deg > row.angle_deg,
         f"did not say {row.says!r}": bool(row.says) and mode in row.says_in and not said_s,
-        f"blamed thruster {', '.join(sorted(blamed))}": bool(blamed) or (not row.name.startswith("thruster") and _blames(told)),
+        f"blamed {', '.join(sorted(blamed))}": bool(blamed) or (not row.leaves_out and _blames(told)),
         "a command was no number": not np.isfinite(commanded).all(),
         "a command was beyond its limits": bool((commanded > vehicle.force_max_n).any() or (commanded < vehicle.force_min_n).any()),
         "a thruster turned while stopped": bool(commanded[still].any()),
@@ -92,7 +95,7 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Any) -> Cell:
 
 
 def errors(flight: Flight, names: Sequence[str]) -> tuple[float, float]:
-    """Largest distance from the set-point, m, and angle, deg, in modes with a place; NaN without one.
+    """Largest distance from the set-point, m, and angle, deg, in modes with a place; NaN without one, infinite where either is no number.
 
     After a mode without a place the body has SETTLE_TICKS to come to rest, and without tags nobody knows the place.
     """
@@ -103,7 +106,8 @@ def errors(flight: Flight, names: Sequence[str]) -> tuple[float, float]:
         return float("nan"), float("nan")
     off = np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
     turn = np.linalg.norm(rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"]), axis=1)
-    return float(off[held].max()), float(np.degrees(turn[held].max()))
+    worst_m, worst_rad = (float(np.nan_to_num(each[held], nan=np.inf).max()) for each in (off, turn))
+    return worst_m, math.degrees(worst_rad)
 
 
 SETTLE_TICKS = 300

@@ -50,6 +50,11 @@ class Row:
     task: Mapping[str, Any] = field(default_factory=dict)
     """What else about the task changes: who falls silent."""
 
+    @property
+    def leaves_out(self) -> bool:
+        """Whether the thruster that breaks is no longer flown with."""
+        return NUMBER in self.says
+
 
 def _fault(kind: str, value: float = 0.0, **more: float | str) -> Fault:
     return Fault(kind=kind, at_s=AT_S, value=value, **more)  # type: ignore[arg-type]

@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import fcntl
+import math
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
+from firmware_py.core.transitions import ARMED
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
-from hil.bench import DEFAULT_BUS, fly_scenario
-from hil.checks import Result, judge, write_result
-from hil.dock_plot import write_dock_plot
+from hil.bench import DEFAULT_BUS, SCRIPTS, fleet_of, fly_scenario
+from hil.checks import RESULT_FILE, Limit, Result, judge, write_result
+from hil.dock_plot import DOCK_PLOT, write_dock_plot
 from hil.docking_metrics import docking_metrics
 from hil.force_metrics import force_metrics
-from hil.metrics import PAPER_SPIRAL_RMSE_MM, flight_metrics
+from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics
 from hil.plant.spec import Tank
-from hil.plots import Window, write_plots
+from hil.plots import PLOTS, Window, write_plots
 from hil.realtime import fly_in_real_time
-from hil.report import Scene, write_report
+from hil.report import REPORT_FILE, Scene, write_report
 from hil.scenario import Scenario
-from hil.signals import Flight, read_flight
+from hil.script import Script
+from hil.signals import Flight, period_of, read_flight
 
-REGULAR_TICKS = 50
-"""Ticks at the start of a log that its period is read from."""
+LEFT_BEHIND = (RESULT_FILE, REPORT_FILE, DOCK_PLOT, *(f"{name}.png" for name in PLOTS))
+"""What an earlier flight may have left in a folder, beside the logs, which are written anew."""
+LATE_SHARE = 0.01
+"""Of the ticks of a run in real time, frames of which may be lost on a bus with others on it."""
 PAPER_RMSE_MM = {"spiral": PAPER_SPIRAL_RMSE_MM}
 """What the paper measured, by the kind of task."""
 
@@ -38,37 +47,80 @@ def fly_and_judge(
     progress: Callable[[float], None] | None = None,
     realtime: bool = False,
 ) -> Result:
-    """Flies `scenario`; the logs and result.json are in `out` afterwards. Raises DescriptionError and PortError."""
+    """Flies `scenario`; the logs and result.json are in `out` afterwards, and nothing of an earlier flight is.
+
+    Raises DescriptionError and PortError.
+    """
     out.mkdir(parents=True, exist_ok=True)
     scenario = scenario.for_seed(seed)
-    if realtime:
-        flown = fly_in_real_time(scenario, seed, parameters, out, bus, rate_hz, progress)
-        result = judge_logs(scenario, seed, out, flown.wall_s, flown.deadline_misses)
-    else:
-        result = judge_logs(scenario, seed, out, fly_scenario(scenario, seed, parameters, out, bus, rate_hz, progress))
-    write_result(result, out)
+    with _alone_in(out):
+        for name in LEFT_BEHIND:
+            (out / name).unlink(missing_ok=True)
+        if realtime:
+            flown = fly_in_real_time(scenario, seed, parameters, out, bus, rate_hz, progress)
+            result = judge_logs(scenario, seed, out, flown.wall_s, flown.deadline_misses, LATE_SHARE)
+        else:
+            result = judge_logs(scenario, seed, out, fly_scenario(scenario, seed, parameters, out, bus, rate_hz, progress))
+        write_result(result, out)
     return result
 
 
-def judge_logs(scenario: Scenario, seed: int, folder: Path, wall_s: float = 0.0, deadline_misses: int = 0) -> Result:
-    """The result of the flight whose logs are in `folder`; `wall_s` is what the whole run took."""
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Raises DescriptionError where another flight is being written into `folder`."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DescriptionError(f"{folder} is being written by another flight; wait for it or give another --out") from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def judge_logs(
+    scenario: Scenario, seed: int, folder: Path, wall_s: float = 0.0, deadline_misses: int = 0, lost_share: float = 0.0
+) -> Result:
+    """The result of the flight whose logs are in `folder`: what the scenario checks, and that no tick of it is missing.
+
+    Args:
+        wall_s: what the whole run took.
+        lost_share: of the ticks, which one of the two logs may lack.
+    """
     whole = read_flight(folder)
     begin_ns = start_of(whole) + round(scenario.task.settle_s * 1e9)
     flight = whole.between(begin_ns, begin_ns + round(scenario.task.duration_s * 1e9))
-    share = len(flight.time_s) / len(whole.time_s)
+    share = len(flight.firmware["tick"]) / len(whole.firmware["tick"])
     vehicle = load_vehicle(scenario.module[0].vehicle)
-    metrics = flight_metrics(flight, com_m=vehicle.inertial.com_m, wall_s=wall_s * share, deadline_misses=deadline_misses)
+    metrics = flight_metrics(
+        flight,
+        wanted=wanted_in(scenario, flight, begin_ns),
+        com_m=vehicle.inertial.com_m,
+        wall_s=wall_s * share,
+        deadline_misses=deadline_misses,
+    )
+    metrics["armed_share"] = float(np.isin(flight.firmware["state"], list(ARMED)).mean()) if share else math.nan
     if scenario.task.kind == "dock":
         metrics |= docking_metrics(scenario, folder)
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
-    return judge(scenario.name, seed, metrics, scenario.checks)
+    whole_log = Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"]))
+    return judge(scenario.name, seed, metrics, [*scenario.checks, whole_log])
+
+
+def wanted_in(scenario: Scenario, flight: Flight, begin_ns: int) -> Poses | None:
+    """What the task, begun at `begin_ns`, wants in every tick of `flight`; None where it is no path."""
+    if scenario.task.kind in SCRIPTS:
+        return None
+    path = Script(scenario, fleet_of(scenario, DEFAULT_BUS, 100)).trajectory
+    poses = [path.sample(time_ns * 1e-9) for time_ns in (flight.firmware["time_ns"] - begin_ns).tolist()]
+    return Poses(np.array([pose.p_wb for pose in poses]).reshape(-1, 3), np.array([pose.q_wb for pose in poses]).reshape(-1, 4))
 
 
 def start_of(flight: Flight) -> int:
-    """Time of the start of a run, one tick before its first, ns."""
-    time_ns = flight.ticks["time_ns"]
-    return int(time_ns[0] - np.min(np.diff(time_ns[:REGULAR_TICKS])))
+    """Time of the start of a run, one tick before its first, ns; also where the first ticks are not in the log."""
+    return int(flight.ticks["time_ns"][0] - flight.ticks["tick"][0] * period_of(flight.ticks))
 
 
 def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:

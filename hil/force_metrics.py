@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,10 +50,17 @@ def force_metrics(scenario: Scenario, folder: Path, begin_ns: int) -> dict[str, 
             name = NAMES.get(count, str(count))
             rmse[name] = float(np.sqrt(np.mean(np.square(measured - wanted)))) / count
             metrics[f"force_rmse_{name}_{phase}_n"] = rmse[name]
-            scaled = np.polynomial.polynomial.polyfit(wanted / count, measured / count, DEGREE)
-            metrics |= {f"force_fit{k}_{name}_{phase}": float(c) for k, c in enumerate(scaled)}
-        metrics[f"force_difference_{phase}"] = abs(rmse["two"] - rmse["one"]) / rmse["one"]
+            metrics |= {f"force_fit{k}_{name}_{phase}": c for k, c in enumerate(_fit(wanted / count, measured / count))}
+        metrics[f"force_difference_{phase}"] = abs(rmse["two"] - rmse["one"]) / rmse["one"] if rmse["one"] > 0.0 else math.nan
     return metrics
+
+
+def _fit(wanted: np.ndarray, measured: np.ndarray) -> list[float]:
+    """Coefficients of the polynomial, from degree 0 on; no numbers where nothing was asked for."""
+    if np.ptp(wanted) == 0.0:
+        return [math.nan] * (DEGREE + 1)
+    fitted: list[float] = np.polynomial.polynomial.polyfit(wanted, measured, DEGREE).tolist()
+    return fitted
 
 
 def _forces(firmware: Columns, truth: Columns, start_ns: int, end_ns: int) -> tuple[np.ndarray, np.ndarray]:

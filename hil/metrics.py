@@ -43,7 +43,8 @@ SHOWN = {
     "supply_power_w": Shown("Electrical power of all modules, mean", "W"),
     "wrench_margin_min": Shown("Busiest thruster, worst tick: share of its range left", "%", 100.0, 1),
     "tags_rejected": Shown("Tag observations refused by the gate", digits=0),
-    "docked": Shown("Together and apart as asked for (1: yes)", digits=0),
+    "armed_share": Shown("Armed, share of the ticks judged", "%", 100.0, 1),
+    "docked": Shown("There, together and apart as asked for (1: yes)", digits=0),
     "tries": Shown("Meetings of a probe with a funnel", digits=0),
     "jams": Shown("Jams", digits=0),
     "outcome": Shown("Outcome (0 docked, 1 jammed, 2 unstable, 3 refused, 4 gave up)", digits=0),
@@ -54,7 +55,7 @@ SHOWN = {
     "duration_s": Shown("Duration of the judged part", "s"),
     "real_time_factor": Shown("Faster than real time by", "times", digits=1),
     "ticks": Shown("Ticks judged", digits=0),
-    "unmatched_ticks": Shown("Ticks without truth", digits=0),
+    "unmatched_ticks": Shown("Ticks that one of the two logs lacks", digits=0),
     "deadline_misses": Shown("Deadlines missed", digits=0),
 }
 """Metrics in the order in which tables show them."""
@@ -111,9 +112,19 @@ def body_positions(flight: Flight, com_m: np.ndarray) -> np.ndarray:
     return p_wm + np.array([rotate(q, com_m) for q in np.ascontiguousarray(q_wm)])
 
 
+class Poses(NamedTuple):
+    """Of one body, tick by tick."""
+
+    p_wb: np.ndarray
+    """(k, 3) m."""
+    q_wb: np.ndarray
+    """(k, 4)."""
+
+
 def flight_metrics(
     flight: Flight,
     *,
+    wanted: Poses | None = None,
     com_m: np.ndarray | None = None,
     wall_s: float = 0.0,
     deadline_misses: int = 0,
@@ -121,15 +132,19 @@ def flight_metrics(
     """All metrics of result.json of a flight of one body.
 
     Args:
-        flight: the ticks of the trajectory, from its start to its end (`Flight.between`).
+        flight: the ticks of the trajectory, from its start to its end (`Flight.between`). Of none nothing is a number.
+        wanted: where the task wants the body in each of them; the firmware's own set-point, which may be any, when left out.
         com_m: (3,) nominal centre of mass in the module frame, m; the hull's centre when left out.
         wall_s: time that the machine took for the same ticks, s; 0 where it is not known gives a real-time factor of 0.
         deadline_misses: ticks that began late; 0 in lockstep.
     """
     firmware = flight.firmware
+    if not len(firmware["tick"]):
+        return dict.fromkeys((name for name in SHOWN if name not in DOCKING), math.nan)
+    wanted = wanted or Poses(firmware["setpoint_p_wb"], firmware["setpoint_q_wb"])
     position = body_positions(flight, np.zeros(3) if com_m is None else com_m)
-    error = np.linalg.norm(position - firmware["setpoint_p_wb"], axis=1)
-    angle = np.linalg.norm(rotation_vectors(flight.q_wb, firmware["setpoint_q_wb"]), axis=1)
+    error = np.linalg.norm(position - wanted.p_wb, axis=1)
+    angle = np.linalg.norm(rotation_vectors(flight.q_wb, wanted.q_wb), axis=1)
     estimate_error = firmware["p_wb"] - position
     estimate_angle = rotation_vectors(flight.q_wb, firmware["q_wb"])
     time_s = flight.time_s
@@ -152,14 +167,14 @@ def flight_metrics(
         "sigma3_share": float(inside.mean(axis=0).min()),
         "thrust_rms_n": float(np.sqrt(np.nanmean(np.square(firmware["commanded_n"])))),
         "thrust_rate_rms_n_s": rate_rms(firmware["commanded_n"], period_s),
-        "supply_power_w": float(np.nansum(flight.truth["power_w"], axis=1).mean()),
+        "supply_power_w": float(np.sum([module["power_w"] for module in flight.modules], axis=0).mean()),
         "wrench_margin_min": float(np.fmin.reduce(firmware["wrench_margin"])),
         "tags_rejected": float(np.maximum(np.diff(firmware["rejected"]), 0).sum()),  # a body that joins or parts counts anew
         "warnings": float(warnings(flight.events["severity"], flight.events["text"])),
         "duration_s": duration_s,
         "real_time_factor": duration_s / wall_s if wall_s > 0.0 else 0.0,
         "ticks": float(len(time_s)),
-        "unmatched_ticks": float(flight.unmatched),
+        "unmatched_ticks": float(len(flight.lost_ns)),
         "deadline_misses": float(deadline_misses),
     }
 

@@ -12,6 +12,8 @@ from hil.signals import Flight
 
 TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
 """One colour per kind of signal in every plot (Okabe and Ito's palette, safe for colour-blind readers)."""
+PLOTS = ("overview", "position", "attitude", "estimate", "thrusters", "disturbance")
+"""Names of the files, without .png."""
 AXIS_COLOURS = ("#cc3311", "#009988", "#0077bb")
 STYLE: dict[str, Any] = {
     "font.size": 10,
@@ -71,8 +73,8 @@ def write_plots(
     with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
         from matplotlib import pyplot
 
-        for name, draw in figures.items():
-            figure = draw()
+        for name in PLOTS:
+            figure = figures[name]()
             paths.append(folder / f"{name}.png")
             figure.savefig(paths[-1], metadata={"Software": None})
             pyplot.close(figure)

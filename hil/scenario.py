@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, quantity, read_toml
-from firmware_py.description.vehicle import FACE_NAMES, load_vehicle
+from firmware_py.description.vehicle import FACE_NAMES, Vehicle, load_vehicle
 from hil.plant.build import nominal_centre
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream
@@ -263,12 +264,27 @@ def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
             lever = rotations.rotate(start.q_wm, places[m].position - centre)
             q_wm = rotations.multiply(start.q_wm, places[m].quaternion)
             starts[m] = Start(start.p_wm + lever, q_wm)
+    _refuse_overlap(scenario, vehicles, starts, seed)
     spec = (scenario.world, scenario.tank, vehicles, starts, seed, period_ns)
     world = World(*spec, groups=groups, places=places, dock=scenario.dock, jam=scenario.jam)
     for body, members in enumerate(world.bodies):
         if any(scenario.module[m].clamped for m in members):
             world.clamp(body)
     return world
+
+
+def _refuse_overlap(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:
+    """Raises DescriptionError where two bodies would start one inside the other: balls that fit into their hulls overlap."""
+    radii = [0.5 * float(vehicle.hull.size_m.min()) for vehicle in vehicles]
+    docked = {pair for members in scenario.groups for pair in itertools.combinations(members, 2)}
+    for (i, one), (j, other) in itertools.combinations(enumerate(starts), 2):
+        apart_m = float(np.linalg.norm(one.p_wm - other.p_wm))
+        if (i, j) not in docked and apart_m < radii[i] + radii[j]:
+            numbers = f"{scenario.module[i].number} and {scenario.module[j].number}"
+            raise DescriptionError(
+                f"{scenario.name}: in seed {seed} modules {numbers} start {apart_m:.3g} m apart, one inside the other; "
+                f"{radii[i] + radii[j]:.3g} m is the least"
+            )
 
 
 def _origin(scenario: Scenario, groups: Sequence[Sequence[int]], module: int) -> np.ndarray:

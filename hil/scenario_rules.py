@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from firmware_py.description.schema import limits_of
+from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN
 
 if TYPE_CHECKING:
     from hil.scenario import Scenario
 
+SHORTEST_S = 0.1
+"""Of a path."""
 Mistake = tuple[tuple[str | int, ...], str]
 """The keys that lead to what is wrong, and what is wrong with it."""
 
@@ -64,6 +68,9 @@ def _in_polycube(scenario: Scenario) -> Iterator[Mistake]:
 
 def _in_steps(scenario: Scenario) -> Iterator[Mistake]:
     kind = scenario.task.kind
+    for i, step in enumerate(scenario.step):
+        if step.do in ("move", "moebius") and step.duration_s < SHORTEST_S:
+            yield ("step", i, "duration_s"), f"{step.duration_s:g} s; a {step.do} takes {SHORTEST_S:g} s at least"
     if kind != "dock" and scenario.step:
         yield ("step", 0), f"a task of the kind {kind} runs no steps; only dock does"
     if kind == "dock" and not scenario.step:
@@ -101,6 +108,17 @@ def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
             yield (table, i, "position_m"), f"{where} with its surface's centre at [0, 0, 0]"
 
 
+def _in_start(scenario: Scenario) -> Iterator[Mistake]:
+    """However far a seed may put a body off its place."""
+    for corner in itertools.product((-1.0, 1.0), repeat=3):
+        for members in scenario.groups:
+            place = scenario.module[members[0]].position_m + scenario.start.position_m * corner
+            if not scenario.tank.holds(place):
+                where = f"a seed may start module {scenario.module[members[0]].number} at {place.round(3).tolist()} m"
+                yield ("start", "position_m"), f"{where}, outside the tank, a {scenario.tank}"
+                return
+
+
 def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:
     """Of modules that are not there."""
     numbers = module_numbers(scenario)
@@ -126,11 +144,16 @@ def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
     for i, check in enumerate(scenario.check):
         if check.metric not in names:
             yield ("check", i, "metric"), f"{check.metric!r} is unknown; a run of the kind {scenario.task.kind} has {', '.join(names)}"
+        first = next(k for k, other in enumerate(scenario.check) if other.metric == check.metric)
+        if first < i:
+            yield ("check", i, "metric"), f"{check.metric} is checked by another [[check]] already; give low and high in one"
+        if check.low <= -UNBOUNDED and check.high >= UNBOUNDED:
+            yield ("check", i, "metric"), f"{check.metric} has neither low nor high; every value would pass"
         if check.low > check.high:
             yield ("check", i, "low"), f"{check.low:g} is above high, {check.high:g}; no value would pass"
 
 
 RULES = (
-    _in_name, _in_numbers, _in_polycube, _in_steps, _in_file, _in_bodies, _in_tank, _in_mentions, _in_faults, _in_checks
+    _in_name, _in_numbers, _in_polycube, _in_steps, _in_file, _in_bodies, _in_tank, _in_start, _in_mentions, _in_faults, _in_checks
 )  # fmt: skip
 """The first that finds a mistake is heard first."""

@@ -43,7 +43,7 @@ class Script:
         start = scenario.module[0].start
         self.start_pose = rest_at(np.array(start.p_wm, dtype=float), np.array(start.q_wm, dtype=float))
         self.trajectory = TASKS[scenario.task.kind](scenario.task, self.start_pose)
-        _refuse_outside(self.trajectory, scenario)
+        refuse_outside(self.trajectory, scenario)
         self.begin_ns = round(scenario.task.settle_s * 1e9)
         self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
         self.ticks = self.end_ns // fleet.period_ns
@@ -68,7 +68,7 @@ class Script:
         return False
 
 
-def _refuse_outside(path: paths.Trajectory, scenario: Scenario) -> None:
+def refuse_outside(path: paths.Trajectory, scenario: Scenario) -> None:
     """Raises DescriptionError where the body's centre would have to leave the tank."""
     for time_s in np.linspace(0.0, path.duration_s, LOOKS).tolist():
         place = path.sample(time_s).p_wb

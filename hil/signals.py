@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 TRUTH_LOG = "truth.mcap"
 SIGNAL_LOG = "signals.mcap"
+REGULAR_TICKS = 50
+"""Ticks at the start of a log that its period is read from."""
 CHUNK_BYTES = 65536
 """About two seconds of one module at 100 Hz; a killed bench loses no more."""
 
@@ -185,18 +187,18 @@ class TruthRecorder:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One body over the ticks that both logs hold, row by row; `unmatched` ticks of the firmware have no truth.
+    """One body over the ticks that both logs hold, row by row; `lost_ns` are the times of ticks that one of them lacks.
 
     `truth` has the columns of the body's leading module (its `force_n` and `power_w` those of all its modules), and with them
-    `member`, `p_wb`, `q_wb`, `v_wb`, `w_bb` of the body where the log has them. `modules` has `p_wm`, `q_wm` and `force_n` of
-    every module of the fleet, in its order, whichever body it is in.
+    `member`, `p_wb`, `q_wb`, `v_wb`, `w_bb` of the body where the log has them. `modules` has `p_wm`, `q_wm`, `force_n` and
+    `power_w` of every module of the fleet, in its order, whichever body it is in.
     """
 
     firmware: Columns
     truth: Columns
     events: Columns
     ticks: Columns
-    unmatched: int
+    lost_ns: np.ndarray
     modules: tuple[Columns, ...] = ()
 
     @property
@@ -224,7 +226,8 @@ class Flight:
         pick = {name: column[keep] for name, column in self.firmware.items()}
         truth = {name: column[keep] for name, column in self.truth.items()}
         modules = tuple({name: column[keep] for name, column in module.items()} for module in self.modules)
-        return Flight(pick, truth, self.events, self.ticks, self.unmatched, modules)
+        lost_ns = self.lost_ns[(self.lost_ns >= start_ns) & (self.lost_ns <= end_ns)]
+        return Flight(pick, truth, self.events, self.ticks, lost_ns, modules)
 
 
 def read_flight(folder: Path, body: int = 0, module: int = 0) -> Flight:
@@ -242,25 +245,27 @@ def read_flight(folder: Path, body: int = 0, module: int = 0) -> Flight:
     _, mine, theirs = np.intersect1d(firmware["tick"], truth["tick"], return_indices=True)
     if not len(mine):
         raise ValueError(f"{folder}: the two logs share no tick")
-    nothing: Columns = {"tick": np.zeros(0, np.int64), "severity": np.zeros(0, np.int64), "text": np.zeros(0, str)}
+    nothing: Columns = {name: np.zeros(0, np.int64) for name in ("tick", "severity", "log_time")} | {"text": np.zeros(0, str)}
     believed = {name: column[mine] for name, column in firmware.items()}
     true = {name: column[theirs] for name, column in truth.items()}
     _tell_of_same_body(believed, true, thrusters)
-    return Flight(
-        believed,
-        true,
-        signals.get("/events", nothing),
-        signals.get("/firmware/ticks", {}),
-        len(firmware["tick"]) - len(mine),
-        _fleet(truths, true["tick"]),
-    )
+    ticks = signals["/firmware/ticks"]
+    untold = np.concatenate([np.setdiff1d(firmware["tick"], truth["tick"]), np.setdiff1d(truth["tick"], ticks["tick"])])
+    lost_ns = ticks["time_ns"][0] + period_of(ticks) * (untold - ticks["tick"][0])
+    return Flight(believed, true, signals.get("/events", nothing), ticks, lost_ns, _fleet(truths, true["tick"]))
+
+
+def period_of(ticks: Columns) -> int:
+    """Of the firmware's ticks, by their numbers and times, ns; 0 of a single one."""
+    numbers, times = ticks["tick"][:REGULAR_TICKS], ticks["time_ns"][:REGULAR_TICKS]
+    return int(np.min(np.diff(times) // np.diff(numbers))) if len(numbers) > 1 else 0
 
 
 def _fleet(truths: Mapping[str, Columns], ticks: np.ndarray) -> tuple[Columns, ...]:
-    """Pose and forces of every module at these ticks, in the order of the fleet."""
+    """Pose, forces and power of every module at these ticks, in the order of the fleet."""
     count = sum(name.startswith("/plant/module") for name in truths)
     modules = [truths[f"/plant/module{m}"] for m in range(count)]
-    return tuple({name: _at(module, ticks, name) for name in ("p_wm", "q_wm", "force_n")} for module in modules)
+    return tuple({name: _at(module, ticks, name) for name in ("p_wm", "q_wm", "force_n", "power_w")} for module in modules)
 
 
 def _joined(module: Columns, body: Columns | None, truths: Mapping[str, Columns]) -> Columns:

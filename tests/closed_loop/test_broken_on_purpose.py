@@ -1,16 +1,25 @@
 """What is broken on purpose must fail a check: else the checks would prove nothing."""
 
 import dataclasses
+import fcntl
 import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from firmware_py.app.firmware import Firmware
 from firmware_py.bus.codec import Frame
 from firmware_py.core import rotations
+from firmware_py.core.types import Action, Request
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from hil.checks import Result
+from hil.plant.fault_spec import Fault
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
 
@@ -74,6 +83,69 @@ def test_crc_off_by_one_bit_on_one_side_fails_the_flight(
 ) -> None:
     corrupt(crc_off_by_one_bit, to_plant)
     assert not fly(shortened("hover", HOVER_S)).passed
+
+
+@pytest.fixture
+def deaf(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """deaf(action, ...): the firmware does not hear these requests."""
+    step = Firmware.step
+
+    def deafen(*actions: Action) -> None:
+        def step_of_the_deaf(self: Firmware, tick: int, time_ns: int, received: Any, requests: Sequence[Request]) -> Any:
+            return step(self, tick, time_ns, received, [request for request in requests if request.action not in actions])
+
+        monkeypatch.setattr(Firmware, "step", step_of_the_deaf)
+
+    return deafen
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "action"), [("hover", Action.ARM), ("spiral", Action.TRACK), ("waypoints", Action.TRACK)])
+def test_robot_that_does_as_it_likes_fails_the_flight_however_well_it_does_it(
+    fly: Fly, deaf: Callable[..., None], name: str, action: Action
+) -> None:
+    deaf(action)
+    assert "position_rmse_m" in failed(fly(shortened(name, settle_s=3.0)))
+
+
+@pytest.mark.slow
+def test_undock_that_is_not_heard_and_a_move_that_is_not_flown_are_no_success(fly: Fly, deaf: Callable[..., None]) -> None:
+    deaf(Action.UNDOCK, Action.TRACK)
+    assert "docked" in failed(fly(shortened("dock-undock-dock", 60.0), 3))
+    assert "docked" in failed(fly(shortened("dock-near-miss", 10.0)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("at_s", "until_s", "lost"), [(7.0, 1e6, 101), (0.0, 5.5, 150)])
+def test_ticks_without_firmware_are_no_success(fly: Fly, at_s: float, until_s: float, lost: int) -> None:
+    """Also where they are the first of the run: what is judged begins when the task does."""
+    hover = shortened("hover", 4.0, 4.0)
+    gone = dataclasses.replace(hover, fault=(Fault(kind="process_killed", at_s=at_s, until_s=until_s),))
+    result = fly(gone)
+    assert result.metrics["unmatched_ticks"] == lost and "unmatched_ticks" in failed(result)
+
+
+@pytest.mark.slow
+def test_flight_whose_firmware_is_gone_before_the_task_begins_fails_and_ends_no_campaign(fly: Fly) -> None:
+    gone = dataclasses.replace(shortened("hover", 2.0, 4.0), fault=(Fault(kind="process_killed", at_s=3.0),))
+    assert {"position_rmse_m", "unmatched_ticks"} <= failed(fly(gone))
+
+
+@pytest.mark.slow
+def test_folder_holds_one_flight(fly: Fly, tmp_path: Path) -> None:
+    """Nothing of an earlier one stays, and two are not flown into it at once."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("report.html", "docking.png", "result.json", "notes.txt"):
+        (folder / name).write_text("of an earlier flight")
+    handle = os.open(folder, os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    with pytest.raises(DescriptionError, match="is being written by another flight; wait for it or give another --out"):
+        fly(shortened("hover", 1.0, 2.0))
+    assert (folder / "report.html").exists()
+    os.close(handle)
+    fly(shortened("hover", 1.0, 2.0))
+    assert {path.name for path in folder.iterdir()} == {"can.log", "notes.txt", "result.json", "signals.mcap", "truth.mcap"}
 
 
 @pytest.mark.slow

@@ -16,6 +16,8 @@ TRIALS = [trial(0, 0.003), trial(1, 0.011, "position_rmse_m"), trial(2, 0.004), 
 
 def test_seeds_that_failed_are_the_worst_however_near_they_flew() -> None:
     assert summarise("dock", [trial(0, 0.9), trial(1, 0.001, "jammed"), trial(2, 0.5)])["worst_seeds"] == [1, 0, 2]
+    no_figure = {**trial(3, 0.0, "armed_share"), "metrics": {"position_rmse_m": None}}
+    assert summarise("dock", [trial(0, 0.9), trial(1, 0.7, "jammed"), no_figure])["worst_seeds"] == [3, 1, 0]
 
 
 def test_summary_counts_outcomes_and_names_the_worst_seeds_first() -> None:

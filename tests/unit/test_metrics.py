@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil.checks import Limit, check_metrics, judge, write_result
-from hil.metrics import body_positions, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
+from hil.metrics import Poses, body_positions, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
 from hil.signals import Flight, read_flight
 from tests.unit.flights import MARGIN, POWER_W, START_NS, write_flight, write_pair
 
@@ -27,6 +27,45 @@ def test_robot_beside_its_path_shows_that_distance(tmp_path: Path) -> None:
     assert metrics["position_max_m"] == pytest.approx(0.005, abs=1e-12)
     assert metrics["attitude_rmse_rad"] == pytest.approx(0.0, abs=1e-12)
     assert metrics["estimate_position_rmse_m"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_robot_is_measured_by_the_task_and_not_by_what_it_wants_itself(tmp_path: Path) -> None:
+    flight = spiral_of(tmp_path, noise=0.0)
+    quarter = np.tile([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)], (501, 1))
+    metrics = flight_metrics(flight, wanted=Poses(flight.firmware["setpoint_p_wb"] + [0.0, 0.3, 0.0], quarter))
+    assert metrics["position_rmse_m"] == metrics["position_max_m"] == pytest.approx(0.3, abs=1e-12)
+    assert metrics["attitude_rmse_rad"] == pytest.approx(math.pi / 2, abs=1e-9)
+    assert metrics["estimate_position_rmse_m"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_estimate_beside_the_truth_shows_that_distance_and_angle_and_leaves_three_sigma(tmp_path: Path) -> None:
+    flight = spiral_of(tmp_path, noise=0.0)
+    flight.firmware["p_wb"][:, 0] += 0.0025  # its sigma is 0.8 mm
+    flight.firmware["q_wb"][:] = [math.cos(0.005), 0.0, 0.0, math.sin(0.005)]
+    flight.firmware["sigma_q"][:, 2] = 0.0034
+    metrics = flight_metrics(flight)
+    assert metrics["estimate_position_rmse_m"] == pytest.approx(0.0025, abs=1e-12)
+    assert metrics["estimate_attitude_rmse_rad"] == pytest.approx(0.01, abs=1e-9)
+    assert (metrics["sigma3_share_x"], metrics["sigma3_share_yaw"], metrics["sigma3_share"]) == (0.0, 1.0, 0.0)
+
+
+def test_thrust_is_rooted_and_refused_tags_are_counted(tmp_path: Path) -> None:
+    flight = spiral_of(tmp_path, noise=0.0)
+    flight.firmware["commanded_n"][:] = np.where(np.arange(501) % 2 == 0, 3.0, 1.0)[:, None]
+    flight.firmware["rejected"][:] = np.repeat([7, 9, 2], 167)  # a body that joins counts anew
+    metrics = flight_metrics(flight)
+    assert metrics["thrust_rms_n"] == pytest.approx(math.sqrt((251 * 9 + 250) / 501))
+    assert metrics["tags_rejected"] == 2
+
+
+def test_power_is_that_of_all_modules_whichever_body_they_are_in(tmp_path: Path) -> None:
+    write_pair(tmp_path, ticks=100, joined_from=40, known_from=60, offset_m=(0.0, 0.0, 0.0))
+    assert flight_metrics(read_flight(tmp_path))["supply_power_w"] == pytest.approx(2 * POWER_W)
+
+
+def test_flight_without_a_tick_has_no_figures(tmp_path: Path) -> None:
+    metrics = flight_metrics(spiral_of(tmp_path).between(0, 0))
+    assert "position_rmse_m" in metrics and all(math.isnan(value) for value in metrics.values())
 
 
 def test_tilted_robot_shows_its_angle(tmp_path: Path) -> None:

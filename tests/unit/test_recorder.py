@@ -202,6 +202,6 @@ def test_flight_joins_firmware_and_plant_by_tick(tmp_path: Path) -> None:
             truth.record(tick, tick * PERIOD_NS, 0, np.full(3, float(tick)), q, zero, zero, np.zeros(8), zero)
     flight = read_flight(tmp_path)
     assert flight.firmware["tick"].tolist() == flight.truth["tick"].tolist() == list(range(3, 90))
-    assert flight.unmatched == 13
+    np.testing.assert_array_equal(np.sort(flight.lost_ns), PERIOD_NS * np.r_[0:3, 90:100])
     np.testing.assert_array_equal(flight.truth["p_wm"][:, 0], np.arange(3.0, 90.0))
     assert flight.between(10 * PERIOD_NS, 12 * PERIOD_NS).truth["tick"].tolist() == [10, 11, 12]

@@ -1,0 +1,115 @@
+"""What is told of docks: wishes obeyed one after the other, with the faces that they name, and joins that were none."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.signals import Columns
+from hil.docking_metrics import DECLARED, _false_declarations, is_as_asked, is_obeyed
+from hil.force_metrics import force_metrics
+from hil.scenario import Scenario, Step, load_scenario, make_world
+
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+TICKS = np.arange(1, 101)
+APART, PAIR = ((0,), (1,), (2,)), ((0, 1), (2,))
+
+
+@pytest.mark.parametrize(
+    ("wishes", "runs", "obeyed"),
+    [
+        ([True], "apart joined", True),
+        ([True], "apart", False),
+        ([True], "apart joined apart", False),
+        ([True, False, True], "apart joined apart joined", True),
+        ([True, False, True], "apart joined", False),
+        ([True, False], "apart joined apart joined", False),
+        ([False], "joined apart", True),
+        ([False], "joined", False),
+        ([True], "apart joined apart joined", True),
+    ],
+)
+def test_wishes_are_obeyed_one_after_the_other(wishes: list[bool], runs: str, obeyed: bool) -> None:
+    together = np.repeat([run == "joined" for run in runs.split()], 50)
+    assert is_obeyed(wishes, together) == obeyed
+
+
+def truth_of(bodies: list[tuple[tuple[int, ...], ...]], places: list[list[float]]) -> dict[str, Columns]:
+    """Logs of three modules, level, that hang together as `bodies` says, for equal shares of the run."""
+    share = len(TICKS) // len(bodies)
+    truths: dict[str, Columns] = {"/plant/docks": {"tick": TICKS}}
+    for m, place in enumerate(places):
+        truths[f"/plant/module{m}"] = {"tick": TICKS, "p_wm": np.tile(place, (100, 1)), "q_wm": np.tile(LEVEL, (100, 1))}
+    for leader in range(3):
+        rows = [(tick, members) for k, groups in enumerate(bodies) for members in groups if members[0] == leader
+                for tick in TICKS[k * share : (k + 1) * share]]  # fmt: skip
+        member = np.array([[float(m in members) for m in range(3)] for _, members in rows]).reshape(-1, 3)
+        p_wb = np.array([np.mean([places[m] for m in members], axis=0) for _, members in rows]).reshape(-1, 3)
+        truths[f"/plant/body{leader}"] = {"tick": np.array([tick for tick, _ in rows], np.int64), "member": member, "p_wb": p_wb}
+    return truths
+
+
+def asked(*steps: Step) -> Scenario:
+    """Three modules, numbered from 1."""
+    third = load_scenario("dock-third")
+    return dataclasses.replace(third, step=steps)
+
+
+PLACES = [[0.0, 0.0, 0.4], [0.21, 0.0, 0.4], [0.5, 0.0, 0.4]]
+DOCK = Step(do="dock", module=2, face="-x", target_module=1, target_face="+x")
+
+
+def test_dock_counts_with_the_faces_that_were_named() -> None:
+    joined = truth_of([APART, PAIR], PLACES)
+    assert is_as_asked(asked(DOCK), joined)
+    assert not is_as_asked(asked(dataclasses.replace(DOCK, face="+x")), joined)
+    assert not is_as_asked(asked(dataclasses.replace(DOCK, target_face="+y")), joined)
+    assert not is_as_asked(asked(DOCK), truth_of([APART, APART], PLACES))
+    assert not is_as_asked(asked(DOCK, Step(do="undock", module=2, target_module=1)), joined)
+
+
+def test_move_counts_when_it_led_there() -> None:
+    at = np.array([0.52, 0.0, 0.4])
+    move = Step(do="move", module=3, position_m=at)
+    assert is_as_asked(asked(move), truth_of([APART], PLACES))
+    assert not is_as_asked(asked(dataclasses.replace(move, position_m=at + 0.1)), truth_of([APART], PLACES))
+
+
+def test_without_a_dock_nothing_may_join_or_part() -> None:
+    wait = asked(Step(do="wait"))
+    assert is_as_asked(wait, truth_of([APART], PLACES)) and is_as_asked(wait, truth_of([PAIR], PLACES))
+    assert not is_as_asked(wait, truth_of([APART, PAIR], PLACES))
+
+
+@pytest.mark.parametrize(("module_a", "module_b", "false"), [(0, 1, 0), (1, 2, 1)])
+def test_join_of_others_than_those_that_hang_together_is_a_false_one(module_a: int, module_b: int, false: int) -> None:
+    truths = truth_of([APART, PAIR], PLACES)
+    docks = {"tick": np.array([59, 60]), "stage": np.array([4, DECLARED]),
+             "module_a": np.array([module_a] * 2), "module_b": np.array([module_b] * 2)}  # fmt: skip
+    signals = {"/firmware/docks": docks, "/firmware/body0": {"tick": TICKS}, "/firmware/body1": {"tick": TICKS},
+               "/firmware/body2": {"tick": TICKS[:59]}}  # fmt: skip
+    assert _false_declarations(truths, signals) == false
+
+
+def test_join_that_no_dock_declared_is_found_by_the_number_of_bodies() -> None:
+    signals = {"/firmware/body0": {"tick": TICKS}, "/firmware/body1": {"tick": TICKS[:30]}, "/firmware/body2": {"tick": TICKS}}
+    assert _false_declarations(truth_of([APART], PLACES), signals) == 1
+    assert _false_declarations(truth_of([APART, PAIR], PLACES), signals) == 1  # thirty ticks in, and true from fifty
+
+
+def test_bodies_that_would_start_one_inside_the_other_are_refused() -> None:
+    scenario = load_scenario("dock")
+    near = dataclasses.replace(scenario.module[1], position_m=scenario.module[0].position_m)
+    with pytest.raises(DescriptionError, match=r"modules 1 and 2 start 0\.\d+ m apart, one inside the other; 0\.2"):
+        make_world(dataclasses.replace(scenario, module=(scenario.module[0], near)), 0, 10_000_000)
+
+
+def test_force_of_a_robot_that_never_pushed_has_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = load_scenario("force-tracking")
+    time_ns = np.arange(1, 8501) * 10_000_000
+    still = {"tick": np.arange(1, 8501), "time_ns": time_ns, "wrench_wanted": np.zeros((8500, 6)), "load": np.zeros((8500, 6))}
+    logs = {f"/{side}/body{leader}": still for side in ("firmware", "plant") for leader in (0, 1)}
+    monkeypatch.setattr("hil.force_metrics.read_signals", lambda path: logs)
+    assert np.isnan(force_metrics(scenario, tmp_path, 0)["force_difference_off"])
