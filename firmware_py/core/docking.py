@@ -140,12 +140,8 @@ class DockingStage:
         """
         if not self._joints.rows.size:
             return []
-        rows = self._joints.rows[self._joints.rows["open"] >= least]
         parting = [modules_of(joint) for undock in self._undocks for joint in undock.plan.opens]
-        found = [
-            DockRequest(module, face, target, target_face)
-            for (target, module), (target_face, face) in zip(rows["module"].tolist(), rows["face"].tolist(), strict=True)
-        ]
+        found = [self._watched[k].request for k in np.flatnonzero(self._joints.rows["open"] >= least).tolist()]
         return [joint for joint in found if modules_of(joint) not in parting]
 
     @property

@@ -217,8 +217,7 @@ class Guidance:
         v_w, w_b = (np.where(np.isnan(value), 0.0, value) for value in (point.v_w, point.w_b))
         q_wb = None if np.isnan(point.q_wb).any() else point.q_wb
         if age_s > self._p.guided_timeout_s:
-            v_w, w_b, age_s = ZERO, ZERO, self._p.guided_timeout_s
-            age_s = 0.0 if np.isnan(point.p_wb).any() else age_s
+            v_w, w_b = ZERO, ZERO
         moved = np.where(np.isnan(point.v_w), 0.0, point.v_w) * min(age_s, self._p.guided_timeout_s)
         return Wish(self._held_in(self._glider.at.p_wb, v_w), w_b, self._inside(point.p_wb + moved), q_wb)
 

@@ -138,8 +138,6 @@ class Steering:
 
     def _manual(self, arrival: Arrival) -> None:
         m = arrival.message
-        if m["target"] not in (0, self._system.outbox.system):
-            return
         extensions = m["enabled_extensions"]
         force = (_axis(m["x"]), _axis(m["y"]), -self._up(m["z"]))
         moment = (

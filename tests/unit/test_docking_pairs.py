@@ -12,7 +12,7 @@ from firmware_py.core.joints import joints_of
 from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
 from firmware_py.core.types import DockFeedback, ModuleInputs, TagObservation
 from firmware_py.description.parameters import Docking
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import FACE_NORMALS, load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 TICK_NS, PITCH_M = 10_000_000, 0.21
@@ -224,6 +224,23 @@ def test_joints_go_on_when_other_joints_come_and_go(row: Row) -> None:
     after = PairBank(ROW[1:], P, bank)
     assert after.status(0) == before[1] and not after.status(1).docked
     assert all(status.docked for status in row.watch(after, 0.9))
+
+
+@pytest.mark.parametrize(("cell", "turns"), [((0, 1, 0), (0, 2)), ((0, 1, 0), (0, 14)), ((0, 0, 1), (0, 3)), ((0, 0, 1), (0, 21))])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_joint_of_modules_that_sit_turned_is_told_in_their_own_frames(cell: tuple[int, ...], turns: tuple[int, int], swapped: bool) -> None:
+    """Whichever comes first in the body: the other's centre is a pitch before the face that is turned to it."""
+    vehicles, cells, modules = [load_vehicle("modcube")] * 2, [(0, 0, 0), cell], [5, 6]
+    if swapped:
+        cells, turns = cells[::-1], turns[::-1]
+    body = assemble(cells, list(turns), vehicles, modules)
+    ((request, offset, q_ta),) = joints_of(body)
+    np.testing.assert_allclose(multiply(body.q_bm[0].copy(), q_ta), body.q_bm[1], atol=1e-12)
+    assert (request.target_module, request.module) == (5, 6)
+    np.testing.assert_allclose(offset, PITCH_M * FACE_NORMALS[request.target_face], atol=1e-12)
+    step_b = body.r_bm[1] - body.r_bm[0]
+    for i, face, way_b in ((0, request.target_face, step_b), (1, request.face, -step_b)):
+        np.testing.assert_allclose(PITCH_M * rotate(body.q_bm[i].copy(), FACE_NORMALS[face].astype(float)), way_b, atol=1e-12)
 
 
 def test_body_has_a_joint_between_every_two_neighbours() -> None:

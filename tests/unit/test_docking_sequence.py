@@ -4,15 +4,17 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation, Slerp
 
+from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
-from firmware_py.core.docking_sequence import DockingSequence, Stage, nearest_pass
-from firmware_py.core.rotations import from_euler, rotate
+from firmware_py.core.docking_sequence import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockingSequence, Stage, Steering, nearest_pass
+from firmware_py.core.rotations import conjugate, difference, from_euler, multiply, rotate, rotate_back, to_matrix
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRequest, Estimate
 from firmware_py.description.parameters import PAPER, Docking
-from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.assembly import assemble
+from firmware_py.description.vehicle import FACE_NORMALS, load_vehicle
+from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.docking import plan_dock
 
 TICK_NS = 10_000_000
@@ -124,3 +126,252 @@ def test_body_that_is_turned_is_turned_before_it_is_aligned() -> None:
     assert sequence.stage == Stage.PRE_APPROACH and isinstance(steering.active, Wish)
     sequence.step(100 * TICK_NS, estimate(p_a), estimate(p_t), NEITHER)
     assert sequence.stage == Stage.ALIGN
+
+
+@pytest.mark.parametrize("off", [(0.025, 0.0, 0.0), (-0.025, 0.0, 0.0), (0.0, 0.025, 0.0)])
+def test_body_that_is_off_its_stand_off_is_brought_there_before_it_is_aligned(off: tuple[float, ...]) -> None:
+    sequence, p_t, p_a = begin(Docking(), Docking().standoff_m)
+    for tick in range(1, 10):
+        sequence.step(tick * TICK_NS, estimate(p_a + np.array(off)), estimate(p_t), NEITHER)
+    assert sequence.stage == Stage.PRE_APPROACH
+    sequence.step(10 * TICK_NS, estimate(p_a), estimate(p_t), NEITHER)
+    assert sequence.stage == Stage.ALIGN
+
+
+# ---------------------------------------------------------------- bodies of several modules, anyhow turned
+
+TILTED = from_euler(0.3, -0.4, 1.2)
+DRIFT = np.array([0.02, -0.01, 0.03, 0.0, 0.0, 0.0])
+STILL = np.zeros(6)
+STAGED = Docking()
+
+
+def face_of(body: Body, module: int, face: int, at: Estimate) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and outward normal of a face in the world."""
+    i = body.modules.index(module)
+    normal = to_matrix(np.ascontiguousarray(body.q_bm[i])) @ FACE_NORMALS[face]
+    return at.p_wb + rotate(at.q_wb, body.r_bm[i] + 0.5 * PITCH_M * normal), np.asarray(rotate(at.q_wb, normal))
+
+
+class Follower:
+    """A pair's second module docks to another pair's second, whose bodies are anyhow turned; the active one is just where it is wanted."""
+
+    def __init__(self, parameters: Docking = STAGED, nu: np.ndarray = STILL, comes: bool = False) -> None:
+        vehicles = [load_vehicle("modcube")] * 4
+        self.target = assemble([(0, 0, 0), (0, 1, 0)], [0, 12], vehicles[:2], [0, 1])
+        self.active = assemble([(0, 0, 0), (0, 0, 1)], [0, 12], vehicles[2:], [2, 3])
+        self.plan = plan_dock(DockRequest(3, 3, 1, 0, 1), self.active, self.target, vehicles)
+        self.sequence = DockingSequence(self.plan, self.active, self.target, parameters, 0, comes)
+        self.there = estimate(np.array([1.0, 2.0, 3.0]))._replace(q_wb=TILTED, nu=nu)
+        self.face, self.outward = face_of(self.target, 1, 0, self.there)
+        self.at = estimate(self.face + 0.5 * self.outward)._replace(q_wb=TILTED)
+        self.tick = 0
+
+    def step(self, status: PairStatus = NEITHER) -> Steering:
+        self.tick += 1
+        steering = self.sequence.step(self.tick * TICK_NS, self.at, self.there, status)
+        self.at = self.at._replace(p_wb=steering.active.p_wb, q_wb=steering.active.q_wb)
+        return steering
+
+    def until(self, stage: Stage, status: PairStatus = NEITHER) -> Steering:
+        while self.tick < 8000:
+            steering = self.step(status)
+            if self.sequence.stage == stage:
+                return steering
+        raise AssertionError(f"still {self.sequence.stage.name}")
+
+    def astray(self, sideways_m: float = 0.0, turned_rad: float = 0.0) -> None:
+        """The active body is not where it was wanted."""
+        across = np.cross(self.outward, [0.0, 0.0, 1.0])
+        q_wb = multiply(self.at.q_wb, from_euler(0.0, 0.0, turned_rad))
+        self.at = self.at._replace(p_wb=self.at.p_wb + sideways_m * across / np.linalg.norm(across), q_wb=q_wb)
+
+
+def test_pair_is_led_so_that_its_module_stands_before_the_face_of_a_tilted_pair() -> None:
+    dock = Follower(nu=DRIFT)
+    dock.until(Stage.PUSH)
+    steering = dock.step()
+    mine, inward = face_of(dock.active, 3, 3, dock.at)
+    np.testing.assert_allclose(inward, -dock.outward, atol=1e-9)
+    np.testing.assert_allclose(mine, dock.face, atol=0.001)
+    np.testing.assert_allclose(np.cross(mine - dock.face, dock.outward), 0.0, atol=1e-9)
+    turn, merged = (
+        multiply(conjugate(np.ascontiguousarray(a)), np.ascontiguousarray(b))
+        for a, b in (
+            (multiply(TILTED, dock.target.q_bm[1].copy()), multiply(dock.at.q_wb, dock.active.q_bm[1].copy())),
+            (dock.plan.merged.q_bm[1], dock.plan.merged.q_bm[3]),
+        )
+    )
+    assert np.linalg.norm(difference(turn, merged)) < 1e-6
+    np.testing.assert_allclose(steering.active.v_w, rotate(TILTED, DRIFT[:3]) - STAGED.contact_speed_m_s * dock.outward, atol=1e-9)
+
+
+@pytest.mark.parametrize("approach", ["staged", "straight"])
+def test_tilted_target_comes_half_of_the_way_in_the_world(approach: str) -> None:
+    dock = Follower(Docking(approach=approach), DRIFT, comes=True)
+    dock.astray(sideways_m=0.1)
+    centre = dock.face - 0.5 * PITCH_M * dock.outward
+    r_a = dock.active.r_bm[1].copy()
+    way = dock.at.p_wb + rotate(dock.at.q_wb, r_a) - centre - PITCH_M * dock.outward
+    before = dock.at.p_wb + rotate(dock.at.q_wb, r_a)
+    steering = dock.step()
+    if approach == "straight":
+        assert np.linalg.norm(dock.at.p_wb + rotate(dock.at.q_wb, r_a) - before) < 0.001, "it begins where it is"
+    left = STAGED.standoff_m if approach == "staged" else 0.0
+    np.testing.assert_allclose(steering.meets, 0.5 * (way - left * dock.outward), atol=1e-9)
+    if approach == "straight":  # it meets the target where that comes to rest
+        dock.until(Stage.PUSH)
+        np.testing.assert_allclose(dock.at.p_wb + rotate(dock.at.q_wb, r_a), centre + PITCH_M * dock.outward + steering.meets, atol=0.002)
+        np.testing.assert_allclose(dock.step().active.v_w, -STAGED.contact_speed_m_s * dock.outward, atol=1e-9)
+
+
+@pytest.mark.parametrize(("sideways_m", "turned_rad"), [(0.005, 0.0), (0.0, 0.04)])
+def test_alignment_must_be_good_for_a_whole_second_in_place_and_attitude(sideways_m: float, turned_rad: float) -> None:
+    dock = Follower()
+    dock.until(Stage.ALIGN)
+    for _ in range(90):
+        np.testing.assert_allclose(dock.step().active.v_w, 0.0, atol=1e-12)
+    dock.astray(sideways_m, turned_rad)
+    dock.step()
+    for _ in range(95):
+        dock.step()
+    assert dock.sequence.stage == Stage.ALIGN, "the second begins anew"
+    for _ in range(8):
+        dock.step()
+    assert dock.sequence.stage == Stage.APPROACH
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_module_that_comes_too_near_on_the_way_is_found_however_both_bodies_are_turned(seed: int) -> None:
+    """Against the way as scipy has it: straight, and turning evenly."""
+    dock, rng, standoff_m = Follower(), np.random.default_rng(seed), STAGED.standoff_m
+    target, active, plan = dock.target, dock.active, dock.plan
+    there, at = (estimate(rng.normal(0.0, 0.35, 3))._replace(q_wb=Rotation.random(rng=rng).as_quat()[[3, 0, 1, 2]]) for _ in range(2))
+    r_t, r_a, q_t, q_a, q_ta = (
+        Rotation.from_quat(q[[1, 2, 3, 0]]) for q in (there.q_wb, at.q_wb, target.q_bm[1], active.q_bm[1], plan.q_ta)
+    )
+    r_end = r_t * q_t * q_ta * q_a.inv()
+    p_end = there.p_wb + r_t.apply(target.r_bm[1] + q_t.apply(plan.place_t + plan.axis_t * standoff_m)) - r_end.apply(active.r_bm[1])
+    shares = np.linspace(0.0, 1.0, 2001)
+    turned = Slerp([0.0, 1.0], Rotation.concatenate([r_a, r_end]))(shares)
+    mine = at.p_wb + shares[:, None] * (p_end - at.p_wb)
+    mine = np.stack([mine + turned.apply(r) for r in active.r_bm], axis=1)
+    gaps = np.linalg.norm(mine[:, :, None] - (there.p_wb + r_t.apply(target.r_bm)), axis=3)
+    least, ends = gaps.min(axis=0), np.minimum(gaps[0], gaps[-1])
+    near = np.clip(ends - 0.25 * standoff_m, 2**0.5 * PITCH_M, 3**0.5 * PITCH_M)
+    touching = (least < ends - 0.005) & (least < near)
+    wanted = int(np.where(touching, least, np.inf).min(axis=0).argmin()) if touching.any() else None
+    assert nearest_pass(plan, active, at, target, there, standoff_m) == wanted
+
+
+def test_approach_slows_down_to_the_speed_of_contact() -> None:
+    dock, speeds = Follower(), {}
+    dock.until(Stage.APPROACH)
+    while dock.sequence.stage == Stage.APPROACH:
+        gap_mm = round(dock.sequence._gap_m * 1000)
+        speeds[gap_mm] = -float(dock.step().active.v_w @ dock.outward)
+    assert speeds[110] == pytest.approx(STAGED.speed_m_s)
+    assert speeds[50] == pytest.approx(0.025, abs=0.0005)
+    assert speeds[10] == speeds[1] == pytest.approx(STAGED.contact_speed_m_s)
+
+
+@pytest.mark.parametrize(("sideways_m", "turned_rad"), [(0.0, 0.0), (0.0065, 0.0), (0.0, 0.055)])
+def test_approach_waits_for_a_body_that_is_off_the_cone(sideways_m: float, turned_rad: float) -> None:
+    dock = Follower()
+    dock.until(Stage.APPROACH)
+    before = dock.sequence._gap_m
+    for _ in range(50):
+        dock.astray(sideways_m, turned_rad)
+        steering = dock.step()
+        assert steering.relay == RELAY_PULL
+    waits = sideways_m > 0.0 or turned_rad > 0.0
+    assert (dock.sequence._gap_m == before) == waits
+    if not waits:
+        assert before - dock.sequence._gap_m == pytest.approx(0.5 * STAGED.speed_m_s, abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("condition", "words"), [("current", "current alone"), ("position", "position alone"), (None, "neither condition")]
+)
+def test_jam_lets_go_backs_off_turns_a_little_and_is_tried_again_to_the_other_side(condition: str | None, words: str) -> None:
+    status = NEITHER if condition is None else NEITHER._replace(**{condition: True})
+    dock, turns = Follower(Docking(tries=3)), []
+    straight = dock.until(Stage.ALIGN).active.q_wb
+    for number in (1, 2, 3):
+        assert dock.sequence.tries == number
+        aligned = dock.tick
+        dock.until(Stage.APPROACH, status)
+        assert (dock.tick - aligned) * 0.01 == pytest.approx(STAGED.align_s, abs=0.02), "each time anew"
+        assert dock.sequence._gap_m == pytest.approx(STAGED.standoff_m, abs=0.001)
+        dock.until(Stage.PUSH, status)
+        turns.append(float(np.dot(difference(dock.at.q_wb, straight), rotate_back(straight, dock.outward))))
+        if condition is not None:
+            dock.until(Stage.VERIFY, status)
+        if number == 3:
+            break
+        began = dock.tick
+        assert dock.until(Stage.RELEASE, status).relay == RELAY_PUSH
+        assert (dock.tick - began) * 0.01 == pytest.approx(STAGED.push_s, abs=0.02)
+        assert dock.sequence.reason == f"jam: {words} after {'PUSH' if condition is None else 'VERIFY'}"
+        released = dock.tick
+        assert np.linalg.norm(difference(dock.at.q_wb, straight)) == pytest.approx(0.0, abs=1e-9)
+        assert dock.until(Stage.BACK_OFF, status).relay == RELAY_OFF
+        assert (dock.tick - released) * 0.01 == pytest.approx(STAGED.release_s, abs=0.02)
+        assert dock.until(Stage.ALIGN, status).relay == RELAY_OFF
+        assert dock.sequence._gap_m > STAGED.standoff_m - 5.1 * STAGED.align_m
+    np.testing.assert_allclose(turns, [0.0, 0.03, -0.03], atol=1e-6)
+    dock.until(Stage.FAILED, status)
+    assert dock.sequence.reason.endswith(", 3 tries")
+    assert dock.step().relay == RELAY_OFF
+
+
+def test_module_that_does_not_get_away_stays_in_back_off_until_its_time_is_over() -> None:
+    dock = Follower(Docking(tries=2, timeout_s=20.0))
+    dock.until(Stage.BACK_OFF)
+    stuck = dock.at
+    for _ in range(1900):
+        dock.at = stuck
+        assert dock.step().relay == RELAY_OFF
+    assert dock.sequence.stage == Stage.BACK_OFF
+    for _ in range(120):
+        dock.at = stuck
+        dock.step()
+    assert dock.sequence.stage == Stage.ABORTED
+    assert dock.sequence.reason == "BACK_OFF took longer than 20 s"
+
+
+def test_faces_that_are_still_near_while_they_push_apart_are_no_dock() -> None:
+    dock = Follower()
+    dock.until(Stage.RELEASE)
+    both = NEITHER._replace(current=True, position=True, docked=True)
+    assert dock.step(both).relay == RELAY_PUSH
+    dock.until(Stage.BACK_OFF, both)
+    dock.until(Stage.APPROACH)
+    dock.step(both)
+    assert dock.sequence.stage == Stage.DOCKED
+
+
+@pytest.mark.parametrize("side", ["active", "target"])
+def test_dock_needs_both_places_known_but_backs_off_blindly(side: str) -> None:
+    dock = Follower()
+    dock.until(Stage.RELEASE)
+    dock.at, dock.there = (
+        body._replace(sigma_p=np.array([0.001, 0.006, 0.001])) if who == side else body
+        for who, body in (("active", dock.at), ("target", dock.there))
+    )
+    dock.step()
+    assert dock.sequence.stage == Stage.RELEASE
+    dock.until(Stage.ALIGN)
+    dock.step()
+    assert dock.sequence.stage == Stage.ABORTED
+
+
+def test_push_goes_no_farther_than_it_may() -> None:
+    dock = Follower(Docking(push_s=10.0))
+    dock.until(Stage.PUSH)
+    gaps = []
+    for _ in range(500):
+        steering = dock.step()
+        gaps.append(dock.sequence.errors(dock.at, dock.there).gap_m)
+    assert min(gaps) == pytest.approx(-STAGED.push_m, abs=1e-6)
+    np.testing.assert_allclose(steering.active.v_w, 0.0, atol=1e-12)

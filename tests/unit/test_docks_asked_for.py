@@ -76,14 +76,14 @@ def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
 # ---------------------------------------------------------------- what was asked for
 
 
-def before_each_other(y_m: float) -> Docked:
+def before_each_other(y_m: float, parameters: Parameters | None = None, armed: tuple[int, ...] = (0, 1)) -> Docked:
     """Two armed modules in one line; no magnet draws current."""
-    tank = Docked([(0, 0, 0), (0, 1, 0)], apart=True)
+    tank = Docked([(0, 0, 0), (0, 1, 0)], parameters, apart=True)
     tank.weak = {0, 1}
     for state, y in zip(tank.states, (0.0, y_m), strict=True):
         state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
-    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
+    tank.run(0.5, *(Request(Action.ARM, m) for m in armed))
     return tank
 
 
@@ -109,6 +109,28 @@ def test_dock_whose_way_leads_through_the_target_is_refused() -> None:
     outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
     assert tank.when("dock refused: on its way it would come too near to module 0")
     assert outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
+
+
+def test_straight_dock_is_begun_from_anywhere_as_the_papers() -> None:
+    tank = before_each_other(2.0, Parameters().replace("docking.approach", "straight"))
+    outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
+    assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] and outputs.records[1].mode == Mode.DOCK
+
+
+@pytest.mark.parametrize("approach", ["staged", "straight"])
+def test_target_that_is_disarmed_is_not_expected_to_come(approach: str) -> None:
+    tank = before_each_other(2.0, Parameters().replace("docking.approach", approach), armed=(1,))
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    (dock,) = tank.pipeline.formation.docking._docks
+    assert not dock.sequence.met_w.any() and tank.pipeline.formation.chains[0].guidance._goal is None
+
+
+def test_body_whose_dock_is_over_may_dock_again() -> None:
+    tank = before_each_other(0.6)
+    outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
+    assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
+    outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    assert len(outputs.docks) == 1 and outputs.records[1].mode == Mode.DOCK
 
 
 def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> None:
@@ -179,6 +201,20 @@ def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
     goal = tank.pipeline.formation.chains[0].guidance._goal
     assert goal is not None and goal.p_wb is not None
     assert 0.6 < goal.p_wb[1] < 0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m) + 0.01
+
+
+def test_target_comes_to_meet_the_first_of_two_alone() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], apart=True)
+    for state, y in zip(tank.states, (0.0, 2.0, -1.5), strict=True):
+        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
+    wanted = DockRequest(1, 3, 0, 2, 0, True), DockRequest(2, 2, 0, 3, 0, True)
+    tank.run(0.2, *(Request(Action.DOCK, request.module, request) for request in wanted))
+    assert len(tank.outputs[-1].docks) == 2
+    goal = tank.pipeline.formation.chains[0].guidance._goal
+    assert goal is not None and goal.p_wb is not None
+    assert goal.p_wb[1] == pytest.approx(0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m), abs=0.01)
 
 
 def test_undock_that_ends_in_the_tick_of_a_join_is_not_said_to_be_done() -> None:

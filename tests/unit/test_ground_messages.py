@@ -255,6 +255,11 @@ def test_every_command_is_acknowledged_when_all_its_parameters_are_left_out() ->
         assert acknowledged(world, client, number) <= mavlink.MAV_RESULT_FAILED
 
 
+@pytest.mark.parametrize(("speed", "answer"), [(0.0, 2), (0.009, 2), (0.02, 0), (2.0, 0), (2.1, 2), (-1.0, 0), (-0.5, 2)])
+def test_speed_that_would_never_arrive_is_denied(world: World, client: Client, speed: float, answer: int) -> None:
+    assert ask(world, client, 178, 1, speed) == answer
+
+
 @pytest.mark.parametrize("number", [20, 21])
 def test_return_and_land_both_surface(world: World, client: Client, number: int) -> None:
     assert ask(world, client, number) == mavlink.MAV_RESULT_ACCEPTED
@@ -387,6 +392,23 @@ def test_motor_test_asks_for_one_thruster(world: World, client: Client) -> None:
     assert ask(world, client, 209, 1, 0, 120, 2.0) == mavlink.MAV_RESULT_DENIED
 
 
+@pytest.mark.parametrize(
+    ("kind", "throttle", "share"), [(0, -30, -0.3), (0, 100, 1.0), (1, 1500, 0.0), (1, 1700, 0.5), (1, 1100, -1.0), (1, 1900, 1.0)]
+)
+def test_throttle_of_a_motor_test_is_a_share_or_a_pulse_about_its_middle(
+    world: World, client: Client, kind: int, throttle: float, share: float
+) -> None:
+    client.command(209, 8, kind, throttle, 50.0)
+    world.run(1)
+    assert world.robot.asked[-1].argument == (7, pytest.approx(share), 10.0)
+
+
+@pytest.mark.parametrize("parameters", [(0, 0, 10), (9, 0, 10), (1, 0, 101), (1, 1, 1050), (1, 1, 1950), (1, 2, 10)])
+def test_motor_test_of_no_thruster_or_beyond_full_throttle_is_denied(world: World, client: Client, parameters: tuple[float, ...]) -> None:
+    assert ask(world, client, 209, *parameters, 1.0) == mavlink.MAV_RESULT_DENIED
+    assert not world.robot.asked
+
+
 def test_dock_and_undock_are_user_commands() -> None:
     world = World(modules=2)
     client = world.client()
@@ -396,6 +418,15 @@ def test_dock_and_undock_are_user_commands() -> None:
     wanted = [(Action.DOCK, DockRequest(0, 0, 1, 1, 2, True)), (Action.UNDOCK, DockRequest(0, 0, 1, 1))]
     assert [(r.action, r.argument) for r in world.robot.asked] == wanted
     assert ask(world, client, 31010, 0, 0, 0, 1) == mavlink.MAV_RESULT_DENIED
+
+
+@pytest.mark.parametrize(
+    "parameters", [(0, 6, 1, 1), (0, 0, 1, 6), (0, -1, 1, 1), (0, 0, 2, 1), (2, 0, 1, 1), (1, 0, 1, 1), (0, 0, 1, 1, 4)]
+)
+def test_dock_of_faces_or_modules_that_there_are_not_is_denied(parameters: tuple[float, ...]) -> None:
+    world = World(modules=2)
+    assert ask(world, world.client(), 31010, *parameters) == mavlink.MAV_RESULT_DENIED
+    assert not world.robot.asked
 
 
 def test_each_body_is_a_system_and_commands_reach_the_right_one() -> None:
@@ -471,6 +502,13 @@ def test_rc_override_has_ardusubs_channels(world: World, client: Client) -> None
     assert sticks.force == pytest.approx((0.25, 0, -1.0)) and sticks.moment == pytest.approx((0.5, 0, -0.5))
 
 
+def test_rc_channel_beyond_its_ends_is_a_full_stick(world: World, client: Client) -> None:
+    client.send("RC_CHANNELS_OVERRIDE", 1, 1, 1500, 1500, 2200, 1500, 2200, 800, 0, 0)
+    world.run(1)
+    sticks = world.robot.asked[-1].argument
+    assert tuple(sticks.force) == (1.0, -1.0, -1.0) and tuple(sticks.moment) == (0.0, 0.0, 0.0)
+
+
 def test_rc_channel_that_is_left_out_stays_until_it_is_let_go_or_old(world: World, client: Client) -> None:
     """As a script does that sends one channel at a time: UINT16_MAX ignores, 0 releases (MAVLink, RC_CHANNELS_OVERRIDE)."""
 
@@ -512,6 +550,26 @@ def test_guided_mode_needs_a_setpoint_first_and_ends_when_they_stay_away(world: 
     assert "set-points stay away" in client.last("STATUSTEXT").text
 
 
+def test_velocities_move_no_place_before_guided_mode_is_entered(world: World, client: Client) -> None:
+    for _ in range(10):
+        send_target(client, 0xDC7, vx=0.5)
+        world.run(10)
+    assert world.robot.asked[-1].argument.p_wb == pytest.approx(world.robot.p_wb[0])
+
+
+def test_set_point_that_comes_just_after_they_stayed_away_begins_where_the_robot_is(world: World, client: Client) -> None:
+    """The hold is asked for, and the mode is still the old one."""
+    ask(world, client, 400, 1)
+    send_target(client, 0xDC7, vx=0.1)
+    ask(world, client, 176, 1, 6)
+    world.robot.refuse[Action.SET_MODE] = "not now"
+    for gap in (51, 60):
+        world.run(gap)
+        send_target(client, 0xDC7, vx=0.5)
+        world.run(2)
+        assert world.robot.asked[-1].argument.p_wb == pytest.approx(world.robot.p_wb[0])
+
+
 def test_velocity_setpoints_move_the_place_along(world: World, client: Client) -> None:
     ask(world, client, 400, 1)
     send_target(client, 0xDC7, vx=0.1)
@@ -544,6 +602,16 @@ def test_offsets_from_the_body_are_added_to_its_place_in_every_body_frame(world:
     send_target(client, 0xDF8, frame=frame, x=0.1)
     world.run(1)
     assert world.robot.asked[-1].argument.p_wb[2] == pytest.approx(world.robot.p_wb[0][2])
+    assert np.linalg.norm(world.robot.asked[-1].argument.p_wb - world.robot.p_wb[0]) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("frame", [7, 8, 9, 12])
+def test_offsets_count_from_where_the_body_is_and_not_from_where_it_should_be(world: World, client: Client, frame: int) -> None:
+    record, wanted = world.robot._record, world.robot.p_wb[0] + np.array([1.0, 0.0, 0.0])
+    world.robot._record = lambda body: (r := record(body))._replace(setpoint=r.setpoint._replace(p_wb=wanted))  # type: ignore[method-assign]
+    world.run(1)
+    send_target(client, 0xDF8, frame=frame, x=0.1)
+    world.run(1)
     assert np.linalg.norm(world.robot.asked[-1].argument.p_wb - world.robot.p_wb[0]) == pytest.approx(0.1)
 
 

@@ -278,6 +278,58 @@ def test_a_plan_that_is_no_longer_wanted_is_not_flown(world: World, client: Clie
     assert Action.TRACK not in [r.action for r in world.robot.asked]
 
 
+def test_plan_that_comes_after_something_else_was_asked_for_is_not_flown(world: World, client: Client) -> None:
+    """Until the hold is settled nothing new is planned: a plan that comes meanwhile is the one before's."""
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    client.command(400, 1)
+    world.run(3)
+    client.command(176, 1, 4, 4)
+    world.run(10)
+    (old,) = world.station.jobs()
+    client.command(224, 2)
+    world.run(1)
+    world.station.planned(0, Plan(old.serial, Path(), (10.0, 20.0, 30.0)))
+    world.run(3)
+    assert Action.TRACK not in [r.action for r in world.robot.asked]
+
+
+def test_new_mission_is_not_called_paused_or_done_when_the_old_one_ends(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    upload(world, client, [item(0, PLACES[0])])
+    client.command(193, 0)
+    world.run(200)
+    told = client.last("MISSION_CURRENT")
+    assert (told.seq, told.mission_state) == (0, mavlink.MISSION_STATE_NOT_STARTED)
+
+
+def test_mission_that_flies_is_not_begun_anew_when_it_is_asked_for_again(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    before = len(world.robot.asked)
+    client.command(176, 1, 4, 4)
+    world.run(20)
+    assert world.station.jobs() == [] and len(world.robot.asked) == before and world.robot.mode[0] == Mode.AUTO
+
+
+def test_mission_is_complete_once_its_last_hold_is_over(world: World, client: Client) -> None:
+    upload(world, client, [item(0, PLACES[0]), item(1, PLACES[1], p=(5, 0, 0, NAN))])
+    fly(world, client)
+    world.run(2400)
+    assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_ACTIVE
+    assert "mission complete" not in client.texts
+    world.run(250)
+    assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_COMPLETE
+
+
+def test_mission_that_is_done_is_flown_again_from_its_beginning(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    world.run(3200)
+    assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_COMPLETE
+    assert continued(world, client) == [0, 1, 2]
+
+
 def test_mission_goes_on_when_every_client_is_gone(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)

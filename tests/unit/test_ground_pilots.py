@@ -96,3 +96,14 @@ def test_override_of_no_channel_is_nothing(world: World, client: Client, raw: in
     other.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, 0)
     world.run(1)
     assert sticks(world) == [1.0], "nobody had the sticks"
+
+
+def test_override_that_ignores_every_channel_does_not_hold_the_sticks(world: World, client: Client) -> None:
+    other = world.client(77)
+    client.send("RC_CHANNELS_OVERRIDE", 1, 1, *[1500] * 4, 1700, *[65535] * 3)
+    world.run(10)
+    client.send("RC_CHANNELS_OVERRIDE", 1, 1, *[65535] * 8)
+    world.run(round(world.parameters.steering.stick_timeout_s * 100) - 5)
+    other.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, 0)
+    world.run(1)
+    assert sticks(world) == [0.5, 1.0]

@@ -21,6 +21,7 @@ from tests.unit.healths import BLIND, GOOD
 BODY = assemble_vehicle(load_vehicle("modcube"))
 ZERO = np.zeros(3)
 TICK = 10_000_000
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 WRENCH = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 FLOWN = [Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.SURFACE, Mode.DOCK]
 
@@ -109,6 +110,17 @@ def test_manual_sticks_are_forces_and_moments_of_the_body() -> None:
     assert wrench[0] > 5.0 and wrench[5] < -0.3 and not np.any(wrench[1:5])
     flight.run(1.0)
     assert not flight.wrenches[-1].any(), "sticks that fell silent are neutral"
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_full_stick_is_a_share_of_what_all_thrusters_can_do_along_its_axis(axis: int) -> None:
+    flight, held, t = Flight(), np.zeros(6), BODY.thrusters
+    held[axis] = 1.0
+    flight.do(Effect.ENTER_MODE, Mode.MANUAL)
+    flight.run(2.0, Sticks(tuple(held[:3]), tuple(held[3:])), follows=False)
+    there, back = (np.where(t.matrix[axis] * sign > 0.0, t.f_max, -t.f_min) for sign in (1.0, -1.0))
+    most = 0.5 * np.abs(t.matrix[axis]) @ (there + back)
+    np.testing.assert_allclose(flight.wrenches[-1], Parameters().steering.stick_share * most * held, atol=1e-9)
 
 
 def test_stabilize_keeps_the_controllers_moment() -> None:
@@ -310,3 +322,90 @@ def test_docking_sequence_steers_in_its_mode_alone() -> None:
 @pytest.mark.parametrize("pitch", [0.0, 1.0, 1.4, 1.5707, -1.0, -1.4, -1.5707])
 def test_heading_is_kept_through_the_vertical(pitch: float) -> None:
     np.testing.assert_allclose(difference(heading(from_euler(0.0, pitch, 0.8)), from_euler(0.0, 0.0, 0.8)), 0.0, atol=1e-3)
+
+
+# ---------------------------------------------------------------- a place that moves, a body that changes
+
+
+def test_place_that_is_moved_is_the_one_that_the_robot_is_on_its_way_to() -> None:
+    flight = Flight()
+    flight.do(Effect.HOLD_AT, Mode.POSHOLD, rest_at(np.array([1.0, 0.0, 1.0]), LEVEL))
+    flight.run(1.0)
+    flight.guidance.move_by(np.array([0.0, 0.5, 0.0]))
+    np.testing.assert_allclose(flight.run(40.0).p_wb, [1.0, 0.5, 1.0], atol=1e-3)
+    flight.guidance.move_by(np.array([0.0, -0.5, 0.2]))
+    np.testing.assert_allclose(flight.run(40.0).p_wb, [1.0, 0.0, 1.2], atol=1e-3)
+
+
+def test_place_is_not_moved_out_of_the_fence() -> None:
+    flight = Flight(Parameters().replace("fence.east_m", 2.0))
+    flight.guidance.move_by(np.array([0.0, 2.3, 0.0]))
+    assert flight.run(60.0).p_wb[1] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_body_that_takes_over_goes_on_at_its_speed_and_from_its_thrusters_wrench() -> None:
+    flight, before = Flight(), np.array([4.0, -1.0, 2.0, 0.5, 0.4, -0.3])
+    turned = from_euler(0.0, 0.0, 0.5 * math.pi)
+    moving = estimate((0.5, 0.5, 1.0), turned, (0.2, 0.0, 0.0, 0.0, 0.0, 0.1))
+    flight.guidance.take_over(Mode.POSHOLD, moving, before)
+    flight.estimate = moving
+    now = flight.run(0.01, follows=False)
+    np.testing.assert_allclose(now.p_wb, moving.p_wb, atol=1e-6)
+    np.testing.assert_allclose(now.v_w, [0.0, 0.2, 0.0], atol=1e-9)
+    np.testing.assert_allclose(flight.wrenches[-1], before, atol=1e-9)
+    flight.run(0.5 * Parameters().steering.blend_s, follows=False)
+    np.testing.assert_allclose(flight.wrenches[-1], 0.5 * (before + WRENCH), atol=1e-9)
+    flight.run(0.5 * Parameters().steering.blend_s, follows=False)
+    np.testing.assert_allclose(flight.wrenches[-1], WRENCH, atol=1e-9)
+
+
+def test_sticks_push_along_the_robots_own_axes() -> None:
+    flight = Flight()
+    flight.estimate = estimate(q=from_euler(0.0, 0.0, 0.5 * math.pi))
+    flight.guidance.rest(flight.estimate)
+    flight.do(Effect.ENTER_MODE, Mode.POSHOLD)
+    moved = flight.run(2.0, sticks(forward=1.0)).p_wb
+    assert moved[1] > 0.3 and abs(moved[0]) < 1e-6
+
+
+def test_second_dock_begins_without_the_wish_of_the_first() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.DOCK)
+    flight.guidance.dock(rest_at(np.array([0.0, 0.0, 1.1]), LEVEL))
+    flight.run(0.1)
+    flight.do(Effect.ENTER_MODE, Mode.POSHOLD)
+    flight.run(0.1)
+    flight.estimate = estimate((3.0, 0.0, 1.0))
+    flight.do(Effect.ENTER_MODE, Mode.DOCK)
+    assert flight.run(0.1).p_wb[0] == pytest.approx(3.0, abs=0.01)
+
+
+def test_robot_that_is_turned_far_from_its_set_point_holds_as_it_is() -> None:
+    flight = Flight()
+    flight.run(0.1)
+    flight.estimate = estimate(q=from_euler(0.0, 0.0, 0.5))
+    flight.do(Effect.ENTER_MODE)
+    assert np.linalg.norm(difference(flight.run(0.01, follows=False).q_wb, flight.estimate.q_wb)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("point", "kept"),
+    [((9.0, 0.0, 1.0), (2.0, 0.0, 1.0)), ((0.0, -9.0, 1.0), (0.0, -3.0, 1.0)), ((0.0, 0.0, 30.0), (0.0, 0.0, 4.0))],
+)
+def test_point_beyond_the_fence_is_flown_to_as_far_as_the_fence_goes(point: tuple[float, ...], kept: tuple[float, ...]) -> None:
+    fence = {"fence.north_m": 2.0, "fence.east_m": 3.0, "fence.bottom_m": 4.0}
+    parameters = Parameters()
+    for name, value in fence.items():
+        parameters = parameters.replace(name, value)
+    flight = Flight(parameters)
+    flight.do(Effect.ENTER_MODE, Mode.GUIDED)
+    flight.do(Effect.TAKE_POINT, Mode.GUIDED, rest_at(np.array(point), LEVEL))
+    np.testing.assert_allclose(flight.run(60.0).p_wb, kept, atol=1e-3)
+
+
+def test_robot_that_is_told_to_hold_goes_no_farther_to_the_place_that_it_was_sent_to() -> None:
+    flight = Flight()
+    flight.do(Effect.HOLD_AT, Mode.POSHOLD, rest_at(np.array([5.0, 0.0, 1.0]), LEVEL))
+    there = flight.run(3.0).p_wb[0]
+    flight.do(Effect.ENTER_MODE, Mode.POSHOLD)
+    assert flight.run(20.0).p_wb[0] < there + 0.3

@@ -74,3 +74,10 @@ def test_limits_set_in_flight_are_those_of_every_stage_from_that_tick_on(flying:
         wet.modules[0].leak = True
         outputs = flying.step(wet)
     assert outputs.records[0].state == State.DISARMED, "the leak disarms now"
+
+
+def test_share_of_a_thruster_test_may_be_set_in_flight(flying: Pipeline) -> None:
+    chain = flying.formation.chains[0]
+    step(flying, 120, [Request(Action.SET_PARAMETER, 0, ("steering.test_share", 0.1))])
+    chain.motor_test.start((2, 1.0, 1.0), 0)
+    np.testing.assert_allclose(chain.motor_test.step(0)[2], 0.1 * chain.body.thrusters.f_max[2])

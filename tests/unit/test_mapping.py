@@ -255,6 +255,18 @@ def test_lost_half_does_not_spoil_the_next_observation():
     assert tag.p_wt == pytest.approx([1.0, 1.0, 1.0])
 
 
+def test_half_does_not_pair_with_a_half_of_its_own_kind_when_the_counter_comes_round():
+    robot = Robot()
+    robot.tick(0)
+    for counter in range(16):
+        robot.see_tag(halves="P", counter=counter, p=(9.0, 9.0, 9.0))
+    robot.see_tag(halves="PA", counter=0, p=(1.0, 1.0, 1.0))
+    (tag,) = robot.tick(1).modules[0].tags
+    assert tag.tag_id == 4 and tag.p_wt == pytest.approx([1.0, 1.0, 1.0])
+    robot.tick(2)
+    assert robot.faults == {"tag_unpaired": 16}
+
+
 @pytest.mark.parametrize("sequence", ["P1 A1 P2 A2", "P1 P2 A1 A2", "P1 P2 A2 A1"])
 def test_two_tags_of_one_module_in_one_picture_are_two_observations(sequence):
     robot = Robot()

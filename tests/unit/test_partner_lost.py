@@ -13,23 +13,27 @@ from firmware_py.core.types import Action, DockFeedback, DockRequest, Inputs, Mo
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
-from tests.unit.test_pipeline import Tank, single
+from tests.unit.test_pipeline import Tank
 
 MODCUBE = load_vehicle("modcube")
 RING = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
 LOST = "fail-safe on: a docked partner is lost"
 
 
+def _body_of(cells: list[tuple[int, int, int]], first: int) -> Body:
+    return assemble(cells, [0] * len(cells), [MODCUBE] * len(cells), list(range(first, first + len(cells))))
+
+
 class Docked(Tank):
     """A tank in which the magnets of some modules carry no current, and some modules' tags are out of sight."""
 
     def __init__(
-        self, cells: list[tuple[int, int, int]], parameters: Parameters | None = None, delay: int = 0, apart: bool = False
+        self, cells: list[tuple[int, int, int]], parameters: Parameters | None = None, delay: int = 0, apart: bool = False, each: int = 0
     ) -> None:
-        """`delay`: ticks until a plan that was asked for is there. `apart`: each module is a body of its own."""
+        """`delay`: ticks until a plan that was asked for is there. `apart`: each module is a body of its own; `each`: so many are one."""
         count = len(cells)
-        whole: Body = assemble(cells, [0] * count, [MODCUBE] * count, list(range(count)))
-        super().__init__([single(m) for m in range(count)] if apart else [whole], parameters)
+        size = 1 if apart else each or count
+        super().__init__([_body_of(cells[m : m + size], m) for m in range(0, count, size)], parameters)
         self.cabin_pa = [101_325.0] * count
         self.weak: set[int] = set()
         self.hidden: set[int] = set()
@@ -86,6 +90,35 @@ def test_module_that_is_lost_is_parted_half_a_second_later_and_both_hold() -> No
     assert [(record.state, record.mode) for record in outputs.records] == [(State.ARMED, Mode.POSHOLD)] * 2
     assert 0.5 < tank.when(LOST) - lost_s < 0.65
     assert tank.when("is undocked") - tank.when(LOST) < 0.05, "an open joint needs no pushing apart"
+
+
+def test_two_bodies_that_come_apart_in_one_tick_are_both_parted() -> None:
+    tank = Docked(RING, each=2)
+    tank.run(0.5)
+    tank.run(1.0, Request(Action.ARM, 0), Request(Action.ARM, 2))
+    lost_s = tank.lose(1, 3)
+    tank.run(1.0)
+    assert tank.shape == [(0,), (1,), (2,), (3,)]
+    assert max(at for at, said in tank.said if "is undocked" in said) - lost_s < 0.7
+    assert not [said for _, said in tank.said if "refused" in said or "ended" in said], "each asks for its own joint"
+
+
+def test_magnets_of_each_body_are_told_their_own_states() -> None:
+    tank = Docked([(0, 0, 0), (1, 0, 0), (0, 0, 0), (0, 1, 0)], each=2)
+    tank.run(0.2)
+    told = [{outputs.modules[m].relays for outputs in tank.outputs} - {None} for m in range(4)]
+    assert told == [{(1, 0, 0, 0, 0, 0)}, {(0, 1, 0, 0, 0, 0)}, {(0, 0, 1, 0, 0, 0)}, {(0, 0, 0, 1, 0, 0)}]
+
+
+def test_only_the_body_that_lost_a_partner_is_told_and_parted() -> None:
+    tank = Docked(RING, each=2)
+    tank.run(0.5)
+    tank.run(1.0, Request(Action.ARM, 0), Request(Action.ARM, 2))
+    tank.lose(1)
+    tank.run(1.0)
+    assert tank.shape == [(0,), (1,), (2, 3)]
+    assert {event.body for outputs in tank.outputs for event in outputs.events if LOST in event.text} == {0}
+    assert [record.body for record in tank.outputs[-1].records] == [0, 1, 2], "in the order of their numbers"
 
 
 def test_current_alone_is_reported_and_parts_nothing_that_pictures_show_in_its_place() -> None:
@@ -185,6 +218,19 @@ def test_undock_that_is_asked_for_twice_parts_once() -> None:
     tank.run(2.5)
     assert tank.shape == [(0,), (1,)]
     assert sum(CHANGED in text for _, text in tank.said) == 1
+
+
+def test_partner_that_is_being_undocked_is_not_lost() -> None:
+    """While the magnets push, currents and pictures say that the joint is open: it is wanted so."""
+    tank = Docked(RING[:2], Parameters().replace("docking.release_s", 2.0))
+    tank.fly()
+    tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    tank.lose(1)
+    tank.run(1.7)
+    assert tank.shape == [(0, 1)]
+    tank.run(0.5)
+    assert tank.shape == [(0,), (1,)]
+    assert not [said for _, said in tank.said if LOST in said]
 
 
 def test_undock_that_is_asked_for_while_the_partner_is_being_lost_parts_once() -> None:

@@ -12,7 +12,7 @@ from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.core.types import Action, EscFeedback, Inputs, Mode, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -242,6 +242,28 @@ def test_motor_test_of_a_disarmed_robot_turns_one_thruster_and_disarms(tank: Tan
     assert tank.outputs[-1].records[0].state == State.DISARMED
 
 
+def test_motor_detection_turns_one_thruster_after_the_other_with_pauses_between(tank: Tank) -> None:
+    p, first = tank.pipeline.parameters.steering, len(tank.outputs)
+    tank.run(1.0, Request(Action.SET_MODE, 0, Mode.MOTOR_DETECT))
+    tank.run(8 * 1.5 * p.test_s + 1.0, Request(Action.ARM))
+    turned = np.array([outputs.modules[0].thrusters for outputs in tank.outputs[first:]]) > 0.0
+    assert turned.sum(axis=1).max() == 1 and not turned[-1].any()
+    begins = np.flatnonzero(np.diff(turned.any(axis=1).astype(int)) == 1) + 1
+    assert [int(turned[tick].argmax()) for tick in begins] == list(range(8))
+    np.testing.assert_allclose(turned.sum(axis=0) * DT, p.test_s, atol=2 * DT)
+    np.testing.assert_allclose(np.diff(begins) * DT, 1.5 * p.test_s, atol=2 * DT)
+
+
+@pytest.mark.parametrize("share", [0.1, -0.1, 1.0, -1.0])
+def test_tested_thruster_gives_the_wanted_share_of_its_side_and_never_more_than_it_may(tank: Tank, share: float) -> None:
+    tank.run(1.0)
+    record = tank.run(0.3, Request(Action.MOTOR_TEST, 0, (2, share, 2.0))).records[0]
+    t, most = tank.bodies[0].thrusters, tank.pipeline.parameters.steering.test_share
+    force = np.zeros(8)
+    force[2] = np.clip(share, -most, most) * (t.f_max[2] if share > 0.0 else -t.f_min[2])
+    np.testing.assert_allclose(record.thrust.force_n, force, atol=1e-9)
+
+
 def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(tank: Tank) -> None:
     """What no longer turns is found again within half a second of flying."""
     tank.run(0.5)
@@ -253,6 +275,7 @@ def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(
     assert tank.run(0.1).records[0].state == State.ARMED and chain.health.now.lost_axes == 1
     tank.run(0.1, Request(Action.DISARM))
     assert chain.faults.now.dead == () and tank.run(3.0, Request(Action.ARM)).records[0].state == State.ARMED
+    assert tank.outputs[-1].modules[0].thrusters.all(), "and they are used again"
 
 
 def test_same_inputs_give_the_same_bytes() -> None:

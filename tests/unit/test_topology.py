@@ -103,3 +103,28 @@ def test_third_module_docks_to_a_pair_in_an_l() -> None:
     plan = plan_dock(DockRequest(2, 3, 0, 2), third, pair, VEHICLES)
     assert plan.merged.modules == (0, 1, 2)
     assert plan.merged.cells.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
+
+def test_biases_of_a_joined_body_are_the_mean_of_both_and_stay_with_their_modules_when_they_part(
+    two: tuple[Body, Body, Body, np.ndarray, np.ndarray],
+) -> None:
+    """The active module is turned a quarter against the target: its axes are others than the body's."""
+    target, active, merged, x_t, x_a = two
+    rng = np.random.default_rng(4)
+    x_t[13:19], x_a[13:19], x_t[25], x_a[25] = rng.normal(size=6), rng.normal(size=6), 0.1, 0.3
+    joined = join([(target, Motion(x_t, np.eye(ERRORS), 10, 0)), (active, Motion(x_a, np.eye(ERRORS), 10, 0))], merged)
+    for rows in (slice(13, 16), slice(16, 19)):
+        turned = [rotation(merged.q_bm[i]).apply(x[rows]) for i, x in enumerate((x_t, x_a))]
+        np.testing.assert_allclose(joined.x[rows], np.mean(turned, axis=0), atol=1e-9)
+        for i, body in enumerate((target, active)):
+            parted = part_of(merged, joined, body)
+            np.testing.assert_allclose(parted.x[rows], rotation(merged.q_bm[i]).inv().apply(joined.x[rows]), atol=1e-9)
+    assert joined.x[25] == pytest.approx(0.2)
+
+
+def test_joined_body_is_known_no_better_than_the_worse_of_both(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
+    target, active, merged, x_t, x_a = two
+    sure, unsure = Motion(x_t, np.eye(ERRORS), 500, 9_000), Motion(x_a, np.eye(ERRORS), 3, 1_000)
+    joined = join([(target, sure), (active, unsure)], merged)
+    assert (joined.accepted, joined.tag_ns) == (3, 1_000)
+    assert np.all(joined.covariance.diagonal()[:12] > 1.0)
