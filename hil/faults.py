@@ -9,22 +9,23 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 
 import numpy as np
 
 from firmware_py.bus.codec import Frame
 from firmware_py.core import rotations
-from hil.nodes import Nodes
+from hil.nodes import Mcu, Nodes
 from hil.plant.camera import Sighting
 from hil.plant.draw import stream
-from hil.plant.fault_spec import ALL, DIRECTIONS, FRAME_KINDS, THRUSTER_KINDS, Fault
+from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, THRUSTER_KINDS, Fault
 
 LOWEST_BABBLE_ID = 0x040
 """A babbling node takes no id of ESTOP or SYNC: those are faults of another kind."""
 ESTOP, SYNC = Frame(0x01E, b""), Frame(0x020, bytes(4))
 """Of the e-stop box, and of somebody else who means to lead the bus."""
 ESTOP_PERIOD_NS = 50_000_000
+RELAYS = {-1.0: 2, 0.0: 0, 1.0: 1}
+"""Of a magnet that hangs, by the fault's value."""
 PUSH_LEVER_M = 0.03
 """From the hull's centre to the point that is pushed."""
 
@@ -92,7 +93,15 @@ class Faults:
         self._bias_axis = axis / np.linalg.norm(axis)
         hand = stream(seed, "push", link).standard_normal((2, 3))
         self._hand, self._grip = hand / np.linalg.norm(hand, axis=1, keepdims=True)
-        self._began: dict[Fault, Callable[[], None]] = {}
+        self._breaks: dict[str, Callable[[Fault, Mcu], None]] = {
+            **dict.fromkeys(THRUSTER_KINDS, self._break_thrusters),
+            "imu_frozen": lambda fault, mcu: setattr(mcu, "frozen", True),
+            "leak": lambda fault, mcu: setattr(mcu, "leaks", True),
+            "battery_sag": lambda fault, mcu: self._world.sag(mcu.module, fault.value),
+            "magnet": self._hang_magnets,
+            "jets": lambda fault, mcu: setattr(self._world, "jet_strength", fault.value),
+            "push": self._push,
+        }
         self._estop_due_ns = 0
         for camera in nodes.cameras:
             camera.change = self._change_tag
@@ -113,15 +122,9 @@ class Faults:
     def update(self, time_ns: int) -> None:
         """Begins and ends what is due. To be called after every advance of the world."""
         on = [f for f in self._faults if f.is_on(time_ns)]
-        if on == self._on:
-            return
-        for fault in [f for f in self._on if f not in on]:
-            self._began.pop(fault, lambda: None)()
-        for fault in [f for f in on if f not in self._on]:
-            end = self._begin(fault)
-            if end is not None:
-                self._began[fault] = end
-        self._on = on
+        if on != self._on:
+            self._on = on
+            self._break_plant()
 
     def incoming(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
         """Frames to the plant, as they arrive."""
@@ -148,69 +151,32 @@ class Faults:
     def _modules(self, fault: Fault) -> list[int]:
         return [mcu.module for number, mcu in self._nodes.mcus.items() if fault.module in (0, number)]
 
-    def _begin(self, fault: Fault) -> Callable[[], None] | None:
-        """Breaks it; returns what mends it."""
-        modules = self._modules(fault)
-        if fault.kind in THRUSTER_KINDS:
-            return self._break_thrusters(fault, modules)
-        if fault.kind == "imu_frozen" or fault.kind == "leak":
-            mcus = [mcu for mcu in self._nodes.mcus.values() if mcu.module in modules]
-            name = "frozen" if fault.kind == "imu_frozen" else "leaks"
+    def _break_plant(self) -> None:
+        """What is broken depends on the faults that are on, and not on what was before: all is mended, then each breaks what it breaks.
 
-            def wet_or_frozen(yes: bool) -> None:
-                for mcu in mcus:
-                    setattr(mcu, name, yes)
+        Of two that break the same thing the later in the list counts; sags and hands add up.
+        """
+        self._world.jet_strength = self._world.spec.jet_strength
+        for number, mcu in self._nodes.mcus.items():
+            mcu.frozen = mcu.leaks = False
+            self._world.mend(mcu.module)
+            for fault in self._on:
+                if fault.kind in self._breaks and fault.module in (0, number):
+                    self._breaks[fault.kind](fault, mcu)
+            self._world.docks.move_hung(mcu.module)
 
-            wet_or_frozen(True)
-            return partial(wet_or_frozen, False)
-        if fault.kind == "battery_sag":
-            self._world.sag(modules, fault.value)
-            return lambda: self._world.sag(modules, -fault.value)
-        if fault.kind == "magnet":
-            return self._hang_magnets(fault, modules)
-        if fault.kind == "jets":
-            before, self._world.jet_strength = self._world.jet_strength, fault.value
-            return lambda: setattr(self._world, "jet_strength", before)
-        if fault.kind == "push":
-            return self._push(fault, modules)
-        return None
+    def _break_thrusters(self, fault: Fault, mcu: Mcu) -> None:
+        for t in range(len(self._world.vehicles[mcu.module].thruster)):
+            if fault.index in (ALL, t):
+                self._world.break_thruster(mcu.module, t, fault.kind.removeprefix("thruster_"), fault.value)
 
-    def _break_thrusters(self, fault: Fault, modules: Sequence[int]) -> Callable[[], None]:
-        broken = [
-            (m, t) for m in modules for t in range(len(self._world.vehicles[m].thruster)) if fault.index in (ALL, t)
-        ]
-        for m, t in broken:
-            self._world.break_thruster(m, t, fault.kind.removeprefix("thruster_"), fault.value)
-
-        def mend() -> None:
-            for m, t in broken:
-                self._world.mend_thruster(m, t)
-
-        return mend
-
-    def _push(self, fault: Fault, modules: Sequence[int]) -> Callable[[], None]:
+    def _push(self, fault: Fault, mcu: Mcu) -> None:
         """A hand on the rim of a side's disk: it shoves and turns."""
-        wrench = fault.value * np.concatenate([self._hand, PUSH_LEVER_M * np.cross(self._grip, self._hand)])
-        for m in modules:
-            self._world.push[m] += wrench
+        self._world.push[mcu.module] += fault.value * np.concatenate([self._hand, PUSH_LEVER_M * np.cross(self._grip, self._hand)])
 
-        def let_go() -> None:
-            for m in modules:
-                self._world.push[m] -= wrench
-
-        return let_go
-
-    def _hang_magnets(self, fault: Fault, modules: Sequence[int]) -> Callable[[], None]:
-        docks, relay = self._world.docks, {1: 1, -1: 2}.get(int(fault.value), 0)
-        hung = [(m, f) for m in modules for f in range(6) if fault.index in (ALL, f)]
-        for m, f in hung:
-            docks.hang(m, f, relay)
-
-        def let_go() -> None:
-            for m, f in hung:
-                docks.hang(m, f, None)
-
-        return let_go
+    def _hang_magnets(self, fault: Fault, mcu: Mcu) -> None:
+        for face in range(FACES) if fault.index == ALL else (fault.index,):
+            self._world.docks.hang(mcu.module, face, RELAYS[fault.value])
 
     def _change_tag(self, sighting: Sighting) -> Sighting | None:
         for fault in self._on:

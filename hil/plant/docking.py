@@ -91,9 +91,16 @@ class Docks:
             self.relays[module] = wanted
             self._busy = True
 
-    def hang(self, module: int, face: int, relay: int | None) -> None:
-        """A fault: this relay stays as it is told here, whatever comes; None: it obeys again, from the next command on."""
-        self._hung[module, face] = -1 if relay is None else relay
+    def hang(self, module: int, face: int, relay: int) -> None:
+        """A fault: from `move_hung` on this relay stays as it is told here, whatever comes."""
+        self._hung[module, face] = relay
+
+    def free(self, module: int) -> None:
+        """None of a module's relays hangs any longer: they obey again, from the next command on."""
+        self._hung[module] = -1
+
+    def move_hung(self, module: int) -> None:
+        """A module's relays that hang go where they hang, all at once."""
         self.set_relays(module, self.relays[module].tolist())
 
     def energise(self, joints: Sequence[Joint]) -> None:

@@ -14,6 +14,7 @@ OTHER_KINDS = (
 )  # fmt: skip
 ALL = -1
 """Index of a fault that means every thruster, or every face."""
+FACES = 6
 DIRECTIONS = ("to_plant", "from_plant", "both")
 NS = 1_000_000_000
 

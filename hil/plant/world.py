@@ -174,15 +174,17 @@ class World(DockedBodies):
             how: dead; weak: `value` is the share of its force left, and its propeller turns slower; reversed; stuck: at
                 the command `value`; fake_rpm: `value` is the share of its force left, and its ESC reports a healthy one.
         """
-        self.mend_thruster(module, thruster)
         self._broken[module, thruster] = (how, value)
-        if how == "fake_rpm":
-            self._thrusters.constants[self._first[module] + thruster, 0] *= value
+        share = value if how == "fake_rpm" else 1.0
+        self._thrusters.constants[self._first[module] + thruster, 0] = share * self._draws[module].gain[thruster]
 
-    def mend_thruster(self, module: int, thruster: int) -> None:
-        """As it was drawn at the start."""
-        self._broken.pop((module, thruster), None)
-        self._thrusters.constants[self._first[module] + thruster, 0] = self._draws[module].gain[thruster]
+    def mend(self, module: int) -> None:
+        """Thrusters, battery and magnets of a module are as they were drawn at the start, and nobody's hand is on it."""
+        self._broken = {key: broken for key, broken in self._broken.items() if key[0] != module}
+        self._thrusters.constants[self._first[module] : self._first[module + 1], 0] = self._draws[module].gain
+        self._thrusters.supply[module, 1] = self.vehicles[module].supply.voltage_v
+        self.push[module] = 0.0
+        self.docks.free(module)
 
     def _as_broken(self, module: int, wanted: np.ndarray) -> np.ndarray:
         for (m, t), (how, value) in self._broken.items():
@@ -190,9 +192,9 @@ class World(DockedBodies):
                 wanted[t] = {"dead": 0.0, "reversed": -wanted[t], "stuck": value}[how]
         return wanted
 
-    def sag(self, modules: Sequence[int], volts: float) -> None:
-        """The batteries of these modules give so much less, open circuit."""
-        self._thrusters.supply[list(modules), 1] -= volts
+    def sag(self, module: int, volts: float) -> None:
+        """The battery of a module gives so much less, open circuit."""
+        self._thrusters.supply[module, 1] -= volts
 
     def advance(self, duration_ns: int) -> None:
         """Moves the world on. The duration must be a multiple of the sub-step, else DescriptionError."""

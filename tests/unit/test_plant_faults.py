@@ -1,5 +1,8 @@
 """Faults of the plant and of its wire: each breaks what it says, from when to when it says, and the rest stays as it was."""
 
+import dataclasses
+import itertools
+
 import numpy as np
 import pytest
 
@@ -14,9 +17,10 @@ CODEC = Codec.load()
 FRAMES = [Frame(0x100 + i, bytes([i] * 6)) for i in range(20)]
 
 
-def nodes_with(*faults: Fault) -> Nodes:
-    scenario = load_scenario("hover")
-    nodes = make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, {1: 0}, scenario)
+def nodes_with(*faults: Fault, scenario: str = "hover") -> Nodes:
+    flown = load_scenario(scenario)
+    numbers = {module.number: m for m, module in enumerate(flown.module)}
+    nodes = make_nodes(make_world(flown, 0, PERIOD_NS), CODEC, numbers, flown)
     nodes.faults = Faults(nodes, faults)
     return nodes
 
@@ -72,6 +76,91 @@ def test_fault_lasts_as_long_as_it_says() -> None:
     fly(nodes, 60, first=96)
     after = nodes.world.truth(0).force_n[3]
     assert before > 2.0 and during == pytest.approx(0.0, abs=0.05) and after == pytest.approx(before, rel=0.05)
+
+
+SINGLE = (
+    Fault(kind="thruster_dead", index=3), Fault(kind="thruster_weak", index=3, value=0.4), Fault(kind="thruster_fake_rpm", value=0.3),
+    Fault(kind="thruster_reversed", module=1), Fault(kind="thruster_stuck", module=2, index=3, value=-0.6),
+    Fault(kind="imu_frozen"), Fault(kind="imu_frozen", module=1), Fault(kind="leak", module=2), Fault(kind="leak"),
+    Fault(kind="battery_sag", value=1.8), Fault(kind="battery_sag", module=2, value=0.7), Fault(kind="magnet", index=1, value=1.0),
+    Fault(kind="magnet", value=0.0), Fault(kind="magnet", module=2, index=1, value=-1.0), Fault(kind="jets", value=0.9),
+    Fault(kind="jets", value=0.0), Fault(kind="push", value=2.0), Fault(kind="push", module=1, value=-0.7),
+)  # fmt: skip
+
+
+def broken(nodes: Nodes) -> list[object]:
+    """What the plant's faults have made of two modules that are told the same."""
+    fly(nodes, 1)
+    world, mcus = nodes.world, nodes.mcus.values()
+    for mcu in mcus:
+        world.set_relays(mcu.module, [1, 0, 1, 1, 1, 1])
+        world.set_command(mcu.module, [0.5] * 8, True)
+    levels = world._thrusters.level[:, 0].tolist(), world._thrusters.constants[:, 0].tolist()
+    supply = world._thrusters.supply[:, 1].tolist()
+    return [*levels, supply, world.docks.relays.tolist(), world.push.tolist(), world.jet_strength, [(m.frozen, m.leaks) for m in mcus]]
+
+
+def lasting(fault: Fault, at_s: float, until_s: float) -> Fault:
+    return dataclasses.replace(fault, at_s=at_s, until_s=until_s)
+
+
+@pytest.mark.parametrize("fault", SINGLE, ids=lambda fault: f"{fault.kind}-{fault.module}")
+def test_what_broke_is_whole_again_when_the_fault_is_over(fault: Fault) -> None:
+    nodes = nodes_with(lasting(fault, 0.02, 0.05), scenario="dock")
+    fly(nodes, 3)
+    assert broken(nodes) != broken(nodes_with(scenario="dock"))
+    fly(nodes, 3, first=4)
+    assert broken(nodes) == broken(nodes_with(scenario="dock"))
+
+
+PAIRS = [pair for pair in itertools.permutations(SINGLE, 2) if pair[0] is SINGLE[0] or len({f.kind.split("_")[0] for f in pair}) == 1]
+"""Faults of the same parts, and one beside all others."""
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_fault_that_begins_or_ends_leaves_another_one_as_it_was(first: Fault, second: Fault) -> None:
+    """Whichever began first and whichever ends first: what is broken is that of those that are on."""
+    alone = [broken(nodes_with(fault, scenario="dock")) for fault in (first, second)]
+    both = broken(nodes_with(first, second, scenario="dock"))
+    times = (((0.0, 0.08), (0.02, 0.05)), ((0.02, 0.05), (0.0, 0.08)), ((0.0, 0.05), (0.02, 0.08)), ((0.02, 0.08), (0.0, 0.05)))
+    for mine, other in times:
+        nodes = nodes_with(lasting(first, *mine), lasting(second, *other), scenario="dock")
+        fly(nodes, 3)
+        assert broken(nodes) == both
+        fly(nodes, 2, first=4)
+        assert broken(nodes) == alone[0 if mine[1] > other[1] else 1]
+
+
+def test_two_faults_of_the_same_words_are_two() -> None:
+    """Each begins once and ends once."""
+    push, sag = (Fault(kind=kind, value=1.0, at_s=0.1, until_s=0.3) for kind in ("push", "battery_sag"))
+    nodes = nodes_with(push, push, sag, sag)
+    fly(nodes, 20)
+    assert np.linalg.norm(nodes.world.push[0, :3]) == pytest.approx(2.0) and nodes.world._thrusters.supply[0, 1] == 10.0
+    fly(nodes, 20, first=21)
+    assert not nodes.world.push.any() and nodes.world._thrusters.supply[0, 1] == 12.0
+
+
+def test_magnet_that_hangs_is_not_moved_by_another_fault() -> None:
+    """A relay that goes off and on again would surge."""
+    nodes = nodes_with(
+        Fault(kind="magnet", index=1, value=1.0), Fault(kind="magnet", index=1, value=0.0, at_s=0.1), Fault(kind="leak", at_s=0.5)
+    )
+    moved = []
+    nodes.world.docks.set_relays = lambda module, relays, move=nodes.world.docks.set_relays: moved.append(  # type: ignore[method-assign]
+        (nodes.world.docks.relays[0, 1], move(module, relays), nodes.world.docks.relays[0, 1])
+    )
+    fly(nodes, 60)
+    assert [(before, after) for before, _, after in moved if before != after] == [(0, 1), (1, 0)]
+
+
+def test_fault_of_one_module_leaves_the_other_whole() -> None:
+    nodes = nodes_with(Fault(kind="imu_frozen", module=2), Fault(kind="thruster_dead", module=1), scenario="dock")
+    for tick in range(1, 50):
+        commands = [CODEC.message(f"THRUSTER_CMD_{h}").encode(n, [0.5] * 4 + [1], tick) for n in (1, 2) for h in "AB"]
+        nodes.step([CODEC.message("SYNC").encode(0, [tick]), *commands])
+    assert [mcu.frozen for mcu in nodes.mcus.values()] == [False, True]
+    assert not nodes.world.truth(0).force_n.any() and nodes.world.truth(1).force_n.all()
 
 
 def test_hand_pushes_with_its_force_for_its_time_from_a_side_of_the_seed_s_own() -> None:
