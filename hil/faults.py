@@ -19,6 +19,8 @@ from hil.plant.camera import Sighting
 from hil.plant.draw import stream
 from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, THRUSTER_KINDS, Fault
 
+NUMBER = 0x1F
+"""Bits of an id that say whose frame it is."""
 LOWEST_BABBLE_ID = 0x040
 """A babbling node takes no id of ESTOP or SYNC: those are faults of another kind."""
 ESTOP, SYNC = Frame(0x01E, b""), Frame(0x020, bytes(4))
@@ -37,6 +39,11 @@ class Wire:
         self._direction = direction
         self._rng = stream(seed, "faults", 2 * link + DIRECTIONS.index(direction))
         self._late: deque[tuple[int, Frame]] = deque()
+        self._changes: dict[str, Callable[[list[Frame]], list[Frame]]] = {
+            "frame_loss": lambda copies: [],
+            "frame_duplicate": lambda copies: copies + copies,
+            "frame_corrupt": lambda copies: [self._corrupted(copy) for copy in copies],
+        }
 
     def pass_on(self, frames: Iterable[Frame], faults: Sequence[Fault], time_ns: int) -> list[Frame]:
         """The frames that come out at the other end now."""
@@ -46,29 +53,29 @@ class Wire:
         out = [frame for due, frame in self._late if due <= time_ns]
         self._late = deque((due, frame) for due, frame in self._late if due > time_ns)
         for frame in frames:
-            out += self._one(frame, mine, time_ns)
+            out += self._one(frame, [f for f in mine if f.module in (0, frame.id & NUMBER)], time_ns)
         for fault in mine:
             if fault.kind == "babble" and self._direction == "from_plant":
                 out += [self._babble() for _ in range(round(fault.value))]
         return out
 
     def _one(self, frame: Frame, faults: Sequence[Fault], time_ns: int) -> list[Frame]:
-        copies = [frame]
+        """What comes of a frame at once. Delays are the last that happens to it, whatever stands first in the list, and add up."""
+        copies, late_ns = [frame], 0
         for fault in faults:
             if fault.kind == "frame_delay":
-                self._late += [(time_ns + round(1e6 * fault.value), f) for f in copies]
-                copies = []
-            elif fault.kind in FRAME_KINDS and fault.kind != "babble" and self._rng.random() < fault.value:
-                if fault.kind == "frame_loss":
-                    copies = []
-                elif fault.kind == "frame_duplicate":
-                    copies = copies + copies
-                elif frame.data:
-                    copies = [self._corrupted(f) for f in copies]
-        return copies
+                late_ns += round(1e6 * fault.value)
+            elif fault.kind in self._changes and self._rng.random() < fault.value:
+                copies = self._changes[fault.kind](copies)
+        if not late_ns:
+            return copies
+        self._late += [(time_ns + late_ns, copy) for copy in copies]
+        return []
 
     def _corrupted(self, frame: Frame) -> Frame:
-        """One bit of the payload is wrong."""
+        """One bit of the payload is wrong; a frame without one stays as it is."""
+        if not frame.data:
+            return frame
         data = bytearray(frame.data)
         bit = int(self._rng.integers(8 * len(data)))
         data[bit // 8] ^= 1 << (bit % 8)

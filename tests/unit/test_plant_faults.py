@@ -235,6 +235,47 @@ def test_delayed_frames_come_later_in_order() -> None:
     assert wire.pass_on([], [], 30_000_000) == FRAMES
 
 
+@pytest.mark.parametrize(("kind", "count", "changed"), [("frame_loss", 0, 0), ("frame_duplicate", 40, 0), ("frame_corrupt", 20, 20)])
+def test_what_happens_to_a_late_frame_is_the_same_whatever_stands_first(kind: str, count: int, changed: int) -> None:
+    faults = [Fault(kind="frame_delay", value=20.0), Fault(kind=kind, value=1.0)]
+    for order in (faults, faults[::-1]):
+        wire = Wire(0, "to_plant")
+        assert wire.pass_on(FRAMES, order, 0) == []
+        out = wire.pass_on([], order, 20_000_000)
+        assert (len(out), sum(frame not in FRAMES for frame in out)) == (count, changed)
+
+
+def test_two_delays_add_up() -> None:
+    wire, late = Wire(0, "to_plant"), [Fault(kind="frame_delay", value=20.0), Fault(kind="frame_delay", value=5.0)]
+    assert wire.pass_on(FRAMES, late, 0) == wire.pass_on([], late, 24_000_000) == []
+    assert wire.pass_on([], late, 25_000_000) == FRAMES
+
+
+@pytest.mark.parametrize("kind", ["frame_loss", "frame_delay", "frame_duplicate", "frame_corrupt"])
+def test_frame_fault_of_one_module_is_of_the_frames_with_its_number(kind: str) -> None:
+    """SYNC and everything else that has another number goes through."""
+    frames = [CODEC.message("SYNC").encode(0, [7]), *FRAMES, Frame(0x01E, b"")]
+    out = Wire(0, "to_plant").pass_on(frames, [Fault(kind=kind, value=1.0, module=3)], 0)
+    assert [f for f in out if f.id & 31 != 3] == [f for f in frames if f.id & 31 != 3]
+    assert out.count(FRAMES[3]) == (2 if kind == "frame_duplicate" else 0)
+
+
+def test_every_direction_draws_from_a_stream_of_its_own() -> None:
+    lost = [Fault(kind="frame_loss", value=0.5)]
+    one, other = (Wire(0, way).pass_on(FRAMES, lost, 0) for way in ("to_plant", "from_plant"))
+    assert one != other
+
+
+def test_any_bit_of_the_payload_may_be_the_wrong_one() -> None:
+    wire, zeros = Wire(0, "to_plant"), Frame(0x101, bytes(8))
+    wrong = [int.from_bytes(wire.pass_on([zeros], [Fault(kind="frame_corrupt", value=1.0)], 0)[0].data, "little") for _ in range(2000)]
+    assert set(wrong) == {1 << bit for bit in range(64)}
+
+
+def test_frame_without_a_payload_cannot_be_corrupt() -> None:
+    assert Wire(0, "to_plant").pass_on([Frame(0x01E, b"")], [Fault(kind="frame_corrupt", value=1.0)], 0) == [Frame(0x01E, b"")]
+
+
 def test_duplicated_frames_come_twice() -> None:
     assert len(Wire(0, "to_plant").pass_on(FRAMES, [Fault(kind="frame_duplicate", value=1.0)], 0)) == 2 * len(FRAMES)
 
