@@ -138,20 +138,20 @@ class Faults:
         return self._to_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
 
     def outgoing(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
-        """Frames from the plant, as they leave, and those of nodes that should not be there."""
-        others = self._others(time_ns) if self._on else []
-        return self._from_plant.pass_on([*frames, *others], [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
+        """Frames from the plant, as they leave."""
+        return self._from_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS and f.kind != "babble"], time_ns)
 
-    def _others(self, time_ns: int) -> list[Frame]:
-        """What an e-stop box or another SYNC producer sends, and what the nodes answer to it."""
+    def intruders(self, time_ns: int) -> list[Frame]:
+        """Frames of nodes that should not be there, and what the others answer to them."""
+        kinds = {f.kind for f in self._on}
         frames = []
-        for kind in {f.kind for f in self._on}:
-            if kind == "foreign_sync":
-                frames.append(SYNC)
-            elif kind == "estop" and time_ns >= self._estop_due_ns:
-                self._estop_due_ns = time_ns + ESTOP_PERIOD_NS
-                frames.append(ESTOP)
-        return frames + [answer for frame in frames for answer in self._nodes.take(frame, time_ns)]
+        if "estop" in kinds and time_ns >= self._estop_due_ns:
+            self._estop_due_ns = time_ns + ESTOP_PERIOD_NS
+            frames.append(ESTOP)
+        if "foreign_sync" in kinds:
+            frames.append(SYNC)
+        frames += [answer for frame in frames for answer in self._nodes.take(frame, time_ns)]
+        return self._from_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
 
     # ------------------------------------------------------------ in the plant
 

@@ -197,6 +197,9 @@ class WireFaults(Protocol):
     def outgoing(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
         """Frames from the plant, as they leave."""
 
+    def intruders(self, time_ns: int) -> list[Frame]:
+        """What nodes that should not be there put on the wire, once a tick."""
+
 
 class NoFaults:
     """Nothing is wrong."""
@@ -209,6 +212,10 @@ class NoFaults:
         return list(frames)
 
     outgoing = incoming
+
+    def intruders(self, time_ns: int) -> list[Frame]:
+        """Nobody."""
+        return []
 
 
 class Nodes:
@@ -240,7 +247,7 @@ class Nodes:
         """One tick of a world that has this one bus: advance a period, take the frames, return the answers."""
         self.world.advance(self.world.period_ns)
         self.watch()
-        return self.answer(frames, self.world.time_ns)
+        return self.answer(frames, self.world.time_ns) + self.faults.intruders(self.world.time_ns)
 
     def answer(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
         """Takes frames off the wire at `time_ns` and puts the answers on it, through whatever is wrong with the wire."""

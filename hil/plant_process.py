@@ -72,7 +72,10 @@ class PlantProcess:
             self._nodes.watch()
 
     def _answer(self, port: Port, frame: Frame) -> None:
-        for answer in self._nodes.answer([frame], self._world.time_ns):
+        """A tick begins with its SYNC, whatever becomes of that on the wire."""
+        is_tick = frame.id == self._sync.id_of(0) and len(frame.data) == self._sync.length
+        answers = self._nodes.answer([frame], self._world.time_ns)
+        for answer in answers + self._nodes.faults.intruders(self._world.time_ns) if is_tick else answers:
             port.send(answer)
-        if self._truth is not None and frame.id == self._sync.id_of(0) and len(frame.data) == self._sync.length:
+        if self._truth is not None and is_tick:
             self._truth.record_world(int(self._sync.decode(frame.data)[0]), self._world)

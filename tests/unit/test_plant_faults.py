@@ -293,6 +293,28 @@ def test_babbling_node_floods_the_bus_but_raises_no_estop() -> None:
     assert len(heard) == 50 and min(f.id for f in heard) >= 0x40
 
 
+def test_estop_box_sends_at_20_hz_while_it_is_raised() -> None:
+    nodes = nodes_with(Fault(kind="estop", at_s=0.1, until_s=1.1))
+    ticks = [tick for tick in range(1, 201) if any(frame.id == 0x01E for frame in fly(nodes, 1, first=tick))]
+    assert ticks == list(range(10, 110, 5))
+    assert nodes.mcus[1].stopped
+
+
+def test_every_node_answers_a_foreign_sync_too() -> None:
+    frames = fly(nodes_with(Fault(kind="foreign_sync")), 20, first=100)
+    assert sum(frame.id == 0x020 for frame in frames) == 20
+    status = [Receiver(CODEC).accept(frame) for frame in frames if frame.id == 0x441]
+    ticks = [r.values[0] for r in status if r is not None]
+    assert ticks == [n for tick in range(100, 120) for n in (tick, 0)]
+
+
+def test_box_and_second_leader_speak_in_an_order_that_depends_on_nothing() -> None:
+    """The number that is lower wins the bus."""
+    for kinds in (("estop", "foreign_sync"), ("foreign_sync", "estop")):
+        nodes = nodes_with(*(Fault(kind=kind) for kind in kinds))
+        assert [frame.id for frame in fly(nodes, 1) if frame.id in (0x01E, 0x020)] == [0x01E, 0x020]
+
+
 def test_magnet_that_hangs_does_not_obey() -> None:
     nodes = nodes_with(Fault(kind="magnet", module=1, index=1, value=1.0))
     fly(nodes, 2)
