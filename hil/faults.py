@@ -185,9 +185,14 @@ class Faults:
         for face in range(FACES) if fault.index == ALL else (fault.index,):
             self._world.docks.hang(mcu.module, face, RELAYS[fault.value])
 
-    def _change_tag(self, sighting: Sighting) -> Sighting | None:
+    def _change_tag(self, sighting: Sighting, carrier: int) -> Sighting | None:
+        """What becomes of a sighting, in the world's frame, by a camera that the module `carrier` carries (-1: a fixed one).
+
+        What a fault did to the carrier's own sighting is in there already, since it was placed by that: it counts once.
+        """
         for fault in self._on:
-            if not fault.kind.startswith(("tag_", "camera_")) or sighting.module not in self._modules(fault):
+            modules = self._modules(fault)
+            if not fault.kind.startswith(("tag_", "camera_")) or sighting.module not in modules or carrier in modules:
                 continue
             if fault.kind == "tag_absent":
                 return None

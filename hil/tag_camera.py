@@ -15,7 +15,7 @@ class TagCamera:
     """The tag computer, number 31: sends what its cameras saw, in the world's frame, when its delay is over.
 
     It knows where its fixed cameras stand. What a carried camera sees it places in the world by the carrier's own tag in
-    a fixed camera's picture of the same moment; without one the sighting is of no use and is dropped.
+    a fixed camera's picture of the same moment, whose errors it takes over; without one the sighting is of no use and is dropped.
     """
 
     def __init__(
@@ -29,8 +29,8 @@ class TagCamera:
         self._waiting: deque[tuple[Sighting, int, int]] = deque()
         self._sync: tuple[int, int] | None = None
         self._counters = dict.fromkeys(self._number_of, 0)
-        self.change: Callable[[Sighting], Sighting | None] = lambda sighting: sighting
-        """What a fault makes of every sighting; None: lost."""
+        self.change: Callable[[Sighting, int], Sighting | None] = lambda sighting, carrier: sighting
+        """What a fault makes of every sighting by a camera that is carried by that module (-1: by none); None: lost."""
         self.watch()
 
     def watch(self) -> None:
@@ -49,13 +49,13 @@ class TagCamera:
         for camera in self._cameras:
             found = camera.watch(self._world)
             if camera.carrier < 0:
-                fixed += [s for s in map(self.change, found) if s is not None]
+                fixed += [seen for s in found if (seen := self.change(s, s.carrier)) is not None]
                 continue
             for relative in found:
                 own = [s for s in fixed if s.module == relative.carrier and s.capture_ns == relative.capture_ns]
                 if own:
                     tag = self._tags[own[0].module][own[0].tag_id]
-                    seen = self.change(in_the_world(relative, own[0], tag))
+                    seen = self.change(in_the_world(relative, own[0], tag), relative.carrier)
                     fixed += [] if seen is None else [seen]
         return sorted(fixed, key=lambda s: s.capture_ns)
 

@@ -208,6 +208,46 @@ def test_tags_jump_and_vanish() -> None:
     assert not values(fly(nodes_with(Fault(kind="tag_absent")), 50), "TAG_POSITION")
 
 
+def sighted(*faults: Fault, scenario: str) -> dict[int, np.ndarray]:
+    """(n, 3) what the tag computer says of each module's place, by its number."""
+    frames, receiver = fly(nodes_with(*faults, scenario=scenario), 60, u=0.0), Receiver(CODEC)
+    received = [r for frame in frames if (r := receiver.accept(frame)) is not None and r.message.name == "TAG_POSITION"]
+    return {number: np.array([r.values[:3] for r in received if r.number == number]) for number in (1, 2)}
+
+
+@pytest.mark.parametrize(
+    ("fault", "off_m"),
+    [
+        (Fault(kind="camera_bias", value=0.01), {1: 0.01, 2: 0.01}), (Fault(kind="tag_jump", value=0.1), {1: 0.1, 2: 0.1}),
+        (Fault(kind="tag_jump", module=1, value=0.1), {1: 0.1, 2: 0.0}), (Fault(kind="tag_jump", module=2, value=0.1), {1: 0.1, 2: 0.1}),
+        (Fault(kind="camera_bias", module=1, value=0.01), {1: 0.01, 2: 0.0}),
+    ],
+)  # fmt: skip
+def test_module_that_a_carried_camera_sees_is_off_by_a_fault_once(fault: Fault, off_m: dict[int, float]) -> None:
+    """Module 2 carries the camera that sees module 1, which takes over what is wrong with the carrier's own place."""
+    bad, good = sighted(fault, scenario="dock-vertical"), sighted(scenario="dock-vertical")
+    for number, expected in off_m.items():
+        off = bad[number] - good[number]
+        np.testing.assert_allclose(np.linalg.norm(off, axis=1), expected, atol=0.0015)
+
+
+def test_tag_fault_is_of_the_module_that_it_names() -> None:
+    jumped = sighted(Fault(kind="tag_jump", module=2, value=0.3), scenario="dock")
+    whole = sighted(scenario="dock")
+    np.testing.assert_array_equal(jumped[1], whole[1])
+    np.testing.assert_allclose((jumped[2] - whole[2])[:, 0], 0.3, atol=1e-3)
+    absent = sighted(Fault(kind="tag_absent", module=1), scenario="dock")
+    assert len(absent[1]) == 0 and len(absent[2]) > 20
+
+
+def test_that_share_of_the_tags_is_flipped() -> None:
+    flipped, straight = (
+        values(fly(nodes_with(*f), 400, u=0.0), "TAG_ATTITUDE") for f in ([Fault(kind="tag_flip", value=0.3)], [])
+    )
+    turned = [a[:4] != b[:4] for a, b in zip(flipped, straight, strict=True)]
+    assert np.mean(turned) == pytest.approx(0.3, abs=0.1)
+
+
 def test_flipped_tags_turn_and_stay_in_place() -> None:
     np.testing.assert_array_equal(tags(Fault(kind="tag_flip", value=1.0)), tags())
     flipped, straight = (
