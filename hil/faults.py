@@ -14,6 +14,7 @@ import numpy as np
 
 from firmware_py.bus.codec import Frame
 from firmware_py.core import rotations
+from firmware_py.description.schema import DescriptionError
 from hil.nodes import Mcu, Nodes
 from hil.plant.camera import Sighting
 from hil.plant.draw import stream
@@ -114,7 +115,10 @@ class Faults:
             camera.change = self._change_tag
 
     def add(self, fault: Fault) -> None:
-        """A fault more, live."""
+        """A fault more, live. Raises DescriptionError for one that would do nothing."""
+        thrusters = {number: len(self._world.vehicles[mcu.module].thruster) for number, mcu in self._nodes.mcus.items()}
+        for key, what in fault.mistakes(thrusters):
+            raise DescriptionError(f"fault.{key}: {what}")
         self._faults.append(fault)
 
     def clear(self, kind: str = "") -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from firmware_py.description.schema import limits_of
+from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN
@@ -133,10 +134,21 @@ def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:
             yield keys, f"no module has the number {number}; {every} {', '.join(map(str, numbers))}"
 
 
+def _thrusters(scenario: Scenario) -> dict[int, int]:
+    """How many each module has, by its number. Raises DescriptionError where a vehicle is none."""
+    counts = {vehicle: len(load_vehicle(vehicle).thruster) for vehicle in {module.vehicle for module in scenario.module}}
+    vehicles = itertools.cycle(module.vehicle for module in scenario.module)  # a polycube's modules are all of one kind
+    return {number: counts[vehicle] for number, vehicle in zip(module_numbers(scenario), vehicles, strict=False)}
+
+
 def _in_faults(scenario: Scenario) -> Iterator[Mistake]:
     for i, fault in enumerate(scenario.fault):
-        if fault.until_s <= fault.at_s:
-            yield ("fault", i, "until_s"), f"{fault.until_s:g} s is not after at_s, {fault.at_s:g} s; the fault would never begin"
+        for key, what in fault.mistakes(_thrusters(scenario)):
+            yield ("fault", i, key), what
+        if fault.at_s > scenario.duration_s:
+            yield ("fault", i, "at_s"), f"{fault.at_s:g} s is after the end of the run, which lasts {scenario.duration_s:g} s"
+        if fault.kind == "jets" and len(module_numbers(scenario)) < 2:
+            yield ("fault", i, "kind"), "jets disturb a neighbour, and there is one module alone"
 
 
 def _in_checks(scenario: Scenario) -> Iterator[Mistake]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from firmware_py.bus.codec import Codec, Frame, Receiver
+from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults, Wire
 from hil.nodes import Nodes, make_nodes
 from hil.plant.fault_spec import Fault
@@ -372,6 +373,17 @@ def test_live_fault_can_be_cleared() -> None:
     assert not values(fly(nodes, 50), "TAG_POSITION")
     faults.clear("tag_absent")
     assert values(fly(nodes, 50, first=51), "TAG_POSITION")
+
+
+@pytest.mark.parametrize(("fault", "refusal"), [
+    (Fault(kind="frame_loss", value=30.0), "fault.value: 30 is not for frame_loss, which takes 0 to 1, except 0"),
+    (Fault(kind="thruster_dead", index=8), "fault.index: 8 is beyond what the module has for thruster_dead; it takes 0 to 7"),
+    (Fault(kind="babble", value=float("nan")), "fault.value: nan is not for babble, which takes whole numbers from 1"),
+])  # fmt: skip
+def test_live_fault_that_would_do_nothing_is_refused(fault: Fault, refusal: str) -> None:
+    faults = Faults(nodes_with())
+    with pytest.raises(DescriptionError, match=refusal):
+        faults.add(fault)
 
 
 def test_process_is_dead_between_its_times() -> None:

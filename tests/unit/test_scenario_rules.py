@@ -70,6 +70,31 @@ def load(tmp_path: Path) -> Load:
         ("hover", "", '[[check]]\nmetric = "nis_mean"\nlow = 0.5', "metric: nis_mean is checked by another [[check]] already"),
         ("hover", "", "[start]\nposition_m = [0.0, 0.7, 0.0]", "start.position_m: a seed may start module 1 at [0.0, -0.7, 0.38] m"),
         ("dock-moving", "duration_s = 60.0", "duration_s = 0.0", "step[0].duration_s: 0 s; a move takes 0.1 s at least"),
+        ("hover-blind", "until_s = 17.0", "until_s = 12.00000000001", "fault[0].until_s: 12 s is not after at_s, 12 s"),
+        *(("hover", "", f"[[fault]]\nkind = {fault}", f"fault[0].{refusal}") for fault, refusal in (
+            ('"leak"\nat_s = 75.1', "at_s: 75.1 s is after the end of the run, which lasts 75 s"),
+            ('"thruster_dead"\nindex = 8', "index: 8 is beyond what the module has for thruster_dead; it takes 0 to 7, and -1 for all"),
+            ('"magnet"\nindex = 6', "index: 6 is beyond what the module has for magnet; it takes 0 to 5, and -1 for all"),
+            ('"magnet"\nvalue = 2', "value: 2 is not for magnet, which takes whole numbers from -1 to 1"),
+            ('"magnet"\nvalue = 0.5', "value: 0.5 is not for magnet, which takes whole numbers from -1 to 1"),
+            ('"frame_loss"', "value: 0 is not for frame_loss, which takes 0 to 1, except 0"),
+            ('"frame_duplicate"\nvalue = 1.1', "value: 1.1 is not for frame_duplicate, which takes 0 to 1, except 0"),
+            ('"frame_corrupt"\nvalue = -0.1', "value: -0.1 is not for frame_corrupt, which takes 0 to 1, except 0"),
+            ('"tag_flip"\nvalue = 30.0', "value: 30 is not for tag_flip, which takes 0 to 1, except 0"),
+            ('"frame_delay"', "value: 0 is not for frame_delay, which takes 0 to 1e+06, except 0"),
+            ('"frame_delay"\nvalue = -20.0', "value: -20 is not for frame_delay"),
+            ('"thruster_weak"\nvalue = 1.0', "value: 1 is not for thruster_weak, which takes 0 to 1, except 1"),
+            ('"thruster_fake_rpm"\nvalue = -0.1', "value: -0.1 is not for thruster_fake_rpm, which takes 0 to 1, except 1"),
+            ('"thruster_stuck"\nvalue = 1.5', "value: 1.5 is not for thruster_stuck, which takes -1 to 1"),
+            ('"babble"\nvalue = 0.5', "value: 0.5 is not for babble, which takes whole numbers from 1 to 1e+06"),
+            ('"babble"\nvalue = 5.0\ndirection = "to_plant"', "direction: babble does not go to_plant; it goes both, from_plant"),
+            ('"push"', "value: 0 is not for push"), ('"tag_jump"', "value: 0 is not for tag_jump"),
+            ('"camera_bias"', "value: 0 is not for camera_bias"), ('"battery_sag"', "value: 0 is not for battery_sag"),
+            ('"jets"\nvalue = 0.5', "kind: jets disturb a neighbour, and there is one module alone"),
+            ('"babble"\nvalue = 5.0\nmodule = 1', "module: babble is not of one module, as of 1; leave it out"),
+            *((f'"{kind}"\nmodule = 1', f"module: {kind} is not of one module") for kind in ("estop", "foreign_sync", "process_killed")),
+        )),
+        ("dock", "", '[[fault]]\nkind = "jets"\nvalue = 0.5\nmodule = 1', "fault[0].module: jets is not of one module, as of 1"),
         ("hover", "", '[[step]]\ndo = "wait"', "step[0]: a task of the kind hover runs no steps"),
         ("hover", 'kind = "hover"', 'kind = "hover"\nfile = "none.csv"', "task.file: a task of the kind hover flies no file"),
         ("waypoints", 'file = "waypoints.csv"', "", "task.kind: waypoints flies a file, and there is none"),
@@ -88,6 +113,19 @@ def test_mistake_is_refused_before_the_flight(load: Load, tmp_path: Path, name: 
     assert refusal in line
     assert line.startswith(f"{tmp_path / name}.toml:")
     assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        ("hover", '"leak"\nat_s = 75.0'), ("hover", '"thruster_dead"\nindex = 7'), ("polycube", '"thruster_dead"\nmodule = 2\nindex = 7'),
+        ("hover", '"magnet"\nindex = 5'), ("hover", '"frame_loss"\nvalue = 1.0\nmodule = 1'), ("hover", '"thruster_weak"'),
+        ("hover", '"babble"\nvalue = 1.0\ndirection = "from_plant"'), ("hover", '"thruster_stuck"\nvalue = -1.0'),
+        ("dock", '"jets"'), ("hover", '"magnet"\nvalue = -1.0'), ("hover", '"tag_jump"\nvalue = -0.1'),
+    ],
+)  # fmt: skip
+def test_fault_at_the_edge_of_what_it_takes_is_flown(load: Load, name: str, fault: str) -> None:
+    assert len(load(name, "", f"[[fault]]\nkind = {fault}").fault) == 1
 
 
 def test_line_of_the_mistake_is_named(load: Load, tmp_path: Path) -> None:
