@@ -156,7 +156,7 @@ def plant(
     from hil.plant_process import serve_until_signal
 
     check_reaches_others(bus, "the plant alone")
-    serve_until_signal(load_scenario(scenario), seed, bus, rate_hz, out)
+    serve_until_signal(load_scenario(scenario).for_seed(seed), seed, bus, rate_hz, out)
 
 
 @app.command("list")

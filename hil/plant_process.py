@@ -12,6 +12,7 @@ from pathlib import Path
 
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import Port, open_port
+from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults
 from hil.nodes import Nodes, make_nodes
 from hil.scenario import Scenario, make_world
@@ -25,6 +26,14 @@ def started_clock() -> Callable[[], int]:
     """The plant's own clock: nanoseconds since now."""
     start_ns = time.monotonic_ns()
     return lambda: time.monotonic_ns() - start_ns
+
+
+def check_served(scenario: Scenario) -> None:
+    """Raises DescriptionError for a fault that is not the plant's to make."""
+    for i, fault in enumerate(scenario.fault):
+        if fault.kind == "process_killed":
+            where = f"scenario {scenario.name!r}: fault[{i}].kind"
+            raise DescriptionError(f"{where}: only a flight in lockstep kills the firmware; fly without --realtime, or leave it out")
 
 
 def serve_until_signal(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None) -> None:
@@ -42,9 +51,10 @@ def serve_until_signal(scenario: Scenario, seed: int, bus: str, rate_hz: int, ou
 
 
 class PlantProcess:
-    """The world and its nodes, moved along by a clock. `serve` returns when `stop` says so."""
+    """The world and its nodes, moved along by a clock. `serve` returns when `stop` says so. Raises DescriptionError."""
 
     def __init__(self, scenario: Scenario, seed: int, rate_hz: int, out: Path | None) -> None:
+        check_served(scenario)
         self._world = make_world(scenario, seed, CHUNK_NS)
         numbers = {module.number: index for index, module in enumerate(scenario.module)}
         codec = Codec.load()

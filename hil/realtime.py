@@ -25,7 +25,7 @@ from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from hil.bench import fleet_of, script_of
-from hil.plant_process import PlantProcess
+from hil.plant_process import PlantProcess, check_served
 from hil.scenario import Scenario
 
 
@@ -76,6 +76,7 @@ def fly_in_real_time(
         observers: called after each tick, besides the recorder.
         serve: what the plant's process runs, with the arguments of `serve_plant`.
     """
+    check_served(scenario)
     spawn, fork = multiprocessing.get_context("spawn"), multiprocessing.get_context("fork")
     context: SpawnContext | ForkContext = fork if start_method == "fork" else spawn
     ready, stop = context.Event(), context.Event()

@@ -8,6 +8,7 @@ import hil.fault_campaign
 import hil.plant_process
 from firmware_py.cli import main
 from hil.fault_campaign import Cell
+from hil.scenario import load_scenario
 
 OFF = [["--trials", "20"], ["--controller", "modcube"], ["--vehicle", "modcube_sim"], ["--sensors", "real"], ["--dask", "tcp://a:1"]]
 
@@ -72,3 +73,26 @@ def test_plant_alone_refuses_a_bus_that_nobody_else_reaches(monkeypatch: pytest.
     assert "udp:GROUP:PORT or socketcan:IFACE" in line
     assert line.count("\n") == 1
     assert served == []
+
+
+def test_plant_alone_serves_the_modules_of_its_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    served: list[int] = []
+    monkeypatch.setattr(hil.plant_process, "serve_until_signal", lambda scenario, *_: served.append(len(scenario.module)))
+    for seed in range(3):
+        assert status_of(["plant", "polycube", "--bus", "udp:239.74.163.9:43119", "--seed", str(seed)], monkeypatch) == 0
+    assert served == [len(load_scenario("polycube").for_seed(seed).module) for seed in range(3)]
+    assert min(served) > 1
+
+
+def test_what_only_lockstep_can_break_is_refused_in_real_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "hover.toml"
+    text = (Path(hil.plant_process.__file__).parent / "scenarios" / "hover.toml").read_text(encoding="utf-8")
+    path.write_text(f'{text}\n[[fault]]\nkind = "leak"\n[[fault]]\nkind = "process_killed"\nat_s = 5.0\n', encoding="utf-8")
+    bus = ["--bus", "udp:239.74.163.9:43119"]
+    for command in (["run", str(path), "--realtime", "--out", str(tmp_path), *bus], ["plant", str(path), *bus]):
+        assert status_of(command, monkeypatch) == 2
+        line = capsys.readouterr().err
+        assert "scenario 'hover': fault[1].kind: only a flight in lockstep kills the firmware; fly without --realtime" in line
+        assert line.count("\n") == 1
