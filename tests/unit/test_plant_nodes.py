@@ -166,6 +166,37 @@ def test_repeated_or_damaged_command_does_not_keep_thrusters_alive() -> None:
     assert nodes.receiver.dropped["crc"] == 26 and nodes.receiver.dropped["counter"] == 26
 
 
+def test_error_is_reported_once() -> None:
+    nodes = nodes_of(calm())
+    good = thrust(0.1, ARMED, 0)
+    damaged = Frame(good[0].id, good[0].data[:-1] + bytes([good[0].data[-1] ^ 1]))
+    answers = [nodes.step([*thrust(0.1, ARMED, k), *[damaged][: k == 2], sync(k)]) for k in range(1, 5)]
+    assert [named(frames, "MCU_STATUS").values[2] for frames in answers] == [0, 1, 0, 0]
+
+
+def test_slow_frames_count_by_one() -> None:
+    nodes, receiver = nodes_of(calm()), Receiver(CODEC)
+    counters = collections.defaultdict(list)
+    for tick in range(1, 2001):
+        for r in decode(nodes.step([sync(tick)]), receiver):
+            if not r.message.per_tick:
+                counters[r.message.name].append(r.counter)
+    assert {"DEPTH", "DOCK_CURRENT_ABC", "ESC_FEEDBACK_1", "POWER", "ENVIRONMENT"} < set(counters)
+    for name, seen in counters.items():
+        assert seen == [i & 15 for i in range(len(seen))], name
+
+
+def test_picture_that_was_taken_too_long_after_sync_to_say_so_is_not_sent() -> None:
+    """Its time since SYNC goes to 25.5 ms."""
+    nodes = nodes_of(dataclasses.replace(calm(), sensors=dataclasses.replace(calm().sensors, tag_rate_hz=400.0, tag_phase=0.0)))
+    nodes.step([sync(1)])
+    for _ in range(6):
+        nodes.step([])
+    told = [r.values[7] for k in range(2, 12) for r in decode(nodes.step([sync(k)])) if r.message.name == "TAG_ATTITUDE"]
+    assert max(told) == pytest.approx(25.0)
+    assert sum(told_ms > 10.0 for told_ms in told) == 6
+
+
 def test_disarmed_command_gives_no_thrust_even_in_one_half() -> None:
     nodes = nodes_of(calm())
     nodes.step([*thrust(0.5, ARMED, 0, "A"), *thrust(0.5, DISARMED, 0, "B"), sync(0)])
