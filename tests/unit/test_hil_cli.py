@@ -91,6 +91,7 @@ def test_what_only_lockstep_can_break_is_refused_in_real_time(
     text = (Path(hil.plant_process.__file__).parent / "scenarios" / "hover.toml").read_text(encoding="utf-8")
     path.write_text(f'{text}\n[[fault]]\nkind = "leak"\n[[fault]]\nkind = "process_killed"\nat_s = 5.0\n', encoding="utf-8")
     bus = ["--bus", "udp:239.74.163.9:43119"]
+    monkeypatch.setattr(hil.plant_process.PlantProcess, "serve", lambda *_: None)
     for command in (["run", str(path), "--realtime", "--out", str(tmp_path), *bus], ["plant", str(path), *bus]):
         assert status_of(command, monkeypatch) == 2
         line = capsys.readouterr().err

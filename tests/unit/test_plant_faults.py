@@ -390,6 +390,12 @@ def test_live_fault_that_would_do_nothing_is_refused(fault: Fault, refusal: str)
         faults.add(fault)
 
 
+def test_thruster_is_one_that_a_module_of_the_fault_has() -> None:
+    counts = {1: 8, 2: 6}
+    wrong = {module: [key for key, _ in Fault(kind="thruster_dead", module=module, index=7).mistakes(counts)] for module in (0, 1, 2)}
+    assert wrong == {0: [], 1: [], 2: ["index"]}
+
+
 def test_process_is_dead_between_its_times() -> None:
     faults = Faults(nodes_with(), [Fault(kind="process_killed", at_s=1.0, until_s=2.0)])
     assert [faults.process_killed(round(t * 1e9)) for t in (0.99, 1.0, 1.99, 2.0)] == [False, True, True, False]
