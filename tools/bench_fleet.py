@@ -1,6 +1,6 @@
 """For tools/bench.py: what a tick of many docked modules costs beside that of one, with every module's sensors arriving.
 
-    python tools/bench_fleet.py EDGE
+    .venv/bin/python tools/bench_fleet.py EDGE
 
 holds a cube of EDGE^3 modules and prints the duration of a tick, how far it strayed, and the memory of the process.
 """

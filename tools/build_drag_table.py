@@ -1,7 +1,7 @@
 """Build the drag tables of docked modules, draw their drag spaces and compare the ways to an outline.
 
-python tools/build_drag_table.py                              the paper's three shapes
-python tools/build_drag_table.py --cells "0,0,0 1,0,0 1,1,0"  any other; --compare adds the paper's sampling
+.venv/bin/python tools/build_drag_table.py                              the paper's three shapes
+.venv/bin/python tools/build_drag_table.py --cells "0,0,0 1,0,0 1,1,0"  any other; --compare adds the paper's sampling
 """
 
 from __future__ import annotations

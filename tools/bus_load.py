@@ -1,9 +1,8 @@
-#!/usr/bin/env python
 """How full the CAN buses of a fleet are, computed from the DBC; and that DBC written out for every id of the fleet.
 
-    tools/bus_load.py                         1, 2 and 4 modules at 100 Hz, 2 at 200 Hz, 1 at 400 Hz
-    tools/bus_load.py --fleet FILE            the buses of a fleet file
-    tools/bus_load.py --fleet FILE --dbc DIR  and one DBC per bus, for SavvyCAN and the like: no id mask needed
+    .venv/bin/python tools/bus_load.py                         1, 2 and 4 modules at 100 Hz, 2 at 200 Hz, 1 at 400 Hz
+    .venv/bin/python tools/bus_load.py --fleet FILE            the buses of a fleet file
+    .venv/bin/python tools/bus_load.py --fleet FILE --dbc DIR  and one DBC per bus, for SavvyCAN and the like: no id mask needed
 
 Exit status: 0 within the limits, 1 beyond one, 2 cannot run.
 """

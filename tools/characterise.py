@@ -1,10 +1,9 @@
-#!/usr/bin/env python3
 """What a vehicle, an assembly or the paper's seven robots can do; or which shape to dock for a task.
 
-characterise.py modcube bluerov2_heavy --out runs/capability
-characterise.py --assembly 2x2x1 --module modcube
-characterise.py --table1 --out runs/table1
-characterise.py --choose 4 --task task.toml
+.venv/bin/python tools/characterise.py modcube bluerov2_heavy --out runs/capability
+.venv/bin/python tools/characterise.py --assembly 2x2x1 --module modcube
+.venv/bin/python tools/characterise.py --table1 --out runs/table1
+.venv/bin/python tools/characterise.py --choose 4 --task task.toml
 """
 
 from __future__ import annotations

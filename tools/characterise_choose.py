@@ -1,4 +1,4 @@
-"""`characterise.py --choose N --task FILE`: all shapes of N modules for a task, best first."""
+"""`--choose N --task FILE` of characterise.py: all shapes of N modules for a task, best first."""
 
 from __future__ import annotations
 

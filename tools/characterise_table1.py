@@ -1,4 +1,4 @@
-"""`characterise.py --table1`: ours beside the paper's, a word on each cell, rank correlation, thrust variance."""
+"""`--table1` of characterise.py: ours beside the paper's, a word on each cell, rank correlation, thrust variance."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Draws docs/supervisor.md from the tables of the supervisor, so that the drawing cannot differ from what runs.
 
-    python tools/draw_supervisor.py            writes docs/supervisor.md
-    python tools/draw_supervisor.py --check    exits 1 when it is not up to date
+    .venv/bin/python tools/draw_supervisor.py            writes docs/supervisor.md
+    .venv/bin/python tools/draw_supervisor.py --check    exits 1 when it is not up to date
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def page() -> str:
     """The whole page."""
     lines = [
         "# Supervisor", "",
-        "Drawn from the tables in `firmware_py/core` by `python tools/draw_supervisor.py`; do not edit.", "",
+        "Drawn from the tables in `firmware_py/core` by `.venv/bin/python tools/draw_supervisor.py`; do not edit.", "",
         "## States", "", *diagram(), "Every transition there is; what has no row is refused in words.", "", *transitions(),
         "## Modes", "", *modes(), "## Arming checks", "", *arming(),
         "## Fail-safes", "", "Gravest first, with the default parameters (`failsafes.NAME_limit`, `_delay_s`, `_action`, `_latched`).", "",

@@ -1,12 +1,11 @@
-#!/usr/bin/env python3
 """Fit the paper's fifth-order polynomials to a thruster's load-cell measurement, rising all the way as the vehicle file asks.
 
     .venv/bin/python tools/fit_thruster.py bench.csv --voltage 12 --out curve.toml
 
 The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w, above 0 wherever it pushes. Force is brought
 to one voltage by its square, power by its cube. Power measured at the command nearest zero, where nothing pushes, is the electronics',
-which a vehicle file counts apart (idle_w): it is taken off first. Written are the fields of a vehicle file's [curve], for it or for
-tools/identify.py --curve; what was not measured (power, lag, speed) is --vehicle's.
+which a vehicle file counts apart (idle_w): it is taken off first. Written are the fields of a vehicle file's [curve], for it or
+for --curve of tools/identify.py; what was not measured (power, lag, speed) is --vehicle's.
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
-#!/usr/bin/env python
-"""Puts this checkout's release on a vehicle, over OpenSSH: tools/flash.py USER@HOST.
+"""Puts this checkout's release on a vehicle, over OpenSSH.
 
 Builds the wheel, ships it with its locked dependencies, installs it into a release folder of its own, switches the
 service to it, waits for its health report, and goes back to the release before when there is none.
 
-    tools/flash.py USER@HOST              flash
-    tools/flash.py USER@HOST --dry-run    check everything, change nothing
-    tools/flash.py USER@HOST --offline    from the cache of wheels alone, without any registry
-    tools/flash.py USER@HOST --status     what is installed and how it runs
-    tools/flash.py USER@HOST --rollback   back to the release before
+    .venv/bin/python tools/flash.py USER@HOST              flash
+    .venv/bin/python tools/flash.py USER@HOST --dry-run    check everything, change nothing
+    .venv/bin/python tools/flash.py USER@HOST --offline    from the cache of wheels alone, without any registry
+    .venv/bin/python tools/flash.py USER@HOST --status     what is installed and how it runs
+    .venv/bin/python tools/flash.py USER@HOST --rollback   back to the release before
 
 Exit status: 0 done, 1 switched in vain (the old release runs again) or out of sight, 2 cannot run (nothing was changed).
 """

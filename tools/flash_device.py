@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Runs on the vehicle, shipped there by flash.py: installs releases, switches between them, rolls back.
 
 Layout of the root folder (say /opt/modcube):

@@ -1,5 +1,4 @@
-#!/usr/bin/env python
-"""C for the microcontrollers, from the DBC: `tools/generate_mcu_code.py DIR` writes four files into DIR.
+"""C for the microcontrollers, from the DBC: `.venv/bin/python tools/generate_mcu_code.py DIR` writes four files into DIR.
 
     modcube.h, modcube.c              structs, pack and unpack of every message (cantools)
     modcube_wire.h, modcube_wire.c    ids with numbers, counter and CRC, a receiver's checks, the schedule of slow

@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Fit a vehicle file to recorded flights of one module, with 95 % intervals; the bench's logs or a real vehicle's.
 
     .venv/bin/python tools/identify.py runs/shaken                                  # no reference: ratios only

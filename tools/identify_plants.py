@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """How well tools/identify.py finds plants that are known: each seed's robot is shaken on the bench and told from its log alone.
 
     .venv/bin/python tools/identify_plants.py --plants 10 --jobs 2

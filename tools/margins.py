@@ -1,9 +1,8 @@
-#!/usr/bin/env python3
 """Gain and phase margins of the loops broken at the plant's input, and how far they shrink where the plant is not as believed.
 
-margins.py                                     # the shipped gains, bodies of 1, 2 and 4 modules
-margins.py --controller runs/tune/parameters.toml --modules 1
-margins.py --vehicle bluerov2_heavy --modules 1 --out runs/margins
+.venv/bin/python tools/margins.py                                     # the shipped gains, bodies of 1, 2 and 4 modules
+.venv/bin/python tools/margins.py --controller runs/tune/parameters.toml --modules 1
+.venv/bin/python tools/margins.py --vehicle bluerov2_heavy --modules 1 --out runs/margins
 
 Status 1 where a margin is under its bar, or a controlled axis swings or never crosses 0 dB. An axis that the thrusters cannot push is
 named and does not count. In DIR: margins.json and margins.png, the Bode plot.

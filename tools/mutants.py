@@ -1,6 +1,6 @@
 """Mutation tests of what must be trusted: changes one thing at a time in limiter, supervisor, tables and fail-safes, and runs their tests.
 
-    python tools/mutants.py [MODULE ...] [--jobs N] [--list]
+    .venv/bin/python tools/mutants.py [MODULE ...] [--jobs N] [--list]
 
 Prints killed and survived per module, names each survivor with its line, and exits 1 when there is one. A mutant lives in a forked process
 alone: no file is touched. Everything heavy is imported before the fork.

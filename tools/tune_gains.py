@@ -1,9 +1,8 @@
-#!/usr/bin/env python3
 """Tune controller and estimator parameters on the bench with Optuna. Killed and started again, it goes on: no finished trial is lost.
 
-tune_gains.py tools/objectives/spiral-and-push.toml --trials 60 --out runs/tune
-tune_gains.py tools/objectives/spiral-and-push.toml --detune 1 --minutes 15      # from gains that are wrong by up to 3
-tune_gains.py tools/objectives/hover.toml --live mavlink:udpin:127.0.0.1:14550   # a vehicle that hovers; asks before each step
+.venv/bin/python tools/tune_gains.py tools/objectives/spiral-and-push.toml --trials 60 --out runs/tune
+.venv/bin/python tools/tune_gains.py tools/objectives/spiral-and-push.toml --detune 1 --minutes 15   # from gains off by up to 3
+.venv/bin/python tools/tune_gains.py tools/objectives/hover.toml --live mavlink:udpin:127.0.0.1:14550   # a vehicle that hovers
 
 The objective is a file: which flights, which seeds, which parameters within which bounds, and what each metric costs. In DIR: the
 best parameters as a file for --controller, tuning.json with the figures on seeds that the search never saw beside those of the

@@ -94,3 +94,22 @@ def test_every_table_of_the_readme_is_of_a_known_kind_and_filled() -> None:
     for match in found:
         assert match["kind"] in readme_tables.TABLES
         assert match[0].count("\n|") >= 2, f"empty table: {match[1].strip()}"
+
+
+PAGES = [ROOT / "README.md", ROOT / "can_dbc" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TOOLS = sorted((ROOT / "tools").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", [*PAGES, *TOOLS], ids=lambda path: str(path.relative_to(ROOT)))
+def test_shown_command_of_a_tool_starts_with_the_python_that_has_its_packages(path: Path) -> None:
+    """In pages and in the tools' usage; the tables of figures say once, above, which python theirs is."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        text = ast.get_docstring(ast.parse(text)) or ""
+    lines = [line for line in text.splitlines() if not line.startswith("|")]
+    assert [line for line in lines if re.search(r"(?:^ *|`)(?:python tools/\w+\.py|(?:tools/)?\w+\.py(?: |$))", line)] == []
+
+
+@pytest.mark.parametrize("path", TOOLS, ids=lambda path: path.name)
+def test_tool_that_cannot_be_executed_does_not_look_as_if_it_could(path: Path) -> None:
+    assert path.read_text(encoding="utf-8").startswith("#!") == bool(path.stat().st_mode & 0o100)
