@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from contextlib import ExitStack
@@ -19,9 +20,12 @@ from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig, check_store, load_ground
 from firmware_py.ground.identity import IDENTITIES
+from firmware_py.runtime import disk
 
 CANNOT_RUN = 2
 """Exit status when nothing could be started: wrong usage, no such bus, a file that is wrong."""
+REASONS = {errno.EEXIST: "is a file; a folder is needed"}
+"""In place of the system's words, where these do not say what would be right."""
 BUS, VEHICLE, RATE_HZ = "socketcan:can0", "modcube", 100
 """Of one module, where the command line does not say."""
 
@@ -186,9 +190,10 @@ def main() -> None:
     except (DescriptionError, PortError) as error:
         status = _refuse(f"modcube: {error}")
     except OSError as error:
-        if error.filename is None:  # no file or folder of the user's is to blame
+        if error.filename is None and error.errno not in disk.FAILURES:  # no file, folder or disk of the user's is to blame
             raise
-        status = _refuse(f"modcube: {error.filename}: {error.strerror}")
+        place = f"{error.filename}: " if error.filename else ""
+        status = _refuse(f"modcube: {place}{REASONS.get(error.errno or 0, error.strerror)}")
     sys.exit(status or 0)
 
 

@@ -17,6 +17,7 @@ from firmware_py.bus.port import Port, open_port
 from firmware_py.core.types import Outputs
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters
+from firmware_py.runtime.disk import writing_to
 from firmware_py.runtime.realtime import quiet_garbage
 from firmware_py.runtime.recorder import Recorder
 from hil.dock_script import DockScript
@@ -132,13 +133,16 @@ def fly_scenario(
     rate_hz: int = 100,
     progress: Callable[[float], None] | None = None,
 ) -> float:
-    """Flies `scenario` and leaves the logs in `out`; returns the wall time of the flight, s."""
-    with ExitStack() as stack:
+    """Flies `scenario` and leaves the logs in `out`; returns the wall time of the flight, s. Raises OSError where the disk is full."""
+    with writing_to(out), ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, parameters, bus, rate_hz)
         recorder = Recorder(out, configuration_of(bench.firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz))
         stack.callback(recorder.close)
         thrusters = tuple(len(v.thruster) for v in bench.nodes.world.vehicles)
         truth = stack.enter_context(TruthRecorder(out, thrusters))
-        return bench.fly([recording(recorder, rate_hz)], progress, truth)
+        wall_s = bench.fly([recording(recorder, rate_hz)], progress, truth)
+        recorder.close()
+        recorder.check()
+        return wall_s
 
 

@@ -26,6 +26,7 @@ from typing import Any
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.runtime.disk import writing_to
 from hil.campaign_summary import Trial, summarise, table_of
 from hil.checks import Result
 from hil.docking_metrics import OUTCOMES
@@ -103,19 +104,21 @@ def run_campaign(
 ) -> dict[str, Any]:
     """Flies every seed that `out` does not hold yet; writes campaign.json and trials.csv there; returns what the first holds.
 
-    Raises DescriptionError where `out` holds another campaign, which `anew` throws away; and for seeds that kill their workers.
+    Raises DescriptionError where `out` holds another campaign, which `anew` throws away, and for seeds that kill their workers; OSError
+    where the disk takes no more.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with TrialFile(out / TRIALS_FILE, identity(scenario, parameters), anew=anew) as file:
-        missing = [seed for seed in seeds if seed not in file.trials]
-        for trial in _flown(scenario, parameters, missing, pool):
-            file.add(trial)
-            if progress is not None:
-                progress(sum(seed in file.trials for seed in seeds), len(seeds))
-        trials = [file.trials[seed] for seed in sorted(seeds)]
-    summary = summarise(scenario.name, trials)
-    (out / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    (out / TABLE_FILE).write_text(table_of(trials), encoding="utf-8")
+    with writing_to(out):
+        with TrialFile(out / TRIALS_FILE, identity(scenario, parameters), anew=anew) as file:
+            missing = [seed for seed in seeds if seed not in file.trials]
+            for trial in _flown(scenario, parameters, missing, pool):
+                file.add(trial)
+                if progress is not None:
+                    progress(sum(seed in file.trials for seed in seeds), len(seeds))
+            trials = [file.trials[seed] for seed in sorted(seeds)]
+        summary = summarise(scenario.name, trials)
+        (out / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        (out / TABLE_FILE).write_text(table_of(trials), encoding="utf-8")
     return summary
 
 

@@ -28,6 +28,7 @@ class TrialFile:
 
         Raises:
             DescriptionError: `path` is being written, or holds trials of another owner.
+            OSError: it cannot be written.
         """
         self.trials: dict[int, Trial] = {}
         self._key = key
@@ -36,9 +37,9 @@ class TrialFile:
             self._claim(path)
             stands = self._read(path, {"campaign": owner}, "" if anew else who)
             self._file.truncate(stands)
+            if not stands:
+                self._write({"campaign": owner})
             refused.pop_all()
-        if not stands:
-            self._write({"campaign": owner})
 
     def _claim(self, path: Path) -> None:
         """The file is this one's until it is closed."""

@@ -158,6 +158,12 @@ class Recorder:
         self._writer.flush()
         return self._failure()
 
+    def check(self) -> None:
+        """For whoever needs the log: raises the OSError of a file that has failed."""
+        for file in (self._can, self._mcap):
+            if file.error is not None:
+                raise file.error
+
     def _failure(self) -> list[Event]:
         """A warning where a file has failed, once."""
         failed = next((file for file in (self._can, self._mcap) if file.error is not None), None)

@@ -1,13 +1,23 @@
 """The command line refuses what is wrong in one line on stderr, with status 2, and says what would be right."""
 
+import errno
+import os
+import sys
+import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 import hil.bench
 import hil.campaign
+from firmware_py.__main__ import INTERRUPTED
+from firmware_py.__main__ import main as main_from_the_start
 from firmware_py.cli import main
+from firmware_py.runtime.guarded_file import GuardedFile
 from hil.scenario import scenario_names
+from hil.signals import TruthRecorder
+from hil.trial_file import TrialFile
 
 SPIRAL = (Path(hil.bench.__file__).parent / "scenarios" / "spiral.toml").read_text(encoding="utf-8")
 
@@ -146,6 +156,61 @@ def test_folder_that_cannot_be_made_is_refused(
     file = tmp_path / "taken"
     file.touch()
     assert str(file) in refusal(["hil", "run", "hover", "--out", str(file / "run")], monkeypatch, capsys)
+
+
+def test_folder_that_is_a_file_is_refused_with_what_is_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "README.md"
+    file.touch()
+    line = refusal(["hil", "run", "hover", "--out", str(file)], monkeypatch, capsys)
+    assert line == f"modcube: {file}: is a file; a folder is needed"
+
+
+def find_the_disk_full(*_: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize(
+    ("command", "writer", "write"),
+    [("run", TruthRecorder, "record_world"), ("run", GuardedFile, "_append"), ("campaign", TrialFile, "_write")],
+)
+def test_full_disk_ends_the_bench_in_one_line_with_the_folder(
+    command: str, writer: type, write: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The firmware's own log fails in silence, for a vehicle flies on without it; a bench has no use for such a flight."""
+    if writer is GuardedFile:
+        monkeypatch.setattr(hil.bench.Bench, "fly", lambda *_: 1.0)
+    monkeypatch.setattr(writer, write, find_the_disk_full)
+    line = refusal(["hil", command, "hover", "--out", str(tmp_path)], monkeypatch, capsys)
+    assert line == f"modcube: {tmp_path}: No space left on device"
+
+
+def test_full_disk_is_told_in_one_line_where_nobody_knows_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(hil.campaign, "run_campaign", find_the_disk_full)
+    line = refusal(["hil", "campaign", "hover", "--out", str(tmp_path)], monkeypatch, capsys)
+    assert line == "modcube: No space left on device"
+
+
+def test_interrupt_during_the_imports_is_silent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those of the command line itself, of which `modcube` knows nothing yet when it starts."""
+
+    class Interrupted(ModuleType):
+        def __getattr__(self, name: str) -> object:
+            raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "firmware_py.cli", Interrupted("firmware_py.cli"))
+    with pytest.raises(SystemExit) as ended:
+        main_from_the_start()
+    assert ended.value.code == INTERRUPTED
+    assert capsys.readouterr() == ("", "")
+
+
+def test_installed_command_is_the_one_that_bears_an_interrupt() -> None:
+    project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["scripts"] == {"modcube": f"{main_from_the_start.__module__}:main"}
 
 
 def test_list_names_every_scenario_with_one_line_of_help(
