@@ -14,7 +14,7 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, quantity, read_toml
-from firmware_py.description.vehicle import FACE_NAMES, Vehicle, load_vehicle
+from firmware_py.description.vehicle import FACE_NAMES, Vehicle, check_vehicles, load_vehicle
 from hil.plant.build import nominal_centre
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream
@@ -313,6 +313,7 @@ def load_scenario(name: str) -> Scenario:
     scenario: Scenario = build(Scenario, table, source)
     if (mistake := next(mistakes(scenario), None)) is not None:
         raise source.error(*mistake)
+    check_vehicles((module.vehicle for module in scenario.module), source)
     return _with_file_text(scenario, path.parent, source)
 
 

@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
+from firmware_py.description.vehicle import check_vehicles
 
 _Item = TypeVar("_Item")
 
@@ -66,6 +67,7 @@ def load_fleet(path: Path) -> Fleet:
     if "buses" not in table:
         raise source.error(("buses",), 'missing key; it needs the bus of each index, such as ["socketcan:can0"]')
     fleet: Fleet = build(Fleet, table, source)
+    check_vehicles((module.vehicle for module in fleet.module), source)
     return fleet
 
 

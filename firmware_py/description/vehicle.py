@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
-from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, quantity, read_toml
 
 FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Faces A..F of the bus, in order; also the tag ids of tags that sit on a face."""
@@ -228,6 +229,16 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
         hull = dataclasses.replace(vehicle.hull, mesh=str(path.parent / vehicle.hull.mesh))
         vehicle = dataclasses.replace(vehicle, hull=hull)
     return vehicle
+
+
+def check_vehicles(names: Iterable[str], source: Source) -> None:
+    """Loads the vehicles of the [[module]] tables in `source`. Raises DescriptionError, which names the line of one that is none."""
+    names = list(names)
+    for name in dict.fromkeys(names):
+        try:
+            load_vehicle(name)
+        except DescriptionError as error:
+            raise source.error(("module", names.index(name), "vehicle"), str(error)) from None
 
 
 def flu_to_frd(vectors: np.ndarray) -> np.ndarray:

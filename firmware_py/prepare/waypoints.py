@@ -147,7 +147,7 @@ def _waypoint(row: dict[str, str], place: str) -> WaypointTable:
             table[key] = [_number(row[n], n, place) for n in present]
     if (row.get("duration_s") or "").strip():
         table["duration_s"] = _number(row["duration_s"], "duration_s", place)
-    table["stop"] = bool(_number(row.get("stop") or "0", "stop", place))
+    table["stop"] = _truth(row.get("stop") or "0", "stop", place)
     waypoint: WaypointTable = build(WaypointTable, table, Source(place, ""))
     return waypoint
 
@@ -157,3 +157,10 @@ def _number(text: str, name: str, place: str) -> float:
         return float(text)
     except ValueError:
         raise DescriptionError(f"{place}: {name}: {text.strip()!r} is not a number") from None
+
+
+def _truth(text: str, name: str, place: str) -> bool:
+    value = _number(text, name, place)
+    if value not in (0.0, 1.0):
+        raise DescriptionError(f"{place}: {name}: {text.strip()} is neither 0 nor 1")
+    return bool(value)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from firmware_py.description.schema import SHOWN_CHARACTERS, DescriptionError
-from firmware_py.description.signals import Layout, LogMessage, TextLayout, is_closed, read_attachment, read_messages
+from firmware_py.description.signals import MCAP_MAGIC, Layout, LogMessage, TextLayout, is_closed, read_attachment, read_messages
 from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG, candump_stamp
 from firmware_py.runtime.tick_messages import REQUESTS, TICK_SIGNALS, TICKS, TIMES
 
@@ -76,9 +76,12 @@ class FlightLog:
     def __init__(self, folder: Path) -> None:
         """Raises LogError when there is no log, and OSError when it cannot be read."""
         self.folder = folder
+        if folder.is_file():
+            raise LogError(f"{folder}: is a file; give the folder that a run left, here {folder.parent}")
         for name in (CAN_LOG, SIGNAL_LOG):
             if not (folder / name).is_file():
                 raise LogError(f"{folder}: no {name} there; give the folder that a run left")
+        _check_mcap(folder / SIGNAL_LOG)
         text = read_attachment(folder / SIGNAL_LOG, CONFIGURATION)
         self.configuration: dict[str, Any] | None = self._configuration(text) if text is not None else None
         self.torn = "" if is_closed(folder / SIGNAL_LOG) else f"{SIGNAL_LOG} was not closed"
@@ -104,14 +107,17 @@ class FlightLog:
                 self.torn = self.torn or f"{CAN_LOG} ends before tick {logged.tick}"
                 return
             if group.stamp != candump_stamp(logged.time_ns):
-                raise LogError(f"{self.folder}: {CAN_LOG} has frames of {shown(group.stamp)} where {SIGNAL_LOG} has tick {logged.tick}")
-            _sort_lines(group.lines, logged)
+                here = f"{self.folder / CAN_LOG}:{group.first}"
+                raise LogError(f"{here}: frames of {shown(group.stamp)} where {SIGNAL_LOG} has tick {logged.tick}")
+            self._sort_lines(group, logged)
             wanted, came = _received_frames(logged), len(logged.received)
             if group.is_last and (self.torn or came != wanted or next(thoughts, None) is not None):
                 self.torn = self.torn or f"{CAN_LOG} ends with tick {logged.tick}"
                 return
             if came != wanted:
-                raise LogError(f"{self.folder}: {CAN_LOG} has {came} frames for tick {logged.tick}, which took {wanted}")
+                after = next(groups)
+                here = f"{self.folder / CAN_LOG}:{after.first}"
+                raise LogError(f"{here}: {shown(after.lines[0])} after {came} frames for tick {logged.tick}, which took {wanted}")
             yield logged
         if next(groups, None) is not None:
             self.torn = self.torn or f"{SIGNAL_LOG} ends before {CAN_LOG}"
@@ -145,12 +151,26 @@ class FlightLog:
         """The lines of can.log tick by tick; half a line at the end is left out."""
         with (self.folder / CAN_LOG).open(encoding="ascii", errors="replace") as file:
             before: _Group | None = None
+            first = 1
             for stamp, lines in groupby((line for line in file if line.endswith("\n")), key=_stamp):
                 if before is not None:
                     yield before
-                before = _Group(stamp, list(lines), False)
+                    first += len(before.lines)
+                before = _Group(stamp, list(lines), False, first)
             if before is not None:
                 yield before._replace(is_last=True)
+
+    def _sort_lines(self, group: _Group, logged: LoggedTick) -> None:
+        """Puts the frames of one tick where they belong. Raises LogError."""
+        for number, line in enumerate(group.lines, group.first):
+            if line.endswith(" T\n"):
+                logged.sent.append(line)
+                continue
+            try:
+                logged.received.append(frame_of(line))
+            except ValueError:
+                what = f"{shown(line)} is no frame as `candump -L -x` writes it"
+                raise LogError(f"{self.folder / CAN_LOG}:{number}: {what}") from None
 
 
 class _Group(NamedTuple):
@@ -159,6 +179,8 @@ class _Group(NamedTuple):
     stamp: str
     lines: list[str]
     is_last: bool
+    first: int
+    """Number of its first line in the file, from 1 on."""
 
 
 _TICK = Layout("Tick", TICK_SIGNALS)
@@ -173,13 +195,9 @@ def _stamp(line: str) -> str:
     return line.partition(" ")[0]
 
 
-def _sort_lines(lines: list[str], logged: LoggedTick) -> None:
-    """Puts the frames of one tick where they belong. Raises LogError."""
-    for line in lines:
-        if line.endswith(" T\n"):
-            logged.sent.append(line)
-            continue
-        try:
-            logged.received.append(frame_of(line))
-        except ValueError:
-            raise LogError(f"{CAN_LOG}: {shown(line)} is no frame as `candump -L -x` writes it") from None
+def _check_mcap(path: Path) -> None:
+    """Raises LogError where a file does not begin as every MCAP log does, a torn one too."""
+    with path.open("rb") as file:
+        begins = file.read(len(MCAP_MAGIC))
+    if begins != MCAP_MAGIC:
+        raise LogError(f"{path}: {'is no MCAP log' if begins else 'is empty'}, so nothing can be read of the flight")

@@ -136,7 +136,7 @@ def test_log_that_does_not_say_what_flew_is_refused(tmp_path: Path) -> None:
 def test_logs_of_two_flights_are_not_taken_for_one(log: Path) -> None:
     lines = (log / CAN_LOG).read_text().splitlines(True)
     (log / CAN_LOG).write_text("".join(lines[100:]))
-    with pytest.raises(DescriptionError, match=r"can\.log has frames of '\(.*\)' where signals\.mcap has tick 1$"):
+    with pytest.raises(DescriptionError, match=r"can\.log:1: frames of '\(.*\)' where signals\.mcap has tick 1$"):
         replay(log)
 
 
@@ -167,8 +167,8 @@ def test_binary_can_log_is_refused_in_a_short_line_of_plain_characters(log: Path
     for read in (replay, recover):
         with pytest.raises(LogError) as refused:
             read(log)
-        line = str(refused.value).removeprefix(str(log))
-        assert line.startswith(": can.log has frames of ")
+        line = str(refused.value).removeprefix(f"{log}/")
+        assert line.startswith("can.log:1: frames of ")
         assert line.endswith("... where signals.mcap has tick 1")
         assert line.isascii()
         assert line.isprintable()
@@ -179,10 +179,10 @@ def test_line_that_is_no_frame_is_named_in_short(log: Path) -> None:
     head, _, rest = (log / CAN_LOG).read_text().partition("\n")
     stamp = head.partition(" ")[0]
     (log / CAN_LOG).write_bytes(f"{stamp} {NOISE} R\n{rest}".encode())
-    with pytest.raises(LogError, match=r"is no frame as `candump -L -x` writes it$") as refused:
+    with pytest.raises(LogError, match=r"can\.log:1: .*is no frame as `candump -L -x` writes it$") as refused:
         replay(log)
     assert str(refused.value).isprintable()
-    assert len(str(refused.value)) < 150
+    assert len(str(refused.value).removeprefix(str(log))) < 150
 
 
 @pytest.mark.parametrize("frame", ["FFFFFFFF#00", "-101#00", f"101#{'00' * 65}"])
@@ -192,8 +192,29 @@ def test_frame_that_no_bus_carries_is_named(log: Path, frame: str) -> None:
     at = next(i for i, line in enumerate(lines) if f" {GYRO}#" in line)
     lines[at] = f"{lines[at].partition(' ')[0]} can0 {frame} R\n"
     (log / CAN_LOG).write_text("".join(lines))
-    with pytest.raises(LogError, match=r"is no frame as `candump -L -x` writes it$"):
+    with pytest.raises(LogError, match=rf"can\.log:{at + 1}: .*is no frame as `candump -L -x` writes it$"):
         replay(log)
+
+
+def test_line_between_those_of_one_tick_is_named_by_its_number(log: Path) -> None:
+    lines = (log / CAN_LOG).read_text().splitlines(True)
+    at = next(i for i, line in enumerate(lines[499:], 499) if f" {GYRO}#" in line)
+    (log / CAN_LOG).write_text("".join([*lines[:at], "garbage\n", *lines[at:]]))
+    with pytest.raises(LogError, match=rf"/can\.log:{at + 1}: 'garbage' after \d+ frames for tick \d+, which took \d+$"):
+        replay(log)
+
+
+@pytest.mark.parametrize(("data", "what"), [(b"", "is empty"), (bytes(range(256)), "is no MCAP log")])
+def test_signal_log_that_is_none_is_refused_as_such(log: Path, data: bytes, what: str) -> None:
+    (log / SIGNAL_LOG).write_bytes(data)
+    with pytest.raises(LogError, match=f"{SIGNAL_LOG}: {what}, so nothing can be read of the flight$"):
+        replay(log)
+
+
+def test_file_of_a_log_is_refused_with_its_folder(log: Path) -> None:
+    with pytest.raises(LogError) as refused:
+        replay(log / CAN_LOG)
+    assert str(refused.value) == f"{log / CAN_LOG}: is a file; give the folder that a run left, here {log}"
 
 
 def test_sent_line_that_is_no_frame_differs_in_short(log: Path) -> None:

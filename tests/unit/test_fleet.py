@@ -110,7 +110,10 @@ def test_fleet_file_that_names_no_bus_is_refused(tmp_path: Path) -> None:
             APART.replace('["virtual:a"]', '["virtual:a", "virtual:b"]').replace("number = 9", "number = 7\nbus = 1"),
             r"fleet\.toml: no docked face joins module 7 on virtual:b to module 7 on virtual:a$",
         ),
-        ('buses = ["virtual:a"]\n[[module]]\nnumber = 7\nvehicle = "yacht"\n', r"fleet\.toml: vehicle 'yacht'"),
+        (
+            'buses = ["virtual:a"]\n[[module]]\nnumber = 7\n[[module]]\nnumber = 8\nvehicle = "yacht"\n',
+            r"fleet\.toml:6: module\[1\]\.vehicle: vehicle 'yacht' is unknown; there are .*modcube",
+        ),
     ],
 )
 def test_modules_that_cannot_be_docked_so_are_refused_by_file_and_number(tmp_path: Path, text: str, words: str) -> None:
