@@ -31,6 +31,7 @@ from accept_measures import (
 )
 from accept_safety import SAFETY
 from accept_tuning import TUNING
+from argument_types import run_command
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -40,6 +41,7 @@ from hil.checks import limit_text
 OUT = Path("accept.json")
 RUNS = Path("runs") / "accept"
 MM, DEG = 1e3, 57.29577951308232
+app = typer.Typer(add_completion=False)
 ON_TIME = ("alone", "beside four busy loops", "200 Hz", "200 Hz beside four busy loops")
 
 
@@ -95,6 +97,7 @@ def print_outcomes(entries: Sequence[Mapping[str, Any]]) -> None:
     Console(width=None if sys.stdout.isatty() else 120).print(table)
 
 
+@app.command()
 def main(
     only: Annotated[list[str] | None, typer.Option(help="group to measure; may be given again")] = None,
     out: Annotated[Path, typer.Option(help="where the entries go")] = OUT,
@@ -318,4 +321,4 @@ GROUPS: tuple[Group, ...] = (
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(app, "accept")

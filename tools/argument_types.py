@@ -1,10 +1,18 @@
-"""For the command lines of the tools: numbers that argparse takes, each refused in one line."""
+"""For the command lines of the tools: what they take, and where their results go, each refused in one line."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
+
+import typer
+from typer.exceptions import TyperException
+
+from firmware_py.description.schema import DescriptionError
 
 
 def whole(least: int) -> Callable[[str], int]:
@@ -27,3 +35,35 @@ def positive(text: str) -> float:
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text!r} is not a number above zero")
     return value
+
+
+def run_command(app: typer.Typer, name: str) -> None:
+    """Runs the tool called `name`; wrong arguments end in one line on stderr and status 2."""
+    try:
+        status = app(prog_name=name, standalone_mode=False)
+    except TyperException as error:
+        print(f"{name}: {' '.join(error.format_message().split())}", file=sys.stderr)
+        status = 2
+    sys.exit(status or 0)
+
+
+def make_folder(out: Path) -> None:
+    """Makes the folder of a tool's results and tries that it takes a file, before the minutes of the work. Raises DescriptionError."""
+    _try_folder(out, out)
+
+
+def make_room(out: Path) -> None:
+    """The same for the folder of one file. Raises DescriptionError."""
+    if out.is_dir():
+        raise DescriptionError(f"--out {out}: is a folder; a file is needed")
+    _try_folder(out.parent, out)
+
+
+def _try_folder(folder: Path, out: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except FileExistsError:
+        raise DescriptionError(f"--out {out}: {folder} is a file; a folder is needed") from None
+    except OSError as error:
+        raise DescriptionError(f"--out {out}: cannot be written: {error.strerror}") from None

@@ -15,6 +15,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from argument_types import make_room, run_command
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -163,16 +164,6 @@ def draw(path: Path, tables: dict[str, DragTable]) -> None:
     plt.close(figure)
 
 
-def make_room(path: Path) -> None:
-    """Makes the picture's folder, before the minutes that its contents may take. Raises DescriptionError."""
-    if path.is_dir():
-        raise DescriptionError(f"--out {path}: is a folder; a file is needed")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DescriptionError(f"--out {path}: cannot be written: {error.strerror}") from None
-
-
 @app.command()
 def main(
     vehicle: Annotated[str, typer.Option(help="vehicle name or file")] = "modcube",
@@ -210,4 +201,4 @@ def main(
 
 
 if __name__ == "__main__":
-    app()
+    run_command(app, "build_drag_table")

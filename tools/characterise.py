@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 import characterise_blas  # noqa: F401
 import characterise_table as table
 import numpy as np
-from argument_types import positive, whole
+from argument_types import make_folder, positive, whole
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -91,6 +91,8 @@ def arguments() -> argparse.Namespace:
 
 def run(given: argparse.Namespace) -> None:
     """Does what is asked for. Raises DescriptionError."""
+    if given.out:
+        make_folder(given.out)
     settings = {"count": given.directions, "sizes": {"force": given.force, "torque": given.torque}}
     if given.choose is not None:
         from characterise_choose import choose

@@ -19,6 +19,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from argument_types import make_folder
 from identify_excitation import MOTIONS, SPACE_M, check_space, excitation
 from identify_fit import Reference, fit
 from identify_log import Recording, read_recording
@@ -111,6 +112,7 @@ def identify(given: argparse.Namespace) -> int:
         raise DescriptionError(f"vehicle {vehicle.name}: its drag is published damping; only cd_face and cd_edge can be fitted")
     curve = read_curve(given.curve) if given.curve else vehicle.curve
     reference = reference_of(recordings[0], given.thruster, given.accuracy) if given.curve else None
+    make_folder(given.out)
     flights = [Equations(recording, smooth(recording), curve, weight) for recording in recordings]
     if weight is not None:
         check_hung(weight, flights[0])
@@ -118,7 +120,6 @@ def identify(given: argparse.Namespace) -> int:
     found, logs = findings(result, vehicle), ", ".join(given.logs)
     print_findings(found)
     wanted = missing(found)
-    given.out.mkdir(parents=True, exist_ok=True)
     report = {"logs": given.logs, "has_reference": result.has_scale, "residual": result.residual.tolist(), "missing": wanted}
     report["found"] = [each._asdict() for each in found]
     (given.out / "identified.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")

@@ -17,7 +17,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from argument_types import positive, whole
+from argument_types import make_folder, positive, whole
 from fit_thruster import fit_curve
 from identify_excitation import MOTIONS, excitation
 from identify_fit import Reference, fit
@@ -119,6 +119,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/plants"), help="for logs and plants.json")
     given = parser.parse_args()
     try:
+        make_folder(given.out)
         found = examine_all(range(given.seed, given.seed + given.plants), given.jobs, given.out, given.seconds)
     except (DescriptionError, OSError) as error:
         print(f"identify_plants: {error}", file=sys.stderr)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from argument_types import whole
+from argument_types import make_folder, whole
 from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure
 from rich import box
 from rich.console import Console
@@ -143,7 +143,7 @@ def main() -> int:
     try:
         load_vehicle(given.vehicle)
         chosen = CONTROLLERS.get(given.controller) or load_parameters(Path(given.controller))
-        given.out.mkdir(parents=True, exist_ok=True)
+        make_folder(given.out)
         found = measured(given.modules, chosen, given.vehicle, given.jobs)
     except (DescriptionError, OSError) as error:
         print(f"margins: {error}", file=sys.stderr)

@@ -21,7 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from argument_types import positive, whole
+from argument_types import make_folder, positive, whole
 from tune_objective import Objective, detuned, load_objective, with_values
 
 from firmware_py.description.parameters import Parameters, load_parameters
@@ -132,7 +132,7 @@ def main() -> int:
         start = load_parameters(given.start) if given.start else Parameters()
         if given.detune is not None:
             start = detuned(objective, start, DETUNED, given.detune)
-        given.out.mkdir(parents=True, exist_ok=True)
+        make_folder(given.out)
         if given.live:
             from tune_live import tune_live
 

@@ -1,6 +1,7 @@
 """The tools' command lines: --help says what they do and does nothing, and wrong arguments end with status 2 and no traceback."""
 
 import importlib
+import runpy
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,7 +26,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
     def run_it(tool: str, *arguments: str) -> int:
         monkeypatch.setattr("sys.argv", [tool, *arguments])
         module = importlib.import_module(tool)
-        for name in ("batch_entries", "ProcessPoolExecutor"):
+        for name in ("batch_entries", "ProcessPoolExecutor", "processes"):
             monkeypatch.setattr(module, name, begins, raising=False)
         try:
             return int(module.main() or 0)
@@ -61,6 +62,46 @@ def test_wrong_arguments_are_refused(
 ) -> None:
     assert run(tool, *arguments) == 2
     assert refusal in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "refusal"),
+    [
+        ("build_drag_table", ["--foo"], "build_drag_table: No such option: --foo"),
+        ("build_drag_table", ["--directions", "one"], "build_drag_table: Invalid value for '--directions': Input should be a valid integer"),
+        ("accept", ["--only", "nosuch"], "accept: Invalid value: nosuch: unknown; there are hover, spiral, "),
+    ],
+)
+def test_tool_of_typer_refuses_wrong_arguments_in_one_line_too(
+    run: Run, tool: str, arguments: list[str], refusal: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", [tool, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(TOOLS / f"{tool}.py"), run_name="__main__")
+    line = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert line.startswith(refusal)
+    assert line.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments"),
+    [
+        ("margins", []),
+        ("identify_plants", []),
+        ("characterise", ["modcube"]),
+        ("tune_gains", [str(TOOLS / "objectives" / "hover.toml")]),
+    ],
+)
+@pytest.mark.parametrize(("out", "why"), [("/proc/self", "cannot be written: "), ("taken", "taken is a file; a folder is needed")])
+def test_folder_that_takes_no_file_is_refused_before_the_work_begins(
+    run: Run, tool: str, arguments: list[str], out: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "taken").touch()
+    assert run(tool, *arguments, "--out", out) == 2
+    line = capsys.readouterr().err
+    assert f"--out {out}: {why}" in line
+    assert line.count("\n") == 1
 
 
 def test_tables_of_the_readme_need_the_project_s_root(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
