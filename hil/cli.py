@@ -53,7 +53,7 @@ def check_reaches_others(bus: str, who: str, kinds: tuple[str, ...] = ("virtual:
 def run(
     scenario: ScenarioName,
     seed: Annotated[int, typer.Option(min=0, help="of the world's every draw")] = 0,
-    bus: Annotated[str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE")] = DEFAULT_BUS,
+    bus: Annotated[str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")] = DEFAULT_BUS,
     out: Annotated[Path | None, typer.Option(help="folder for logs, plots and report; those of an earlier flight go")] = None,
     controller: Controller = "modcube",
     vehicle: Vehicle = "",

@@ -19,6 +19,8 @@ MARK = "#555f6b"
 STAGES = ("pre-approach", "align", "approach", "push", "verify", "docked", "release", "back off", "aborted", "failed")
 """By the number that the log has."""
 DOCK_PLOT = "docking.png"
+TRUE_GAP = "true gap (near by, until locked)"
+"""The plant's own, which has none for modules that are far from each other, or of one body."""
 LAST_S = 0.3
 """How long the last tick of a dock is drawn."""
 
@@ -79,7 +81,7 @@ def _gap(axes: Any, time_s: np.ndarray, rows: Columns, truth: Columns, start_ns:
     axes.plot(time_s, 1e3 * rows["lateral_m"], color=FACES[1], linewidth=1.0, label="beside the axis, by the estimates")
     true_s = 1e-9 * (truth["time_ns"] - start_ns)
     under_way = (true_s >= time_s[0]) & (true_s <= time_s[-1])
-    axes.plot(true_s[under_way], 1e3 * truth["gap_m"][under_way], color="black", linestyle=":", linewidth=1.2, label="true gap")
+    axes.plot(true_s[under_way], 1e3 * truth["gap_m"][under_way], color="black", linestyle=":", linewidth=1.2, label=TRUE_GAP)
     axes.set(ylabel="mm", title="Between the faces")
     axes.legend(loc="upper right", ncols=3, fontsize=9)
 

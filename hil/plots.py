@@ -212,11 +212,15 @@ def estimate(flight: Flight, window: Window) -> Any:
 
 
 def _innovation(axes: Any, flight: Flight) -> None:
+    title = "Tag innovation squared over its expectation"
     used = flight.firmware["nis_dof"] > 0
+    if not used.any():
+        _say_none(axes, title, "this filter tells no innovations")
+        return
     ratio = flight.firmware["nis"][used] / flight.firmware["nis_dof"][used]
     axes.plot(flight.time_s[used], ratio, ".", color=TRUTH, markersize=2.0, alpha=0.5)
     axes.axhline(1.0, color=REFERENCE, linestyle="--", linewidth=1.2)
-    axes.set_title(f"Tag innovation squared over its expectation: mean {np.mean(ratio) if len(ratio) else np.nan:.2f}")
+    axes.set_title(f"{title}: mean {np.mean(ratio):.2f}")
     axes.set(ylabel="NIS / dof")
     axes.set_ylim(bottom=0.0)
 
@@ -263,12 +267,21 @@ def disturbance(flight: Flight, window: Window) -> Any:
         (flight.truth["water_w"], "Water velocity (truth), world", "m/s"),
     )
     for i, (cell, (values, title, unit)) in enumerate(zip(cells.flat, parts, strict=True)):
+        _finish_time_axis(cell, flight, window, last=i >= 2)
+        if title.startswith("Estimated") and not values.any():
+            _say_none(cell, title, "this filter estimates no disturbance")
+            continue
         for axis, name in enumerate("xyz"):
             cell.plot(flight.time_s, values[:, axis], color=AXIS_COLOURS[axis], linewidth=1.1, label=name)
         cell.set(title=title, ylabel=unit)
-        _finish_time_axis(cell, flight, window, last=i >= 2)
-    _legends_below(figure, cells[0, :1])
+    _legends_below(figure, cells[1, :1])
     return figure
+
+
+def _say_none(axes: Any, title: str, why: str) -> None:
+    """An empty panel, and why it is empty."""
+    axes.set(title=f"{title}: none", yticks=[])
+    axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", va="center")
 
 
 def _figure(width: float, height: float) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ def draw(path: Path, found: Mapping[str, Capability], titles: Mapping[str, str])
         _row_title(figure, grid[row, 0], parts[space, frame].title, width)
     for row, frame in enumerate(UNITS, len(SPACES)):
         _violins(figure, grid, row, frame, found)
-    _legend(figure, height)
+    _legend(figure, height, [picture for parts in shown.values() for picture in parts.values() if picture.limit > 0.0])
     figure.text(0.2 / width, 0.1 / height, "\n".join(lines), fontsize=7, va="bottom")
     figure.savefig(path)
     plt.close(figure)
@@ -108,12 +108,12 @@ def _violins(figure: Any, grid: Any, row: int, frame: str, found: Mapping[str, C
         power, count = result.power[frame], result.layout.count
         axes: Any = figure.add_subplot(grid[row, column], sharey=first)
         first = first or axes
-        parts = axes.violinplot(list(power.forces.T), range(count), widths=0.85, showextrema=False, points=80)
+        parts = axes.violinplot(list(power.forces.T), range(1, count + 1), widths=0.85, showextrema=False, points=80)
         for body in parts["bodies"]:
             body.set(facecolor="#456990", alpha=0.8, edgecolor="none")
         axes.set_ylim(-limit, limit)
-        axes.set_xlim(-0.7, count - 0.3)
-        axes.set_xticks(range(0, count, 1 if count <= _MOST_MARKED else 4))
+        axes.set_xlim(0.3, count + 0.7)
+        axes.set_xticks(range(1, count + 1, 1 if count <= _MOST_MARKED else 4))
         axes.tick_params(labelsize=7)
         axes.grid(axis="y", alpha=0.3)
         if is_flat:
@@ -125,13 +125,14 @@ def _violins(figure: Any, grid: Any, row: int, frame: str, found: Mapping[str, C
             axes.set_ylabel(f"force at {power.size:g} {UNITS[frame]}\n({frame} frame), N", fontsize=8)
 
 
-def _legend(figure: Any, height: float) -> None:
+def _legend(figure: Any, height: float, drawn: Sequence[Picture]) -> None:
+    """Of the colours that there are."""
     entries = (
-        (_SURFACE["power"], "power above idle"),
-        (_SURFACE["wrench"], "reachable wrench, 8 N of thrust in all"),
-        (_DECLARED, "the same with the passive degree of freedom declared"),
-        (_ELLIPSOID, "largest inscribed ellipsoid"),
+        (_SURFACE["power"], "power above idle", any(picture.space == "power" for picture in drawn)),
+        (_SURFACE["wrench"], "reachable wrench, 8 N of thrust in all", any(p.space == "wrench" and not p.declared for p in drawn)),
+        (_DECLARED, "reachable wrench, the passive degree of freedom declared", any(picture.declared for picture in drawn)),
+        (_ELLIPSOID, "largest inscribed ellipsoid", any(picture.ellipsoid for picture in drawn)),
     )
-    handles = [plt.Rectangle((0, 0), 1, 1, color=colour, alpha=0.7) for colour, _ in entries]
-    figure.legend(handles, [text for _, text in entries], loc="upper center", ncols=2, fontsize=8, frameon=False,
+    handles = [plt.Rectangle((0, 0), 1, 1, color=colour, alpha=0.7, label=text) for colour, text, is_there in entries if is_there]
+    figure.legend(handles=handles, loc="upper center", ncols=2, fontsize=8, frameon=False,
                   bbox_to_anchor=(0.5, 1.0 - 0.05 / height))  # fmt: skip

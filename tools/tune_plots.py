@@ -104,6 +104,7 @@ def draw_search(path: Path, objective: Objective, study: optuna.Study) -> None:
         values = np.minimum([float(t.value) for t in trials], top)
         history.plot([t.number + 1 for t in trials], values, marker, color=COLOURS["start"], markersize=4, label=label)
     history.step([t.number + 1 for t in complete], best, where="post", color=COLOURS["tuned"], label="best so far")
+    history.xaxis.get_major_locator().set_params(integer=True)
     history.set(xlabel="trial", ylabel="objective", ylim=(0.0, 1.04 * top), title="search; four times the best and worse lie on top")
     history.legend(frameon=False, loc="center right")
     if len(complete) > len(objective.search):

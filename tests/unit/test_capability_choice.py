@@ -19,7 +19,7 @@ from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from firmware_py.prepare.capability import summary
 from firmware_py.prepare.capability.choice import fitness, rank
-from firmware_py.prepare.capability.layout import of_modules
+from firmware_py.prepare.capability.layout import of_modules, of_vehicle
 from firmware_py.prepare.capability.polycubes import canonical, polycubes, poses
 from firmware_py.prepare.capability.programs import reach_by_programs
 from firmware_py.prepare.capability.task import Task, load_task, required_wrench, wrenches_along
@@ -196,6 +196,22 @@ def test_space_that_rounding_left_of_none_is_called_degenerate_and_has_no_ticks(
     written = ["degenerate" in [text.get_text() for text in panel.texts] for panel in panels]
     assert written == [False, True, True, True, False, True]  # power and wrench, each by force and torque; forces for both
     assert [panel.get_yticks().size == 0 for panel in panels] == written
+
+
+def test_figure_counts_thrusters_from_one_and_its_legend_has_the_colours_that_are_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    drawing = importlib.import_module("characterise_draw")
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure))
+    layouts = {name: of_vehicle(load_vehicle(name)) for name in ("modcube", "bluerov2")}
+    found = {name: summary.characterise(layout, count=121) for name, layout in layouts.items()}
+    for names in (["modcube"], ["modcube", "bluerov2"]):
+        drawing.draw(tmp_path / "found.png", {name: found[name] for name in names}, {name: name for name in names})
+    alone, both = ([text.get_text() for text in figure.legends[0].get_texts()] for figure in drawn)
+    assert [text for text in both if text not in alone] == ["reachable wrench, the passive degree of freedom declared"]
+    assert [axes.get_xticks().tolist() for axes in drawn[0].axes if axes.get_xlabel() == "thruster"] == [list(range(1, 9))] * 2
 
 
 @pytest.mark.slow

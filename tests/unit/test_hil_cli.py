@@ -64,6 +64,12 @@ def test_flight_in_two_processes_refuses_a_bus_that_is_none_in_one_line(
     assert line.count("\n") == 1
 
 
+def test_help_names_every_bus_that_a_flight_takes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert status_of(["run", "--help"], monkeypatch) == 0
+    shown = capsys.readouterr().out
+    assert [kind for kind in ("virtual:", "udp:", "socketcan:", "slcan:") if kind not in shown] == []
+
+
 def test_plant_alone_refuses_a_bus_that_nobody_else_reaches(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     served: list[object] = []
     monkeypatch.setattr(hil.plant_process, "serve_until_signal", lambda *arguments: served.append(arguments))

@@ -1,6 +1,7 @@
 """What a run leaves for people: plots, a report that opens without a network, and the table in the terminal."""
 
 import base64
+import dataclasses
 import io
 import json
 import math
@@ -17,7 +18,7 @@ from firmware_py.description.vehicle import load_vehicle
 from hil.checks import Limit, Result, judge
 from hil.console import flight_progress, print_result
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown_limit, shown_value
-from hil.plots import STYLE, Window, overview, thrusters, write_plots
+from hil.plots import STYLE, Window, disturbance, estimate, overview, thrusters, write_plots
 from hil.report import CAPTIONS, Scene, animation, write_report
 from hil.signals import Flight, read_flight
 from tests.unit.flights import START_NS, write_flight, write_pair
@@ -64,6 +65,27 @@ def test_every_plot_is_written_and_has_a_caption(flight: Flight, tmp_path: Path)
     paths = write_plots(flight, tmp_path, WINDOW, TANK_M, np.array([-8.0, 10.0]), 20.92)
     assert [*(path.stem for path in paths), "docking"] == list(CAPTIONS)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
+
+
+def test_panel_says_why_it_is_empty_where_the_filter_has_nothing_to_show(flight: Flight) -> None:
+    """The paper's filter tells no innovations and estimates no disturbance."""
+    silent = {name: np.zeros_like(flight.firmware[name]) for name in ("nis", "nis_dof", "force_w", "moment_b")}
+    for draw, titles, why in (
+        (estimate, ["Tag innovation squared over its expectation: none"], "this filter tells no innovations"),
+        (
+            disturbance,
+            ["Estimated disturbance force, world: none", "Estimated disturbance moment, body: none"],
+            "this filter estimates no disturbance",
+        ),
+    ):
+        figure = draw(dataclasses.replace(flight, firmware=flight.firmware | silent), WINDOW)
+        empty = [axes for axes in figure.axes if why in [text.get_text() for text in axes.texts]]
+        assert [axes.get_title(loc="left") or axes.get_title() for axes in empty] == titles
+        assert all(not axes.get_yticks().size for axes in empty)
+        assert figure.legends[0].get_texts()
+        spoken = draw(flight, WINDOW)
+        assert not [text for axes in spoken.axes for text in axes.texts]
+        pyplot.close("all")
 
 
 def test_report_needs_no_network_and_carries_its_plots(flight: Flight, result: Result, tmp_path: Path) -> None:

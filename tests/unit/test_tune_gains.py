@@ -290,3 +290,16 @@ def test_live_address_whose_port_is_none_is_refused_in_one_line(tools: tuple[Any
 
     with pytest.raises(DescriptionError, match=f"--live mavlink:{re.escape(address)}: .* is no port, 0 to 65535; it needs an address"):
         connect(address)
+
+
+def test_trials_of_the_picture_are_whole_numbers(tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import optuna
+    import tune_plots
+
+    drawn: list[Any] = []
+    monkeypatch.setattr(tune_plots, "_save", lambda figure, path, title: drawn.append(figure))
+    study = optuna.create_study()
+    study.add_trials([optuna.trial.create_trial(value=value) for value in (3.0, 2.0, 2.5)])
+    tune_plots.draw_search(tmp_path / "search.png", objective_of(tools, tmp_path), study)
+    ticks = drawn[0].axes[0].get_xticks()
+    assert [tick for tick in ticks if tick != round(tick)] == []
