@@ -31,7 +31,7 @@ from accept_measures import (
 )
 from accept_safety import SAFETY
 from accept_tuning import TUNING
-from argument_types import run_command
+from argument_types import make_room, run_command
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -106,6 +106,7 @@ def main(
     names = [group.name for group in GROUPS]
     if unknown := set(only or ()) - set(names):
         raise typer.BadParameter(f"{', '.join(sorted(unknown))}: unknown; there are {', '.join(names)}")
+    make_room(out)
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for the processes that fly
     measured: list[Outcome] = []
     for group in GROUPS:

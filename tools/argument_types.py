@@ -38,13 +38,15 @@ def positive(text: str) -> float:
 
 
 def run_command(app: typer.Typer, name: str) -> None:
-    """Runs the tool called `name`; wrong arguments end in one line on stderr and status 2."""
+    """Runs the tool called `name`; wrong arguments, and a DescriptionError, end in one line on stderr and status 2."""
     try:
-        status = app(prog_name=name, standalone_mode=False)
+        sys.exit(app(prog_name=name, standalone_mode=False) or 0)
     except TyperException as error:
-        print(f"{name}: {' '.join(error.format_message().split())}", file=sys.stderr)
-        status = 2
-    sys.exit(status or 0)
+        line = " ".join(error.format_message().split())
+    except DescriptionError as error:
+        line = str(error)
+    print(f"{name}: {line}", file=sys.stderr)
+    sys.exit(2)
 
 
 def make_folder(out: Path) -> None:

@@ -69,6 +69,7 @@ def test_wrong_arguments_are_refused(
     [
         ("build_drag_table", ["--foo"], "build_drag_table: No such option: --foo"),
         ("build_drag_table", ["--directions", "one"], "build_drag_table: Invalid value for '--directions': Input should be"),
+        ("accept", ["--out", "/proc/self/accept.json"], "accept: --out /proc/self/accept.json: cannot be written: "),
         ("accept", ["--only", "nosuch"], "accept: Invalid value: nosuch: unknown; there are hover, spiral, "),
     ],
 )
