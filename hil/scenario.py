@@ -311,9 +311,9 @@ def load_scenario(name: str) -> Scenario:
         )
     table, source = read_toml(path)
     scenario: Scenario = build(Scenario, table, source)
+    check_vehicles((module.vehicle for module in scenario.module), source)
     if (mistake := next(mistakes(scenario), None)) is not None:
         raise source.error(*mistake)
-    check_vehicles((module.vehicle for module in scenario.module), source)
     return _with_file_text(scenario, path.parent, source)
 
 

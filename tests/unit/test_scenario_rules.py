@@ -66,6 +66,7 @@ def load(tmp_path: Path) -> Load:
         ("polycube", "", '[[fault]]\nkind = "leak"\nmodule = 3', "no module has the number 3; in every seed there are 1, 2"),
         ("hover", "[[camera]]", "[[camera]]\nmodule = 3", "camera[0].module: no module has the number 3"),
         ("hover-blind", "until_s = 17.0", "until_s = 11.0", "fault[0].until_s: 11 s is not after at_s, 12 s"),
+        ("hover-blind", 'vehicle = "modcube"', 'vehicle = "modcub"', "module[0].vehicle: vehicle 'modcub' is unknown"),
         ("hover", "high = 0.005", "", "check[0].metric: position_rmse_m has neither low nor high; every value would pass"),
         ("hover", "", '[[check]]\nmetric = "nis_mean"\nlow = 0.5', "metric: nis_mean is checked by another [[check]] already"),
         ("hover", "", "[start]\nposition_m = [0.0, 0.7, 0.0]", "start.position_m: a seed may start module 1 at [0.0, -0.7, 0.38] m"),
