@@ -47,6 +47,7 @@ def sent(logs: dict[str, bytes]) -> list[bytes]:
     return [line for line in logs[CAN_LOG].splitlines() if line.endswith(b" T")]
 
 
+@pytest.mark.slow
 def test_short_spiral_over_udp_is_the_spiral_over_virtual_byte_for_byte(tmp_path: Path) -> None:
     scenario = shortened("spiral", duration_s=5.0, settle_s=2.0)
     assert fly(scenario, UDP, tmp_path / "udp") == fly(scenario, f"virtual:{tmp_path.name}", tmp_path / "virtual")
@@ -58,6 +59,7 @@ def test_whole_spiral_over_udp_is_the_spiral_over_virtual_byte_for_byte(tmp_path
     assert fly(scenario, UDP, tmp_path / "udp") == fly(scenario, f"virtual:{tmp_path.name}", tmp_path / "virtual")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["virtual", "udp"])
 def test_strangers_on_the_bus_do_not_change_what_the_robot_is_told(tmp_path: Path, kind: str) -> None:
     scenario = shortened("hover", duration_s=2.0, settle_s=2.0)

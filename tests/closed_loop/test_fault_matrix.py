@@ -49,6 +49,7 @@ def test_robot_that_tumbles_or_is_turned_over_comes_to_rest(fault: str, mode: st
     assert fly_cell(BY_NAME[fault], mode, 0).broken == ()
 
 
+@pytest.mark.slow
 def test_fail_safe_that_was_switched_off_breaks_the_promise() -> None:
     deaf = Parameters().replace("failsafes.leak_action", 0)
     assert fly_cell(BY_NAME["leak"], "POSHOLD", 0, deaf).broken == (
@@ -56,6 +57,7 @@ def test_fail_safe_that_was_switched_off_breaks_the_promise() -> None:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_promise_of_less_error_than_there_is_is_broken() -> None:
     strict = dataclasses.replace(BY_NAME["pilot silent"], error_m=1e-4)
     (words,) = fly_cell(strict, "POSHOLD", 0).broken

@@ -9,6 +9,7 @@ HOVER_S = 20.0
 SINGLE_SEED_LIMIT_M = 0.005
 
 
+@pytest.mark.slow
 def test_module_in_still_water_with_ideal_sensors_keeps_its_place_within_half_a_millimetre(fly: Fly) -> None:
     result = fly(shortened("hover", HOVER_S).with_calm_world().with_ideal_sensors())
     assert result.passed
@@ -27,6 +28,7 @@ def test_module_with_real_sensors_in_a_gusty_current_keeps_its_place_within_five
     assert result.metrics["unmatched_ticks"] == 0
 
 
+@pytest.mark.slow
 def test_estimate_of_a_hovering_module_is_as_good_as_it_says(fly: Fly) -> None:
     metrics = fly(shortened("hover", HOVER_S), 2).metrics
     assert 0.7 <= metrics["nis_mean"] <= 1.4

@@ -52,6 +52,7 @@ def fly(bench: Bench) -> tuple[list[Any], float]:
     return log, float(abs(bench.nodes.world.truth(0).v_w).max())
 
 
+@pytest.mark.slow
 def test_hover_with_the_c_node_is_the_hover_with_the_plants_own_frame_for_frame(library: CDLL) -> None:
     flights = []
     for is_c in (False, True):

@@ -44,6 +44,7 @@ def test_flight_comes_out_to_the_byte(flown: Path) -> None:
     assert outcome.seconds == pytest.approx(4.99)
 
 
+@pytest.mark.slow
 def test_killed_process_goes_on_as_another_one(fly: Fly, tmp_path: Path) -> None:
     killed = Fault(kind="process_killed", at_s=3.0, until_s=3.5)
     scenario = dataclasses.replace(shortened("hover", duration_s=2.0, settle_s=4.0), fault=(killed,))
@@ -100,6 +101,7 @@ def test_frame_that_came_otherwise_is_dropped_and_so_named(log: Path) -> None:
     assert (first.recorded, first.replayed) == ("0", "1")
 
 
+@pytest.mark.slow
 def test_tolerance_lets_pass_what_is_within_it(flown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noise = Estimator._process_noise
     monkeypatch.setattr(Estimator, "_process_noise", lambda self: noise(self) * (1.0 + 1e-9))

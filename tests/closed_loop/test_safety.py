@@ -57,10 +57,12 @@ def test_spiral_is_flown_through_thirty_percent_of_lost_frames() -> None:
     assert spiral_through_loss(0, 0.3) <= 0.008
 
 
+@pytest.mark.slow
 def test_command_ends_a_tenth_of_a_second_after_the_last_frame() -> None:
     assert 50.0 <= command_outlives_frames_ms() <= 100.0 + TICK_MS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_after_an_e_stop_nothing_turns_whatever_else_happens(seed: int) -> None:
     flight = fly_to_estop(seed)
@@ -78,6 +80,7 @@ def test_hover_without_tags_drifts_no_farther_than_it_says_and_less_with_a_quiet
     assert np.mean([flight.error_m for flight in quiet]) < 0.9 * np.mean([flight.error_m for flight in shipped])
 
 
+@pytest.mark.slow
 def test_fuzzed_frames_raise_nothing_and_command_nothing_beyond_the_limits() -> None:
     result = fuzz_flight(40_000, seed=3)
     assert result.beyond == 0

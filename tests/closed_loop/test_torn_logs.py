@@ -61,6 +61,7 @@ def tear(path: Path, share: float) -> None:
     path.write_bytes(data[: round(share * len(data))])
 
 
+@pytest.mark.slow
 def test_killed_process_leaves_a_log_that_lacks_a_second_at_the_most(tmp_path: Path) -> None:
     process = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], capture_output=True, text=True)
     assert process.returncode == -signal.SIGKILL, process.stderr
@@ -135,6 +136,7 @@ def fly_recorded(folder: Path, queued: bool = False) -> tuple[list[BusFrame], li
     return sent_all, said
 
 
+@pytest.mark.slow
 def test_full_disk_ends_the_log_and_changes_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, said = fly_recorded(tmp_path)
     assert said == []
@@ -152,6 +154,7 @@ def test_full_disk_ends_the_log_and_changes_no_command(tmp_path: Path, monkeypat
     assert 0 < len(ticks_of(tmp_path)) < TICKS
 
 
+@pytest.mark.slow
 def test_file_that_may_not_grow_ends_the_log_with_one_warning(tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
@@ -165,6 +168,7 @@ def test_file_that_may_not_grow_ends_the_log_with_one_warning(tmp_path: Path) ->
     assert 0 < len(ticks_of(tmp_path)) < TICKS
 
 
+@pytest.mark.slow
 def test_disk_that_stalls_holds_up_no_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, _ = fly_recorded(tmp_path)
     monkeypatch.setattr(guarded_file, "MOST_WAITING_BYTES", 50_000)

@@ -193,6 +193,7 @@ def tuned(live: Any, robot: Robot, tmp_path: Path) -> Callable[..., int]:
     return run
 
 
+@pytest.mark.slow
 def test_step_is_taken_when_it_is_confirmed_and_goes_when_nothing_is_kept(tuned: Callable[..., int]) -> None:
     person = Scripted("n", "y", "q", "n")
     assert tuned(person) == 0
@@ -234,6 +235,7 @@ TROUBLES: dict[str, tuple[Request | BaseException, str, list[Request]]] = {
 """What happens in the middle of a step, what is said of it, and what somebody asks to make the robot hover again."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TROUBLES)
 def test_old_values_are_back_after(name: str, live: Any, robot: Robot, tuned: Callable[..., int], tmp_path: Path, capsys: Any) -> None:
     event, words, cure = TROUBLES[name]
@@ -317,6 +319,7 @@ def test_byte_that_is_no_letter_is_no_yes(live: Any) -> None:
         assert live.Typist(None, stream).answer("?") not in ("y", "q")
 
 
+@pytest.mark.slow
 def test_tuner_that_was_killed_puts_the_old_values_back_when_it_is_started_again(
     live: Any, robot: Robot, tuned: Callable[..., int], capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -328,6 +331,7 @@ def test_tuner_that_was_killed_puts_the_old_values_back_when_it_is_started_again
     assert "is of a run that did not end: its values go back first" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_vehicle_that_fell_silent_is_to_be_set_by_hand_or_by_the_next_start(robot: Robot, tuned: Callable[..., int]) -> None:
     """It was tried for a minute."""
 
@@ -342,6 +346,7 @@ def test_vehicle_that_fell_silent_is_to_be_set_by_hand_or_by_the_next_start(robo
     assert tuned(Scripted("q", "n")) == 0
 
 
+@pytest.mark.slow
 def test_vehicle_that_is_heard_again_within_a_minute_gets_its_old_values(
     live: Any, robot: Robot, tuned: Callable[..., int], tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

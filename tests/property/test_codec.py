@@ -282,6 +282,7 @@ def unit_quaternions():
     return raw.map(lambda q: np.array(q) / np.linalg.norm(q))
 
 
+@pytest.mark.slow
 @given(q=unit_quaternions())
 @MANY_EXAMPLES
 def test_tag_attitude_survives_the_wire_to_ten_milliradians(q):

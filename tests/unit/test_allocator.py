@@ -170,6 +170,7 @@ def test_clipping_bends_the_wrench_and_least_squares_does_not(single: Body) -> N
     assert bend(Allocation()) < 1e-6
 
 
+@pytest.mark.slow
 def test_sixty_four_modules_saturate_as_few_do() -> None:
     """512 thrusters: directions kept, attitude first, and the answer is stationary to the last thruster."""
     cells = list(itertools.product(range(4), repeat=3))

@@ -102,6 +102,7 @@ def test_core_opens_no_file() -> None:
     assert not refused
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ["firmware_py", "hil"])
 def test_random_numbers_come_from_seeded_generators(package: str) -> None:
     refused = []

@@ -175,6 +175,7 @@ def test_rigid_part_of_the_mass_matrix_does_not_couple_about_the_centre_of_mass(
     np.testing.assert_allclose(body.mass[:3, :3], body.rigid_mass_kg * np.eye(3), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_coriolis_forces_do_no_work_on_any_assembly(shape: str, lopsided: Vehicle) -> None:
     cells = SHAPES[shape]
@@ -222,6 +223,7 @@ def test_supply_of_each_module_is_what_its_electronics_leave(modcube: Vehicle) -
     np.testing.assert_allclose(assemble(SHAPES["2x2"], [0] * 4, [modcube] * 4).supply_power_w, 12.0 * 10.0 - 8.0)
 
 
+@pytest.mark.slow
 def test_no_corner_of_a_hull_is_farther_than_the_reach_of_the_body(modcube: Vehicle) -> None:
     half = 0.5 * modcube.hull.size_m
     for cells in SHAPES.values():
@@ -285,6 +287,7 @@ def test_body_has_1_to_64_modules(modcube: Vehicle, count: int) -> None:
         assemble([(k, 0, 0) for k in range(count)], [0] * count, [modcube] * count)
 
 
+@pytest.mark.slow
 def test_64_modules_make_one_body(modcube: Vehicle) -> None:
     cells = list(itertools.product(range(4), repeat=3))
     body = assemble(cells, [0] * 64, [modcube] * 64)

@@ -68,6 +68,7 @@ def test_people_read_what_a_metric_goes_with() -> None:
     assert "Position RMSE, truth against reference goes with: mass_factor 1.00 (" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_noise_goes_with_nothing_and_a_true_cause_is_still_named() -> None:
     rng = np.random.default_rng(0)
     named = {"noise": 0, "cause": 0}

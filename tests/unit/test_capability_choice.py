@@ -198,6 +198,7 @@ def test_space_that_rounding_left_of_none_is_called_degenerate_and_has_no_ticks(
     assert [panel.get_yticks().size == 0 for panel in panels] == written
 
 
+@pytest.mark.slow
 def test_figure_counts_thrusters_from_one_and_its_legend_has_the_colours_that_are_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,6 +28,7 @@ def test_paper_module_has_the_known_singular_values(name: str, values: list[floa
     assert np.linalg.svd(raw(name).matrix, compute_uv=False) == pytest.approx(values, abs=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "force", "torque"),
     [("A_single", 67.02, 0.1546), ("B_double_line", 536.2, 2.683), ("C_quad_2x2", 4289.0, 27.88)],
@@ -48,6 +49,7 @@ def test_volume_of_the_force_frame_grows_with_the_cube_of_the_modules() -> None:
     assert np.array(volumes) / volumes[0] == pytest.approx([1.0, 8.0, 64.0], rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SEVEN)
 def test_linear_programs_and_facets_agree_for_each_of_the_seven_robots(name: str) -> None:
     layout = one_of_seven(name)

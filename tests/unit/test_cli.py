@@ -41,6 +41,7 @@ def refusal(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytes
     return error.strip()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "wrong", "right"),
     [
@@ -172,6 +173,7 @@ def find_the_disk_full(*_: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "writer", "write"),
     [("run", TruthRecorder, "record_world"), ("run", GuardedFile, "_append"), ("campaign", TrialFile, "_write")],

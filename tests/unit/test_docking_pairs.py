@@ -206,6 +206,7 @@ def test_pictures_of_different_times_place_nobody(row: Row) -> None:
     assert not bank.status(0).position
 
 
+@pytest.mark.slow
 def test_many_pairs_are_each_as_one_alone(row: Row) -> None:
     row.noise_m, row.gaps_m = 0.002, [0.0, 0.005, 0.01]
     bank, alone = PairBank(ROW, P), [PairDetector(pair, P) for pair in ROW]
@@ -243,6 +244,7 @@ def test_joint_of_modules_that_sit_turned_is_told_in_their_own_frames(cell: tupl
         np.testing.assert_allclose(PITCH_M * rotate(body.q_bm[i].copy(), FACE_NORMALS[face].astype(float)), way_b, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_body_has_a_joint_between_every_two_neighbours() -> None:
     cells = [(x, y, z) for x in range(4) for y in range(4) for z in range(4)]
     joints = joints_of(assemble(cells, [0] * 64, [load_vehicle("modcube")] * 64))

@@ -82,6 +82,7 @@ def test_dock_that_is_aborted_at_once_moves_nobody() -> None:
 # ---------------------------------------------------------------- the way to the stand-off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("start", "is_free"),
     [
@@ -241,6 +242,7 @@ def test_alignment_must_be_good_for_a_whole_second_in_place_and_attitude(sideway
     assert dock.sequence.stage == Stage.APPROACH
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(60))
 def test_module_that_comes_too_near_on_the_way_is_found_however_both_bodies_are_turned(seed: int) -> None:
     """Against the way as scipy has it: straight, and turning evenly."""
@@ -290,6 +292,7 @@ def test_approach_waits_for_a_body_that_is_off_the_cone(sideways_m: float, turne
         assert before - dock.sequence._gap_m == pytest.approx(0.5 * STAGED.speed_m_s, abs=0.001)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("condition", "words"), [("current", "current alone"), ("position", "position alone"), (None, "neither condition")]
 )

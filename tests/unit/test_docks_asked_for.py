@@ -29,6 +29,7 @@ def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
     assert outputs.records[0].mode == Mode.POSHOLD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", ["e-stop", "DISARM"])
 def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str) -> None:
     tank = Docked(RING[:2], apart=True)
@@ -54,6 +55,7 @@ def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str
     assert np.linalg.norm(tank.states[1][:3] - before) < 0.02
 
 
+@pytest.mark.slow
 def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
     tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], Parameters().replace("docking.push_m", 0.0), apart=True)
     for state, side in zip(tank.states, (0.0, PITCH_M, -PITCH_M), strict=True):
@@ -87,6 +89,7 @@ def before_each_other(y_m: float, parameters: Parameters | None = None, armed: t
     return tank
 
 
+@pytest.mark.slow
 def test_dock_from_afar_glides_to_the_stand_off_and_keeps_it() -> None:
     tank, near, fastest = before_each_other(2.0), [], []
     first = len(tank.outputs)
@@ -133,6 +136,7 @@ def test_body_whose_dock_is_over_may_dock_again() -> None:
     assert len(outputs.docks) == 1 and outputs.records[1].mode == Mode.DOCK
 
 
+@pytest.mark.slow
 def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> None:
     tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], apart=True)
     tank.weak = {0, 1, 2}
@@ -162,6 +166,7 @@ def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_ho
     assert tank.pipeline.formation.docking.relays == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
 
 
+@pytest.mark.slow
 def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> None:
     tank = Docked(RING)
     tank.fly()
@@ -174,6 +179,7 @@ def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> 
     assert [max(states) for states in tank.pipeline.formation.docking.relays] == [1, 1, 1, 0]
 
 
+@pytest.mark.slow
 def test_dock_that_is_asked_for_again_while_it_ends_begins_anew() -> None:
     tank, wanted = before_each_other(0.6), Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
     tank.run(0.1, wanted)
@@ -186,6 +192,7 @@ def test_dock_that_is_asked_for_again_while_it_ends_begins_anew() -> None:
     assert [dock.stage for dock in outputs.docks] == [Stage.PRE_APPROACH] and outputs.records[1].mode == Mode.DOCK
 
 
+@pytest.mark.slow
 def test_dock_that_is_refused_leaves_the_one_under_way_alone() -> None:
     tank = before_each_other(0.6)
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
@@ -194,6 +201,7 @@ def test_dock_that_is_refused_leaves_the_one_under_way_alone() -> None:
     assert [(dock.face_a, dock.face_b) for dock in outputs.docks] == [(2, 3)] and outputs.records[1].mode == Mode.DOCK
 
 
+@pytest.mark.slow
 def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
     tank = before_each_other(2.0)
     for turns in (0, 1, 0, 1):
@@ -203,6 +211,7 @@ def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
     assert 0.6 < goal.p_wb[1] < 0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m) + 0.01
 
 
+@pytest.mark.slow
 def test_target_comes_to_meet_the_first_of_two_alone() -> None:
     tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], apart=True)
     for state, y in zip(tank.states, (0.0, 2.0, -1.5), strict=True):

@@ -73,6 +73,7 @@ def direct(vehicle: Vehicle, cells: list[tuple[int, int, int]], d: np.ndarray) -
 # ---------------------------------------------------------------- force
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_look_up_is_within_one_percent_of_the_exact_drag(shape: str, modcube: Vehicle) -> None:
     cells, d = SHAPES[shape], directions(500)
@@ -212,6 +213,7 @@ def test_alpha_mode_gives_the_same_table_within_one_percent(modcube: Vehicle) ->
 # ---------------------------------------------------------------- turned and moved shapes, kept on disk
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotation", range(24))
 def test_turned_shape_has_the_turned_drag(rotation: int, modcube: Vehicle) -> None:
     slab = dataclasses.replace(modcube.hull, size_m=frozen_array([0.21, 0.15, 0.09]))
@@ -226,6 +228,7 @@ def test_turned_shape_has_the_turned_drag(rotation: int, modcube: Vehicle) -> No
         np.testing.assert_allclose(found, np.concatenate([turn @ expected[:3], turn @ expected[3:]]), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_turned_or_moved_shape_is_one_entry_in_the_cache(modcube: Vehicle, cache: DragCache) -> None:
     for rotation in range(24):
         turned = np.array(SHAPES["tripod"]) @ lattice.MATRICES[rotation].T

@@ -234,6 +234,7 @@ def run(body: Body, flight: Flight, p: Estimation = P) -> tuple[Estimator, list[
 # ---------------------------------------------------------------- late tags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "delay_ms",
     [lambda n: 0.0, lambda n: 65.0, lambda n: 43.0 + 8.0 * (n % 2), lambda n: 300.0],

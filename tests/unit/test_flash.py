@@ -129,6 +129,7 @@ def current(fake: Path, root: str = "root") -> str | None:
     return Device(fake / root, flash_files.run).linked(fake / root / "current")
 
 
+@pytest.mark.slow
 def test_release_is_installed_started_and_runs_its_own_code(put: Callable[..., int], fake: Path) -> None:
     assert put(GOOD) == 0
     assert current(fake) == GOOD
@@ -140,6 +141,7 @@ def test_release_is_installed_started_and_runs_its_own_code(put: Callable[..., i
     assert f"{fake}/root/flash/flash_device.py {fake}/root boot" in (fake / "etc" / flash_units.GUARD).read_text()
 
 
+@pytest.mark.slow
 def test_second_flash_keeps_the_first_to_go_back_to(
     put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -153,6 +155,7 @@ def test_second_flash_keeps_the_first_to_go_back_to(
     assert f"robot@sub runs {GOOD}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_rollback_without_an_earlier_release_changes_nothing(
     put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -162,6 +165,7 @@ def test_rollback_without_an_earlier_release_changes_nothing(
     assert current(fake) == GOOD
 
 
+@pytest.mark.slow
 def test_rollback_to_a_release_without_health_is_told_as_what_it_is(
     put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -173,6 +177,7 @@ def test_rollback_to_a_release_without_health_is_told_as_what_it_is(
     assert current(fake) == BETTER
 
 
+@pytest.mark.slow
 def test_connection_lost_in_a_rollback_says_that_the_vehicle_goes_on(
     put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -183,6 +188,7 @@ def test_connection_lost_in_a_rollback_says_that_the_vehicle_goes_on(
     assert current(fake) == GOOD
 
 
+@pytest.mark.slow
 def test_python_in_the_home_of_the_vehicle_is_found(put: Callable[..., int], fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """docs/jetson.md: quoted, so that it is the vehicle's shell that knows whose home it is."""
     monkeypatch.setenv("HOME", str(fake))
@@ -192,6 +198,7 @@ def test_python_in_the_home_of_the_vehicle_is_found(put: Callable[..., int], fak
     assert put(GOOD, "--python", "~/python3.12") == 0
 
 
+@pytest.mark.slow
 def test_release_without_health_is_taken_back_and_the_old_one_runs(
     put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -202,6 +209,7 @@ def test_release_without_health_is_taken_back_and_the_old_one_runs(
     assert current(fake) == GOOD and not (fake / "root" / "trial.json").exists()
 
 
+@pytest.mark.slow
 def test_first_release_without_health_leaves_none(put: Callable[..., int], fake: Path) -> None:
     assert put(BROKEN) == 1
     assert current(fake) is None
@@ -213,6 +221,7 @@ def test_dry_run_changes_nothing(put: Callable[..., int], fake: Path, capsys: py
     assert not (fake / "root").exists()
 
 
+@pytest.mark.slow
 def test_flashing_the_same_release_again_ships_nothing(
     put: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -391,6 +400,7 @@ def boot_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     return machine
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("release", [BETTER, BROKEN])
 def test_power_cut_at_any_step_brings_a_release_up_that_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, release: str
@@ -439,6 +449,7 @@ def test_power_cut_at_any_step_of_going_back_is_made_good_by_the_next_boot(
     assert cut >= 8
 
 
+@pytest.mark.slow
 def test_first_flash_cut_at_any_step_is_made_whole_by_the_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A unit that is there already, and neither read by systemd nor enabled, is no reason to do less."""
     for cut in range(200):
@@ -594,6 +605,7 @@ def test_compiled_code_is_carried_over_only_if_all_its_sources_are_the_same(tmp_
     assert not flash_files.carry_compiled(old, new)
 
 
+@pytest.mark.slow
 def test_wheel_carries_the_wire_the_vehicles_the_dialect_and_the_units(tmp_path: Path) -> None:
     with zipfile.ZipFile(flash_payload.build_wheel(tmp_path)) as archive:
         names = set(archive.namelist())

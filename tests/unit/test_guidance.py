@@ -265,6 +265,7 @@ def test_single_point_is_flown_to_without_a_stream() -> None:
     assert flight.run(15.0).p_wb[2] == pytest.approx(2.0, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [Mode.POSHOLD, Mode.ALT_HOLD])
 @pytest.mark.parametrize(
     ("roll", "given", "tilt"),

@@ -81,6 +81,7 @@ def test_plant_alone_refuses_a_bus_that_nobody_else_reaches(monkeypatch: pytest.
     assert served == []
 
 
+@pytest.mark.slow
 def test_plant_alone_serves_the_modules_of_its_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     served: list[int] = []
     monkeypatch.setattr(hil.plant_process, "serve_until_signal", lambda scenario, *_: served.append(len(scenario.module)))

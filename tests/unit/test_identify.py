@@ -129,6 +129,7 @@ def hang(flight: model.Equations, x: dict[str, np.ndarray], lever: np.ndarray, n
     return np.asarray(moved)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_m", [None, (0.0, 0.0, 0.0), (0.1, -0.05, 0.03)])
 def test_weight_that_pulls_at_an_arm_is_not_taken_for_righting(at_m: tuple[float, float, float] | None) -> None:
     com = (0.01, 0.0, 0.02)

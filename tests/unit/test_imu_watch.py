@@ -78,6 +78,7 @@ def test_frozen_imu_is_left_out_of_the_mean() -> None:
     assert none.gyro is None and none.accel is None
 
 
+@pytest.mark.slow
 def test_robot_whose_imu_freezes_holds_its_place_and_says_so() -> None:
     tank = Tank([single()])
     tank.run(0.5)

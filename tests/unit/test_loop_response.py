@@ -106,6 +106,7 @@ def test_loop_that_one_decibel_more_makes_swing_shows_less_than_that_and_one_tha
     assert swinging[SURGE][:2] == (0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_vehicle_that_never_finds_its_pose_has_no_margins() -> None:
     with pytest.raises(DescriptionError, match="girona500: its loops are open"):
         measure(1, Parameters(), vehicle="girona500")

@@ -356,6 +356,7 @@ def test_least_usage_of_the_thrusters_is_between_the_bounds(one: Body) -> None:
     assert usage(one, np.array([[0, 0, 0.1, 0, 0, 0], [0, 0, 5.0, 0, 0, 0]]))[1] == 1
 
 
+@pytest.mark.slow
 def test_worst_force_that_the_thrusters_reach_is_the_paper_s(one: Body) -> None:
     """Errata: at least 22.9 N in the worst direction, at 10 and -8 N."""
     d = np.random.default_rng(7).normal(size=(150, 3))
@@ -364,6 +365,7 @@ def test_worst_force_that_the_thrusters_reach_is_the_paper_s(one: Body) -> None:
     assert min(reach) == pytest.approx(22.9, abs=0.3)
 
 
+@pytest.mark.slow
 def test_path_is_stretched_until_the_thrusters_can_fly_it(one: Body) -> None:
     waypoints = poses(5)
     with pytest.raises(InfeasibleError, match=r"thrusters would be used to \d+ % .* between waypoints \d and \d"):
@@ -374,6 +376,7 @@ def test_path_is_stretched_until_the_thrusters_can_fly_it(one: Body) -> None:
     assert usage(one, wrenches(one, motion))[0] == pytest.approx(0.8, abs=0.01)
 
 
+@pytest.mark.slow
 def test_free_durations_are_as_short_as_the_thrusters_allow(one: Body) -> None:
     found = plan(poses(4), None, body=one)
     motion = found.grid(16)[..., :19].reshape(-1, 19)
@@ -391,6 +394,7 @@ def test_attitude_that_cannot_be_held_is_refused_at_once() -> None:
         plan(waypoints, [10.0], body=assemble_vehicle(heavy))
 
 
+@pytest.mark.slow
 def test_docked_bodies_fly_the_same_waypoints() -> None:
     vehicle = load_vehicle("modcube")
     for cells in ([(0, 0, 0), (1, 0, 0)], [(0, 0, 0), (1, 0, 0), (0, 1, 0)]):

@@ -110,6 +110,7 @@ def test_magnets_of_each_body_are_told_their_own_states() -> None:
     assert told == [{(1, 0, 0, 0, 0, 0)}, {(0, 1, 0, 0, 0, 0)}, {(0, 0, 1, 0, 0, 0)}, {(0, 0, 0, 1, 0, 0)}]
 
 
+@pytest.mark.slow
 def test_only_the_body_that_lost_a_partner_is_told_and_parted() -> None:
     tank = Docked(RING, each=2)
     tank.run(0.5)
@@ -181,6 +182,7 @@ def test_middle_of_three_that_is_lost_leaves_three() -> None:
     assert tank.shape == [(0,), (1,), (2,)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0, 5, 30])
 def test_joint_that_opens_while_another_is_being_parted_waits_its_turn(delay: int) -> None:
     tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)], delay=delay)
@@ -220,6 +222,7 @@ def test_undock_that_is_asked_for_twice_parts_once() -> None:
     assert sum(CHANGED in text for _, text in tank.said) == 1
 
 
+@pytest.mark.slow
 def test_partner_that_is_being_undocked_is_not_lost() -> None:
     """While the magnets push, currents and pictures say that the joint is open: it is wanted so."""
     tank = Docked(RING[:2], Parameters().replace("docking.release_s", 2.0))
@@ -233,6 +236,7 @@ def test_partner_that_is_being_undocked_is_not_lost() -> None:
     assert not [said for _, said in tank.said if LOST in said]
 
 
+@pytest.mark.slow
 def test_undock_that_is_asked_for_while_the_partner_is_being_lost_parts_once() -> None:
     tank = Docked(RING[:2], delay=30)
     tank.fly()
@@ -253,6 +257,7 @@ def test_estimate_of_a_part_is_as_old_as_that_of_the_whole() -> None:
     assert not fresh.estimator.restart(5_000_000_000, motion._replace(accepted=0)).ready
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [[(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 0, 0), (2, 0, 0), (1, 0, 0)], [(1, 0, 0), (0, 0, 0), (1, 1, 0)]])
 def test_three_that_have_all_come_apart_are_three_however_they_are_numbered(cells: list[tuple[int, int, int]]) -> None:
     tank = Docked(cells)
@@ -265,6 +270,7 @@ def test_three_that_have_all_come_apart_are_three_however_they_are_numbered(cell
 # ---------------------------------------------------------------- what is known is not forgotten
 
 
+@pytest.mark.slow
 def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
     """A thruster is out, a cabin loses its pressure, the ground station has fallen silent; then the joint opens."""
     tank = Docked(RING[:2])
@@ -300,6 +306,7 @@ def test_body_that_was_prepared_with_other_gains_flies_with_those_of_now() -> No
     assert all(chain.parameters.control.position_bandwidth == 1.5 for chain in tank.pipeline.formation.chains)
 
 
+@pytest.mark.slow
 def test_magnets_of_a_joint_rest_when_their_account_is_empty_and_take_power_while_they_pull() -> None:
     parameters = Parameters().replace("limiter.relay_on_s", 2.0).replace("limiter.relay_duty", 0.25)
     tank = Docked(RING[:2], parameters)

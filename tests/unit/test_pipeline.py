@@ -166,6 +166,7 @@ def test_record_says_whether_arm_would_be_granted(tank: Tank) -> None:
     assert not armed.records[0].may_arm
 
 
+@pytest.mark.slow
 def test_armed_robot_holds_the_place_where_it_armed(tank: Tank) -> None:
     tank.run(0.5)
     armed = tank.run(DT, Request(Action.ARM))
@@ -177,6 +178,7 @@ def test_armed_robot_holds_the_place_where_it_armed(tank: Tank) -> None:
     assert np.abs(tank.states[0][7:13]).max() < 5e-3
 
 
+@pytest.mark.slow
 def test_robot_follows_a_path_to_its_end(tank: Tank) -> None:
     tank.run(0.5)
     tank.run(0.5, Request(Action.ARM))
@@ -242,6 +244,7 @@ def test_motor_test_of_a_disarmed_robot_turns_one_thruster_and_disarms(tank: Tan
     assert tank.outputs[-1].records[0].state == State.DISARMED
 
 
+@pytest.mark.slow
 def test_motor_detection_turns_one_thruster_after_the_other_with_pauses_between(tank: Tank) -> None:
     p, first = tank.pipeline.parameters.steering, len(tank.outputs)
     tank.run(1.0, Request(Action.SET_MODE, 0, Mode.MOTOR_DETECT))
@@ -331,6 +334,7 @@ def test_battery_reading_of_nothing_changes_no_command(tank: Tank) -> None:
 # ---------------------------------------------------------------- fleets
 
 
+@pytest.mark.slow
 def test_each_body_obeys_its_own_requests() -> None:
     tank = Tank([single(0), single(1)])
     tank.run(0.5)
@@ -348,6 +352,7 @@ def test_what_is_said_names_the_body_that_it_is_about() -> None:
     assert {(event.text.split(":")[0], event.body) for event in refused.events} >= {("ARM refused", 1), ("SET_MODE refused", 0)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("modules", [[0, 1, 2], [2, 0, 1]])
 def test_docked_shape_holds_its_place_however_its_modules_sit_and_count(modules: list[int]) -> None:
     """An L of three whose modules all sit differently: a mix-up of frames, levers or commands would throw it about."""
@@ -381,6 +386,7 @@ def spoilt(body: Body, mistake: str) -> Body:
     return replace(body, thrusters=replace(t, matrix=matrix, pinv=np.linalg.pinv(matrix)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mistake", ["tag lever 3 cm off", "tag turned by 5 degrees", "two thrusters swapped", "one thruster the wrong way"]
 )

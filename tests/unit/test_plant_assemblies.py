@@ -123,6 +123,7 @@ def test_rigid_pair_stays_in_its_lattice_while_it_tumbles() -> None:
         np.testing.assert_allclose(between, 0.21 * np.array(cell), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_random_shapes_can_be_docked(seed: int) -> None:
     seats = grow(stream(seed, "shape"), 8, VEHICLE.faces)

@@ -241,6 +241,7 @@ def test_tag_fault_is_of_the_module_that_it_names() -> None:
     assert len(absent[1]) == 0 and len(absent[2]) > 20
 
 
+@pytest.mark.slow
 def test_that_share_of_the_tags_is_flipped() -> None:
     flipped, straight = (
         values(fly(nodes_with(*f), 400, u=0.0), "TAG_ATTITUDE") for f in ([Fault(kind="tag_flip", value=0.3)], [])

@@ -197,6 +197,7 @@ def test_draws_stay_within_their_magnitudes_and_fill_them() -> None:
     assert 10 < (errors > 0).sum() < 50
 
 
+@pytest.mark.slow
 def test_gusts_have_the_wanted_strength_and_smoothness() -> None:
     world = still(current_m_s=0.05, gust_m_s=0.015, gust_time_s=2.0, gust_smoothing_s=0.5)
     flow = np.empty((60_000, 3))

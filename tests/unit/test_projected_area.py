@@ -72,6 +72,7 @@ def test_area_of_an_elbow_agrees_with_counting_rays() -> None:
         assert hit.mean() == pytest.approx(area, abs=4.0 * math.sqrt(area / len(flat)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cells", "mean"), [(ONE, 0.06615), (LINE, 0.11025), (QUAD, 0.1764), (ELBOW, 0.14994)])
 def test_mean_area_is_a_quarter_of_the_surface_for_convex_shapes(cells: Cells, mean: float) -> None:
     areas = areas_and_centroids(solids(cells), fibonacci(2000))[0]

@@ -61,6 +61,7 @@ def scene(title: str = "Spiral", modules: int = 1) -> Scene:
     )
 
 
+@pytest.mark.slow
 def test_every_plot_is_written_and_has_a_caption(flight: Flight, tmp_path: Path) -> None:
     paths = write_plots(flight, tmp_path, WINDOW, TANK_M, np.array([-8.0, 10.0]), 20.92)
     assert [*(path.stem for path in paths), "docking"] == list(CAPTIONS)
@@ -164,6 +165,7 @@ def test_overview_of_a_dock_shows_the_other_module_until_it_joins(dock: Flight) 
     pyplot.close(figure)
 
 
+@pytest.mark.slow
 def test_thrusters_that_joined_later_stay_inside_their_axes(dock: Flight) -> None:
     with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
         figure = thrusters(dock, Window(0.0, 2.0), np.array([-8.0, 10.0]))

@@ -201,6 +201,7 @@ def test_path_of_a_file_leads_from_the_start_through_its_points_and_rests_at_the
     np.testing.assert_allclose(path.sample(44.0).q_wb, np.array([1, 0, 0, 1]) / np.sqrt(2.0), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_path_without_an_attitude_keeps_that_of_the_start(tmp_path: Path) -> None:
     turned = waypoints(tmp_path, PATH_TOML, "path.toml", "[0, 0, 90]")
     for point in sampled(turned):

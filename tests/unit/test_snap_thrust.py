@@ -65,6 +65,7 @@ def test_vehicle_that_leaves_an_axis_to_buoyancy_has_its_missions_planned(passiv
     assert flown(plan_mission(job(place, yaw=yaw), passive)).duration_s == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [NORTH, EAST, 5.0 * NORTH], ids=["north", "east", "far and deep"])
 def test_mission_of_such_a_vehicle_is_flown_and_it_leans_no_more_than_planned(passive: Body, place: np.ndarray) -> None:
     """As fast as it can: the moment of the added mass, which tips a body under way, counts beside buoyancy."""

@@ -112,6 +112,7 @@ def test_margins_that_lack_cost_on_top_and_those_that_suffice_cost_nothing(
     assert lacking == pytest.approx([value + 2.5 for value in flights])
 
 
+@pytest.mark.slow
 def test_search_finds_the_valley_and_ends_early_what_lies_above_it(tools: tuple[Any, Any], tmp_path: Path) -> None:
     study = search(tools, tmp_path, 25, Inline())
     assert study.trials[0].params == {BANDWIDTH: 7.5, DAMPING: 1.0}
@@ -121,6 +122,7 @@ def test_search_finds_the_valley_and_ends_early_what_lies_above_it(tools: tuple[
     assert min(t.intermediate_values[0] for t in pruned) > study.best_trial.intermediate_values[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flights", [1, 17, 40])
 def test_search_that_was_killed_loses_no_trial_and_ends_in_the_same_bytes(tools: tuple[Any, Any], tmp_path: Path, flights: int) -> None:
     search(tools, tmp_path / "whole", 14, Inline())

@@ -56,6 +56,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.slow
 def test_tick_is_not_held_up_by_who_reads_its_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(teller, "CLOSE_S", 0.01)
     let, over = threading.Event(), threading.Event()
@@ -70,6 +71,7 @@ def test_tick_is_not_held_up_by_who_reads_its_lines(tmp_path: Path, monkeypatch:
     assert over.wait(10)
 
 
+@pytest.mark.slow
 def test_flight_goes_on_when_nobody_reads_its_lines_any_more(tmp_path: Path) -> None:
     def hang_up() -> None:
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
@@ -78,12 +80,14 @@ def test_flight_goes_on_when_nobody_reads_its_lines_any_more(tmp_path: Path) -> 
     assert len(list(FlightLog(tmp_path / "log").ticks())) >= 10  # the farewell
 
 
+@pytest.mark.slow
 def test_lines_are_said_by_an_ordinary_thread(tmp_path: Path) -> None:
     policies: list[int] = []
     fly(tmp_path, then=lambda: policies.append(os.sched_getscheduler(0)))
     assert policies == [os.SCHED_OTHER]
 
 
+@pytest.mark.slow
 def test_log_of_the_process_before_is_kept(tmp_path: Path) -> None:
     out = tmp_path / "log"
     fly(tmp_path, out)
@@ -111,6 +115,7 @@ def test_folder_without_a_log_takes_the_first(tmp_path: Path) -> None:
     assert make_log_folder(tmp_path / "made" / "anew").is_dir()
 
 
+@pytest.mark.slow
 def test_start_that_failed_leaves_no_log_behind(tmp_path: Path) -> None:
     """A service that waits for its bus would fill the disk, and the log of the crash would not be the newest."""
     fly(tmp_path, tmp_path / "log")
@@ -123,6 +128,7 @@ def test_start_that_failed_leaves_no_log_behind(tmp_path: Path) -> None:
     assert not (tmp_path / "log" / "0002").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
 def test_vehicle_flies_without_log_where_the_disk_takes_no_folder(
     tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch
@@ -152,6 +158,7 @@ def in_flight(tmp_path: Path, more: str = "", modules: tuple[Module, ...] = FLEE
     return Fleet(module=modules, buses=(bus_of(tmp_path), f"{bus_of(tmp_path)}-b"))
 
 
+@pytest.mark.slow
 def test_process_killed_in_flight_holds_again_where_a_parameter_says_so(tmp_path: Path) -> None:
     fleet = in_flight(tmp_path)
     assert HOLDS in fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet)
@@ -159,6 +166,7 @@ def test_process_killed_in_flight_holds_again_where_a_parameter_says_so(tmp_path
     assert HOLDS not in fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet)  # 0002 ended disarmed
 
 
+@pytest.mark.slow
 def test_process_killed_in_flight_waits_to_be_armed_otherwise(tmp_path: Path) -> None:
     fleet = in_flight(tmp_path)
     assert HOLDS not in fly(tmp_path, None, parameters=REARM, fleet=fleet)
@@ -181,6 +189,7 @@ def docked(first: int, second: int) -> tuple[Module, ...]:
     return tuple(modules)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [REARM, Parameters()])
 def test_modules_that_docked_in_flight_are_named_and_not_armed_again(tmp_path: Path, parameters: Parameters) -> None:
     said = fly(tmp_path, tmp_path / "log", parameters=parameters, fleet=in_flight(tmp_path, PAIR))
@@ -189,11 +198,13 @@ def test_modules_that_docked_in_flight_are_named_and_not_armed_again(tmp_path: P
     assert any(line.startswith("running at") for line in said)  # the start refuses nothing
 
 
+@pytest.mark.slow
 def test_modules_that_the_fleet_file_has_docked_hold_again(tmp_path: Path) -> None:
     said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, PAIR, docked(0, 1)))
     assert said[0] == HOLDS
 
 
+@pytest.mark.slow
 def test_dock_at_another_face_than_the_fleet_files_is_none_of_its_joints(tmp_path: Path) -> None:
     said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, PAIR, docked(1, 0)))
     assert said[0] == APART.format(bus=bus_of(tmp_path))
@@ -203,6 +214,7 @@ def test_dock_at_another_face_than_the_fleet_files_is_none_of_its_joints(tmp_pat
 UNDOCKED = dock_line(0, (0,) * 6) + dock_line(1, (0,) * 6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", [True, False])
 def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
     tmp_path: Path, hold: bool, monkeypatch: pytest.MonkeyPatch
@@ -225,6 +237,7 @@ def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
     assert to_arm == [set(), set()]
 
 
+@pytest.mark.slow
 def test_relays_of_single_modules_are_no_undock(tmp_path: Path) -> None:
     assert fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, UNDOCKED))[0] == HOLDS
 
