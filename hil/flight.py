@@ -89,8 +89,9 @@ def judge_logs(
         lost_share: of the ticks, which one of the two logs may lack.
     """
     whole = read_flight(folder)
-    begin_ns = start_of(whole) + round(scenario.task.settle_s * 1e9)
-    flight = whole.between(begin_ns, begin_ns + round(scenario.task.duration_s * 1e9))
+    period_ns, duration_ns = period_of(whole.ticks), round(scenario.task.duration_s * 1e9)
+    begin_ns = start_of(whole) + math.ceil(round(scenario.task.settle_s * 1e9) / period_ns) * period_ns
+    flight = whole.between(begin_ns, begin_ns + duration_ns)
     share = len(flight.firmware["tick"]) / len(whole.firmware["tick"])
     vehicle = load_vehicle(scenario.module[0].vehicle)
     metrics = flight_metrics(
@@ -101,8 +102,10 @@ def judge_logs(
         deadline_misses=deadline_misses,
     )
     metrics["armed_share"] = float(np.isin(flight.firmware["state"], list(ARMED)).mean()) if share else math.nan
-    if scenario.task.kind == "dock":
+    if scenario.task.kind == "dock":  # which may end before its time
         metrics |= docking_metrics(scenario, folder)
+    elif duration_ns // period_ns > len(flight.firmware["tick"]) + len(flight.lost_ns):
+        metrics["unmatched_ticks"] = float(duration_ns // period_ns - len(flight.firmware["tick"]))
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
     whole_log = Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"]))

@@ -44,7 +44,8 @@ SHOWN = {
     "wrench_margin_min": Shown("Busiest thruster, worst tick: share of its range left", "%", 100.0, 1),
     "tags_rejected": Shown("Tag observations refused by the gate", digits=0),
     "armed_share": Shown("Armed, share of the ticks judged", "%", 100.0, 1),
-    "docked": Shown("There, together and apart as asked for (1: yes)", digits=0),
+    "docked": Shown("Together and apart as asked for (1: yes)", digits=0),
+    "gap_min_m": Shown("Faces that came nearest to each other", "mm", 1e3),
     "tries": Shown("Meetings of a probe with a funnel", digits=0),
     "jams": Shown("Jams", digits=0),
     "outcome": Shown("Outcome (0 docked, 1 jammed, 2 unstable, 3 refused, 4 gave up)", digits=0),
@@ -59,7 +60,7 @@ SHOWN = {
     "deadline_misses": Shown("Deadlines missed", digits=0),
 }
 """Metrics in the order in which tables show them."""
-DOCKING = ("docked", "tries", "jams", "outcome", "false_declarations", "docked_rmse_m", "join_jump_n")
+DOCKING = ("docked", "gap_min_m", "tries", "jams", "outcome", "false_declarations", "docked_rmse_m", "join_jump_n")
 """Those that only a run with [[step]]s has."""
 
 

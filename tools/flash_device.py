@@ -215,7 +215,8 @@ class Device:
 
     def _take_back(self, trial: dict[str, Any]) -> None:
         """Links and units as they were before a trial; it is over when all are. Raises RefusedError."""
-        for link, release in ((self.current, trial["old"]), (self.previous, trial.get("previous"))):
+        links = {self.current: trial["old"]} | ({self.previous: trial["previous"]} if "previous" in trial else {})
+        for link, release in links.items():
             if release is None:
                 remove(link)
             elif (self.releases / release / "release.json").is_file():

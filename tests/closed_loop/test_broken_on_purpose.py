@@ -19,6 +19,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from hil.checks import Result
+from hil.flight import judge_logs
 from hil.plant.fault_spec import Fault
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
@@ -112,7 +113,7 @@ def test_robot_that_does_as_it_likes_fails_the_flight_however_well_it_does_it(
 def test_undock_that_is_not_heard_and_a_move_that_is_not_flown_are_no_success(fly: Fly, deaf: Callable[..., None]) -> None:
     deaf(Action.UNDOCK, Action.TRACK)
     assert "docked" in failed(fly(shortened("dock-undock-dock", 60.0), 3))
-    assert "docked" in failed(fly(shortened("dock-near-miss", 10.0)))
+    assert "gap_min_m" in failed(fly(shortened("dock-near-miss", 10.0)))
 
 
 @pytest.mark.slow
@@ -123,6 +124,22 @@ def test_ticks_without_firmware_are_no_success(fly: Fly, at_s: float, until_s: f
     gone = dataclasses.replace(hover, fault=(Fault(kind="process_killed", at_s=at_s, until_s=until_s),))
     result = fly(gone)
     assert result.metrics["unmatched_ticks"] == lost and "unmatched_ticks" in failed(result)
+
+
+@pytest.mark.slow
+def test_ticks_that_both_logs_lack_are_missed(fly: Fly, tmp_path: Path) -> None:
+    """As those that a vehicle's process skips in real time."""
+    hover = shortened("hover", 4.0, 4.0)
+    assert fly(hover).passed
+    longer = shortened("hover", 4.5, 4.0)
+    assert judge_logs(longer, 0, tmp_path / "run").metrics["unmatched_ticks"] == 49
+
+
+@pytest.mark.slow
+def test_task_begins_in_the_first_tick_that_is_not_before_it(fly: Fly) -> None:
+    """At 3.005 s in ticks of 10 ms, so 5 ms late, which is no error of the flight."""
+    late, early = (fly(shortened("spiral", 20.0, settle_s)).metrics["position_rmse_m"] for settle_s in (3.005, 3.01))
+    assert abs(late - early) < 1e-5
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ LARGEST_JUMP_N = 1.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["dock-undock-dock", "dock-third", "dock-vertical"])
+@pytest.mark.parametrize("name", ["dock-undock-dock", "dock-third", "dock-vertical", "dock-moving"])
 def test_modules_dock_and_no_command_jumps(fly: Fly, name: str) -> None:
     metrics = fly(load_scenario(name), 3).metrics
     assert metrics["docked"] == 1.0

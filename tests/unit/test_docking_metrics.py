@@ -8,9 +8,10 @@ import pytest
 
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import Columns
-from hil.docking_metrics import DECLARED, _false_declarations, is_as_asked, is_obeyed
+from hil.docking_metrics import DECLARED, _false_declarations, docking_metrics, is_as_asked, is_obeyed
 from hil.force_metrics import force_metrics
 from hil.scenario import Scenario, Step, load_scenario, make_world
+from hil.signals import SIGNAL_LOG, TRUTH_LOG
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 TICKS = np.arange(1, 101)
@@ -70,11 +71,16 @@ def test_dock_counts_with_the_faces_that_were_named() -> None:
     assert not is_as_asked(asked(DOCK, Step(do="undock", module=2, target_module=1)), joined)
 
 
-def test_move_counts_when_it_led_there() -> None:
-    at = np.array([0.52, 0.0, 0.4])
-    move = Step(do="move", module=3, position_m=at)
-    assert is_as_asked(asked(move), truth_of([APART], PLACES))
-    assert not is_as_asked(asked(dataclasses.replace(move, position_m=at + 0.1)), truth_of([APART], PLACES))
+def test_faces_that_came_nearest_are_told_of_and_none_where_none_came_near(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    truths = truth_of([APART], PLACES)
+    for module in range(3):
+        truths[f"/plant/module{module}"]["force_n"] = np.zeros((100, 8))
+    events = {"text": np.zeros(0, str)}
+    for gap_m, nearest_m in ((np.r_[np.full(60, np.nan), np.linspace(0.3, 0.02, 40)], 0.02), (np.full(100, np.nan), np.nan)):
+        truths["/plant/docks"] |= {"gap_m": gap_m, "contacts": np.zeros(100), "jams": np.zeros(100)}
+        logs = {TRUTH_LOG: truths, SIGNAL_LOG: {"/events": events}}
+        monkeypatch.setattr("hil.docking_metrics.read_signals", lambda path, logs=logs: logs[path.name])
+        assert docking_metrics(asked(Step(do="wait")), tmp_path)["gap_min_m"] == pytest.approx(nearest_m, nan_ok=True)
 
 
 def test_without_a_dock_nothing_may_join_or_part() -> None:

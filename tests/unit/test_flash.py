@@ -552,6 +552,18 @@ def test_release_whose_watcher_died_is_taken_back_at_the_next_start(tmp_path: Pa
     assert not device.trial.exists()
 
 
+def test_trial_that_says_nothing_of_the_release_before_leaves_it_as_it_is(tmp_path: Path) -> None:
+    """As an earlier flasher wrote it."""
+    machine = Machine(tmp_path)
+    machine.install_and_activate(GOOD)
+    machine.install_and_activate(BETTER)
+    device = machine.device()
+    gone: dict[str, Any] = {**flash_files.watcher(), "started": "1"}
+    flash_files.write_whole(device.trial, json.dumps({"release": "2.0-x", "old": BETTER, **gone}))
+    assert BETTER in device.boot()
+    assert device.linked(device.previous) == GOOD
+
+
 def test_old_releases_and_wheels_that_nobody_needs_go(tmp_path: Path) -> None:
     machine = Machine(tmp_path)
     for number in range(6):
