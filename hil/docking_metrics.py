@@ -21,7 +21,7 @@ DOCKED, JAMMED, UNSTABLE, REFUSED, GAVE_UP = range(len(OUTCOMES))
 DECLARED = STAGES.index("docked")
 """Stage of a dock in the tick in which the firmware takes two bodies for one."""
 FACING = math.cos(math.radians(30.0))
-"""Between the normals of faces that meet and the way from centre to centre."""
+"""Least cosine between the normals of faces that meet and the way from centre to centre: 30 deg, a third of a quarter turn."""
 UNSTABLE_RAD, KEPT_UP_TICKS = math.radians(30.0), 200
 """A module that stays so far from the attitude that it was bound for is out of control."""
 

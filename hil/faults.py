@@ -17,6 +17,7 @@ from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
 from hil.nodes import Mcu, Nodes
 from hil.plant.camera import Sighting
+from hil.plant.docking import RELAY
 from hil.plant.draw import stream
 from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, THRUSTER_KINDS, Fault
 
@@ -27,8 +28,6 @@ LOWEST_BABBLE_ID = 0x040
 ESTOP, SYNC = Frame(0x01E, b""), Frame(0x020, bytes(4))
 """Of the e-stop box, and of somebody else who means to lead the bus."""
 ESTOP_PERIOD_NS = 50_000_000
-RELAYS = {-1.0: 2, 0.0: 0, 1.0: 1}
-"""Of a magnet that hangs, by the fault's value."""
 PUSH_LEVER_M = 0.03
 """From the hull's centre to the point that is pushed."""
 
@@ -187,7 +186,7 @@ class Faults:
 
     def _hang_magnets(self, fault: Fault, mcu: Mcu) -> None:
         for face in range(FACES) if fault.index == ALL else (fault.index,):
-            self._world.docks.hang(mcu.module, face, RELAYS[fault.value])
+            self._world.docks.hang(mcu.module, face, RELAY.index(fault.value))
 
     def _change_tag(self, sighting: Sighting, carrier: int) -> Sighting | None:
         """What becomes of a sighting, in the world's frame, by a camera that the module `carrier` carries (-1: a fixed one).

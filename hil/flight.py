@@ -86,7 +86,7 @@ def judge_logs(
 
     Args:
         wall_s: what the whole run took.
-        lost_share: of the ticks, which one of the two logs may lack.
+        lost_share: of the ticks, which a log may lack.
     """
     whole = read_flight(folder)
     period_ns, duration_ns = period_of(whole.ticks), round(scenario.task.duration_s * 1e9)
@@ -104,8 +104,8 @@ def judge_logs(
     metrics["armed_share"] = float(np.isin(flight.firmware["state"], list(ARMED)).mean()) if share else math.nan
     if scenario.task.kind == "dock":  # which may end before its time
         metrics |= docking_metrics(scenario, folder)
-    elif duration_ns // period_ns > len(flight.firmware["tick"]) + len(flight.lost_ns):
-        metrics["unmatched_ticks"] = float(duration_ns // period_ns - len(flight.firmware["tick"]))
+    else:
+        metrics["unmatched_ticks"] = max(metrics["unmatched_ticks"], float(duration_ns // period_ns - len(flight.firmware["tick"])))
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
     whole_log = Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"]))

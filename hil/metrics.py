@@ -56,7 +56,7 @@ SHOWN = {
     "duration_s": Shown("Duration of the judged part", "s"),
     "real_time_factor": Shown("Faster than real time by", "times", digits=1),
     "ticks": Shown("Ticks judged", digits=0),
-    "unmatched_ticks": Shown("Ticks that one of the two logs lacks", digits=0),
+    "unmatched_ticks": Shown("Ticks that a log lacks", digits=0),
     "deadline_misses": Shown("Deadlines missed", digits=0),
 }
 """Metrics in the order in which tables show them."""

@@ -23,7 +23,8 @@ from firmware_py.core.types import Action, Inputs, Mode, Outputs, Request, Stick
 from firmware_py.description.parameters import Parameters
 from hil.bench import fly_scenario, open_bench
 from hil.fault_table import ROWS
-from hil.metrics import flight_metrics, rotation_vectors
+from hil.flight import wanted_in
+from hil.metrics import Poses, flight_metrics, rotation_vectors
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
 from hil.scenario import MODES, Scenario, load_scenario
@@ -43,6 +44,15 @@ def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None) -
         return read_flight(Path(folder))
 
 
+def in_task(scenario: Scenario, flight: Flight) -> tuple[Flight, Poses]:
+    """The ticks of the task, and where its path wants the body in each: not the firmware's own set-point, which may be any."""
+    begin_ns = round(scenario.task.settle_s * 1e9)
+    part = flight.between(begin_ns, round(scenario.duration_s * 1e9))
+    wanted = wanted_in(scenario, part, begin_ns)
+    assert wanted is not None, scenario.task.kind
+    return part, wanted
+
+
 def timed(name: str, settle_s: float, duration_s: float, *faults: Fault) -> Scenario:
     """A scenario with other times, in which something breaks."""
     scenario = load_scenario(name)
@@ -57,7 +67,7 @@ class ThrusterFlight(NamedTuple):
     """A spiral in which thrusters broke."""
 
     rmse_m: float
-    """Truth against reference, from the spiral's start to its end or to the mode that a fail-safe took."""
+    """Truth against the path, from the spiral's start to its end or to the mode that a fail-safe took."""
     peak_m: float
     angle_peak_deg: float
     found_s: tuple[float, ...]
@@ -73,17 +83,16 @@ def spiral_with(broken: Sequence[int], kind: str = "thruster_dead", value: float
     at_s = base.task.settle_s + BREAKS_AFTER_S
     faults = tuple(Fault(kind=kind, at_s=at_s, index=index, value=value) for index in broken)
     whole = flown(dataclasses.replace(base, fault=faults), seed)
-    task_ns = (round(base.task.settle_s * 1e9), round(base.duration_s * 1e9))
-    flight = whole.between(*task_ns)
-    off = np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
-    turn = np.degrees(np.linalg.norm(rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"]), axis=1))
+    flight, wanted = in_task(base, whole)
+    off = np.linalg.norm(flight.p_wb - wanted.p_wb, axis=1)
+    turn = np.degrees(np.linalg.norm(rotation_vectors(flight.q_wb, wanted.q_wb), axis=1))
     kept = np.logical_and.accumulate(flight.firmware["mode"] == Mode.AUTO)
     left_out = {
         int(found[1]) - 1: float(at) * 1e-9
         for text, at in zip(whole.events["text"], whole.events["log_time"], strict=True)
         if (found := LEFT_OUT.search(str(text)))
     }
-    after = whole.between(round(at_s * 1e9), task_ns[1])
+    after = whole.between(round(at_s * 1e9), round(base.duration_s * 1e9))
     return ThrusterFlight(
         float(np.sqrt(np.mean(off[kept] ** 2))), float(off[kept].max()), float(turn[kept].max()),
         tuple(_found_after(after, index, left_out) for index in broken), tuple(sorted(set(left_out) - set(broken))),
@@ -132,8 +141,8 @@ def hover_blind(seed: int, imu: Imu | None = None) -> BlindFlight:
         told = getattr(parameters.estimation, name) / getattr(scenario.sensors, name)
         parameters = parameters.replace(f"estimation.{name}", told * sigma)
         scenario = dataclasses.replace(scenario, sensors=dataclasses.replace(scenario.sensors, **{name: sigma}))
-    flight = flown(scenario, seed, parameters).between(round(scenario.task.settle_s * 1e9), round(scenario.duration_s * 1e9))
-    off = np.linalg.norm((flight.p_wb - flight.firmware["setpoint_p_wb"])[:, :2], axis=1)
+    flight, wanted = in_task(scenario, flown(scenario, seed, parameters))
+    off = np.linalg.norm((flight.p_wb - wanted.p_wb)[:, :2], axis=1)
     wrong = (flight.firmware["p_wb"] - flight.p_wb)[-1, :2] / flight.firmware["sigma_p"][-1, :2]
     return BlindFlight(float(off.max()), float(np.sqrt(np.mean(off**2))), (float(wrong[0]), float(wrong[1])))
 
@@ -144,9 +153,8 @@ def hover_blind(seed: int, imu: Imu | None = None) -> BlindFlight:
 def spiral_through_loss(seed: int, share: float = 0.3) -> float:
     """Position RMSE of a spiral of which a share of the frames is lost in both directions, m."""
     base = load_scenario("spiral")
-    begin_ns, end_ns = round(base.task.settle_s * 1e9), round(base.duration_s * 1e9)
-    flight = flown(dataclasses.replace(base, fault=(Fault(kind="frame_loss", value=share),)), seed).between(begin_ns, end_ns)
-    return float(flight_metrics(flight)["position_rmse_m"])
+    flight, wanted = in_task(base, flown(dataclasses.replace(base, fault=(Fault(kind="frame_loss", value=share),)), seed))
+    return float(flight_metrics(flight, wanted=wanted)["position_rmse_m"])
 
 
 def command_outlives_frames_ms(seed: int = 0) -> float:

@@ -15,8 +15,6 @@ from hil.metrics import DOCKING, SHOWN
 if TYPE_CHECKING:
     from hil.scenario import Scenario
 
-SHORTEST_S = 0.1
-"""Of a path."""
 Mistake = tuple[tuple[str | int, ...], str]
 """The keys that lead to what is wrong, and what is wrong with it."""
 
@@ -69,9 +67,10 @@ def _in_polycube(scenario: Scenario) -> Iterator[Mistake]:
 
 def _in_steps(scenario: Scenario) -> Iterator[Mistake]:
     kind = scenario.task.kind
+    shortest_s = limits_of(type(scenario.task), "duration_s").low
     for i, step in enumerate(scenario.step):
-        if step.do in ("move", "moebius") and step.duration_s < SHORTEST_S:
-            yield ("step", i, "duration_s"), f"{step.duration_s:g} s; a {step.do} takes {SHORTEST_S:g} s at least"
+        if step.do in ("move", "moebius") and step.duration_s < shortest_s:
+            yield ("step", i, "duration_s"), f"{step.duration_s:g} s; a {step.do} takes {shortest_s:g} s at least"
     if kind != "dock" and scenario.step:
         yield ("step", 0), f"a task of the kind {kind} runs no steps; only dock does"
     if kind == "dock" and not scenario.step:
@@ -142,8 +141,9 @@ def _thrusters(scenario: Scenario) -> dict[int, int]:
 
 
 def _in_faults(scenario: Scenario) -> Iterator[Mistake]:
+    thrusters = _thrusters(scenario)
     for i, fault in enumerate(scenario.fault):
-        for key, what in fault.mistakes(_thrusters(scenario)):
+        for key, what in fault.mistakes(thrusters):
             yield ("fault", i, key), what
         if fault.at_s > scenario.duration_s:
             yield ("fault", i, "at_s"), f"{fault.at_s:g} s is after the end of the run, which lasts {scenario.duration_s:g} s"

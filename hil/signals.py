@@ -256,9 +256,9 @@ def read_flight(folder: Path, body: int = 0, module: int = 0) -> Flight:
 
 
 def period_of(ticks: Columns) -> int:
-    """Of the firmware's ticks, by their numbers and times, ns; 0 of a single one."""
+    """Of the firmware's ticks, by their numbers and times, ns; 1 of a single one, which tells none."""
     numbers, times = ticks["tick"][:REGULAR_TICKS], ticks["time_ns"][:REGULAR_TICKS]
-    return int(np.min(np.diff(times) // np.diff(numbers))) if len(numbers) > 1 else 0
+    return int(np.min(np.diff(times) // np.diff(numbers))) if len(numbers) > 1 else 1
 
 
 def _fleet(truths: Mapping[str, Columns], ticks: np.ndarray) -> tuple[Columns, ...]:

@@ -21,7 +21,8 @@ class Formation:
 
     def __init__(self, chains: list[BodyPipeline], docking: DockingStage, parameters: Parameters) -> None:
         self.chains, self.docking = chains, docking
-        self._parameters = parameters
+        self.parameters = parameters
+        """Of now, for bodies that are still prepared too."""
         self._watch_joints()
 
     @property
@@ -30,8 +31,8 @@ class Formation:
         return [chain.body for chain in self.chains]
 
     def retune(self, parameters: Parameters) -> None:
-        """Takes other parameters from this tick on, for bodies that are still prepared too."""
-        self._parameters = parameters
+        """Takes other parameters from this tick on."""
+        self.parameters = parameters
         for chain in self.chains:
             chain.retune(parameters)
         self.docking.retune(parameters.docking)
@@ -97,8 +98,8 @@ class Formation:
 
     def _begin(self, chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
         """A body that was prepared takes over, with the parameters of now. Returns its estimate."""
-        if chain.parameters is not self._parameters:
-            chain.retune(self._parameters)
+        if chain.parameters is not self.parameters:
+            chain.retune(self.parameters)
         return take_over(chain, before, time_ns)
 
     def _chains_of(self, *bodies: int) -> list[BodyPipeline]:

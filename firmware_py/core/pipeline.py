@@ -186,16 +186,20 @@ class Pipeline:
     """All bodies of one firmware process."""
 
     def __init__(self, bodies: list[Body], parameters: Parameters, period_ns: int) -> None:
-        self.parameters = parameters
         self._period_ns = period_ns
         self._modules = 1 + max(module for body in bodies for module in body.modules)
         docking = DockingStage(parameters.docking, tag_table(bodies), self._modules)
-        self.formation = Formation([self.chain_of(body) for body in bodies], docking, parameters)
+        self.formation = Formation([BodyPipeline(body, parameters, period_ns) for body in bodies], docking, parameters)
 
     @property
     def bodies(self) -> list[Body]:
         """The bodies as they are docked now."""
         return self.formation.bodies
+
+    @property
+    def parameters(self) -> Parameters:
+        """Of now."""
+        return self.formation.parameters
 
     def chain_of(self, body: Body) -> BodyPipeline:
         """The stages of a body that is not there yet: made beside the loop, swapped in by a join or part."""
@@ -229,12 +233,13 @@ class Pipeline:
         wanted = dict.fromkeys(r.argument for r in requests if r.action == Action.SET_PARAMETER)
         if not wanted:
             return
+        parameters = self.parameters
         for name, value in wanted:
             try:
-                self.parameters = self.parameters.replace(name, value)
+                parameters = parameters.replace(name, value)
             except DescriptionError as error:
                 outputs.events.append(Event(WARNING, str(error)))
-        self.formation.retune(self.parameters)
+        self.formation.retune(parameters)
 
 
 IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from firmware_py.description.schema import quantity
+from firmware_py.description.vehicle import FACE_NAMES
 
 THRUSTER_KINDS = ("thruster_dead", "thruster_weak", "thruster_reversed", "thruster_stuck", "thruster_fake_rpm")
 FRAME_KINDS = ("frame_loss", "frame_delay", "frame_duplicate", "frame_corrupt", "babble")
@@ -17,10 +18,11 @@ OTHER_KINDS = (
 )  # fmt: skip
 ALL = -1
 """Index of a fault that means every thruster, or every face."""
-FACES = 6
+FACES = len(FACE_NAMES)
 DIRECTIONS = ("to_plant", "from_plant", "both")
 NS = 1_000_000_000
 LARGEST = 1e6
+"""Of any fault's value, in the unit of its kind."""
 
 
 class Takes(NamedTuple):

@@ -143,8 +143,9 @@ def test_task_begins_in_the_first_tick_that_is_not_before_it(fly: Fly) -> None:
 
 
 @pytest.mark.slow
-def test_flight_whose_firmware_is_gone_before_the_task_begins_fails_and_ends_no_campaign(fly: Fly) -> None:
-    gone = dataclasses.replace(shortened("hover", 2.0, 4.0), fault=(Fault(kind="process_killed", at_s=3.0),))
+@pytest.mark.parametrize("at_s", [0.015, 3.0])
+def test_flight_whose_firmware_is_gone_before_the_task_begins_fails_and_ends_no_campaign(fly: Fly, at_s: float) -> None:
+    gone = dataclasses.replace(shortened("hover", 2.0, 4.0), fault=(Fault(kind="process_killed", at_s=at_s),))
     assert {"position_rmse_m", "unmatched_ticks"} <= failed(fly(gone))
 
 

@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import Columns
 from hil.docking_metrics import DECLARED, _false_declarations, docking_metrics, is_as_asked, is_obeyed
-from hil.force_metrics import force_metrics
-from hil.scenario import Scenario, Step, load_scenario, make_world
+from hil.scenario import Scenario, Step, load_scenario
 from hil.signals import SIGNAL_LOG, TRUTH_LOG
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -103,19 +101,3 @@ def test_join_that_no_dock_declared_is_found_by_the_number_of_bodies() -> None:
     signals = {"/firmware/body0": {"tick": TICKS}, "/firmware/body1": {"tick": TICKS[:30]}, "/firmware/body2": {"tick": TICKS}}
     assert _false_declarations(truth_of([APART], PLACES), signals) == 1
     assert _false_declarations(truth_of([APART, PAIR], PLACES), signals) == 1  # thirty ticks in, and true from fifty
-
-
-def test_bodies_that_would_start_one_inside_the_other_are_refused() -> None:
-    scenario = load_scenario("dock")
-    near = dataclasses.replace(scenario.module[1], position_m=scenario.module[0].position_m)
-    with pytest.raises(DescriptionError, match=r"modules 1 and 2 start 0\.\d+ m apart, one inside the other; 0\.2"):
-        make_world(dataclasses.replace(scenario, module=(scenario.module[0], near)), 0, 10_000_000)
-
-
-def test_force_of_a_robot_that_never_pushed_has_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scenario = load_scenario("force-tracking")
-    time_ns = np.arange(1, 8501) * 10_000_000
-    still = {"tick": np.arange(1, 8501), "time_ns": time_ns, "wrench_wanted": np.zeros((8500, 6)), "load": np.zeros((8500, 6))}
-    logs = {f"/{side}/body{leader}": still for side in ("firmware", "plant") for leader in (0, 1)}
-    monkeypatch.setattr("hil.force_metrics.read_signals", lambda path: logs)
-    assert np.isnan(force_metrics(scenario, tmp_path, 0)["force_difference_off"])

@@ -264,7 +264,9 @@ def test_a_plan_that_cannot_be_made_is_told_and_the_body_holds(world: World, cli
     assert world.robot.mode[0] == Mode.POSHOLD
 
 
-def test_a_plan_that_is_no_longer_wanted_is_not_flown(world: World, client: Client) -> None:
+@pytest.mark.parametrize("ticks", [1, 10])
+def test_plan_that_comes_after_something_else_was_asked_for_is_not_flown(world: World, client: Client, ticks: int) -> None:
+    """Until the hold is settled nothing new is planned: a plan that comes meanwhile is the one before's, as is one that comes later."""
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     client.command(400, 1)
     world.run(3)
@@ -272,22 +274,7 @@ def test_a_plan_that_is_no_longer_wanted_is_not_flown(world: World, client: Clie
     world.run(10)
     (old,) = world.station.jobs()
     client.command(224, 2)
-    world.run(10)
-    world.station.planned(0, Plan(old.serial, Path(), (10.0, 20.0, 30.0)))
-    world.run(3)
-    assert Action.TRACK not in [r.action for r in world.robot.asked]
-
-
-def test_plan_that_comes_after_something_else_was_asked_for_is_not_flown(world: World, client: Client) -> None:
-    """Until the hold is settled nothing new is planned: a plan that comes meanwhile is the one before's."""
-    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
-    client.command(400, 1)
-    world.run(3)
-    client.command(176, 1, 4, 4)
-    world.run(10)
-    (old,) = world.station.jobs()
-    client.command(224, 2)
-    world.run(1)
+    world.run(ticks)
     world.station.planned(0, Plan(old.serial, Path(), (10.0, 20.0, 30.0)))
     world.run(3)
     assert Action.TRACK not in [r.action for r in world.robot.asked]

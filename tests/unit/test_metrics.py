@@ -9,7 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil.checks import Limit, check_metrics, judge, write_result
+from hil.force_metrics import force_metrics
 from hil.metrics import Poses, body_positions, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
+from hil.scenario import load_scenario
 from hil.signals import Flight, read_flight
 from tests.unit.flights import MARGIN, POWER_W, START_NS, write_flight, write_pair
 
@@ -183,3 +185,12 @@ def test_truth_is_told_of_the_body_that_the_firmware_steers(tmp_path: Path) -> N
     np.testing.assert_allclose(off_m, 0.005, atol=1e-9)
     turned = rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"])
     np.testing.assert_allclose(turned, np.full((200, 3), -0.01), atol=1e-9)
+
+
+def test_force_of_a_robot_that_never_pushed_has_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = load_scenario("force-tracking")
+    time_ns = np.arange(1, 8501) * 10_000_000
+    still = {"tick": np.arange(1, 8501), "time_ns": time_ns, "wrench_wanted": np.zeros((8500, 6)), "load": np.zeros((8500, 6))}
+    logs = {f"/{side}/body{leader}": still for side in ("firmware", "plant") for leader in (0, 1)}
+    monkeypatch.setattr("hil.force_metrics.read_signals", lambda path: logs)
+    assert np.isnan(force_metrics(scenario, tmp_path, 0)["force_difference_off"])

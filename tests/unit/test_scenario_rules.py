@@ -17,7 +17,7 @@ from hil.campaign import identity
 from hil.dock_script import AFTERWARDS_NS, DockScript
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN
-from hil.scenario import Scenario, load_scenario, scenario_names
+from hil.scenario import Scenario, load_scenario, make_world, scenario_names
 from hil.scenario_rules import metric_names
 from hil.script import Script
 
@@ -252,3 +252,10 @@ def test_path_that_does_not_fit_is_refused_before_the_flight(tmp_path: Path, nam
     assert refusal in str(refused.value)
     assert str(refused.value).startswith(name)
     assert "\n" not in str(refused.value)
+
+
+def test_bodies_that_would_start_one_inside_the_other_are_refused() -> None:
+    scenario = load_scenario("dock")
+    near = dataclasses.replace(scenario.module[1], position_m=scenario.module[0].position_m)
+    with pytest.raises(DescriptionError, match=r"modules 1 and 2 start 0\.\d+ m apart, one inside the other; 0\.2"):
+        make_world(dataclasses.replace(scenario, module=(scenario.module[0], near)), 0, 10_000_000)
