@@ -86,7 +86,7 @@ class Operator:
             return []
         self._strike_out(last)
         self._expire()
-        ready = [record.body for record in last.records if record.body in self.to_arm and record.estimate.ready]
+        ready = [record.body for record in last.records if record.body in self.to_arm and record.estimate.placed]
         if not ready or self._ticks < self._next_try:
             return []
         self._next_try = self._ticks + round(ARM_EVERY_S * self.rate_hz)

@@ -143,9 +143,9 @@ def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:
     """What `mode` needs and does not have, in words."""
     limits, needs = parameters.failsafes, MODES[mode].needs
     reasons = []
-    if Need.ATTITUDE in needs and not health.ready:
+    if (Need.ATTITUDE in needs and not health.ready) or (Need.POSITION in needs and not health.placed):
         reasons.append("no pose yet")
-    if Need.POSITION in needs and health.ready and health.tag_age_s > limits.tag_lost_limit:
+    elif Need.POSITION in needs and health.tag_age_s > limits.tag_lost_limit:
         reasons.append(f"no tag for {health.tag_age_s:.1f} s")
     if Need.DEPTH in needs and min(health.depth_age_s, health.tag_age_s) > limits.depth_unknown_limit:
         reasons.append("depth unknown")

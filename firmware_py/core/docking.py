@@ -392,7 +392,7 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
 
 def _in_the_way(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, standoff_m: float) -> str:
     """Why the straight way to the stand-off is none; empty: it is free, or nobody knows, which is for the sequence to say."""
-    if not (at.ready and target_at.ready):
+    if not (at.placed and target_at.placed):
         return ""
     module = nearest_pass(plan, active, at, target, target_at, standoff_m)
     return "" if module is None else f"on its way it would come too near to module {module}: bring it before that face first"

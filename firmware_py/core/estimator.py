@@ -1,7 +1,10 @@
 """Stage 2 of a tick: an error-state Kalman filter of pose, velocity, sensor biases and one lumped disturbance.
 
 The filter stands at its anchor: the time of the newest tag picture, or half a second ago when none came. Everything is fused once, in the
-order in which it happened; from the anchor the state is carried to now through the stored thruster wrenches and gyro readings.
+order in which it happened; from the anchor the state is carried to now through the stored thruster wrenches and gyro readings. While no
+tag comes, what would be half a second old is not waited for: a head runs on ahead of the anchor, and the state is carried from there.
+
+Until the first tags come it stands upright by gravity (`alignment`): attitude but for the heading, and depth.
 
 The body moves by the model of `propagation`, and the accelerometer measures what that model left out (`observation.fuse_inertial`): so the
 velocity follows the robot and not the command, which is worth 15 degrees of phase (docs/tuning.md).
@@ -10,28 +13,48 @@ velocity follows the robot and not the command, which is worth 15 degrees of pha
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from firmware_py.core import observation
+from firmware_py.core.alignment import FirstSight, upright
 from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.history import WINDOW_S, History
 from firmware_py.core.propagation import ERRORS, STATES
-from firmware_py.core.rotations import rotate
+from firmware_py.core.rotations import heading, multiply, rotate, rotate_back
 from firmware_py.core.topology import Motion
-from firmware_py.core.types import BodyPose, Estimate, Measured
+from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 
-NEVER_NS = 1 << 60
-"""Age of the last tag before the first one."""
 READY_AFTER = 10
 """Tag observations to accept before the pose is believed."""
+DOWN = np.array([0.0, 0.0, 1.0])
 UNKNOWN_SIGMA = np.full(6, 1e3)
 """Of the pose before the first tag, m and rad."""
+UPRIGHT_AFTER_S = 1.0
+"""Without a tag, until gravity has to do: its mean over the last `FELT_NS`."""
+FELT_NS = 200_000_000
+BLIND_NS = 250_000_000
+"""Without a tag, until the head leaves the anchor."""
+CATCH_UP = 4
+"""Samples that the head takes in a tick at most: it is with the present after half a second."""
+STAY_DENSITY = 0.01
+"""Of the noise of the place that is made up until tags tell one, horizontally, m^2 s: a metre in a tick at 100 Hz."""
+KEPT = np.r_[7:19, 21:25]
+"""Of the state: velocity, biases, vertical force and moment, which say the same whatever the heading."""
 RESET_AFTER = 30
 """Observations refused one after the other (half a second) until the filter believes them and not itself."""
 INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
 """Of position m, attitude rad, velocity m/s, rate rad/s, gyro bias, accelerometer bias, disturbance over mass, over inertia, depth bias."""
+
+
+class Belief(NamedTuple):
+    """State (26,) and covariance (25, 25) at a time, as core.propagation orders them."""
+
+    x: np.ndarray
+    covariance: np.ndarray
+    time_ns: int
 
 
 class Estimator:
@@ -44,14 +67,17 @@ class Estimator:
             body.mass, body.mass_inv, body.righting, body.drag.nodes, body.drag.rotational, body.drag.linear,
         )  # fmt: skip
         self._dt = period_ns * 1e-9
+        self._stay_variance = np.r_[np.full(2, STAY_DENSITY / self._dt), np.full(4, 1e6)]
         self._history = History(period_ns)
+        self._now: np.ndarray
+        self._anchor: Belief
+        self._head: Belief
         self._forget()
-        self._covariance = np.eye(ERRORS)
         self.retune(parameters)
-        self._anchor_ns = 0
         self._refused_in_row = 0
         self._rejected = 0
-        self._last_tag_ns = -NEVER_NS
+        self._last_tag_ns, self._taken_ns = -NEVER_NS, 0
+        self._first_sight, self._made_up = FirstSight(), np.zeros(3)
         self._nis = math.nan
         self._nis_dof = 0
 
@@ -80,25 +106,31 @@ class Estimator:
         """
         self._nis, self._nis_dof = math.nan, 0
         if self._history.newest >= 0 and time_ns - self._history.newest_ns > int(WINDOW_S * 1e9):
-            self._accepted = 0  # the process stood still: what is remembered joins on to nothing
+            self._accepted = self._waited = 0  # the process stood still: what is remembered joins on to nothing
         self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
         for pose in measured.tags:
             self._take(pose)
+        if not self._accepted:
+            self._wait(time_ns)
         if self._accepted:
-            self._advance(time_ns - int(WINDOW_S * 1e9))
+            self._anchor = self._advanced(self._anchor, time_ns - int(WINDOW_S * 1e9))
+            self._lead(time_ns)
+            if self._last_tag_ns == -NEVER_NS:
+                self._anchor, self._head = self._stayed(self._anchor), self._stayed(self._head)
         return self._estimate(time_ns)
 
     @property
     def motion(self) -> Motion:
         """State and covariance now, for a body that joins or parts."""
-        return Motion(self._now.copy(), self._covariance.copy(), self._accepted, self._last_tag_ns)
+        return Motion(self._now.copy(), self._head.covariance.copy(), self._accepted, self._last_tag_ns)
 
     def restart(self, time_ns: int, motion: Motion) -> Estimate:
         """Goes on from `motion` at `time_ns`, as after a dock; returns the estimate of the same tick."""
         self._history.push(time_ns, np.zeros(6), None, None, None)
-        self._x, self._covariance = motion.x.copy(), motion.covariance.copy()
-        self._now = self._x
-        self._anchor_ns, self._last_tag_ns = time_ns, motion.tag_ns
+        self._anchor = self._head = Belief(motion.x.copy(), motion.covariance.copy(), time_ns)
+        self._now = self._anchor.x
+        self._first_sight, self._made_up = FirstSight(), motion.x[:3].copy()
+        self._last_tag_ns, self._taken_ns = motion.tag_ns, time_ns
         self._accepted, self._refused_in_row = motion.accepted, 0
         self._nis, self._nis_dof = math.nan, 0
         return self._estimate(time_ns)
@@ -110,46 +142,79 @@ class Estimator:
             self._rejected += 1
         elif not self._accepted:
             self._start(pose)
-        elif pose.capture_ns >= self._anchor_ns:
-            self._advance(min(pose.capture_ns, self._history.newest_ns))
-            self._fuse_tag(pose)
+        elif pose.capture_ns >= self._anchor.time_ns:
+            self._anchor = self._advanced(self._anchor, min(pose.capture_ns, self._history.newest_ns))
+            if self._last_tag_ns == -NEVER_NS:
+                self._place(pose)
+            else:
+                self._fuse_tag(pose)
         else:
             self._rejected += 1
 
     def _start(self, pose: BodyPose) -> None:
-        self._x = np.zeros(STATES)
-        self._x[3:7] = pose.q_wb
-        self._x[:3] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
+        x = np.zeros(STATES)
+        x[3:7] = pose.q_wb
+        x[:3] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
         inertia = np.diag(self._body.mass)
         sigma = np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1])
         sigma[18:24] *= inertia
-        self._covariance = np.diag(sigma**2)
-        self._anchor_ns = pose.capture_ns
-        self._last_tag_ns = pose.capture_ns
+        self._anchor = self._head = Belief(x, np.diag(sigma**2), pose.capture_ns)
+        self._last_tag_ns, self._taken_ns = pose.capture_ns, self._history.newest_ns
         self._accepted, self._refused_in_row = 1, 0
-        self._now = self._x
+        self._now = x
 
-    def _advance(self, to_ns: int) -> None:
-        """Moves the filter to `to_ns`, fusing the inertial and depth measurements on the way."""
-        if to_ns <= self._anchor_ns:
+    def _wait(self, time_ns: int) -> None:
+        """For a tag; after a second without any the body stands upright by gravity, where and as it was last believed to head."""
+        self._waited += 1
+        if self._waited * self._dt <= UPRIGHT_AFTER_S:
             return
-        index = self._history.first_after(self._anchor_ns)
+        _, gyros, others = self._history.since(self._history.first_after(time_ns - FELT_NS))
+        tilt = upright(gyros, others[:, :3])
+        if tilt is None:
+            return
+        depths = others[~np.isnan(others[:, 3]), 3]
+        place = np.r_[self._now[:2], depths.mean() if len(depths) else self._now[2]]
+        self._start(BodyPose(time_ns, place, np.zeros(3), multiply(heading(self._now[3:7]), tilt), 1.0))
+        self._accepted, self._last_tag_ns = READY_AFTER, -NEVER_NS
+        self._first_sight, self._made_up = FirstSight(), place
+
+    def _stayed(self, at: Belief) -> Belief:
+        """While nobody tells the place the body is made up to be about where it was, as by ArduPilot's EKF3 without aiding: a speed
+        that nothing bounds would pass for drag, and spoil the tilt.
+        """
+        place, same = np.r_[self._made_up[:2], at.x[2]], at.x[3:7].copy()
+        _, x, covariance = observation.fuse_tag(at.x, at.covariance, place, np.zeros(3), same, self._stay_variance, math.inf)
+        return Belief(x, covariance, at.time_ns)
+
+    def _place(self, pose: BodyPose) -> None:
+        """The first tags say where the upright body is; what it knows of its motion and its sensors stays."""
+        if not self._first_sight.agrees(pose, self._anchor.x[:3], self._anchor.x[3:7]):
+            self._refuse(pose)
+        elif self._first_sight.count >= READY_AFTER:
+            kept = self._anchor.x[KEPT]
+            self._start(pose)
+            self._anchor.x[KEPT], self._accepted = kept, READY_AFTER
+
+    def _advanced(self, start: Belief, to_ns: int) -> Belief:
+        """The filter at `to_ns`, the inertial and depth measurements on the way fused."""
+        if to_ns <= start.time_ns:
+            return start
+        index = self._history.first_after(start.time_ns)
         first_ns = self._history.time_of(index)
         count, rest_ns = divmod(to_ns - first_ns, self._history.period_ns)
         count += 1
         if count == 0:
-            rest_ns = to_ns - self._anchor_ns
-        self._x, self._covariance = observation.advance(
-            self._x, self._covariance, *self._history.since(index), (first_ns - self._anchor_ns) * 1e-9, count, self._dt, rest_ns * 1e-9,
+            rest_ns = to_ns - start.time_ns
+        x, covariance = observation.advance(
+            start.x, start.covariance, *self._history.since(index), (first_ns - start.time_ns) * 1e-9, count, self._dt, rest_ns * 1e-9,
             self._density, self._under_way, self._inertial_sigma, *self._plant,
         )  # fmt: skip
-        self._anchor_ns = to_ns
+        return Belief(x, covariance, to_ns)
 
     def _fuse_tag(self, pose: BodyPose) -> None:
-        variance, gate = self._tag_variance / pose.tags, self._p.tag_gate**2
-        nis, self._x, self._covariance = observation.fuse_tag(
-            self._x, self._covariance, pose.p_wt, pose.lever_b, pose.q_wb, variance, gate
-        )
+        variance, gate, at = self._tag_variance / pose.tags, self._p.tag_gate**2, self._anchor
+        nis, x, covariance = observation.fuse_tag(at.x, at.covariance, pose.p_wt, pose.lever_b, pose.q_wb, variance, gate)
+        self._anchor = Belief(x, covariance, at.time_ns)
         if not nis <= gate:  # also when it is NaN
             self._refuse(pose)
             return
@@ -157,7 +222,7 @@ class Estimator:
         self._nis_dof += 6
         self._accepted += 1
         self._refused_in_row = 0
-        self._last_tag_ns = pose.capture_ns
+        self._last_tag_ns, self._taken_ns = pose.capture_ns, self._history.newest_ns
 
     def _refuse(self, pose: BodyPose) -> None:
         self._rejected += 1
@@ -167,21 +232,34 @@ class Estimator:
 
     # ------------------------------------------------------------ from the anchor to now
 
+    def _lead(self, time_ns: int) -> None:
+        """Moves the head: it is the anchor while tags come, and else runs on to the sample before the newest."""
+        if time_ns - self._taken_ns < BLIND_NS:
+            self._head = self._anchor
+            return
+        start = max(self._head, self._anchor, key=lambda belief: belief.time_ns)
+        period_ns = self._history.period_ns
+        self._head = self._advanced(start, min(time_ns - period_ns, start.time_ns + CATCH_UP * period_ns))
+
     def _carry(self, time_ns: int) -> tuple[np.ndarray, bool]:
         """Brings the state to `time_ns`; returns sigma (6,) of its pose, and whether all of that is sound."""
-        index = self._history.first_after(self._anchor_ns)
+        head = self._head
+        index = self._history.first_after(head.time_ns)
         taus, gyros, _ = self._history.since(index)
-        until_first = (self._history.time_of(index) - self._anchor_ns) * 1e-9
-        lag, rate_variance = (time_ns - self._anchor_ns) * 1e-9, self._p.gyro_sigma**2 * self._dt
+        until_first = (self._history.time_of(index) - head.time_ns) * 1e-9
+        lag, rate_variance = (time_ns - head.time_ns) * 1e-9, self._p.gyro_sigma**2 * self._dt
         self._now, sigma, sound = observation.carried(
-            self._x, self._covariance, taus, gyros, self._dt, until_first, self._density, lag, rate_variance, *self._plant
+            head.x, head.covariance, taus, gyros, self._dt, until_first, self._density, lag, rate_variance, *self._plant
         )
+        if self._last_tag_ns == -NEVER_NS:  # of what the upright body is taken for, only the tilt was measured
+            sigma = np.concatenate([UNKNOWN_SIGMA[:3], sigma[3:] + UNKNOWN_SIGMA[3:] * np.abs(rotate_back(self._now[3:7], DOWN))])
         return sigma, sound
 
     def _forget(self) -> None:
-        """Nothing is known: the filter begins anew with the next tag."""
-        self._accepted = 0
-        self._x = self._now = np.eye(1, STATES, 3)[0]
+        """Nothing is known: the filter begins anew with the next tag, or upright."""
+        self._accepted = self._waited = 0
+        self._now = np.eye(1, STATES, 3)[0]
+        self._anchor = self._head = Belief(self._now, np.eye(ERRORS), 0)
 
     def _estimate(self, time_ns: int) -> Estimate:
         sigma, sound = self._carry(time_ns) if self._accepted else (UNKNOWN_SIGMA, True)

@@ -65,6 +65,7 @@ class Guidance:
         self._trajectory: Trajectory | None = None
         self._start_ns: int | None = None
         self._goal: Wish | None = None
+        self._upright = False
         self._point: tuple[int, Setpoint] | None = None
         self._docking: Setpoint | Wish | None = None
         self._sticks, self._sticks_ns = NEUTRAL, 0
@@ -157,6 +158,10 @@ class Guidance:
         """The set-point at `time_ns`, and the one that the thrusters' force will meet."""
         dt_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) * 1e-9
         self._time_ns = time_ns
+        if self._upright and health.placed:  # tags have told where the world begins and where its north is
+            self._glider.put(at_estimate(estimate))
+            self._goal = None
+        self._upright = health.ready and not health.placed
         if self.mode == Mode.AUTO and self._trajectory is not None and self._joined(self._trajectory, time_ns):
             return self._sample(self._trajectory, time_ns)
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):

@@ -37,7 +37,7 @@ class Health(NamedTuple):
 
     time_ns: int
     ready: bool
-    """A pose has been found."""
+    """An attitude has been found."""
     tag_age_s: float
     sigma_m: float
     """Largest standard deviation of the position, m."""
@@ -82,6 +82,11 @@ class Health(NamedTuple):
     """Every stage has run at least once."""
     topology: str
     """Which docked partner is lost, in words; empty: none."""
+
+    @property
+    def placed(self) -> bool:
+        """Whether tags have told heading and place."""
+        return self.ready and self.tag_age_s < NEVER_S
 
 
 class HealthMonitor:
@@ -181,7 +186,7 @@ class HealthMonitor:
             ground_age_s=_age_s(self._ground_ns, now, math.nan),
             pilot_age_s=_age_s(self._pilot_ns, now, math.nan),
             stick=self._stick,
-            outside_m=outside(estimate.p_wb, self._fence) if estimate.ready else math.nan,
+            outside_m=outside(estimate.p_wb, self._fence) if estimate.placed else math.nan,
             dead=faults.dead,
             lost_axes=faults.lost_axes,
             warm=self.warm,

@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.estimator import NEVER_NS, READY_AFTER, RESET_AFTER
+from firmware_py.core.estimator import READY_AFTER, RESET_AFTER
 from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rotations import conjugate, exp, log, multiply, rotate, to_matrix
 from firmware_py.core.topology import Motion
-from firmware_py.core.types import BodyPose, Estimate, Measured
+from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 
 PAPER_ACCEL_DENSITY = 0.05

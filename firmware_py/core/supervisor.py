@@ -126,8 +126,8 @@ class Supervisor:
         return decisions
 
     def _ladder(self, level: Level, health: Health) -> tuple[Trigger, ...]:
-        """What is tried. A body whose thrusters are tested, or that never had a pose, may lie on a bench: no test becomes a flight."""
-        if self.mode == Mode.MOTOR_DETECT and (self._testing or not health.ready):
+        """What is tried. A body whose thrusters are tested, or that never saw a tag, may lie on a bench: no test becomes a flight."""
+        if self.mode == Mode.MOTOR_DETECT and (self._testing or not health.placed):
             return LADDER[Level.DISARM]
         return LADDER[level]
 

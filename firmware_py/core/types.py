@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Array = np.ndarray
+NEVER_NS = 1 << 60
+"""Age of the last tag before the first one."""
 
 
 # ---------------------------------------------------------------- what comes in
@@ -239,7 +241,12 @@ class Estimate(NamedTuple):
     rejected: int
     """Tag observations refused by the gate so far."""
     ready: bool
-    """A pose has been found."""
+    """An attitude has been found: by tags, or before the first by gravity."""
+
+    @property
+    def placed(self) -> bool:
+        """Whether tags have told heading and place."""
+        return self.ready and self.tag_age_ns < NEVER_NS
 
 
 class Setpoint(NamedTuple):

@@ -35,7 +35,9 @@ GOOD = Health(
 )
 
 BLIND = GOOD._replace(ready=False, tag_age_s=NEVER_S, sigma_m=1e3, outside_m=math.nan)
-"""No tag was ever seen."""
+"""No tag was ever seen, and gravity was not felt yet."""
+UPRIGHT = BLIND._replace(ready=True)
+"""No tag was ever seen; the attitude is known by gravity."""
 
 
 def at(health: Health, seconds: float) -> Health:

@@ -11,7 +11,7 @@ from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Limiter, Parameters
-from tests.unit.healths import BLIND, GOOD
+from tests.unit.healths import BLIND, GOOD, UPRIGHT
 
 P = Parameters()
 PLACED = (Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK)
@@ -175,6 +175,7 @@ def test_mode_needs_what_it_steers_by(mode: Mode) -> None:
         **{key: ["no pose yet"] for key in PLACED},
     }  # fmt: skip
     assert missing(mode, blind, P) == expected.get(mode, [])
+    assert missing(mode, UPRIGHT, P) == (["no pose yet"] if mode in PLACED else [])
     lost = GOOD._replace(tag_age_s=above(8.0), depth_age_s=above(5.0))
     expected = {Mode.ALT_HOLD: ["depth unknown"], **{key: ["no tag for 8.0 s"] for key in PLACED}}
     assert missing(mode, lost, P) == expected.get(mode, [])

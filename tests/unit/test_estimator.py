@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from firmware_py.core import propagation
 from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.drag_lookup import add_drag
-from firmware_py.core.estimator import NEVER_NS, READY_AFTER, RESET_AFTER, Estimator
+from firmware_py.core.estimator import READY_AFTER, RESET_AFTER, Estimator
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
-from firmware_py.core.types import BodyPose, Estimate, Measured
+from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
@@ -86,9 +86,9 @@ def assert_rests(estimate: Estimate, p_wb: np.ndarray = P_WB, tolerance_m: float
 # ---------------------------------------------------------------- from nothing to a pose
 
 
-def test_robot_that_saw_no_tag_knows_nothing(body: Body) -> None:
+def test_robot_that_saw_no_tag_knows_nothing_for_a_second(body: Body) -> None:
     robot = Robot(body)
-    for _ in range(200):
+    for _ in range(100):
         estimate = robot.step(sensors())
     assert not estimate.ready
     assert estimate.sigma_p.min() > 100.0
@@ -209,6 +209,44 @@ def test_pose_is_carried_through_two_seconds_without_a_tag(body: Body) -> None:
     assert blind.tag_age_ns >= 2_000_000_000
 
 
+def test_depth_is_followed_at_once_while_no_tag_comes(body: Body) -> None:
+    """Waiting for late tags is no reason to know the depth of half a second ago."""
+    robot = Robot(body)
+    robot.rest(300)
+    for _ in range(100):
+        robot.step(sensors())
+    for _ in range(30):
+        estimate = robot.step(sensors()._replace(depth_m=P_WB[2] + 0.1))
+    assert estimate.p_wb[2] > P_WB[2] + 0.05
+
+
+def test_head_and_anchor_believe_the_same(body: Body) -> None:
+    """What runs on ahead has fused what the anchor is to fuse, in the same order."""
+    robot = Robot(body)
+    robot.rest(301)
+    for tick in range(80):
+        robot.step(sensors(P_WB + 1e-3 * tick))
+    estimator = robot.estimator
+    assert estimator._head.time_ns == robot.time_ns - 2 * PERIOD
+    assert estimator._anchor.time_ns == robot.time_ns - PERIOD - 500_000_000
+    caught_up = estimator._advanced(estimator._anchor, estimator._head.time_ns)
+    np.testing.assert_allclose(estimator._head.x, caught_up.x, atol=1e-12)
+    np.testing.assert_allclose(estimator._head.covariance, caught_up.covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize(("blind_ticks", "ahead"), [(24, 0), (25, 4), (27, 12), (40, 44), (70, 49)])
+def test_head_leaves_the_anchor_after_a_quarter_of_a_second_and_hurries(body: Body, blind_ticks: int, ahead: int) -> None:
+    robot = Robot(body)
+    robot.rest(302)
+    for _ in range(blind_ticks):
+        robot.step(sensors())
+    estimator = robot.estimator
+    assert (estimator._head.time_ns - estimator._anchor.time_ns) // PERIOD == ahead
+    back = robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - DELAY_TICKS * PERIOD)))
+    assert estimator._head is estimator._anchor
+    assert_rests(back)
+
+
 def test_gyro_turns_the_robot_between_tags(body: Body) -> None:
     """What the gyro felt since the last picture shows in the same tick, whatever the thruster model says."""
     robot = Robot(body)
@@ -306,7 +344,7 @@ def disturbance_doubt(vehicle: str, current_walk: float, speed_m_s: float) -> fl
     way = np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0])
     add_drag(body.drag.nodes, body.drag.rotational, body.drag.linear, way, robot.tau)
     robot.tau = 2.0 * holding(body) - robot.tau  # what drag takes off
-    robot.estimator._x[7:10] = way[:3]
+    robot.estimator._anchor.x[7:10] = way[:3]
     for _ in range(1000):
         robot.step(Measured(np.zeros(3), None, None, []))
     assert np.linalg.norm(robot.estimator.motion.x[7:10]) == pytest.approx(speed_m_s, abs=0.1 * CRUISE_M_S)
@@ -328,9 +366,9 @@ def test_estimate_that_is_no_number_any_longer_is_given_up_and_found_again(body:
     robot = Robot(body)
     robot.rest(200)
     if spoil == "state":
-        robot.estimator._x[7] = math.nan
+        robot.estimator._anchor.x[7] = math.nan
     else:
-        robot.estimator._covariance[:3, :3] = np.eye(3) * (math.nan if spoil == "covariance" else -1e3)
+        robot.estimator._anchor.covariance[:3, :3] = np.eye(3) * (math.nan if spoil == "covariance" else -1e3)
     lost = robot.step(sensors())
     assert not lost.ready
     assert all(np.isfinite(part).all() for part in lost[:7])

@@ -16,7 +16,7 @@ from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
-from tests.unit.healths import BLIND, GOOD
+from tests.unit.healths import BLIND, GOOD, UPRIGHT
 
 BODY = assemble_vehicle(load_vehicle("modcube"))
 ZERO = np.zeros(3)
@@ -308,6 +308,28 @@ def test_surfacing_robot_lifts_blindly_when_it_must() -> None:
         flight.do(Effect.ENTER_MODE, Mode.SURFACE)
         flight.run(0.5, health=health)
         np.testing.assert_allclose(flight.wrenches[-1], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", [Mode.STABILIZE, Mode.ALT_HOLD, Mode.SURFACE])
+def test_first_tags_move_the_set_point_with_the_world(mode: Mode) -> None:
+    """They tell another place and heading: the robot, which is where it was, is not to go back to what it believed before."""
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, mode)
+    flight.run(2.0, health=UPRIGHT)
+    there = flight.estimate = estimate((5.0, -3.0, 1.4), from_euler(0.0, 0.0, 2.5), (0.1, 0.0, 0.0, 0.0, 0.0, 0.2))
+    now = flight.run(0.01, follows=False)
+    np.testing.assert_allclose(now.p_wb, there.p_wb, atol=0.01)
+    assert np.linalg.norm(difference(now.q_wb, there.q_wb)) < 0.01
+    assert flight.run(1.0).p_wb[0] < 5.2
+
+
+def test_tags_that_come_back_move_no_set_point() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    flight.run(1.0, health=GOOD._replace(tag_age_s=100.0), follows=False)
+    flight.estimate = estimate((0.0, 0.0, 1.3), from_euler(0.0, 0.0, 0.3))
+    now = flight.run(0.01, follows=False)
+    assert now.p_wb[2] == pytest.approx(1.0) and np.linalg.norm(difference(now.q_wb, flight.estimate.q_wb)) > 0.29
 
 
 def test_docking_sequence_steers_in_its_mode_alone() -> None:

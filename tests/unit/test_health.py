@@ -234,3 +234,9 @@ def test_robot_without_a_pose_is_nowhere() -> None:
     health = Ear().hear(ready=False, tag_age_ns=1 << 60)  # type: ignore[arg-type]
     assert math.isnan(health.outside_m) and not health.ready and health.tag_age_s > NEVER_S
     assert Ear().hear().sigma_m == 0.03
+
+
+def test_robot_that_stands_by_gravity_alone_is_nowhere_but_ready() -> None:
+    health = Ear().hear(tag_age_ns=1 << 60)  # type: ignore[arg-type]
+    assert health.ready and not health.placed and math.isnan(health.outside_m)
+    assert Ear().hear().placed and not Ear().hear(ready=False).placed  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ import pytest
 
 from firmware_py.app.vehicle import ARM_EVERY_S, REARM_S, Operator, with_ground
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, BodyRecord, Mode, Outputs, Request
+from firmware_py.core.types import NEVER_NS, Action, BodyRecord, Mode, Outputs, Request
 from tests.unit.ground_world import Robot
 
 RATE_HZ = 100
@@ -20,10 +20,11 @@ class Waiting(Robot):
     """A robot whose pose may not be known yet."""
 
     ready = True
+    tag_age_ns = 0
 
     def _record(self, body: int) -> BodyRecord:
         record = super()._record(body)
-        return record._replace(estimate=record.estimate._replace(ready=self.ready))
+        return record._replace(estimate=record.estimate._replace(ready=self.ready, tag_age_ns=self.tag_age_ns))
 
 
 class Flight:
@@ -171,7 +172,10 @@ def test_order_to_hold_stays_without_limit() -> None:
     flight = Flight()
     flight.robot.ready = False
     flight.run(2 * MINUTE)
-    flight.robot.ready = True
+    flight.robot.ready, flight.robot.tag_age_ns = True, NEVER_NS
+    flight.run(MINUTE)
+    assert flight.arms == [], "it stands upright, and does not know where"
+    flight.robot.tag_age_ns = 0
     flight.run(2)
     assert flight.arms == [0]
     assert flight.said == []

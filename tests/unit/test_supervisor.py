@@ -14,7 +14,7 @@ from firmware_py.core.supervisor import CRITICAL, INFORMATION, WARNING, Decision
 from firmware_py.core.transitions import ARMED, ROWS, TABLE, TRIGGERS, Effect, Guard, State, Transition, Trigger
 from firmware_py.core.types import Action, DockRequest, Event, Mode, Request, Sticks
 from firmware_py.description.parameters import Parameters
-from tests.unit.healths import BLIND, GOOD, at
+from tests.unit.healths import BLIND, GOOD, UPRIGHT, at
 
 P = Parameters()
 HERE = rest_at(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -380,7 +380,7 @@ def test_cause_that_comes_and_goes_is_said_once_while_it_takes_the_robot_from_no
     ("figure", "value"),
     [("silent_s", 1.0), ("ground_age_s", 6.0), ("imu_age_s", 1.0), ("lost_axes", 1), ("leak", True), ("outside_m", 9.0)],
 )
-@pytest.mark.parametrize("base", [GOOD, BLIND], ids=["placed", "blind"])
+@pytest.mark.parametrize("base", [GOOD, UPRIGHT, BLIND], ids=["placed", "upright", "blind"])
 def test_fail_safe_during_a_motor_test_disarms(base: Health, figure: str, value: float) -> None:
     """The robot may lie on a bench, with hands near its propellers."""
     supervisor = supervisor_in(State.DISARMED)
@@ -410,8 +410,9 @@ def test_body_that_comes_to_rest_keeps_no_mode_that_no_person_chose(rest: str) -
     assert tuple(after(supervisor_in(mode=mode)) for mode in chosen) == chosen
 
 
-def test_robot_that_detects_its_motors_is_disarmed_where_it_never_had_a_pose_and_holds_where_it_has_one() -> None:
-    for base, state, mode in ((BLIND, State.DISARMED, Mode.MOTOR_DETECT), (GOOD, State.ARMED, Mode.POSHOLD)):
+def test_robot_that_detects_its_motors_is_disarmed_where_it_never_saw_a_tag_and_holds_where_it_has_a_pose() -> None:
+    on_a_bench = State.DISARMED, Mode.MOTOR_DETECT
+    for base, (state, mode) in ((BLIND, on_a_bench), (UPRIGHT, on_a_bench), (GOOD, (State.ARMED, Mode.POSHOLD))):
         supervisor = supervisor_in(State.ARMED, Mode.MOTOR_DETECT)
         supervisor.step(False, base._replace(silent_s=1.0), [])
         assert (supervisor.state, supervisor.mode) == (state, mode)
@@ -545,6 +546,7 @@ def test_robot_that_a_pilot_steers_is_steered_by_him_when_it_joins_or_parts(mode
 @pytest.mark.parametrize(("state", "mode", "health", "may"), [
     (State.DISARMED, Mode.POSHOLD, GOOD, True), (State.DISARMED, Mode.POSHOLD, GOOD._replace(esc_missing=(3,)), False),
     (State.DISARMED, Mode.POSHOLD, BLIND, False), (State.DISARMED, Mode.MANUAL, BLIND, True),
+    (State.DISARMED, Mode.POSHOLD, UPRIGHT, False), (State.DISARMED, Mode.ALT_HOLD, UPRIGHT, True),
     (State.ARMED, Mode.POSHOLD, GOOD, False), (State.ESTOP, Mode.POSHOLD, GOOD, False),
 ])  # fmt: skip
 def test_robot_that_may_arm_is_disarmed_and_passes_every_check_of_its_mode(state: State, mode: Mode, health: Health, may: bool) -> None:

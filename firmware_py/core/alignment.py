@@ -1,0 +1,59 @@
+"""How the estimator begins without a tag: upright by gravity, heading and place unknown, until the first tags give those.
+
+What inertial navigation calls coarse alignment (Groves 2013, Principles of GNSS, Inertial and Multisensor Navigation, 5.6): at rest the
+accelerometer shows which way is down. By that alone a robot is stabilised, holds its depth and surfaces.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from firmware_py.core.observation import GRAVITY
+from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
+from firmware_py.core.types import BodyPose
+
+AT_REST_M_S2 = 0.05 * GRAVITY
+"""Mean specific force and gravity differ by less where nothing else pushes; the direction then errs by three degrees at most."""
+AT_REST_RAD_S = 0.5
+LEVEL_RAD = 0.35
+"""A tag that tells another way down by more is flipped (20 deg; as `measurements`), or not where the vehicle file says."""
+SAME_RAD, SAME_M = 0.1, 0.1
+"""Tags that differ by less in heading and place tell the same."""
+
+
+def upright(gyros: np.ndarray, accels: np.ndarray) -> np.ndarray | None:
+    """Attitude (4,) with heading 0 by the mean of (k, 3) specific forces, m/s^2; None where gravity cannot be told from the rest.
+
+    Half of them must have come (NaN: did not), and by those and the (k, 3) angular rates, rad/s, the body must be about at rest.
+    """
+    felt, turned = accels[~np.isnan(accels[:, 0])], gyros[~np.isnan(gyros[:, 0])]
+    if min(len(felt), len(turned)) < max(1, len(accels) // 2):
+        return None
+    x, y, z = (-felt.mean(axis=0)).tolist()
+    force = math.sqrt(x * x + y * y + z * z)
+    if not abs(force - GRAVITY) <= AT_REST_M_S2 or not np.linalg.norm(turned.mean(axis=0)) <= AT_REST_RAD_S:
+        return None
+    return from_euler(math.atan2(y, z), math.asin(max(-1.0, min(1.0, -x / force))), 0.0)
+
+
+class FirstSight:
+    """Tags before the place is known: counts those that agree with gravity and with the one before."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._heading, self._offset = math.nan, np.full(3, math.nan)
+
+    def agrees(self, pose: BodyPose, p_wb: np.ndarray, q_wb: np.ndarray) -> bool:
+        """Whether `pose` has the same way down as q_wb (4,); notes where it would move the body that is believed at p_wb (3,)."""
+        w, x, y, z = multiply(pose.q_wb, conjugate(q_wb)).tolist()
+        if 2.0 * math.asin(min(1.0, math.hypot(x, y))) > LEVEL_RAD:
+            self.count = 0
+            return False
+        heading, offset = 2.0 * math.atan2(z, w), pose.p_wt - rotate(pose.q_wb, pose.lever_b) - p_wb
+        turned = abs(math.remainder(heading - self._heading, 2.0 * math.pi)) if self.count else math.inf
+        same = turned <= SAME_RAD and float(np.linalg.norm(offset - self._offset)) <= SAME_M
+        self.count = self.count + 1 if same else 1
+        self._heading, self._offset = heading, offset
+        return True

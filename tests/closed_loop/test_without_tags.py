@@ -1,0 +1,143 @@
+"""A robot that no camera sees: stabilised by gravity, held at its depth and brought up; and what happens when tags come at last."""
+
+import dataclasses
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.core.rotations import heading, rotate
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Action, BodyRecord, Inputs, Mode, Outputs, Request, Sticks
+from firmware_py.description.parameters import Parameters
+from hil.bench import open_bench
+from hil.plant.fault_spec import Fault
+from hil.plant.world import BodyTruth
+from hil.scenario import load_scenario
+
+DOWN = np.array([0.0, 0.0, 1.0])
+NEUTRAL, AHEAD = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Sticks((0.3, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+class Pilot:
+    """Takes a mode, arms in it as soon as that is granted, and may steer ahead for a while and then ask for another mode."""
+
+    def __init__(
+        self, mode: Mode, duration_s: float, ahead_s: tuple[float, float] = (0.0, 0.0), then: tuple[float, Mode] | None = None
+    ) -> None:
+        self.ticks = round(100 * duration_s)
+        self._modes = {50: mode} if then is None else {50: mode, round(100 * then[0]): then[1]}
+        self._ahead, self._armed = ahead_s, False
+
+    def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
+        tick, t = time_ns // 10_000_000, time_ns * 1e-9
+        self._armed = self._armed or (last is not None and last.records[0].state == State.ARMED)
+        asked = [Request(Action.STICKS, 0, AHEAD if self._ahead[0] <= t < self._ahead[1] else NEUTRAL), Request(Action.GROUND_ALIVE)]
+        if tick in self._modes:
+            asked.append(Request(Action.SET_MODE, 0, self._modes[tick]))
+        if tick % 50 == 10 and not self._armed:
+            asked.append(Request(Action.ARM))
+        return asked
+
+    def is_over(self, time_ns: int) -> bool:
+        return False
+
+
+class Flight:
+    """Every tick of a flight in which tags are seen between two times alone: truth, record, words."""
+
+    def __init__(self, pilot: Pilot, *faults: Fault, tags_s: tuple[float, float] = (1e5, 1e6), seed: int = 1) -> None:
+        absent = (Fault(kind="tag_absent", until_s=tags_s[0]), Fault(kind="tag_absent", at_s=tags_s[1] - 1e-3))
+        scenario = dataclasses.replace(load_scenario("faults"), fault=(*absent, *faults))
+        self.truth: list[BodyTruth] = []
+        self.records: list[BodyRecord] = []
+        self.words: list[str] = []
+        with ExitStack() as stack:
+            bench = open_bench(stack, scenario, seed, Parameters(), "virtual:without-tags")
+            bench.script = pilot  # type: ignore[assignment]
+
+            def watch(received: list[BusFrame], sent: list[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+                self.truth.append(bench.nodes.world.body_truth(0))
+                self.records += outputs.records
+                self.words += [event.text for event in outputs.events]
+
+            bench.fly([watch])  # type: ignore[list-item]
+
+    def between(self, first_s: float, last_s: float) -> list[tuple[BodyTruth, BodyRecord]]:
+        return list(zip(self.truth, self.records, strict=True))[round(100 * first_s) : round(100 * last_s)]
+
+    def tilt_error_deg(self, first_s: float, last_s: float) -> float:
+        """Largest angle between the way down and the believed one."""
+        pairs = [(rotate_back(t.q_wb), rotate_back(r.estimate.q_wb)) for t, r in self.between(first_s, last_s)]
+        return float(np.degrees(max(np.arccos(min(1.0, a @ b)) for a, b in pairs)))
+
+
+def rotate_back(q_wb: np.ndarray) -> np.ndarray:
+    """Down, body frame."""
+    return np.asarray(rotate(np.asarray(q_wb) * [1, -1, -1, -1], DOWN))
+
+
+def tilt_deg(q_wb: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(min(1.0, rotate(np.ascontiguousarray(q_wb), DOWN)[2]))))
+
+
+@pytest.mark.slow
+def test_depth_and_attitude_are_held_without_any_tag_and_the_place_once_there_are_some() -> None:
+    flight = Flight(Pilot(Mode.ALT_HOLD, 20.0, then=(16.0, Mode.POSHOLD)), tags_s=(12.0, 1e6))
+    for truth, record in flight.between(3.0, 12.0):
+        assert (record.state, record.mode, record.estimate.placed) == (State.ARMED, Mode.ALT_HOLD, False)
+        assert abs(truth.p_wb[2] - flight.truth[300].p_wb[2]) < 0.02
+        assert abs(truth.p_wb[2] - record.estimate.p_wb[2]) < 0.05
+    assert flight.tilt_error_deg(3.0, 12.0) < 1.0
+    before = flight.truth[1199]
+    for truth, record in flight.between(12.3, 16.0):  # told where it is, it does not turn to a north that it believed in before
+        assert record.estimate.placed
+        np.testing.assert_allclose(record.estimate.p_wb, truth.p_wb, atol=0.01)
+        assert abs(truth.p_wb[2] - before.p_wb[2]) < 0.02
+        assert np.linalg.norm(truth.w_b) < 0.1
+    assert flight.records[-1].mode == Mode.POSHOLD
+    for truth, _ in flight.between(17.0, 20.0):
+        np.testing.assert_allclose(truth.p_wb, flight.truth[1700].p_wb, atol=0.02)
+    assert "ARMED ALT_HOLD -> ARMED POSHOLD" in flight.words
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_robot_that_leaks_comes_up_level_without_any_tag_and_stays_up(seed: int) -> None:
+    flight = Flight(Pilot(Mode.ALT_HOLD, 55.0), Fault(kind="leak", at_s=6.0), seed=seed)
+    assert flight.records[700].mode == Mode.SURFACE
+    assert all(tilt_deg(truth.q_wb) < 5.0 for truth, _ in flight.between(12.0, 55.0))
+    at_the_top = flight.between(45.0, 55.0)
+    assert all(0.05 < truth.p_wb[2] < 0.15 for truth, _ in at_the_top)
+    lift_n = np.array([record.wrench[2] for _, record in at_the_top])
+    assert lift_n.std() < 3.0 and np.abs(lift_n).max() < 20.0, "it rests there and does not beat the water"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_robot_that_lost_its_tags_rests_at_the_surface(seed: int) -> None:
+    """What it feels there no model foresees: half a second of waiting for late tags made it rise and dive with all its force."""
+    flight = Flight(Pilot(Mode.STABILIZE, 55.0), Fault(kind="leak", at_s=6.0), seed=seed, tags_s=(1e-3, 5.0))
+    at_the_top = flight.between(45.0, 55.0)
+    assert flight.records[-1].mode == Mode.SURFACE
+    assert all(0.05 < truth.p_wb[2] < 0.15 and abs(record.estimate.p_wb[2] - truth.p_wb[2]) < 0.02 for truth, record in at_the_top)
+    lift_n = np.array([record.wrench[2] for _, record in at_the_top])
+    assert lift_n.std() < 3.0 and np.abs(lift_n).max() < 20.0
+
+
+@pytest.mark.slow
+def test_pilot_steers_a_stabilised_robot_without_any_tag() -> None:
+    flight = Flight(Pilot(Mode.ALT_HOLD, 16.0, ahead_s=(3.0, 12.0)), tags_s=(10.0, 1e6))
+    assert flight.tilt_error_deg(3.0, 16.0) < 2.0
+    way_w = flight.truth[1000].p_wb - flight.truth[300].p_wb
+    ahead_w = rotate(heading(flight.truth[300].q_wb), np.array([1.0, 0.0, 0.0]))
+    assert way_w @ ahead_w > 1.0 and abs(way_w[2]) < 0.05
+    for truth, record in flight.between(11.0, 16.0):  # the tags came while it was under way
+        np.testing.assert_allclose(record.estimate.p_wb, truth.p_wb, atol=0.01)
+
+
+def test_no_mode_that_keeps_a_place_is_armed_without_a_tag() -> None:
+    flight = Flight(Pilot(Mode.POSHOLD, 3.0))
+    assert flight.records[-1].state == State.DISARMED
+    assert flight.words[-1] == "ARM refused: no pose yet"

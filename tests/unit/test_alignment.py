@@ -1,0 +1,244 @@
+"""Before the first tag: upright by gravity after a second, no place and no heading until ten tags tell the same."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from firmware_py.core.alignment import FirstSight, upright
+from firmware_py.core.estimator import READY_AFTER, RESET_AFTER, Estimator
+from firmware_py.core.rotations import difference, exp, from_euler, heading, multiply
+from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
+from firmware_py.description.parameters import Estimation
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+
+BODY = assemble_vehicle(load_vehicle("modcube"))
+PERIOD = 10_000_000
+G = 9.80665
+STILL = np.zeros((20, 3))
+P_WB, Q_WB = np.array([1.0, -0.5, 0.8]), from_euler(0.2, -0.4, 2.5)
+LEVER = np.array([0.0, 0.0, -0.105])
+UPSIDE_DOWN = (math.pi, 0.0, 0.0)
+
+
+def turned_back(q_wb: np.ndarray, v_w: np.ndarray) -> np.ndarray:
+    return np.asarray(Rotation.from_quat(q_wb[[1, 2, 3, 0]]).inv().apply(v_w))
+
+
+def felt(q_wb: np.ndarray, more: tuple[float, float, float] = (0.0, 0.0, 0.0), count: int = 20) -> np.ndarray:
+    """(count, 3) specific forces of a body that is at rest but for the acceleration `more`, world."""
+    return np.tile(turned_back(q_wb, np.array(more) - [0.0, 0.0, G]), (count, 1))
+
+
+def tag(capture_ns: int, p_wb: np.ndarray = P_WB, q_wb: np.ndarray = Q_WB) -> BodyPose:
+    return BodyPose(capture_ns, p_wb + Rotation.from_quat(q_wb[[1, 2, 3, 0]]).apply(LEVER), LEVER, q_wb, 1.0)
+
+
+class Robot:
+    """A robot at rest and its estimator, tick by tick."""
+
+    def __init__(self, q_wb: np.ndarray = Q_WB) -> None:
+        self.estimator, self.q_wb, self.tick = Estimator(BODY, Estimation(), PERIOD), q_wb, 0
+        down_b = turned_back(q_wb, np.array([0.0, 0.0, 1.0]))
+        self.tau = np.r_[0.0, 0.0, 0.0, np.cross(BODY.righting, down_b)]
+        assert np.abs(self.tau).max() > 0.0 or np.abs(BODY.righting).max() == 0.0
+
+    @property
+    def time_ns(self) -> int:
+        return self.tick * PERIOD
+
+    def step(self, *tags: BodyPose, depth_m: float | None = 0.8, gyro: np.ndarray | None = None) -> Estimate:
+        self.tick += 1
+        rate = np.zeros(3) if gyro is None else gyro
+        return self.estimator.step(self.time_ns, Measured(rate, felt(self.q_wb)[0], depth_m, list(tags)), self.tau)
+
+    def rest(self, ticks: int) -> Estimate:
+        for _ in range(ticks):
+            estimate = self.step()
+        return estimate
+
+    def see(self, count: int, p_wb: np.ndarray = P_WB, q_wb: np.ndarray = Q_WB) -> Estimate:
+        for _ in range(count):
+            estimate = self.step(tag(self.time_ns - 2 * PERIOD, p_wb, q_wb))
+        return estimate
+
+
+# ---------------------------------------------------------------- gravity
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.5, -0.3, 0.0), (-2.0, 1.2, 0.0), UPSIDE_DOWN, (0.3, 1.5, 0.0)])
+def test_gravity_tells_roll_and_pitch(angles: tuple[float, float, float]) -> None:
+    q_wb = from_euler(*angles)
+    found = upright(STILL, felt(q_wb))
+    assert found is not None
+    np.testing.assert_allclose(difference(found, q_wb), 0.0, atol=1e-9)
+
+
+def test_heading_is_not_felt() -> None:
+    found = upright(STILL, felt(from_euler(0.3, 0.2, 2.0)))
+    assert found is not None
+    np.testing.assert_allclose(difference(found, from_euler(0.3, 0.2, 0.0)), 0.0, atol=1e-9)
+
+
+def test_mean_is_taken_over_what_came() -> None:
+    accels = felt(Q_WB)
+    accels[::2] = np.nan
+    accels[1::4] += 0.2
+    accels[3::4] -= 0.2
+    found = upright(STILL, accels)
+    assert found is not None
+    np.testing.assert_allclose(turned_back(found, np.array([0.0, 0.0, -G])), felt(Q_WB)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("gyros", "accels"), [
+    (STILL, felt(Q_WB, (0.0, 0.0, 0.51))),
+    (STILL, felt(Q_WB, (0.0, 0.0, -0.51))),
+    (STILL + np.array([0.0, 0.51, 0.0]), felt(Q_WB)),
+    (STILL, np.full((20, 3), np.nan)),
+    (np.full((20, 3), np.nan), felt(Q_WB)),
+    (STILL, np.where(np.arange(20)[:, None] < 11, np.nan, felt(Q_WB))),
+    (STILL[:0], felt(Q_WB, count=0)),
+    (STILL, np.full((20, 3), np.inf)),
+], ids=["pushed down", "pushed up", "turning", "no accelerometer", "no gyro", "too few", "nothing", "infinite"])  # fmt: skip
+def test_attitude_is_not_guessed_from_what_is_not_gravity(gyros: np.ndarray, accels: np.ndarray) -> None:
+    assert upright(gyros, accels) is None
+
+
+# ---------------------------------------------------------------- the first tags
+
+
+def test_tags_that_tell_the_same_are_counted() -> None:
+    sight = FirstSight()
+    for n in range(3):
+        assert sight.agrees(tag(n, P_WB + 0.01 * n), np.zeros(3), Q_WB)
+    assert sight.count == 3
+
+
+@pytest.mark.parametrize(("p_wb", "q_wb"), [
+    (P_WB + np.array([0.0, 0.11, 0.0]), Q_WB), (P_WB, multiply(from_euler(0.0, 0.0, 0.11), Q_WB)),
+], ids=["elsewhere", "heading elsewhere"])  # fmt: skip
+def test_tag_that_tells_another_place_or_heading_begins_the_count_anew(p_wb: np.ndarray, q_wb: np.ndarray) -> None:
+    sight = FirstSight()
+    for n in range(5):
+        sight.agrees(tag(n), np.zeros(3), Q_WB)
+    assert sight.agrees(tag(5, p_wb, q_wb), np.zeros(3), Q_WB) and sight.count == 1
+    assert sight.agrees(tag(6, p_wb, q_wb), np.zeros(3), Q_WB) and sight.count == 2
+
+
+def test_headings_are_compared_around_the_circle() -> None:
+    sight = FirstSight()
+    for n, north in enumerate((math.pi - 0.02, -math.pi + 0.02, math.pi - 0.02)):
+        assert sight.agrees(tag(n, q_wb=from_euler(0.0, 0.0, north)), np.zeros(3), from_euler(0.0, 0.0, 0.0))
+    assert sight.count == 3
+
+
+@pytest.mark.parametrize(("tilt_rad", "agrees"), [(0.34, True), (0.36, False), (0.7, False), (math.pi, False)])
+def test_tag_with_another_way_down_does_not_agree(tilt_rad: float, agrees: bool) -> None:
+    sight = FirstSight()
+    sight.agrees(tag(0), np.zeros(3), Q_WB)
+    flipped = multiply(from_euler(0.0, 0.0, 1.0), multiply(exp(np.array([0.0, tilt_rad, 0.0])), Q_WB))
+    assert sight.agrees(tag(1, q_wb=flipped), np.zeros(3), Q_WB) is agrees
+    assert sight.count == (1 if agrees else 0)
+
+
+# ---------------------------------------------------------------- the estimator
+
+
+def test_robot_without_a_tag_stands_upright_after_a_second() -> None:
+    robot = Robot()
+    assert not robot.rest(100).ready
+    estimate = robot.rest(1)
+    assert estimate.ready and not estimate.placed and estimate.tag_age_ns >= NEVER_NS
+    estimate = robot.rest(1000)
+    level = multiply(heading(estimate.q_wb), from_euler(0.2, -0.4, 0.0))
+    np.testing.assert_allclose(difference(estimate.q_wb, level), 0.0, atol=2e-3)
+    assert estimate.p_wb[2] == pytest.approx(0.8, abs=2e-3)
+    assert np.abs(estimate.p_wb[:2]).max() < 0.1 and np.abs(estimate.nu).max() < 0.01
+    assert estimate.sigma_p.min() == 1e3
+    vertical = turned_back(estimate.q_wb, np.array([0.0, 0.0, 1.0]))
+    assert np.linalg.norm(estimate.sigma_q) == pytest.approx(1e3, rel=0.01) and abs(vertical @ estimate.sigma_q) > 900.0
+
+
+def test_turning_robot_waits_until_it_rests() -> None:
+    robot = Robot()
+    for _ in range(150):
+        assert not robot.step(gyro=np.array([0.0, 0.6, 0.0])).ready
+    assert robot.rest(30).ready
+
+
+def test_depth_that_was_not_heard_is_said_to_be_none() -> None:
+    robot = Robot()
+    for _ in range(110):
+        estimate = robot.step(depth_m=None)
+    assert estimate.ready and estimate.p_wb[2] == pytest.approx(0.0, abs=0.01)
+
+
+def test_ten_tags_that_tell_the_same_give_place_and_heading() -> None:
+    robot = Robot()
+    before = robot.rest(300)
+    estimate = robot.see(READY_AFTER - 1)
+    assert estimate.ready and not estimate.placed
+    assert np.linalg.norm(estimate.p_wb[:2] - before.p_wb[:2]) < 0.05
+    estimate = robot.see(1)
+    assert estimate.placed and estimate.tag_age_ns == 3 * PERIOD
+    np.testing.assert_allclose(estimate.p_wb, P_WB, atol=5e-3)
+    np.testing.assert_allclose(difference(estimate.q_wb, Q_WB), 0.0, atol=5e-3)
+    assert estimate.sigma_p.max() < 0.05 and estimate.rejected == 0
+
+
+def test_what_was_learned_upright_stays_when_the_place_is_told() -> None:
+    """The body is held down with 2 N that no model knows of, and turned about its x axis: both are felt without any tag."""
+    robot = Robot()
+    robot.tau = robot.tau + np.r_[turned_back(Q_WB, np.array([0.0, 0.0, 2.0])), 0.0, 0.0, 0.0]
+    before = robot.rest(2000)
+    after = robot.see(READY_AFTER)
+    assert before.force_w[2] == pytest.approx(-2.0, abs=0.2)
+    assert after.force_w[2] == pytest.approx(before.force_w[2], abs=0.1)
+    np.testing.assert_allclose(after.nu, before.nu, atol=0.02)
+    np.testing.assert_allclose(after.moment_b, before.moment_b, atol=0.02)
+
+
+def test_flipped_tags_place_nobody_until_they_are_all_there_is() -> None:
+    robot = Robot()
+    robot.rest(200)
+    flipped = multiply(Q_WB, exp(np.array([0.7, 0.0, 0.0])))
+    robot.see(READY_AFTER - 1)
+    estimate = robot.see(1, q_wb=flipped)
+    assert estimate.rejected == 1 and not estimate.placed
+    assert not robot.see(READY_AFTER - 1).placed
+    assert robot.see(1).placed
+    lost = Robot()
+    lost.rest(200)
+    assert lost.see(RESET_AFTER - 1, q_wb=flipped).ready
+    assert not lost.see(1, q_wb=flipped).ready
+
+
+def test_tag_within_the_first_second_needs_no_gravity() -> None:
+    robot = Robot()
+    robot.rest(50)
+    assert robot.see(READY_AFTER).placed
+    assert robot.rest(300).placed, "and tags that end do not take the place away"
+
+
+def test_robot_whose_process_stood_still_stands_up_where_it_was() -> None:
+    robot = Robot()
+    robot.rest(20)
+    robot.see(200)
+    robot.tick += 60
+    assert not robot.rest(1).ready
+    estimate = robot.rest(130)
+    assert estimate.ready and not estimate.placed
+    np.testing.assert_allclose(estimate.p_wb, P_WB, atol=0.05)
+    np.testing.assert_allclose(difference(estimate.q_wb, Q_WB), 0.0, atol=0.02)
+
+
+def test_parted_body_that_never_saw_a_tag_stands_on() -> None:
+    robot, part = Robot(), Robot()
+    before = robot.rest(300)
+    estimate = part.estimator.restart(robot.time_ns, robot.estimator.motion)
+    assert estimate.ready and not estimate.placed
+    part.tick = robot.tick
+    np.testing.assert_allclose(part.rest(50).p_wb, before.p_wb, atol=0.05)
+    assert part.see(READY_AFTER).placed
