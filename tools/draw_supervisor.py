@@ -20,9 +20,12 @@ from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "supervisor.md"
-PILOT = "A pilot is missing who was heard and fell silent. Where none was ever heard, sticks are neutral, and the first that come count."
+NEEDS = """\
+The attitude is known by tags, or until the first by gravity: a second after a start without any the body stands upright, and ten tags
+that tell the same give place and heading. Only tags tell a position. SURFACE without an attitude lifts along the body. A pilot is missing
+who was heard and fell silent. Where none was ever heard, sticks are neutral, and the first that come count."""
 WHILE_TESTED = """\
-In MOTOR_DETECT a body is disarmed instead, whatever the action, where a motor test has armed it or where it never had a pose: it may lie
+In MOTOR_DETECT a body is disarmed instead, whatever the action, where a motor test has armed it or where it never saw a tag: it may lie
 on a bench. A cause that comes back before its fail-safe is over acts again when it has lasted its delay. A body that is disarmed or stopped
 keeps the mode that a person chose for it; out of a motor test, a dock or a fail-safe's mode it goes to POSHOLD."""
 
@@ -70,7 +73,7 @@ def modes() -> list[str]:
         (row.mode.name, str(int(row.mode)), ", ".join(words(n.name) for n in sorted(row.needs)), "yes" if row.by_pilot else "")
         for row in MODE_TABLE
     ]
-    return [*table(("mode", "number", "needs", "a pilot may always take it"), rows), PILOT, ""]
+    return [*table(("mode", "number", "needs", "a pilot may always take it"), rows), NEEDS, ""]
 
 
 def arming() -> list[str]:

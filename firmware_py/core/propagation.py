@@ -155,7 +155,11 @@ def squared_speeds(x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """State (26,) and covariance (25, 25) after dt seconds: F P F^T + Q dt.
+    """State (26,) and covariance (25, 25) after dt seconds: F P F^T + Q.
+
+    What turned the body unforeseen has turned it for half of the step, as the gyro at its end then tells (Q of a double integrator,
+    Bar-Shalom et al. 2001, 6.2.2): without that a body that meets 0.5 rad/s^2 more than its model knows is wrong by 8 deg after a minute
+    at 100 Hz. Q is diagonal otherwise: what half a step of unforeseen acceleration moves is nothing that tags would not tell.
 
     Args:
         density: (25,) process noise of a body at rest, per second.
@@ -176,7 +180,12 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
         out[i, i] += density[i] * dt
     speed, rate = squared_speeds(x)
     for i in range(3):
-        out[9 + i, 9 + i] += under_way[2] ** 2 * rate * dt
+        doubt = under_way[2] ** 2 * rate
+        out[9 + i, 9 + i] += doubt * dt
+        doubt += density[9 + i]
+        out[3 + i, 9 + i] += 0.5 * doubt * dt**2
+        out[9 + i, 3 + i] += 0.5 * doubt * dt**2
+        out[3 + i, 3 + i] += doubt * dt**3 / 3.0
         out[18 + i, 18 + i] += (under_way[0] ** 2 * speed + under_way[1] ** 2 * rate) * dt
     return step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear), out
 

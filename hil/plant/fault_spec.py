@@ -10,12 +10,7 @@ from typing import NamedTuple
 from firmware_py.description.schema import quantity
 from firmware_py.description.vehicle import FACE_NAMES
 
-THRUSTER_KINDS = ("thruster_dead", "thruster_weak", "thruster_reversed", "thruster_stuck", "thruster_fake_rpm")
-FRAME_KINDS = ("frame_loss", "frame_delay", "frame_duplicate", "frame_corrupt", "babble")
-OTHER_KINDS = (
-    "estop", "foreign_sync", "imu_frozen", "tag_flip", "tag_jump", "tag_absent", "camera_bias", "battery_sag", "leak", "magnet", "jets",
-    "process_killed", "push",
-)  # fmt: skip
+THRUSTER, FACE = "thruster", "face"
 ALL = -1
 """Index of a fault that means every thruster, or every face."""
 FACES = len(FACE_NAMES)
@@ -28,46 +23,57 @@ LARGEST = 1e6
 class Takes(NamedTuple):
     """What a kind of fault takes, beyond the ranges of all kinds."""
 
-    low: float = -LARGEST
-    high: float = LARGEST
+    low: float = 0.0
+    high: float = 0.0
+    """Range of the value; 0 to 0: it takes none."""
     idle: float = math.nan
     """Value with which nothing would be wrong."""
     whole: bool = False
     """Whole numbers alone."""
     one_module: bool = True
     """It can be of one module alone, or else is always of the whole bus or of all the water."""
-    directions: tuple[str, ...] = DIRECTIONS
+    part: str = ""
+    """What its index counts; empty: it takes none."""
+    directions: tuple[str, ...] = ("both",)
 
 
-SHARE, OFF, OF_ALL = Takes(0.0, 1.0, idle=0.0), Takes(idle=0.0), Takes(one_module=False)
+OF_ALL, ANY_SIZE = Takes(one_module=False), Takes(-LARGEST, LARGEST, idle=0.0)
+FRAME_SHARE = Takes(0.0, 1.0, idle=0.0, directions=DIRECTIONS)
 TAKES: Mapping[str, Takes] = {
-    "thruster_weak": Takes(0.0, 1.0, idle=1.0),
-    "thruster_fake_rpm": Takes(0.0, 1.0, idle=1.0),
-    "thruster_stuck": Takes(-1.0, 1.0),
-    "frame_loss": SHARE,
-    "frame_delay": Takes(0.0, idle=0.0),
-    "frame_duplicate": SHARE,
-    "frame_corrupt": SHARE,
-    "babble": Takes(1.0, whole=True, one_module=False, directions=("both", "from_plant")),
+    "thruster_dead": Takes(part=THRUSTER),
+    "thruster_weak": Takes(0.0, 1.0, idle=1.0, part=THRUSTER),
+    "thruster_reversed": Takes(part=THRUSTER),
+    "thruster_stuck": Takes(-1.0, 1.0, part=THRUSTER),
+    "thruster_fake_rpm": Takes(0.0, 1.0, idle=1.0, part=THRUSTER),
+    "frame_loss": FRAME_SHARE,
+    "frame_delay": Takes(0.0, LARGEST, idle=0.0, directions=DIRECTIONS),
+    "frame_duplicate": FRAME_SHARE,
+    "frame_corrupt": FRAME_SHARE,
+    "babble": Takes(1.0, LARGEST, whole=True, one_module=False, directions=("both", "from_plant")),
     "estop": OF_ALL,
     "foreign_sync": OF_ALL,
-    "tag_flip": SHARE,
-    "tag_jump": OFF,
-    "camera_bias": OFF,
-    "battery_sag": OFF,
-    "magnet": Takes(-1.0, 1.0, whole=True),
+    "imu_frozen": Takes(),
+    "tag_flip": Takes(0.0, 1.0, idle=0.0),
+    "tag_jump": ANY_SIZE,
+    "tag_absent": Takes(),
+    "camera_bias": ANY_SIZE,
+    "battery_sag": ANY_SIZE,
+    "leak": Takes(),
+    "magnet": Takes(-1.0, 1.0, whole=True, part=FACE),
     "jets": Takes(0.0, 1.0, one_module=False),
     "process_killed": OF_ALL,
-    "push": OFF,
+    "push": ANY_SIZE,
 }
-"""By kind; a kind that is not here takes anything."""
+"""By kind."""
+THRUSTER_KINDS = tuple(kind for kind, takes in TAKES.items() if takes.part == THRUSTER)
+FRAME_KINDS = tuple(kind for kind, takes in TAKES.items() if takes.directions != ("both",))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
     """One fault."""
 
-    kind: str = quantity(choices=(*THRUSTER_KINDS, *FRAME_KINDS, *OTHER_KINDS), help="what breaks")
+    kind: str = quantity(choices=tuple(TAKES), help="what breaks")
     at_s: float = quantity(0.0, unit="s", low=0, high=1e6, help="when it begins")
     until_s: float = quantity(1e6, unit="s", low=0, high=1e6, help="when it is over")
     module: int = quantity(0, low=0, high=29, help="number of the module; frames: those with its number; 0: all")
@@ -86,22 +92,25 @@ class Fault:
         Args:
             thrusters: number of each module's thrusters, by the module's number.
         """
-        takes = TAKES.get(self.kind, Takes())
+        takes = TAKES[self.kind]
         if round(self.until_s * NS) <= round(self.at_s * NS):
             yield "until_s", f"{self.until_s:g} s is not after at_s, {self.at_s:g} s; the fault would never begin"
         is_odd = takes.whole and self.value % 1.0 != 0.0
         if is_odd or not takes.low <= self.value <= takes.high or self.value == takes.idle:
             wanted = f"{'whole numbers from ' if takes.whole else ''}{takes.low:g} to {takes.high:g}"
             but = "" if math.isnan(takes.idle) else f", except {takes.idle:g}"
-            yield "value", f"{self.value:g} is not for {self.kind}, which takes {wanted}{but}"
+            wanted = wanted + but if takes.low < takes.high else "none"
+            yield "value", f"{self.value:g} is not for {self.kind}, which takes {wanted}"
         if self.module and not takes.one_module:
             yield "module", f"{self.kind} is not of one module, as of {self.module}; leave it out"
         if self.direction not in takes.directions:
             yield "direction", f"{self.kind} does not go {self.direction}; it goes {', '.join(takes.directions)}"
-        most = max((count for number, count in thrusters.items() if self.module in (0, number)), default=0)
-        parts = {**dict.fromkeys(THRUSTER_KINDS, most), "magnet": FACES}.get(self.kind, LARGEST)
-        if self.index >= parts:
-            yield "index", f"{self.index} is beyond what the module has for {self.kind}; it takes 0 to {parts - 1:g}, and -1 for all"
+        parts = {THRUSTER: max((n for number, n in thrusters.items() if self.module in (0, number)), default=0), FACE: FACES}
+        if takes.part and self.index >= parts[takes.part]:
+            last = parts[takes.part] - 1
+            yield "index", f"{self.index} is beyond what the module has for {self.kind}; it takes 0 to {last}, and -1 for all"
+        elif not takes.part and self.index != ALL:
+            yield "index", f"{self.index} is not for {self.kind}, which is of no thruster and no face; leave it out"
 
     def is_on(self, time_ns: int) -> bool:
         """Whether it is at work."""

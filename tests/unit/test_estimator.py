@@ -259,6 +259,18 @@ def test_gyro_turns_the_robot_between_tags(body: Body) -> None:
     np.testing.assert_allclose(difference(estimate.q_wb, Q_WB), turned, atol=4e-3)
 
 
+def test_turn_that_no_model_foresees_is_followed_to_its_end(body: Body) -> None:
+    """A second at 2 rad/s^2 that no thruster made: half a tick of each tick's share was lost, half a degree in all."""
+    robot = Robot(body)
+    robot.rest(301)
+    axis, alpha = np.array([0.0, 0.6, 0.8]), 2.0
+    for tick in range(1, 101):
+        turned = exp(axis * (0.5 * alpha * (0.01 * tick) ** 2))
+        q_wb = multiply(Q_WB, turned)
+        estimate = robot.step(sensors(P_WB, q_wb)._replace(gyro=axis * (alpha * 0.01 * tick)))
+    assert np.linalg.norm(difference(estimate.q_wb, q_wb)) < 1.5e-3
+
+
 def test_skipped_ticks_are_flown_through(body: Body) -> None:
     robot = Robot(body)
     robot.rest(200)

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from filterpy import kalman
+from filterpy.common import Q_continuous_white_noise
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -350,7 +351,11 @@ def test_prediction_is_that_of_filterpy(body: Body, seed: int) -> None:
     f = transition(state(seed), DT, body)
     speed, rate = (np.linalg.norm(state(seed)[at]) for at in (slice(7, 10), slice(10, 13)))
     moving = np.repeat([0.0, 0.4 * rate, 0.0, np.hypot(0.7 * speed, 0.2 * rate), 0.0], [9, 3, 6, 3, 4])
-    _, expected = kalman.predict(np.zeros(ERRORS), covariance, f, np.diag(density + moving**2) * DT)
+    q = np.diag(density + moving**2) * DT
+    for i in range(3):
+        pair = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])
+        q[pair] += Q_continuous_white_noise(2, DT, density[9 + i] + moving[9 + i] ** 2) - np.diag([0.0, q[9 + i, 9 + i]])
+    _, expected = kalman.predict(np.zeros(ERRORS), covariance, f, q)
     x, got = propagation.predict(state(seed), covariance, TAU, DT, density, np.array([0.7, 0.2, 0.4]), *plant(body))
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(got, got.T)
