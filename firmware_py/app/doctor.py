@@ -58,6 +58,7 @@ def check_machine(folder: Path, look: Look = read_file) -> list[Finding]:
         check_kernel(look),
         *check_permissions(),
         check_governor(look),
+        check_throttle(look, os.cpu_count() or 1),
         check_clock(look, time.gmtime().tm_year),
         check_disk(folder, shutil.disk_usage(folder).free),
         check_cache(),
@@ -93,6 +94,19 @@ def check_governor(look: Look) -> Finding:
     if governor in ("", "performance"):
         return Finding("processors", OK, text)
     return Finding("processors", WARNING, text, "clocks rise too late: sudo jetson_clocks, or governor performance")
+
+
+def check_throttle(look: Look, processors: int) -> Finding:
+    """What the kernel leaves real-time threads of each second. A reader that works through a flood needs a processor whole; on one that
+    the tick shares with it the tick stood still for 15 to 20 ms, and once for 590 ms (measured in a flood of cangen).
+    """
+    runtime, period = (int(look(f"/proc/sys/kernel/sched_rt_{name}_us") or -1) for name in ("runtime", "period"))
+    if runtime < 0 or period <= runtime:
+        return Finding("throttling", OK, "real-time threads may run all the time")
+    text = f"real-time threads are stopped when they had {runtime / period:.0%} of {period / 1e6:g} s"
+    if processors > 1:
+        return Finding("throttling", OK, f"{text} on a processor; the tick has one of its own")
+    return Finding("throttling", WARNING, f"{text}, and there is one processor", "sudo sysctl kernel.sched_rt_runtime_us=-1")
 
 
 def check_clock(look: Look, year: int) -> Finding:

@@ -23,6 +23,7 @@ from firmware_py.app.doctor import (
     check_governor,
     check_interface,
     check_kernel,
+    check_throttle,
     lines_of,
 )
 from firmware_py.app.doctor_bus import Seen, judge, look_at
@@ -74,6 +75,23 @@ def test_interface_is_judged_by_what_ip_says_of_it(text: str, state: str, says: 
 def test_kernel_without_preempt_rt_is_warned_of_and_one_with_it_is_not() -> None:
     assert check_kernel(lambda path: "1").state == OK
     assert check_kernel(lambda path: "").state in (OK, WARNING)
+
+
+@pytest.mark.parametrize(
+    ("runtime", "processors", "state", "says"),
+    [
+        ("950000", 1, WARNING, "stopped when they had 95% of 1 s, and there is one processor"),
+        ("950000", 6, OK, "95% of 1 s on a processor"),
+        ("-1", 1, OK, "all the time"), ("1000000", 1, OK, "all the time"), ("", 1, OK, "all the time"),
+    ],
+)  # fmt: skip
+def test_real_time_that_the_kernel_stops_is_warned_of_where_a_flood_could_stop_the_tick(
+    runtime: str, processors: int, state: str, says: str
+) -> None:
+    files = {"/proc/sys/kernel/sched_rt_runtime_us": runtime, "/proc/sys/kernel/sched_rt_period_us": "1000000" if runtime else ""}
+    finding = check_throttle(lambda path: files[path], processors)
+    assert finding.state == state and says in finding.text
+    assert ("sysctl" in finding.advice) == (state == WARNING)
 
 
 @pytest.mark.parametrize(("governor", "state"), [("performance", OK), ("", OK), ("schedutil", WARNING)])
