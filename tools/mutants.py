@@ -26,9 +26,10 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 TIMEOUT_S = 60
 """A mutant that runs longer is killed."""
+SUPERVISOR = tuple(f"tests/unit/test_supervisor{part}.py" for part in ("", "_failsafes", "_bodies"))
 TARGETS: dict[str, tuple[str, ...]] = {
-    "firmware_py.core.transitions": ("tests/unit/test_transitions.py", "tests/unit/test_supervisor.py"),
-    "firmware_py.core.supervisor": ("tests/unit/test_supervisor.py",),
+    "firmware_py.core.transitions": ("tests/unit/test_transitions.py", *SUPERVISOR),
+    "firmware_py.core.supervisor": SUPERVISOR,
     "firmware_py.core.arming": ("tests/unit/test_arming.py",),
     "firmware_py.core.failsafes": ("tests/unit/test_failsafes.py",),
     "firmware_py.core.limiter": ("tests/unit/test_limiter.py",),

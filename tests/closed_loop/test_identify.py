@@ -21,7 +21,6 @@ from hil.scenario import load_scenario
 from hil.signals import read_flight
 from tests.closed_loop.flights import Fly, shortened
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 fit_thruster, identify, identify_fit, identify_log, identify_model, identify_motion, identify_plants, identify_quantities = (
     importlib.import_module(name)
     for name in (

@@ -3,9 +3,9 @@
 import dataclasses
 import itertools
 import math
-import sys
 from pathlib import Path
 
+import build_drag_table
 import numpy as np
 import pytest
 from click.testing import Result
@@ -22,10 +22,6 @@ from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from firmware_py.prepare.drag_cache import DragCache, default_folder
 from firmware_py.prepare.joints import Placement
 from firmware_py.prepare.projected_area import areas_and_centroids
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-
-import build_drag_table
 
 PITCH = 0.21
 ELBOW = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]

@@ -10,7 +10,6 @@ import pytest
 from firmware_py.description.schema import DescriptionError, build, read_toml
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 tool = importlib.import_module("fit_thruster")
 LIKE = load_vehicle("modcube").curve
 POWERS = np.arange(1, 6)

@@ -15,7 +15,6 @@ from firmware_py.description.vehicle import Vehicle, load_vehicle, vehicle_names
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.scenario import load_scenario
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 excitation, fit, model, motion, tool = (
     importlib.import_module(name) for name in ("identify_excitation", "identify_fit", "identify_model", "identify_motion", "identify")
 )

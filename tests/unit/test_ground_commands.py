@@ -1,0 +1,228 @@
+"""Commands: what each does, what is refused and in which words; through pymavlink's own encoder and parser."""
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from firmware_py.core.types import Action, DockRequest, Event, Mode
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.identity import px4
+from tests.unit.ground_requests import NAN, acknowledged, actions, ask
+from tests.unit.ground_world import Client, World
+
+
+def test_arm_is_acknowledged_when_the_supervisor_has_granted_it(world: World, client: Client) -> None:
+    client.command(400, 1)
+    assert not client.all("COMMAND_ACK")
+    assert acknowledged(world, client, 400) == mavlink.MAV_RESULT_ACCEPTED
+    world.run(100)
+    assert client.last("HEARTBEAT").base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+    assert ask(world, client, 400, 0, 21196) == mavlink.MAV_RESULT_ACCEPTED
+    forced = [(r.action, r.argument) for r in world.robot.asked]
+    assert forced == [(Action.ARM, False), (Action.DISARM, True)]
+
+
+def test_unknown_command_is_unsupported_at_once(world: World, client: Client) -> None:
+    client.clear()
+    client.command(2000, *[NAN] * 7)
+    world.run(1)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_UNSUPPORTED
+
+
+def test_every_command_is_acknowledged_when_all_its_parameters_are_left_out() -> None:
+    for number in World().station.services[1].commands._table:
+        world = World()
+        client = world.client()
+        client.command(number, *[NAN] * 7)
+        assert acknowledged(world, client, number) <= mavlink.MAV_RESULT_FAILED
+
+
+@pytest.mark.parametrize(("speed", "answer"), [(0.0, 2), (0.009, 2), (0.02, 0), (2.0, 0), (2.1, 2), (-1.0, 0), (-0.5, 2)])
+def test_speed_that_would_never_arrive_is_denied(world: World, client: Client, speed: float, answer: int) -> None:
+    assert ask(world, client, 178, 1, speed) == answer
+
+
+@pytest.mark.parametrize("number", [20, 21])
+def test_return_and_land_both_surface(world: World, client: Client, number: int) -> None:
+    assert ask(world, client, number) == mavlink.MAV_RESULT_ACCEPTED
+    assert world.robot.mode[0] == Mode.SURFACE
+
+
+def test_component_zero_and_system_zero_are_accepted(world: World, client: Client) -> None:
+    client.command(410, component=0)
+    assert acknowledged(world, client, 410) == mavlink.MAV_RESULT_ACCEPTED
+    client.clear()
+    client.command(410, target=0, component=0)
+    assert acknowledged(world, client, 410) == mavlink.MAV_RESULT_ACCEPTED
+    client.clear()
+    client.command(410, component=154)
+    world.run(3)
+    assert not client.all("COMMAND_ACK"), "another component's command is not ours"
+
+
+@pytest.mark.parametrize(
+    ("main", "sub", "mode"),
+    [
+        (1, 0, Mode.MANUAL),
+        (2, NAN, Mode.ALT_HOLD),
+        (3, 0, Mode.POSHOLD),
+        (4, 3, Mode.POSHOLD),
+        (7, 0, Mode.STABILIZE),
+        (4, 6, Mode.SURFACE),
+    ],
+)
+def test_generic_identity_takes_px4s_mode_pairs(world: World, client: Client, main: float, sub: float, mode: Mode) -> None:
+    assert ask(world, client, 176, 1, main, sub) == mavlink.MAV_RESULT_ACCEPTED
+    assert world.robot.mode[0] == mode
+    world.run(100)
+    assert client.last("HEARTBEAT").custom_mode == px4(int(main), 0 if math.isnan(sub) else int(sub))
+
+
+def test_ardusub_identity_takes_ardusubs_numbers_by_command_and_by_message() -> None:
+    world = World(config=GroundConfig(identity="ardusub"))
+    client = world.client()
+    assert ask(world, client, 176, 1, 19) == mavlink.MAV_RESULT_ACCEPTED
+    assert world.robot.mode[0] == Mode.MANUAL
+    client.clear()
+    client.send("SET_MODE", 1, 1, 2)
+    assert acknowledged(world, client, 176) == mavlink.MAV_RESULT_ACCEPTED
+    world.run(100)
+    heartbeat = client.last("HEARTBEAT")
+    assert (heartbeat.autopilot, heartbeat.custom_mode) == (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 2)
+
+
+def test_a_number_of_the_other_encoding_is_no_mode() -> None:
+    world = World()
+    client = world.client()
+    assert ask(world, client, 176, 1, 19) == mavlink.MAV_RESULT_UNSUPPORTED
+    assert ask(world, client, 176, 1, NAN) == mavlink.MAV_RESULT_UNSUPPORTED
+
+
+def test_estop_and_its_clearing(world: World, client: Client) -> None:
+    assert ask(world, client, 185, 1) == mavlink.MAV_RESULT_ACCEPTED
+    world.run(100)
+    assert client.last("HEARTBEAT").system_status == mavlink.MAV_STATE_EMERGENCY
+    assert ask(world, client, 31012) == mavlink.MAV_RESULT_ACCEPTED
+    assert ask(world, client, 31013) == mavlink.MAV_RESULT_ACCEPTED
+    assert actions(world) == [Action.ESTOP, Action.ESTOP, Action.CLEAR_ESTOP]
+
+
+def test_reboot_only_while_disarmed(world: World, client: Client) -> None:
+    ask(world, client, 400, 1)
+    assert ask(world, client, 246, 1) == mavlink.MAV_RESULT_DENIED
+    ask(world, client, 400, 0)
+    assert not world.station.reboot_asked
+    assert ask(world, client, 246, 1) == mavlink.MAV_RESULT_ACCEPTED
+    assert world.station.reboot_asked
+
+
+def test_reboot_is_denied_while_any_body_of_the_process_is_armed() -> None:
+    world = World(modules=2)
+    client = world.client()
+    client.command(400, 1, target=1)
+    world.run(3)
+    client.clear()
+    client.command(246, 1, target=2)
+    world.run(3)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_DENIED and not world.station.reboot_asked
+
+
+def test_one_refusal_answers_one_command(world: World, client: Client) -> None:
+    other = world.client(system=200)
+    client.command(176, 1, 1)
+    other.command(176, 1, 7)
+    world.robot.mode[0] = Mode.MANUAL
+    world.robot.refuse[Action.SET_MODE] = "no"
+    world.station.services[1].system.requests.clear()
+    world.robot.events = [Event(4, "SET_MODE refused: no", 0)]
+    world.run(3)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+    assert other.last("COMMAND_ACK").result == mavlink.MAV_RESULT_DENIED
+
+
+def test_parameters_of_a_command_without_a_place_are_plain_in_command_int() -> None:
+    world = World(modules=2)
+    client = world.client()
+    client.send("COMMAND_INT", 1, 1, 0, 31010, 0, 0, 0, 0, 1, 1, 2, 1, 0)
+    world.run(2)
+    assert world.robot.asked[-1].argument == DockRequest(0, 0, 1, 1, 2, True)
+
+
+@pytest.mark.parametrize("text", ["x" * length for length in (1, 49, 50, 51, 99, 100, 150)])
+def test_client_knows_where_a_text_ends(world: World, client: Client, text: str) -> None:
+    """MAVLink: the last chunk of a text is one that is not full."""
+    world.station.say(text)
+    world.run(1)
+    chunks = [m for m in client.all("STATUSTEXT") if m.text.startswith("x") or m.id]
+    assert "".join(m.text for m in chunks) == text
+    assert len(chunks) == 1 if len(text) <= 50 else (len(chunks[-1].text) < 50 and [m.chunk_seq for m in chunks] == [*range(len(chunks))])
+
+
+def test_time_since_boot_begins_anew_after_49_days(world: World, client: Client) -> None:
+    world.robot.tick += (2**32 + 5_000) // 10
+    world.run(2)
+    assert world.station.services[1].system.subject.time_ms < 6_000
+
+
+def test_motor_test_asks_for_one_thruster(world: World, client: Client) -> None:
+    client.command(209, 3, 0, 20, 2.0)
+    world.run(2)
+    assert world.robot.asked[-1].argument == (2, 0.2, 2.0)
+    assert ask(world, client, 209, 9, 0, 20, 2.0) == mavlink.MAV_RESULT_DENIED
+    assert ask(world, client, 209, 1, 0, 120, 2.0) == mavlink.MAV_RESULT_DENIED
+
+
+@pytest.mark.parametrize(
+    ("kind", "throttle", "share"), [(0, -30, -0.3), (0, 100, 1.0), (1, 1500, 0.0), (1, 1700, 0.5), (1, 1100, -1.0), (1, 1900, 1.0)]
+)
+def test_throttle_of_a_motor_test_is_a_share_or_a_pulse_about_its_middle(
+    world: World, client: Client, kind: int, throttle: float, share: float
+) -> None:
+    client.command(209, 8, kind, throttle, 50.0)
+    world.run(1)
+    assert world.robot.asked[-1].argument == (7, pytest.approx(share), 10.0)
+
+
+@pytest.mark.parametrize("parameters", [(0, 0, 10), (9, 0, 10), (1, 0, 101), (1, 1, 1050), (1, 1, 1950), (1, 2, 10)])
+def test_motor_test_of_no_thruster_or_beyond_full_throttle_is_denied(world: World, client: Client, parameters: tuple[float, ...]) -> None:
+    assert ask(world, client, 209, *parameters, 1.0) == mavlink.MAV_RESULT_DENIED
+    assert not world.robot.asked
+
+
+def test_dock_and_undock_are_user_commands() -> None:
+    world = World(modules=2)
+    client = world.client()
+    client.command(31010, 0, 0, 1, 1, 2, 1)
+    client.command(31011, 0, 0, 1, 1)
+    world.run(2)
+    wanted = [(Action.DOCK, DockRequest(0, 0, 1, 1, 2, True)), (Action.UNDOCK, DockRequest(0, 0, 1, 1))]
+    assert [(r.action, r.argument) for r in world.robot.asked] == wanted
+    assert ask(world, client, 31010, 0, 0, 0, 1) == mavlink.MAV_RESULT_DENIED
+
+
+@pytest.mark.parametrize(
+    "parameters", [(0, 6, 1, 1), (0, 0, 1, 6), (0, -1, 1, 1), (0, 0, 2, 1), (2, 0, 1, 1), (1, 0, 1, 1), (0, 0, 1, 1, 4)]
+)
+def test_dock_of_faces_or_modules_that_there_are_not_is_denied(parameters: tuple[float, ...]) -> None:
+    world = World(modules=2)
+    assert ask(world, world.client(), 31010, *parameters) == mavlink.MAV_RESULT_DENIED
+    assert not world.robot.asked
+
+
+def test_each_body_is_a_system_and_commands_reach_the_right_one() -> None:
+    world = World(modules=2)
+    client = world.client()
+    world.run(100)
+    assert {m.get_srcSystem() for m in client.all("HEARTBEAT")} == {1, 2}
+    client.command(400, 1, target=2)
+    world.run(3)
+    assert [(r.action, r.body) for r in world.robot.asked] == [(Action.ARM, 1)]
+
+
+def test_timesync_and_ping_are_answered(world: World, client: Client) -> None:
+    client.send("TIMESYNC", 0, 123)
+    client.send("PING", 5, 6, 0, 0)
+    world.run(1)
+    assert (client.last("TIMESYNC").ts1, client.last("TIMESYNC").tc1 > 0) == (123, True)
+    assert (client.last("PING").seq, client.last("PING").target_system) == (6, 255)
