@@ -15,12 +15,13 @@ from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
 from firmware_py.core.types import BodyPose
 
 AT_REST_M_S2 = 0.05 * GRAVITY
-"""Mean specific force and gravity differ by less where nothing else pushes; the direction then errs by three degrees at most."""
+"""Mean specific force and gravity differ by less in size where nothing pushes up or down. What pushes across tilts the beginning, by ten
+degrees for 1.7 m/s^2; the filter, whose model knows the thrusters, rights it within seconds."""
 AT_REST_RAD_S = 0.5
 LEVEL_RAD = 0.35
 """A tag that tells another way down by more is flipped (20 deg; as `measurements`), or not where the vehicle file says."""
-SAME_RAD, SAME_M = 0.1, 0.1
-"""Tags that differ by less in heading and place tell the same."""
+SAME_RAD, SAME_M, SAME_M_S, SAME_S = 0.1, 0.1, 1.0, 1.0
+"""Tags that differ by less in heading, place and time tell the same; a body that is said to stand still may move so fast."""
 
 
 def upright(gyros: np.ndarray, accels: np.ndarray) -> np.ndarray | None:
@@ -43,17 +44,20 @@ class FirstSight:
 
     def __init__(self) -> None:
         self.count = 0
-        self._heading, self._offset = math.nan, np.full(3, math.nan)
+        self._heading, self._offset, self._capture_ns = math.nan, np.full(3, math.nan), 0
 
     def agrees(self, pose: BodyPose, p_wb: np.ndarray, q_wb: np.ndarray) -> bool:
-        """Whether `pose` has the same way down as q_wb (4,); notes where it would move the body that is believed at p_wb (3,)."""
+        """Whether `pose` has the same way down as q_wb (4,), or else is flipped; notes where it would move the body that is believed
+        at p_wb (3,).
+        """
         w, x, y, z = multiply(pose.q_wb, conjugate(q_wb)).tolist()
         if 2.0 * math.asin(min(1.0, math.hypot(x, y))) > LEVEL_RAD:
-            self.count = 0
             return False
         heading, offset = 2.0 * math.atan2(z, w), pose.p_wt - rotate(pose.q_wb, pose.lever_b) - p_wb
         turned = abs(math.remainder(heading - self._heading, 2.0 * math.pi)) if self.count else math.inf
-        same = turned <= SAME_RAD and float(np.linalg.norm(offset - self._offset)) <= SAME_M
+        gap_s = (pose.capture_ns - self._capture_ns) * 1e-9
+        near = float(np.linalg.norm(offset - self._offset)) <= SAME_M + SAME_M_S * gap_s
+        same = turned <= SAME_RAD and near and gap_s <= SAME_S
         self.count = self.count + 1 if same else 1
-        self._heading, self._offset = heading, offset
+        self._heading, self._offset, self._capture_ns = heading, offset, pose.capture_ns
         return True

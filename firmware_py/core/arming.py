@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from firmware_py.core.failsafes import Failsafes
-from firmware_py.core.health import Health
+from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.transitions import MODES, Need
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters, invalid
@@ -147,7 +147,8 @@ def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:
         reasons.append("no pose yet")
     elif Need.POSITION in needs and health.tag_age_s > limits.tag_lost_limit:
         reasons.append(f"no tag for {health.tag_age_s:.1f} s")
-    if Need.DEPTH in needs and min(health.depth_age_s, health.tag_age_s) > limits.depth_unknown_limit:
+    depth_age_s = min(health.depth_age_s if health.depth_heard else NEVER_S, health.tag_age_s)
+    if Need.DEPTH in needs and depth_age_s > limits.depth_unknown_limit:
         reasons.append("depth unknown")
     if Need.PILOT in needs and health.pilot_age_s > limits.pilot_lost_limit:  # one who was never heard is no cause: sticks are neutral
         reasons.append("pilot input lost")

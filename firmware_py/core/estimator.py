@@ -4,7 +4,8 @@ The filter stands at its anchor: the time of the newest tag picture, or half a s
 order in which it happened; from the anchor the state is carried to now through the stored thruster wrenches and gyro readings. While no
 tag comes, what would be half a second old is not waited for: a head runs on ahead of the anchor, and the state is carried from there.
 
-Until the first tags come it stands upright by gravity (`alignment`): attitude but for the heading, and depth.
+Until the first tags come it stands upright by gravity (`alignment`): attitude but for the heading, and depth. Without any for long it is
+adrift: it makes up that it stands still, and believes only tags that tell the same ten times.
 
 The body moves by the model of `propagation`, and the accelerometer measures what that model left out (`observation.fuse_inertial`): so the
 velocity follows the robot and not the command, which is worth 15 degrees of phase (docs/tuning.md).
@@ -39,10 +40,17 @@ BLIND_NS = 250_000_000
 """Without a tag, until the head leaves the anchor."""
 CATCH_UP = 4
 """Samples that the head takes in a tick at most: it is with the present after half a second."""
-STAY_DENSITY = 0.01
-"""Of the noise of the place that is made up until tags tell one, horizontally, m^2 s: a metre in a tick at 100 Hz."""
-KEPT = np.r_[7:19, 21:25]
-"""Of the state: velocity, biases, vertical force and moment, which say the same whatever the heading."""
+ADRIFT_NS = 10_000_000_000
+"""Without a tag, until nobody knows how the body moves over ground. What pushes it and what the water takes of its speed are the same to
+the accelerometer: the speed that is believed would grow, to 15 m/s within a minute of half stick, and spoil the tilt."""
+STILL_DENSITY = 0.0003
+"""Of the noise of the speed that is made up then, m^2/s: 0.17 m/s in a tick at 100 Hz."""
+KEPT, MOVING = np.r_[10:19, 21:25], slice(6, 9)
+"""Of the state: rates, biases, vertical force and moment, which say the same whatever the heading. Of the error: velocity."""
+SPEED_SIGMA = 0.5
+"""Of one that was adrift, when tags come, m/s."""
+FELT_LIMIT_NS = 2_000_000_000
+"""Without an accelerometer, until one that is adrift does not know its attitude either."""
 RESET_AFTER = 30
 """Observations refused one after the other (half a second) until the filter believes them and not itself."""
 INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
@@ -67,9 +75,8 @@ class Estimator:
             body.mass, body.mass_inv, body.righting, body.drag.nodes, body.drag.rotational, body.drag.linear,
         )  # fmt: skip
         self._dt = period_ns * 1e-9
-        self._stay_variance = np.r_[np.full(2, STAY_DENSITY / self._dt), np.full(4, 1e6)]
         self._history = History(period_ns)
-        self._now: np.ndarray
+        self._now = np.eye(1, STATES, 3)[0]
         self._anchor: Belief
         self._head: Belief
         self._forget()
@@ -77,7 +84,7 @@ class Estimator:
         self._refused_in_row = 0
         self._rejected = 0
         self._last_tag_ns, self._taken_ns = -NEVER_NS, 0
-        self._first_sight, self._made_up = FirstSight(), np.zeros(3)
+        self._first_sight, self._felt_ns = FirstSight(), 0
         self._nis = math.nan
         self._nis_dof = 0
 
@@ -108,15 +115,18 @@ class Estimator:
         if self._history.newest >= 0 and time_ns - self._history.newest_ns > int(WINDOW_S * 1e9):
             self._accepted = self._waited = 0  # the process stood still: what is remembered joins on to nothing
         self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
+        self._felt_ns = time_ns if measured.accel is not None else self._felt_ns
         for pose in measured.tags:
             self._take(pose)
+        if self._is_lost(time_ns):
+            self._forget()
         if not self._accepted:
             self._wait(time_ns)
         if self._accepted:
             self._anchor = self._advanced(self._anchor, time_ns - int(WINDOW_S * 1e9))
             self._lead(time_ns)
-            if self._last_tag_ns == -NEVER_NS:
-                self._anchor, self._head = self._stayed(self._anchor), self._stayed(self._head)
+            if self._is_adrift:
+                self._anchor, self._head = self._stilled(self._anchor), self._stilled(self._head)
         return self._estimate(time_ns)
 
     @property
@@ -129,7 +139,7 @@ class Estimator:
         self._history.push(time_ns, np.zeros(6), None, None, None)
         self._anchor = self._head = Belief(motion.x.copy(), motion.covariance.copy(), time_ns)
         self._now = self._anchor.x
-        self._first_sight, self._made_up = FirstSight(), motion.x[:3].copy()
+        self._first_sight, self._felt_ns = FirstSight(), time_ns
         self._last_tag_ns, self._taken_ns = motion.tag_ns, time_ns
         self._accepted, self._refused_in_row = motion.accepted, 0
         self._nis, self._nis_dof = math.nan, 0
@@ -144,7 +154,7 @@ class Estimator:
             self._start(pose)
         elif pose.capture_ns >= self._anchor.time_ns:
             self._anchor = self._advanced(self._anchor, min(pose.capture_ns, self._history.newest_ns))
-            if self._last_tag_ns == -NEVER_NS:
+            if self._is_adrift:
                 self._place(pose)
             else:
                 self._fuse_tag(pose)
@@ -175,25 +185,36 @@ class Estimator:
         depths = others[~np.isnan(others[:, 3]), 3]
         place = np.r_[self._now[:2], depths.mean() if len(depths) else self._now[2]]
         self._start(BodyPose(time_ns, place, np.zeros(3), multiply(heading(self._now[3:7]), tilt), 1.0))
-        self._accepted, self._last_tag_ns = READY_AFTER, -NEVER_NS
-        self._first_sight, self._made_up = FirstSight(), place
+        self._anchor.covariance[2, 2] = INITIAL_SIGMA[-1] ** 2 if len(depths) else UNKNOWN_SIGMA[2] ** 2
+        self._accepted, self._last_tag_ns, self._first_sight = READY_AFTER, -NEVER_NS, FirstSight()
 
-    def _stayed(self, at: Belief) -> Belief:
-        """While nobody tells the place the body is made up to be about where it was, as by ArduPilot's EKF3 without aiding: a speed
-        that nothing bounds would pass for drag, and spoil the tilt.
-        """
-        place, same = np.r_[self._made_up[:2], at.x[2]], at.x[3:7].copy()
-        _, x, covariance = observation.fuse_tag(at.x, at.covariance, place, np.zeros(3), same, self._stay_variance, math.inf)
+    @property
+    def _is_adrift(self) -> bool:
+        """Whether tags have told nothing for long, or never."""
+        return self._history.newest_ns - self._last_tag_ns > ADRIFT_NS
+
+    def _is_lost(self, time_ns: int) -> bool:
+        """Whether what is believed rests on too little: a few tags that no more came after, or nothing but a gyro for long."""
+        few = self._accepted < READY_AFTER and time_ns - self._taken_ns > UPRIGHT_AFTER_S * 1e9
+        return self._accepted > 0 and (few or (self._is_adrift and time_ns - self._felt_ns > FELT_LIMIT_NS))
+
+    def _stilled(self, at: Belief) -> Belief:
+        """It is made up that the body stands still over ground, more or less (ADRIFT_NS); ArduPilot's EKF3 does the like without aiding."""
+        x, covariance = observation.fuse_stillness(at.x, at.covariance, STILL_DENSITY / self._dt)
         return Belief(x, covariance, at.time_ns)
 
     def _place(self, pose: BodyPose) -> None:
-        """The first tags say where the upright body is; what it knows of its motion and its sensors stays."""
+        """The first tags for long say where the body is; what it knows of its turning and its sensors stays."""
         if not self._first_sight.agrees(pose, self._anchor.x[:3], self._anchor.x[3:7]):
             self._refuse(pose)
-        elif self._first_sight.count >= READY_AFTER:
+            return
+        self._refused_in_row = 0
+        if self._first_sight.count >= READY_AFTER:
             kept = self._anchor.x[KEPT]
             self._start(pose)
             self._anchor.x[KEPT], self._accepted = kept, READY_AFTER
+            self._anchor.covariance[MOVING, MOVING] = SPEED_SIGMA**2 * np.eye(3)
+            self._first_sight = FirstSight()
 
     def _advanced(self, start: Belief, to_ns: int) -> Belief:
         """The filter at `to_ns`, the inertial and depth measurements on the way fused."""
@@ -251,14 +272,17 @@ class Estimator:
         self._now, sigma, sound = observation.carried(
             head.x, head.covariance, taus, gyros, self._dt, until_first, self._density, lag, rate_variance, *self._plant
         )
-        if self._last_tag_ns == -NEVER_NS:  # of what the upright body is taken for, only the tilt was measured
-            sigma = np.concatenate([UNKNOWN_SIGMA[:3], sigma[3:] + UNKNOWN_SIGMA[3:] * np.abs(rotate_back(self._now[3:7], DOWN))])
+        if self._is_adrift:  # its place is made up, and before the first tag the heading
+            sigma[:2] = UNKNOWN_SIGMA[:2]
+        if self._last_tag_ns == -NEVER_NS:
+            sigma[3:] += UNKNOWN_SIGMA[3:] * np.abs(rotate_back(self._now[3:7], DOWN))
         return sigma, sound
 
     def _forget(self) -> None:
-        """Nothing is known: the filter begins anew with the next tag, or upright."""
+        """Nothing is known: the filter begins anew with the next tag, or upright where it was."""
         self._accepted = self._waited = 0
-        self._now = np.eye(1, STATES, 3)[0]
+        sound = observation.are_finite(self._now[:3], self._now[3:7])
+        self._now = np.r_[self._now[:7] if sound else np.eye(1, 7, 3)[0], np.zeros(STATES - 7)]
         self._anchor = self._head = Belief(self._now, np.eye(ERRORS), 0)
 
     def _estimate(self, time_ns: int) -> Estimate:

@@ -10,7 +10,7 @@ from enum import IntEnum
 from operator import attrgetter
 from typing import NamedTuple
 
-from firmware_py.core.health import Health
+from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.types import Mode
 from firmware_py.description.failsafe_parameters import Failsafes as FailsafeParameters
 
@@ -142,7 +142,8 @@ class Watch:
 
     def words(self, health: Health) -> str:
         """How it is, for people."""
-        return self.row.words.format(self.row.value(health))
+        value, words = self._value(health), self.row.words
+        return words.replace(" for {:.1f} s", " so far") if value >= NEVER_S else words.format(value)
 
     def reason(self, health: Health) -> str:
         """What is wrong, for people; what was wrong when it began, where its cause is gone."""

@@ -85,6 +85,15 @@ class Guidance:
         self._lift_n = p.surface_force_n * len(self._body.modules)
         self._glider.retune(p.bandwidth, p.speed_m_s, p.rate_rad_s)
 
+    def look(self, estimate: Estimate, health: Health) -> None:
+        """To be called before the decisions of a tick: where a body begins to stand by gravity alone, or tags tell it at last where the
+        world begins and where its north is, what was wanted in the old world is forgotten.
+        """
+        before, self._upright = self._upright, health.ready and not health.placed
+        if self._upright != before:
+            self._glider.put(at_estimate(estimate))
+            self._goal = self._point = None
+
     # ------------------------------------------------------------ what is asked for
 
     def apply(self, decision: Decision, time_ns: int, estimate: Estimate) -> None:
@@ -158,10 +167,6 @@ class Guidance:
         """The set-point at `time_ns`, and the one that the thrusters' force will meet."""
         dt_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) * 1e-9
         self._time_ns = time_ns
-        if self._upright and health.placed:  # tags have told where the world begins and where its north is
-            self._glider.put(at_estimate(estimate))
-            self._goal = None
-        self._upright = health.ready and not health.placed
         if self.mode == Mode.AUTO and self._trajectory is not None and self._joined(self._trajectory, time_ns):
             return self._sample(self._trajectory, time_ns)
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):

@@ -46,6 +46,9 @@ class Health(NamedTuple):
     rejected_share: float
     """Share of tag observations that the gate refused, mean of a second."""
     depth_age_s: float
+    """From the start, until one is heard."""
+    depth_heard: bool
+    """Once, or more often."""
     imu_age_s: float
     """Since the last sample of any module's IMU that is to be believed."""
     voltage_share: float
@@ -109,6 +112,7 @@ class HealthMonitor:
         self._cabin_change_pa: dict[int, float] = {}
         self._readings = (self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa)
         self._depth_ns = self._imu_ns = 0
+        self._depth_heard = False
         self._ground_ns: int | None = None
         self._pilot_ns: int | None = None
         self._stick = 0.0
@@ -144,6 +148,7 @@ class HealthMonitor:
                 for channel, thruster in self._thruster_at[i].items():
                     self._esc_ns[thruster] = other._esc_ns[other._thruster_at[j][channel]]
         self._depth_ns, self._imu_ns = max(other._depth_ns for other in before), max(other._imu_ns for other in before)
+        self._depth_heard = any(other._depth_heard for other in before)
         self._time_ns = max((other._time_ns for other in before if other._time_ns is not None), default=None)
         self._ground_ns = max((other._ground_ns for other in before if other._ground_ns is not None), default=None)
         self._pilot_ns = max((other._pilot_ns for other in before if other._pilot_ns is not None), default=None)
@@ -171,6 +176,7 @@ class HealthMonitor:
             nis_ratio=self._nis_ratio,
             rejected_share=self._rejected_share,
             depth_age_s=_age_s(self._depth_ns, now),
+            depth_heard=self._depth_heard,
             imu_age_s=_age_s(self._imu_ns, now),
             voltage_share=min(self._voltage_share.values(), default=math.nan),
             leak=any(self._leak),
@@ -201,7 +207,7 @@ class HealthMonitor:
             elif module.heard:
                 self._heard_ns[index] = now
             if module.pressure_pa is not None:
-                self._depth_ns = now
+                self._depth_ns, self._depth_heard = now, True
             if module.leak is not None:
                 self._wet_ns[index] = now if module.leak and self._wet[index] else self._wet_ns[index]
                 self._leak[index] = module.leak or now - self._wet_ns[index] < DRY_NS

@@ -175,6 +175,17 @@ def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, gate):  # type: ignor
     return update(x, covariance, residual, h, noise, np.zeros((6, ERRORS)), gate)
 
 
+@njit(f"{STATE}({V},{M},float64)", cache=True)
+def fuse_stillness(x, covariance, variance):  # type: ignore[no-untyped-def]
+    """State and covariance after a made-up measurement: no horizontal speed over ground, with `variance` (m/s)^2."""
+    across = np.ascontiguousarray(to_matrix(x[3:7].copy())[:2])
+    h = np.zeros((2, ERRORS))
+    h[:, 6:9] = across
+    residual = -(across @ x[7:10].copy())
+    _, x_after, after = update(x, covariance, residual, h, np.full(2, variance), np.zeros((2, ERRORS)), ANY_NIS)
+    return x_after, after
+
+
 @njit(cache=True)
 def carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance):  # type: ignore[no-untyped-def]
     """(6,) variance of position (world) and attitude (body) after carrying the state for `lag` seconds by gyro and

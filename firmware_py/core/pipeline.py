@@ -111,7 +111,7 @@ class BodyPipeline:
     def decide(self, inputs: Inputs, estimate: Estimate, requests: Sequence[Request]) -> list[DockRequest]:
         """Sound requests and fail-safes -> state and mode. Returns the docks and undocks that were granted."""
         mine = [r for r in requests if r.body == self.body.index or r.action in FOR_ALL]
-        self.health.step(inputs, estimate, mine, self.faults.now)
+        self.guidance.look(estimate, self.health.step(inputs, estimate, mine, self.faults.now))
         was_armed = self.supervisor.armed
         decisions = self.supervisor.step(inputs.estop, self.health.now, mine, self._endings())
         for decision in decisions:

@@ -116,16 +116,17 @@ _SENSOR_FRESH_NS = 500_000_000
 def sys_status(s: Subject) -> list[Values]:
     now = s.picture.time_ns
     fresh = s.picture.pose_is_fresh(s.body)
-    modules = s.modules
+    modules, ready = s.modules, s.record.estimate.ready
+    pressure = any(now - m.pressure_ns < _SENSOR_FRESH_NS for m in modules)
     healthy = {
         "gyro": all(now - m.gyro_ns < _SENSOR_FRESH_NS for m in modules),
         "accel": all(now - m.accel_ns < _SENSOR_FRESH_NS for m in modules),
-        "pressure": any(now - m.pressure_ns < _SENSOR_FRESH_NS for m in modules),
+        "pressure": pressure,
         "vision": fresh,
         "rate": True,
-        "attitude": fresh,
+        "attitude": ready,
         "yaw": fresh,
-        "depth": fresh,
+        "depth": ready and (pressure or fresh),
         "position": fresh,
         "motors": all(now - m.answered_ns < _SENSOR_FRESH_NS for m in modules),
         "battery": not math.isnan(modules[0].voltage_v),
@@ -186,12 +187,13 @@ def odometry(s: Subject) -> list[Values]:
 
 def global_position_int(s: Subject) -> list[Values]:
     e, v = s.record.estimate, s.v_w
+    heading = round(_heading_deg(s) * 100) % 36000 if e.placed else _UNKNOWN_16
     latitude, longitude, altitude = s.origin.geodetic(e.p_wb)
     return [{
         "time_boot_ms": s.time_ms, "lat": round(latitude * 1e7), "lon": round(longitude * 1e7),
         "alt": round(altitude * 1e3), "relative_alt": round(-e.p_wb[2] * 1e3),
         "vx": round(v[0] * 100), "vy": round(v[1] * 100), "vz": round(v[2] * 100),
-        "hdg": round(_heading_deg(s) * 100) % 36000,
+        "hdg": heading,
     }]  # fmt: skip
 
 

@@ -17,23 +17,24 @@ from hil.plant.world import BodyTruth
 from hil.scenario import load_scenario
 
 DOWN = np.array([0.0, 0.0, 1.0])
-NEUTRAL, AHEAD = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Sticks((0.3, 0.0, 0.0), (0.0, 0.0, 0.0))
+NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 class Pilot:
     """Takes a mode, arms in it as soon as that is granted, and may steer ahead for a while and then ask for another mode."""
 
     def __init__(
-        self, mode: Mode, duration_s: float, ahead_s: tuple[float, float] = (0.0, 0.0), then: tuple[float, Mode] | None = None
-    ) -> None:
+        self, mode: Mode, duration_s: float, ahead_s: tuple[float, float] = (0.0, 0.0), stick: float = 0.3,
+        then: tuple[float, Mode] | None = None,
+    ) -> None:  # fmt: skip
         self.ticks = round(100 * duration_s)
         self._modes = {50: mode} if then is None else {50: mode, round(100 * then[0]): then[1]}
-        self._ahead, self._armed = ahead_s, False
+        self._ahead, self._stick, self._armed = ahead_s, NEUTRAL._replace(force=(stick, 0.0, 0.0)), False
 
     def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
         tick, t = time_ns // 10_000_000, time_ns * 1e-9
         self._armed = self._armed or (last is not None and last.records[0].state == State.ARMED)
-        asked = [Request(Action.STICKS, 0, AHEAD if self._ahead[0] <= t < self._ahead[1] else NEUTRAL), Request(Action.GROUND_ALIVE)]
+        asked = [Request(Action.STICKS, 0, self._stick if self._ahead[0] <= t < self._ahead[1] else NEUTRAL), Request(Action.GROUND_ALIVE)]
         if tick in self._modes:
             asked.append(Request(Action.SET_MODE, 0, self._modes[tick]))
         if tick % 50 == 10 and not self._armed:
@@ -47,9 +48,10 @@ class Pilot:
 class Flight:
     """Every tick of a flight in which tags are seen between two times alone: truth, record, words."""
 
-    def __init__(self, pilot: Pilot, *faults: Fault, tags_s: tuple[float, float] = (1e5, 1e6), seed: int = 1) -> None:
+    def __init__(self, pilot: Pilot, *faults: Fault, tags_s: tuple[float, float] = (1e5, 1e6), seed: int = 1, size_m: float = 8.0) -> None:
         absent = (Fault(kind="tag_absent", until_s=tags_s[0]), Fault(kind="tag_absent", at_s=tags_s[1] - 1e-3))
         scenario = dataclasses.replace(load_scenario("faults"), fault=(*absent, *faults))
+        scenario = dataclasses.replace(scenario, tank=dataclasses.replace(scenario.tank, size_m=np.array([size_m, size_m, 6.0])))
         self.truth: list[BodyTruth] = []
         self.records: list[BodyRecord] = []
         self.words: list[str] = []
@@ -135,6 +137,20 @@ def test_pilot_steers_a_stabilised_robot_without_any_tag() -> None:
     assert way_w @ ahead_w > 1.0 and abs(way_w[2]) < 0.05
     for truth, record in flight.between(11.0, 16.0):  # the tags came while it was under way
         np.testing.assert_allclose(record.estimate.p_wb, truth.p_wb, atol=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stick", "size_m"), [(0.5, 400.0), (1.0, 400.0), (1.0, 8.0)], ids=["half", "full", "full, against a wall"])
+@pytest.mark.parametrize("tags_s", [(1e5, 1e6), (1e-3, 3.0)], ids=["never a tag", "tags that end"])
+def test_robot_that_is_driven_ahead_for_a_minute_without_a_tag_stays_level(
+    stick: float, size_m: float, tags_s: tuple[float, float]
+) -> None:
+    flight = Flight(Pilot(Mode.ALT_HOLD, 63.0, ahead_s=(3.0, 63.0), stick=stick), tags_s=tags_s, size_m=size_m)
+    assert flight.records[-1].mode == Mode.ALT_HOLD
+    assert flight.tilt_error_deg(5.0, 63.0) < 10.0
+    for truth, record in flight.between(20.0, 63.0):
+        assert np.linalg.norm(record.estimate.nu[:3]) < 0.6 and np.linalg.norm(record.estimate.force_w) < 40.0
+        assert abs(truth.p_wb[2] - flight.truth[300].p_wb[2]) < 0.1
 
 
 def test_no_mode_that_keeps_a_place_is_armed_without_a_tag() -> None:

@@ -12,6 +12,7 @@ GOOD = Health(
     nis_ratio=1.0,
     rejected_share=0.01,
     depth_age_s=0.02,
+    depth_heard=True,
     imu_age_s=0.01,
     voltage_share=1.0,
     leak=False,

@@ -176,6 +176,8 @@ def test_mode_needs_what_it_steers_by(mode: Mode) -> None:
     }  # fmt: skip
     assert missing(mode, blind, P) == expected.get(mode, [])
     assert missing(mode, UPRIGHT, P) == (["no pose yet"] if mode in PLACED else [])
+    deaf = UPRIGHT._replace(depth_heard=False, depth_age_s=1.0)
+    assert missing(mode, deaf, P) == (["no pose yet"] if mode in PLACED else ["depth unknown"] if mode == Mode.ALT_HOLD else [])
     lost = GOOD._replace(tag_age_s=above(8.0), depth_age_s=above(5.0))
     expected = {Mode.ALT_HOLD: ["depth unknown"], **{key: ["no tag for 8.0 s"] for key in PLACED}}
     assert missing(mode, lost, P) == expected.get(mode, [])

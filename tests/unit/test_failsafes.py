@@ -10,7 +10,7 @@ from firmware_py.core.failsafes import ANY, MOVING, PERMITTED, PILOTED, PLACED, 
 from firmware_py.core.health import Health
 from firmware_py.core.types import Mode
 from firmware_py.description.failsafe_parameters import Failsafes as Parameters
-from tests.unit.healths import GOOD, at
+from tests.unit.healths import GOOD, UPRIGHT, at
 
 P = Parameters()
 ROWS = {row.name: row for row in TABLE}
@@ -248,6 +248,10 @@ WORDS = {
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_alarm_has_its_words(name: str) -> None:
     assert Watch(ROWS[name], P).words(bad(name)) == WORDS[name]
+
+
+def test_what_was_never_heard_of_has_no_age_in_seconds() -> None:
+    assert Watch(ROWS["tag_gone"], P).words(UPRIGHT) == "no tag so far"
 
 
 # ---------------------------------------------------------------- modes that are refused while a cause lasts

@@ -11,7 +11,7 @@ from pymavlink.generator import mavgen
 
 from firmware_py.app.deadlines import times_of
 from firmware_py.core.rotations import rotate
-from firmware_py.core.types import Action
+from firmware_py.core.types import NEVER_NS, Action
 from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.identity import px4
 from firmware_py.ground.telemetry import STREAMS
@@ -78,6 +78,15 @@ def test_system_status_tells_of_health_and_of_readiness_to_arm(world: World, cli
     world.robot.tag_age_ns = 2_000_000_000
     world.run(100)
     assert not client.last("SYS_STATUS").onboard_control_sensors_health & (vision | prearm)
+
+
+def test_robot_that_no_camera_has_seen_knows_its_attitude_and_depth_and_no_heading(world: World, client: Client) -> None:
+    world.robot.tag_age_ns = NEVER_NS
+    world.run(200)
+    health = client.last("SYS_STATUS").onboard_control_sensors_health
+    assert health & mavlink.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION and health & mavlink.MAV_SYS_STATUS_SENSOR_Z_ALTITUDE_CONTROL
+    assert not health & (mavlink.MAV_SYS_STATUS_SENSOR_YAW_POSITION | mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL)
+    assert client.last("GLOBAL_POSITION_INT").hdg == 65535
 
 
 def test_esc_messages_decode_with_a_dialect_that_mavgen_made(world: World, client: Client, tmp_path: Path) -> None:

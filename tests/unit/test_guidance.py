@@ -52,6 +52,7 @@ class Flight:
             self.time_ns += TICK
             if sticks is not None:
                 self.do(Effect.TAKE_STICKS, self.guidance.mode, sticks)
+            self.guidance.look(self.estimate, health)
             now, _ = self.guidance.step(self.time_ns, self.estimate, health)
             self.setpoints.append(now)
             self.wrenches.append(self.guidance.mix(WRENCH, self.time_ns, self.estimate, health))
@@ -321,6 +322,28 @@ def test_first_tags_move_the_set_point_with_the_world(mode: Mode) -> None:
     np.testing.assert_allclose(now.p_wb, there.p_wb, atol=0.01)
     assert np.linalg.norm(difference(now.q_wb, there.q_wb)) < 0.01
     assert flight.run(1.0).p_wb[0] < 5.2
+
+
+def test_what_was_asked_for_in_the_world_before_is_forgotten_and_what_comes_with_the_first_tags_is_not() -> None:
+    flight, there = Flight(), estimate((5.0, -3.0, 1.4))
+    flight.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    flight.run(1.0, health=UPRIGHT)
+    flight.do(Effect.TAKE_POINT, Mode.ALT_HOLD, rest_at(ZERO, LEVEL))
+    flight.estimate = there
+    flight.guidance.look(there, GOOD)
+    flight.do(Effect.HOLD_AT, Mode.POSHOLD, rest_at(np.array([4.0, -3.0, 1.4]), LEVEL))
+    assert flight.run(20.0).p_wb[0] == pytest.approx(4.0, abs=0.01)
+    flight.do(Effect.ENTER_MODE, Mode.GUIDED)
+    assert flight.run(5.0).p_wb[0] == pytest.approx(4.0, abs=0.01)
+
+
+def test_robot_that_falls_back_on_gravity_goes_on_from_where_it_is_believed_to_be() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    flight.run(1.0)
+    flight.estimate = estimate((0.0, 0.0, 1.3), from_euler(0.0, 0.0, 2.5))
+    now = flight.run(0.01, health=UPRIGHT, follows=False)
+    assert np.linalg.norm(difference(now.q_wb, flight.estimate.q_wb)) < 0.01
 
 
 def test_tags_that_come_back_move_no_set_point() -> None:

@@ -236,6 +236,15 @@ def test_robot_without_a_pose_is_nowhere() -> None:
     assert Ear().hear().sigma_m == 0.03
 
 
+def test_depth_is_known_from_the_first_that_is_heard() -> None:
+    ear = Ear()
+    assert not ear.hear(here()).depth_heard
+    assert ear.hear(here(pressure_pa=1.1e5)).depth_heard and ear.hear(here()).depth_heard
+    whole = HealthMonitor(BODY, Parameters(), TICK_NS)
+    whole.take_over([HealthMonitor(BODY, Parameters(), TICK_NS), ear.monitor])
+    assert whole._depth_heard
+
+
 def test_robot_that_stands_by_gravity_alone_is_nowhere_but_ready() -> None:
     health = Ear().hear(tag_age_ns=1 << 60)  # type: ignore[arg-type]
     assert health.ready and not health.placed and math.isnan(health.outside_m)
