@@ -65,11 +65,12 @@ class Failsafes:
     depth_unknown_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_DEPU_S")
     depth_unknown_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_DEPU_ACT")
     depth_unknown_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_DEPU_LAT")
-    # tags do not come back
+    # tags do not come back: what a fail-safe makes hold its depth comes up, 30 s after the last tag, or 22 s after a pilot is gone who flew
+    # without any
     tag_gone_limit: float = quantity(
-        30.0, unit="s", low=0.1, high=3600, help="no tag for longer", mavlink="FS_TAGG_LIM"
+        8.0, unit="s", low=0.1, high=3600, help="no tag for longer", mavlink="FS_TAGG_LIM"
     )
-    tag_gone_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_TAGG_S")
+    tag_gone_delay_s: float = quantity(22.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_TAGG_S")
     tag_gone_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_TAGG_ACT")
     tag_gone_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_TAGG_LAT")
     # a docked partner is lost

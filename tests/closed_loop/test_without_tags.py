@@ -25,16 +25,19 @@ class Pilot:
 
     def __init__(
         self, mode: Mode, duration_s: float, ahead_s: tuple[float, float] = (0.0, 0.0), stick: float = 0.3,
-        then: tuple[float, Mode] | None = None,
+        then: tuple[float, Mode] | None = None, until_s: float = 1e6,
     ) -> None:  # fmt: skip
         self.ticks = round(100 * duration_s)
         self._modes = {50: mode} if then is None else {50: mode, round(100 * then[0]): then[1]}
         self._ahead, self._stick, self._armed = ahead_s, NEUTRAL._replace(force=(stick, 0.0, 0.0)), False
+        self._until_s = until_s
 
     def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
         tick, t = time_ns // 10_000_000, time_ns * 1e-9
         self._armed = self._armed or (last is not None and last.records[0].state == State.ARMED)
-        asked = [Request(Action.STICKS, 0, self._stick if self._ahead[0] <= t < self._ahead[1] else NEUTRAL), Request(Action.GROUND_ALIVE)]
+        asked = [Request(Action.GROUND_ALIVE)]
+        if t < self._until_s:
+            asked.append(Request(Action.STICKS, 0, self._stick if self._ahead[0] <= t < self._ahead[1] else NEUTRAL))
         if tick in self._modes:
             asked.append(Request(Action.SET_MODE, 0, self._modes[tick]))
         if tick % 50 == 10 and not self._armed:
@@ -151,6 +154,15 @@ def test_robot_that_is_driven_ahead_for_a_minute_without_a_tag_stays_level(
     for truth, record in flight.between(20.0, 63.0):
         assert np.linalg.norm(record.estimate.nu[:3]) < 0.6 and np.linalg.norm(record.estimate.force_w) < 40.0
         assert abs(truth.p_wb[2] - flight.truth[300].p_wb[2]) < 0.1
+
+
+@pytest.mark.slow
+def test_robot_whose_pilot_falls_silent_holds_its_depth_before_it_comes_up() -> None:
+    """As one that loses its tags does: in 22 s a pilot may come back."""
+    flight = Flight(Pilot(Mode.STABILIZE, 35.0, until_s=6.0))
+    for begin_s, end_s, mode in ((5.0, 6.9, Mode.STABILIZE), (7.1, 28.9, Mode.ALT_HOLD), (29.1, 35.0, Mode.SURFACE)):
+        assert {record.mode for _, record in flight.between(begin_s, end_s)} == {mode}
+    assert "fail-safe on: no tag so far" in flight.words
 
 
 def test_no_mode_that_keeps_a_place_is_armed_without_a_tag() -> None:

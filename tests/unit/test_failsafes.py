@@ -227,7 +227,7 @@ WORDS = {
     "cabin_pressure": "cabin pressure off by 20000 Pa",
     "axis_lost": "the thrusters left cannot make every wrench",
     "depth_unknown": "depth unknown for 5.0 s",
-    "tag_gone": "no tag for 30.0 s",
+    "tag_gone": "no tag for 8.0 s",
     "partner_lost": "a docked partner is lost",
     "estimator": "sensors and model disagree: 5.0 of the expected",
     "rejected": "80% of the tags refused",
