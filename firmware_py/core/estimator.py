@@ -45,6 +45,9 @@ ADRIFT_NS = 10_000_000_000
 the accelerometer: the speed that is believed would grow, to 15 m/s within a minute of half stick, and spoil the tilt."""
 STILL_DENSITY = 0.0003
 """Of the noise of the speed that is made up then, m^2/s: 0.17 m/s in a tick at 100 Hz."""
+NORTH_DENSITY = 1e-4
+"""Of the noise of the heading before the first tag, rad^2 s: it says where north is, and so is known. What the filter else took for
+knowledge of it was noise: a bump turned the belief by a third of a circle."""
 KEPT, MOVING = np.r_[10:19, 21:25], slice(6, 9)
 """Of the state: rates, biases, vertical force and moment, which say the same whatever the heading. Of the error: velocity."""
 SPEED_SIGMA = 0.5
@@ -84,7 +87,7 @@ class Estimator:
         self._refused_in_row = 0
         self._rejected = 0
         self._last_tag_ns, self._taken_ns = -NEVER_NS, 0
-        self._first_sight, self._felt_ns = FirstSight(), 0
+        self._first_sight, self._felt_ns, self._depth_ns = FirstSight(), 0, 0
         self._nis = math.nan
         self._nis_dof = 0
 
@@ -116,10 +119,12 @@ class Estimator:
             self._accepted = self._waited = 0  # the process stood still: what is remembered joins on to nothing
         self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
         self._felt_ns = time_ns if measured.accel is not None else self._felt_ns
+        self._depth_ns = time_ns if measured.depth_m is not None else self._depth_ns
         for pose in measured.tags:
             self._take(pose)
         if self._is_lost(time_ns):
             self._forget()
+            self._waited = round(UPRIGHT_AFTER_S / self._dt)
         if not self._accepted:
             self._wait(time_ns)
         if self._accepted:
@@ -139,7 +144,7 @@ class Estimator:
         self._history.push(time_ns, np.zeros(6), None, None, None)
         self._anchor = self._head = Belief(motion.x.copy(), motion.covariance.copy(), time_ns)
         self._now = self._anchor.x
-        self._first_sight, self._felt_ns = FirstSight(), time_ns
+        self._first_sight, self._felt_ns, self._depth_ns = FirstSight(), time_ns, time_ns
         self._last_tag_ns, self._taken_ns = motion.tag_ns, time_ns
         self._accepted, self._refused_in_row = motion.accepted, 0
         self._nis, self._nis_dof = math.nan, 0
@@ -196,11 +201,16 @@ class Estimator:
     def _is_lost(self, time_ns: int) -> bool:
         """Whether what is believed rests on too little: a few tags that no more came after, or nothing but a gyro for long."""
         few = self._accepted < READY_AFTER and time_ns - self._taken_ns > UPRIGHT_AFTER_S * 1e9
-        return self._accepted > 0 and (few or (self._is_adrift and time_ns - self._felt_ns > FELT_LIMIT_NS))
+        borne_out_ns = max(self._felt_ns, self._last_tag_ns + ADRIFT_NS)
+        return self._accepted > 0 and (few or time_ns - borne_out_ns > FELT_LIMIT_NS)
 
     def _stilled(self, at: Belief) -> Belief:
-        """It is made up that the body stands still over ground, more or less (ADRIFT_NS); ArduPilot's EKF3 does the like without aiding."""
-        x, covariance = observation.fuse_stillness(at.x, at.covariance, STILL_DENSITY / self._dt)
+        """It is made up that the body stands still over ground, more or less (ADRIFT_NS); ArduPilot's EKF3 does the like without aiding.
+        Up and down only where no depth tells.
+        """
+        axes = 2 if self._history.newest_ns - self._depth_ns < BLIND_NS else 3
+        north = NORTH_DENSITY / self._dt if self._last_tag_ns == -NEVER_NS else math.inf
+        x, covariance = observation.fuse_stillness(at.x, at.covariance, STILL_DENSITY / self._dt, axes, north)
         return Belief(x, covariance, at.time_ns)
 
     def _place(self, pose: BodyPose) -> None:

@@ -143,7 +143,7 @@ class Watch:
     def words(self, health: Health) -> str:
         """How it is, for people."""
         value, words = self._value(health), self.row.words
-        return words.replace(" for {:.1f} s", " so far") if value >= NEVER_S else words.format(value)
+        return words.replace(" for {:.1f} s", "") if value >= NEVER_S else words.format(value)
 
     def reason(self, health: Health) -> str:
         """What is wrong, for people; what was wrong when it began, where its cause is gone."""

@@ -65,7 +65,7 @@ class Guidance:
         self._trajectory: Trajectory | None = None
         self._start_ns: int | None = None
         self._goal: Wish | None = None
-        self._upright = False
+        self._upright = self._lost = False
         self._point: tuple[int, Setpoint] | None = None
         self._docking: Setpoint | Wish | None = None
         self._sticks, self._sticks_ns = NEUTRAL, 0
@@ -173,7 +173,8 @@ class Guidance:
             self._glider.put(self._docking)
             return self._docking, ahead_of(self._docking, self._lead_s)
         now = self._glider.step(self._wish(time_ns, estimate, health), dt_s)
-        if STEERING[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and not self._placed(health)):
+        lost, self._lost = self._lost, not self._placed(health)  # in the tick in which tags tell a place, the set-point still moves to it
+        if STEERING[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (lost or self._lost)):
             now = self._let_go(now, estimate)
         return now, ahead_of(now, self._lead_s)
 

@@ -213,8 +213,53 @@ def test_steady_thrust_for_a_minute_is_believed_to_drive_nobody_mad() -> None:
     robot.rest(300)
     robot.tau = robot.tau - 1.3 * drag
     estimate = robot.rest(6000)
+    assert np.linalg.norm(robot.estimator._anchor.x[7:10]) < 0.5, "late tags find the filter sound"
     assert np.linalg.norm(estimate.nu[:3]) < 0.5 and np.linalg.norm(estimate.force_w) < 30.0
     assert np.linalg.norm(difference(estimate.q_wb, multiply(heading(estimate.q_wb), robot.q_wb))) < 0.05
+
+
+def test_heading_that_nobody_told_is_not_learned_from_noise() -> None:
+    """A bump turned the belief by 344 deg: heading and vertical gyro bias passed for known."""
+    rng, robot, q_wb = np.random.default_rng(1), Robot(from_euler(0.0, 0.0, 0.0)), []
+    for tick in range(3100):
+        robot.tick += 1
+        bump = np.array([1.5, 1.0, 0.0]) if 3000 <= tick < 3010 else np.zeros(3)
+        accel = felt(robot.q_wb)[0] + bump + rng.normal(0.0, 0.036, 3)
+        q_wb.append(robot.estimator.step(robot.time_ns, Measured(rng.normal(0.0, 0.0022, 3), accel, 0.8, []), robot.tau).q_wb)
+    assert np.linalg.norm(difference(q_wb[-1], q_wb[2999])) < 0.01
+    assert abs(robot.estimator.motion.x[15]) < 1e-3
+
+
+def test_rise_or_fall_that_no_depth_tells_is_not_believed_to_go_on_for_ever() -> None:
+    robot = Robot(from_euler(0.1, 0.0, 0.0))
+    drag, way = np.zeros(6), np.r_[0.4, 0.0, 0.45, np.zeros(3)]
+    add_drag(BODY.drag.nodes, BODY.drag.rotational, BODY.drag.linear, way, drag)
+    robot.rest(300)
+    robot.tau = robot.tau - 1.3 * drag
+    for _ in range(6000):
+        estimate = robot.step(depth_m=None)
+    assert np.linalg.norm(estimate.nu[:3]) < 0.2 and np.linalg.norm(estimate.force_w) < 30.0
+    estimate = robot.rest(100)
+    assert estimate.p_wb[2] == pytest.approx(0.8, abs=0.02)
+    assert np.linalg.norm(difference(estimate.q_wb, multiply(heading(estimate.q_wb), robot.q_wb))) < 0.03
+
+
+def test_tags_that_come_too_seldom_to_be_believed_keep_nobody_from_standing_up() -> None:
+    robot, ready = Robot(), []
+    for tick in range(1000):
+        seen = [tag(robot.time_ns - 2 * PERIOD)] if tick % 150 == 0 else []
+        ready.append(robot.step(*seen).ready)
+    assert ready.index(True) < 250 and np.mean(ready[250:]) > 0.9
+
+
+@pytest.mark.parametrize(("blind_ticks", "ready"), [(1150, True), (1230, False)])
+def test_attitude_that_tags_bore_out_is_given_up_twelve_seconds_after_them(blind_ticks: int, ready: bool) -> None:
+    robot = Robot()
+    for tick in range(200 + blind_ticks):
+        robot.tick += 1
+        seen = [tag(robot.time_ns - 2 * PERIOD)] if tick < 200 else []
+        estimate = robot.estimator.step(robot.time_ns, Measured(np.zeros(3), None, 0.8, seen), robot.tau)
+    assert estimate.ready == ready
 
 
 def test_attitude_that_no_accelerometer_bears_out_is_given_up() -> None:
@@ -268,6 +313,7 @@ def test_speed_that_was_made_up_is_not_kept_when_the_place_is_told() -> None:
     robot.rest(200)
     robot.estimator._anchor.x[7:10] = robot.estimator._head.x[7:10] = [0.6, 0.0, 0.0]
     robot.see(READY_AFTER)
+    assert robot.estimator._anchor.covariance.diagonal()[6:9] == pytest.approx(0.25)
     assert np.linalg.norm(robot.see(30).nu[:3]) < 0.1
     assert robot.see(1).rejected == 0
 
@@ -328,6 +374,8 @@ def test_parted_body_that_never_saw_a_tag_stands_on() -> None:
     before = robot.rest(300)
     estimate = part.estimator.restart(robot.time_ns, robot.estimator.motion)
     assert estimate.ready and not estimate.placed
-    part.tick = robot.tick
+    part.tick = robot.tick + 1
+    still = Measured(np.zeros(3), None, None, [])
+    assert part.estimator.step(part.time_ns, still, part.tau).ready, "what the whole has felt, its parts have"
     np.testing.assert_allclose(part.rest(50).p_wb, before.p_wb, atol=0.05)
     assert part.see(READY_AFTER).placed

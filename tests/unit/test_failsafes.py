@@ -251,7 +251,7 @@ def test_every_alarm_has_its_words(name: str) -> None:
 
 
 def test_what_was_never_heard_of_has_no_age_in_seconds() -> None:
-    assert Watch(ROWS["tag_gone"], P).words(UPRIGHT) == "no tag so far"
+    assert Watch(ROWS["tag_gone"], P).words(UPRIGHT) == "no tag"
 
 
 # ---------------------------------------------------------------- modes that are refused while a cause lasts

@@ -333,8 +333,23 @@ def test_what_was_asked_for_in_the_world_before_is_forgotten_and_what_comes_with
     flight.guidance.look(there, GOOD)
     flight.do(Effect.HOLD_AT, Mode.POSHOLD, rest_at(np.array([4.0, -3.0, 1.4]), LEVEL))
     assert flight.run(20.0).p_wb[0] == pytest.approx(4.0, abs=0.01)
-    flight.do(Effect.ENTER_MODE, Mode.GUIDED)
-    assert flight.run(5.0).p_wb[0] == pytest.approx(4.0, abs=0.01)
+    other = Flight()
+    other.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    other.run(1.0, health=UPRIGHT)
+    other.do(Effect.TAKE_POINT, Mode.ALT_HOLD, rest_at(ZERO, LEVEL))
+    other.estimate = there
+    other.guidance.look(there, GOOD)
+    other.do(Effect.ENTER_MODE, Mode.GUIDED)
+    assert other.run(5.0).p_wb[0] == pytest.approx(5.0, abs=0.01)
+
+
+def test_place_that_tags_tell_a_surfacing_robot_anew_is_not_swum_back_from() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    flight.run(2.0, health=GOOD._replace(tag_age_s=20.0), follows=False)
+    flight.estimate = estimate((1.5, -1.0, 1.0))
+    now = flight.run(0.01, follows=False)
+    np.testing.assert_allclose(now.p_wb[:2], [1.5, -1.0], atol=1e-3)
 
 
 def test_robot_that_falls_back_on_gravity_goes_on_from_where_it_is_believed_to_be() -> None:

@@ -345,6 +345,25 @@ def test_measurement_beyond_the_gate_changes_nothing(spoil: float) -> None:
     np.testing.assert_array_equal(got, covariance)
 
 
+@pytest.mark.parametrize(("axes", "kept"), [(2, 1.0), (3, 0.0)])
+def test_stillness_takes_the_speed_over_ground_and_leaves_what_it_says_nothing_of(axes: int, kept: float) -> None:
+    x = state(3)
+    before, down = Rotation.from_quat(x[[4, 5, 6, 3]]).apply(x[7:10]), np.array([0.0, 0.0, 1.0])
+    after, covariance = observation.fuse_stillness(x, np.eye(ERRORS), 1e-9, axes, np.inf)
+    now = Rotation.from_quat(after[[4, 5, 6, 3]]).apply(after[7:10])
+    np.testing.assert_allclose(now, kept * (before @ down) * down, atol=1e-6)
+    np.testing.assert_allclose(after[10:], x[10:], atol=1e-12)
+    np.testing.assert_allclose(covariance[3:6, 3:6], np.eye(3), atol=1e-12)
+
+
+def test_heading_that_is_north_by_definition_is_known_and_no_other_angle() -> None:
+    x = state(3)
+    after, covariance = observation.fuse_stillness(x, np.eye(ERRORS), 1e9, 2, 1e-9)
+    down_b = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(covariance[3:6, 3:6], np.eye(3) - np.outer(down_b, down_b), atol=1e-6)
+    np.testing.assert_allclose(difference(after[3:7], x[3:7].copy()), 0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_prediction_is_that_of_filterpy(body: Body, seed: int) -> None:
     covariance, density = measurement(seed)[0], np.random.default_rng(seed).uniform(1, 2, ERRORS)
