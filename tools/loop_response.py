@@ -110,7 +110,7 @@ class Loop:
         self._commanded = np.zeros(self.body.thrusters.f_max.size)
         self._tick = 0
         self.is_ready = False
-        """Whether the estimator believes its pose."""
+        """Whether the estimator knows its place."""
         self.pose = np.zeros(6)
         """Estimated place, m, and rotation vector, rad."""
 
@@ -122,11 +122,11 @@ class Loop:
         chain = self._chain
         estimate = chain.measure(inputs)
         thrust = chain.allocator.step(chain.controller.step(self.aim, self.aim, estimate))
-        self._commanded, _ = chain.limiter.step(thrust.force_n, estimate.ready, chain.supply.voltage_v)
+        self._commanded, _ = chain.limiter.step(thrust.force_n, estimate.placed, chain.supply.voltage_v)
         chain.lag.command(self._commanded)
         self._world.advance(PERIOD_NS)
         self._seen += self._camera.watch(self._world)
-        self.is_ready = bool(estimate.ready)
+        self.is_ready = bool(estimate.placed)
         self.pose = np.concatenate([estimate.p_wb, log(estimate.q_wb)])
         return np.asarray(self.body.thrusters.matrix @ self._commanded)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from filterpy.common import Q_continuous_white_noise
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core import propagation
@@ -111,6 +112,7 @@ def fly(
         before, surprise = x, np.zeros(ERRORS)
         if k:
             surprise = process_sigma(body, p, x) * np.sqrt(DT) * rng.normal(size=ERRORS)
+            surprise[3:6] = 0.5 * DT * surprise[9:12]  # what turned it in this tick has turned it for half of it
             x = propagation.inject(propagation.step(x, tau, DT, *plant(body)), surprise)
         while taken < len(pictures) and pictures[taken] <= t:
             capture = pictures[taken]
@@ -152,9 +154,12 @@ class InOrder:
         dt = (to_ns - self.time_ns) * 1e-9
         if dt > 0.0:
             f = np.vstack([propagation.transition(self.x, tau, dt, *self.plant), np.eye(ERRORS)[propagation.MOVING :]])
-            noise = np.diag(process_sigma(self.body, self.p, self.x) ** 2)
+            density = process_sigma(self.body, self.p, self.x) ** 2
+            noise = np.diag(density * dt)
+            for i in range(3):
+                noise[np.ix_([3 + i, 9 + i], [3 + i, 9 + i])] = Q_continuous_white_noise(2, dt, density[9 + i])
             self.x = propagation.step(self.x, tau, dt, *self.plant)
-            self.covariance = f @ self.covariance @ f.T + noise * dt
+            self.covariance = f @ self.covariance @ f.T + noise
         self.time_ns = to_ns
         return dt
 
