@@ -86,11 +86,11 @@ class Operator:
             return []
         self._strike_out(last)
         self._expire()
-        ready = [record.body for record in last.records if record.body in self.to_arm and record.estimate.placed]
-        if not ready or self._ticks < self._next_try:
+        placed = [record.body for record in last.records if record.body in self.to_arm and record.estimate.placed]
+        if not placed or self._ticks < self._next_try:
             return []
         self._next_try = self._ticks + round(ARM_EVERY_S * self.rate_hz)
-        return [Request(Action.ARM, body) for body in ready]
+        return [Request(Action.ARM, body) for body in placed]
 
     def _strike_out(self, last: Outputs) -> None:
         """Who has been armed, and after an e-stop everybody, is a person's to arm."""

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from firmware_py.core.measurements import FLIP_RAD
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
 from firmware_py.core.types import BodyPose
@@ -18,10 +19,10 @@ AT_REST_M_S2 = 0.05 * GRAVITY
 """Mean specific force and gravity differ by less in size where nothing pushes up or down. What pushes across tilts the beginning, by ten
 degrees for 1.7 m/s^2; the filter, whose model knows the thrusters, rights it within seconds."""
 AT_REST_RAD_S = 0.5
-LEVEL_RAD = 0.35
-"""A tag that tells another way down by more is flipped (20 deg; as `measurements`), or not where the vehicle file says."""
+"""Half of the time over which the mean is taken, 0.1 s, then turns a body by three degrees."""
 SAME_RAD, SAME_M, SAME_M_S, SAME_S = 0.1, 0.1, 1.0, 1.0
-"""Tags that differ by less in heading, place and time tell the same; a body that is said to stand still may move so fast."""
+"""Tags that differ by less in heading, place, rad and m, and time, s, tell the same; a body that is said to stand still may move so
+fast, m/s. Ten times a tag's noise in attitude; a flipped one is off by twice the angle at which it is seen."""
 
 
 def upright(gyros: np.ndarray, accels: np.ndarray) -> np.ndarray | None:
@@ -47,14 +48,14 @@ class FirstSight:
         self._heading, self._offset, self._capture_ns = math.nan, np.full(3, math.nan), 0
 
     def agrees(self, pose: BodyPose, p_wb: np.ndarray, q_wb: np.ndarray) -> bool:
-        """Whether `pose` has the same way down as q_wb (4,), or else is flipped; notes where it would move the body that is believed
-        at p_wb (3,).
+        """Whether `pose` has the same way down as q_wb (4,), or else is flipped or not where the vehicle file says; notes where it would
+        move the body that is believed at p_wb (3,), m.
         """
         w, x, y, z = multiply(pose.q_wb, conjugate(q_wb)).tolist()
-        if 2.0 * math.asin(min(1.0, math.hypot(x, y))) > LEVEL_RAD:
+        if 2.0 * math.asin(min(1.0, math.hypot(x, y))) > FLIP_RAD:
             return False
         heading, offset = 2.0 * math.atan2(z, w), pose.p_wt - rotate(pose.q_wb, pose.lever_b) - p_wb
-        turned = abs(math.remainder(heading - self._heading, 2.0 * math.pi)) if self.count else math.inf
+        turned = abs(math.remainder(heading - self._heading, 2.0 * math.pi))  # NaN at first, which is the same as nothing
         gap_s = (pose.capture_ns - self._capture_ns) * 1e-9
         near = float(np.linalg.norm(offset - self._offset)) <= SAME_M + SAME_M_S * gap_s
         same = turned <= SAME_RAD and near and gap_s <= SAME_S

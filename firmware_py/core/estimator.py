@@ -23,21 +23,20 @@ from firmware_py.core.alignment import FirstSight, upright
 from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.history import WINDOW_S, History
 from firmware_py.core.propagation import ERRORS, STATES
-from firmware_py.core.rotations import heading, multiply, rotate, rotate_back
+from firmware_py.core.rotations import heading, multiply, rotate, to_matrix
 from firmware_py.core.topology import Motion
 from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 
 READY_AFTER = 10
 """Tag observations to accept before the pose is believed."""
-DOWN = np.array([0.0, 0.0, 1.0])
 UNKNOWN_SIGMA = np.full(6, 1e3)
 """Of the pose before the first tag, m and rad."""
 UPRIGHT_AFTER_S = 1.0
 """Without a tag, until gravity has to do: its mean over the last `FELT_NS`."""
 FELT_NS = 200_000_000
 BLIND_NS = 250_000_000
-"""Without a tag, until the head leaves the anchor."""
+"""Without a tag, until the head leaves the anchor: fifteen pictures. Without a depth, until none tells."""
 CATCH_UP = 4
 """Samples that the head takes in a tick at most: it is with the present after half a second."""
 ADRIFT_NS = 10_000_000_000
@@ -51,9 +50,9 @@ knowledge of it was noise: a bump turned the belief by a third of a circle."""
 KEPT, MOVING = np.r_[10:19, 21:25], slice(6, 9)
 """Of the state: rates, biases, vertical force and moment, which say the same whatever the heading. Of the error: velocity."""
 SPEED_SIGMA = 0.5
-"""Of one that was adrift, when tags come, m/s."""
+"""Of one that was adrift, when tags come, m/s: what a module swims at half stick."""
 FELT_LIMIT_NS = 2_000_000_000
-"""Without an accelerometer, until one that is adrift does not know its attitude either."""
+"""Without an accelerometer, until one that is adrift does not know its attitude either: four times what the fail-safe `imu_lost` waits."""
 RESET_AFTER = 30
 """Observations refused one after the other (half a second) until the filter believes them and not itself."""
 INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
@@ -124,7 +123,7 @@ class Estimator:
             self._take(pose)
         if self._is_lost(time_ns):
             self._forget()
-            self._waited = round(UPRIGHT_AFTER_S / self._dt)
+            self._waited = round(UPRIGHT_AFTER_S / self._dt)  # it has done so already
         if not self._accepted:
             self._wait(time_ns)
         if self._accepted:
@@ -144,7 +143,7 @@ class Estimator:
         self._history.push(time_ns, np.zeros(6), None, None, None)
         self._anchor = self._head = Belief(motion.x.copy(), motion.covariance.copy(), time_ns)
         self._now = self._anchor.x
-        self._first_sight, self._felt_ns, self._depth_ns = FirstSight(), time_ns, time_ns
+        self._felt_ns = self._depth_ns = time_ns
         self._last_tag_ns, self._taken_ns = motion.tag_ns, time_ns
         self._accepted, self._refused_in_row = motion.accepted, 0
         self._nis, self._nis_dof = math.nan, 0
@@ -191,7 +190,7 @@ class Estimator:
         place = np.r_[self._now[:2], depths.mean() if len(depths) else self._now[2]]
         self._start(BodyPose(time_ns, place, np.zeros(3), multiply(heading(self._now[3:7]), tilt), 1.0))
         self._anchor.covariance[2, 2] = INITIAL_SIGMA[-1] ** 2 if len(depths) else UNKNOWN_SIGMA[2] ** 2
-        self._accepted, self._last_tag_ns, self._first_sight = READY_AFTER, -NEVER_NS, FirstSight()
+        self._accepted, self._last_tag_ns = READY_AFTER, -NEVER_NS
 
     @property
     def _is_adrift(self) -> bool:
@@ -224,7 +223,6 @@ class Estimator:
             self._start(pose)
             self._anchor.x[KEPT], self._accepted = kept, READY_AFTER
             self._anchor.covariance[MOVING, MOVING] = SPEED_SIGMA**2 * np.eye(3)
-            self._first_sight = FirstSight()
 
     def _advanced(self, start: Belief, to_ns: int) -> Belief:
         """The filter at `to_ns`, the inertial and depth measurements on the way fused."""
@@ -285,7 +283,7 @@ class Estimator:
         if self._is_adrift:  # its place is made up, and before the first tag the heading
             sigma[:2] = UNKNOWN_SIGMA[:2]
         if self._last_tag_ns == -NEVER_NS:
-            sigma[3:] += UNKNOWN_SIGMA[3:] * np.abs(rotate_back(self._now[3:7], DOWN))
+            sigma[3:] += UNKNOWN_SIGMA[3:] * np.abs(to_matrix(self._now[3:7])[2])
         return sigma, sound
 
     def _forget(self) -> None:

@@ -177,21 +177,20 @@ def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, gate):  # type: ignor
 
 @njit(f"{STATE}({V},{M},float64,int64,float64)", cache=True)
 def fuse_stillness(x, covariance, variance, axes, heading_variance):  # type: ignore[no-untyped-def]
-    """State and covariance after measurements that are made up: no speed over ground, and the heading that is believed.
+    """State (26,) and covariance (25, 25) after measurements that are made up: no speed over ground, and the heading that is believed.
 
     Args:
         variance: of the speed, (m/s)^2; axes: 2: of the horizontal speed alone, 3: downwards too.
         heading_variance: rad^2; infinite: nothing is said of the heading.
     """
-    r = to_matrix(x[3:7].copy())
-    h, residual, noise = np.zeros((axes + 1, ERRORS)), np.zeros(axes + 1), np.full(axes + 1, variance)
+    r, rows = to_matrix(x[3:7].copy()), axes + 1
+    h, residual, noise = np.zeros((rows, ERRORS)), np.zeros(rows), np.full(rows, variance)
     for i in range(axes):
         h[i, 6:9] = r[i]
         residual[i] = -np.dot(r[i], x[7:10])
     h[axes, 3:6] = r[2]
     noise[axes] = heading_variance
-    rows = axes if math.isinf(heading_variance) else axes + 1
-    _, x_after, after = update(x, covariance, residual[:rows], h[:rows], noise[:rows], np.zeros((rows, ERRORS)), ANY_NIS)
+    _, x_after, after = update(x, covariance, residual, h, noise, np.zeros((rows, ERRORS)), ANY_NIS)
     return x_after, after
 
 

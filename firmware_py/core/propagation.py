@@ -179,13 +179,13 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
     for i in range(ERRORS):
         out[i, i] += density[i] * dt
     speed, rate = squared_speeds(x)
+    turning = under_way[2] ** 2 * rate
     for i in range(3):
-        doubt = under_way[2] ** 2 * rate
-        out[9 + i, 9 + i] += doubt * dt
-        doubt += density[9 + i]
-        out[3 + i, 9 + i] += 0.5 * doubt * dt**2
-        out[9 + i, 3 + i] += 0.5 * doubt * dt**2
-        out[3 + i, 3 + i] += doubt * dt**3 / 3.0
+        alpha = density[9 + i] + turning
+        out[9 + i, 9 + i] += turning * dt
+        out[3 + i, 9 + i] += 0.5 * alpha * dt**2
+        out[9 + i, 3 + i] += 0.5 * alpha * dt**2
+        out[3 + i, 3 + i] += alpha * dt**3 / 3.0
         out[18 + i, 18 + i] += (under_way[0] ** 2 * speed + under_way[1] ** 2 * rate) * dt
     return step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear), out
 

@@ -97,9 +97,9 @@ class Fault:
             yield "until_s", f"{self.until_s:g} s is not after at_s, {self.at_s:g} s; the fault would never begin"
         is_odd = takes.whole and self.value % 1.0 != 0.0
         if is_odd or not takes.low <= self.value <= takes.high or self.value == takes.idle:
-            wanted = f"{'whole numbers from ' if takes.whole else ''}{takes.low:g} to {takes.high:g}"
             but = "" if math.isnan(takes.idle) else f", except {takes.idle:g}"
-            wanted = wanted + but if takes.low < takes.high else "none"
+            span = f"{'whole numbers from ' if takes.whole else ''}{takes.low:g} to {takes.high:g}{but}"
+            wanted = span if takes.low < takes.high else "none"
             yield "value", f"{self.value:g} is not for {self.kind}, which takes {wanted}"
         if self.module and not takes.one_module:
             yield "module", f"{self.kind} is not of one module, as of {self.module}; leave it out"

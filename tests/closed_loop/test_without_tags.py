@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.core.rotations import heading, rotate
+from firmware_py.core.rotations import heading, rotate, to_matrix
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, BodyRecord, Inputs, Mode, Outputs, Request, Sticks
 from firmware_py.description.parameters import Parameters
@@ -16,7 +16,6 @@ from hil.plant.fault_spec import Fault
 from hil.plant.world import BodyTruth
 from hil.scenario import load_scenario
 
-DOWN = np.array([0.0, 0.0, 1.0])
 NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
@@ -74,17 +73,17 @@ class Flight:
 
     def tilt_error_deg(self, first_s: float, last_s: float) -> float:
         """Largest angle between the way down and the believed one."""
-        pairs = [(rotate_back(t.q_wb), rotate_back(r.estimate.q_wb)) for t, r in self.between(first_s, last_s)]
+        pairs = [(down_b(t.q_wb), down_b(r.estimate.q_wb)) for t, r in self.between(first_s, last_s)]
         return float(np.degrees(max(np.arccos(min(1.0, a @ b)) for a, b in pairs)))
 
 
-def rotate_back(q_wb: np.ndarray) -> np.ndarray:
-    """Down, body frame."""
-    return np.asarray(rotate(np.asarray(q_wb) * [1, -1, -1, -1], DOWN))
+def down_b(q_wb: np.ndarray) -> np.ndarray:
+    """(3,) the way down, body frame."""
+    return np.asarray(to_matrix(np.ascontiguousarray(q_wb))[2])
 
 
 def tilt_deg(q_wb: np.ndarray) -> float:
-    return float(np.degrees(np.arccos(min(1.0, rotate(np.ascontiguousarray(q_wb), DOWN)[2]))))
+    return float(np.degrees(np.arccos(min(1.0, down_b(q_wb)[2]))))
 
 
 @pytest.mark.slow

@@ -95,6 +95,13 @@ def send_target(client: Client, mask: int, frame: int = 1, **values: float) -> N
     client.send("SET_POSITION_TARGET_LOCAL_NED", 0, 1, 1, frame, mask, *(values.get(name, 0.0) for name in names))
 
 
+def fly_by_velocity(world: World, client: Client) -> None:
+    """Armed, and in GUIDED: the first set-point has come."""
+    ask(world, client, 400, 1)
+    send_target(client, 0xDC7, vx=0.1)
+    ask(world, client, 176, 1, 6)
+
+
 def test_guided_mode_needs_a_setpoint_first_and_ends_when_they_stay_away(world: World, client: Client) -> None:
     ask(world, client, 400, 1)
     assert ask(world, client, 176, 1, 6) == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
@@ -121,9 +128,7 @@ def test_velocities_move_no_place_before_guided_mode_is_entered(world: World, cl
 
 def test_set_point_that_comes_just_after_they_stayed_away_begins_where_the_robot_is(world: World, client: Client) -> None:
     """The hold is asked for, and the mode is still the old one."""
-    ask(world, client, 400, 1)
-    send_target(client, 0xDC7, vx=0.1)
-    ask(world, client, 176, 1, 6)
+    fly_by_velocity(world, client)
     world.robot.refuse[Action.SET_MODE] = "not now"
     for gap in (51, 60):
         world.run(gap)
@@ -133,9 +138,7 @@ def test_set_point_that_comes_just_after_they_stayed_away_begins_where_the_robot
 
 
 def test_velocity_setpoints_move_the_place_along(world: World, client: Client) -> None:
-    ask(world, client, 400, 1)
-    send_target(client, 0xDC7, vx=0.1)
-    ask(world, client, 176, 1, 6)
+    fly_by_velocity(world, client)
     for _ in range(10):
         send_target(client, 0xDC7, vx=0.1)
         world.run(10)
