@@ -22,7 +22,7 @@ from firmware_py.bus.port import open_port
 from firmware_py.core.types import Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.clock import MonotonicClock
-from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, real_time, use_priority
+from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, read_libraries, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from hil.bench import fleet_of, script_of
 from hil.plant_process import PlantProcess, check_served
@@ -83,6 +83,7 @@ def fly_in_real_time(
     arguments = (scenario, seed, bus, rate_hz, out, ready, stop)
     plant = context.Process(target=serve, args=arguments, name="plant", daemon=True)
     open_port(bus).close()  # one that cannot be opened is told of here, before there are two processes to tell of it
+    read_libraries()  # before the plant's clock starts: a robot that nobody has armed yet drifts
     with ExitStack() as stack:
         plant.start()
         stack.callback(plant.join)

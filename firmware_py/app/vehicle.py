@@ -34,6 +34,7 @@ from firmware_py.runtime.realtime import (
     TICK_PRIORITY,
     beside_the_tick,
     quiet_garbage,
+    read_libraries,
     real_time,
     release_compiler,
     use_priority,
@@ -132,6 +133,7 @@ def run_vehicle(
     store = ground.parameter_file if ground is not None else None
     laid = laid_over(parameters, store)
     release_compiler()
+    read_libraries()
     with ExitStack() as stack:
         teller = Teller(say)  # before this thread takes its priority, like every thread below that is none of the loop's
         stack.callback(teller.close)

@@ -129,14 +129,31 @@ def release_compiler() -> None:
     They are a file's, never written: who compiles again after all reads them again. Its constants stay: some hold addresses
     that were written when it was loaded.
     """
-    if not _MAPS.exists():
-        return
-    madvise = ctypes.CDLL(None).madvise
-    for line in _MAPS.read_text().splitlines():
-        span, rights = line.split()[:2]
-        if _COMPILER in line and rights == "r-xp":
+    for begin, end, library in _instructions():
+        if _COMPILER in library:
+            ctypes.CDLL(None).madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _MADV_DONTNEED)
+
+
+def read_libraries() -> None:
+    """Reads the libraries of this process into the system's cache: 0.1 s when they are there, as long as the disk takes when not.
+
+    Without, a tick waits for the disk whenever it first needs a page: from a disk that took 0.3 s for one, the fifth tick was 0.23 s
+    late, and nobody could arm the robot for the next three seconds. The compiler is left out, for nothing is compiled in flight.
+    """
+    chunk = bytearray(1 << 20)
+    for library in {library for _, _, library in _instructions() if _COMPILER not in library}:
+        with suppress(OSError), open(library, "rb", buffering=0) as file:
+            while file.readinto(chunk):
+                pass
+
+
+def _instructions() -> Iterator[tuple[int, int, str]]:
+    """Begin, end and file of what this process has mapped to run; nothing where there is no /proc."""
+    for line in _MAPS.read_text().splitlines() if _MAPS.exists() else []:
+        span, rights, _, _, inode, *name = line.split(maxsplit=5)
+        if rights == "r-xp" and inode != "0":
             begin, end = (int(word, 16) for word in span.split("-"))
-            madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _MADV_DONTNEED)
+            yield begin, end, name[0]
 
 
 def lock_memory() -> str:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numba
 import pytest
@@ -83,6 +84,30 @@ def test_compiler_whose_pages_were_given_back_still_compiles() -> None:
     twice = numba.njit("i8(i8)")(lambda number: 2 * number)
     realtime.release_compiler()
     assert twice(21) == 42
+
+
+def test_libraries_are_read_to_their_end_before_the_flight_and_the_compiler_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library, compiler = tmp_path / "a library.so", tmp_path / "libllvmlite.so"  # whoever reads a pipe waits for who writes it
+    os.mkfifo(library)
+    os.mkfifo(compiler)
+    rows = [
+        f"7f0000000000-7f0000001000 r-xp 00001000 08:01 17         {library}",
+        f"7f0000002000-7f0000003000 r-xp 00000000 08:01 18         {tmp_path / 'gone.so (deleted)'}",
+        f"7f0000004000-7f0000005000 rw-s 00000000 00:15 19         {tmp_path / 'shared'}",
+        f"7f0000006000-7f0000007000 r-xp 00000000 08:01 20         {compiler}",
+        "7f0000008000-7f0000009000 r-xp 00000000 00:00 0          [vdso]",
+        "7f000000a000-7f000000b000 r-xp 00000000 00:00 0 ",
+    ]
+    maps = tmp_path / "maps"
+    maps.write_text("\n".join(rows))
+    monkeypatch.setattr(realtime, "_MAPS", maps)
+    written = threading.Thread(target=lambda: library.write_bytes(bytes(3_000_000)), daemon=True)
+    read = threading.Thread(target=realtime.read_libraries, daemon=True)
+    for thread in (written, read):
+        thread.start()
+    for thread in (written, read):
+        thread.join(20.0)
+        assert not thread.is_alive()
 
 
 def test_helper_whose_vehicle_has_ended_already_ends_too() -> None:

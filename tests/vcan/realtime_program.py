@@ -9,6 +9,7 @@ import dataclasses
 import json
 import multiprocessing
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -79,15 +80,21 @@ class TickLog:
     """Every module has answered, and armed modules obey."""
     readers: int = 0
     """Threads that read a bus, at the last tick."""
+    waits: int = 0
+    """For a file, by any thread of this process, since the first tick."""
+    _waits_before: int = 0
 
     def observe(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        waits = resource.getrusage(resource.RUSAGE_SELF).ru_majflt
         if not self.ended_ns:
+            self._waits_before = waits
             self.on_first()
         flying = all(module.answered and module.mcu_state == MCU_ARMED for module in inputs.modules)
         if flying and not any(self.flying):
             self.on_armed()
         self.ended_ns.append(time.monotonic_ns())
         self.flying.append(flying)
+        self.waits = waits - self._waits_before
         self.readers = sum(thread.name.startswith("reader") for thread in threading.enumerate())
 
 
@@ -161,6 +168,7 @@ def fly(plan: Plan, folder: Path) -> dict[str, Any]:
         "ticks": len(log.flying),
         "flying_at_the_end": log.flying[-1],
         "readers": log.readers,
+        "waits": log.waits,
         "events": len(events),
         "resumed_s": resumed_s(events, log),
     }
