@@ -75,7 +75,7 @@ def check_kernel(look: Look) -> Finding:
 
 
 def check_permissions() -> Iterator[Finding]:
-    """Real-time priority, fine timers and locked memory, by trying them."""
+    """Real-time priority, fine timers and locked memory of small pages, by trying them."""
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     with real_time() as refused:
         pass
@@ -98,7 +98,7 @@ def check_governor(look: Look) -> Finding:
 
 def check_throttle(look: Look, processors: int) -> Finding:
     """What the kernel leaves real-time threads of each second. A reader that works through a flood needs a processor whole; on one that
-    the tick shares with it the tick stood still for 15 to 20 ms, and once for 590 ms (measured in a flood of cangen).
+    the tick shares with it the tick stood still for 15 to 20 ms (measured in a flood of cangen).
     """
     runtime, period = (int(look(f"/proc/sys/kernel/sched_rt_{name}_us") or -1) for name in ("runtime", "period"))
     if runtime < 0 or period <= runtime:

@@ -50,6 +50,13 @@ def test_reader_threads_inherit_the_priority_and_a_bench_is_ordinary_again_after
     assert policy() == os.SCHED_OTHER
 
 
+def test_kernel_joins_no_pages_of_a_process_in_real_time() -> None:
+    assert "THP_enabled:\t1" in Path("/proc/self/status").read_text()
+    with realtime.real_time():
+        assert "THP_enabled:\t0" in Path("/proc/self/status").read_text()
+    assert "THP_enabled:\t1" in Path("/proc/self/status").read_text()
+
+
 def test_tick_has_a_processor_to_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     places: dict[int, list[int]] = {}
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 1, 2})
