@@ -41,20 +41,27 @@ class RealTimeFlight(NamedTuple):
     """What the system would not give of real time, a line each."""
 
 
-def serve_plant(
-    scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, ready: ProcessEvent, stop: ProcessEvent
-) -> None:
-    """The plant's process: serves until `stop` is set or it is interrupted."""
+class Handshake(NamedTuple):
+    """Between a flight and its plant's process."""
+
+    ready: ProcessEvent
+    """Set by the plant when its world stands."""
+    begin: ProcessEvent
+    """The world's clock may start: not before the firmware's, for a robot that nobody has armed yet drifts."""
+    stop: ProcessEvent
+
+
+def serve_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, handshake: Handshake) -> None:
+    """The plant's process: serves from `begin` until `stop`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     plant = PlantProcess(scenario, seed, rate_hz, out)
-    clock = MonotonicClock.started_now()
-    with (
-        real_time(PLANT_PRIORITY - 1),
-        open_port(bus, reader=True, now_ns=clock.now_ns, arrival=threading.Event()) as port,
-    ):
-        use_priority(PLANT_PRIORITY)
-        ready.set()
-        plant.serve(port, clock.now_ns, stop.is_set)
+    with real_time(PLANT_PRIORITY - 1):
+        handshake.ready.set()
+        handshake.begin.wait()
+        clock = MonotonicClock.started_now()
+        with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=threading.Event()) as port:
+            use_priority(PLANT_PRIORITY)
+            plant.serve(port, clock.now_ns, handshake.stop.is_set)
 
 
 def fly_in_real_time(
@@ -79,18 +86,19 @@ def fly_in_real_time(
     check_served(scenario)
     spawn, fork = multiprocessing.get_context("spawn"), multiprocessing.get_context("fork")
     context: SpawnContext | ForkContext = fork if start_method == "fork" else spawn
-    ready, stop = context.Event(), context.Event()
-    arguments = (scenario, seed, bus, rate_hz, out, ready, stop)
+    handshake = Handshake(context.Event(), context.Event(), context.Event())
+    arguments = (scenario, seed, bus, rate_hz, out, handshake)
     plant = context.Process(target=serve, args=arguments, name="plant", daemon=True)
     open_port(bus).close()  # one that cannot be opened is told of here, before there are two processes to tell of it
-    read_libraries()  # before the plant's clock starts: a robot that nobody has armed yet drifts
+    read_libraries()
     with ExitStack() as stack:
         plant.start()
         stack.callback(plant.join)
-        stack.callback(stop.set)
+        stack.callback(handshake.begin.set)
+        stack.callback(handshake.stop.set)
         fleet = fleet_of(scenario, bus, rate_hz)
         firmware = compose(fleet, parameters)
-        while not ready.wait(timeout=1.0):
+        while not handshake.ready.wait(timeout=1.0):
             if not plant.is_alive():
                 raise RuntimeError("the plant's process ended before it was ready")
         script = script_of(scenario, fleet)
@@ -112,8 +120,9 @@ def fly_in_real_time(
         loop = open_loop(stack, firmware, requests)
         loop.observers = [recording(recorder, rate_hz), recording_times(recorder, loop.rate_keeper, rate_hz), *observers]
         use_priority(TICK_PRIORITY)
-        loop.listen()
         stack.enter_context(quiet_garbage())
+        handshake.begin.set()
+        loop.listen()
         start_ns = loop.clock.now_ns()
         loop.rate_keeper.start(start_ns + fleet.period_ns)
         loop.run(stop_at_end)

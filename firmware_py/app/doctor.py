@@ -75,12 +75,12 @@ def check_kernel(look: Look) -> Finding:
 
 
 def check_permissions() -> Iterator[Finding]:
-    """Real-time priority, fine timers and locked memory of small pages, by trying them."""
+    """Real-time priority, fine timers, small pages and locked memory, by trying them."""
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     with real_time() as refused:
         pass
     if not refused:
-        yield Finding("real time", OK, f"priority, timers and locked memory are granted (rtprio {limit})")
+        yield Finding("real time", OK, f"priority, timers, small pages and locked memory are granted (rtprio {limit})")
     for line in refused:
         yield Finding(
             "real time", WARNING, line, "run it as modcube.service, or raise rtprio and memlock in limits.conf"

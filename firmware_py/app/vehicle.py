@@ -133,7 +133,6 @@ def run_vehicle(
     store = ground.parameter_file if ground is not None else None
     laid = laid_over(parameters, store)
     release_compiler()
-    read_libraries()
     with ExitStack() as stack:
         teller = Teller(say)  # before this thread takes its priority, like every thread below that is none of the loop's
         stack.callback(teller.close)
@@ -163,6 +162,7 @@ def run_vehicle(
             side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY, started=parameters))
             observers.append(side.observe)
             requests = with_ground(operator, side, lambda: firmware.pipeline.bodies)
+        read_libraries()
         for line in stack.enter_context(real_time()):
             teller.say(f"warning: {line}")
         loop = open_loop(stack, firmware, requests)

@@ -57,7 +57,6 @@ def real_time(priority: int = READER_PRIORITY) -> Iterator[list[str]]:
         sys.setswitchinterval(switch_interval_s)
         use_ordinary_priority()
         unlock_memory()
-        use_small_pages(False)
 
 
 def use_priority(priority: int) -> str:
@@ -106,34 +105,32 @@ def use_fine_timers(slack_ns: int = 1) -> str:
 
     Threads of real-time priority have no slack anyway: this is for those that may not have it.
     """
-    return _refused("fine timers", _PR_SET_TIMERSLACK, slack_ns)
+    return _ask_kernel("fine timers", _PR_SET_TIMERSLACK, slack_ns)
 
 
-def use_small_pages(small: bool = True) -> str:
-    """The kernel joins no pages of this process to huge ones; "" or why it does.
+def use_small_pages() -> str:
+    """From here on the kernel joins no pages of this process to huge ones; "" or why it does.
 
-    The thread of the kernel that joins them, an ordinary one, keeps the process's address space to itself meanwhile. Who needs memory
+    Its thread that joins them, of the lowest priority, keeps the process's address space to itself meanwhile. Who needs memory
     waits for it, and it for a processor: in a flood on one processor up to 3.6 s (measured in hil/guest, every 10 s or so).
     """
-    return _refused("small pages", _PR_SET_THP_DISABLE, int(small))
+    return _ask_kernel("small pages", _PR_SET_THP_DISABLE, 1)
 
 
-def _refused(what: str, option: int, value: int) -> str:
-    """Asks the kernel for `what` by prctl; "" or why not."""
+def die_with(parent: int) -> None:
+    """This process is killed when the thread of the process `parent` that started it ends, however that ends."""
+    _ask_kernel("end with its parent", _PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before it was asked
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _ask_kernel(what: str, option: int, value: int) -> str:
+    """Asks for `what` by prctl; "" or why not."""
     prctl = getattr(ctypes.CDLL(None, use_errno=True), "prctl", None)
     if prctl is None:
         return f"no {what} (not Linux)"
     words = [ctypes.c_ulong(word) for word in (value, 0, 0, 0)]
     return "" if prctl(option, *words) == 0 else f"no {what} ({os.strerror(ctypes.get_errno())})"
-
-
-def die_with(parent: int) -> None:
-    """This process is killed when the thread of the process `parent` that started it ends, however that ends."""
-    prctl = getattr(ctypes.CDLL(None), "prctl", None)
-    if prctl is not None:
-        prctl(_PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGKILL), 0, 0, 0)
-    if os.getppid() != parent:  # it ended before it was asked
-        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def release_compiler() -> None:
@@ -148,7 +145,7 @@ def release_compiler() -> None:
 
 
 def read_libraries() -> None:
-    """Reads the libraries of this process into the system's cache: 0.1 s when they are there, as long as the disk takes when not.
+    """Reads the libraries of this process, 190 MB, into the system's cache: 0.1 s when they are there, as long as the disk takes when not.
 
     Without, a tick waits for the disk whenever it first needs a page: from a disk that took 0.3 s for one, the fifth tick was 0.23 s
     late, and nobody could arm the robot for the next three seconds. The compiler is left out, for nothing is compiled in flight.
@@ -160,13 +157,16 @@ def read_libraries() -> None:
                 pass
 
 
-def _instructions() -> Iterator[tuple[int, int, str]]:
-    """Begin, end and file of what this process has mapped to run; nothing where there is no /proc."""
-    for line in _MAPS.read_text().splitlines() if _MAPS.exists() else []:
-        span, rights, _, _, inode, *name = line.split(maxsplit=5)
-        if rights == "r-xp" and inode != "0":
-            begin, end = (int(word, 16) for word in span.split("-"))
-            yield begin, end, name[0]
+def _instructions() -> list[tuple[int, int, str]]:
+    """Begin, end and file of what this process has mapped to run; empty where the system does not tell."""
+    found = []
+    with suppress(OSError):
+        for line in _MAPS.read_text(errors="surrogateescape").splitlines():
+            span, rights, _, _, inode, *name = line.split(maxsplit=5)
+            if rights == "r-xp" and inode != "0" and not name[0].startswith("/dev/"):
+                begin, end = (int(word, 16) for word in span.split("-"))
+                found.append((begin, end, name[0]))
+    return found
 
 
 def lock_memory() -> str:

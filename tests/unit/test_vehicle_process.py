@@ -88,6 +88,20 @@ def test_lines_are_said_by_an_ordinary_thread(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_libraries_are_read_when_all_is_composed_and_before_the_first_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[str] = []
+
+    def listed(name: str) -> None:
+        step = getattr(vehicle, name)
+        monkeypatch.setattr(vehicle, name, lambda *a, **k: (steps.append(name), step(*a, **k))[1])
+
+    for name in ("compose", "read_libraries", "open_loop"):
+        listed(name)
+    fly(tmp_path)
+    assert steps == ["compose", "read_libraries", "open_loop"]
+
+
+@pytest.mark.slow
 def test_log_of_the_process_before_is_kept(tmp_path: Path) -> None:
     out = tmp_path / "log"
     fly(tmp_path, out)

@@ -30,7 +30,7 @@ from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.realtime import PLANT_PRIORITY, READER_PRIORITY, real_time, use_priority
-from hil.realtime import fly_in_real_time, serve_plant
+from hil.realtime import Handshake, fly_in_real_time, serve_plant
 from hil.reference_node import SocketPlant
 from hil.scenario import Scenario, load_scenario
 from tests.vcan.can_utils import cangen_command
@@ -81,7 +81,7 @@ class TickLog:
     readers: int = 0
     """Threads that read a bus, at the last tick."""
     waits: int = 0
-    """For a file, by any thread of this process, since the first tick."""
+    """Page faults of any thread of this process that waited for a file, after the first tick."""
     _waits_before: int = 0
 
     def observe(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
@@ -122,24 +122,20 @@ def flood(begin: Event) -> None:
     os.execvp(command[0], command)  # in this process's place, so that it ends when this is killed
 
 
-def serve_socket_plant(
-    scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, ready: Event, stop: Event
-) -> None:
+def serve_socket_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, handshake: Handshake) -> None:
     """The plant's process, and the C node as its child."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     path, arrival = Path(mkdtemp(), "board.socket"), threading.Event()
     plant = SocketPlant(scenario, seed, rate_hz, out, path)
-    clock = MonotonicClock.started_now()
-    with (
-        real_time(PLANT_PRIORITY - 1),
-        open_port(bus, reader=True, now_ns=clock.now_ns, arrival=arrival) as port,
-        plant.open_board(arrival),
-    ):
-        use_priority(PLANT_PRIORITY)
+    with real_time(PLANT_PRIORITY - 1), plant.open_board(arrival):
         node = subprocess.Popen([sys.argv[2], BUS, "1", str(rate_hz), str(path)])
         os.sched_setscheduler(node.pid, os.SCHED_FIFO, os.sched_param(NODE_PRIORITY))
-        ready.set()
-        plant.serve(port, clock.now_ns, stop.is_set)
+        handshake.ready.set()
+        handshake.begin.wait()
+        clock = MonotonicClock.started_now()
+        with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=arrival) as port:
+            use_priority(PLANT_PRIORITY)
+            plant.serve(port, clock.now_ns, handshake.stop.is_set)
     assert node.wait(NODE_ENDS_S) == 0, "the node ends when its board does"
 
 

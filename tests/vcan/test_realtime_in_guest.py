@@ -100,6 +100,9 @@ def test_robot_keeps_time_and_place(flight: Flight, request: pytest.FixtureReque
 @pytest.mark.parametrize("flight", ["in a flood"], indirect=True)
 def test_flood_at_full_speed_leaves_the_robot_in_its_place(flight: Flight) -> None:
     figure("real time on vcan0, in a flood of cangen: position RMSE", flight["position_rmse_m"] * 1e3, "mm")
+    figure("real time on vcan0, in a flood of cangen: p99 lateness", flight["lateness_ns"]["p99"] * 1e-3, "us")
+    assert flight["lateness_ns"]["p99"] <= P99_LATENESS_NS
+    assert flight["deadline_misses"] == 0
     assert flight["position_rmse_m"] <= RMSE_M
 
 
