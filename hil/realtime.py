@@ -49,19 +49,25 @@ class Handshake(NamedTuple):
     begin: ProcessEvent
     """The world's clock may start: not before the firmware's, for a robot that nobody has armed yet drifts."""
     stop: ProcessEvent
+    """Set by the flight when it is over."""
 
 
 def serve_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, handshake: Handshake) -> None:
-    """The plant's process: serves from `begin` until `stop`."""
+    """The plant's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     plant = PlantProcess(scenario, seed, rate_hz, out)
     with real_time(PLANT_PRIORITY - 1):
-        handshake.ready.set()
-        handshake.begin.wait()
-        clock = MonotonicClock.started_now()
-        with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=threading.Event()) as port:
-            use_priority(PLANT_PRIORITY)
-            plant.serve(port, clock.now_ns, handshake.stop.is_set)
+        serve_between(handshake, plant, bus, threading.Event())
+
+
+def serve_between(handshake: Handshake, plant: PlantProcess, bus: str, arrival: threading.Event) -> None:
+    """Serves `bus` from `begin` until `stop`, on a clock that starts with it; `arrival` is the one of its port."""
+    handshake.ready.set()
+    handshake.begin.wait()
+    clock = MonotonicClock.started_now()
+    with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=arrival) as port:
+        use_priority(PLANT_PRIORITY)
+        plant.serve(port, clock.now_ns, handshake.stop.is_set)
 
 
 def fly_in_real_time(

@@ -193,6 +193,11 @@ class Estimator:
         self._accepted, self._last_tag_ns = READY_AFTER, -NEVER_NS
 
     @property
+    def _has_north(self) -> bool:
+        """Whether a tag has told the heading."""
+        return self._last_tag_ns != -NEVER_NS
+
+    @property
     def _is_adrift(self) -> bool:
         """Whether tags have told nothing for long, or never."""
         return self._history.newest_ns - self._last_tag_ns > ADRIFT_NS
@@ -208,7 +213,7 @@ class Estimator:
         Up and down only where no depth tells.
         """
         axes = 2 if self._history.newest_ns - self._depth_ns < BLIND_NS else 3
-        north = NORTH_DENSITY / self._dt if self._last_tag_ns == -NEVER_NS else math.inf
+        north = math.inf if self._has_north else NORTH_DENSITY / self._dt
         x, covariance = observation.fuse_stillness(at.x, at.covariance, STILL_DENSITY / self._dt, axes, north)
         return Belief(x, covariance, at.time_ns)
 
@@ -282,7 +287,7 @@ class Estimator:
         )
         if self._is_adrift:  # its place is made up, and before the first tag the heading
             sigma[:2] = UNKNOWN_SIGMA[:2]
-        if self._last_tag_ns == -NEVER_NS:
+        if not self._has_north:
             sigma[3:] += UNKNOWN_SIGMA[3:] * np.abs(to_matrix(self._now[3:7])[2])
         return sigma, sound
 

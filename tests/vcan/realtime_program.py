@@ -25,12 +25,10 @@ from tempfile import mkdtemp
 from typing import Any
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.bus.port import open_port
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
-from firmware_py.runtime.clock import MonotonicClock
-from firmware_py.runtime.realtime import PLANT_PRIORITY, READER_PRIORITY, real_time, use_priority
-from hil.realtime import Handshake, fly_in_real_time, serve_plant
+from firmware_py.runtime.realtime import PLANT_PRIORITY, READER_PRIORITY, real_time
+from hil.realtime import Handshake, fly_in_real_time, serve_between, serve_plant
 from hil.reference_node import SocketPlant
 from hil.scenario import Scenario, load_scenario
 from tests.vcan.can_utils import cangen_command
@@ -130,12 +128,7 @@ def serve_socket_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, ou
     with real_time(PLANT_PRIORITY - 1), plant.open_board(arrival):
         node = subprocess.Popen([sys.argv[2], BUS, "1", str(rate_hz), str(path)])
         os.sched_setscheduler(node.pid, os.SCHED_FIFO, os.sched_param(NODE_PRIORITY))
-        handshake.ready.set()
-        handshake.begin.wait()
-        clock = MonotonicClock.started_now()
-        with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=arrival) as port:
-            use_priority(PLANT_PRIORITY)
-            plant.serve(port, clock.now_ns, handshake.stop.is_set)
+        serve_between(handshake, plant, bus, arrival)
     assert node.wait(NODE_ENDS_S) == 0, "the node ends when its board does"
 
 
