@@ -33,6 +33,8 @@ FAST_SHARE = 2.0
 """A propeller that turns at more than this share of the believed speed does not obey."""
 FAST_MARGIN = 0.25
 """Share of full speed that it must be off besides: below, deadband and lag explain it."""
+TELLS = 0.3
+"""Weight of one feedback in what an ESC tells of its thruster's force: ten come in a second."""
 
 
 class ThrusterFaults(NamedTuple):
@@ -54,6 +56,8 @@ def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:
     Args:
         made, lost: (6, r) and (6, 6 - r) orthonormal bases of the wrenches that can be made, and of the rest.
     """
+    if not lost.size:
+        return np.eye(6)  # without rounding
     give_up = np.eye(6)
     give_up[3:] -= np.linalg.pinv(lost[3:].T) @ lost.T
     return np.asarray(made @ made.T @ give_up)
@@ -84,6 +88,7 @@ class FaultDetector:
         n = t.f_max.size
         self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
+        self._heard, self._share = np.zeros((n, 2)), np.ones(n)
         self.words: list[str] = []
         """What was found in this tick, for people."""
         self.changed = False
@@ -124,7 +129,7 @@ class FaultDetector:
             armed: nothing is looked for while disarmed.
         """
         self.words, self.changed = [], False
-        found = self._motion.step(measured, estimate, mean_n, self.now.alive, armed)
+        found = self._motion.step(measured, estimate, mean_n * self._share, self.now.alive, armed)
         if found is not None:
             self._lose(found, "does not push as it says")
         if armed:
@@ -142,7 +147,7 @@ class FaultDetector:
         if not heard:
             return
         feedback = np.array(heard, dtype=np.float64).reshape(-1, 3, 2)
-        if judge(feedback, force_n, self.now.alive, *self._believed, *self._limits, self._needed, self._counts):
+        if judge(feedback, force_n, self.now.alive, *self._believed, *self._limits, self._needed, self._counts, self._heard, self._share):
             for i, kind in np.argwhere(self._counts >= self._needed).tolist():
                 if self.now.alive[i]:
                     self._lose(i, WHY[kind])
@@ -172,9 +177,9 @@ def believed_rpm(force_n, full_n, rpm_at_full):  # type: ignore[no-untyped-def]
     return math.copysign(rpm_at_full * math.sqrt(abs(force_n) / full_n[0 if force_n > 0.0 else 1]), force_n)
 
 
-@njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},float64,float64,int64[::1],int64[:,::1])", cache=True)
-def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts):  # type: ignore[no-untyped-def]
-    """Counts what each feedback shows; whether it was shown often enough by a thruster.
+@njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},float64,float64,int64[::1],int64[:,::1],{M},{V})", cache=True)
+def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts, heard, share):  # type: ignore[no-untyped-def]
+    """Counts what each feedback shows, and notes how much force it tells of; whether a fault was shown often enough by a thruster.
 
     Args:
         feedback: (k, 3, 2) of two thrusters each their indices (-1: there is none), speeds 1/min and EscStatus.
@@ -182,6 +187,8 @@ def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, ne
         least_n: force from which a speed is judged, N; dead_share: as the parameter.
         needed: (3,) feedbacks in a row that suffice for DOWN, STANDS, DISOBEYS.
         counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS.
+        heard: (n, 2) means of what the speed tells of the force times what is believed of it, and of that squared, any unit.
+        share: (n,) of the believed force that the speeds tell of, 0 to 1: a weak thruster does not lie when its ESC says so.
     """
     found = False
     for k in range(feedback.shape[0]):
@@ -191,6 +198,10 @@ def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, ne
                 continue
             believed = believed_rpm(force_n[i], full_n[i], rpm_at_full[i])
             count, margin = counts[i], FAST_MARGIN * rpm_at_full[i]
+            asked, given = believed * abs(believed), rpm * abs(rpm)
+            heard[i, 0] += TELLS * (given * asked - heard[i, 0])
+            heard[i, 1] += TELLS * (asked * asked - heard[i, 1])
+            share[i] = min(1.0, max(0.0, heard[i, 0] / heard[i, 1])) if heard[i, 1] > 0.0 else 1.0
             stands = abs(rpm) < dead_share * abs(believed)
             wrong_way = rpm * believed < 0.0 and not stands and abs(rpm - believed) > margin
             count[DOWN] = count[DOWN] + 1 if status in ESC_DOWN else 0

@@ -132,7 +132,7 @@ def take_over(chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int)
         motion = join([(other.body, other.estimator.motion) for other in before], chain.body)
     for other in before:
         _take_forces(chain, other)
-    chain.imus.take_over([other.imus for other in before])
+    chain.sensors.take_over([other.sensors for other in before])
     chain.faults.take_over([other.faults for other in before])
     chain.allocator.set_alive(chain.faults.now.alive)
     chain.health.take_over([other.health for other in before])

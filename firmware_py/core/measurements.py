@@ -53,21 +53,16 @@ class Measurements:
         self._levers = np.ascontiguousarray(body.r_bt)
         self._q_tb = np.array([conjugate(np.ascontiguousarray(q)) for q in body.q_bt]).reshape(-1, 4)
 
-    def fuse(self, modules: Sequence[ModuleInputs], q_wb: np.ndarray, frozen: Sequence[bool] = ()) -> Measured:
+    def fuse(self, modules: Sequence[ModuleInputs], q_wb: np.ndarray) -> Measured:
         """One measurement of each kind.
 
         Args:
             modules: inputs of the whole fleet, by fleet index.
             q_wb: (4,) latest attitude, for the height of each pressure sensor above the centre of mass.
-            frozen: of each module of the body, whether its IMU is left out; empty: none is.
         """
         mine = [modules[i] for i in self._modules]
-        gyros, accels = [m.gyro for m in mine], [m.accel for m in mine]
-        if any(frozen):
-            gyros = [None if still else value for still, value in zip(frozen, gyros, strict=True)]
-            accels = [None if still else value for still, value in zip(frozen, accels, strict=True)]
-        gyro = self._mean(gyros)
-        return Measured(gyro, self._accel(accels, gyro), self._depth(mine, q_wb), self._poses(mine, q_wb))
+        gyro = self._mean([m.gyro for m in mine])
+        return Measured(gyro, self._accel([m.accel for m in mine], gyro), self._depth(mine, q_wb), self._poses(mine, q_wb))
 
     def _mean(self, readings: list[np.ndarray | None]) -> np.ndarray | None:
         """Mean over the modules that were heard, body frame."""

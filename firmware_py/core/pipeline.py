@@ -18,13 +18,13 @@ from firmware_py.core.faults import FaultDetector
 from firmware_py.core.formation import Formation
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import HealthMonitor
-from firmware_py.core.imu_watch import ImuWatch
 from firmware_py.core.joints import joints_of
 from firmware_py.core.limiter import Limiter
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.motor_test import MotorTest
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.requests import FOR_ALL, sift
+from firmware_py.core.sensor_watch import SensorWatch
 from firmware_py.core.supervisor import WARNING, Decision, Supervisor
 from firmware_py.core.supply import SupplyMeter
 from firmware_py.core.thruster import ThrusterLag
@@ -59,8 +59,8 @@ class BodyPipeline:
     def __init__(self, body: Body, parameters: Parameters, period_ns: int) -> None:
         self.body, self.parameters = body, parameters
         self.joints = joints_of(body)
+        self.sensors = SensorWatch(body.modules)
         self.measurements = Measurements(body, period_ns)
-        self.imus = ImuWatch(body.modules)
         self.estimator = ESTIMATORS[parameters.estimation.kind](body, parameters.estimation, period_ns)
         self.faults = FaultDetector(body, parameters.faults, period_ns)
         self.health = HealthMonitor(body, parameters, period_ns)
@@ -96,8 +96,9 @@ class BodyPipeline:
         """Sensors -> estimate."""
         self.supply.step(inputs.modules)
         mean_n = self.lag.step()
-        self.health.imu_heard = self.imus.step(inputs.modules)
-        measured = self.measurements.fuse(inputs.modules, self.estimator.q_wb, self.imus.frozen)
+        believed = self.sensors.step(inputs.modules)
+        self.health.imu_heard = self.sensors.imu_heard
+        measured = self.measurements.fuse(believed, self.estimator.q_wb)
         estimate = self.estimator.step(inputs.time_ns, measured, self.body.thrusters.matrix @ mean_n)
         self._find_faults(inputs, measured, estimate, mean_n)
         return estimate
@@ -179,7 +180,7 @@ class BodyPipeline:
         if self.supervisor.mode == Mode.MOTOR_DETECT:
             force = self.motor_test.step(time_ns)
             return Thrust(force, self.body.thrusters.matrix @ force, (1.0, 1.0))
-        return self.allocator.step(self.faults.now.keep @ wrench if self.faults.now.lost_axes else wrench)
+        return self.allocator.step(self.faults.now.keep @ wrench)
 
 
 class Pipeline:

@@ -8,12 +8,14 @@ import pytest
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
 from firmware_py.core.faults import FaultDetector
+from firmware_py.core.pipeline import BodyPipeline
 from firmware_py.core.preload import preload
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import difference, from_euler, to_matrix
 from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
+from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 
@@ -251,6 +253,19 @@ def test_healthy_robot_that_is_pushed_about_has_no_liar(seed: int) -> None:
         assert water.run(0.5, PUSH + BODY.thrusters.pinv @ wrench) == []
 
 
+@pytest.mark.parametrize("thruster", range(8))
+def test_weak_thruster_whose_speed_says_so_does_not_lie_and_one_that_says_too_little_does(thruster: int) -> None:
+    """Half the force comes with 71 % of the speed."""
+    found = {}
+    for gain, speed in ((0.5, 0.5**0.5), (0.0, 0.9)):
+        water = Water(seed=thruster)
+        water.fly()
+        water.gain[thruster] *= gain
+        water.speed_factor[thruster] = speed
+        found[gain] = [words for _, words in water.run(5.0, PUSH * np.where(np.arange(8) == thruster, 1.4, 1.0))]
+    assert found == {0.5: [], 0.0: [f"thruster {thruster + 1} does not push as it says: left out"]}
+
+
 # ---------------------------------------------------------------- what follows
 
 
@@ -268,6 +283,17 @@ def test_axes_that_are_lost_with_a_pair_are_those_of_the_errata(pair: tuple[int,
     np.testing.assert_allclose(matrix @ np.linalg.pinv(matrix) @ kept, kept, atol=1e-9)
     np.testing.assert_allclose(kept[:3], wrench[:3], atol=1e-9, err_msg="the force, and so the place, is kept")
     assert np.linalg.matrix_rank(now.keep, tol=1e-6) == 6 - now.lost_axes
+
+
+@pytest.mark.parametrize(("wanted", "made"), [([200.0, 200.0, 0, 0, 0, 0], [64.84, 64.84]), ([60.0, 60.0, 0, 0, 0.5, 0], [60.0, 60.0])])
+def test_healthy_robot_that_lacks_an_axis_makes_the_force_that_it_can(wanted: list[float], made: list[float]) -> None:
+    """BlueROV2 cannot pitch, and its surge pitches it a little: saturated, nothing was left of it."""
+    body = assemble_vehicle(load_vehicle("bluerov2"))
+    chain = BodyPipeline(body, Parameters(), TICK_NS)
+    assert chain.faults.now.lost_axes == 0 and np.linalg.matrix_rank(body.thrusters.matrix) == 5
+    thrust = chain._allocate(np.array(wanted, dtype=np.float64), 0)
+    np.testing.assert_allclose(thrust.achieved[:2], np.array(made), rtol=0.02)
+    assert np.abs(thrust.achieved[3:]).max() < 0.02 * made[0]
 
 
 def test_robot_that_is_armed_anew_trusts_its_thrusters_again(water: Water) -> None:

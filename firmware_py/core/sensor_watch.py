@@ -1,0 +1,94 @@
+"""Takes away samples that are not to be believed: an IMU that repeats itself, a reading that leaps. Stands before stage 1 of a tick.
+
+Noise never repeats itself for long; the body flies on by tags, depth and its model. A reading that is far from the one before is a wrong
+bit on its way unless the next one says the same: no thruster moves a body so suddenly, and a blow costs one sample.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from firmware_py.core.rotations import V
+from firmware_py.core.topology import in_both
+from firmware_py.core.types import ModuleInputs
+
+REPEATS = 10
+"""Samples in a row that are the same in all six numbers. A quiet sensor of one count of noise does that once in a day of 100 Hz."""
+LEAPS = {"gyro": 1.0, "accel": 2.0, "pressure_pa": 2000.0}
+"""From sample to sample, rad/s, m/s^2, Pa: at 50 Hz twice what full thrust does to a module that is not slowed by anything."""
+FROZEN = {"gyro": None, "accel": None}
+"""What is left of a frozen IMU."""
+NOTHING = np.full(3, np.nan)
+Trace = tuple[np.ndarray, np.ndarray]
+"""The sample (k,) that was believed last, and the one after it that was not; NaN where there is none."""
+
+
+class SensorWatch:
+    """Watches the sensors of one body's modules.
+
+    Attributes:
+        frozen: of each module, whether its IMU is not to be believed now.
+        imu_heard: whether any IMU that is to be believed gave a sample in this tick.
+    """
+
+    def __init__(self, modules: Sequence[int]) -> None:
+        self._modules = tuple(modules)
+        self._last: list[tuple[bytes, np.ndarray]] = [(b"", np.zeros(0))] * len(self._modules)
+        self._repeats = [0] * len(self._modules)
+        self._traces: list[dict[str, Trace]] = [{} for _ in self._modules]
+        self.frozen = [False] * len(self._modules)
+        self.imu_heard = False
+
+    def take_over(self, before: Sequence[SensorWatch]) -> None:
+        """Goes on from the bodies that this one is made of, or was part of."""
+        for other in before:
+            for i, j in in_both(self._modules, other._modules):
+                self._last[i], self._repeats[i], self.frozen[i] = other._last[j], other._repeats[j], other.frozen[j]
+                self._traces[i] = dict(other._traces[j])
+
+    def step(self, modules: Sequence[ModuleInputs]) -> Sequence[ModuleInputs]:
+        """The inputs of the fleet, by fleet index, less what is not to be believed."""
+        believed = list(modules)
+        self.imu_heard = False
+        for i, index in enumerate(self._modules):
+            module = modules[index]
+            if module.gyro is not None and module.accel is not None:
+                self.frozen[i] = self._repeats_itself(i, module.gyro, module.accel)
+                self.imu_heard = self.imu_heard or not self.frozen[i]
+            gone: dict[str, Any] = {name: None for name in LEAPS if self._leaps(i, name, getattr(module, name))}
+            if self.frozen[i]:
+                gone |= FROZEN
+            if gone:
+                believed[index] = dataclasses.replace(module, **gone)
+        return believed
+
+    def _repeats_itself(self, i: int, gyro: np.ndarray, accel: np.ndarray) -> bool:
+        rate, (last_rate, last_accel) = gyro.tobytes(), self._last[i]
+        repeats = rate == last_rate and accel.tobytes() == last_accel.tobytes()
+        self._repeats[i] = self._repeats[i] + 1 if repeats else 0
+        self._last[i] = rate, accel
+        return self._repeats[i] >= REPEATS
+
+    def _leaps(self, i: int, name: str, reading: np.ndarray | float | None) -> bool:
+        """Whether a reading is far from the one that was believed last, and from the one after that as well."""
+        if reading is None:
+            return False
+        sample = np.atleast_1d(reading)
+        sound, odd = self._traces[i].get(name, (sample, NOTHING))
+        is_odd = not (is_near(sample, sound, LEAPS[name]) or is_near(sample, odd, LEAPS[name]))
+        self._traces[i][name] = (sound, sample) if is_odd else (sample, NOTHING)
+        return is_odd
+
+
+@njit(f"boolean({V},{V},float64)", cache=True)
+def is_near(a, b, reach):  # type: ignore[no-untyped-def]
+    """Whether no number of `a` (k,) is farther than `reach` from that of `b`; never where one is NaN."""
+    near = True
+    for i in range(a.size):
+        near = near and abs(a[i] - b[i]) <= reach
+    return near

@@ -1,0 +1,161 @@
+"""An IMU that repeats itself and a reading that leaps are noticed, and not measured with; the body flies on without."""
+
+import math
+
+import numpy as np
+import pytest
+
+from firmware_py.core.measurements import Measurements
+from firmware_py.core.rotations import difference
+from firmware_py.core.sensor_watch import LEAPS, REPEATS, SensorWatch
+from firmware_py.core.types import Action, ModuleInputs, Request
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+from tests.unit.test_pipeline import Tank, single
+
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+PAIR = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
+
+
+def sample(value: float, accel: float = 9.8) -> ModuleInputs:
+    return ModuleInputs(gyro=np.full(3, value), accel=np.full(3, accel))
+
+
+def hears(watch: SensorWatch, *modules: ModuleInputs) -> bool:
+    """Whether an IMU is believed in a tick of these inputs."""
+    watch.step(modules)
+    return watch.imu_heard
+
+
+def test_sample_that_is_repeated_too_often_is_not_believed_until_it_changes() -> None:
+    watch = SensorWatch([0])
+    assert [hears(watch, sample(0.1)) for _ in range(REPEATS + 3)] == [True] * REPEATS + [False] * 3
+    assert watch.frozen == [True]
+    assert hears(watch, sample(0.2))
+    assert watch.frozen == [False]
+
+
+@pytest.mark.parametrize("change", ["gyro", "accel"])
+def test_one_number_that_changes_is_a_sensor_that_lives(change: str) -> None:
+    watch = SensorWatch([0])
+    for n in range(5 * REPEATS):
+        module = sample(0.1)
+        getattr(module, change)[2] += 1e-9 * (n % 2)
+        assert hears(watch, module)
+
+
+def test_lost_frames_neither_freeze_nor_thaw() -> None:
+    watch = SensorWatch([0])
+    for _ in range(5 * REPEATS):
+        assert not hears(watch, ModuleInputs())
+    assert watch.frozen == [False]
+    for n in range(2 * REPEATS + 1):
+        watch.step([sample(0.1) if n % 2 == 0 else ModuleInputs()])
+    assert watch.frozen == [True]
+    assert not hears(watch, ModuleInputs(gyro=np.ones(3)))
+    assert watch.frozen == [True]
+
+
+def test_each_module_is_watched_by_itself() -> None:
+    watch = SensorWatch([2, 0])
+    for n in range(REPEATS + 1):
+        assert hears(watch, sample(0.1 * n), sample(9.0), sample(0.1))
+    assert watch.frozen == [True, False]
+
+
+def test_body_that_takes_over_knows_which_imu_is_frozen_and_what_was_believed_of_each() -> None:
+    whole = SensorWatch([0, 1])
+    for n in range(REPEATS + 1):
+        whole.step([sample(0.1 * n), sample(0.1)])
+    parts = SensorWatch([0]), SensorWatch([1])
+    for part in parts:
+        part.take_over([whole])
+    assert [hears(part, sample(1.1), sample(0.1)) for part in parts] == [True, False]
+    again = SensorWatch([1, 0])
+    again.take_over(parts)
+    assert again.frozen == [True, False]
+    assert again.step([sample(9.0), sample(0.1)])[0].gyro is None
+
+
+def test_frozen_imu_is_left_out_of_the_mean() -> None:
+    """The other stands 0.105 m off the centre of mass, and feels 0.21 m/s^2 of a turn at 1 rad/s about each axis."""
+    watch, fuse = SensorWatch(PAIR.modules), Measurements(PAIR).fuse
+    both = fuse(watch.step([sample(1.0, 4.0), sample(3.0, 8.0)]), LEVEL)
+    for n in range(REPEATS + 1):
+        first = fuse(watch.step([sample(1.0, 4.0 + 1e-9 * (n % 2)), sample(3.0, 8.0)]), LEVEL)
+    for _ in range(REPEATS + 1):
+        none = fuse(watch.step([sample(1.0, 4.0), sample(3.0, 8.0)]), LEVEL)
+    assert both.gyro is not None and both.accel is not None and first.gyro is not None and first.accel is not None
+    np.testing.assert_allclose([both.gyro[0], both.accel[0], first.gyro[0], first.accel[0]], [2.0, 6.0, 1.0, 4.0 - 0.21])
+    assert none.gyro is None and none.accel is None
+
+
+@pytest.mark.slow
+def test_robot_whose_imu_freezes_holds_its_place_and_says_so() -> None:
+    tank = Tank([single()])
+    tank.run(0.5)
+    tank.run(2.0, Request(Action.ARM))
+    here, hear = tank.states[0].copy(), tank._hear
+    frozen = hear(len(tank.outputs))[0]
+
+    def repeat(tick: int) -> list[ModuleInputs]:
+        modules = hear(tick)
+        modules[0].gyro, modules[0].accel = frozen.gyro, frozen.accel
+        return modules
+
+    tank._hear = repeat  # type: ignore[method-assign]
+    tank.run(6.0)
+    assert any(event.text == "fail-safe on: no IMU for 0.5 s" for o in tank.outputs for event in o.events)
+    np.testing.assert_allclose(tank.states[0][:3], here[:3], atol=5e-3)
+    assert np.linalg.norm(difference(tank.states[0][3:7].copy(), here[3:7].copy())) < 0.02
+
+
+# ---------------------------------------------------------------- readings that leap
+
+
+def readings(*values: float, name: str) -> list[bool]:
+    """Which of the readings, in multiples of what counts as a leap, are believed."""
+    watch = SensorWatch([0])
+    samples = [value * LEAPS[name] for value in values]
+    inputs = [ModuleInputs(**{name: x if name == "pressure_pa" else np.array([0.0, x, 0.0])}) for x in samples]  # type: ignore[arg-type]
+    return [getattr(watch.step([module])[0], name) is not None for module in inputs]
+
+
+@pytest.mark.parametrize("name", LEAPS)
+def test_reading_that_leaps_is_left_out_and_one_that_stays_there_is_believed(name: str) -> None:
+    assert readings(0.0, 0.0, 5.0, 0.0, 0.9, 0.0, name=name) == [True, True, False, True, True, True]
+    assert readings(0.0, 5.0, 5.2, 5.4, name=name) == [True, False, True, True]
+    assert readings(0.0, 5.0, -5.0, 0.0, name=name) == [True, False, False, True]
+    assert readings(0.0, math.nan, 0.0, name=name) == [True, False, True]
+    assert readings(5.0, 0.0, 0.0, name=name) == [True, False, True], "the first may be the wrong one"
+
+
+def test_only_the_reading_that_leaps_is_left_out() -> None:
+    watch = SensorWatch([0])
+    watch.step([ModuleInputs(np.zeros(3), np.zeros(3), 1e5, heard=True)])
+    (left,) = watch.step([ModuleInputs(np.zeros(3), np.array([0.0, 0.0, 50.0]), 1e5, heard=True)])
+    assert left.accel is None and left.gyro is not None and left.pressure_pa == 1e5 and left.heard
+
+
+@pytest.mark.parametrize(("name", "off"), [("gyro", 35.0), ("accel", 50.0), ("pressure_pa", 1e5)])
+def test_one_wrong_reading_does_not_move_the_robot(name: str, off: float) -> None:
+    """Without the watch it moves 50 to 200 mm."""
+    tank = Tank([single()])
+    tank.run(0.5)
+    tank.run(2.0, Request(Action.ARM))
+    here, hear, wrong = tank.states[0].copy(), tank._hear, 0
+
+    def glitch(tick: int) -> list[ModuleInputs]:
+        nonlocal wrong
+        modules = hear(tick)
+        if not wrong and getattr(modules[0], name) is not None:
+            wrong += 1
+            setattr(modules[0], name, getattr(modules[0], name) + off)
+        return modules
+
+    tank._hear = glitch  # type: ignore[method-assign]
+    farthest = 0.0
+    for _ in range(100):
+        tank.run(0.01)
+        farthest = max(farthest, float(np.linalg.norm(tank.states[0][:3] - here[:3])))
+    assert wrong == 1 and farthest < 0.008
