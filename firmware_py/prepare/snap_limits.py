@@ -166,12 +166,18 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     Raises:
         InfeasibleError: names the limit and the place that conflict.
     """
+    _, most_used = worst(limits, system.coefficients(knots.value, start), system.durations)
+    if knots.fixed.all():
+        raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s that stops at every waypoint keeps the {most_used}")
     table = _Table.of(limits)
     problem = _Problem(system, knots, start)
     index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
     where = np.tile(np.arange(_FIRST_POINTS) * (_CHECK_POINTS // _FIRST_POINTS), len(limits))
     for _ in range(_ROUNDS):
-        unknown, conflict = problem.solve(table, index, where / _CHECK_POINTS)
+        try:
+            unknown, conflict = problem.solve(table, index, where / _CHECK_POINTS)
+        except osqp.OSQPException as error:
+            raise InfeasibleError(f"no trajectory was found that keeps the {most_used}: OSQP gave up with error {error}") from None
         if conflict >= 0:
             what = _sentence(limits[index[conflict]], where[conflict] / _CHECK_POINTS, system.durations)
             raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s keeps the {what}")

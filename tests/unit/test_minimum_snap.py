@@ -6,6 +6,7 @@ import math
 
 import daqp
 import numpy as np
+import osqp
 import pytest
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
@@ -250,6 +251,32 @@ def test_time_is_stretched_no_more_than_the_limit_asks() -> None:
     shorter = np.diff(found.breaks) * 0.99
     with pytest.raises(InfeasibleError):
         plan(waypoints, shorter, limits, stretch=False)
+
+
+STOPS = [Waypoint(np.array(p, dtype=float), stop=True) for p in ((0, 0, 0), (1, 0, 0), (1, 1, 0))]
+
+
+def test_path_that_stops_at_every_waypoint_says_which_limit_it_cannot_keep() -> None:
+    message = r"no trajectory in 4.00 s that stops at every waypoint keeps the velocity along [xy] within 0.4 m/s between waypoints"
+    with pytest.raises(InfeasibleError, match=message):
+        plan(STOPS, 4.0, Limits(velocity=np.full(3, 0.4), corridor_m=0.1), stretch=False)
+
+
+@pytest.mark.parametrize("times", [None, 4.0, [1.0, 2.0]])
+def test_path_that_stops_at_every_waypoint_takes_the_time_that_its_limit_asks(times: object) -> None:
+    found = plan(STOPS, times, Limits(velocity=np.full(3, 0.4)))  # type: ignore[arg-type]
+    assert extremes(found)[0].max() == pytest.approx(0.4, rel=5e-3)
+    assert extremes(found)[0].max() <= 0.4 * (1.0 + 1e-3)
+
+
+def test_solver_that_gives_up_is_a_limit_that_cannot_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def give_up(*_: object, **__: object) -> None:
+        raise osqp.OSQPException(4)
+
+    monkeypatch.setattr(osqp.OSQP, "setup", give_up)
+    waypoints = [Waypoint(p) for p in walk(6)]
+    with pytest.raises(InfeasibleError, match=r"keeps the velocity along [xyz] within 0.12 m/s .*: OSQP gave up with error 4"):
+        plan(waypoints, durations(walk(6)), Limits(velocity=np.full(3, 0.12)), stretch=False)
 
 
 def test_request_that_fits_is_not_stretched(one: Body) -> None:
