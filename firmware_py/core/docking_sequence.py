@@ -215,8 +215,7 @@ class DockingSequence:
             self.abort(time_ns, f"relative sigma {sigma * 1e3:.1f} mm, {self._p.sigma_m * 1e3:.1f} permitted")
             return
         row = TABLE[self.stage]
-        limit_s = getattr(self._p, row.limit_s) if row.limit_s else 0.0
-        if limit_s and time_ns - self._entered_ns > limit_s * 1e9:
+        if row.limit_s and time_ns - self._entered_ns > getattr(self._p, row.limit_s) * 1e9:
             self._time_out(time_ns, status)
         elif self._is_done(time_ns, errors, status):
             self._enter(NEXT[self.stage], time_ns)

@@ -369,6 +369,15 @@ def test_dock_needs_both_places_known_but_backs_off_blindly(side: str) -> None:
     assert dock.sequence.stage == Stage.ABORTED
 
 
+def test_push_of_no_time_is_a_jam_at_once() -> None:
+    dock = Follower(Docking(push_s=0.0, tries=1))
+    dock.until(Stage.PUSH)
+    began = dock.tick
+    dock.until(Stage.FAILED)
+    assert dock.tick - began <= 1
+    assert dock.sequence.reason == "jam: neither condition after PUSH, 1 tries"
+
+
 def test_push_goes_no_farther_than_it_may() -> None:
     dock = Follower(Docking(push_s=10.0))
     dock.until(Stage.PUSH)
