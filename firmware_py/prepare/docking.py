@@ -78,7 +78,7 @@ def plan_undock(
         lost: where a body has come apart, its open joints: then no other is opened.
 
     Raises:
-        DescriptionError: there is no such joint, or something else still holds the pieces together.
+        DescriptionError: there is no such joint, something else still holds the pieces together, or neighbours close every way out.
     """
     near, far = request.target_module, request.module
     joints = [joint.request for joint in joints_of(whole)]
@@ -94,6 +94,7 @@ def plan_undock(
         raise DescriptionError(f"modules {near} and {far} are also held together by other modules: undock those first")
     opens = [joint if joint.module in piece else turned(joint) for joint in joints if len(modules_of(joint) & piece) == 1]
     opens.sort(key=lambda joint: modules_of(joint) != wanted)
+    way = _away(whole, piece, [_cell_of(whole, joint.module) - _cell_of(whole, joint.target_module) for joint in opens])
     rest, leaves = (
         assemble(
             np.array([_cell_of(whole, m) for m in half]),
@@ -105,17 +106,34 @@ def plan_undock(
         )
         for half in (stays, [m for m in whole.modules if m in piece])
     )
-    steps = [_cell_of(whole, joint.module) - _cell_of(whole, joint.target_module) for joint in opens]
-    return UndockPlan(tuple(opens), rest, leaves, _away(whole, piece, steps))
+    return UndockPlan(tuple(opens), rest, leaves, way)
 
 
 def _away(whole: Body, piece: set[int], steps: Sequence[np.ndarray]) -> np.ndarray:
-    """(3,) unit vector, the way that a piece leaves: along its joints, or from the middle of the rest where these cancel out."""
-    way = np.sum(steps, axis=0).astype(float)
-    if not way.any():
-        inside = np.array([m in piece for m in whole.modules])
-        way = whole.cells[inside].mean(axis=0) - whole.cells[~inside].mean(axis=0)
-    return np.asarray(way / np.linalg.norm(way))
+    """(3,) unit vector, the way that a piece leaves: along its joints, or along the free axis that leads most from the middle of the rest.
+
+    Raises:
+        DescriptionError: neighbours close every way; they are named.
+    """
+    inside = np.array([m in piece for m in whole.modules])
+    outward = whole.cells[inside].mean(axis=0) - whole.cells[~inside].mean(axis=0)
+    along_joints = np.sum(steps, axis=0)
+    ways = ([along_joints] if along_joints.any() else []) + sorted(FACE_NORMALS, key=lambda normal: -float(normal @ outward))
+    around: set[int] = set()
+    for way in ways:
+        met = _met(whole, inside, way)
+        if not met:
+            return np.asarray(way / np.linalg.norm(way))
+        around |= met
+    words = [f"module{'s' if len(group) > 1 else ''} {', '.join(map(str, sorted(group)))}" for group in (piece, around)]
+    raise DescriptionError(f"{words[0]} cannot leave, enclosed by {words[1]}: undock one of those first")
+
+
+def _met(whole: Body, inside: np.ndarray, way: np.ndarray) -> set[int]:
+    """Modules of the rest that the modules `inside` (n,) would run into within the first pitch along `way` (3,)."""
+    offset = whole.cells[~inside] - whole.cells[inside][:, None]
+    met = np.all((offset == 0) | (offset == np.sign(way)), axis=-1).any(axis=0)
+    return {whole.modules[i] for i in np.flatnonzero(~inside)[met]}
 
 
 def _mated(turn_t: np.ndarray, request: DockRequest, normal: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.topology import Motion, join, part_of
 from firmware_py.core.types import DockRequest
+from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.docking import plan_dock, plan_undock
@@ -103,6 +104,36 @@ def test_third_module_docks_to_a_pair_in_an_l() -> None:
     plan = plan_dock(DockRequest(2, 3, 0, 2), third, pair, VEHICLES)
     assert plan.merged.modules == (0, 1, 2)
     assert plan.merged.cells.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
+
+def lattice(cells: list[tuple[int, ...]]) -> Body:
+    return assemble(cells, [0] * len(cells), [VEHICLES[0]] * len(cells))
+
+
+@pytest.mark.parametrize(
+    ("cells", "leaves", "way"),
+    [
+        ([(x, y) for x in range(2) for y in range(2)], (1, 1), [0.5**0.5, 0.5**0.5, 0]),  # corner: across
+        ([(x, y) for x in range(4) for y in range(3) if (x, y) not in ((1, 1), (2, 1))], (1, 0), [0, -1, 0]),  # between two of a ring
+        ([(x, y) for x in range(3) for y in range(3)], (1, 1), [0, 0, 1]),  # middle of a plate: out of its plane
+        ([(1, 1), (0, 1), (0, 0), (1, 0), (2, 0), (3, 0), (3, 1), (3, 2), (2, 2)], (1, 1), [0, 1, 0]),  # corner, one stands across
+    ],
+)
+def test_module_leaves_a_lattice_by_a_way_that_no_neighbour_closes(
+    cells: list[tuple[int, int]], leaves: tuple[int, int], way: list[float]
+) -> None:
+    body = lattice([(*cell, 0) for cell in cells])
+    module = cells.index(leaves)
+    neighbour = next(i for i, cell in enumerate(cells) if abs(cell[0] - leaves[0]) + abs(cell[1] - leaves[1]) == 1)
+    found = plan_undock(DockRequest(module, 0, neighbour, 0), body, VEHICLES[:1] * len(cells))
+    assert found.leaves.modules == (module,)
+    np.testing.assert_allclose(np.abs(found.axis_b) if way[2] else found.axis_b, way, atol=1e-12)
+
+
+def test_module_that_its_neighbours_enclose_is_not_undocked() -> None:
+    cells = [(x, y, z) for x in range(3) for y in range(3) for z in range(3)]
+    with pytest.raises(DescriptionError, match=r"^module 13 cannot leave, enclosed by modules 4, 10, 12, 14, 16, 22: undock one"):
+        plan_undock(DockRequest(13, 0, 4, 0), lattice(cells), VEHICLES[:1] * 27)
 
 
 def test_biases_of_a_joined_body_are_the_mean_of_both_and_stay_with_their_modules_when_they_part(
