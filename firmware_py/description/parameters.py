@@ -61,7 +61,9 @@ class Estimation:
     tag_sigma_rad: float = quantity(
         0.0096, unit="rad", low=1e-5, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
     )
-    tag_gate: float = quantity(5.0, low=1, high=50, help="innovation gate in standard deviations", mavlink="TAG_GATE")
+    tag_gate: float = quantity(
+        5.0, low=4, high=50, help="root of a tag's NIS over all six axes beyond which it is refused; 2.4 is usual", mavlink="TAG_GATE"
+    )
     gyro_sigma: float = quantity(0.0022, unit="rad/s", low=1e-6, high=1, help="gyro noise per sample", mavlink="GYRO_SD")
     gyro_bias_walk: float = quantity(
         2.2e-5, unit="rad/s/sqrt(s)", low=0, high=1, help="gyro bias random walk", mavlink="GYRO_WALK"

@@ -15,6 +15,7 @@ from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
 from firmware_py.core.types import BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
+from firmware_py.description.schema import limits_of
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
@@ -302,6 +303,16 @@ def test_errors_are_as_large_as_the_sigmas_say(drawn: list[tuple[Flight, list[Es
         per_axis = np.mean(np.square(normalised), axis=0)
         assert np.all(per_axis > 0.4) and np.all(per_axis < 2.0), "eight flights are few independent draws an axis"
         assert np.mean(per_axis) == pytest.approx(1.0, abs=0.35)
+
+
+def test_narrowest_gate_refuses_few_good_tags(body: Body) -> None:
+    """NIS of six axes is distributed as chi squared: 1.4 % lie beyond 4 squared."""
+    narrowest = replace(P, tag_gate=limits_of(Estimation, "tag_gate").low)
+    _, estimates = run(body, fly(body, 4.0, 1, lambda n: 45.0), narrowest)
+    tags = estimates[-1].rejected + sum(e.nis_dof for e in estimates) / 6
+    assert tags > 200
+    assert estimates[-1].rejected < 0.05 * tags
+    assert all(e.ready for e in estimates[SETTLED:])
 
 
 def test_estimate_is_better_than_the_tags(drawn: list[tuple[Flight, list[Estimate]]]) -> None:
