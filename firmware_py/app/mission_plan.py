@@ -11,10 +11,11 @@ from firmware_py.core.body import Body
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Setpoint
 from firmware_py.ground.mission_flight import Leg, Plan, PlanJob
-from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan
+from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, distinct, plan
 from firmware_py.prepare.piecewise import Piecewise
 
-_SAME_PLACE_M, _SAME_ATTITUDE = 1e-3, 1e-6
+_SAME = 1e-3
+"""m, and of a quaternion, below which legs do not differ."""
 _ANGULAR_RATE, _ANGULAR_ACCELERATION = 0.5, 0.5
 """rad/s and rad/s^2: turning on the way is gentle, so that the tag stays readable."""
 _THRUSTER_SHARE = 0.6
@@ -77,15 +78,11 @@ def _sections(legs: Sequence[Leg]) -> Iterator[list[Leg]]:
 
 def _waypoints(p_wb: np.ndarray, q_wb: np.ndarray, section: Sequence[Leg]) -> tuple[list[Waypoint], list[int]]:
     """The waypoints from a pose through a section, and for each leg the number of its own; equal neighbours are one."""
-    points, places = [Waypoint(p_wb, q_wb)], []
+    wanted = [Waypoint(p_wb, q_wb)]
     for leg in section:
-        q = q_wb if leg.yaw is None else from_euler(0.0, 0.0, leg.yaw)
-        moved = float(np.linalg.norm(leg.p_wb - points[-1].p_wb)) > _SAME_PLACE_M
-        if moved or abs(float(q @ q_wb)) < 1.0 - _SAME_ATTITUDE:
-            points.append(Waypoint(leg.p_wb, q))
-        q_wb = q
-        places.append(len(points) - 1)
-    return points, places
+        wanted.append(Waypoint(leg.p_wb, wanted[-1].q_wb if leg.yaw is None else from_euler(0.0, 0.0, leg.yaw)))
+    points, places = distinct(wanted, _SAME)
+    return points, places[1:]
 
 
 def _end(points: Sequence[Waypoint]) -> tuple[np.ndarray, np.ndarray]:

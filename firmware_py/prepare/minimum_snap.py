@@ -18,7 +18,7 @@ from firmware_py.prepare.snap_limits import InfeasibleError, Limits, planes, sol
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
 from firmware_py.prepare.snap_thrust import divide, usage
 
-__all__ = ["InfeasibleError", "Limits", "Waypoint", "plan"]
+__all__ = ["InfeasibleError", "Limits", "Waypoint", "distinct", "plan"]
 
 ATTITUDE_LEVER_M = 0.5
 """One radian counts as this many metres where time is divided among the pieces."""
@@ -35,7 +35,7 @@ _CHECK_POINTS = 16
 _LONGEST_STRETCH = 1024.0
 _STRETCH_TOLERANCE = 2e-3
 _SHORTEST_QUATERNION = 0.3
-_SAME = 1e-9
+_SAME = 1e-6
 """m, and of a quaternion, below which waypoints do not differ."""
 
 
@@ -69,6 +69,8 @@ def plan(
 ) -> Piecewise:
     """The trajectory of least snap through the waypoints, rest to rest.
 
+    Neighbours that do not differ are one waypoint, and count once in `breaks` and messages, unless each piece is given its duration.
+
     Args:
         waypoints: two or more.
         durations_s: of each piece; or their sum, divided for least snap; or None: as short as limits and body allow.
@@ -82,7 +84,10 @@ def plan(
             anything that bounds them.
     """
     limits = limits or Limits()
-    request = _Request.of(waypoints, limits, body)
+    _check(waypoints)
+    if not isinstance(durations_s, Sequence | np.ndarray):
+        waypoints, _ = distinct(waypoints)
+    request = _Request.of(waypoints if len(waypoints) > 1 else [*waypoints, *waypoints], limits, body)
     base = request.durations(durations_s)
     if durations_s is not None and not stretch:
         return request.attempt(base)
@@ -93,6 +98,30 @@ def plan(
             "on angular rate or acceleration where it turns; or a body, and a path that moves or turns"
         )
     return _fit(request, base, free=durations_s is None)
+
+
+def distinct(waypoints: Sequence[Waypoint], same: float = _SAME) -> tuple[list[Waypoint], list[int]]:
+    """Neighbours that do not differ as one waypoint, and for each of `waypoints` which of these it is.
+
+    Those that are passed with two velocities differ, as one that is passed and a rest do: a loop leads from one to the other.
+
+    Args:
+        same: m, and of a quaternion, below which they do not differ.
+    """
+    attitudes = _continuous(waypoints)
+    first, passed = 0, _velocity(waypoints, 0)
+    kept, own = [waypoints[0]], [0]
+    for k, waypoint in enumerate(waypoints[1:], 1):
+        velocity = _velocity(waypoints, k)
+        is_near = np.linalg.norm(waypoint.p_wb - kept[-1].p_wb) <= same and np.linalg.norm(attitudes[k] - attitudes[first]) <= same
+        if is_near and (velocity is None or passed is None or np.array_equal(velocity, passed)):
+            passed = velocity if passed is None else passed
+            kept[-1] = replace(kept[-1], velocity_w=passed, stop=kept[-1].stop or waypoint.stop)
+        else:
+            first, passed = k, velocity
+            kept.append(waypoint)
+        own.append(len(kept) - 1)
+    return kept, own
 
 
 def _fit(request: _Request, base: np.ndarray, free: bool) -> Piecewise:
@@ -133,15 +162,10 @@ class _Request:
 
     @staticmethod
     def of(waypoints: Sequence[Waypoint], limits: Limits, body: Body | None) -> _Request:
-        if len(waypoints) < 2:
-            raise ValueError(f"a trajectory needs two waypoints, not {len(waypoints)}")
         value = np.array([w.p_wb for w in waypoints], dtype=float)
         position = Knots.at_rest(value)
         attitude = Knots.at_rest(_continuous(waypoints))
         for k, waypoint in enumerate(waypoints):
-            rests = waypoint.stop or k in (0, len(waypoints) - 1)
-            if rests and waypoint.velocity_w is not None and np.any(waypoint.velocity_w):
-                raise ValueError(f"waypoint {k} has a velocity, but the path rests there")
             if waypoint.stop:
                 position.fixed[k], attitude.fixed[k] = True, True
             elif waypoint.velocity_w is not None:
@@ -251,6 +275,24 @@ class _Request:
         share, k = usage(body, part.thrust)
         if share > self.limits.thruster_share:
             raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, place(k)))
+
+
+def _check(waypoints: Sequence[Waypoint]) -> None:
+    """Refuse too few waypoints, and a velocity where the path rests. Raises ValueError."""
+    if len(waypoints) < 2:
+        raise ValueError(f"a trajectory needs two waypoints, not {len(waypoints)}")
+    for k, waypoint in enumerate(waypoints):
+        if _rests(waypoints, k) and waypoint.velocity_w is not None and np.any(waypoint.velocity_w):
+            raise ValueError(f"waypoint {k} has a velocity, but the path rests there")
+
+
+def _rests(waypoints: Sequence[Waypoint], k: int) -> bool:
+    return waypoints[k].stop or k in (0, len(waypoints) - 1)
+
+
+def _velocity(waypoints: Sequence[Waypoint], k: int) -> np.ndarray | None:
+    """(3,) m/s with which waypoint k is passed, or None where it is free."""
+    return np.zeros(3) if _rests(waypoints, k) else waypoints[k].velocity_w
 
 
 def _thrust_message(share: float, limit: float, where: str) -> str:

@@ -19,6 +19,11 @@ ORDERS = 5
 
 _UNKNOWN = ORDERS - 1
 
+_SHORTER, _LONGER = 100.0, 10.0
+"""How many times shorter, and longer, a piece may be than by the longest way at one speed: beyond, the form is too stiff for floats."""
+_TOO_STIFF = 1e3
+"""Logarithm of a cost above all others."""
+
 
 def _falling(power: int, order: int) -> int:
     product = 1
@@ -192,7 +197,9 @@ def divide_time(knots: Knots, total_s: float, weights: np.ndarray) -> np.ndarray
     """
     scaled = Knots(knots.value * np.sqrt(weights), knots.fixed, knots.derivative * np.sqrt(weights))
     distance = np.linalg.norm(np.diff(scaled.value, axis=0), axis=1)
-    start = np.log(np.maximum(distance, 1e-3 * distance.max() + 1e-12))
+    if distance.max() == 0.0:
+        return np.full(len(distance), total_s / len(distance))
+    start = np.log(np.maximum(distance, distance.max() / _SHORTER))
 
     def log_cost(z: np.ndarray) -> tuple[float, np.ndarray]:
         share = np.exp(z - z.max())
@@ -200,11 +207,12 @@ def divide_time(knots: Knots, total_s: float, weights: np.ndarray) -> np.ndarray
         system = System.of(total_s * share)
         unknown = solve(system, scaled)
         cost = system.cost(scaled.value, unknown)
+        if not cost > 0.0:
+            return _TOO_STIFF, np.zeros_like(z)
         by_share = total_s * system.cost_by_duration(scaled.value, unknown) / cost
         return float(np.log(cost)), share * (by_share - share @ by_share)
 
-    if distance.max() == 0.0:
-        return np.full(len(distance), total_s / len(distance))
-    best = minimize(log_cost, start, jac=True, method="L-BFGS-B", options={"maxiter": 100, "ftol": 1e-6}).x
+    bounds = [(start.max() - np.log(_SHORTER), start.max() + np.log(_LONGER))] * len(start)
+    best = minimize(log_cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 100, "ftol": 1e-6}).x
     share = np.exp(best - best.max())
     return np.asarray(total_s * share / share.sum())

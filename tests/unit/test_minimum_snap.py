@@ -16,7 +16,7 @@ from firmware_py.core.body import Body
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
-from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan
+from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, distinct, plan
 from firmware_py.prepare.piecewise import Piecewise
 from firmware_py.prepare.snap_thrust import least_usage, usage, wrenches
 
@@ -127,6 +127,62 @@ def test_division_of_the_time_costs_less_snap_than_any_other_nearby() -> None:
     for _ in range(10):
         other = np.diff(best.breaks) * np.exp(0.05 * rng.normal(size=11))
         assert plan(waypoints, other * 60.0 / other.sum(), stretch=False).snap_cost > best.snap_cost
+
+
+A, B, C = (np.array(p, dtype=float) for p in ((0, 0, 0.5), (1, 0, 0.5), (1, 1, 0.5)))
+STOP = {"stop": True}
+
+
+@pytest.mark.parametrize("total_s", [None, 20.0])
+@pytest.mark.parametrize(
+    ("repeated", "once"),
+    [
+        ([(A, {}), (A, {}), (B, {}), (C, {})], [(A, {}), (B, {}), (C, {})]),
+        ([(A, {}), (B, {}), (B + 1e-7, {}), (B, {}), (C, {})], [(A, {}), (B, {}), (C, {})]),
+        ([(A, {}), (B, {}), (B, STOP), (C, {})], [(A, {}), (B, STOP), (C, {})]),
+        ([(A, {}), (B, STOP), (B, {}), (C, {})], [(A, {}), (B, STOP), (C, {})]),
+        ([(A, {}), (B, {}), (B, {"velocity_w": C - A}), (C, {})], [(A, {}), (B, {"velocity_w": C - A}), (C, {})]),
+        ([(A, {}), (B, {}), (C, {}), (C, {})], [(A, {}), (B, {}), (C, {})]),
+    ],
+)
+def test_waypoint_that_is_given_twice_is_flown_as_one(repeated: list, once: list, total_s: float | None) -> None:
+    limits = Limits(velocity=np.full(3, 1.5))
+    found, wanted = (plan([Waypoint(p, **more) for p, more in points], total_s, limits) for points in (repeated, once))
+    np.testing.assert_array_equal(found.breaks, wanted.breaks)
+    np.testing.assert_array_equal(found.coefficients, wanted.coefficients)
+
+
+@pytest.mark.parametrize("stop", [False, True])
+@pytest.mark.parametrize("off_m", [1e-5, 1e-4, 1e-3])
+def test_waypoints_that_are_nearly_one_are_flown_in_a_time_that_is_not_absurd(off_m: float, stop: bool) -> None:
+    limits = Limits(velocity=np.full(3, 0.4))
+    once = plan([Waypoint(A), Waypoint(B, stop=stop), Waypoint(C)], None, limits)
+    found = plan([Waypoint(A), Waypoint(B, stop=stop), Waypoint(B + off_m), Waypoint(C)], None, limits)
+    assert found.duration_s < 1.5 * once.duration_s
+    assert np.all(extremes(found)[0] <= 0.4 * (1.0 + 1e-3))
+
+
+def test_waypoint_that_is_given_twice_with_durations_has_the_time_between() -> None:
+    assert plan([Waypoint(p) for p in (A, B, B, C)], [6.0, 5.0, 6.0]).breaks.tolist() == [0.0, 6.0, 11.0, 17.0]
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        {"q_wb": rotations.from_euler(0.0, 0.0, 1.0)},
+        {"velocity_w": np.array([0.1, 0.0, 0.0])},
+    ],
+)
+def test_place_that_is_passed_in_another_way_is_another_waypoint(second: dict[str, np.ndarray]) -> None:
+    waypoints = [Waypoint(A), Waypoint(B, velocity_w=np.array([0.0, 0.1, 0.0])), Waypoint(B, **second), Waypoint(C)]
+    assert distinct(waypoints)[1] == [0, 1, 2, 3]
+    assert len(plan(waypoints, 20.0).breaks) == 4
+
+
+def test_robot_that_is_to_stay_stays() -> None:
+    found = plan([Waypoint(B)] * 4, 10.0)
+    assert found.duration_s == 10.0
+    np.testing.assert_allclose(found.sample(4.0).p_wb, B)
 
 
 def test_same_request_gives_the_same_path() -> None:
