@@ -29,7 +29,7 @@ FIRST_SPEED = 0.1
 MOST_LEAN = 0.2
 """rad by which a body may lean to leave a moment to buoyancy; a fifth of a force along one axis then goes into another."""
 
-_CHECK_POINTS = 16
+_CHECK_POINTS = 48
 """Points of each piece at which attitude rates and thrusters are checked."""
 
 _LONGEST_STRETCH = 1024.0
@@ -272,7 +272,7 @@ class _Request:
         if lean > MOST_LEAN:
             degrees = f"{math.degrees(lean):.1f} deg, of at most {math.degrees(MOST_LEAN):.1f} deg"
             raise InfeasibleError(f"the robot would lean by {degrees}, for a moment that its thrusters do not give, {place(k)}")
-        share, k = usage(body, part.thrust)
+        share, k = usage(body, part.thrust, self.limits.thruster_share)
         if share > self.limits.thruster_share:
             raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, place(k)))
 

@@ -113,7 +113,7 @@ def _matters(part: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(part, axis=1) > _OUTSIDE * np.linalg.norm(wanted, axis=1) + _NOTHING)
 
 
-def usage(body: Body, wanted: np.ndarray) -> tuple[float, int]:
+def usage(body: Body, wanted: np.ndarray, least: float = 0.0) -> tuple[float, int]:
     """Largest share of the thrusters' range that any of the wrenches takes, and which one it is.
 
     The share of one wrench w is the least s for which forces f with J f = w and s f_min <= f <= s f_max exist. The
@@ -123,6 +123,7 @@ def usage(body: Body, wanted: np.ndarray) -> tuple[float, int]:
     Args:
         body: its thrusters.
         wanted: (k, 6) wrenches.
+        least: a largest share below this need not be found; what is returned is then below it too.
     """
     thrusters = body.thrusters
     forces = wanted @ thrusters.pinv.T
@@ -131,7 +132,7 @@ def usage(body: Body, wanted: np.ndarray) -> tuple[float, int]:
     order = np.argsort(-above, kind="stable")[:_MOST_PROGRAMS]
     best, where = 0.0, int(order[0])
     for k in order:
-        if above[k] <= best:
+        if above[k] <= max(best, least):
             break
         share = least_usage(body, wanted[k])
         if share > best:
