@@ -1,4 +1,4 @@
-"""Forces between modules of different bodies: corners on faces, magnets, funnels. At every stage of the integration.
+"""Forces between modules of different bodies: faces on faces, magnets, funnels. At every stage of the integration.
 
 Every force has its counter-force at the same point, so that nothing here changes the momentum of all bodies together.
 """
@@ -12,8 +12,10 @@ import numpy as np
 from numba import types
 
 from hil.plant.bodies import MODULES, add_force
+from hil.plant.overlap import overlap, turning
 from hil.plant.vectors import (
     F2,
+    F3,
     F8,
     M3,
     V3,
@@ -32,8 +34,8 @@ from hil.plant.vectors import (
 )
 
 I8 = types.int64
-NEAR_M = 0.5
-"""Centres of modules that are further apart do not act on each other."""
+NEAR_M = 0.14
+"""Modules whose hulls' circumscribed spheres are further apart do not act on each other."""
 FRICTION = 0.3
 """Largest friction of a corner, share of the normal force (synthetic)."""
 
@@ -49,6 +51,8 @@ class Faces(NamedTuple):
     """(m, m) 1 where the probe of the pair is in the funnel; i < j."""
     stop: np.ndarray
     """(m, m) gap at which a jam holds the pair apart, m; 0: none."""
+    outline: np.ndarray
+    """(2, CORNERS, 2) working memory of `overlap`."""
     pull: float
     magnet_gap: float
     guide: float
@@ -59,7 +63,7 @@ class Faces(NamedTuple):
     damping: float
 
 
-FACES = types.NamedTuple((F2, F2, F2, F2, *(F8,) * 8), Faces)
+FACES = types.NamedTuple((F2, F2, F2, F2, F3, *(F8,) * 8), Faces)
 
 
 @compiled(M3(M3, M3))
@@ -126,31 +130,59 @@ def face_to(r, d):
 
 
 @callee
-def _corners(modules, faces, x, i, j, wrench):
-    """Corners of module i in the box of module j: pushed out through the face that looks at i."""
+def _face_between(modules, r_i, r_j, at, i, j):
+    """Face of module j that looks at module i, whose centre is `at` in j's frame; -1 where one of j's axes parts the hulls."""
+    axis, widest = 0, -math.inf
+    x, y, z = turn_back(r_j, column(r_i, 0)), turn_back(r_j, column(r_i, 1)), turn_back(r_j, column(r_i, 2))
+    size = triple(modules.size, i, 0)
+    for k in range(3):
+        reach = 0.5 * (size[0] * abs(x[k]) + size[1] * abs(y[k]) + size[2] * abs(z[k]) + modules.size[j, k])
+        if abs(at[k]) - reach > widest:
+            axis, widest = k, abs(at[k]) - reach
+    if widest > 0.0:
+        return -1
+    return 2 * axis + (1 if at[axis] < 0.0 else 0)
+
+
+@callee
+def _press(modules, faces, x, i, j, wrench):
+    """The face of module i that looks at module j is pushed out of the face of j that looks at i, at the corners of their overlap.
+
+    The stiffness is that of four corners where all of the smaller face overlaps, less by its area elsewhere. The corners of the
+    overlap share it by the angles at which its outline turns there, so that none comes or goes with a jolt.
+    """
     p_i, r_i = pose_of(modules, x, i)
     p_j, r_j = pose_of(modules, x, j)
-    face = face_to(r_j, minus(p_i, p_j))
+    at = turn_back(r_j, minus(p_i, p_j))
+    face = _face_between(modules, r_i, r_j, at, i, j)
+    if face < 0:
+        return
     axis, sign = face // 2, 1.0 if face % 2 == 0 else -1.0
-    outward = times(sign, column(r_j, axis))
-    size, other = triple(modules.size, i, 0), triple(modules.size, j, 0)
-    a, b = modules.body[i], modules.body[j]
-    for k in range(8):
-        corner = (size[0] * (0.5 if k & 1 else -0.5), size[1] * (0.5 if k & 2 else -0.5), size[2] * (0.5 if k & 4 else -0.5))
-        p = plus(p_i, turn(r_i, corner))
-        at = turn_back(r_j, minus(p, p_j))
-        deep = 0.5 * other[axis] - sign * at[axis]
-        beside = max(
-            abs(at[(axis + 1) % 3]) - 0.5 * other[(axis + 1) % 3], abs(at[(axis + 2) % 3]) - 0.5 * other[(axis + 2) % 3]
-        )
-        if deep <= 0.0 or beside > 1e-3:  # aligned cubes: their corners lie on each other's edges
+    outward, u, w = times(sign, column(r_j, axis)), column(r_j, (axis + 1) % 3), column(r_j, (axis + 2) % 3)
+    own = face_to(r_i, times(-1.0, outward)) // 2
+    look = times(1.0 if dot(column(r_i, own), outward) < 0.0 else -1.0, column(r_i, own))
+    frame = (u, w, outward)  # turns the world into along the face, along the face, out of it
+    top = plus(p_j, times(0.5 * modules.size[j, axis], outward))
+    middle = turn(frame, minus(plus(p_i, times(0.5 * modules.size[i, own], look)), top))
+    size_u, size_w = modules.size[i, (own + 1) % 3], modules.size[i, (own + 2) % 3]
+    wide, high = modules.size[j, (axis + 1) % 3], modules.size[j, (axis + 2) % 3]
+    first = turn(frame, times(0.5 * size_u, column(r_i, (own + 1) % 3)))
+    second = turn(frame, times(0.5 * size_w, column(r_i, (own + 2) % 3)))
+    n, area = overlap(faces.outline, middle, first, second, 0.5 * wide, 0.5 * high)
+    slope = turn(frame, look)
+    whole, a, b = 4.0 * area / min(size_u * size_w, wide * high), modules.body[i], modules.body[j]
+    for k in range(n if n > 2 else 0):
+        s, t = faces.outline[0, k, 0], faces.outline[0, k, 1]
+        height = middle[2] - (slope[0] * (s - middle[0]) + slope[1] * (t - middle[1])) / slope[2]
+        if height >= 0.0:
             continue
+        p = plus(top, plus(plus(times(s, u), times(t, w)), times(height, outward)))
         v = minus(velocity_at(x, a, p), velocity_at(x, b, p))
-        out = dot(v, outward)
-        normal = max(0.0, faces.stiffness * deep - faces.damping * out)
+        share, out = whole * turning(faces.outline[0], n, k), dot(v, outward)
+        normal = share * max(0.0, -faces.stiffness * height - faces.damping * out)
         along = minus(v, times(out, outward))
         speed = math.sqrt(dot(along, along))
-        rub = min(faces.damping, FRICTION * normal / speed) if speed > 1e-9 else 0.0
+        rub = min(share * faces.damping, FRICTION * normal / speed) if speed > 1e-9 else 0.0
         push_apart(wrench, x, b, a, p, minus(times(normal, outward), times(rub, along)))
 
 
@@ -233,8 +265,9 @@ def near(modules, x, i, j):
         return False
     p_i, _ = pose_of(modules, x, i)
     p_j, _ = pose_of(modules, x, j)
-    d = minus(p_i, p_j)
-    return dot(d, d) < NEAR_M * NEAR_M
+    d, a, b = minus(p_i, p_j), triple(modules.size, i, 0), triple(modules.size, j, 0)
+    reach = 0.5 * (math.sqrt(dot(a, a)) + math.sqrt(dot(b, b))) + NEAR_M
+    return dot(d, d) < reach * reach
 
 
 @callee
@@ -244,6 +277,6 @@ def interact(bodies, modules, faces, x):
     for i in range(count):
         for j in range(i + 1, count):
             if near(modules, x, i, j):
-                _corners(modules, faces, x, i, j, bodies.wrench)
-                _corners(modules, faces, x, j, i, bodies.wrench)
+                _press(modules, faces, x, i, j, bodies.wrench)
+                _press(modules, faces, x, j, i, bodies.wrench)
                 _mate(modules, faces, x, i, j, bodies.wrench)

@@ -17,6 +17,7 @@ from hil.plant.bodies import Modules
 from hil.plant.contact import Faces, mating, near
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream
+from hil.plant.overlap import CORNERS
 
 KINDS = {"P": 1.0, "D": -1.0, "-": 0.0}
 RELAY = (0.0, 1.0, -1.0, 0.0)
@@ -66,7 +67,7 @@ class Docks:
         self.spec, self.jam_rule = spec, jam
         self.faces = Faces(
             np.array([[KINDS[k] for k in v.faces] for v in vehicles]),
-            np.zeros((m, 6)), np.zeros((m, m)), np.zeros((m, m)),
+            np.zeros((m, 6)), np.zeros((m, m)), np.zeros((m, m)), np.zeros((2, CORNERS, 2)),
             spec.pull_n, spec.magnet_gap_m, spec.guide_n_m, spec.guide_ns_m, spec.turn_nm, spec.turn_nms,
             spec.contact_n_m, spec.contact_ns_m,
         )  # fmt: skip
@@ -203,7 +204,7 @@ class Docks:
         return (
             self.faces.stop[i, j] == 0.0
             and pull > 2.0 * LEAST_HOLD
-            and gap <= s.lock_m
+            and abs(gap) <= s.lock_m
             and lateral <= s.lock_m
             and max(abs(tilt), abs(roll)) <= math.radians(s.lock_deg)
         )

@@ -4,9 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+import shapely
+import shapely.affinity
 
 from firmware_py.core import rotations
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.docking import Joint
 from hil.plant.spec import CALM, Tank, WorldSpec
@@ -195,3 +197,62 @@ def test_colliding_cubes_bounce_off_and_gain_no_energy() -> None:
         assert np.abs(away).max() > 0.205
     assert world.kinetic_energy().sum() < energy
     assert world.truth(0).v_w[0] < -0.01, "the other one was hit"
+
+
+SMOOTH = dataclasses.replace(
+    VEHICLE,
+    faces=("-",) * 6,
+    drag=dataclasses.replace(VEHICLE.drag, cd_face=0.0, cd_edge=0.0, rotational_cd=0.0),
+    inertial=dataclasses.replace(VEHICLE.inertial, righting_arm_m=0.0),
+)
+"""Hulls alone: nothing but their contact acts on them."""
+
+
+def hulls(x_m: float, y_m: float = 0.0, roll_deg: float = 0.0, vehicle: Vehicle = SMOOTH) -> World:
+    """Two hulls along x, the second one rolled."""
+    q = rotations.from_euler(np.radians(roll_deg), 0.0, 0.0)
+    starts = [Start(np.array([0.0, 0.0, 400.0]), LEVEL), Start(np.array([x_m, y_m, 400.0]), q)]
+    return World(WorldSpec(**CALM), OCEAN, [vehicle] * 2, starts, 0, PERIOD_NS, jam=NEVER)
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 0.6, 5.0, 20.0, 45.0])
+@pytest.mark.parametrize("y_m", [0.0, 0.003])
+def test_rolled_cubes_do_not_pass_through_each_other(roll_deg: float, y_m: float) -> None:
+    world = hulls(0.23, y_m, roll_deg)
+    world.set_motion(1, [-0.1, 0.0, 0.0], np.zeros(3))
+    energy, momentum = world.kinetic_energy().sum(), world.momentum().sum(axis=0)
+    for _ in range(60):
+        world.advance(PERIOD_NS)
+        assert world.truth(1).p_wm[0] - world.truth(0).p_wm[0] > 0.209
+        assert world.kinetic_energy().sum() <= energy * (1.0 + 1e-9)
+    assert world.truth(1).v_w[0] - world.truth(0).v_w[0] > 0.0
+    np.testing.assert_allclose(world.momentum().sum(axis=0), momentum, rtol=0, atol=1e-6 * np.abs(momentum).max())
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 1e-9, 0.3, 30.0, 45.0])
+@pytest.mark.parametrize("y_m", [0.0, 0.05])
+def test_overlap_of_faces_bears_by_its_area(roll_deg: float, y_m: float) -> None:
+    deep = 2e-4
+    world = hulls(0.21 - deep, y_m, roll_deg)
+    squares = [shapely.box(-0.105, -0.105, 0.105, 0.105)]
+    squares.append(shapely.affinity.translate(shapely.affinity.rotate(squares[0], roll_deg), y_m))
+    area = squares[0].intersection(squares[1]).area / squares[0].area
+    np.testing.assert_allclose(world._body_arrays.wrench[1, 0], 8.0 * area * deep * DockSpec().contact_n_m, rtol=1e-9)
+
+
+def test_hulls_of_any_size_stop_each_other() -> None:
+    girona = load_vehicle("girona500")
+    length = girona.hull.size_m[0]
+    world = hulls(length + 0.02, vehicle=dataclasses.replace(girona, inertial=dataclasses.replace(girona.inertial, righting_arm_m=0.0)))
+    world.set_motion(1, [-0.2, 0.0, 0.0], np.zeros(3))
+    run(world, 1.0)
+    assert world.truth(1).p_wm[0] - world.truth(0).p_wm[0] > length - 0.01
+    assert world.truth(0).v_w[0] < -0.01, "the other one was hit"
+
+
+@pytest.mark.parametrize("gap_m", [0.0008, -0.0008, -0.01])
+def test_faces_lock_from_no_deeper_than_from_afar(gap_m: float) -> None:
+    world = two(gap_m)
+    world.docks.faces.coil[:], world.docks.faces.inside[0, 1] = 1.0, 1.0
+    verdict = world.docks.step(0, 0.01, world._modules, world._body_arrays.state, world._pull_on)
+    assert bool(verdict.join) == (abs(gap_m) < DockSpec().lock_m)
