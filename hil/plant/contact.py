@@ -11,12 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from hil.plant.bodies import MODULES, add_force
+from hil.plant.bodies import BODIES, MODULES, add_force, add_walls, touches
 from hil.plant.overlap import overlap, turning
 from hil.plant.vectors import (
     F2,
     F3,
     F8,
+    I1,
     M3,
     V3,
     callee,
@@ -32,6 +33,7 @@ from hil.plant.vectors import (
     turn,
     turn_back,
 )
+from hil.plant.water import WATER
 
 I8 = types.int64
 NEAR_M = 0.14
@@ -277,6 +279,21 @@ def interact(bodies, modules, faces, x):
     for i in range(count):
         for j in range(i + 1, count):
             if near(modules, x, i, j):
+                _press(modules, faces, x, i, j, bodies.wrench)
+                _press(modules, faces, x, j, i, bodies.wrench)
+                _mate(modules, faces, x, i, j, bodies.wrench)
+
+
+@compiled(types.void(BODIES, MODULES, FACES, WATER, I1))
+def touch(bodies, modules, faces, water, chosen):
+    """Adds what walls and modules of other bodies do to the modules where `chosen` (m,) is 1 to `bodies.wrench`."""
+    x, count = bodies.state, modules.body.shape[0]
+    for m in range(count):
+        if chosen[m] and touches(modules, m, water, x):
+            add_walls(bodies, modules, m, water, x)
+    for i in range(count):
+        for j in range(i + 1, count):
+            if chosen[i] + chosen[j] > 0 and near(modules, x, i, j):
                 _press(modules, faces, x, i, j, bodies.wrench)
                 _press(modules, faces, x, j, i, bodies.wrench)
                 _mate(modules, faces, x, i, j, bodies.wrench)

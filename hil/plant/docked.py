@@ -11,6 +11,7 @@ from firmware_py.core import rotations
 from firmware_py.description.vehicle import FACE_NORMALS, Vehicle
 from hil.plant.bodies import Bodies, Modules
 from hil.plant.build import fill_body, make_bodies, make_modules, seat_thrusters
+from hil.plant.contact import touch
 from hil.plant.docking import DISK_M, Docks, Joint, joints_between
 from hil.plant.draw import ModuleDraw
 from hil.plant.joining import centre_of, force_needed, motion_of, pieces, seats_after_join
@@ -36,6 +37,8 @@ class DockedBodies(ABC):
     _modules: Modules
     _body_arrays: Bodies
     _stage: np.ndarray
+    _hands: np.ndarray
+    """(m, 6) what jets and hands do to each module, about O of its body, body frame."""
 
     @abstractmethod
     def _step(self, steps: int) -> None:
@@ -53,6 +56,7 @@ class DockedBodies(ABC):
             fill_body(self._body_arrays, b, parts, self.spec)
         self._stage = np.zeros((6, len(self.bodies), 13))
         self._external = np.zeros((len(self.bodies), 6))
+        self._hands = np.zeros((len(self.vehicles), 6))
         self._thrust = np.zeros((len(self.bodies), 6))
 
     def join(self, joint: Joint) -> None:
@@ -131,10 +135,19 @@ class DockedBodies(ABC):
         )
         for t in np.flatnonzero(np.isin(self._thrusters.module, far)):
             need -= self._thrusters.column[t] * self._thrusters.force[t]
+        need -= self._hands[list(far)].sum(axis=0) + self._touch_on(far)[b]
         outward = self._modules.turn[joint.module] @ FACE_NORMALS[joint.face]
         at = self._modules.position[joint.module] + 0.5 * self._modules.size[joint.module, joint.face // 2] * outward
         bending = np.cross(outward, need[3:] - np.cross(at, need[:3]))
         return float(-outward @ need[:3] + np.linalg.norm(bending) / DISK_M)
+
+    def _touch_on(self, members: Sequence[int]) -> np.ndarray:
+        """(b, 6) what walls and other bodies do to these modules of one body, in that body's row, body frame."""
+        chosen = np.zeros(len(self.vehicles), dtype=np.int64)
+        chosen[list(members)] = 1
+        found = self._body_arrays._replace(wrench=np.zeros((len(self.bodies), 6)))
+        touch(found, self._modules, self.docks.faces, self._water, chosen)
+        return found.wrench
 
     def clamp(self, body: int) -> None:
         """Holds a body where it is; `load` then says with what force."""

@@ -36,7 +36,7 @@ def in_the_way(modules, x, m, start, jet, radius):
 
 @compiled(types.void(THRUSTERS, BODIES, MODULES, F8, F8, F8, F2))
 def add_jets(thrusters, bodies, modules, strength, length, radius, out):
-    """Adds the push of every jet to the wrenches out (b, 6).
+    """Adds the push of every jet to the wrenches out (m, 6) of the modules that it hits, about O of their bodies, body frame.
 
     A jet leaves against the force. `strength` of its thrust is felt at its start, half of that after `length` (m), at
     the point of its axis nearest to the centre of the first module in its way. Modules of the same body count too.
@@ -59,4 +59,4 @@ def add_jets(thrusters, bodies, modules, strength, length, radius, out):
             other = matrix_of(x[c, 3], x[c, 4], x[c, 5], x[c, 6])
             at = turn_back(other, minus(plus(start, times(way, jet)), triple(x, c, 0)))
             push = strength * caught * abs(force) / (1.0 + way / length)
-            add_force(out, c, at, turn_back(other, times(push, jet)))
+            add_force(out, hit, at, turn_back(other, times(push, jet)))

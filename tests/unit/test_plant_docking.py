@@ -11,6 +11,7 @@ from firmware_py.core import rotations
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.docking import Joint
+from hil.plant.lattice import Place
 from hil.plant.spec import CALM, Tank, WorldSpec
 from hil.plant.world import Start, World
 
@@ -256,3 +257,44 @@ def test_faces_lock_from_no_deeper_than_from_afar(gap_m: float) -> None:
     world.docks.faces.coil[:], world.docks.faces.inside[0, 1] = 1.0, 1.0
     verdict = world.docks.step(0, 0.01, world._modules, world._body_arrays.state, world._pull_on)
     assert bool(verdict.join) == (abs(gap_m) < DockSpec().lock_m)
+
+
+SLIPPERY = dataclasses.replace(SMOOTH, faces=VEHICLE.faces)
+
+
+def start_docked(third_m: float = 100.0, tank: Tank = OCEAN, **world: float) -> World:
+    """Two modules docked along x, and a third one on beyond them."""
+    starts = [Start(np.array([x, 0.0, 400.0]), LEVEL) for x in (0.0, 0.21, third_m)]
+    places = [Place(np.array([x, 0.0, 0.0]), LEVEL.copy()) for x in (0.0, 0.21, 0.0)]
+    spec = WorldSpec(**{**CALM, **world})
+    return World(spec, tank, [SLIPPERY] * 3, starts, 0, PERIOD_NS, groups=[(0, 1), (2,)], places=places, jam=NEVER)
+
+
+@pytest.mark.parametrize(("module", "force"), [(1, 60.0), (0, -60.0), (1, -60.0)])
+def test_hand_on_one_of_two_loads_their_joint_with_half_its_force(module: int, force: float) -> None:
+    world = start_docked()
+    world.push[module, 0] = force
+    world._step(0)
+    assert world._pull_on(world.docks.joints[0]) == pytest.approx(abs(force) / 2 * np.sign(force if module else -force), rel=1e-6)
+
+
+def test_what_touches_one_of_two_loads_their_joint_with_half_its_force() -> None:
+    deep = 2e-4
+    world = start_docked(0.42 - deep)
+    assert world._pull_on(world.docks.joints[0]) == pytest.approx(-4.0 * deep * DockSpec().contact_n_m, rel=1e-3)
+
+
+def test_jet_on_one_of_two_loads_their_joint_as_a_hand_would() -> None:
+    world = start_docked(0.6, jet_strength=0.3)
+    along = VEHICLE.directions[:, 0]
+    world.set_command(2, 0.8 * along / np.abs(along).max(), True)
+    run(world, 0.2)
+    world._step(0)
+    jet, load = world._hands[1].copy(), world._pull_on(world.docks.joints[0])
+    assert jet[0] < -0.01 and not world._hands[0].any()
+    world.jet_strength = 0.0
+    world._step(0)
+    assert abs(world._pull_on(world.docks.joints[0])) < 0.01 * abs(load)
+    world.push[1, :3], world.push[1, 3:] = jet[:3], jet[3:] - np.cross([0.21, 0.0, 0.0], jet[:3])
+    world._step(0)
+    assert world._pull_on(world.docks.joints[0]) == pytest.approx(load, abs=1e-9)
