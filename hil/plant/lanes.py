@@ -13,7 +13,7 @@ from numba import njit, types
 
 from hil.plant import drag
 from hil.plant.bodies import BODIES, MODULES, NEAR_M, add_walls, respond, touches, turning, weigh
-from hil.plant.thrusters import THRUSTERS, voltage_of
+from hil.plant.thrusters import THRUSTERS, idle_of, voltage_of
 from hil.plant.vectors import (
     F1,
     F2,
@@ -157,7 +157,7 @@ def _load_supplies(w, n, halves):
         w[MEMORY * LANES + j] = _curve(w, POWER_CURVE, j, abs(f), f > 0.0)
     for m in range(n):
         v0, open_v, resistance, limit_a, electronics = _five(w, SUPPLY, m)
-        idle_a, conductance = electronics / open_v, _sum(w, MEMORY, m) / v0**3
+        idle_a, conductance = idle_of(open_v, resistance, limit_a, electronics), _sum(w, MEMORY, m) / v0**3
         v = voltage_of(open_v, resistance, limit_a, idle_a, conductance)
         w[(SUPPLY + 5) * LANES + m] = v
         w[(SUPPLY + 6) * LANES + m] = idle_a + conductance * v * v

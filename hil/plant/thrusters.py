@@ -68,13 +68,19 @@ def command(thrusters, first, u):
 
 
 @inlined
+def idle_of(open_v, resistance, limit_a, electronics_w):
+    """Current of the electronics: no more than the supply gives at no voltage, or than its limit."""
+    return min(limit_a, open_v / resistance, electronics_w / open_v) if open_v > 0.0 else 0.0
+
+
+@inlined
 def voltage_of(open_v, resistance, limit_a, idle_a, conductance):
     """Voltage at which supply and load agree.
 
     At a given duty the power of a thruster goes with V^3, so its current with V^2: I(V) = idle + conductance V^2. The
-    supply gives V = open - R I, and never more than its limit.
+    supply gives V = open - R I, and never more than its limit: nothing is left of V where the idle current takes all of it.
     """
-    v = open_v - resistance * idle_a
+    v = max(0.0, open_v - resistance * idle_a) if idle_a < limit_a else 0.0
     if resistance * conductance > 1e-12:
         rc = resistance * conductance
         v = (math.sqrt(1.0 + 4.0 * rc * v) - 1.0) / (2.0 * rc)
@@ -95,7 +101,7 @@ def load_supplies(thrusters, halves):
         power[thrusters.module[t], 1] += polynomial(thrusters.power_curve, t, 0 if f > 0.0 else 1, abs(f))
     for m in range(supply.shape[0]):
         v0 = supply[m, 0]
-        idle_a = supply[m, 4] / supply[m, 1]
+        idle_a = idle_of(supply[m, 1], supply[m, 2], supply[m, 3], supply[m, 4])
         conductance = power[m, 1] / v0**3
         v = voltage_of(supply[m, 1], supply[m, 2], supply[m, 3], idle_a, conductance)
         power[m, 0], power[m, 1] = v, idle_a + conductance * v * v

@@ -193,8 +193,8 @@ class World(DockedBodies):
         return wanted
 
     def sag(self, module: int, volts: float) -> None:
-        """The battery of a module gives so much less, open circuit."""
-        self._thrusters.supply[module, 1] -= volts
+        """The battery of a module gives so much less, open circuit, and nothing at worst."""
+        self._thrusters.supply[module, 1] = max(0.0, self._thrusters.supply[module, 1] - volts)
 
     def advance(self, duration_ns: int) -> None:
         """Moves the world on. The duration must be a multiple of the sub-step, else DescriptionError."""

@@ -8,6 +8,7 @@ import pytest
 
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import Vehicle, load_vehicle
+from hil.batch import fly
 from hil.plant.spec import CALM, Tank, WorldSpec
 from hil.plant.world import Start, World
 
@@ -111,6 +112,22 @@ def test_supply_gives_no_more_than_its_current() -> None:
     assert truth.force_n.max() < 0.4 * static_force(1.0)
     currents = world.esc(0)[:, 1].sum()
     assert currents == pytest.approx(10.0 - 8.0 / 12.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("sag_v", [3.0, 9.0, 11.0, 11.5, 12.0, 24.0])
+@pytest.mark.parametrize("resistance_ohm", [0.0, 0.1])
+@pytest.mark.parametrize("worlds", [1, 3])  # one by one; in lanes
+def test_sagged_battery_gives_what_is_left_of_it(sag_v: float, resistance_ohm: float, worlds: int) -> None:
+    flown = [still(supply_resistance_ohm=resistance_ohm, supply_limit=True) for _ in range(worlds)]
+    for world in flown:
+        world.sag(0, sag_v)
+    fly(flown, np.full((20, 8), 0.8))
+    truth, left = flown[-1].truth(0), max(0.0, 12.0 - sag_v)
+    assert 0.0 <= truth.voltage_v <= left and 0.0 <= truth.current_a <= 10.0 * (1.0 + 1e-12)
+    assert truth.voltage_v <= left - resistance_ohm * truth.current_a + 1e-9
+    np.testing.assert_allclose(truth.force_n, static_force(0.8) * (truth.voltage_v / 12.0) ** 2, atol=1e-12)
+    can_idle = left > 0.0 and 8.0 / left < 10.0 and left > resistance_ohm * 8.0 / left
+    assert (truth.voltage_v > 0.0) == can_idle
 
 
 def test_each_thruster_turns_and_pushes_as_its_place_says() -> None:
