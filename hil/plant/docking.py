@@ -79,7 +79,8 @@ class Docks:
         self._hung = np.full((m, 6), -1, dtype=np.int64)
         self._surge = np.zeros((m, 6))
         self._engaged = np.zeros((m, 6))
-        self._busy = False
+        self.busy = False
+        """Whether any coil is on, or its current still falls."""
         self._jam = stream(seed, "jam")
         self._magnet_w = np.array([v.supply.magnet_w for v in vehicles])
 
@@ -90,7 +91,7 @@ class Docks:
         if changed.any():
             self._surge[module, changed] = 1.0
             self.relays[module] = wanted
-            self._busy = True
+            self.busy = True
 
     def hang(self, module: int, face: int, relay: int) -> None:
         """A fault: from `move_hung` on this relay stays as it is told here, whatever comes."""
@@ -111,7 +112,7 @@ class Docks:
             for m, f in ((joint.module, joint.face), (joint.other, joint.other_face)):
                 self.relays[m, f] = FORWARD
                 self.faces.coil[m, f] = self._engaged[m, f] = 1.0
-        self._busy = bool(joints)
+        self.busy = bool(joints)
 
     def magnet_power_w(self) -> np.ndarray:
         """(m,) what the coils of each module take from its supply."""
@@ -133,7 +134,7 @@ class Docks:
     ) -> Verdict:
         """What happened during the last tick; `load_n` gives the pull on a joint."""
         verdict = Verdict([], [])
-        if self._busy:
+        if self.busy:
             self._coils(elapsed_s)
         pairs = itertools.combinations(range(len(self.relays)), 2)
         self._engaged[:] = 0.0
@@ -165,7 +166,7 @@ class Docks:
         wanted = np.array(RELAY)[self.relays]
         self.faces.coil[:] += (wanted - self.faces.coil) * -math.expm1(-elapsed_s / self.spec.coil_lag_s)
         self._surge *= math.exp(-elapsed_s / self.spec.surge_s)
-        self._busy = bool(self.relays.any() or np.abs(self.faces.coil).max() > 1e-9)
+        self.busy = bool(self.relays.any() or np.abs(self.faces.coil).max() > 1e-9)
 
     def _pair(self, time_ns: int, i: int, j: int, modules: Modules, state: np.ndarray, verdict: Verdict) -> None:
         """Two modules of different bodies that are close."""

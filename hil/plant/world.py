@@ -203,7 +203,7 @@ class World(DockedBodies):
         self._water.flow[2] = self._gusts.step()
         self._step(duration_ns // self._step_ns)
         self.time_ns += duration_ns
-        if len(self.vehicles) > 1 or np.count_nonzero(self.docks.relays):  # quicker than any()
+        if len(self.vehicles) > 1 or self.docks.busy:
             self._dock(1e-9 * duration_ns)
 
     def set_relays(self, module: int, relays: Sequence[int]) -> None:

@@ -128,7 +128,7 @@ def test_a_stronger_pull_than_the_magnets_opens_the_joint() -> None:
     assert pull > 15.0, "two modules pull against each other"
     weak = docked_pair()
     weak.docks.faces.coil[:] *= 0.2
-    weak.docks._busy = False
+    weak.docks.busy = False
     for module, sign in ((0, -1.0), (1, 1.0)):
         weak.set_command(module, np.clip(sign * along / np.abs(along).max(), -0.8, 0.8), True)
     run(weak, 0.5)
@@ -298,3 +298,15 @@ def test_jet_on_one_of_two_loads_their_joint_as_a_hand_would() -> None:
     world.push[1, :3], world.push[1, 3:] = jet[:3], jet[3:] - np.cross([0.21, 0.0, 0.0], jet[:3])
     world._step(0)
     assert world._pull_on(world.docks.joints[0]) == pytest.approx(load, abs=1e-9)
+
+
+def test_current_of_a_lone_module_dies_away_as_it_rose() -> None:
+    world = World(WorldSpec(**CALM), OCEAN, [VEHICLE], [Start(np.array([0.0, 0.0, 400.0]), LEVEL)], 0, PERIOD_NS)
+    world.set_relays(0, [PULL, 0, 0, 0, 0, 0])
+    run(world, 1.0)
+    assert world.docks.current_ma()[0, 0] == pytest.approx(DockSpec().idle_ma, rel=1e-3)
+    world.set_relays(0, [OFF] * 6)
+    run(world, 0.1)
+    assert world.docks.faces.coil[0, 0] == pytest.approx(np.exp(-0.1 / DockSpec().coil_lag_s), rel=1e-3)
+    run(world, 2.0)
+    np.testing.assert_allclose(world.docks.current_ma(), 0.0, atol=1e-6)
