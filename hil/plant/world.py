@@ -246,12 +246,16 @@ class World(DockedBodies):
     def terms(self) -> tuple[object, ...]:
         """What the worlds of one batch must agree in: water, tank, tick and sub-step.
 
-        Raises DescriptionError for more than one module, or a thruster that is broken: these need Python between the ticks.
+        Raises DescriptionError for more than one module, a thruster that is broken, a hand on it, a load cell that holds it, or a coil
+        with a current: these need Python between the ticks.
         """
         if len(self.vehicles) > 1 or self._broken:
             raise DescriptionError(
                 f"plant: a batch is of lone modules that are whole; here are {len(self.vehicles)} modules, {len(self._broken)} faults"
             )
+        acts = {"a hand is on it": self.push.any(), "it is clamped": self._body_arrays.clamped.any(), "a coil is on": self.docks.busy}
+        if found := [what for what, does in acts.items() if does]:
+            raise DescriptionError(f"plant: a batch is of lone modules that nothing but thrusters and water moves; here {', '.join(found)}")
         return (self._water[1:], self.period_ns, self._step_ns)
 
     def lend(self, ticks: int) -> Arrays:

@@ -118,3 +118,18 @@ def test_world_that_is_given_twice_is_refused() -> None:
 def test_less_than_no_threads_are_refused() -> None:
     with pytest.raises(DescriptionError, match="batch: -1 threads"):
         fly(worlds(1), np.zeros((10, 8)), threads=-1)
+
+
+@pytest.mark.parametrize("what", ["a hand is on it", "it is clamped", "a coil is on"])
+@pytest.mark.parametrize("count", [1, 3])
+def test_what_a_batch_would_leave_out_is_refused(what: str, count: int) -> None:
+    refused = worlds(count)
+    if what == "a hand is on it":
+        refused[-1].push[0, 2] = 5.0
+    elif what == "it is clamped":
+        refused[-1].clamp(0)
+    else:
+        refused[-1].set_relays(0, [1, 0, 0, 0, 0, 0])
+    with pytest.raises(DescriptionError, match=what):
+        fly(refused, np.zeros((10, 8)))
+    assert refused[0].time_ns == 0
