@@ -36,6 +36,8 @@ class DockedBodies(ABC):
     _water: Water
     _modules: Modules
     _body_arrays: Bodies
+    _held: set[int]
+    """A module of each body that a load cell holds."""
     _stage: np.ndarray
     _hands: np.ndarray
     """(m, 6) what jets and hands do to each module, about O of its body, body frame."""
@@ -54,13 +56,14 @@ class DockedBodies(ABC):
         for b, members in enumerate(self.bodies):
             parts = [(self._draws[m], self._modules.position[m], self._modules.turn[m]) for m in members]
             fill_body(self._body_arrays, b, parts, self.spec)
+            self._body_arrays.clamped[b] = not self._held.isdisjoint(members)
         self._stage = np.zeros((6, len(self.bodies), 13))
         self._external = np.zeros((len(self.bodies), 6))
         self._hands = np.zeros((len(self.vehicles), 6))
         self._thrust = np.zeros((len(self.bodies), 6))
 
     def join(self, joint: Joint) -> None:
-        """Makes one body of the two that `joint` links, and closes whatever else then meets. Momentum stays as it is."""
+        """Makes one body of the two that `joint` links, and closes whatever else then meets. Momentum stays as it is, unless clamped."""
         a, b = sorted((int(self._modules.body[joint.module]), int(self._modules.body[joint.other])))
         old, total = self._body_arrays, self.momentum()
         kept = joint.module if joint.module in self.bodies[a] else joint.other
@@ -82,6 +85,8 @@ class DockedBodies(ABC):
         x[3:7] = rotations.normalise(rotations.multiply(q_a, rotations.exp(off * masses[1] / masses.sum())))
         x[:3] = centre - rotations.rotate(x[3:7].copy(), centre_of(self._body_arrays, new))
         motion_of(self._body_arrays, new, total[a] + total[b], self._flow())
+        if self._body_arrays.clamped[new]:
+            x[7:13] = 0.0
         known = set(self.docks.joints)
         for met in joints_between(self._modules, self.docks.faces.kind):
             if met not in known:
@@ -150,7 +155,8 @@ class DockedBodies(ABC):
         return found.wrench
 
     def clamp(self, body: int) -> None:
-        """Holds a body where it is; `load` then says with what force."""
+        """Holds a body where it is, by its leader, whatever joins it; `load` then says with what force."""
+        self._held.add(self.bodies[body][0])
         self._body_arrays.clamped[body] = 1
         self._body_arrays.state[body, 7:13] = 0.0
 

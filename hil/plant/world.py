@@ -142,6 +142,7 @@ class World(DockedBodies):
         self._seen = np.zeros((len(vehicles), 16))
         self.docks = Docks(vehicles, dock or DockSpec(), jam or JamRule(), seed)
         self.jet_strength = spec.jet_strength
+        self._held = set()
         self._broken: dict[tuple[int, int], tuple[str, float]] = {}
         self.push = np.zeros((len(vehicles), 6))
         """Wrench of somebody's hand on each module about its hull's centre, module frame, N and N m."""

@@ -310,3 +310,28 @@ def test_current_of_a_lone_module_dies_away_as_it_rose() -> None:
     assert world.docks.faces.coil[0, 0] == pytest.approx(np.exp(-0.1 / DockSpec().coil_lag_s), rel=1e-3)
     run(world, 2.0)
     np.testing.assert_allclose(world.docks.current_ma(), 0.0, atol=1e-6)
+
+
+def test_clamped_body_stays_clamped_when_others_join_and_part() -> None:
+    world = start_docked()
+    world.clamp(1)
+    world.push[2, 0] = 5.0
+    start = world.truth(2).p_wm
+    world.part(world.docks.joints[0])
+    assert world._body_arrays.clamped.tolist() == [0, 0, 1]
+    world.join(Joint(0, 0, 1, 1))
+    run(world, 0.2)
+    assert world.bodies == [(0, 1), (2,)]
+    np.testing.assert_array_equal(world.truth(2).p_wm, start)
+    assert world.load(1)[0] == pytest.approx(5.0, rel=1e-3) and not world.load(0).any()
+
+
+def test_what_joins_a_clamped_body_stands_still() -> None:
+    world = start_docked()
+    world.part(world.docks.joints[0])
+    world.clamp(0)
+    world.set_motion(1, [-0.1, 0.0, 0.0], np.zeros(3))
+    world.join(Joint(0, 0, 1, 1))
+    assert not world.truth(1).v_w.any() and world._body_arrays.clamped.tolist() == [1, 0]
+    world.part(world.docks.joints[0])
+    assert world._body_arrays.clamped.tolist() == [1, 0, 0]
