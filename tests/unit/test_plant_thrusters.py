@@ -9,8 +9,10 @@ import pytest
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.batch import fly
+from hil.plant.jets import add_jets, in_the_way
 from hil.plant.spec import CALM, Tank, WorldSpec
 from hil.plant.world import Start, World
+from hil.scenario import load_scenario, make_world
 
 PERIOD_NS = 10_000_000
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -167,6 +169,26 @@ def test_jet_pushes_less_from_farther_away() -> None:
 
     near, far = pushed(0.3), pushed(1.0)
     assert 0.0 < far < 0.7 * near
+
+
+@pytest.mark.parametrize("name", ["mobius-2", "mobius-4"])
+def test_jets_of_a_body_on_itself_do_not_depend_on_its_pose(name: str) -> None:
+    world, rng = make_world(load_scenario(name), 0, PERIOD_NS), np.random.default_rng(0)
+    world._thrusters.force[:] = 8.0
+    found = []
+    for _ in range(50):
+        x = world._body_arrays.state[0]
+        x[:3], x[3:7] = rng.uniform(-1.0, 1.0, 3), rotations.normalise(rng.standard_normal(4))
+        found.append(np.zeros((len(world.vehicles), 6)))
+        add_jets(world._thrusters, world._body_arrays, world._modules, 0.3, 0.5, 0.06, found[-1])
+    assert found[0].any() and (np.array(found) == found[0]).all()
+
+
+def test_jet_fades_from_what_falls_back_beside_its_start() -> None:
+    ahead = np.array([-1e-3, -1e-15, 0.0, 1e-15, 1e-5, 0.01, 0.06, 0.2])
+    shares = [in_the_way((float(a), 0.1, 0.0), (0.21, 0.21, 0.21), (1.0, 0.0, 0.0), 0.06)[1] for a in ahead]
+    np.testing.assert_allclose(shares, np.clip(ahead / 0.06, 0.0, 1.0), atol=1e-4)
+    assert shares[:4] == [0.0] * 4
 
 
 def test_same_seed_gives_the_same_world_and_another_does_not() -> None:
