@@ -234,7 +234,7 @@ def _mate(modules, faces, x, i, j, wrench):
     first, second = modules.body[i], modules.body[j]
     coil = 0.5 * (faces.coil[i, f_i] + faces.coil[j, f_j])
     if coil != 0.0:
-        far = math.sqrt(max(0.0, gap) ** 2 + dot(side, side)) + g0
+        far = math.sqrt((max(0.0, gap) + g0) ** 2 + dot(side, side))  # the gradient of -1/far: a loop takes no work
         pull = coil * faces.pull * g0 * g0 / far**3
         push_apart(wrench, x, first, second, middle, times(-pull, plus(side, times(max(0.0, gap) + g0, n_i))))
     if faces.inside[i, j] == 0.0:

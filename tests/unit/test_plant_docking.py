@@ -9,6 +9,7 @@ import shapely.affinity
 
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import Vehicle, load_vehicle
+from hil.plant.contact import touch
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.docking import Joint
 from hil.plant.lattice import Place
@@ -335,3 +336,25 @@ def test_what_joins_a_clamped_body_stands_still() -> None:
     assert not world.truth(1).v_w.any() and world._body_arrays.clamped.tolist() == [1, 0]
     world.part(world.docks.joints[0])
     assert world._body_arrays.clamped.tolist() == [1, 0, 0]
+
+
+def test_magnets_do_no_work_around_a_loop() -> None:
+    world = two(0.012)
+    world.docks.faces.coil[[0, 1], [0, 1]] = 1.0
+    x, chosen = world._body_arrays.state, np.array([0, 1])
+
+    def force(gap_m: float, side_m: float) -> np.ndarray:
+        x[1, 0], x[1, 1] = 0.21 + gap_m, side_m
+        world._body_arrays.wrench[:] = 0.0
+        touch(world._body_arrays, world._modules, world.docks.faces, world._water, chosen)
+        return world._body_arrays.wrench[1, :2].copy()
+
+    def work(start: tuple[float, float], end: tuple[float, float]) -> float:
+        way = np.subtract(end, start)
+        return float(sum(force(*(start + way * (k + 0.5) / 1000)) @ way for k in range(1000)) / 1000)
+
+    corners = [(0.0002, 0.0), (0.0002, 0.01), (0.012, 0.01), (0.012, 0.0)]
+    legs = [work(corners[k - 1], corners[k]) for k in range(4)]
+    assert abs(sum(legs)) < 1e-5 * max(np.abs(legs))
+    for gap in (0.001, 0.003, 0.02):
+        assert force(gap, 0.0)[0] == pytest.approx(-40.0 / (1.0 + gap / 0.003) ** 2, rel=1e-12)
