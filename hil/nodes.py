@@ -317,6 +317,6 @@ def make_nodes(world: World, codec: Codec, numbers: Mapping[int, int], scenario:
             index,
             scenario.index_of(pose.module) if pose.module else -1,
         )
-        for index, pose in enumerate(scenario.camera)
+        for index, pose in enumerate(sorted(scenario.camera, key=lambda pose: pose.module > 0))  # carried ones take the first one's phase
     ]
     return Nodes(world, codec, numbers, scenario.sensors, cameras, tick_ns)

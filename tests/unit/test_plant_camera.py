@@ -1,17 +1,21 @@
 """The tag camera of the plant: when it sees, what it sees, and how wrong."""
 
+import dataclasses
 import math
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from firmware_py.bus.codec import Codec
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import load_vehicle
+from hil.nodes import make_nodes
 from hil.plant.camera import Camera, Sighting, tag_pose
 from hil.plant.sight import crosses
 from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
+from hil.scenario import load_scenario, make_world
 
 PERIOD_NS = 10_000_000
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -177,3 +181,15 @@ def test_losing_pictures_changes_no_other_draw() -> None:
     assert 0 < len(lossy) < len(clean)
     for sighting in lossy:
         np.testing.assert_array_equal(sighting.p_wt, clean[sighting.capture_ns])
+
+
+def test_order_in_which_cameras_are_listed_changes_no_picture() -> None:
+    scenario = load_scenario("hover")
+    carried = dataclasses.replace(scenario.camera[0], module=1)
+    due = []
+    for cameras in ((scenario.camera[0], carried), (carried, scenario.camera[0])):
+        listed = dataclasses.replace(scenario, camera=cameras)
+        nodes = make_nodes(make_world(listed, 3, 10_000_000), Codec.load(), {1: 0}, listed)
+        due.append([(camera.carrier, camera.next_ns) for camera in nodes.cameras[0]._cameras])
+    assert due[0] == due[1]
+    assert due[0][0][1] == due[0][1][1]
