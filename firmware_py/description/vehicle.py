@@ -84,7 +84,7 @@ class Drag:
         low=0,
         high=1e5,
         shape=(-1,),
-        help="published quadratic damping, in place of areas",
+        help="published quadratic damping of the six axes, in place of areas",
     )
 
 
@@ -225,10 +225,18 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
         )
     table, source = read_toml(path)
     vehicle: Vehicle = build(Vehicle, table, source)
+    _check_drag(vehicle.drag, source)
     if vehicle.hull.mesh:
         hull = dataclasses.replace(vehicle.hull, mesh=str(path.parent / vehicle.hull.mesh))
         vehicle = dataclasses.replace(vehicle, hull=hull)
     return vehicle
+
+
+def _check_drag(drag: Drag, source: Source) -> None:
+    """Raises DescriptionError, which names the line, where published damping is not that of six axes."""
+    if drag.quadratic.size not in (0, 6):
+        what = f"has {drag.quadratic.size} numbers; it needs six, surge, sway, heave, roll, pitch and yaw, or none: leave it out"
+        raise source.error(("drag", "quadratic"), what)
 
 
 def check_vehicles(names: Iterable[str], source: Source) -> None:
