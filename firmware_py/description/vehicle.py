@@ -233,10 +233,17 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
 
 
 def _check_drag(drag: Drag, source: Source) -> None:
-    """Raises DescriptionError, which names the line, where published damping is not that of six axes."""
+    """Raises DescriptionError, which names the line, where the drag is none that water has.
+
+    The drag table's coefficient is linear in the cubic harmonic from cd_face to cd_corner, so those two tell of every direction.
+    """
     if drag.quadratic.size not in (0, 6):
         what = f"has {drag.quadratic.size} numbers; it needs six, surge, sway, heave, roll, pitch and yaw, or none: leave it out"
         raise source.error(("drag", "quadratic"), what)
+    if not drag.quadratic.size and 0.0 < drag.cd_face >= 4.0 * drag.cd_edge:
+        what = f"{drag.cd_edge:g} is too small for drag.cd_face, {drag.cd_face:g}: along a space diagonal the coefficient, "
+        what += "(4 cd_edge - cd_face) / 3, would not be above 0"
+        raise source.error(("drag", "cd_edge"), f"{what}; cd_edge must be above cd_face / 4, here {drag.cd_face / 4.0:g}")
 
 
 def check_vehicles(names: Iterable[str], source: Source) -> None:

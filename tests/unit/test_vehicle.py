@@ -19,6 +19,7 @@ from firmware_py.description.vehicle import (
     load_vehicle,
     vehicle_names,
 )
+from firmware_py.prepare.assembly import assemble_vehicle
 
 MODULES = ("modcube", "modcube_sim")
 S, A, B = 0.70710678, 0.848048, 0.529919
@@ -229,12 +230,30 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
         ("power_reverse = [2.6, 0.52", "power_reverse = [2.6, -0.52", r"curve.power_reverse falls somewhere in 0..8 N"),
         ("force_max_n = 10.0", "force_max_n = 30.0", "forward limit of 30 N is above the 10 N of curve.forward"),
         ("cd_edge = 0.80", "cd_edge = 0.80\nquadratic = [1, 2, 3]", r"odd.toml:24: drag.quadratic: has 3 numbers; it needs six, .* or none"),
+        (
+            "cd_face = 1.05\ncd_edge = 0.80", "cd_face = 5\ncd_edge = 0.1",
+            r"odd.toml:23: drag.cd_edge: 0.1 is too small for drag.cd_face, 5: .* must be above cd_face / 4, here 1.25",
+        ),
+        ("cd_face = 1.05\ncd_edge = 0.80", "cd_face = 1.0\ncd_edge = 0.25", "must be above cd_face / 4, here 0.25"),
         ("id = 0", "id = 16", r"tag\[0\].id: 16 is out of range; permitted: 0 to 15"),
     ],
-)
+)  # fmt: skip
 def test_odd_vehicle_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
     with pytest.raises(DescriptionError, match=words):
         load_vehicle(str(changed(tmp_path, old, new)))
+
+
+@pytest.mark.parametrize(
+    "drag",
+    [
+        "cd_face = 1.0\ncd_edge = 0.26",
+        "cd_face = 0.0\ncd_edge = 0.0",
+        "cd_face = 5.0\ncd_edge = 0.1\nquadratic = [1.0, 1.0, 1.0, 0.1, 0.1, 0.1]",
+    ],
+)
+def test_drag_that_is_negative_in_no_direction_is_taken(tmp_path: Path, drag: str) -> None:
+    vehicle = load_vehicle(str(changed(tmp_path, "cd_face = 1.05\ncd_edge = 0.80", drag)))
+    assert np.all(assemble_vehicle(vehicle).drag.nodes[..., 0] >= 0.0)
 
 
 def test_vehicle_without_thrusters_is_refused(tmp_path: Path) -> None:
