@@ -14,7 +14,7 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, quantity, read_toml
-from firmware_py.description.vehicle import FACE_NAMES, Vehicle, check_vehicles, load_vehicle
+from firmware_py.description.vehicle import FACE_NAMES, Vehicle, find_vehicles, load_vehicle
 from hil.plant.build import nominal_centre
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream
@@ -31,7 +31,7 @@ class ModuleStart:
     """One module: what it is and where it is put into the water."""
 
     number: int = quantity(low=1, high=29, help="number on the bus")
-    vehicle: str = quantity("modcube", help="vehicle name or file")
+    vehicle: str = quantity("modcube", help="vehicle name, or a file beside the scenario's")
     position_m: np.ndarray = quantity(
         [0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,),
         help="world; a lone module: its hull's centre; docked ones: their centre of mass, given with the first",
@@ -311,7 +311,9 @@ def load_scenario(name: str) -> Scenario:
         )
     table, source = read_toml(path)
     scenario: Scenario = build(Scenario, table, source)
-    check_vehicles((module.vehicle for module in scenario.module), source)
+    vehicles = find_vehicles((module.vehicle for module in scenario.module), source)
+    modules = (dataclasses.replace(m, vehicle=vehicle) for m, vehicle in zip(scenario.module, vehicles, strict=True))
+    scenario = dataclasses.replace(scenario, module=tuple(modules))
     if (mistake := next(mistakes(scenario), None)) is not None:
         raise source.error(*mistake)
     return _with_file_text(scenario, path.parent, source)

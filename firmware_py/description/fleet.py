@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
-from firmware_py.description.vehicle import check_vehicles
+from firmware_py.description.vehicle import find_vehicles
 
 _Item = TypeVar("_Item")
 
@@ -21,7 +22,7 @@ class Module:
 
     number: int = quantity(low=1, high=29, help="number on the bus")
     bus: int = quantity(0, low=0, high=15, help="index into `buses`")
-    vehicle: str = quantity("modcube", help="vehicle name or file")
+    vehicle: str = quantity("modcube", help="vehicle name, or a file beside the fleet's")
     body: int = quantity(-1, low=-1, high=63, help="modules with the same number start docked; -1: alone")
     cell: np.ndarray = quantity([0, 0, 0], unit="lattice", low=-64, high=64, shape=(3,), help="place in its body")
     rotation: int = quantity(0, low=0, high=23, help="which of the 24 rotations of the cube (prepare.lattice)")
@@ -67,8 +68,9 @@ def load_fleet(path: Path) -> Fleet:
     if "buses" not in table:
         raise source.error(("buses",), 'missing key; it needs the bus of each index, such as ["socketcan:can0"]')
     fleet: Fleet = build(Fleet, table, source)
-    check_vehicles((module.vehicle for module in fleet.module), source)
-    return fleet
+    vehicles = find_vehicles((module.vehicle for module in fleet.module), source)
+    modules = (dataclasses.replace(m, vehicle=vehicle) for m, vehicle in zip(fleet.module, vehicles, strict=True))
+    return dataclasses.replace(fleet, module=tuple(modules))
 
 
 def _first_twice(items: Sequence[_Item]) -> _Item | None:

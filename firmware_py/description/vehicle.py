@@ -246,14 +246,28 @@ def _check_drag(drag: Drag, source: Source) -> None:
         raise source.error(("drag", "cd_edge"), f"{what}; cd_edge must be above cd_face / 4, here {drag.cd_face / 4.0:g}")
 
 
-def check_vehicles(names: Iterable[str], source: Source) -> None:
-    """Loads the vehicles of the [[module]] tables in `source`. Raises DescriptionError, which names the line of one that is none."""
+def find_vehicles(names: Iterable[str], source: Source) -> list[str]:
+    """The vehicles of the [[module]] tables in `source`, as load_vehicle takes them without a folder.
+
+    A file lies beside that of `source`, or else in the working directory.
+
+    Raises:
+        DescriptionError: one is no vehicle; names its line.
+    """
     names = list(names)
-    for name in dict.fromkeys(names):
+    found = {name: _beside(Path(source.path).parent, name) for name in names}
+    for name, path in found.items():
         try:
-            load_vehicle(name)
+            load_vehicle(path)
         except DescriptionError as error:
             raise source.error(("module", names.index(name), "vehicle"), str(error)) from None
+    return [found[name] for name in names]
+
+
+def _beside(folder: Path, name: str) -> str:
+    """A vehicle's `name`; a file's with the folder before it, unless it lies in the working directory alone."""
+    path = folder / name
+    return str(path) if name.endswith(".toml") and (path.exists() or not Path(name).exists()) else name
 
 
 def flu_to_frd(vectors: np.ndarray) -> np.ndarray:

@@ -1,12 +1,15 @@
 """The fleet file: which modules on which buses, and how they start out docked."""
 
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from firmware_py.app.firmware import read_fleet
+from firmware_py.app.configuration import configuration_of, firmware_of
+from firmware_py.app.firmware import compose, read_fleet
 from firmware_py.description.fleet import Fleet, load_fleet, single
+from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 
 TWO = """\
@@ -127,6 +130,29 @@ def test_fleet_file_of_the_documentation_loads_as_it_stands_there(tmp_path: Path
     fleet = read_fleet(written(tmp_path, "\n".join(line[4:] for line in lines[:end])))
     assert [(m.number, m.bus, m.body) for m in fleet.module] == [(1, 0, 0), (1, 1, 0)]
     assert fleet.buses == ("socketcan:can0", "socketcan:can1")
+
+
+@pytest.mark.parametrize(("places", "dry_kg"), [(("beside",), 2.5), (("here",), 2.6), (("beside", "here"), 2.5)])
+def test_vehicle_file_is_looked_up_beside_the_fleet_s_before_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, places: tuple[str, ...], dry_kg: float
+) -> None:
+    text = (resources.files("firmware_py") / "vehicles" / "modcube.toml").read_text(encoding="utf-8")
+    for place, mass in (("beside", "2.5"), ("here", "2.6")):
+        (tmp_path / place).mkdir()
+        if place in places:
+            (tmp_path / place / "own.toml").write_text(text.replace("dry_kg = 2.6", f"dry_kg = {mass}"), encoding="utf-8")
+    monkeypatch.chdir(tmp_path / "here")
+    fleet = read_fleet(written(tmp_path / "beside", 'buses = ["virtual:a"]\n[[module]]\nnumber = 2\nvehicle = "own.toml"\n'))
+    firmware = compose(fleet, Parameters())
+    assert firmware.vehicles[0].inertial.dry_kg == dry_kg
+    again = firmware_of(configuration_of(firmware), "log")
+    assert again.vehicles[0].inertial.dry_kg == dry_kg
+
+
+def test_vehicle_file_that_lies_nowhere_is_looked_for_beside_the_fleet_s(tmp_path: Path) -> None:
+    text = 'buses = ["virtual:a"]\n[[module]]\nnumber = 2\nvehicle = "own.toml"\n'
+    with pytest.raises(DescriptionError, match=rf"fleet\.toml:4: module\[0\]\.vehicle: {tmp_path}/own\.toml: cannot be read: No such file"):
+        read_fleet(written(tmp_path, text))
 
 
 def test_same_number_on_two_buses_is_two_modules(tmp_path: Path) -> None:

@@ -4,11 +4,13 @@ import dataclasses
 import pickle
 import shutil
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from firmware_py.app.firmware import vehicles_of
 from firmware_py.core.types import Outputs, Setpoint
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
@@ -264,3 +266,14 @@ def test_bodies_that_would_start_one_inside_the_other_are_refused() -> None:
     near = dataclasses.replace(scenario.module[1], position_m=scenario.module[0].position_m)
     with pytest.raises(DescriptionError, match=r"modules 1 and 2 start 0\.\d+ m apart, one inside the other; 0\.2"):
         make_world(dataclasses.replace(scenario, module=(scenario.module[0], near)), 0, 10_000_000)
+
+
+def test_vehicle_file_is_looked_up_beside_the_scenario_s(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (resources.files("firmware_py") / "vehicles" / "modcube.toml").read_text(encoding="utf-8")
+    (tmp_path / "own.toml").write_text(text.replace("dry_kg = 2.6", "dry_kg = 2.5"), encoding="utf-8")
+    monkeypatch.chdir("/")
+    scenario = load("hover", 'vehicle = "modcube"', 'vehicle = "own.toml"')
+    world = make_world(scenario, 0, 10_000_000)
+    assert world.vehicles[0].inertial.dry_kg == 2.5
+    assert vehicles_of(fleet_of(scenario, "virtual:own", 100)).popitem()[1].inertial.dry_kg == 2.5
+    assert identity(scenario, Parameters())

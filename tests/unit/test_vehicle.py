@@ -229,7 +229,7 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
         ("forward = [1.5, 9.0, -0.5", "forward = [1.5, 9.0, -20.5", r":\d+: curve: forward .* falls somewhere in 0..1"),
         ("power_reverse = [2.6, 0.52", "power_reverse = [2.6, -0.52", r"curve.power_reverse falls somewhere in 0..8 N"),
         ("force_max_n = 10.0", "force_max_n = 30.0", "forward limit of 30 N is above the 10 N of curve.forward"),
-        ("cd_edge = 0.80", "cd_edge = 0.80\nquadratic = [1, 2, 3]", r"odd.toml:24: drag.quadratic: has 3 numbers; it needs six, .* or none"),
+        ("cd_edge = 0.80", "cd_edge = 0.80\nquadratic = [1, 2, 3]", r"toml:24: drag.quadratic: has 3 numbers; it needs six, .* or none"),
         (
             "cd_face = 1.05\ncd_edge = 0.80", "cd_face = 5\ncd_edge = 0.1",
             r"odd.toml:23: drag.cd_edge: 0.1 is too small for drag.cd_face, 5: .* must be above cd_face / 4, here 1.25",
