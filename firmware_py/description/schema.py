@@ -123,9 +123,13 @@ class Source:
 
 
 def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
-    """The table in `path` and its source. Raises DescriptionError for a file that is missing or is no TOML."""
+    """The table in `path` and its source; a byte order mark is no part of it.
+
+    Raises:
+        DescriptionError: the file is missing or is no TOML.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     try:

@@ -227,8 +227,10 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     vehicle: Vehicle = build(Vehicle, table, source)
     _check_drag(vehicle.drag, source)
     if vehicle.hull.mesh:
-        hull = dataclasses.replace(vehicle.hull, mesh=str(path.parent / vehicle.hull.mesh))
-        vehicle = dataclasses.replace(vehicle, hull=hull)
+        mesh = path.parent / vehicle.hull.mesh
+        if not mesh.is_file():
+            raise source.error(("hull", "mesh"), f"{mesh}: there is no such mesh")
+        vehicle = dataclasses.replace(vehicle, hull=dataclasses.replace(vehicle.hull, mesh=str(mesh)))
     return vehicle
 
 

@@ -78,7 +78,7 @@ def check_store(store: str) -> None:
     nearest = next(place for place in (Path(store), *Path(store).parents) if place.exists())
     try:
         TemporaryFile(dir=nearest).close()
-    except (NotADirectoryError, PermissionError) as error:
+    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:  # the first: /proc, where nothing can be made
         raise DescriptionError(f"store {store}: {nearest}: {error.strerror}; it needs a folder that this user may write to") from None
     except OSError:
         return

@@ -108,7 +108,8 @@ class ParameterService:
                 raise DescriptionError(f"parameter {name}: {value} is no number")
             dotted, kept = self._store.set(name, value)
         except (DescriptionError, OSError) as error:
-            self._system.say(_WARNING, str(error))
+            stays = f"parameter {name} stays, it cannot be stored"
+            self._system.say(_WARNING, f"{stays}: {error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error))
             self._system.send(arrival.channel, "PARAM_VALUE", self._value(name))
             return
         for system in self._everybody():

@@ -87,6 +87,11 @@ def test_store_that_is_a_file_is_refused(inside: str, file: Path) -> None:
         ground_config(None, ["udpin::14550"], None, str(file / inside), None, 1)
 
 
+def test_store_where_nothing_can_be_made_is_refused() -> None:
+    with pytest.raises(DescriptionError, match=r"store /proc/y: /proc: .*; it needs a folder that this user may write to"):
+        check_store("/proc/y")
+
+
 def test_store_that_can_be_made_is_taken_and_not_made_yet(tmp_path: Path) -> None:
     check_store(str(tmp_path / "deeper" / "still"))
     assert list(tmp_path.iterdir()) == []

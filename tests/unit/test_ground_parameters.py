@@ -65,6 +65,15 @@ def test_out_of_range_is_refused_in_words_and_the_old_value_echoed(world: World,
     assert not world.robot.asked
 
 
+def test_store_that_is_gone_is_named_with_what_is_wrong(world: World, client: Client, tmp_path: Path) -> None:
+    tmp_path.rmdir()
+    tmp_path.write_text("")
+    assert put(world, client, "POS_BW", 2.75) == SHIPPED
+    assert "parameter POS_BW stays, it cannot be stored" in client.texts
+    assert str(tmp_path) in client.texts and "Errno" not in client.texts
+    assert not world.robot.asked
+
+
 def test_unknown_parameter_is_told_of(world: World, client: Client) -> None:
     client.send("PARAM_SET", 1, 1, b"NO_SUCH", 1.0, 9)
     world.run(2)

@@ -209,6 +209,12 @@ def test_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
         read_toml(tmp_path / "boat.toml")
 
 
+def test_byte_order_mark_of_an_editor_is_no_part_of_the_text(tmp_path: Path) -> None:
+    (tmp_path / "boat.toml").write_bytes(b"\xef\xbb\xbfname = 'boat'")
+    table, source = read_toml(tmp_path / "boat.toml")
+    assert (table, source.text) == ({"name": "boat"}, "name = 'boat'")
+
+
 def test_arrays_are_read_only_and_in_order(tmp_path: Path) -> None:
     boat = load(tmp_path, TOP + "inertia = [[1, 2], [3, 4]]\n")
     assert boat.inertia.flags.c_contiguous and boat.inertia.dtype == np.float64

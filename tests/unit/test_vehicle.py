@@ -235,6 +235,7 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
             r"odd.toml:23: drag.cd_edge: 0.1 is too small for drag.cd_face, 5: .* must be above cd_face / 4, here 1.25",
         ),
         ("cd_face = 1.05\ncd_edge = 0.80", "cd_face = 1.0\ncd_edge = 0.25", "must be above cd_face / 4, here 0.25"),
+        ("[hull]\n", '[hull]\nmesh = "hull.stl"\n', r"odd.toml:\d+: hull.mesh: .*/hull.stl: there is no such mesh"),
         ("id = 0", "id = 16", r"tag\[0\].id: 16 is out of range; permitted: 0 to 15"),
     ],
 )  # fmt: skip
