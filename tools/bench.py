@@ -29,6 +29,7 @@ from bench_fleet import TIMED_TICKS, Hold, cube_of
 from bench_flight import FlightTimes, measure_flight
 from bench_ground import ground_entries
 from bench_lateness import lateness_entries
+from command_line import Parser, run_tool
 from rich import box as box_style
 from rich.console import Console
 from rich.table import Table
@@ -194,7 +195,7 @@ def print_entries(entries: Sequence[Entry]) -> None:
 
 def main() -> None:
     """Measures everything; takes no arguments."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":  # read when numpy is imported: start again with it
         os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     print(f"bench: {(batch_entries.__doc__ or '').splitlines()[0]}", file=sys.stderr, flush=True)
@@ -211,4 +212,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_tool(main)

@@ -15,6 +15,7 @@ from pathlib import Path
 from time import perf_counter_ns
 
 import numpy as np
+from command_line import run_tool
 
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
@@ -164,4 +165,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_tool(main)

@@ -9,15 +9,15 @@ Exit status: 0 within the limits, 1 beyond one, 2 cannot run.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from copy import deepcopy
 from importlib import resources
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import cantools.database
+from command_line import Parser, run_tool
 
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.load import MEAN_LIMIT, TICK_LIMIT, BusLoad, bus_load
@@ -56,13 +56,6 @@ def expanded_dbc(numbers: Sequence[int]) -> str:
     return expanded.as_dbc_string()
 
 
-class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see --help\n")
-
-
 def line(name: str, modules: int, rate_hz: int, load: BusLoad) -> str:
     """One line of the table."""
     verdict = "" if load.is_allowed else "  TOO FULL"
@@ -89,7 +82,7 @@ def cases(fleet_file: Path | None, rate_hz: int | None) -> list[tuple[str, list[
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the tool; returns its exit status."""
-    parser = OneLineParser(prog="bus_load", description="bus load from the DBC")
+    parser = Parser(prog="bus_load", description="bus load from the DBC")
     parser.add_argument("--fleet", type=Path, help="fleet file")
     parser.add_argument("--rate", type=int, help="ticks a second, 50 to 400, in place of the fleet's")
     parser.add_argument("--dbc", type=Path, help="folder for one expanded DBC per bus")
@@ -133,4 +126,4 @@ def refuse(text: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

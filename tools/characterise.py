@@ -13,16 +13,16 @@ import io
 import sys
 import tomllib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import characterise_blas  # noqa: F401
 import characterise_table as table
 import numpy as np
 from argument_types import make_folder, positive, whole
+from command_line import Parser, run_tool, worker_pool
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -42,13 +42,6 @@ LARGEST_BOX = 64
 """Modules of an assembly."""
 LEAST_DIRECTIONS, MOST_DIRECTIONS = 121, 100_000
 """Harmonics of degree ten have 121 coefficients."""
-
-
-class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line; exit status 2."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}\n")
 
 
 def main() -> None:
@@ -184,7 +177,7 @@ def _all(layouts: dict[str, Layout], settings: dict[str, Any], jobs: int) -> dic
             for name, layout in layouts.items():
                 done(name, work(layout, progress=partial(_describe, bar, mark, name)))
         else:
-            with ProcessPoolExecutor(min(jobs, len(layouts)), mp_context=get_context("spawn")) as pool:
+            with worker_pool(min(jobs, len(layouts))) as pool:
                 largest_first = sorted(layouts, key=lambda n: -layouts[n].count)
                 waiting = {pool.submit(work, layouts[name]): name for name in largest_first}
                 for future in as_completed(waiting):
@@ -277,4 +270,4 @@ def _robot(robot: dict[str, Any], raw: dict[str, Any]) -> Layout:
 
 
 if __name__ == "__main__":
-    main()
+    run_tool(main)

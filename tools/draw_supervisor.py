@@ -6,10 +6,10 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+from command_line import Parser, run_tool
 
 from firmware_py.core.arming import CHECKS
 from firmware_py.core.failsafes import ANY, PERMITTED, TABLE, Level, Row, Watch
@@ -131,7 +131,7 @@ def page() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Writes or checks the page."""
-    parser = argparse.ArgumentParser(description="draw docs/supervisor.md from the supervisor's tables")
+    parser = Parser(description="draw docs/supervisor.md from the supervisor's tables")
     parser.add_argument("--check", action="store_true", help="only say whether it is up to date")
     if parser.parse_args(arguments).check:
         return 0 if PAGE.exists() and PAGE.read_text(encoding="utf-8") == page() else 1
@@ -141,4 +141,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

@@ -19,6 +19,7 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+from command_line import Parser, run_tool
 from scipy.optimize import nnls
 
 from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of, to_toml
@@ -161,7 +162,7 @@ def checked_toml(curve: ThrusterCurve, out: Path) -> str:
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("csv", type=Path, help="the measurement")
     parser.add_argument("--voltage", type=float, help="V of the curve; else the vehicle's")
     parser.add_argument("--zero", type=float, default=0.05, metavar="N", help="size of a force that counts as none")
@@ -187,4 +188,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

@@ -20,8 +20,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
+from command_line import Parser, run_tool
 from flash_payload import Payload, PayloadError, make_payload
 from flash_ssh import DEVICE_FILES, LostError, Vehicle, VehicleError
 
@@ -173,16 +174,9 @@ def look_or_go_back(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[
     return switch(vehicle, say, "rollback")
 
 
-class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see --help\n")
-
-
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
-    parser = OneLineParser(prog="flash", description="Puts this checkout's release on a vehicle, over OpenSSH.")
+    parser = Parser(prog="flash", description="Puts this checkout's release on a vehicle, over OpenSSH.")
     parser.add_argument("host", metavar="USER@HOST", help="as ssh takes it")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--status", action="store_true", help="what is installed and how it runs")
@@ -227,4 +221,4 @@ def refuse(line: str, status: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

@@ -10,17 +10,17 @@ Exit status: 0, or 2 when it cannot write.
 
 from __future__ import annotations
 
-import argparse
 import re
 import sys
 from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any, NoReturn
+from typing import Any
 
 import cantools.database
 from cantools.database.can import c_source
+from command_line import Parser, run_tool
 
 from firmware_py.bus.codec import Codec, Field, MessageCodec
 from firmware_py.bus.codec.crc import TABLE
@@ -132,16 +132,9 @@ def definition(message: MessageCodec, field: Field) -> str:
     return f"{conversion(message, field)}\n{{\n    return ({raw_type(field)})raw_of(value, {numbers});\n}}"
 
 
-class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see --help\n")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Writes the files; returns the exit status."""
-    parser = OneLineParser(prog="generate_mcu_code", description="C for the microcontrollers, from the DBC")
+    parser = Parser(prog="generate_mcu_code", description="C for the microcontrollers, from the DBC")
     parser.add_argument("folder", type=Path, help="where the four files go")
     folder: Path = parser.parse_args(arguments).folder
     try:
@@ -156,4 +149,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from argument_types import make_folder
+from command_line import Parser, run_tool
 from identify_excitation import MOTIONS, SPACE_M, check_space, excitation
 from identify_fit import Reference, fit
 from identify_log import Recording, read_recording
@@ -139,7 +140,7 @@ def identify(given: argparse.Namespace) -> int:
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="*", metavar="LOG", help="folders of flights of one vehicle, one module alone")
     parser.add_argument("--curve", type=Path, metavar="FILE", help="curve of one thruster, from tools/fit_thruster.py")
     parser.add_argument("--thruster", type=int, default=1, help="which thruster that was, 1 the first")
@@ -158,4 +159,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

@@ -11,13 +11,12 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 from argument_types import make_folder, positive, whole
+from command_line import Parser, run_tool, worker_pool
 from fit_thruster import fit_curve
 from identify_excitation import MOTIONS, excitation
 from identify_fit import Reference, fit
@@ -103,7 +102,7 @@ def summary(plants: Sequence[dict]) -> dict[str, float]:  # type: ignore[type-ar
 def examine_all(seeds: Sequence[int], jobs: int, folder: Path, duration_s: float = 170.0) -> dict[str, float]:
     """Examines all plants in so many processes; plants.json is left in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with worker_pool(jobs) as pool:
         plants = list(pool.map(partial(examine, folder=folder, duration_s=duration_s), seeds))
     (folder / "plants.json").write_text(json.dumps(plants, indent=2) + "\n", encoding="utf-8")
     return summary(plants)
@@ -111,7 +110,7 @@ def examine_all(seeds: Sequence[int], jobs: int, folder: Path, duration_s: float
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plants", type=whole(1), default=10, help="number of seeds")
     parser.add_argument("--seed", type=whole(0), default=0, help="first seed")
     parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
@@ -129,4 +128,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

@@ -15,13 +15,12 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from argument_types import make_folder, whole
+from command_line import Parser, run_tool, worker_pool
 from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure
 from rich import box
 from rich.console import Console
@@ -44,7 +43,7 @@ def measured(modules: Sequence[int], parameters: Parameters, vehicle: str, jobs:
     """The responses of every body in the nominal world and in the eight corners."""
     cases = [(n, scale) for n in modules for scale in (NOMINAL, *corners(SPREAD))]
     found: Found = {n: {} for n in modules}
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with worker_pool(jobs) as pool:
         futures = [pool.submit(measure, n, parameters, scale, vehicle) for n, scale in cases]
         for done, ((n, scale), future) in enumerate(zip(cases, futures, strict=True), 1):
             found[n][scale] = future.result()
@@ -133,7 +132,7 @@ def bode(response: Response) -> tuple[np.ndarray, np.ndarray]:
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--modules", type=int, nargs="+", choices=list(BODIES), default=list(BODIES), help="sizes of body")
     parser.add_argument("--controller", default="modcube", help=f"{', '.join(CONTROLLERS)}, or a file of parameters")
     parser.add_argument("--vehicle", default="modcube", help="vehicle of every module")
@@ -158,4 +157,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

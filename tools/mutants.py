@@ -8,7 +8,6 @@ alone: no file is touched. Everything heavy is imported before the fork.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import copy
 import importlib.abc
@@ -22,6 +21,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import NamedTuple
+
+from command_line import Parser, run_tool
 
 ROOT = Path(__file__).resolve().parents[1]
 TIMEOUT_S = 60
@@ -239,7 +240,7 @@ def run(name: str, todo: list[Mutant], jobs: int) -> list[Mutant]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs all mutants of the modules asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = Parser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("module", nargs="*", help="last part of a module's name; all when none is given")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--list", action="store_true", help="only say what would be tried")
@@ -276,4 +277,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

@@ -15,6 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from command_line import Parser, run_tool
+
 README = Path("README.md")
 SOURCES = {"accept": Path("accept.json"), "bench": Path("bench.json")}
 MARKER = re.compile(r"(<!-- table: (?P<kind>\w+)(?P<words>[^>]*?) -->\n)(?P<old>.*?)(<!-- end -->)", re.DOTALL)
@@ -107,7 +109,7 @@ def read_source(path: Path) -> Entries:
 
 def main() -> int:
     """The command line."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     if not README.is_file():
         print(f"readme: no {README} in {Path.cwd()}; run this in the root of the project", file=sys.stderr)
         return 2
@@ -131,4 +133,4 @@ def write_tables() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

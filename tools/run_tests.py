@@ -10,6 +10,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from command_line import run_tool
+
 CLIENTS = Path(".venv-clients/.stamp")
 """There once every client is installed."""
 PYTEST = [sys.executable, "-m", "pytest"]
@@ -47,4 +49,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

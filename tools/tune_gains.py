@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from argument_types import make_folder, positive, whole
+from command_line import INTERRUPTED, Parser, run_tool
 from tune_objective import Objective, detuned, load_objective, with_values
 
 from firmware_py.description.parameters import Parameters, load_parameters
@@ -108,7 +109,7 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
 
 def arguments() -> argparse.Namespace:
     """What the command line says."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("objective", type=Path, help="objective file, such as tools/objectives/spiral.toml")
     parser.add_argument("--trials", type=whole(1), default=40, help="trials in all, earlier ones in the same folder counted")
     parser.add_argument("--minutes", type=positive, default=float("inf"), help="no trial is begun after so long")
@@ -146,9 +147,9 @@ def main() -> int:
         return 2
     except KeyboardInterrupt:
         print(f"tune_gains: interrupted; the same command with --out {given.out} goes on where it was", file=sys.stderr)
-        return 2
+        return INTERRUPTED
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_tool(main)

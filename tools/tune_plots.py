@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
+from command_line import worker_pool
 from loop_response import AXES, PERIOD_NS, STEP_TICKS, Response, margins, measure, step_responses
 from margins import bode
 from tune_objective import Objective
@@ -29,7 +28,7 @@ def draw(out: Path, objective: Objective, study: optuna.Study, sets: Mapping[str
     import matplotlib
 
     matplotlib.use("Agg")
-    with ProcessPoolExecutor(JOBS, mp_context=get_context("spawn")) as pool:
+    with worker_pool(JOBS) as pool:
         loops = {name: pool.submit(measure, 1, p, vehicle=vehicle) for name, p in sets.items() if name != "start"}
         steps = {name: pool.submit(step_responses, p, SHOWN, vehicle) for name, p in sets.items()}
         draw_bode(out / "bode.png", {name: job.result() for name, job in loops.items()})

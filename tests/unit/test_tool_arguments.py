@@ -1,7 +1,9 @@
 """The tools' command lines: --help says what they do and does nothing, and wrong arguments end with status 2 and no traceback."""
 
 import importlib
+import os
 import runpy
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,7 +28,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
     def run_it(tool: str, *arguments: str) -> int:
         monkeypatch.setattr("sys.argv", [tool, *arguments])
         module = importlib.import_module(tool)
-        for name in ("batch_entries", "ProcessPoolExecutor", "processes"):
+        for name in ("batch_entries", "worker_pool", "processes"):
             monkeypatch.setattr(module, name, begins, raising=False)
         try:
             return int(module.main() or 0)
@@ -55,13 +57,54 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
         ("identify_plants", ["--jobs", "0"], "--jobs: '0' is not a whole number above zero"),
         ("identify_plants", ["--seed", "-1"], "--seed: '-1' is not a whole number from 0 on"),
         ("identify_plants", ["--seconds", "nan"], "--seconds: 'nan' is not a number above zero"),
+        ("identify", ["--thruster", "first"], "identify: argument --thruster: invalid int value: 'first'; see --help"),
+        ("tune_gains", [], "tune_gains: the following arguments are required: objective; see --help"),
+        ("fit_thruster", [], "fit_thruster: the following arguments are required: csv; see --help"),
+        ("characterise", [], "characterise: give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE; see --help"),
+        ("mutants", ["nosuch"], "mutants: nosuch: unknown; there are transitions, "),
     ],
 )
 def test_wrong_arguments_are_refused(
     run: Run, tool: str, arguments: list[str], refusal: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(tool, *arguments) == 2
-    assert refusal in capsys.readouterr().err.splitlines()[-1]
+    line = capsys.readouterr().err
+    assert refusal in line
+    assert line.count("\n") == 1
+
+
+PROGRAM = """
+import os, signal, time
+from command_line import run_tool, worker_pool
+
+
+def main() -> None:
+    with worker_pool(2) as pool:
+        busy = [pool.submit(time.sleep, 60.0) for _ in range(9)]
+        time.sleep({after_s})
+        os.killpg(0, signal.SIGINT)
+        busy[0].result()
+
+
+if __name__ == "__main__":
+    run_tool(main)
+"""
+
+
+@pytest.mark.parametrize("after_s", [0.0, 2.0])
+def test_interrupt_ends_a_tool_and_its_processes_without_a_word(tmp_path: Path, after_s: float) -> None:
+    """Of a terminal, which sends it to all of them: while the processes start, and while they work."""
+    (tmp_path / "program.py").write_text(PROGRAM.format(after_s=after_s), encoding="utf-8")
+    command = [sys.executable, str(tmp_path / "program.py")]
+    paths = {**os.environ, "PYTHONPATH": str(TOOLS)}
+    ended = subprocess.run(command, env=paths, start_new_session=True, capture_output=True, text=True, timeout=50)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
+
+
+@pytest.mark.parametrize("tool", sorted(path.stem for path in TOOLS.glob("*.py") if "Parser(" in path.read_text(encoding="utf-8")))
+def test_every_tool_that_reads_arguments_ends_alike(tool: str) -> None:
+    text = (TOOLS / f"{tool}.py").read_text(encoding="utf-8")
+    assert tool == "command_line" or ("ArgumentParser(" not in text and text.endswith("    run_tool(main)\n"))
 
 
 @pytest.mark.parametrize(

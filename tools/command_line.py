@@ -1,0 +1,52 @@
+"""For the tools: how a command line ends: wrong arguments in one line, and Ctrl-C without a word, in its processes too."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import NoReturn
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C: 128 and SIGINT, as a shell has it."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong with the arguments in one line; exit status 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog.removesuffix('.py')}: {message}; see --help\n")
+
+
+def run_tool(main: Callable[[], int | None]) -> NoReturn:
+    """Ends with what the tool's `main` returns; Ctrl-C ends it in silence."""
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+
+
+@contextmanager
+def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
+    """So many processes. Ctrl-C, which a terminal sends to them too, ends them without a word; what waits for them is not begun."""
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_hear_interrupts) as pool:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited: until a process is set up it hears none
+        try:
+            pool.submit(_hear_interrupts)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _hear_interrupts() -> None:
+    """In a worker."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
