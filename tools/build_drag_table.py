@@ -27,7 +27,7 @@ from firmware_py.description.vehicle import Vehicle, load_vehicle
 from firmware_py.prepare import alpha, drag_table, shape_key
 from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.drag_cache import DragCache, default_folder
-from firmware_py.prepare.joints import Placement
+from firmware_py.prepare.joints import Placement, check_joints
 from firmware_py.prepare.projected_area import areas_and_centroids
 
 Cell = tuple[int, int, int]
@@ -76,6 +76,15 @@ def shapes_of(text: str) -> dict[str, list[Cell]]:
         return PAPER_SHAPES
     cells = parse_cells(text)
     return {f"{len(cells)} module{'s' if len(cells) > 1 else ''}": cells}
+
+
+def check_docks(vehicle: Vehicle, shapes: dict[str, list[Cell]]) -> None:
+    """Raises DescriptionError where the modules of a shape, all upright, cannot be docked so."""
+    for shape, cells in shapes.items():
+        try:
+            check_joints([Placement(vehicle, cell, 0) for cell in cells], range(len(cells)), PITCH_M)
+        except DescriptionError as error:
+            raise DescriptionError(f"{shape} of the vehicle {vehicle.name} cannot be docked: {error}; give --cells 0,0,0") from None
 
 
 def table_of(vehicle: Vehicle, cells: Sequence[Cell], mode: str, cache: DragCache | None) -> DragTable:
@@ -183,6 +192,7 @@ def main(
             raise DescriptionError(f"mode {mode!r} is unknown; there are {', '.join(METHODS)}")
         description = load_vehicle(vehicle)
         shapes = shapes_of(cells)
+        check_docks(description, shapes)
         make_room(out)
         modes = list(METHODS) if compare else [mode]
         tables = {

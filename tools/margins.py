@@ -29,6 +29,8 @@ from rich.table import Table
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import PITCH_M
+from firmware_py.prepare.joints import Placement, check_joints
 
 BARS = {"nominal": (8.0, 40.0), "worst": (6.0, 35.0)}
 """Least gain margin, dB, and phase margin, deg."""
@@ -49,6 +51,16 @@ def measured(modules: Sequence[int], parameters: Parameters, vehicle: str, jobs:
             found[n][scale] = future.result()
             print(f"margins: {done} of {len(cases)}", file=sys.stderr, flush=True)
     return found
+
+
+def check_bodies(modules: Sequence[int], vehicle: str) -> None:
+    """Raises DescriptionError where so many of this vehicle cannot be docked, before minutes are spent on the bodies that can."""
+    described = load_vehicle(vehicle)
+    for count in modules:
+        try:
+            check_joints([Placement(described, cell, 0) for cell in BODIES[count]], range(count), PITCH_M)
+        except DescriptionError as error:
+            raise DescriptionError(f"{count} of the vehicle {vehicle} cannot be docked: {error}; give --modules 1") from None
 
 
 def rows(found: Found) -> list[dict[str, Any]]:
@@ -140,7 +152,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/margins"), help="for margins.json and margins.png")
     given = parser.parse_args()
     try:
-        load_vehicle(given.vehicle)
+        check_bodies(given.modules, given.vehicle)
         chosen = CONTROLLERS.get(given.controller) or load_parameters(Path(given.controller))
         make_folder(given.out)
         found = measured(given.modules, chosen, given.vehicle, given.jobs)

@@ -61,9 +61,13 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
         ("tune_gains", [], "tune_gains: the following arguments are required: objective; see --help"),
         ("fit_thruster", [], "fit_thruster: the following arguments are required: csv; see --help"),
         ("characterise", [], "characterise: give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE; see --help"),
+        (
+            "margins", ["--vehicle", "bluerov2"],
+            "margins: 2 of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --modules 1",
+        ),
         ("mutants", ["nosuch"], "mutants: nosuch: unknown; there are transitions, "),
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments_are_refused(
     run: Run, tool: str, arguments: list[str], refusal: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -112,10 +116,14 @@ def test_every_tool_that_reads_arguments_ends_alike(tool: str) -> None:
     [
         ("build_drag_table", ["--foo"], "build_drag_table: No such option: --foo"),
         ("build_drag_table", ["--directions", "one"], "build_drag_table: Invalid value for '--directions': Input should be"),
+        (
+            "build_drag_table", ["--vehicle", "bluerov2", "--cache", "/proc/self/none"],
+            "line of two of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --cells 0,0,0",
+        ),
         ("accept", ["--out", "/proc/self/accept.json"], "accept: --out /proc/self/accept.json: cannot be written: "),
         ("accept", ["--only", "nosuch"], "accept: Invalid value: nosuch: unknown; there are hover, spiral, "),
     ],
-)
+)  # fmt: skip
 def test_tool_of_typer_refuses_wrong_arguments_in_one_line_too(
     run: Run, tool: str, arguments: list[str], refusal: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
