@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -80,6 +81,19 @@ def reference_of(recording: Recording, thruster: int, accuracy_percent: float) -
     return Reference(thruster - 1, 0.01 * accuracy_percent)
 
 
+def check_excitation(path: Path) -> None:
+    """Raises DescriptionError where no scenario can go to `path`, or something of somebody's is there."""
+    if path.suffix != ".toml":
+        raise DescriptionError(f"--excitation {path}: a scenario's file is a .toml file; give {path}.toml")
+    if path.exists():
+        raise DescriptionError(f"--excitation {path}: there already, and nothing is written over; give another name or delete it")
+
+
+def fly_it(path: Path) -> str:
+    """How the scenario in `path` is flown, as a shell takes it."""
+    return f"fly it: modcube hil run {shlex.quote(str(path))}"
+
+
 def print_findings(found: Sequence[Finding]) -> None:
     """The table."""
     table = Table(box=box_style.SIMPLE_HEAD)
@@ -93,12 +107,14 @@ def print_findings(found: Sequence[Finding]) -> None:
 def identify(given: argparse.Namespace) -> int:
     """Fits, prints and writes; the exit status. Raises DescriptionError and OSError."""
     check_space(given.space)
+    if given.excitation is not None:
+        check_excitation(given.excitation)
     if not given.logs:
         if given.excitation is None:
             raise DescriptionError("no LOG was given; give the folder of a flight, or --excitation FILE for the flight to begin with")
         load_vehicle(given.vehicle)
         given.excitation.write_text(excitation(list(MOTIONS), given.vehicle, given.space), encoding="utf-8")
-        print(f"fly it: modcube hil run {given.excitation}")
+        print(fly_it(given.excitation))
         return 0
     if given.hung_at and not given.weight:
         raise DescriptionError("--hung-at says where a weight hung; give --weight with it")
@@ -134,7 +150,7 @@ def identify(given: argparse.Namespace) -> int:
     if wanted:
         chosen = given.excitation or given.out / "excite.toml"
         chosen.write_text(excitation(list(wanted), recordings[0].vehicle_name, given.space), encoding="utf-8")
-        print(f"fly it: modcube hil run {chosen}")
+        print(fly_it(chosen))
     return 1 if wanted else 0
 
 

@@ -175,6 +175,8 @@ def test_weight_that_neither_came_nor_went_is_refused(from_s: float, until_s: fl
         (["--excitation", "shake.toml", "--space", "0.6", "-0.5", "0.3"], "--space 0.6 -0.5 0.3: three distances of 0 m or more"),
         (["--excitation", "shake.toml", "--space", "0.6", "0.5", "inf"], "--space 0.6 0.5 inf: three distances of 0 m or more"),
         (["--excitation", "shake.toml", "--space", "0.6", "0.5", "0"], "--space 0.6 0.5 0 leaves no room along z"),
+        (["--excitation", "shake"], "--excitation shake: a scenario's file is a .toml file; give shake.toml"),
+        (["nowhere", "--excitation", "shake.txt"], "--excitation shake.txt: a scenario's file is a .toml file"),
         (["nowhere", "--space", "nan", "0.5", "0.3"], "--space nan 0.5 0.3"),
     ],
 )
@@ -187,6 +189,19 @@ def test_what_cannot_run_says_so_in_one_line(
     said = capsys.readouterr().err
     assert complaint in said and said.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_excitation_is_said_how_to_fly_and_writes_over_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["identify", "--excitation", "first shake.toml"])
+    assert tool.main() == 0
+    assert capsys.readouterr().out == "fly it: modcube hil run 'first shake.toml'\n"
+    (tmp_path / "first shake.toml").write_text("mine", encoding="utf-8")
+    assert tool.main() == 2
+    assert "first shake.toml: there already, and nothing is written over; give another name or delete it" in capsys.readouterr().err
+    assert (tmp_path / "first shake.toml").read_text(encoding="utf-8") == "mine"
 
 
 @pytest.mark.parametrize("name", vehicle_names())
