@@ -16,7 +16,7 @@ import numpy as np
 from firmware_py.core.setpoint import Trajectory
 from firmware_py.core.types import Action, Event, Mode
 from firmware_py.description.parameters import Parameters
-from firmware_py.ground.mission_items import LOITER_UNLIMITED, Item, MissionError, flight_order
+from firmware_py.ground.mission_items import LOITER_UNLIMITED, Item, MissionError, beyond_fence, flight_order
 from firmware_py.ground.system import NS_PER_S, System
 
 NONE, READY, ACTIVE, PAUSED, DONE = 1, 2, 3, 4, 5
@@ -111,6 +111,11 @@ class MissionFlight:
     def amend(self, items: tuple[Item, ...]) -> None:
         """The same mission with other items in it, while it does not fly: it goes on where it is."""
         self.items = items
+
+    def against(self, item: Item) -> tuple[int, str]:
+        """A MAV_MISSION_RESULT and why `item` is flown nowhere, by the fence as it is now; 0: it is."""
+        place = item.place(self._system.subject.origin) if item.sequence >= self._first else None
+        return (0, "") if place is None else beyond_fence(place, self._parameters().fence)
 
     @property
     def flies(self) -> bool:

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from firmware_py.description.failsafe_parameters import Fence
+from firmware_py.description.schema import limits_of
 from firmware_py.ground.dialect import Message
 from firmware_py.ground.geodesy import Origin
 
@@ -19,10 +21,14 @@ PLACES = (WAYPOINT, LOITER_UNLIMITED, LOITER_TIME, LAST_SPLINE)
 _COMMANDS = (*PLACES, DELAY, JUMP, CHANGE_SPEED)
 ABSOLUTE, RELATIVE = (0, 5), (3, 6)
 """MAV_FRAME of absolute altitude, and of altitude relative to home."""
-UNSUPPORTED_FRAME, UNSUPPORTED, INVALID_1, INVALID_X, INVALID_Z = 2, 3, 6, 10, 12
+UNSUPPORTED_FRAME, UNSUPPORTED, INVALID_1, INVALID_X, INVALID_Y, INVALID_Z = 2, 3, 6, 10, 11, 12
 """MAV_MISSION_RESULT; the invalid parameters count on from INVALID_1."""
 _MOST_STEPS = 1000
 _LONGEST_S = 86_400.0
+
+
+_ON_FENCE_M = 0.02
+"""Beyond the fence by less is on it: the wire's 1e-7 degrees are 11 mm."""
 
 
 class MissionError(ValueError):
@@ -110,6 +116,19 @@ def _fault(item: Item) -> int:
         if not math.isfinite(value) or abs(value) > _LONGEST_S:
             return INVALID_1 + index
     return INVALID_1 if item.command == DELAY and item.parameters[0] < 0 else 0
+
+
+def beyond_fence(place: np.ndarray, fence: Fence) -> tuple[int, str]:
+    """A MAV_MISSION_RESULT for a place (3,) NED, m, and in words which side of the fence it is beyond; 0 inside."""
+    north, east, down = place.tolist()
+    sides = (
+        (INVALID_X, abs(north) - fence.north_m, "north_m"), (INVALID_Y, abs(east) - fence.east_m, "east_m"),
+        (INVALID_Z, fence.top_m - down, "top_m"), (INVALID_Z, down - fence.bottom_m, "bottom_m"),
+    )  # fmt: skip
+    for result, beyond_m, side in sides:
+        if beyond_m > _ON_FENCE_M:
+            return result, f"{beyond_m:.2f} m beyond {limits_of(Fence, side).mavlink}, {getattr(fence, side):g} m"
+    return 0, ""
 
 
 def flight_order(items: Sequence[Item], first: int) -> Iterator[Item]:

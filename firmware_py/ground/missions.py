@@ -115,9 +115,12 @@ class MissionService:
         if sequence != len(upload.items):
             return  # it came twice, or one is missing: that one is asked for again
         item, fault = item_of(arrival.message)
+        why = f"command {item.command}, frame {item.frame}"
+        if not fault:
+            fault, why = self._flight.against(item)
         if fault:
             self._upload = None
-            self._system.say(_WARNING, f"mission refused: item {sequence}, command {item.command}, frame {item.frame}")
+            self._system.say(_WARNING, f"mission refused: item {sequence}, {why}")
             self._acknowledge(arrival, fault, upload.kind)
             return
         upload.items.append(item)

@@ -128,6 +128,39 @@ def test_items_that_cannot_be_flown_are_refused_when_they_come(
     assert "mission refused: item 0" in client.texts
 
 
+@pytest.mark.parametrize(
+    ("place", "result", "side"),
+    [
+        ((302084000, 1201614000, 1.5), mavlink.MAV_MISSION_INVALID_PARAM7, "0.50 m beyond FENCE_TOP, -1 m"),
+        ((302084000, 1201614000, -51.0), mavlink.MAV_MISSION_INVALID_PARAM7, "1.00 m beyond FENCE_BOTTOM, 50 m"),
+        ((302094000, 1201614000, -0.4), mavlink.MAV_MISSION_INVALID_PARAM5_X, "m beyond FENCE_NORTH, 100 m"),
+        ((302074000, 1201614000, -0.4), mavlink.MAV_MISSION_INVALID_PARAM5_X, "m beyond FENCE_NORTH, 100 m"),
+        ((302084000, 1201625000, -0.4), mavlink.MAV_MISSION_INVALID_PARAM6_Y, "m beyond FENCE_EAST, 100 m"),
+    ],
+)
+def test_item_outside_the_fence_is_refused_when_it_comes(
+    world: World, client: Client, place: tuple[int, int, float], result: int, side: str
+) -> None:
+    assert upload(world, client, [item(0, PLACES[0]), item(1, place)]) == result
+    assert "mission refused: item 1, " in client.texts and side in client.texts
+    assert not world.station.services[1].flight.items
+
+
+def test_item_on_the_fence_is_taken_and_the_fence_is_the_one_that_was_set(world: World, client: Client) -> None:
+    on_top = item(0, (302084000, 1201614000, 1.0))
+    assert upload(world, client, [on_top]) == mavlink.MAV_MISSION_ACCEPTED
+    client.send("PARAM_SET", 1, 1, b"FENCE_TOP", 0.2, 9)
+    world.run(2)
+    assert upload(world, client, [on_top]) == mavlink.MAV_MISSION_INVALID_PARAM7
+    assert upload(world, client, [item(0, PLACES[0])]) == mavlink.MAV_MISSION_ACCEPTED
+
+
+def test_home_of_an_ardupilot_mission_may_lie_outside_the_fence() -> None:
+    world = World(config=GroundConfig(identity="ardusub"))
+    home = item(0, (302084000, 1201614000, 30.0))
+    assert upload(world, world.client(), [home, item(1, PLACES[0])]) == mavlink.MAV_MISSION_ACCEPTED
+
+
 def test_local_frame_is_refused_and_fences_are_told_to_be_unsupported(world: World, client: Client) -> None:
     assert upload(world, client, [item(0, PLACES[0])], kind=1) == mavlink.MAV_MISSION_UNSUPPORTED
     client.send("MISSION_REQUEST_LIST", 1, 1, 1)
