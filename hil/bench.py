@@ -132,10 +132,16 @@ def fly_scenario(
     bus: str = DEFAULT_BUS,
     rate_hz: int = 100,
     progress: Callable[[float], None] | None = None,
+    before_logs: Callable[[], None] | None = None,
 ) -> float:
-    """Flies `scenario` and leaves the logs in `out`; returns the wall time of the flight, s. Raises OSError where the disk is full."""
+    """Flies `scenario` and leaves the logs in `out`; returns the wall time of the flight, s. Raises OSError where the disk is full.
+
+    `before_logs` is called when nothing is refused any more; until then logs of an earlier flight are as they were.
+    """
     with writing_to(out), ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, parameters, bus, rate_hz)
+        if before_logs is not None:
+            before_logs()
         recorder = Recorder(out, configuration_of(bench.firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz))
         stack.callback(recorder.close)
         thrusters = tuple(len(v.thruster) for v in bench.nodes.world.vehicles)

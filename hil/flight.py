@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -49,20 +50,25 @@ def fly_and_judge(
 ) -> Result:
     """Flies `scenario`; the logs and result.json are in `out` afterwards, and nothing of an earlier flight is.
 
-    Raises DescriptionError and PortError.
+    Raises DescriptionError and PortError; what an earlier flight left is then as it was.
     """
     out.mkdir(parents=True, exist_ok=True)
     scenario = scenario.for_seed(seed)
+    flight = (scenario, seed, parameters, out, bus, rate_hz, progress)
     with _alone_in(out):
-        for name in LEFT_BEHIND:
-            (out / name).unlink(missing_ok=True)
         if realtime:
-            flown = fly_in_real_time(scenario, seed, parameters, out, bus, rate_hz, progress)
+            flown = fly_in_real_time(*flight, before_logs=partial(_clear, out))
             result = judge_logs(scenario, seed, out, flown.wall_s, flown.deadline_misses, LATE_SHARE)
         else:
-            result = judge_logs(scenario, seed, out, fly_scenario(scenario, seed, parameters, out, bus, rate_hz, progress))
+            result = judge_logs(scenario, seed, out, fly_scenario(*flight, before_logs=partial(_clear, out)))
         write_result(result, out)
     return result
+
+
+def _clear(folder: Path) -> None:
+    """Removes what an earlier flight left in `folder`, logs apart."""
+    for name in LEFT_BEHIND:
+        (folder / name).unlink(missing_ok=True)
 
 
 @contextmanager

@@ -7,7 +7,8 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from firmware_py.bus.codec import Codec, Frame
@@ -61,20 +62,27 @@ class PlantProcess:
         self._sync = codec.message("SYNC")
         self._nodes: Nodes = make_nodes(self._world, codec, numbers, scenario, tick_ns=1_000_000_000 // rate_hz)
         self._nodes.faults = Faults(self._nodes, scenario.fault)
+        self._out = out
+        self._truth: TruthRecorder | None = None
+
+    @contextmanager
+    def recording(self) -> Iterator[None]:
+        """Truth goes into the folder inside; an earlier log in it is whole until then."""
+        if self._out is None:
+            yield
+            return
         thrusters = tuple(len(v.thruster) for v in self._world.vehicles)
-        self._truth = TruthRecorder(out, thrusters) if out is not None else None
+        with TruthRecorder(self._out, thrusters) as self._truth:
+            yield
 
     def serve(self, port: Port, now_ns: Callable[[], int], stop: Callable[[], bool]) -> None:
         """Answers what comes at `port`; `now_ns` starts near zero."""
-        try:
+        with self.recording():
             while not stop():
                 port.wait(self._world.time_ns + CHUNK_NS)
                 self._advance(now_ns())
                 for frame in port.receive():
                     self._answer(port, frame)
-        finally:
-            if self._truth is not None:
-                self._truth.close()
 
     def _advance(self, now_ns: int) -> None:
         while self._world.time_ns + CHUNK_NS <= now_ns:

@@ -25,8 +25,8 @@ from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, read_libraries, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from hil.bench import fleet_of, script_of
-from hil.plant_process import PlantProcess, check_served
-from hil.scenario import Scenario
+from hil.plant_process import CHUNK_NS, PlantProcess, check_served
+from hil.scenario import Scenario, make_world
 
 
 class RealTimeFlight(NamedTuple):
@@ -64,6 +64,8 @@ def serve_between(handshake: Handshake, plant: PlantProcess, bus: str, arrival: 
     """Serves `bus` from `begin` until `stop`, on a clock that starts with it; `arrival` is the one of its port."""
     handshake.ready.set()
     handshake.begin.wait()
+    if handshake.stop.is_set():  # the flight came to nothing
+        return
     clock = MonotonicClock.started_now()
     with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=arrival) as port:
         use_priority(PLANT_PRIORITY)
@@ -81,6 +83,7 @@ def fly_in_real_time(
     start_method: Literal["spawn", "fork"] = "spawn",
     observers: Sequence[Observer] = (),
     serve: Callable[..., None] = serve_plant,
+    before_logs: Callable[[], None] | None = None,
 ) -> RealTimeFlight:
     """Flies `scenario` against the clock; the logs are in `out`. Raises DescriptionError and PortError.
 
@@ -88,26 +91,30 @@ def fly_in_real_time(
         start_method: of the plant's process. `fork` spares its imports; only for a process without threads.
         observers: called after each tick, besides the recorder.
         serve: what the plant's process runs, with the arguments of `serve_plant`.
+        before_logs: called when nothing is refused any more; until then logs of an earlier flight are as they were.
     """
     check_served(scenario)
+    make_world(scenario, seed, CHUNK_NS)  # told of here, before there are two processes to tell of it: a world that cannot be,
+    open_port(bus).close()  # a bus that cannot be opened,
+    fleet = fleet_of(scenario, bus, rate_hz)
+    script = script_of(scenario, fleet)  # a path that cannot be flown
     spawn, fork = multiprocessing.get_context("spawn"), multiprocessing.get_context("fork")
     context: SpawnContext | ForkContext = fork if start_method == "fork" else spawn
     handshake = Handshake(context.Event(), context.Event(), context.Event())
     arguments = (scenario, seed, bus, rate_hz, out, handshake)
     plant = context.Process(target=serve, args=arguments, name="plant", daemon=True)
-    open_port(bus).close()  # one that cannot be opened is told of here, before there are two processes to tell of it
     read_libraries()
     with ExitStack() as stack:
         plant.start()
         stack.callback(plant.join)
         stack.callback(handshake.begin.set)
         stack.callback(handshake.stop.set)
-        fleet = fleet_of(scenario, bus, rate_hz)
         firmware = compose(fleet, parameters)
         while not handshake.ready.wait(timeout=1.0):
             if not plant.is_alive():
                 raise RuntimeError("the plant's process ended before it was ready")
-        script = script_of(scenario, fleet)
+        if before_logs is not None:
+            before_logs()
         recorder = Recorder(out, configuration_of(firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz), queued=True)
         stack.callback(recorder.close)
         for body in firmware.pipeline.bodies:

@@ -85,7 +85,7 @@ class SocketPlant(PlantProcess):
         """Answers the bus and the board, inside `open_board`."""
         server = self._server
         assert server is not None
-        try:
+        with self.recording():
             while not stop():
                 port.wait(self._world.time_ns + CHUNK_NS, lambda: bool(server.requests) or port.has_frames())
                 self._advance(now_ns())
@@ -93,9 +93,6 @@ class SocketPlant(PlantProcess):
                     self._serve_board(server, server.requests.popleft())
                 for frame in port.receive():
                     self._answer(port, frame)
-        finally:
-            if self._truth is not None:
-                self._truth.close()
 
     def _serve_board(self, server: BoardServer, request: Request) -> None:
         self._board.drive(request.outputs)

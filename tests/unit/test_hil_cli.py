@@ -1,5 +1,6 @@
 """The bench's command line: what does not apply is refused in one line, and nothing flies."""
 
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import hil.fault_campaign
 import hil.plant_process
 from firmware_py.cli import main
 from hil.fault_campaign import Cell
+from hil.flight import LEFT_BEHIND
 from hil.scenario import load_scenario
 
 OFF = [["--trials", "20"], ["--controller", "modcube"], ["--vehicle", "modcube_sim"], ["--sensors", "real"], ["--dask", "tcp://a:1"]]
@@ -104,3 +106,42 @@ def test_what_only_lockstep_can_break_is_refused_in_real_time(
         line = capsys.readouterr().err
         assert "scenario 'hover': fault[1].kind: only a flight in lockstep kills the firmware; fly without --realtime" in line
         assert line.count("\n") == 1
+
+
+NEAR = '[[module]]\nnumber = 2\nposition_m = [0.0, 0.1, 0.38]\n'
+NORTH = "x_m,y_m,z_m,duration_s\n0,0,0.38,\n0.1,north,0.38,5\n"
+
+
+REALTIME = pytest.param(["--realtime", "--bus", "udp:239.74.163.9:43127"], marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("realtime", [[], REALTIME], ids=["lockstep", "realtime"])
+@pytest.mark.parametrize(
+    ("old", "new", "options", "why"),
+    [
+        ("", "", ["--vehicle", "nautilus"], "vehicle 'nautilus' is unknown"),
+        ("", "", ["--vehicle", "no_mesh.toml"], "none.stl: there is no such mesh"),
+        ("", "", ["--bus", "socketcan:can9"], "there is no such interface"),
+        ("[task]", f"{NEAR}\n[task]", [], "modules 1 and 2 start 0.1 m apart, one inside the other"),
+        ('kind = "hover"', 'kind = "waypoints"\nfile = "points.csv"', [], "points.csv:3: y_m: 'north' is not a number"),
+    ],
+    ids=["vehicle", "mesh", "bus", "overlap", "waypoints"],
+)
+def test_refused_flight_leaves_the_one_before_as_it_was(
+    realtime: list[str], old: str, new: str, options: list[str], why: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    text = (Path(hil.plant_process.__file__).parent / "scenarios" / "hover.toml").read_text(encoding="utf-8")
+    Path("own.toml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    Path("points.csv").write_text(NORTH, encoding="utf-8")
+    vehicle = Path(str(resources.files("firmware_py"))) / "vehicles" / "modcube.toml"
+    Path("no_mesh.toml").write_text(vehicle.read_text(encoding="utf-8").replace("[hull]", '[hull]\nmesh = "none.stl"'), encoding="utf-8")
+    files = [Path("run") / name for name in (*LEFT_BEHIND, "can.log", "signals.mcap", "truth.mcap")]
+    Path("run").mkdir()
+    for file in files:
+        file.write_text("the flight before")
+    assert status_of(["run", "own.toml", "--out", "run", *realtime, *options], monkeypatch) == 2
+    line = capsys.readouterr().err
+    assert why in line and line.count("\n") == 1
+    assert {file.read_text() for file in files} == {"the flight before"}
