@@ -15,6 +15,7 @@ import numpy as np
 from firmware_py.core.transitions import ARMED
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
+from firmware_py.description.signals import read_signals
 from firmware_py.description.vehicle import load_vehicle
 from hil.bench import DEFAULT_BUS, SCRIPTS, fleet_of, fly_scenario
 from hil.checks import RESULT_FILE, Limit, Result, judge, write_result
@@ -28,7 +29,7 @@ from hil.realtime import fly_in_real_time
 from hil.report import REPORT_FILE, Scene, write_report
 from hil.scenario import Scenario
 from hil.script import Script
-from hil.signals import Flight, period_of, read_flight
+from hil.signals import SIGNAL_LOG, Flight, period_of, read_flight
 
 LEFT_BEHIND = (RESULT_FILE, REPORT_FILE, DOCK_PLOT, *(f"{name}.png" for name in PLOTS))
 """What an earlier flight may have left in a folder, beside the logs, which are written anew."""
@@ -88,7 +89,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
 def judge_logs(
     scenario: Scenario, seed: int, folder: Path, wall_s: float = 0.0, deadline_misses: int = 0, lost_share: float = 0.0
 ) -> Result:
-    """The result of the flight whose logs are in `folder`: what the scenario checks, and that no tick of it is missing.
+    """The result of the flight whose logs are in `folder`: what the scenario checks, that no tick is missing, and that it was flown.
 
     Args:
         wall_s: what the whole run took.
@@ -114,8 +115,19 @@ def judge_logs(
         metrics["unmatched_ticks"] = max(metrics["unmatched_ticks"], float(duration_ns // period_ns - len(flight.firmware["tick"])))
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
-    whole_log = Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"]))
-    return judge(scenario.name, seed, metrics, [*scenario.checks, whole_log])
+    always = [Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"])), *_armed_at_all(scenario, flight, folder)]
+    return judge(scenario.name, seed, metrics, [*scenario.checks, *always])
+
+
+def _armed_at_all(scenario: Scenario, flight: Flight, folder: Path) -> list[Limit]:
+    """That the robot was armed in one tick of its task at least, where the scenario says nothing of it; of a dock one of its bodies."""
+    if any(check.metric == "armed_share" for check in scenario.checks):
+        return []
+    if scenario.task.kind == "dock":
+        bodies = (columns["state"] for name, columns in read_signals(folder / SIGNAL_LOG).items() if name.startswith("/firmware/body"))
+        if any(np.isin(state, list(ARMED)).any() for state in bodies):
+            return []
+    return [Limit("armed_share", low=1.0 / max(1, len(flight.firmware["tick"])))]
 
 
 def wanted_in(scenario: Scenario, flight: Flight, begin_ns: int) -> Poses | None:

@@ -110,6 +110,20 @@ def test_robot_that_does_as_it_likes_fails_the_flight_however_well_it_does_it(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["hover", "dock"])
+def test_robot_that_never_armed_fails_where_nothing_else_is_checked(fly: Fly, deaf: Callable[..., None], name: str) -> None:
+    deaf(Action.ARM)
+    assert failed(fly(dataclasses.replace(shortened(name, 4.0, settle_s=2.0), check=()))) == {"armed_share"}
+
+
+@pytest.mark.slow
+def test_dock_of_which_one_body_is_armed_is_judged_by_its_own_checks(fly: Fly) -> None:
+    result = fly(shortened("dock-vertical-blind", 4.0))
+    assert result.passed and result.metrics["armed_share"] < 0.1
+    assert "armed_share" not in {check.name for check in result.checks}
+
+
+@pytest.mark.slow
 def test_undock_that_is_not_heard_and_a_move_that_is_not_flown_are_no_success(fly: Fly, deaf: Callable[..., None]) -> None:
     deaf(Action.UNDOCK, Action.TRACK)
     assert "docked" in failed(fly(shortened("dock-undock-dock", 60.0), 3))
