@@ -50,13 +50,15 @@ class Check(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What a run came to, as result.json holds it."""
+    """What a run came to, as result.json holds it, less `told`."""
 
     scenario: str
     seed: int
     passed: bool
     metrics: dict[str, float]
     checks: tuple[Check, ...]
+    told: tuple[str, ...] = ()
+    """Warnings of the firmware, a line each (hil.metrics.told)."""
 
 
 def limit_text(low: float, high: float) -> str:
@@ -78,15 +80,18 @@ def check_metrics(metrics: Mapping[str, float], limits: Iterable[Bounds]) -> tup
     return tuple(checks)
 
 
-def judge(scenario: str, seed: int, metrics: Mapping[str, float], limits: Iterable[Bounds]) -> Result:
+def judge(scenario: str, seed: int, metrics: Mapping[str, float], limits: Iterable[Bounds], told: tuple[str, ...] = ()) -> Result:
     """The result of a run: passed when every check passed and there is at least one."""
     checks = check_metrics(metrics, limits)
-    return Result(scenario, seed, bool(checks) and all(c.passed for c in checks), dict(metrics), checks)
+    return Result(scenario, seed, bool(checks) and all(c.passed for c in checks), dict(metrics), checks, told)
 
 
 def write_result(result: Result, folder: Path) -> Path:
     """Write result.json into `folder`; NaN and infinity, which JSON lacks, become null. Returns its path."""
-    plain = result._asdict() | {
+    plain = {
+        "scenario": result.scenario,
+        "seed": result.seed,
+        "passed": result.passed,
         "metrics": {name: _number(value) for name, value in result.metrics.items()},
         "checks": [
             {"name": check.name, "value": _number(check.value), "limit": check.limit, "passed": check.passed}

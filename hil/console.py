@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,6 +19,8 @@ from hil.metrics import SHOWN, metric_order, shown_limit, shown_value
 
 TOLD = ("position_rmse_m", "attitude_rmse_rad")
 """Metrics of a campaign for which it is said what they go with."""
+TOLD_LINES = 6
+"""Warnings of a run that are shown."""
 
 
 class Advance(Protocol):
@@ -139,10 +141,18 @@ def result_table(result: Result) -> Table:
     return table
 
 
+def told_lines(told: Sequence[str]) -> list[str]:
+    """The first warnings of the firmware under a heading, and how many more there are; nothing where there is none."""
+    more = [f"  and {len(told) - TOLD_LINES} more"] if len(told) > TOLD_LINES else []
+    return ["warnings of the firmware:", *(f"  {line}" for line in told[:TOLD_LINES]), *more] if told else []
+
+
 def print_result(result: Result, report: Path | None = None, console: Console | None = None) -> None:
-    """The table, the verdict in one line, and where the report is."""
+    """The table, what the firmware warned of, the verdict in one line, and where the report is."""
     console = console or Console()
     console.print(result_table(result))
+    for line in told_lines(result.told):
+        console.print(line, highlight=False, markup=False)
     failed = [SHOWN[c.name].label if c.name in SHOWN else c.name for c in result.checks if not c.passed]
     verdict = f"FAILED: {'; '.join(failed)}" if failed else "passed" if result.passed else "FAILED: nothing was checked"
     console.print(verdict, style="green" if result.passed else "bold red", highlight=False)

@@ -22,7 +22,7 @@ from hil.checks import RESULT_FILE, Limit, Result, judge, write_result
 from hil.dock_plot import DOCK_PLOT, write_dock_plot
 from hil.docking_metrics import docking_metrics
 from hil.force_metrics import force_metrics
-from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics
+from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics, told
 from hil.plant.spec import Tank
 from hil.plots import PLOTS, Window, write_plots
 from hil.realtime import fly_in_real_time
@@ -116,7 +116,7 @@ def judge_logs(
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
     always = [Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"])), *_armed_at_all(scenario, flight, folder)]
-    return judge(scenario.name, seed, metrics, [*scenario.checks, *always])
+    return judge(scenario.name, seed, metrics, [*scenario.checks, *always], told(whole.events, start_of(whole)))
 
 
 def _armed_at_all(scenario: Scenario, flight: Flight, folder: Path) -> list[Limit]:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.rotations import rotate
+from firmware_py.description.signals import Columns
 from hil.checks import UNBOUNDED, limit_text
 from hil.signals import Flight
 
@@ -189,6 +190,19 @@ def warnings(severity: np.ndarray, text: np.ndarray) -> int:
     """Events of syslog severity warning or worse in the whole flight. That arming waits for the first tags is none."""
     waiting = np.char.startswith(text, "ARM refused") if text.size else np.zeros(0, bool)
     return int(np.count_nonzero((severity <= WARNING) & ~waiting))
+
+
+def told(events: Columns, start_ns: int) -> tuple[str, ...]:
+    """Events of syslog severity warning or worse, each text once, in their order: `1.0 s: ARM refused: no pose yet (12 x)`.
+
+    Args:
+        events: of the whole flight. start_ns: from when time counts.
+    """
+    grave = events["severity"] <= WARNING
+    texts, first, counts = np.unique(events["text"][grave], return_index=True, return_counts=True)
+    at_s = 1e-9 * (events["log_time"][grave][first] - start_ns)
+    times = [f" ({count} x)" if count > 1 else "" for count in counts]
+    return tuple(f"{at_s[i]:.1f} s: {texts[i]}{times[i]}" for i in np.argsort(first))
 
 
 def nis_mean(nis: np.ndarray, dof: np.ndarray) -> float:

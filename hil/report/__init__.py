@@ -84,6 +84,7 @@ def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plo
         "headline": _headline(result, scene),
         "tiles": _tiles(result),
         "table": _table(result),
+        "told": _told(result.told),
         "plots": "\n".join(_plot(path) for path in plots),
         "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in (NOT_MEASURED, *scene.notes)),
         "style": _asset("style.css"),
@@ -196,6 +197,12 @@ def _table(result: Result) -> str:
         cells = (f"<td>{html.escape(label)}</td>", f'<td class="n">{html.escape(value)}</td>')
         rows.append(f'<tr>{"".join(cells)}<td class="n">{html.escape(limit)}</td><td>{verdict}</td></tr>')
     return "\n".join(rows)
+
+
+def _told(told: Sequence[str]) -> str:
+    """Warnings of the firmware, under the table; nothing where there is none."""
+    lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in told)
+    return f"<h3>Warnings of the firmware</h3>\n<ul>\n{lines}\n</ul>" if told else ""
 
 
 def _plot(path: Path) -> str:

@@ -17,7 +17,7 @@ from rich.console import Console
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import Limit, Result, judge
 from hil.console import flight_progress, print_result
-from hil.metrics import SHOWN, flight_metrics, metric_order, shown_limit, shown_value
+from hil.metrics import SHOWN, flight_metrics, metric_order, shown_limit, shown_value, told
 from hil.plots import STYLE, Window, disturbance, estimate, overview, thrusters, write_plots
 from hil.report import CAPTIONS, Scene, animation, write_report
 from hil.signals import Flight, read_flight
@@ -198,6 +198,21 @@ def test_terminal_table_names_the_check_that_failed(result: Result) -> None:
     assert "FAILED: Position RMSE, truth against reference" in text
     assert "spiral, seed 7" in text
     assert "report: out/report.html" in text
+
+
+def test_table_and_report_say_what_the_firmware_warned_of(flight: Flight, result: Result, tmp_path: Path) -> None:
+    texts = ["ARM refused: no pose yet", "armed", "ARM refused: no pose yet", *(f"thruster {i} <weak>" for i in range(7))]
+    severity, times = np.array([4, 6, 4] + [3] * 7), START_NS + 500_000_000 * np.arange(2, 12)
+    lines = told({"severity": severity, "text": np.array(texts), "log_time": times}, START_NS)
+    assert lines[:2] == ("1.0 s: ARM refused: no pose yet (2 x)", "2.5 s: thruster 0 <weak>") and len(lines) == 8
+    warned, console = result._replace(told=lines), Console(file=io.StringIO(), width=100)
+    print_result(warned, None, console)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "warnings of the firmware:\n  1.0 s: ARM refused: no pose yet (2 x)\n" in shown
+    assert "thruster 4" in shown and "thruster 5" not in shown and "and 2 more" in shown
+    page = write_report(tmp_path, warned, flight, scene(), []).read_text()
+    assert "<li>5.5 s: thruster 6 &lt;weak&gt;</li>" in page
+    assert "Warnings of the firmware</h3>" not in write_report(tmp_path, result, flight, scene(), []).read_text()
 
 
 def test_progress_is_silent_where_nobody_looks() -> None:
