@@ -133,6 +133,17 @@ def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:
             yield keys, f"no module has the number {number}; {every} {', '.join(map(str, numbers))}"
 
 
+def _in_tags(scenario: Scenario) -> Iterator[Mistake]:
+    """Cameras read the tags of `tags` alone. Without a camera or tags nobody is to be seen, nor is a vehicle that carries none."""
+    if not scenario.camera or not scenario.tags:
+        return
+    for i, module in enumerate(scenario.module):
+        carried = [tag.id for tag in load_vehicle(module.vehicle).tag]
+        if carried and not set(carried) & set(scenario.tags):
+            has = ", ".join(map(str, carried))
+            yield ("module", i, "vehicle"), f"{module.vehicle} has no tag of tags = {list(scenario.tags)}; it has {has}"
+
+
 def _thrusters(scenario: Scenario) -> dict[int, int]:
     """How many each module has, by its number. Raises DescriptionError where a vehicle is none."""
     counts = {vehicle: len(load_vehicle(vehicle).thruster) for vehicle in {module.vehicle for module in scenario.module}}
@@ -166,6 +177,7 @@ def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
 
 
 RULES = (
-    _in_name, _in_numbers, _in_polycube, _in_steps, _in_file, _in_bodies, _in_tank, _in_start, _in_mentions, _in_faults, _in_checks
+    _in_name, _in_numbers, _in_polycube, _in_steps, _in_file, _in_bodies, _in_tank, _in_start, _in_mentions, _in_tags,
+    _in_faults, _in_checks,
 )  # fmt: skip
 """The first that finds a mistake is heard first."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import re
 import shutil
 from collections.abc import Callable
 from importlib import resources
@@ -134,6 +135,35 @@ def test_mistake_is_refused_before_the_flight(load: Load, tmp_path: Path, name: 
 )  # fmt: skip
 def test_fault_at_the_edge_of_what_it_takes_is_flown(load: Load, name: str, fault: str) -> None:
     assert len(load(name, "", f"[[fault]]\nkind = {fault}").fault) == 1
+
+
+@pytest.fixture
+def lone_tag(tmp_path: Path) -> str:
+    """A vehicle whose only tag is on its front."""
+    vehicle = (FOLDER.parents[1] / "firmware_py" / "vehicles" / "modcube.toml").read_text(encoding="utf-8")
+    first, second = (part.start() for part in list(re.finditer(r"^\[\[tag\]\]", vehicle, re.MULTILINE))[:2])
+    assert first < second
+    (tmp_path / "octo.toml").write_text(vehicle[:second], encoding="utf-8")
+    return str(tmp_path / "octo.toml")
+
+
+def test_tags_that_a_module_does_not_carry_are_refused(load: Load, lone_tag: str) -> None:
+    with pytest.raises(DescriptionError, match=r"module\[1\]\.vehicle: .*octo\.toml has no tag of tags = \[5\]; it has 0$"):
+        load("dock", SECOND, SECOND.replace("modcube", lone_tag))
+
+
+@pytest.mark.parametrize(("old", "new"), [
+    ("[tank]", "tags = [0, 5]\n[tank]"), ("[tank]", "tags = []\n[tank]"),
+    ("[[camera]]              # above the tank, looking down\nposition_m = [0.0, 0.0, -1.2]\naxis = [0.0, 0.0, 1.0]\n", ""),
+], ids=["carried", "none", "no_camera"])  # fmt: skip
+def test_robot_that_is_not_to_be_seen_is_flown(load: Load, lone_tag: str, tmp_path: Path, old: str, new: str) -> None:
+    load("hover", old, new)
+    (tmp_path / "hover.toml").write_text((tmp_path / "hover.toml").read_text().replace('"modcube"', f'"{lone_tag}"'))
+    assert load_scenario(str(tmp_path / "hover.toml")).module[0].vehicle == lone_tag
+
+
+def test_vehicle_without_tags_is_flown(load: Load) -> None:
+    assert load("hover", '"modcube"', '"girona500"').module[0].vehicle == "girona500"
 
 
 def test_line_of_the_mistake_is_named(load: Load, tmp_path: Path) -> None:
