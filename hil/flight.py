@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import math
 import os
@@ -97,7 +98,7 @@ def judge_logs(
     """
     whole = read_flight(folder)
     period_ns, duration_ns = period_of(whole.ticks), round(scenario.task.duration_s * 1e9)
-    begin_ns = start_of(whole) + math.ceil(round(scenario.task.settle_s * 1e9) / period_ns) * period_ns
+    begin_ns = begin_of(scenario, whole)
     flight = whole.between(begin_ns, begin_ns + duration_ns)
     share = len(flight.firmware["tick"]) / len(whole.firmware["tick"])
     vehicle = load_vehicle(scenario.module[0].vehicle)
@@ -139,6 +140,24 @@ def wanted_in(scenario: Scenario, flight: Flight, begin_ns: int) -> Poses | None
     return Poses(np.array([pose.p_wb for pose in poses]).reshape(-1, 3), np.array([pose.q_wb for pose in poses]).reshape(-1, 4))
 
 
+def as_wanted(scenario: Scenario, flight: Flight) -> Flight:
+    """The same with what the task wants in place of the firmware's own set-points, in the ticks that are judged by it."""
+    begin_ns = begin_of(scenario, flight)
+    time_ns = flight.firmware["time_ns"]
+    judged = (time_ns >= begin_ns) & (time_ns <= begin_ns + round(scenario.task.duration_s * 1e9))
+    if (wanted := wanted_in(scenario, flight, begin_ns)) is None:
+        return flight
+    points = {"setpoint_p_wb": wanted.p_wb, "setpoint_q_wb": wanted.q_wb}
+    changed = {name: np.where(judged[:, None], value, flight.firmware[name]) for name, value in points.items()}
+    return dataclasses.replace(flight, firmware=flight.firmware | changed)
+
+
+def begin_of(scenario: Scenario, flight: Flight) -> int:
+    """Time of the first tick that is not before the task, ns."""
+    period_ns = period_of(flight.ticks)
+    return start_of(flight) + math.ceil(round(scenario.task.settle_s * 1e9) / period_ns) * period_ns
+
+
 def start_of(flight: Flight) -> int:
     """Time of the start of a run, one tick before its first, ns; also where the first ticks are not in the log."""
     return int(flight.ticks["time_ns"][0] - flight.ticks["tick"][0] * period_of(flight.ticks))
@@ -146,8 +165,8 @@ def start_of(flight: Flight) -> int:
 
 def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
     """Writes plots and report.html of the run in `folder`; returns the report's path."""
-    flight = read_flight(folder)
     scenario = scenario.for_seed(result.seed)
+    flight = as_wanted(scenario, read_flight(folder))
     scene = _scene(scenario, flight)
     plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm)
     plots += write_dock_plot(folder, start_of(flight))
@@ -157,8 +176,7 @@ def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
 def _scene(scenario: Scenario, flight: Flight) -> Scene:
     vehicles = tuple(load_vehicle(module.vehicle) for module in scenario.module)
     vehicle = vehicles[0]
-    first_s = float(flight.firmware["time_ns"][0] - start_of(flight)) * 1e-9
-    begin_s = scenario.task.settle_s - first_s
+    begin_s = float(begin_of(scenario, flight) - flight.firmware["time_ns"][0]) * 1e-9
     return Scene(
         title=scenario.name.capitalize(),
         description=scenario.help,

@@ -171,7 +171,7 @@ def flight_metrics(
         "thrust_rate_rms_n_s": rate_rms(firmware["commanded_n"], period_s),
         "supply_power_w": float(np.sum([module["power_w"] for module in flight.modules], axis=0).mean()),
         "wrench_margin_min": float(np.fmin.reduce(firmware["wrench_margin"])),
-        "tags_rejected": float(np.maximum(np.diff(firmware["rejected"]), 0).sum()),  # a body that joins or parts counts anew
+        "tags_rejected": float(refused(firmware["rejected"])),
         "warnings": float(warnings(flight.events["severity"], flight.events["text"])),
         "duration_s": duration_s,
         "real_time_factor": duration_s / wall_s if wall_s > 0.0 else 0.0,
@@ -203,6 +203,11 @@ def told(events: Columns, start_ns: int) -> tuple[str, ...]:
     at_s = 1e-9 * (events["log_time"][grave][first] - start_ns)
     times = [f" ({count} x)" if count > 1 else "" for count in counts]
     return tuple(f"{at_s[i]:.1f} s: {texts[i]}{times[i]}" for i in np.argsort(first))
+
+
+def refused(rejected: np.ndarray) -> int:
+    """Tag observations that the gate refused over these ticks, of the filter's count, which a body that joins or parts begins anew."""
+    return int(np.maximum(np.diff(rejected), 0).sum())
 
 
 def nis_mean(nis: np.ndarray, dof: np.ndarray) -> float:

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.metrics import rotation_vectors
+from hil.metrics import nis_mean, refused, rotation_vectors
 from hil.signals import Flight
 
 TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
 """One colour per kind of signal in every plot (Okabe and Ito's palette, safe for colour-blind readers)."""
 PLOTS = ("overview", "position", "attitude", "estimate", "thrusters", "disturbance")
 """Names of the files, without .png."""
+ROUNDING_S = 1e-6
 AXIS_COLOURS = ("#cc3311", "#009988", "#0077bb")
 STYLE: dict[str, Any] = {
     "font.size": 10,
@@ -203,15 +204,15 @@ def estimate(flight: Flight, window: Window) -> Any:
             _finish_time_axis(cell, flight, window)
     cells[0, 0].set_title("Position: estimate against truth")
     cells[0, 1].set_title("Attitude: estimate against truth")
-    _innovation(cells[3, 0], flight)
-    _tag_age(cells[3, 1], flight)
+    _innovation(cells[3, 0], flight, window)
+    _tag_age(cells[3, 1], flight, window)
     for cell in cells[3]:
         _finish_time_axis(cell, flight, window, last=True)
     _legends_below(figure, cells[0, :1])
     return figure
 
 
-def _innovation(axes: Any, flight: Flight) -> None:
+def _innovation(axes: Any, flight: Flight, window: Window) -> None:
     title = "Tag innovation squared over its expectation"
     used = flight.firmware["nis_dof"] > 0
     if not used.any():
@@ -220,15 +221,16 @@ def _innovation(axes: Any, flight: Flight) -> None:
     ratio = flight.firmware["nis"][used] / flight.firmware["nis_dof"][used]
     axes.plot(flight.time_s[used], ratio, ".", color=TRUTH, markersize=2.0, alpha=0.5)
     axes.axhline(1.0, color=REFERENCE, linestyle="--", linewidth=1.2)
-    axes.set_title(f"{title}: mean {np.mean(ratio):.2f}")
+    inside = _inside(flight, window)
+    axes.set_title(f"{title}: mean {nis_mean(flight.firmware['nis'][inside], flight.firmware['nis_dof'][inside]):.2f}")
     axes.set(ylabel="NIS / dof")
     axes.set_ylim(bottom=0.0)
 
 
-def _tag_age(axes: Any, flight: Flight) -> None:
+def _tag_age(axes: Any, flight: Flight, window: Window) -> None:
     age_ms = flight.firmware["tag_age_ns"] / 1e6
     axes.plot(flight.time_s, np.where(age_ms < 1e4, age_ms, np.nan), color=COMMAND, linewidth=0.8)
-    axes.set_title(f"Age of the last accepted tag; refused: {int(flight.firmware['rejected'][-1])}")
+    axes.set_title(f"Age of the last accepted tag; refused: {refused(flight.firmware['rejected'][_inside(flight, window)])}")
     axes.set(ylabel="ms")
     axes.set_ylim(bottom=0.0)
 
@@ -291,7 +293,8 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _inside(flight: Flight, window: Window) -> np.ndarray:
-    return (flight.time_s >= window.start_s) & (flight.time_s <= window.end_s)
+    """(k,) ticks that are judged; seconds carry rounding, ticks are far longer."""
+    return (flight.time_s >= window.start_s - ROUNDING_S) & (flight.time_s <= window.end_s + ROUNDING_S)
 
 
 def _limit_to_window(axes: Any, flight: Flight, window: Window, values: np.ndarray) -> None:

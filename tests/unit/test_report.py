@@ -17,9 +17,11 @@ from rich.console import Console
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import Limit, Result, judge
 from hil.console import flight_progress, print_result
+from hil.flight import as_wanted, wanted_in
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown_limit, shown_value, told
 from hil.plots import STYLE, Window, disturbance, estimate, overview, thrusters, write_plots
 from hil.report import CAPTIONS, Scene, animation, write_report
+from hil.scenario import load_scenario
 from hil.signals import Flight, read_flight
 from tests.unit.flights import START_NS, write_flight, write_pair
 
@@ -118,6 +120,27 @@ def test_report_of_a_failed_flight_says_so(flight: Flight, result: Result, tmp_p
 def test_markup_in_a_title_stays_text(flight: Flight, result: Result, tmp_path: Path) -> None:
     page = write_report(tmp_path, result, flight, scene("<script>alert(1)</script>"), []).read_text()
     assert "<script>alert" not in page
+
+
+def test_plots_judge_a_robot_that_does_not_follow_as_the_table_does(flight: Flight) -> None:
+    """By the same reference, which it was not told, and over the same ticks."""
+    hover = load_scenario("hover")
+    task = dataclasses.replace(hover.task, settle_s=START_NS / 1e9, duration_s=WINDOW.end_s - WINDOW.start_s)
+    scenario = dataclasses.replace(hover, task=task)
+    before = flight.firmware["time_ns"] < START_NS
+    strays = {"rejected": np.where(before, 7 * np.arange(len(before)), 10_000), "nis": np.where(before, 50.0, flight.firmware["nis"])}
+    strays["rejected"][-100:] += 3
+    whole = dataclasses.replace(flight, firmware=flight.firmware | strays)
+    judged = whole.between(START_NS, START_NS + round(task.duration_s * 1e9))
+    metrics = flight_metrics(judged, wanted=wanted_in(scenario, judged, START_NS))
+    shown = as_wanted(scenario, whole)
+    labels = [text.get_text() for axes in overview(shown, WINDOW, TANK_M, None).axes[1:] for text in axes.get_legend().get_texts()]
+    assert labels == [f"RMSE {shown_value(name, metrics[name])}" for name in ("position_rmse_m", "attitude_rmse_rad")]
+    np.testing.assert_array_equal(shown.firmware["setpoint_p_wb"][before], flight.firmware["setpoint_p_wb"][before])
+    titles = [axes.get_title(loc="left") or axes.get_title() for axes in estimate(shown, WINDOW).axes]
+    assert f"Tag innovation squared over its expectation: mean {metrics['nis_mean']:.2f}" in titles
+    assert metrics["tags_rejected"] == 3.0 and "Age of the last accepted tag; refused: 3" in titles
+    pyplot.close("all")
 
 
 def test_animation_follows_the_true_robot(flight: Flight) -> None:
