@@ -108,6 +108,7 @@ def _lissajous(task: Task, start: Setpoint) -> paths.Trajectory:
 def _waypoints(task: Task, start: Setpoint) -> paths.Trajectory:
     """The path of the file as it is: what does not fit its limits, its task or the start is refused, not stretched."""
     mission = _from_start(read_mission(task.file_text, task.file), start)
+    _refuse_unbounded(mission, task.file)
     try:
         path = mission.plan(stretch=False)
     except ValueError as error:
@@ -121,6 +122,17 @@ def _waypoints(task: Task, start: Setpoint) -> paths.Trajectory:
     if path.duration_s > task.duration_s + LONGER_S:
         raise DescriptionError(f"{task.file}: the path takes {path.duration_s:.7g} s, longer than task.duration_s, {task.duration_s:g} s")
     return path
+
+
+def _refuse_unbounded(mission: Mission, file: str) -> None:
+    """Raises DescriptionError for a file that leaves free how long its path takes."""
+    limits = mission.limits.limits()
+    bounds = (limits.velocity, limits.acceleration, limits.angular_rate, limits.angular_acceleration)
+    if mission.duration_s > 0.0 or mission.waypoint[-1].duration_s > 0.0 or any(bound is not None for bound in bounds):
+        return
+    if file.lower().endswith(".csv"):
+        raise DescriptionError(f"{file}: has no durations; add the column duration_s, or write a .toml with [limits]")
+    raise DescriptionError(f"{file}: has no durations; add duration_s, or [limits] with velocity_m_s or acceleration_m_s2")
 
 
 def _from_start(mission: Mission, start: Setpoint) -> Mission:

@@ -95,7 +95,7 @@ def plan(
     if durations_s is None and not request.bounds_speed():
         raise ValueError(
             "free durations need a limit that this path meets, on velocity or acceleration where it moves, "
-            "on angular rate or acceleration where it turns; or a body, and a path that moves or turns"
+            "on angular rate or acceleration where it turns"
         )
     return _fit(request, base, free=durations_s is None)
 

@@ -273,7 +273,8 @@ def test_scenario_flies_the_same_path_where_its_file_is_not(tmp_path: Path) -> N
         ("path.csv", "0.1,-0.2", "0.1,north", "path.csv:3: y_m: 'north' is not a number"),
         ("path.csv", ",20", ",", "path.csv: waypoint 1 lacks duration_s"),
         ("path.csv", "0.5,,,,,20", "0.5,,,,,20,3", "path.csv:3: has more columns than the header"),
-        ("path.toml", "[limits]\nvelocity_m_s = [0.05, 0.05, 0.05]", "", "path.toml: free durations need a limit"),
+        ("path.toml", "[limits]\nvelocity_m_s = [0.05, 0.05, 0.05]", "", "path.toml: has no durations; add duration_s, or [limits] with v"),
+        ("path.toml", "velocity_m_s = [0.05, 0.05, 0.05]", "angular_rate_rad_s = 1.0", "limit that this path meets, on velocity or "),
         ("path.toml", "\n[limits]", "duration_s = 9.0\n[limits]", "path.toml: no trajectory in 9.00 s keeps the velocity along x within"),
         ("path.toml", "0.05]", "0.05", "path.toml: not valid TOML: "),
         ("path.toml", "position_m = [0.2", "place_m = [0.2", "path.toml:7: waypoint[1].place_m: unknown key"),
@@ -289,6 +290,12 @@ def test_path_that_does_not_fit_is_refused_before_the_flight(tmp_path: Path, nam
     assert refusal in str(refused.value)
     assert str(refused.value).startswith(name)
     assert "\n" not in str(refused.value)
+
+
+def test_points_without_durations_are_refused_with_what_their_file_can_give(tmp_path: Path) -> None:
+    text = "x_m,y_m,z_m\n-0.3,-0.25,0.55\n0.1,-0.2,0.5\n"
+    with pytest.raises(DescriptionError, match=r"path\.csv: has no durations; add the column duration_s, or write a \.toml with"):
+        flown(waypoints(tmp_path, text))
 
 
 def test_bodies_that_would_start_one_inside_the_other_are_refused() -> None:
