@@ -10,12 +10,15 @@ import typer
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
 from hil.bench import DEFAULT_BUS
+from hil.plant.world import STEP_NS
 from hil.scenario import Scenario, load_scenario, scenario_names
 
 app = typer.Typer(help="The bench: the firmware against a simulated plant on the same CAN bus.", no_args_is_help=True)
 
 FAILED = 1
 """Exit status when a check failed."""
+RATES_HZ = tuple(rate for rate in range(50, 401) if 1_000_000_000 % (rate * STEP_NS) == 0)
+"""Ticks a second whose period is whole sub-steps of the plant."""
 
 ScenarioName = Annotated[str, typer.Argument(help="name of a scenario (`modcube hil list`), or a .toml file")]
 Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, paper_sequence, or a file of parameters")]
@@ -43,6 +46,13 @@ def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
     return scenario.with_vehicle(vehicle) if vehicle else scenario
 
 
+def check_rate(rate_hz: int) -> None:
+    """Raises DescriptionError for a rate whose ticks are not whole sub-steps of the plant."""
+    if rate_hz not in RATES_HZ:
+        why = f"a tick is no whole number of the plant's sub-steps of {1e-6 * STEP_NS:g} ms"
+        raise DescriptionError(f"--rate {rate_hz}: {why}; it takes {', '.join(map(str, RATES_HZ))}")
+
+
 def check_reaches_others(bus: str, who: str, kinds: tuple[str, ...] = ("virtual:",)) -> None:
     """Raises DescriptionError where a bus of those kinds ends with its process, and `who` needs another process at its other end."""
     if bus.startswith(kinds):
@@ -66,6 +76,7 @@ def run(
     from hil.console import flight_progress, print_result
     from hil.flight import fly_and_judge, illustrate
 
+    check_rate(rate_hz)
     chosen = scenario_of(scenario, vehicle, sensors)
     parameters = parameters_of(controller)
     folder = out if out is not None else Path("runs") / chosen.name
@@ -155,6 +166,7 @@ def plant(
     """Run the simulated plant alone, in real time, until SIGINT or SIGTERM: the other end of `modcube run`."""
     from hil.plant_process import serve_until_signal
 
+    check_rate(rate_hz)
     check_reaches_others(bus, "the plant alone")
     serve_until_signal(load_scenario(scenario).for_seed(seed), seed, bus, rate_hz, out)
 

@@ -93,6 +93,18 @@ def test_plant_alone_serves_the_modules_of_its_seed(monkeypatch: pytest.MonkeyPa
     assert min(served) > 1
 
 
+@pytest.mark.parametrize("command", [["run", "hover"], ["plant", "hover", "--bus", "udp:239.74.163.9:43119"]], ids=["run", "plant"])
+def test_rate_that_the_plant_cannot_follow_is_refused_with_those_that_it_can(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(hil.plant_process.PlantProcess, "serve", lambda *_: None)
+    assert status_of([*command, "--out", str(tmp_path / "run"), "--rate", "120"], monkeypatch) == 2
+    line = capsys.readouterr().err
+    assert "--rate 120: a tick is no whole number of the plant's sub-steps of 2.5 ms; it takes 50, 80, 100, 200, 400" in line
+    assert line.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
 def test_what_only_lockstep_can_break_is_refused_in_real_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -121,11 +133,12 @@ REALTIME = pytest.param(["--realtime", "--bus", "udp:239.74.163.9:43127"], marks
     [
         ("", "", ["--vehicle", "nautilus"], "vehicle 'nautilus' is unknown"),
         ("", "", ["--vehicle", "no_mesh.toml"], "none.stl: there is no such mesh"),
+        ("", "", ["--rate", "120"], "--rate 120"),
         ("", "", ["--bus", "socketcan:can9"], "there is no such interface"),
         ("[task]", f"{NEAR}\n[task]", [], "modules 1 and 2 start 0.1 m apart, one inside the other"),
         ('kind = "hover"', 'kind = "waypoints"\nfile = "points.csv"', [], "points.csv:3: y_m: 'north' is not a number"),
     ],
-    ids=["vehicle", "mesh", "bus", "overlap", "waypoints"],
+    ids=["vehicle", "mesh", "rate", "bus", "overlap", "waypoints"],
 )
 def test_refused_flight_leaves_the_one_before_as_it_was(
     realtime: list[str], old: str, new: str, options: list[str], why: str,
