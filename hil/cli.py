@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -119,7 +122,7 @@ def campaign(
     unusual = [Path(given).stem for given, usual in ((vehicle, ""), (controller, "modcube"), (sensors, "real")) if given != usual]
     folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual, "campaign"])
     parameters, seeds = parameters_of(controller), range(seed, seed + trials)
-    with campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
+    with _told_that_it_goes_on(), campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
         pool = dask_cluster(dask) if dask else processes(jobs)
         summary = run_campaign(chosen, parameters, seeds, pool, folder, progress)
     print_campaign(summary)
@@ -127,6 +130,16 @@ def campaign(
         again = folder / f"seed-{worst}"
         print(f"seed {worst}: {illustrate(chosen, fly_and_judge(chosen, worst, parameters, again, DEFAULT_BUS), again)}")
     raise typer.Exit(0 if summary["succeeded"] == summary["trials"] else FAILED)
+
+
+@contextmanager
+def _told_that_it_goes_on() -> Iterator[None]:
+    """Says so when it is interrupted."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("modcube: interrupted; the same command goes on where it was", file=sys.stderr)
+        raise
 
 
 FAULT_OPTIONS = ("scenario", "jobs", "seed", "out")

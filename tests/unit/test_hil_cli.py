@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 
+import hil.campaign
 import hil.fault_campaign
 import hil.plant_process
+from firmware_py.__main__ import INTERRUPTED
 from firmware_py.cli import main
 from hil.fault_campaign import Cell
 from hil.flight import LEFT_BEHIND
@@ -51,6 +53,17 @@ def test_matrix_of_faults_refuses_what_it_does_not_take(
 def test_matrix_of_faults_takes_the_others(flown: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert status_of(["campaign", "faults", "--jobs", "3", "--seed", "5", "--out", str(tmp_path)], monkeypatch) == 0
     assert flown == [(3, tmp_path, 5)]
+
+
+def test_interrupted_campaign_says_that_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(hil.campaign, "run_campaign", interrupt)
+    assert status_of(["campaign", "hover", "--out", str(tmp_path)], monkeypatch) == INTERRUPTED
+    assert capsys.readouterr().err == "modcube: interrupted; the same command goes on where it was\n"
 
 
 @pytest.mark.parametrize(("bus", "why"), [
