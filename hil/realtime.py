@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -21,6 +22,7 @@ from firmware_py.app.vehicle import recording
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Outputs, Request
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, read_libraries, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
@@ -56,8 +58,11 @@ def serve_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path
     """The plant's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     plant = PlantProcess(scenario, seed, rate_hz, out)
-    with real_time(PLANT_PRIORITY - 1):
-        serve_between(handshake, plant, bus, threading.Event())
+    try:
+        with real_time(PLANT_PRIORITY - 1):
+            serve_between(handshake, plant, bus, threading.Event())
+    except DescriptionError as error:
+        sys.exit(f"modcube: {error}")
 
 
 def serve_between(handshake: Handshake, plant: PlantProcess, bus: str, arrival: threading.Event) -> None:
@@ -125,8 +130,11 @@ def fly_in_real_time(
             return script.requests(time_ns - start_ns, last)
 
         def stop_at_end(tick: int, outputs: Outputs) -> bool:
-            if progress is not None and tick % rate_hz == 0:
-                progress(tick / rate_hz)
+            if tick % rate_hz == 0:
+                if not plant.is_alive():
+                    raise DescriptionError("the plant's process has ended, and the flight with it")
+                if progress is not None:
+                    progress(tick / rate_hz)
             return tick >= script.ticks
 
         refused = stack.enter_context(real_time())

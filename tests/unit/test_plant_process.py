@@ -1,14 +1,17 @@
 """The plant in a process of its own: what is wrong on its bus is as wrong as in lockstep, tick for tick."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
 from firmware_py.bus.codec import Codec, Frame
+from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults
 from hil.nodes import make_nodes
 from hil.plant.fault_spec import Fault
 from hil.plant_process import PlantProcess
+from hil.reference_node.plant import SocketPlant
 from hil.scenario import load_scenario, make_world
 
 PERIOD_NS = 10_000_000
@@ -17,6 +20,8 @@ CODEC = Codec.load()
 
 class Sent:
     """A port that keeps what is sent."""
+
+    address = "virtual:sent"
 
     def __init__(self) -> None:
         self.frames: list[Frame] = []
@@ -52,3 +57,35 @@ def test_fault_is_per_tick_as_in_lockstep(fault: Fault) -> None:
         for frame in tick_of(k):
             plant._answer(port, frame)  # type: ignore[arg-type]
     assert sorted(frame.id for frame in port.frames) == sorted(lockstep)
+
+
+def status_of(module: int, k: int) -> Frame:
+    return CODEC.message("MCU_STATUS").encode(module, [k, 1, 0, 2], k)
+
+
+def test_plant_refuses_a_bus_on_which_somebody_else_answers_as_its_module() -> None:
+    plant, port = PlantProcess(load_scenario("hover"), 0, 100, None), Sent()
+    plant._answer(port, status_of(2, 1))  # type: ignore[arg-type]
+    for k in range(1, 100):
+        for frame in tick_of(k):
+            plant._answer(port, frame)  # type: ignore[arg-type]
+    words = r"^somebody else answers as module 1 on virtual:sent: another plant, or the robot itself; end it, or take another --bus$"
+    with pytest.raises(DescriptionError, match=words):
+        plant._answer(port, status_of(1, 99))  # type: ignore[arg-type]
+
+
+def test_plant_that_serves_already_is_not_ended_by_another_that_comes() -> None:
+    plant, port = PlantProcess(load_scenario("hover"), 0, 100, None), Sent()
+    for k in range(1, 101):
+        for frame in tick_of(k):
+            plant._answer(port, frame)  # type: ignore[arg-type]
+    answered = len(port.frames)
+    plant._answer(port, status_of(1, 100))  # type: ignore[arg-type]
+    plant._answer(port, tick_of(101)[0])  # type: ignore[arg-type]
+    assert len(port.frames) > answered
+
+
+def test_plant_with_the_c_node_is_answered_by_it_on_its_own_bus(tmp_path: Path) -> None:
+    plant, port = SocketPlant(load_scenario("hover"), 0, 100, None, tmp_path / "board"), Sent()
+    plant._answer(port, tick_of(1)[0])  # type: ignore[arg-type]
+    plant._answer(port, status_of(1, 1))  # type: ignore[arg-type]
