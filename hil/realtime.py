@@ -147,6 +147,8 @@ def fly_in_real_time(
         start_ns = loop.clock.now_ns()
         loop.rate_keeper.start(start_ns + fleet.period_ns)
         loop.run(stop_at_end)
+    if plant.exitcode:
+        raise RuntimeError(f"the plant's process ended with status {plant.exitcode}")
     keeper = loop.rate_keeper
     lateness = {
         "p50": keeper.lateness.quantile_ns(0.5),

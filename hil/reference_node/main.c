@@ -124,17 +124,18 @@ static int open_plant(const char *path, long rate_hz)
 
 static void serve(struct node *node, struct board *board)
 {
-    struct pollfd events = {.fd = board->can, .events = POLLIN};
+    struct pollfd events[] = {{.fd = board->can, .events = POLLIN}, {.fd = board->plant}};
     while (!board->is_plant_gone) {
         struct can_frame frame;
-        poll(&events, 1, WATCH_MS);
+        poll(events, 2, WATCH_MS);
+        board->is_plant_gone |= (events[1].revents & (POLLERR | POLLHUP)) != 0;  /* it may end when nothing is told any more */
         while (read(board->can, &frame, sizeof frame) == (ssize_t)sizeof frame) {
             if ((frame.can_id & (CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG)) == 0) {
                 node_take(node, (uint16_t)frame.can_id, frame.data, frame.can_dlc, now_ns());
             }
         }
         node_watch(node, now_ns());
-        if ((events.revents & (POLLERR | POLLHUP)) != 0) {
+        if ((events[0].revents & (POLLERR | POLLHUP)) != 0) {
             usleep(1000 * WATCH_MS);  /* the interface is down */
         }
     }
