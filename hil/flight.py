@@ -36,6 +36,8 @@ LEFT_BEHIND = (RESULT_FILE, REPORT_FILE, DOCK_PLOT, *(f"{name}.png" for name in 
 """What an earlier flight may have left in a folder, beside the logs, which are written anew."""
 LATE_SHARE = 0.01
 """Of the ticks of a run in real time, frames of which may be lost on a bus with others on it."""
+ARMED_AT_ALL = 0.01
+"""Share of the ticks below which a robot has not flown its task."""
 PAPER_RMSE_MM = {"spiral": PAPER_SPIRAL_RMSE_MM}
 """What the paper measured, by the kind of task."""
 
@@ -121,14 +123,14 @@ def judge_logs(
 
 
 def _armed_at_all(scenario: Scenario, flight: Flight, folder: Path) -> list[Limit]:
-    """That the robot was armed in one tick of its task at least, where the scenario says nothing of it; of a dock one of its bodies."""
+    """That the robot was armed at all, where the scenario says nothing of it; of a dock one of its bodies."""
     if any(check.metric == "armed_share" for check in scenario.checks):
         return []
     if scenario.task.kind == "dock":
         bodies = (columns["state"] for name, columns in read_signals(folder / SIGNAL_LOG).items() if name.startswith("/firmware/body"))
         if any(np.isin(state, list(ARMED)).any() for state in bodies):
             return []
-    return [Limit("armed_share", low=1.0 / max(1, len(flight.firmware["tick"])))]
+    return [Limit("armed_share", low=ARMED_AT_ALL)]
 
 
 def wanted_in(scenario: Scenario, flight: Flight, begin_ns: int) -> Poses | None:
