@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from typing import NoReturn
 
 INTERRUPTED = 130
@@ -32,21 +33,18 @@ def run_tool(main: Callable[[], int | None]) -> NoReturn:
 
 @contextmanager
 def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """So many processes. Ctrl-C, which a terminal sends to them too, ends them without a word; what waits for them is not begun."""
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_hear_interrupts) as pool:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited: until a process is set up it hears none
+    """So many processes. Ctrl-C, which a terminal sends to them too, they leave to the tool, which ends them with what they do."""
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by all that is started here
         try:
-            pool.submit(_hear_interrupts)
+            for _ in range(jobs):
+                pool.submit(os.getpid)  # starts a process
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         try:
             yield pool
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for child in active_children():
+                child.terminate()
             raise
-
-
-def _hear_interrupts() -> None:
-    """In a worker."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

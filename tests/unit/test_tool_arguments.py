@@ -84,8 +84,9 @@ from command_line import run_tool, worker_pool
 
 def main() -> None:
     with worker_pool(2) as pool:
+        for _ in range({waited_for}):
+            pool.submit(os.getpid).result()
         busy = [pool.submit(time.sleep, 60.0) for _ in range(9)]
-        time.sleep({after_s})
         os.killpg(0, signal.SIGINT)
         busy[0].result()
 
@@ -95,10 +96,10 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("after_s", [0.0, 2.0])
-def test_interrupt_ends_a_tool_and_its_processes_without_a_word(tmp_path: Path, after_s: float) -> None:
+@pytest.mark.parametrize("waited_for", [0, 2])
+def test_interrupt_ends_a_tool_and_its_processes_without_a_word(tmp_path: Path, waited_for: int) -> None:
     """Of a terminal, which sends it to all of them: while the processes start, and while they work."""
-    (tmp_path / "program.py").write_text(PROGRAM.format(after_s=after_s), encoding="utf-8")
+    (tmp_path / "program.py").write_text(PROGRAM.format(waited_for=waited_for), encoding="utf-8")
     command = [sys.executable, str(tmp_path / "program.py")]
     paths = {**os.environ, "PYTHONPATH": str(TOOLS)}
     ended = subprocess.run(command, env=paths, start_new_session=True, capture_output=True, text=True, timeout=50)
