@@ -118,15 +118,17 @@ def judge_logs(
         metrics["unmatched_ticks"] = max(metrics["unmatched_ticks"], float(duration_ns // period_ns - len(flight.firmware["tick"])))
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
-    always = [Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"])), *_armed_at_all(scenario, flight, folder)]
+    always = [Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"])), *_armed_at_all(scenario, whole, folder)]
     return judge(scenario.name, seed, metrics, [*scenario.checks, *always], told(whole.events, start_of(whole)))
 
 
-def _armed_at_all(scenario: Scenario, flight: Flight, folder: Path) -> list[Limit]:
-    """That the robot was armed at all, where the scenario says nothing of it; of a dock one of its bodies."""
+def _armed_at_all(scenario: Scenario, whole: Flight, folder: Path) -> list[Limit]:
+    """That the robot was armed at all, where the scenario says nothing of it; of a dock one of its bodies, in the `whole` flight."""
     if any(check.metric == "armed_share" for check in scenario.checks):
         return []
     if scenario.task.kind == "dock":
+        if np.isin(whole.firmware["state"], list(ARMED)).any():
+            return []  # the others' logs need not be read
         bodies = (columns["state"] for name, columns in read_signals(folder / SIGNAL_LOG).items() if name.startswith("/firmware/body"))
         if any(np.isin(state, list(ARMED)).any() for state in bodies):
             return []

@@ -311,9 +311,7 @@ def load_scenario(name: str) -> Scenario:
         )
     table, source = read_toml(path)
     scenario: Scenario = build(Scenario, table, source)
-    vehicles = find_vehicles((module.vehicle for module in scenario.module), source)
-    modules = (dataclasses.replace(m, vehicle=vehicle) for m, vehicle in zip(scenario.module, vehicles, strict=True))
-    scenario = dataclasses.replace(scenario, module=tuple(modules))
+    scenario = dataclasses.replace(scenario, module=find_vehicles(scenario.module, source))
     if (mistake := next(mistakes(scenario), None)) is not None:
         raise source.error(*mistake)
     return _with_file_text(scenario, path.parent, source)

@@ -9,13 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 
 import identify_plants
 import near_miss
+from command_line import worker_pool
 
 from firmware_py.description.parameters import CONTROLLERS
 from hil.campaign import run_campaign
@@ -100,7 +99,7 @@ def passed_by(folder: Path) -> Values:
     """Ten thousand near misses seen by the docking detector through real frames."""
     chunks = [range(first, first + CHUNK) for first in range(0, PASSES, CHUNK)]
     total: dict[str, int] = {}
-    with ProcessPoolExecutor(JOBS, mp_context=get_context("spawn")) as pool:
+    with worker_pool(JOBS) as pool:
         for found in pool.map(near_miss.count, chunks):
             total = {key: total.get(key, 0) + value for key, value in found.items()}
     (folder / "passes.json").write_text(json.dumps(total, indent=2) + "\n", encoding="utf-8")

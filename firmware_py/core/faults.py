@@ -34,7 +34,8 @@ FAST_SHARE = 2.0
 FAST_MARGIN = 0.25
 """Share of full speed that it must be off besides: below, deadband and lag explain it."""
 TELLS = 0.3
-"""Weight of one feedback in what an ESC tells of its thruster's force: ten come in a second."""
+"""Weight of one feedback in what an ESC tells of its thruster's force. Ten come in a second (DESIGN's bus), so that 0.3 s are remembered:
+less than the half second of motion that core.missing_thrust judges."""
 
 
 class ThrusterFaults(NamedTuple):

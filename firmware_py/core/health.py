@@ -280,8 +280,15 @@ def is_sticks(argument: object) -> bool:
     return all(len(group) == 3 and all(-1.0 <= value <= 1.0 for value in group) for group in argument)
 
 
+def beyond(p_w: np.ndarray, fence: Fence) -> dict[str, float]:
+    """How far a place (3,) is beyond each side of the fence, by the side's name, m; negative: how far inside."""
+    north, east, down = p_w.tolist()
+    return {
+        "north_m": abs(north) - fence.north_m, "east_m": abs(east) - fence.east_m,
+        "top_m": fence.top_m - down, "bottom_m": down - fence.bottom_m,
+    }  # fmt: skip
+
+
 def outside(p_w: np.ndarray, fence: Fence) -> float:
     """How far a place (3,) is beyond the fence, m; negative: how far inside."""
-    north, east, down = p_w.tolist()
-    beyond = (abs(north) - fence.north_m, abs(east) - fence.east_m, fence.top_m - down, down - fence.bottom_m)
-    return float(max(beyond))
+    return max(beyond(p_w, fence).values())

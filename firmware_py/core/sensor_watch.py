@@ -20,7 +20,8 @@ from firmware_py.core.types import ModuleInputs
 REPEATS = 10
 """Samples in a row that are the same in all six numbers. A quiet sensor of one count of noise does that once in a day of 100 Hz."""
 LEAPS = {"gyro": 1.0, "accel": 2.0, "pressure_pa": 2000.0}
-"""From sample to sample, rad/s, m/s^2, Pa: at 50 Hz twice what full thrust does to a module that is not slowed by anything."""
+"""From sample to sample, rad/s, m/s^2, Pa. A module's full moment, 3.2 N m of 0.088 kg m^2, turns it by 0.7 rad/s more in a tick at 50 Hz;
+its force, 40 N of 15.5 kg, comes with a lag of 80 ms: reversed, 1.2 m/s^2 in that tick. Twenty centimetres of water are 2000 Pa."""
 FROZEN = {"gyro": None, "accel": None}
 """What is left of a frozen IMU."""
 NOTHING = np.full(3, np.nan)

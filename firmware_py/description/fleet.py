@@ -68,9 +68,7 @@ def load_fleet(path: Path) -> Fleet:
     if "buses" not in table:
         raise source.error(("buses",), 'missing key; it needs the bus of each index, such as ["socketcan:can0"]')
     fleet: Fleet = build(Fleet, table, source)
-    vehicles = find_vehicles((module.vehicle for module in fleet.module), source)
-    modules = (dataclasses.replace(m, vehicle=vehicle) for m, vehicle in zip(fleet.module, vehicles, strict=True))
-    return dataclasses.replace(fleet, module=tuple(modules))
+    return dataclasses.replace(fleet, module=find_vehicles(fleet.module, source))
 
 
 def _first_twice(items: Sequence[_Item]) -> _Item | None:

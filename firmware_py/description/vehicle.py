@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, quantity, read_toml
+
+_Module = TypeVar("_Module", bound=Any)
 
 FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Faces A..F of the bus, in order; also the tag ids of tags that sit on a face."""
@@ -248,22 +251,22 @@ def _check_drag(drag: Drag, source: Source) -> None:
         raise source.error(("drag", "cd_edge"), f"{what}; cd_edge must be above cd_face / 4, here {drag.cd_face / 4.0:g}")
 
 
-def find_vehicles(names: Iterable[str], source: Source) -> list[str]:
-    """The vehicles of the [[module]] tables in `source`, as load_vehicle takes them without a folder.
+def find_vehicles(modules: Sequence[_Module], source: Source) -> tuple[_Module, ...]:
+    """The [[module]] tables of `source` with each `vehicle` as load_vehicle takes it without a folder.
 
     A file lies beside that of `source`, or else in the working directory.
 
     Raises:
         DescriptionError: one is no vehicle; names its line.
     """
-    names = list(names)
+    names: list[str] = [module.vehicle for module in modules]
     found = {name: _beside(Path(source.path).parent, name) for name in names}
     for name, path in found.items():
         try:
             load_vehicle(path)
         except DescriptionError as error:
             raise source.error(("module", names.index(name), "vehicle"), str(error)) from None
-    return [found[name] for name in names]
+    return tuple(dataclasses.replace(module, vehicle=found[module.vehicle]) for module in modules)
 
 
 def _beside(folder: Path, name: str) -> str:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from firmware_py.core.health import beyond
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.schema import limits_of
 from firmware_py.ground.dialect import Message
@@ -25,8 +26,8 @@ UNSUPPORTED_FRAME, UNSUPPORTED, INVALID_1, INVALID_X, INVALID_Y, INVALID_Z = 2, 
 """MAV_MISSION_RESULT; the invalid parameters count on from INVALID_1."""
 _MOST_STEPS = 1000
 _LONGEST_S = 86_400.0
-
-
+_BEYOND = {"north_m": INVALID_X, "east_m": INVALID_Y, "top_m": INVALID_Z, "bottom_m": INVALID_Z}
+"""What an item is refused for that lies beyond this side of the fence."""
 _ON_FENCE_M = 0.02
 """Beyond the fence by less is on it: the wire's 1e-7 degrees are 11 mm."""
 
@@ -120,14 +121,9 @@ def _fault(item: Item) -> int:
 
 def beyond_fence(place: np.ndarray, fence: Fence) -> tuple[int, str]:
     """A MAV_MISSION_RESULT for a place (3,) NED, m, and in words which side of the fence it is beyond; 0 inside."""
-    north, east, down = place.tolist()
-    sides = (
-        (INVALID_X, abs(north) - fence.north_m, "north_m"), (INVALID_Y, abs(east) - fence.east_m, "east_m"),
-        (INVALID_Z, fence.top_m - down, "top_m"), (INVALID_Z, down - fence.bottom_m, "bottom_m"),
-    )  # fmt: skip
-    for result, beyond_m, side in sides:
+    for side, beyond_m in beyond(place, fence).items():
         if beyond_m > _ON_FENCE_M:
-            return result, f"{beyond_m:.2f} m beyond {limits_of(Fence, side).mavlink}, {getattr(fence, side):g} m"
+            return _BEYOND[side], f"{beyond_m:.2f} m beyond {limits_of(Fence, side).mavlink}, {getattr(fence, side):g} m"
     return 0, ""
 
 

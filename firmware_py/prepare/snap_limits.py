@@ -166,9 +166,9 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     Raises:
         InfeasibleError: names the limit and the place that conflict.
     """
-    _, most_used = worst(limits, system.coefficients(knots.value, start), system.durations)
     if knots.fixed.all():
-        raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s that stops at every waypoint keeps the {most_used}")
+        _, what = worst(limits, system.coefficients(knots.value, start), system.durations)
+        raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s that stops at every waypoint keeps the {what}")
     table = _Table.of(limits)
     problem = _Problem(system, knots, start)
     index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
@@ -177,7 +177,8 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
         try:
             unknown, conflict = problem.solve(table, index, where / _CHECK_POINTS)
         except osqp.OSQPException as error:
-            raise InfeasibleError(f"no trajectory was found that keeps the {most_used}: OSQP gave up with error {error}") from None
+            _, what = worst(limits, system.coefficients(knots.value, start), system.durations)
+            raise InfeasibleError(f"no trajectory was found that keeps the {what}: OSQP gave up with error {error}") from None
         if conflict >= 0:
             what = _sentence(limits[index[conflict]], where[conflict] / _CHECK_POINTS, system.durations)
             raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s keeps the {what}")
