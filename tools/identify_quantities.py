@@ -149,7 +149,7 @@ def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) 
         entrained_kg=max(0.0, rigid - old.dry_kg),
         inertia=frozen_array(inertia),
         added=frozen_array(total - np.concatenate([np.full(3, rigid), np.diag(inertia)])),
-        righting_arm_m=float(-fit.value("arm")[2] / (old.dry_kg * GRAVITY)),
+        righting_arm_m=float(-fit.value("arm")[2] / (rigid * GRAVITY)),
     )
     face, edge = fit.value("drag")
     spun = float(np.mean(fit.value("rotational") / body.drag.rotational)) if body.drag.rotational.all() else 1.0

@@ -1,8 +1,9 @@
 """Stage 6 of a tick: from a wrench to the force of each thruster (paper, Eq. 5), within limits.
 
 Where the pseudo-inverse (plus the preload) stays within limits it is the answer. Otherwise a box-constrained
-least-squares problem (box_program) keeps the directions of force and moment and gives way in the force first, and so does
-a body whose supplies cannot feed the answer. Mode `least_power` moves an answer within limits to where the thrusters draw the least.
+least-squares problem (box_program) keeps the directions of force and moment, and gives way first in the force beyond what holds a
+place, then in that and the moment alike; and so does a body whose supplies cannot feed the answer. A robot that lacks moment leans
+into its righting moment and stays where it is, instead of keeping level and drifting away. Mode `least_power` moves an answer within limits to where the thrusters draw the least.
 """
 
 from __future__ import annotations
@@ -18,18 +19,20 @@ from firmware_py.core.thruster import module_power
 from firmware_py.core.types import Room, Thrust
 from firmware_py.description.parameters import Allocation
 
-MOMENT_PRIORITY = 100.0
-"""How much more a lost share of the moment costs than a lost share of the force."""
+HOLD = 0.05
+"""Share of what all thrusters together could push that counts as much as the moment: 4 N of a module, against buoyancy, current, a slow path."""
+PRIORITY = 100.0
+"""How much more a lost share of moment and holding force costs than a lost share of the rest of the force."""
 SHARE_WEIGHT = 1e3
-"""Cost of losing the whole force against all thrusters at their limits: high enough that feasible force is not given away."""
+"""Cost of losing the rest of the force against all thrusters at their limits: high enough that feasible force is not given away."""
 BEYOND = 2.0
 """A wrench above this many times what all thrusters together could give is scaled down first, so that the problem stays well scaled."""
 HALVINGS = 8
 """Bisections of the share that the supplies can feed: it is found to 0.4 %."""
+TINY = 1e-9
+"""Force or moment, N and N m, below which there is none."""
 LEFT = 1e-3
 """Largest difference from the directions of force and moment, N and N m, that is taken; a hundred thousand times what is usual."""
-IS_FORCE = np.r_[np.ones(3), np.zeros(3)]
-"""(6,) 1 for the rows of a wrench that are its force."""
 
 
 @njit("float64(float64[::1],float64[::1],float64[::1])", cache=True)
@@ -47,6 +50,11 @@ def are_within(force, f_min, f_max):  # type: ignore[no-untyped-def]
     return bool(np.all((force >= f_min) & (force <= f_max)))
 
 
+def _sizes(wrench: np.ndarray) -> np.ndarray:
+    """(2,) of force and moment."""
+    return np.sqrt(np.square(wrench).reshape(2, 3).sum(axis=1))
+
+
 class Allocator:
     """Allocates for one body, within its thrusters' nominal limits until `confine` tells others."""
 
@@ -57,7 +65,7 @@ class Allocator:
         self._thrusters = body.thrusters
         n = body.thrusters.f_max.size
         weight = SHARE_WEIGHT * float(np.sum(body.thrusters.f_max**2))
-        self._weights = np.r_[np.ones(n), weight, weight * MOMENT_PRIORITY]
+        self._weights = np.r_[np.ones(n), weight * PRIORITY, weight]
         reach = np.maximum(body.thrusters.f_max, -body.thrusters.f_min)
         self._most = np.array([np.linalg.norm(body.thrusters.matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
         self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
@@ -102,12 +110,22 @@ class Allocator:
 
     def _fed(self, wrench: np.ndarray, unfed: Thrust) -> Thrust:
         """What the supplies can feed; where that is not even the preload, `unfed`, of which the limiter takes each module's share."""
-        force, moment = wrench * IS_FORCE, wrench * (1.0 - IS_FORCE)
-        force_share, thrust = self._largest_share(force, beside=moment)
-        if self._is_fed(thrust):
-            return thrust._replace(scale=(force_share * thrust.scale[0], thrust.scale[1]))
-        moment_share, thrust = self._largest_share(moment, beside=np.zeros(6))
-        return thrust._replace(scale=(0.0, moment_share * thrust.scale[1])) if self._is_fed(thrust) else unfed
+        first, rest = self._parts(wrench)
+        for part, beside in ((rest, first), (first, np.zeros(6))):
+            asked, thrust = self._largest_share(part, beside)
+            if self._is_fed(thrust):
+                kept = thrust.scale * _sizes(asked) / np.maximum(_sizes(wrench), TINY)
+                return thrust._replace(scale=(float(kept[0]), float(kept[1])))
+        return unfed
+
+    def _parts(self, wrench: np.ndarray) -> np.ndarray:
+        """(2, 6) wrenches that make up `wrench`: moment and the force that holds, the rest of the force."""
+        held = min(1.0, HOLD * self._most[0] / max(_sizes(wrench)[0], TINY))
+        parts = np.vstack([wrench, wrench])
+        parts[0, :3] *= held
+        parts[1, :3] *= 1.0 - held
+        parts[1, 3:] = 0.0
+        return parts
 
     def _is_fed(self, thrust: Thrust) -> bool:
         """Whether every module's supply is enough; for forces that are no numbers the limiter has the last word."""
@@ -115,15 +133,15 @@ class Allocator:
         power_w = module_power(thrust.force_n, t.power_forward, t.power_reverse, t.module, supply_w.size)
         return not bool(np.any(power_w > supply_w))
 
-    def _largest_share(self, wrench: np.ndarray, beside: np.ndarray) -> tuple[float, Thrust]:
-        """Largest share of a wrench that is fed beside another, and the forces; 0, and those for the other alone, where none is."""
+    def _largest_share(self, wrench: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, Thrust]:
+        """The largest share of a wrench that is fed beside another, both together, and the forces; where none is, of the other alone."""
         share, step, found = 0.0, 1.0, self._within(beside)
         for _ in range(HALVINGS):
             step *= 0.5
             thrust = self._within(beside + (share + step) * wrench)
             if self._is_fed(thrust):
                 share, found = share + step, thrust
-        return share, found
+        return beside + share * wrench, found
 
     def _within(self, wrench: np.ndarray) -> Thrust:
         """The forces within the thrusters' limits."""
@@ -138,15 +156,15 @@ class Allocator:
         return Thrust(force, self._matrix @ force, kept, 1.0 - busiest(force, self._room.low_n, self._room.high_n))
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
-        """min |f - f_preload|^2 + w_f (1 - a)^2 + w_m (1 - b)^2, J f = [a F; b M], f within limits, 0 <= a, b <= 1."""
-        sizes = np.array([np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])])
-        down = np.minimum(1.0, BEYOND * self._most / np.maximum(sizes, 1e-9))
-        self._rows[-2, :3], self._rows[-1, 3:] = -wrench[:3] * down[0], -wrench[3:] * down[1]
+        """min |f - f_preload|^2 + w_1 (1 - a)^2 + w_2 (1 - b)^2, J f = a W_1 + b W_2, f within limits, 0 <= a, b <= 1."""
+        sizes = np.maximum(_sizes(wrench), TINY)
+        parts = self._parts(wrench * np.minimum(1.0, BEYOND * self._most / sizes).repeat(3))
+        self._rows[-2:] = -parts
         x = np.empty_like(self._goal)
         if not nearest(self._rows, self._weights, self._goal, self._low, self._high, x) <= LEFT:
             share = self._common_share(wrench)
             return self._thrust(self._pinv @ wrench * share, (share, share))
-        kept = x[-2:] * down
+        kept = _sizes(x[-2:] @ parts) / sizes
         return self._thrust(x[:-2].copy(), (float(kept[0]), float(kept[1])))
 
     def _common_share(self, wrench: np.ndarray) -> float:

@@ -73,7 +73,7 @@ class Body:
         r_bi: (m, 3) IMUs from the centre of mass.
         mass: (6, 6) rigid, entrained and added mass about the centre of mass; mass_inv: its inverse.
         rigid_mass_kg: dry and entrained mass; dry_kg: dry mass.
-        righting: (3,) sum of dry weight times (centre of buoyancy - centre of mass), body frame, N m.
+        righting: (3,) sum of weight, entrained water included, times (centre of buoyancy - centre of mass), body frame, N m.
         thrusters, drag: see there.
         tag_ids: (t,) ids; tag_module: (t,) index within the body; r_bt: (t, 3); q_bt: (t, 4) tag frame to body frame.
         tag_module and r_bt follow the order of tag_ids.

@@ -26,13 +26,15 @@ RECENT, GAP, BASE = 5, 12, 30
 """Blocks: what is judged is the mean of the last half second; against that of three seconds that ended 1.2 s before now."""
 LEAST_BASE = 5
 """Blocks that the base needs."""
-SIGMA_FORCE_N, SIGMA_MOMENT = 0.15, 0.010
-"""What a healthy module's half-second mean is off, N and N m: accelerometer tilt and noise, gains, gusts (measured on the bench)."""
+SIGMA_FORCE_N, SIGMA_TILT, SIGMA_YAW = 0.15, 0.006, 0.010
+"""What a healthy module's half-second mean is off, N, N m of roll and pitch, N m of yaw: accelerometer tilt and noise, gains, gusts
+(measured on the bench)."""
 GUST_M_S, GUST_LEVER_M = 0.0135, 0.03
 """Change of the water's speed within seconds that counts as noise: what it does to the drag of a body under way, and how far beside the
 centre that acts. Of a module that is the 0.15 N measured above, of a BlueROV2 Heavy 0.7 N."""
-UNSURE_ARM_M, UNSURE_LIFT_N = 0.008, 0.5
-"""Righting arm and trim (times dry weight a moment) and buoyancy of a module may be off by this much: felt when the body tilts."""
+UNSURE_LIFT_N, UNSURE_ARM_M, UNSURE_TRIM_M = 0.5, 0.003, 0.002
+"""Buoyancy of a module, righting arm and trim along each axis (times the weight, entrained water included, moments) may be off by this
+much: felt when the body tilts. One sigma of what the bench draws: 5 and 3 mm to either side."""
 MODEL_SHARE = 0.12
 """What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too."""
 EXPLAINED = 0.8
@@ -60,8 +62,10 @@ class MissingThrust:
         self._ticks = max(1, round(BLOCK_NS / period_ns))
         count = len(body.modules)
         gust = GUST_M_S * body.drag.cruise_slope
-        self._sigma = np.repeat([max(SIGMA_FORCE_N * np.sqrt(count), gust), np.hypot(SIGMA_MOMENT * count, GUST_LEVER_M * gust)], 3)
-        self._tilt = np.repeat([UNSURE_LIFT_N * np.sqrt(count), UNSURE_ARM_M * body.dry_kg * GRAVITY], 3)
+        moment = np.hypot(np.array([SIGMA_TILT, SIGMA_TILT, SIGMA_YAW]) * count, GUST_LEVER_M * gust)
+        self._sigma = np.r_[np.full(3, max(SIGMA_FORCE_N * np.sqrt(count), gust)), moment]
+        weight_n = body.rigid_mass_kg * GRAVITY
+        self._tilt = np.array([UNSURE_LIFT_N * np.sqrt(count), UNSURE_ARM_M * weight_n, UNSURE_TRIM_M * weight_n])
         self._doubt = np.repeat([float(body.mass[0, 0]) * GRAVITY, 0.0], 3)
         self._period_s = period_ns * 1e-9
         self.forget()
@@ -176,8 +180,8 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, lie_share):  # type: ign
         blocks: (GAP + BASE, FORCES + n + 1) wrench missing 0:6, wrench that acted 6:12, down in the body 12:15, forces, sigma of
             the tilt.
         columns: (n, 6) wrench of unit force. alive: (n,) who may be suspected.
-        sigma, tilt, doubt: (6,) what a healthy body's change may be: noise and model; by each unit that it tilted; by each radian
-            of doubt about the tilt.
+        sigma, doubt: (6,) what a healthy body's change may be: noise and model; by each radian of doubt about the tilt.
+        tilt: (3,) how far net buoyancy, N, and the moments of righting arm and trim, N m, may be off.
         lie_share: least share of its force that a liar has lost.
     """
     n = columns.shape[0]
@@ -186,11 +190,13 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, lie_share):  # type: ign
     if base < LEAST_BASE or recent < RECENT - 1:
         return -1
     change = new - old
-    tilted = math.sqrt(np.sum(change[12:FORCES] ** 2))
+    tx, ty, tz = change[12:FORCES] ** 2
+    lift, arm, trim = tilt**2
+    turned = (lift * tx, lift * ty, lift * tz, arm * ty + trim * tz, arm * tx + trim * tz, trim * (tx + ty))
     y, unsure, total = np.empty(6), np.empty(6), 0.0
     for i in range(6):
         model = MODEL_SHARE * change[6 + i]
-        unsure[i] = math.sqrt(sigma[i] ** 2 + model**2 + (tilt[i] * tilted) ** 2 + (doubt[i] * old[FORCES + n]) ** 2)
+        unsure[i] = math.sqrt(sigma[i] ** 2 + model**2 + turned[i] + (doubt[i] * old[FORCES + n]) ** 2)
         y[i] = change[i] / unsure[i]
         total += y[i] ** 2
     if total < SIGNIFICANT:

@@ -167,9 +167,9 @@ def _reach_m(vehicle: Vehicle, r_bm: np.ndarray) -> float:
 
 
 def _righting(placement: Placement) -> np.ndarray:
-    """(3,) dry weight times the arm from centre of mass up (-z of the module) to that of buoyancy, N m."""
+    """(3,) weight, entrained water included, times the arm from centre of mass up (-z of the module) to that of buoyancy, N m."""
     inertial = placement.vehicle.inertial
-    moment = GRAVITY * inertial.dry_kg * inertial.righting_arm_m
+    moment = GRAVITY * (inertial.dry_kg + inertial.entrained_kg) * inertial.righting_arm_m
     return np.asarray(MATRICES[placement.rotation] @ np.array([0.0, 0.0, -moment]))
 
 

@@ -152,13 +152,13 @@ def fill_body(
     for draw, r, turn in parts:
         bodies.rigid[b] += carried(draw.rigid, r, turn)
         bodies.added[b] += carried(np.diag(draw.added), r, turn)
-        weight = draw.dry_kg * spec.gravity
+        weight = draw.mass * spec.gravity
         bodies.weight[b, 0] += weight
         bodies.weight[b, 1] += draw.buoyancy_n
-        bodies.weight[b, 2:5] += weight * (r + turn @ draw.weight_at)
+        bodies.weight[b, 2:5] += weight * (r + turn @ draw.com)
         bodies.weight[b, 5:8] += draw.buoyancy_n * (r + turn @ draw.buoyancy_at)
         # Neutral but for the buoyancy error: the hull and what floods it displace what robot and entrained water weigh.
-        displaced = draw.entrained_kg + draw.buoyancy_n / spec.gravity
+        displaced = draw.buoyancy_n / spec.gravity
         bodies.hull[b, 0] += displaced
         bodies.hull[b, 1:4] += displaced * r
         for load in draw.payload:  # trimmed: it weighs what it displaces, at one point

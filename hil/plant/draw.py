@@ -32,9 +32,9 @@ class ModuleDraw:
 
     Attributes:
         dry_kg, entrained_kg: masses.
-        weight_at, buoyancy_at: (3,) where weight and buoyancy of the dry parts act, module frame.
-        buoyancy_n: buoyancy of the dry parts.
-        com: (3,) centre of mass, water included, module frame.
+        com: (3,) centre of mass, where the weight of both acts, module frame.
+        buoyancy_at: (3,) where the buoyancy of all that is displaced acts, module frame.
+        buoyancy_n: that buoyancy.
         inertia: (3, 3) of robot and entrained water about `com`.
         added: (6,) added mass about the hull centre.
         drag: (5,) coefficients face-on, edge-on, of rotation about x, y, z.
@@ -44,10 +44,9 @@ class ModuleDraw:
 
     dry_kg: float
     entrained_kg: float
-    weight_at: np.ndarray
+    com: np.ndarray
     buoyancy_at: np.ndarray
     buoyancy_n: float
-    com: np.ndarray
     inertia: np.ndarray
     added: np.ndarray
     drag: np.ndarray
@@ -56,9 +55,14 @@ class ModuleDraw:
     payload: tuple[Payload, ...] = ()
 
     @property
+    def mass(self) -> float:
+        """Of robot and entrained water, kg."""
+        return self.dry_kg + self.entrained_kg
+
+    @property
     def rigid(self) -> np.ndarray:
         """(6, 6) mass matrix of robot, payloads and the water inside them about the hull's centre, module frame."""
-        total = rigid_matrix(self.dry_kg + self.entrained_kg, self.com, self.inertia)
+        total = rigid_matrix(self.mass, self.com, self.inertia)
         for load in self.payload:
             mass = load.dry_kg + load.entrained_kg
             squares = np.square(load.size_m)
@@ -87,10 +91,9 @@ def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> Mo
     return ModuleDraw(
         dry_kg=dry,
         entrained_kg=entrained,
-        weight_at=inertial.com_m + shift,
+        com=inertial.com_m + shift,
         buoyancy_at=inertial.com_m - np.array([0.0, 0.0, arm]),
-        buoyancy_n=dry * spec.gravity + sign * spec.buoyancy_error_n,
-        com=inertial.com_m + shift * dry / (dry + entrained),
+        buoyancy_n=(dry + entrained) * spec.gravity + sign * spec.buoyancy_error_n,
         inertia=inertial.inertia * np.outer(root, root),
         added=inertial.added * np.concatenate([mass[1:], turn[3:]]),
         drag=np.array([drag.cd_face, drag.cd_edge, *(drag.rotational_cd,) * 3]) * spread("drag", spec.drag_spread, 5),

@@ -87,9 +87,9 @@ def force_needed(
     for m in members:
         d, r, turn = draws[m], modules.position[m], modules.turn[m]
         mass += carried(d.rigid + np.diag(d.added), r, turn)
-        w = d.dry_kg * gravity
+        w = d.mass * gravity
         weight[:3] += (w - d.buoyancy_n) * down
-        weight[3:] += np.cross(w * (r + turn @ d.weight_at) - d.buoyancy_n * (r + turn @ d.buoyancy_at), down)
+        weight[3:] += np.cross(w * (r + turn @ d.com) - d.buoyancy_n * (r + turn @ d.buoyancy_at), down)
     p = mass @ x[7:13]
     v, omega = x[7:10], x[10:13]
     gyroscopic = np.concatenate([np.cross(omega, p[:3]), np.cross(omega, p[3:]) + np.cross(v, p[:3])])

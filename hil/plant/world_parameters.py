@@ -32,9 +32,9 @@ def _module_parameters(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int
         "thruster_gain_mean": float(draw.gain.mean()),
         "thruster_gain_spread": float(draw.gain.std()),
         "deadband_n": float(draw.deadband_n.mean()),
-        "net_buoyancy_n": draw.buoyancy_n - draw.dry_kg * spec.gravity,
-        "righting_arm_m": float(draw.weight_at[2] - draw.buoyancy_at[2]),
-        "trim_m": float(np.hypot(*(draw.weight_at - nominal.com_m)[:2])),
+        "net_buoyancy_n": draw.buoyancy_n - draw.mass * spec.gravity,
+        "righting_arm_m": float(draw.com[2] - draw.buoyancy_at[2]),
+        "trim_m": float(np.hypot(*(draw.com - nominal.com_m)[:2])),
     }
 
 
