@@ -3,7 +3,8 @@
 Where the pseudo-inverse (plus the preload) stays within limits it is the answer. Otherwise a box-constrained
 least-squares problem (box_program) keeps the directions of force and moment, and gives way first in the force beyond what holds a
 place, then in that and the moment alike; and so does a body whose supplies cannot feed the answer. A robot that lacks moment leans
-into its righting moment and stays where it is, instead of keeping level and drifting away. Mode `least_power` moves an answer within limits to where the thrusters draw the least.
+into its righting moment and stays where it is, instead of keeping level and drifting away. Mode `least_power` moves an answer
+within limits to where the thrusters draw the least.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from firmware_py.core.types import Room, Thrust
 from firmware_py.description.parameters import Allocation
 
 HOLD = 0.05
-"""Share of what all thrusters together could push that counts as much as the moment: 4 N of a module, against buoyancy, current, a slow path."""
+"""Share of what all thrusters together could push that counts as much as the moment: of a module 4 N, against buoyancy, current and the
+drag of a slow path."""
 PRIORITY = 100.0
 """How much more a lost share of moment and holding force costs than a lost share of the rest of the force."""
 SHARE_WEIGHT = 1e3
@@ -52,7 +54,13 @@ def are_within(force, f_min, f_max):  # type: ignore[no-untyped-def]
 
 def _sizes(wrench: np.ndarray) -> np.ndarray:
     """(2,) of force and moment."""
-    return np.sqrt(np.square(wrench).reshape(2, 3).sum(axis=1))
+    return np.asarray(np.sqrt(np.square(wrench).reshape(2, 3).sum(axis=1)))
+
+
+def _kept(made: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
+    """Shares of force and moment; of one that nobody wants, all."""
+    force, moment = (float(m / w) if w > TINY else 1.0 for m, w in zip(_sizes(made), _sizes(wanted), strict=True))
+    return force, moment
 
 
 class Allocator:
@@ -114,8 +122,7 @@ class Allocator:
         for part, beside in ((rest, first), (first, np.zeros(6))):
             asked, thrust = self._largest_share(part, beside)
             if self._is_fed(thrust):
-                kept = thrust.scale * _sizes(asked) / np.maximum(_sizes(wrench), TINY)
-                return thrust._replace(scale=(float(kept[0]), float(kept[1])))
+                return thrust._replace(scale=_kept(asked * np.repeat(thrust.scale, 3), wrench))
         return unfed
 
     def _parts(self, wrench: np.ndarray) -> np.ndarray:
@@ -157,15 +164,18 @@ class Allocator:
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
         """min |f - f_preload|^2 + w_1 (1 - a)^2 + w_2 (1 - b)^2, J f = a W_1 + b W_2, f within limits, 0 <= a, b <= 1."""
-        sizes = np.maximum(_sizes(wrench), TINY)
-        parts = self._parts(wrench * np.minimum(1.0, BEYOND * self._most / sizes).repeat(3))
-        self._rows[-2:] = -parts
+        parts = self._parts(wrench)
+        down = np.array([self._down(part) for part in parts])
+        self._rows[-2:] = -parts * down[:, None]
         x = np.empty_like(self._goal)
         if not nearest(self._rows, self._weights, self._goal, self._low, self._high, x) <= LEFT:
             share = self._common_share(wrench)
             return self._thrust(self._pinv @ wrench * share, (share, share))
-        kept = _sizes(x[-2:] @ parts) / sizes
-        return self._thrust(x[:-2].copy(), (float(kept[0]), float(kept[1])))
+        return self._thrust(x[:-2].copy(), _kept((x[-2:] * down) @ parts, wrench))
+
+    def _down(self, wrench: np.ndarray) -> float:
+        """What scales a wrench down that is beyond all bounds."""
+        return float(np.min(BEYOND * self._most / np.maximum(_sizes(wrench), TINY), initial=1.0))
 
     def _common_share(self, wrench: np.ndarray) -> float:
         """Largest share of the pseudo-inverse's answer that is within limits."""

@@ -140,7 +140,6 @@ def _body(
         mass=mass,
         mass_inv=np.ascontiguousarray(np.linalg.inv(mass)),
         rigid_mass_kg=float(rigid_mass),
-        dry_kg=float(sum(_dry_kg(p.vehicle) for p in placements)),
         righting=sum((_righting(p) for p in placements), np.zeros(3)),
         thrusters=thruster_set([p.vehicle for p in placements], turns, r_bm),
         drag=drag_table.build(placements, com, pitch_m, cache),
@@ -191,10 +190,6 @@ def _lumps(placement: Placement, origin: np.ndarray) -> list[_Lump]:
         inertia = mass / 12.0 * np.diag(squares.sum() - squares)
         lumps.append(_Lump(mass, origin + turn @ payload.position_m, turn @ inertia @ turn.T))
     return lumps
-
-
-def _dry_kg(vehicle: Vehicle) -> float:
-    return vehicle.inertial.dry_kg + sum(p.dry_kg for p in vehicle.payload)
 
 
 def _mass_matrix(

@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse
 from scipy.optimize import linprog, lsq_linear
 
-from firmware_py.core.allocator import MOMENT_PRIORITY, SHARE_WEIGHT, Allocator
+from firmware_py.core.allocator import HOLD, PRIORITY, SHARE_WEIGHT, Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.preload import preload
 from firmware_py.core.types import Room, Thrust
@@ -73,14 +73,27 @@ def test_no_wrench_is_no_force(body: Body) -> None:
 # ---------------------------------------------------------------- beyond limits
 
 
+def held_n(body: Body) -> float:
+    """Force that counts as much as the moment, N."""
+    t = body.thrusters
+    return HOLD * float(np.linalg.norm(t.matrix[:3], axis=0) @ np.maximum(t.f_max, -t.f_min))
+
+
+def in_parts(body: Body, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Moment and the force that holds; the rest of the force."""
+    size = float(np.linalg.norm(wrench[:3]))
+    rest = np.r_[wrench[:3] * max(0.0, size - held_n(body)) / size, 0.0, 0.0, 0.0]
+    return wrench - rest, rest
+
+
 def best_by_clarabel(body: Body, wrench: np.ndarray) -> tuple[np.ndarray, float]:
     """The allocator's problem in clarabel's form: (n + 2,) forces and shares, and the least cost."""
     t = body.thrusters
     n = t.f_max.size
     whole = SHARE_WEIGHT * float(t.f_max @ t.f_max)
-    weights = np.r_[np.ones(n), whole, whole * MOMENT_PRIORITY]
+    weights = np.r_[np.ones(n), whole * PRIORITY, whole]
     goal = np.r_[np.zeros(n), 1.0, 1.0]
-    equality = np.hstack([t.matrix, -np.r_[wrench[:3], 0, 0, 0][:, None], -np.r_[0, 0, 0, wrench[3:]][:, None]])
+    equality = np.hstack([t.matrix, *(-part[:, None] for part in in_parts(body, wrench))])
     a = sparse.csc_matrix(np.vstack([equality, np.eye(n + 2), -np.eye(n + 2)]))
     b = np.r_[np.zeros(6), t.f_max, 1.0, 1.0, -t.f_min, 0.0, 0.0]
     cones = [clarabel.ZeroConeT(6), clarabel.NonnegativeConeT(2 * n + 4)]
@@ -102,11 +115,14 @@ def test_saturated_answer_is_the_one_another_solver_finds(body: Body, size: floa
             continue
         saturated += 1
         x, cost = best_by_clarabel(body, wrench)
-        weights = SHARE_WEIGHT * float(body.thrusters.f_max @ body.thrusters.f_max) * np.array([1.0, MOMENT_PRIORITY])
-        ours = float(thrust.force_n @ thrust.force_n + weights @ (1.0 - np.array(thrust.scale)) ** 2)
+        first, rest = in_parts(body, wrench)
+        weights = SHARE_WEIGHT * float(body.thrusters.f_max @ body.thrusters.f_max) * np.array([PRIORITY, 1.0])
+        left = np.linalg.norm(wrench[:3]) * thrust.scale[0] - thrust.scale[1] * np.linalg.norm(first[:3])
+        shares = np.array([thrust.scale[1], left / max(float(np.linalg.norm(rest[:3])), 1e-9)])
+        ours = float(thrust.force_n @ thrust.force_n + weights @ (1.0 - shares) ** 2)
         assert ours <= cost + 1e-4 * (1.0 + cost)
         np.testing.assert_allclose(thrust.force_n, x[:-2], atol=2e-2)
-        np.testing.assert_allclose(thrust.scale, x[-2:], atol=1e-4)
+        np.testing.assert_allclose(shares, x[-2:], atol=1e-4)
     assert saturated >= 3
 
 
@@ -119,6 +135,19 @@ def test_saturation_keeps_the_directions_of_force_and_moment(body: Body, size: f
         np.testing.assert_allclose(thrust.achieved, np.r_[force * wrench[:3], moment * wrench[3:]], atol=1e-6)
         assert -1e-9 <= force <= 1.0 + 1e-5 and -1e-9 <= moment <= 1.0 + 1e-5
         assert_within_limits(body, thrust)
+
+
+def test_body_that_lacks_moment_leans_and_does_not_drift(single: Body) -> None:
+    """Two thrusters dead, one and a half times the moment that is left: the small force of a hover is kept as the moment is."""
+    allocator = Allocator(single, PLAIN)
+    for dead in set(itertools.combinations(range(8), 2)) - LOSES_RANK:
+        allocator.set_alive(~np.isin(np.arange(8), dead))
+        for direction in np.random.default_rng(6).normal(size=(5, 3)):
+            direction /= np.linalg.norm(direction)
+            most = allocator.step(np.r_[0.0, 0.0, 0.0, 20.0 * direction]).achieved[3:]
+            thrust = allocator.step(np.r_[0.2 * np.roll(direction, 1), 1.5 * most])
+            assert 0.5 < thrust.scale[1] < 1.0
+            assert thrust.scale[0] == pytest.approx(thrust.scale[1], abs=1e-6)
 
 
 def best_share(body: Body, along: np.ndarray, beside: np.ndarray) -> float:
@@ -333,8 +362,8 @@ def test_other_limits_count_at_once_and_are_kept_when_a_thruster_dies(single: Bo
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
-def test_body_that_cannot_be_fed_gives_way_in_the_force_and_keeps_the_moment(body: Body, size: float) -> None:
-    """Direction kept, moment first, and no module above its supply; what is left unused is less than a step of the bisection."""
+def test_body_that_cannot_be_fed_gives_way_in_the_force_that_does_not_hold_first(body: Body, size: float) -> None:
+    """Directions kept, and no module above its supply; what is left unused is less than a step of the bisection."""
     plenty, allocator = Allocator(body, PLAIN), Allocator(body, PLAIN)
     fed_less = 0
     for wrench in wrenches(body, 30, size) * np.repeat([1.0, 0.2], 3):
@@ -342,16 +371,18 @@ def test_body_that_cannot_be_fed_gives_way_in_the_force_and_keeps_the_moment(bod
         allocator.confine(Room(body.thrusters.f_min, body.thrusters.f_max, supply_w))
         thrust = allocator.step(wrench)
         assert np.all(power_w(body, thrust) <= supply_w)
-        moment_alone = plenty.step(wrench * np.r_[np.zeros(3), np.ones(3)])
+        first, _ = in_parts(body, wrench)
+        first_alone = plenty.step(first)
         np.testing.assert_allclose(thrust.achieved[:3], thrust.scale[0] * wrench[:3], atol=1e-3)
         np.testing.assert_allclose(thrust.achieved[3:], thrust.scale[1] * wrench[3:], atol=1e-3)
-        if np.all(power_w(body, moment_alone) <= supply_w):
+        held = float(np.linalg.norm(thrust.achieved[:3]) / np.linalg.norm(first[:3]))
+        if np.all(power_w(body, first_alone) <= supply_w):
             fed_less += 1
-            assert thrust.scale[1] == pytest.approx(moment_alone.scale[1], abs=2e-2)
-            assert 0.0 < thrust.scale[0] < 1.0
+            assert thrust.scale[1] == pytest.approx(first_alone.scale[1], abs=2e-2)
+            assert thrust.scale[0] < 1.0 and held > first_alone.scale[1] - 2e-2
             assert np.max(power_w(body, thrust) / supply_w) > 0.95
         else:
-            assert thrust.scale[0] == 0.0 and 0.0 < thrust.scale[1] < 1.0
+            assert 0.0 < thrust.scale[1] < 1.0 and held == pytest.approx(thrust.scale[1], abs=1e-3)
     assert fed_less > 5
 
 

@@ -212,7 +212,8 @@ def test_inherited_rotation_matrix_fails_the_check_that_ours_passes() -> None:
 
 def test_righting_moments_of_the_modules_add_up(modcube: Vehicle) -> None:
     body = assemble(SHAPES["2x2"], [0] * 4, [modcube] * 4)
-    np.testing.assert_allclose(body.righting, [0.0, 0.0, -4 * GRAVITY * 2.6 * 0.005], atol=1e-12)
+    np.testing.assert_allclose(body.righting, [0.0, 0.0, -4 * GRAVITY * 9.3 * 0.005], atol=1e-12)
+    assert float(np.linalg.norm(body.righting)) / 4 == pytest.approx(0.45, abs=0.01)  # 5 mm, at 90 degrees (the paper's errata)
     upside_down = next(i for i, m in enumerate(lattice.MATRICES) if np.array_equal(np.diag(m), [1, -1, -1]))
     swapped = dataclasses.replace(modcube, faces="PDPDDP")
     pair = assemble([(0, 0, 0), (0, 0, 1)], [0, upside_down], [modcube, swapped])

@@ -211,7 +211,7 @@ def test_switching_one_error_off_leaves_the_draws_of_the_others() -> None:
     less = World(
         dataclasses.replace(WorldSpec(), mass_spread=0.0, current_m_s=0.0), Tank(), [body], start, 7, PERIOD_NS
     )
-    for name in ("drag", "gain", "deadband_n", "weight_at", "buoyancy_at"):
+    for name in ("drag", "gain", "deadband_n", "com", "buoyancy_at"):
         np.testing.assert_array_equal(getattr(all_on.draw(0), name), getattr(less.draw(0), name))
     assert all_on.draw(0).dry_kg != less.draw(0).dry_kg == pytest.approx(2.6)
 
@@ -226,12 +226,12 @@ def test_draws_stay_within_their_magnitudes_and_fill_them() -> None:
         ([d.inertia[2, 2] / 0.068 for d in draws], 0.85, 1.15),
         ([d.drag[0] / 1.05 for d in draws], 0.80, 1.20),
         ([d.deadband_n[3] for d in draws], 0.10, 0.25),
-        ([d.weight_at[0] for d in draws], -0.003, 0.003),
+        ([d.com[0] for d in draws], -0.003, 0.003),
         ([-d.buoyancy_at[2] for d in draws], 0.0, 0.010),
     ]:
         assert low <= min(values) < low + 0.2 * (high - low)
         assert high - 0.2 * (high - low) < max(values) <= high
-    errors = np.array([d.buoyancy_n - d.dry_kg * spec.gravity for d in draws])
+    errors = np.array([d.buoyancy_n - d.mass * spec.gravity for d in draws])
     np.testing.assert_allclose(np.abs(errors), 0.5)
     assert 10 < (errors > 0).sum() < 50
 
