@@ -96,7 +96,10 @@ class Estimator:
         self._density = self._process_noise()
         drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
         reach_m = self._body.reach_m
-        self._under_way = np.array([drag_walk, drag_walk * reach_m, p.alpha_turning, p.accel_under_way, p.accel_under_way * reach_m])
+        weight_n = self._body.rigid_mass_kg * observation.GRAVITY
+        self._under_way = np.array([
+            drag_walk, drag_walk * reach_m, p.trim_walk * weight_n, p.alpha_turning, p.accel_under_way, p.accel_under_way * reach_m,
+        ])  # fmt: skip
         self._inertial_sigma = np.array([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m])
         self._tag_variance = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2
 

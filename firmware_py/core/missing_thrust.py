@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numba import njit
 
-from firmware_py.core.body import Body
+from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rigid_body import add_restoring
@@ -32,6 +32,9 @@ SIGMA_FORCE_N, SIGMA_TILT, SIGMA_YAW = 0.15, 0.006, 0.010
 GUST_M_S, GUST_LEVER_M = 0.0135, 0.03
 """Change of the water's speed within seconds that counts as noise: what it does to the drag of a body under way, and how far beside the
 centre that acts. Of a module that is the 0.15 N measured above, of a BlueROV2 Heavy 0.7 N."""
+DRIFT_M_S = 0.04
+"""Speed of the water, which a body under way meets from another side within seconds: its drag differs by as much as it rises over that.
+It does so at the middle, so that moments tell more of a body under way than forces."""
 UNSURE_LIFT_N, UNSURE_ARM_M, UNSURE_TRIM_M = 0.5, 0.003, 0.002
 """Buoyancy of a module, righting arm and trim along each axis (times the weight, entrained water included, moments) may be off by this
 much: felt when the body tilts. One sigma of what the bench draws: 5 and 3 mm to either side."""
@@ -44,7 +47,7 @@ RUNNER_UP = 0.5
 SIGNIFICANT = 20.0
 """Squared sigmas that it must explain."""
 FORCES = 15
-"""Column of a block where the thrusters' forces begin."""
+"""Column of a block where the thrusters' forces begin; two more follow them."""
 FRESH_NS = 500_000_000
 """Age of the newest tag from which on nothing is judged: without tags a robot that tumbles knows its tilt and speed too badly."""
 MOST = 2.6
@@ -66,6 +69,7 @@ class MissingThrust:
         self._sigma = np.r_[np.full(3, max(SIGMA_FORCE_N * np.sqrt(count), gust)), moment]
         weight_n = body.rigid_mass_kg * GRAVITY
         self._tilt = np.array([UNSURE_LIFT_N * np.sqrt(count), UNSURE_ARM_M * weight_n, UNSURE_TRIM_M * weight_n])
+        self._drift = np.repeat([DRIFT_M_S * body.drag.cruise_slope / CRUISE_M_S, 0.0], 3)
         self._doubt = np.repeat([float(body.mass[0, 0]) * GRAVITY, 0.0], 3)
         self._period_s = period_ns * 1e-9
         self.forget()
@@ -76,7 +80,7 @@ class MissingThrust:
 
     def forget(self) -> None:
         """What was seen no longer counts, because the body has changed."""
-        self._blocks = np.full((GAP + BASE, FORCES + self._columns.shape[0] + 1), np.nan)
+        self._blocks = np.full((GAP + BASE, FORCES + self._columns.shape[0] + 2), np.nan)
         self._suspect, self._count = -1, 0
         self._start_block(None)
 
@@ -85,7 +89,7 @@ class MissingThrust:
         self._first = self._last = gyro
         self._first_n = self._last_n = 0
         self._sum_a, self._sum_f = np.zeros(3), np.zeros(self._columns.shape[0])
-        self._sum_model = np.zeros(6)
+        self._sum_model, self._sum_speed = np.zeros(6), 0.0
 
     def step(
         self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool
@@ -115,6 +119,7 @@ class MissingThrust:
             self._accels += 1
             self._sum_a += measured.accel + rotate_back(estimate.q_wb, DOWN)
         self._sum_f += force_n
+        self._sum_speed += math.sqrt(nu[0] ** 2 + nu[1] ** 2 + nu[2] ** 2)
         _add_model(self._inertia, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear, nu, estimate.q_wb, self._sum_model)
 
     def _close(self, estimate: Estimate) -> bool:
@@ -130,7 +135,7 @@ class MissingThrust:
             rest = self._body.mass @ motion - acted - self._sum_model / n
         down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
         self._blocks[:-1] = self._blocks[1:]
-        self._blocks[-1] = np.concatenate([rest, acted, down_b, self._sum_f / n, [max(estimate.sigma_q.tolist())]])
+        self._blocks[-1] = np.concatenate([rest, acted, down_b, self._sum_f / n, [max(estimate.sigma_q.tolist()), self._sum_speed / n]])
         return whole
 
     def _decide(self, alive: np.ndarray) -> int | None:
@@ -144,7 +149,7 @@ class MissingThrust:
 
     def _explain(self, alive: np.ndarray) -> int:
         """The one thruster that explains the change, or -1."""
-        return int(explain(self._blocks, self._columns, alive, self._sigma, self._tilt, self._doubt, self.parameters.lie_share))
+        return int(explain(self._blocks, self._columns, alive, self._sigma, self._tilt, self._doubt, self._drift, self.parameters.lie_share))
 
 
 DOWN = np.array([0.0, 0.0, GRAVITY])
@@ -172,15 +177,16 @@ def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
     return total / max(count, 1), count
 
 
-@njit(f"int64({M},{M},boolean[::1],{V},{V},{V},float64)", cache=True)
-def explain(blocks, columns, alive, sigma, tilt, doubt, lie_share):  # type: ignore[no-untyped-def]
+@njit(f"int64({M},{M},boolean[::1],{V},{V},{V},{V},float64)", cache=True)
+def explain(blocks, columns, alive, sigma, tilt, doubt, drift, lie_share):  # type: ignore[no-untyped-def]
     """The one thruster that explains the change of the latest blocks against the oldest, or -1.
 
     Args:
-        blocks: (GAP + BASE, FORCES + n + 1) wrench missing 0:6, wrench that acted 6:12, down in the body 12:15, forces, sigma of
-            the tilt.
+        blocks: (GAP + BASE, FORCES + n + 2) wrench missing 0:6, wrench that acted 6:12, down in the body 12:15, forces, sigma of
+            the tilt, speed.
         columns: (n, 6) wrench of unit force. alive: (n,) who may be suspected.
-        sigma, doubt: (6,) what a healthy body's change may be: noise and model; by each radian of doubt about the tilt.
+        sigma, doubt, drift: (6,) what a healthy body's change may be: noise and model; by each radian of doubt about the tilt; by each
+            m/s that it made.
         tilt: (3,) how far net buoyancy, N, and the moments of righting arm and trim, N m, may be off.
         lie_share: least share of its force that a liar has lost.
     """
@@ -193,10 +199,11 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, lie_share):  # type: ign
     tx, ty, tz = change[12:FORCES] ** 2
     lift, arm, trim = tilt**2
     turned = (lift * tx, lift * ty, lift * tz, arm * ty + trim * tz, arm * tx + trim * tz, trim * (tx + ty))
+    speed = max(old[FORCES + n + 1], new[FORCES + n + 1])
     y, unsure, total = np.empty(6), np.empty(6), 0.0
     for i in range(6):
         model = MODEL_SHARE * change[6 + i]
-        unsure[i] = math.sqrt(sigma[i] ** 2 + model**2 + turned[i] + (doubt[i] * old[FORCES + n]) ** 2)
+        unsure[i] = math.sqrt(sigma[i] ** 2 + model**2 + turned[i] + (doubt[i] * old[FORCES + n]) ** 2 + (drift[i] * speed) ** 2)
         y[i] = change[i] / unsure[i]
         total += y[i] ** 2
     if total < SIGNIFICANT:

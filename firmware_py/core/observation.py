@@ -131,7 +131,7 @@ def fuse_inertial(  # type: ignore[no-untyped-def]
     if not math.isnan(accel[0]) and elapsed > 0.0:
         first = 0 if math.isnan(gyro[0]) else 3
         speed, rate = squared_speeds(x)
-        moving = under_way[3] ** 2 * speed + under_way[4] ** 2 * rate
+        moving = under_way[4] ** 2 * speed + under_way[5] ** 2 * rate
         for i in range(3):
             shared[first + i, 6 + i] = density[6 + i]
             variance[first + i] = ((variance[first + i] + moving) * dt + density[6 + i]) / elapsed

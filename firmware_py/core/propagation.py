@@ -163,9 +163,9 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
 
     Args:
         density: (25,) process noise of a body at rest, per second.
-        under_way: (5,) what motion adds, as what is not as believed of current, drag and mass is felt in proportion to it: to the random
-            walk of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz) for each
-            rad/s; to the noise of the accelerometer (`observation.fuse_inertial`) m/s^2 for each m/s and for each rad/s.
+        under_way: (6,) what motion adds, as what is not as believed of current, drag, trim and mass is felt in proportion to it: to the
+            random walk of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to that of the disturbance moment N m/sqrt(s)
+            for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz) for each rad/s; to the noise of the accelerometer (`observation.fuse_inertial`) m/s^2 for each m/s and for each rad/s.
     """
     f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
     moved = f @ covariance
@@ -179,7 +179,7 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
     for i in range(ERRORS):
         out[i, i] += density[i] * dt
     speed, rate = squared_speeds(x)
-    turning = under_way[2] ** 2 * rate
+    turning = under_way[3] ** 2 * rate
     for i in range(3):
         alpha = density[9 + i] + turning
         out[9 + i, 9 + i] += turning * dt
@@ -187,6 +187,7 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
         out[9 + i, 3 + i] += 0.5 * alpha * dt**2
         out[3 + i, 3 + i] += alpha * dt**3 / 3.0
         out[18 + i, 18 + i] += (under_way[0] ** 2 * speed + under_way[1] ** 2 * rate) * dt
+        out[21 + i, 21 + i] += under_way[2] ** 2 * rate * dt
     return step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear), out
 
 

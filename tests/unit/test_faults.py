@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
-from firmware_py.core.faults import FaultDetector
+from firmware_py.core.faults import CLEAR, FaultDetector
 from firmware_py.core.pipeline import BodyPipeline
 from firmware_py.core.preload import preload
 from firmware_py.core.propagation import STATES
@@ -168,6 +168,18 @@ def test_two_feedbacks_of_a_disobedient_thruster_are_enough_and_one_is_not(water
     assert water.run(1.0, 2.0 * PUSH) == []
     water.speed_factor[3] = factor
     assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == ["thruster 4 does not obey: left out"]
+
+
+def test_two_feedbacks_of_a_clear_standstill_are_enough_and_one_is_not(water: Water) -> None:
+    water.run(1.0, 2.0 * PUSH)
+    busy = int(np.argmax(np.abs(water.believed.force_n)))
+    assert abs(water.believed.force_n[busy]) > CLEAR * Faults().force_n
+    water.speed_factor[busy] = 0.0
+    assert water.run(0.1, 2.0 * PUSH) == []
+    water.speed_factor[busy] = 1.0
+    assert water.run(1.0, 2.0 * PUSH) == []
+    water.speed_factor[busy] = 0.0
+    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == [f"thruster {busy + 1} stands still: left out"]
 
 
 def test_slow_thruster_below_its_deadband_is_healthy(water: Water) -> None:
