@@ -35,9 +35,9 @@ centre that acts. Of a module that is the 0.15 N measured above, of a BlueROV2 H
 DRIFT_M_S = 0.04
 """Speed of the water, which a body under way meets from another side within seconds: its drag differs by as much as it rises over that.
 It does so at the middle, so that moments tell more of a body under way than forces."""
-UNSURE_LIFT_N, UNSURE_ARM_M, UNSURE_TRIM_M = 0.5, 0.003, 0.002
+UNSURE_LIFT_N, UNSURE_ARM_M, UNSURE_TRIM_M = 0.5, 0.003, 0.0006
 """Buoyancy of a module, righting arm and trim along each axis (times the weight, entrained water included, moments) may be off by this
-much: felt when the body tilts. One sigma of what the bench draws: 5 and 3 mm to either side."""
+much: felt when the body tilts. One sigma of what the bench draws: 5 mm to either side, and 3 mm of the dry parts."""
 MODEL_SHARE = 0.12
 """What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too."""
 EXPLAINED = 0.8

@@ -34,7 +34,7 @@ def _module_parameters(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int
         "deadband_n": float(draw.deadband_n.mean()),
         "net_buoyancy_n": draw.buoyancy_n - draw.mass * spec.gravity,
         "righting_arm_m": float(draw.com[2] - draw.buoyancy_at[2]),
-        "trim_m": float(np.hypot(*(draw.com - nominal.com_m)[:2])),
+        "trim_m": float(np.hypot(*(draw.com - nominal.com_m)[:2])) * draw.mass / draw.dry_kg,
     }
 
 

@@ -84,7 +84,8 @@ def process_sigma(body: Body, p: Estimation, x: np.ndarray) -> np.ndarray:
     drag_slope = 2.0 * body.drag.nodes[..., 0].mean() * np.hypot(np.linalg.norm(x[7:10]), body.reach_m * rate)
     force = np.hypot(p.force_walk * m, p.current_walk * drag_slope)
     alpha = np.hypot(p.alpha_process, p.alpha_turning * rate)
-    walks = [p.gyro_bias_walk] * 3 + [p.accel_bias_walk] * 3 + list(force) + list(p.moment_walk * j)
+    moment = np.hypot(p.moment_walk * j, p.trim_walk * 9.80665 * body.rigid_mass_kg * rate)
+    walks = [p.gyro_bias_walk] * 3 + [p.accel_bias_walk] * 3 + list(force) + list(moment)
     return np.array([0.0] * 6 + [p.accel_process] * 3 + [alpha] * 3 + walks + [p.depth_bias_walk])
 
 

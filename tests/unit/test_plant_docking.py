@@ -24,10 +24,12 @@ PULL, PUSH, OFF = 1, 2, 0
 NEVER, ALWAYS = JamRule(probability_inside=0.0, probability_outside=0.0), JamRule(probability_inside=1.0)
 
 
-def two(gap_m: float, lateral_m: float = 0.0, jam: JamRule = NEVER, q: np.ndarray = LEVEL, **world: float) -> World:
+def two(
+    gap_m: float, lateral_m: float = 0.0, jam: JamRule = NEVER, q: np.ndarray = LEVEL, vehicle: Vehicle = VEHICLE, **world: float
+) -> World:
     """Module 1 before module 0's +x face, -x towards it, in calm deep water."""
     starts = [Start(np.array([0.0, 0.0, 400.0]), LEVEL), Start(np.array([0.21 + gap_m, lateral_m, 400.0]), q)]
-    return World(WorldSpec(**{**CALM, **world}), OCEAN, [VEHICLE] * 2, starts, 0, PERIOD_NS, jam=jam)
+    return World(WorldSpec(**{**CALM, **world}), OCEAN, [vehicle] * 2, starts, 0, PERIOD_NS, jam=jam)
 
 
 def relays(world: World, state: int) -> None:
@@ -59,7 +61,8 @@ def test_magnets_draw_two_modules_together_and_lock() -> None:
 @pytest.mark.parametrize("quarter", [0, 1, 2, 3])
 def test_pins_allow_four_rotations(quarter: int) -> None:
     q = rotations.from_euler(np.pi / 2 * quarter + 0.05, 0.0, 0.0)
-    world = two(0.015, q=q)
+    level = dataclasses.replace(VEHICLE, inertial=dataclasses.replace(VEHICLE.inertial, righting_arm_m=0.0))  # it would roll back
+    world = two(0.015, q=q, vehicle=level)
     relays(world, PULL)
     run(world, 3.0)
     assert world.bodies == [(0, 1)]

@@ -226,7 +226,7 @@ def test_draws_stay_within_their_magnitudes_and_fill_them() -> None:
         ([d.inertia[2, 2] / 0.068 for d in draws], 0.85, 1.15),
         ([d.drag[0] / 1.05 for d in draws], 0.80, 1.20),
         ([d.deadband_n[3] for d in draws], 0.10, 0.25),
-        ([d.com[0] for d in draws], -0.003, 0.003),
+        ([d.com[0] * d.mass / d.dry_kg for d in draws], -0.003, 0.003),
         ([-d.buoyancy_at[2] for d in draws], 0.0, 0.010),
     ]:
         assert low <= min(values) < low + 0.2 * (high - low)
