@@ -16,7 +16,7 @@ from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rigid_body import add_restoring
-from firmware_py.core.rotations import M, V, rotate_back
+from firmware_py.core.rotations import M, V, rotate_back, to_matrix
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 
@@ -66,11 +66,14 @@ class MissingThrust:
         count = len(body.modules)
         gust = GUST_M_S * body.drag.cruise_slope
         moment = np.hypot(np.array([SIGMA_TILT, SIGMA_TILT, SIGMA_YAW]) * count, GUST_LEVER_M * gust)
-        self._sigma = np.r_[np.full(3, max(SIGMA_FORCE_N * np.sqrt(count), gust)), moment]
-        weight_n = body.rigid_mass_kg * GRAVITY
-        self._tilt = np.array([UNSURE_LIFT_N * np.sqrt(count), UNSURE_ARM_M * weight_n, UNSURE_TRIM_M * weight_n])
-        self._drift = np.repeat([DRIFT_M_S * body.drag.cruise_slope / CRUISE_M_S, 0.0], 3)
-        self._doubt = np.repeat([float(body.mass[0, 0]) * GRAVITY, 0.0], 3)
+        levers_m = np.mean([np.abs(to_matrix(q)) @ [UNSURE_TRIM_M, UNSURE_TRIM_M, UNSURE_ARM_M] for q in body.q_bm], axis=0)
+        self._healthy = (
+            np.r_[np.full(3, max(SIGMA_FORCE_N * np.sqrt(count), gust)), moment],
+            np.r_[UNSURE_LIFT_N * np.sqrt(count), levers_m * body.rigid_mass_kg * GRAVITY],
+            np.repeat([float(body.mass[0, 0]) * GRAVITY, 0.0], 3),
+            np.repeat([DRIFT_M_S * body.drag.cruise_slope / CRUISE_M_S, 0.0], 3),
+        )  # fmt: skip
+        """What `explain` takes as sigma, tilt, doubt and drift."""
         self._period_s = period_ns * 1e-9
         self.forget()
 
@@ -149,7 +152,7 @@ class MissingThrust:
 
     def _explain(self, alive: np.ndarray) -> int:
         """The one thruster that explains the change, or -1."""
-        return int(explain(self._blocks, self._columns, alive, self._sigma, self._tilt, self._doubt, self._drift, self.parameters.lie_share))
+        return int(explain(self._blocks, self._columns, alive, *self._healthy, self.parameters.lie_share))
 
 
 DOWN = np.array([0.0, 0.0, GRAVITY])
@@ -187,7 +190,7 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, lie_share):  # ty
         columns: (n, 6) wrench of unit force. alive: (n,) who may be suspected.
         sigma, doubt, drift: (6,) what a healthy body's change may be: noise and model; by each radian of doubt about the tilt; by each
             m/s that it made.
-        tilt: (3,) how far net buoyancy, N, and the moments of righting arm and trim, N m, may be off.
+        tilt: (4,) how far net buoyancy, N, and weight times the lever of buoyancy, N m, along each axis may be off.
         lie_share: least share of its force that a liar has lost.
     """
     n = columns.shape[0]
@@ -197,8 +200,8 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, lie_share):  # ty
         return -1
     change = new - old
     tx, ty, tz = change[12:FORCES] ** 2
-    lift, arm, trim = tilt**2
-    turned = (lift * tx, lift * ty, lift * tz, arm * ty + trim * tz, arm * tx + trim * tz, trim * (tx + ty))
+    lift, lx, ly, lz = tilt**2
+    turned = (lift * tx, lift * ty, lift * tz, ly * tz + lz * ty, lz * tx + lx * tz, lx * ty + ly * tx)
     speed = max(old[FORCES + n + 1], new[FORCES + n + 1])
     y, unsure, total = np.empty(6), np.empty(6), 0.0
     for i in range(6):

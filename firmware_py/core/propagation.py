@@ -165,7 +165,8 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
         density: (25,) process noise of a body at rest, per second.
         under_way: (6,) what motion adds, as what is not as believed of current, drag, trim and mass is felt in proportion to it: to the
             random walk of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to that of the disturbance moment N m/sqrt(s)
-            for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz) for each rad/s; to the noise of the accelerometer (`observation.fuse_inertial`) m/s^2 for each m/s and for each rad/s.
+            for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz) for each rad/s; to the noise of the accelerometer
+            (`observation.fuse_inertial`) m/s^2 for each m/s and for each rad/s.
     """
     f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
     moved = f @ covariance

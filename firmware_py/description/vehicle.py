@@ -48,7 +48,7 @@ class Inertial:
         [0, 0, 0, 0, 0, 0], unit="kg, kg m^2", low=0, high=1e4, shape=(6,), help="diagonal added mass and inertia"
     )
     righting_arm_m: float = quantity(
-        0.0, unit="m", low=-0.5, high=0.5, help="centre of buoyancy above the centre of mass, times the weight of both a moment"
+        0.0, unit="m", low=-0.5, high=0.5, help="centre of buoyancy above the centre of mass, entrained water included in both"
     )
 
     def __post_init__(self) -> None:
