@@ -1,5 +1,8 @@
 """Turns one thruster, or one after the other (MOTOR_DETECT), past controller and allocator; the limiter still has the
 last word.
+
+MOTOR_DETECT turns each forward and then as long and as hard in reverse: what it did to the attitude of a free robot is undone, and both
+directions are seen.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ class MotorTest:
         self.parameters = parameters
         self._high, self._low = body.thrusters.f_max, body.thrusters.f_min
         self._plan: list[tuple[int, int, float]] = []
+        """Until when, ns, which thruster, with what force, N."""
 
     @property
     def running(self) -> bool:
@@ -39,15 +43,21 @@ class MotorTest:
         if not isinstance(index, int) or not 0 <= index < self._high.size or not math.isfinite(share + seconds):
             return
         share = max(-self.parameters.test_share, min(self.parameters.test_share, share))
-        self._plan = [(time_ns + round(1e9 * max(0.0, min(seconds, LONGEST_S))), index, share)]
+        force = share * (self._high[index] if share > 0.0 else -self._low[index])
+        self._plan = [(time_ns + round(1e9 * max(0.0, min(seconds, LONGEST_S))), index, force)]
 
     def detect(self, time_ns: int) -> None:
         """All thrusters, one after the other."""
         self.stop()
         turn, pause = round(1e9 * self.parameters.test_s), round(1e9 * self.parameters.test_s * PAUSE_SHARE)
+        force = self.parameters.test_share * np.minimum(self._high, -self._low)
         for index in range(self._high.size):
             begin = time_ns + index * (turn + pause)
-            self._plan += [(begin + turn, index, self.parameters.test_share), (begin + turn + pause, index, 0.0)]
+            self._plan += [
+                (begin + turn // 2, index, force[index]),
+                (begin + turn, index, -force[index]),
+                (begin + turn + pause, index, 0.0),
+            ]
 
     def stop(self) -> None:
         """Ends it at once."""
@@ -59,6 +69,6 @@ class MotorTest:
             self._plan.pop(0)
         force = np.zeros(self._high.size)
         if self._plan:
-            _, index, share = self._plan[0]
-            force[index] = share * (self._high[index] if share > 0.0 else -self._low[index])
+            _, index, wanted = self._plan[0]
+            force[index] = wanted
         return force

@@ -66,5 +66,5 @@ class Steering:
         0.3, low=0.01, high=1, help="largest share of full force in a motor test", mavlink="MOT_TEST_MAX"
     )
     test_s: float = quantity(
-        0.8, unit="s", low=0.1, high=10, help="time per thruster in MOTOR_DETECT", mavlink="MOT_TEST_S"
+        0.8, unit="s", low=0.1, high=10, help="time per thruster in MOTOR_DETECT, half of it in reverse", mavlink="MOT_TEST_S"
     )

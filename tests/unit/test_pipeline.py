@@ -249,12 +249,17 @@ def test_motor_detection_turns_one_thruster_after_the_other_with_pauses_between(
     p, first = tank.pipeline.parameters.steering, len(tank.outputs)
     tank.run(1.0, Request(Action.SET_MODE, 0, Mode.MOTOR_DETECT))
     tank.run(8 * 1.5 * p.test_s + 1.0, Request(Action.ARM))
-    turned = np.array([outputs.modules[0].thrusters for outputs in tank.outputs[first:]]) > 0.0
+    commanded = np.array([outputs.modules[0].thrusters for outputs in tank.outputs[first:]])
+    turned = commanded != 0.0
     assert turned.sum(axis=1).max() == 1 and not turned[-1].any()
     begins = np.flatnonzero(np.diff(turned.any(axis=1).astype(int)) == 1) + 1
     assert [int(turned[tick].argmax()) for tick in begins] == list(range(8))
     np.testing.assert_allclose(turned.sum(axis=0) * DT, p.test_s, atol=2 * DT)
     np.testing.assert_allclose(np.diff(begins) * DT, 1.5 * p.test_s, atol=2 * DT)
+    assert (commanded[begins, np.arange(8)] > 0.0).all(), "forward first"
+    np.testing.assert_allclose((commanded < 0.0).sum(axis=0) * DT, 0.5 * p.test_s, atol=2 * DT)
+    force = np.array([outputs.records[0].thrust.force_n for outputs in tank.outputs[first:]])
+    np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=2.0 * np.abs(force).max())  # what forward turned, reverse undoes
 
 
 @pytest.mark.parametrize("share", [0.1, -0.1, 1.0, -1.0])
@@ -380,7 +385,7 @@ def spoilt(body: Body, mistake: str) -> Body:
         return replace(body, q_bt=np.array([multiply(np.ascontiguousarray(q), turn) for q in body.q_bt]))
     if mistake == "two thrusters swapped":
         channel = t.channel.copy()
-        channel[[0, 4]] = channel[[4, 0]]
+        channel[[0, 2]] = channel[[2, 0]]
         return replace(body, thrusters=replace(t, channel=channel))
     matrix = t.matrix * np.where(np.arange(8) == 4, -1.0, 1.0)
     return replace(body, thrusters=replace(t, matrix=matrix, pinv=np.linalg.pinv(matrix)))

@@ -369,13 +369,13 @@ def test_prediction_is_that_of_filterpy(body: Body, seed: int) -> None:
     covariance, density = measurement(seed)[0], np.random.default_rng(seed).uniform(1, 2, ERRORS)
     f = transition(state(seed), DT, body)
     speed, rate = (np.linalg.norm(state(seed)[at]) for at in (slice(7, 10), slice(10, 13)))
-    moving = np.repeat([0.0, 0.4 * rate, 0.0, np.hypot(0.7 * speed, 0.2 * rate), 0.0], [9, 3, 6, 3, 4])
+    moving = np.repeat([0.0, 0.4 * rate, 0.0, np.hypot(0.7 * speed, 0.2 * rate), 0.3 * rate, 0.0], [9, 3, 6, 3, 3, 1])
     q = np.diag(density + moving**2) * DT
     for i in range(3):
         pair = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])
         q[pair] += Q_continuous_white_noise(2, DT, density[9 + i] + moving[9 + i] ** 2) - np.diag([0.0, q[9 + i, 9 + i]])
     _, expected = kalman.predict(np.zeros(ERRORS), covariance, f, q)
-    x, got = propagation.predict(state(seed), covariance, TAU, DT, density, np.array([0.7, 0.2, 0.4]), *plant(body))
+    x, got = propagation.predict(state(seed), covariance, TAU, DT, density, np.array([0.7, 0.2, 0.3, 0.4]), *plant(body))
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(got, got.T)
     np.testing.assert_array_equal(x, propagation.step(state(seed), TAU, DT, *plant(body)))
