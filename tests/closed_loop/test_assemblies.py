@@ -21,6 +21,13 @@ def test_moebius_strip_is_flown_by_one_two_and_four_modules(fly: Fly, name: str,
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [4, 8])
+def test_healthy_robot_that_turns_over_in_a_current_keeps_all_its_thrusters(fly: Fly, seed: int) -> None:
+    """Its righting arm is off by 3 and 4 mm, and it meets the current from all sides: no motion that a thruster is to blame for."""
+    assert fly(load_scenario("mobius-1").with_ideal_sensors(), seed).metrics["warnings"] == 0.0
+
+
+@pytest.mark.slow
 def test_random_shape_of_modules_flies_a_closed_curve(fly: Fly) -> None:
     assert 0.001 <= fly(load_scenario("polycube"), 0).metrics["position_rmse_m"] <= 0.015
 
