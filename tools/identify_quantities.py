@@ -141,12 +141,12 @@ def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) 
     """
     old, body = vehicle.inertial, assemble_vehicle(vehicle)
     total, before = np.exp(np.concatenate([fit.value("mass"), fit.value("inertia")])), np.diag(body.mass)
-    rigid = min((old.dry_kg + old.entrained_kg) * float(np.mean(total[:3] / before[:3])), float(total[:3].min()))
+    rigid = max(old.dry_kg, min((old.dry_kg + old.entrained_kg) * float(np.mean(total[:3] / before[:3])), float(total[:3].min())))
     turn = min(float(np.mean(total[3:] / before[3:])), float(np.min(total[3:] / np.diag(old.inertia))))
     inertia, gain = old.inertia * turn, float(np.mean(fit.value("gain")))
     inertial = dataclasses.replace(
         old,
-        entrained_kg=max(0.0, rigid - old.dry_kg),
+        entrained_kg=rigid - old.dry_kg,
         inertia=frozen_array(inertia),
         added=frozen_array(total - np.concatenate([np.full(3, rigid), np.diag(inertia)])),
         righting_arm_m=float(-fit.value("arm")[2] / (rigid * GRAVITY)),

@@ -2,9 +2,9 @@
 
 Where the pseudo-inverse (plus the preload) stays within limits it is the answer. Otherwise a box-constrained
 least-squares problem (box_program) keeps the directions of force and moment, and gives way first in the force beyond what holds a
-place, then in that and the moment alike; and so does a body whose supplies cannot feed the answer. A robot that lacks moment leans
-into its righting moment and stays where it is, instead of keeping level and drifting away. Mode `least_power` moves an answer
-within limits to where the thrusters draw the least.
+place, then in that and the moment, whichever costs the less; and so does a body whose supplies cannot feed the answer. A robot that
+lacks moment leans into its righting moment and stays where it is, instead of keeping level and drifting away.
+Mode `least_power` moves an answer within limits to where the thrusters draw the least.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from firmware_py.description.parameters import Allocation
 HOLD = 0.05
 """Share of what all thrusters together could push that counts as much as the moment: of a module 4 N, against buoyancy, current and the
 drag of a slow path."""
-PRIORITY = 100.0
-"""How much more a lost share of moment and holding force costs than a lost share of the rest of the force."""
+PRIORITIES = np.array([1e2, 1e2, 1.0])
+"""What a lost share of the holding force, of the moment and of the rest of the force costs."""
 SHARE_WEIGHT = 1e3
-"""Cost of losing the rest of the force against all thrusters at their limits: high enough that feasible force is not given away."""
+"""Cost of losing the rest of the force, against all thrusters at their limits: high enough that feasible force is not given away."""
 BEYOND = 2.0
 """A wrench above this many times what all thrusters together could give is scaled down first, so that the problem stays well scaled."""
 HALVINGS = 8
@@ -54,7 +54,7 @@ def are_within(force, f_min, f_max):  # type: ignore[no-untyped-def]
 
 def _sizes(wrench: np.ndarray) -> np.ndarray:
     """(2,) of force and moment."""
-    return np.asarray(np.sqrt(np.square(wrench).reshape(2, 3).sum(axis=1)))
+    return np.asarray(np.linalg.norm(wrench.reshape(2, 3), axis=1))
 
 
 def _kept(made: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
@@ -73,7 +73,7 @@ class Allocator:
         self._thrusters = body.thrusters
         n = body.thrusters.f_max.size
         weight = SHARE_WEIGHT * float(np.sum(body.thrusters.f_max**2))
-        self._weights = np.r_[np.ones(n), weight * PRIORITY, weight]
+        self._weights = np.r_[np.ones(n), weight * PRIORITIES]
         reach = np.maximum(body.thrusters.f_max, -body.thrusters.f_min)
         self._most = np.array([np.linalg.norm(body.thrusters.matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
         self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
@@ -98,14 +98,14 @@ class Allocator:
         self._alive = alive
         self._preload = preload(t, alive, self._smallest_n, self._preloaded)
         self._preloaded = (alive.copy(), self._preload)
-        self._rows = np.vstack([self._matrix.T, np.zeros((2, 6))])
-        self._goal = np.r_[self._preload, 1.0, 1.0]
+        self._rows = np.vstack([self._matrix.T, np.zeros((3, 6))])
+        self._goal = np.r_[self._preload, np.ones(3)]
         self._cheaper = LeastPower(t, alive) if self._least_power else None
         self._set_limits()
 
     def _set_limits(self) -> None:
         self._f_min, self._f_max = self._room.low_n * self._alive, self._room.high_n * self._alive
-        self._low, self._high = np.r_[self._f_min, 0.0, 0.0], np.r_[self._f_max, 1.0, 1.0]
+        self._low, self._high = np.r_[self._f_min, np.zeros(3)], np.r_[self._f_max, np.ones(3)]
         if self._cheaper:
             self._cheaper.confine(self._f_min, self._f_max)
 
@@ -118,20 +118,20 @@ class Allocator:
 
     def _fed(self, wrench: np.ndarray, unfed: Thrust) -> Thrust:
         """What the supplies can feed; where that is not even the preload, `unfed`, of which the limiter takes each module's share."""
-        first, rest = self._parts(wrench)
-        for part, beside in ((rest, first), (first, np.zeros(6))):
+        holding, moment, rest = self._parts(wrench)
+        for part, beside in ((rest, holding + moment), (holding + moment, np.zeros(6))):
+            if not part.any():
+                continue
             asked, thrust = self._largest_share(part, beside)
             if self._is_fed(thrust):
                 return thrust._replace(scale=_kept(asked * np.repeat(thrust.scale, 3), wrench))
         return unfed
 
     def _parts(self, wrench: np.ndarray) -> np.ndarray:
-        """(2, 6) wrenches that make up `wrench`: moment and the force that holds, the rest of the force."""
+        """(3, 6) wrenches that make up `wrench`: the force that holds, the moment, the rest of the force."""
         held = min(1.0, HOLD * self._most[0] / max(_sizes(wrench)[0], TINY))
-        parts = np.vstack([wrench, wrench])
-        parts[0, :3] *= held
-        parts[1, :3] *= 1.0 - held
-        parts[1, 3:] = 0.0
+        parts = np.zeros((3, 6))
+        parts[0, :3], parts[1, 3:], parts[2, :3] = held * wrench[:3], wrench[3:], (1.0 - held) * wrench[:3]
         return parts
 
     def _is_fed(self, thrust: Thrust) -> bool:
@@ -163,15 +163,15 @@ class Allocator:
         return Thrust(force, self._matrix @ force, kept, 1.0 - busiest(force, self._room.low_n, self._room.high_n))
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
-        """min |f - f_preload|^2 + w_1 (1 - a)^2 + w_2 (1 - b)^2, J f = a W_1 + b W_2, f within limits, 0 <= a, b <= 1."""
+        """min |f - f_preload|^2 + sum_i w_i (1 - s_i)^2 so that J f = sum_i s_i W_i, f within limits, 0 <= s_i <= 1; W the parts."""
         parts = self._parts(wrench)
         down = np.array([self._down(part) for part in parts])
-        self._rows[-2:] = -parts * down[:, None]
+        self._rows[-3:] = -parts * down[:, None]
         x = np.empty_like(self._goal)
         if not nearest(self._rows, self._weights, self._goal, self._low, self._high, x) <= LEFT:
             share = self._common_share(wrench)
             return self._thrust(self._pinv @ wrench * share, (share, share))
-        return self._thrust(x[:-2].copy(), _kept((x[-2:] * down) @ parts, wrench))
+        return self._thrust(x[:-3].copy(), _kept((x[-3:] * down) @ parts, wrench))
 
     def _down(self, wrench: np.ndarray) -> float:
         """What scales a wrench down that is beyond all bounds."""

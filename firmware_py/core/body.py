@@ -73,6 +73,7 @@ class Body:
         r_bi: (m, 3) IMUs from the centre of mass.
         mass: (6, 6) rigid, entrained and added mass about the centre of mass; mass_inv: its inverse.
         rigid_mass_kg: dry and entrained mass.
+        dry_kg, wet_kg: (m,) mass of each module without what it carries: dry, and with the entrained water.
         righting: (3,) sum of weight, entrained water included, times (centre of buoyancy - centre of mass), body frame, N m.
         thrusters, drag: see there.
         tag_ids: (t,) ids; tag_module: (t,) index within the body; r_bt: (t, 3); q_bt: (t, 4) tag frame to body frame.
@@ -93,6 +94,8 @@ class Body:
     mass: np.ndarray
     mass_inv: np.ndarray
     rigid_mass_kg: float
+    dry_kg: np.ndarray
+    wet_kg: np.ndarray
     righting: np.ndarray
     thrusters: ThrusterSet
     drag: DragTable

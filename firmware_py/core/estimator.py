@@ -96,7 +96,7 @@ class Estimator:
         self._density = self._process_noise()
         drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
         reach_m = self._body.reach_m
-        weight_n = self._body.rigid_mass_kg * observation.GRAVITY
+        weight_n = observation.GRAVITY * float(np.linalg.norm(self._body.wet_kg))  # each module's lever is off on its own
         self._under_way = np.array([
             drag_walk, drag_walk * reach_m, p.trim_walk * weight_n, p.alpha_turning, p.accel_under_way, p.accel_under_way * reach_m,
         ])  # fmt: skip

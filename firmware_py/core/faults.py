@@ -34,7 +34,7 @@ FAST_SHARE = 2.0
 FAST_MARGIN = 0.25
 """Share of full speed that it must be off besides: below, deadband and lag explain it."""
 CLEAR = 4.0
-"""A propeller that stands still where this many times the least force is believed counts twice: it is not about to start."""
+"""A propeller that stands still again where this many times the least force is believed counts twice: it is not about to start."""
 TELLS = 0.3
 """Weight of one feedback in what an ESC tells of its thruster's force. Ten come in a second (DESIGN's bus), so that 0.3 s are remembered:
 less than the half second of motion that core.missing_thrust judges."""
@@ -189,7 +189,7 @@ def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, ne
         force_n, alive, full_n, rpm_at_full: of all thrusters; force believed, may be used, full forces (n, 2), full speed.
         least_n: force from which a speed is judged, N; dead_share: as the parameter.
         needed: (3,) feedbacks in a row that suffice for DOWN, STANDS, DISOBEYS.
-        counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS; of STANDS a clear one counts twice.
+        counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS; of STANDS a clear one after another counts twice.
         heard: (n, 2) means of what the speed tells of the force times what is believed of it, and of that squared, any unit.
         share: (n,) of the believed force that the speeds tell of, 0 to 1: a weak thruster does not lie when its ESC says so.
     """
@@ -209,7 +209,7 @@ def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, ne
             wrong_way = rpm * believed < 0.0 and not stands and abs(rpm - believed) > margin
             count[DOWN] = count[DOWN] + 1 if status in ESC_DOWN else 0
             if abs(force_n[i]) >= least_n:
-                count[STANDS] = count[STANDS] + (2 if abs(force_n[i]) >= CLEAR * least_n else 1) if stands else 0
+                count[STANDS] = count[STANDS] + (2 if count[STANDS] > 0 and abs(force_n[i]) >= CLEAR * least_n else 1) if stands else 0
             count[DISOBEYS] = count[DISOBEYS] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
             for kind in range(len(WHY)):
                 found = found or count[kind] >= needed[kind]

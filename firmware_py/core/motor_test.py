@@ -1,8 +1,8 @@
 """Turns one thruster, or one after the other (MOTOR_DETECT), past controller and allocator; the limiter still has the
 last word.
 
-MOTOR_DETECT turns each forward and then as long and as hard in reverse: what it did to the attitude of a free robot is undone, and both
-directions are seen.
+MOTOR_DETECT turns each forward, twice as long in reverse, and forward again, all with the same force: what that does to place and
+attitude of a free robot is undone at its end, and both directions are seen.
 """
 
 from __future__ import annotations
@@ -47,15 +47,16 @@ class MotorTest:
         self._plan = [(time_ns + round(1e9 * max(0.0, min(seconds, LONGEST_S))), index, force)]
 
     def detect(self, time_ns: int) -> None:
-        """All thrusters, one after the other."""
+        """All thrusters, one after the other, each with its share of what its weaker direction can give."""
         self.stop()
         turn, pause = round(1e9 * self.parameters.test_s), round(1e9 * self.parameters.test_s * PAUSE_SHARE)
         force = self.parameters.test_share * np.minimum(self._high, -self._low)
         for index in range(self._high.size):
             begin = time_ns + index * (turn + pause)
             self._plan += [
-                (begin + turn // 2, index, force[index]),
-                (begin + turn, index, -force[index]),
+                (begin + turn // 4, index, force[index]),
+                (begin + 3 * turn // 4, index, -force[index]),
+                (begin + turn, index, force[index]),
                 (begin + turn + pause, index, 0.0),
             ]
 

@@ -165,7 +165,7 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
         density: (25,) process noise of a body at rest, per second.
         under_way: (6,) what motion adds, as what is not as believed of current, drag, trim and mass is felt in proportion to it: to the
             random walk of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to that of the disturbance moment N m/sqrt(s)
-            for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz) for each rad/s; to the noise of the accelerometer
+            for each rad/s that it tilts; to the angular acceleration rad/s^2/sqrt(Hz) for each rad/s; to the noise of the accelerometer
             (`observation.fuse_inertial`) m/s^2 for each m/s and for each rad/s.
     """
     f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
@@ -181,6 +181,8 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
         out[i, i] += density[i] * dt
     speed, rate = squared_speeds(x)
     turning = under_way[3] ** 2 * rate
+    dx, dy, dz = turned_back(x[3:7], 0.0, 0.0, 1.0)
+    tilting = rate - (x[10] * dx + x[11] * dy + x[12] * dz) ** 2
     for i in range(3):
         alpha = density[9 + i] + turning
         out[9 + i, 9 + i] += turning * dt
@@ -188,7 +190,7 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
         out[9 + i, 3 + i] += 0.5 * alpha * dt**2
         out[3 + i, 3 + i] += alpha * dt**3 / 3.0
         out[18 + i, 18 + i] += (under_way[0] ** 2 * speed + under_way[1] ** 2 * rate) * dt
-        out[21 + i, 21 + i] += under_way[2] ** 2 * rate * dt
+        out[21 + i, 21 + i] += under_way[2] ** 2 * tilting * dt
     return step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear), out
 
 

@@ -186,7 +186,7 @@ class Faults:
         0.45, low=0.05, high=0.95, help="share of the believed speed below which a propeller stands", mavlink="FLT_DEAD"
     )
     dead_count: int = quantity(
-        3, low=1, high=50, help="feedbacks in a row that must agree; a standstill at four times force_n counts twice", mavlink="FLT_COUNT"
+        3, low=1, high=50, help="feedbacks in a row that must agree; the next standstill at 4 force_n counts twice", mavlink="FLT_COUNT"
     )
     stray_count: int = quantity(
         2, low=1, high=50, help="the same where it turns too fast or the wrong way, which turns the robot over", mavlink="FLT_STRAY"

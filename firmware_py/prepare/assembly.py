@@ -140,6 +140,8 @@ def _body(
         mass=mass,
         mass_inv=np.ascontiguousarray(np.linalg.inv(mass)),
         rigid_mass_kg=float(rigid_mass),
+        dry_kg=np.array([p.vehicle.inertial.dry_kg for p in placements]),
+        wet_kg=np.array([p.vehicle.inertial.dry_kg + p.vehicle.inertial.entrained_kg for p in placements]),
         righting=sum((_righting(p) for p in placements), np.zeros(3)),
         thrusters=thruster_set([p.vehicle for p in placements], turns, r_bm),
         drag=drag_table.build(placements, com, pitch_m, cache),

@@ -60,7 +60,7 @@ class Bodies(NamedTuple):
     inverse: np.ndarray
     """(b, 6, 6) inverse of their sum."""
     weight: np.ndarray
-    """(b, 8) weight W and buoyancy B of the dry parts, N; W r_W and B r_B, N m."""
+    """(b, 8) weight W, entrained water included, and buoyancy B, N; W r_W and B r_B, N m."""
     hull: np.ndarray
     """(b, 4) mass of the water that the hulls displace, entrained water included, kg; mass times centre, kg m."""
     wrench: np.ndarray

@@ -160,7 +160,7 @@ def fill_body(
         # Neutral but for the buoyancy error: the hull and what floods it displace what robot and entrained water weigh.
         displaced = draw.buoyancy_n / spec.gravity
         bodies.hull[b, 0] += displaced
-        bodies.hull[b, 1:4] += displaced * r
+        bodies.hull[b, 1:4] += displaced * (r + turn @ draw.buoyancy_at)
         for load in draw.payload:  # trimmed: it weighs what it displaces, at one point
             bodies.hull[b, 0] += load.dry_kg + load.entrained_kg
             bodies.hull[b, 1:4] += (load.dry_kg + load.entrained_kg) * (r + turn @ load.position_m)

@@ -81,10 +81,11 @@ def process_sigma(body: Body, p: Estimation, x: np.ndarray) -> np.ndarray:
     """(25,) root spectral density of what the model leaves out of a robot in state x, from the parameters' own words."""
     m, j = np.diag(body.mass)[:3], np.diag(body.mass)[3:]
     rate = np.linalg.norm(x[10:13])
+    tilting = np.linalg.norm(np.cross(x[10:13], Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, 1.0])))
     drag_slope = 2.0 * body.drag.nodes[..., 0].mean() * np.hypot(np.linalg.norm(x[7:10]), body.reach_m * rate)
     force = np.hypot(p.force_walk * m, p.current_walk * drag_slope)
     alpha = np.hypot(p.alpha_process, p.alpha_turning * rate)
-    moment = np.hypot(p.moment_walk * j, p.trim_walk * 9.80665 * body.rigid_mass_kg * rate)
+    moment = np.hypot(p.moment_walk * j, p.trim_walk * 9.80665 * np.linalg.norm(body.wet_kg) * tilting)
     walks = [p.gyro_bias_walk] * 3 + [p.accel_bias_walk] * 3 + list(force) + list(moment)
     return np.array([0.0] * 6 + [p.accel_process] * 3 + [alpha] * 3 + walks + [p.depth_bias_walk])
 

@@ -259,7 +259,9 @@ def test_motor_detection_turns_one_thruster_after_the_other_with_pauses_between(
     assert (commanded[begins, np.arange(8)] > 0.0).all(), "forward first"
     np.testing.assert_allclose((commanded < 0.0).sum(axis=0) * DT, 0.5 * p.test_s, atol=2 * DT)
     force = np.array([outputs.records[0].thrust.force_n for outputs in tank.outputs[first:]])
-    np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=2.0 * np.abs(force).max())  # what forward turned, reverse undoes
+    rate = np.cumsum(force, axis=0) * DT  # of a mass of one
+    np.testing.assert_allclose(rate[-1], 0.0, atol=2.0 * DT * np.abs(force).max())
+    np.testing.assert_allclose(rate.sum(axis=0) * DT, 0.0, atol=4.0 * DT * p.test_s * np.abs(force).max())  # it is back
 
 
 @pytest.mark.parametrize("share", [0.1, -0.1, 1.0, -1.0])

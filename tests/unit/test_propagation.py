@@ -369,7 +369,9 @@ def test_prediction_is_that_of_filterpy(body: Body, seed: int) -> None:
     covariance, density = measurement(seed)[0], np.random.default_rng(seed).uniform(1, 2, ERRORS)
     f = transition(state(seed), DT, body)
     speed, rate = (np.linalg.norm(state(seed)[at]) for at in (slice(7, 10), slice(10, 13)))
-    moving = np.repeat([0.0, 0.4 * rate, 0.0, np.hypot(0.7 * speed, 0.2 * rate), 0.3 * rate, 0.0], [9, 3, 6, 3, 3, 1])
+    down = Rotation.from_quat(state(seed)[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, 1.0])
+    tilting = np.linalg.norm(np.cross(state(seed)[10:13], down))
+    moving = np.repeat([0.0, 0.4 * rate, 0.0, np.hypot(0.7 * speed, 0.2 * rate), 0.3 * tilting, 0.0], [9, 3, 6, 3, 3, 1])
     q = np.diag(density + moving**2) * DT
     for i in range(3):
         pair = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])
