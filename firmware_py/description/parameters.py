@@ -91,7 +91,7 @@ class Estimation:
         0.035, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia, of a body at rest", mavlink="DIST_M_WALK"
     )
     trim_walk: float = quantity(
-        0.0004, unit="m sqrt(s)", low=0, high=1, help="trim and righting arm, felt by a body that tilts", mavlink="DIST_T_WALK"
+        0.0006, unit="m sqrt(s)", low=0, high=1, help="trim and righting arm, felt by a body that tilts", mavlink="DIST_T_WALK"
     )
     accel_process: float = quantity(
         0.0107, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC"
