@@ -7,6 +7,7 @@ import json
 import subprocess
 import tarfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from shlex import quote
 from typing import IO, Any, cast
@@ -70,15 +71,14 @@ class Vehicle:
         command = [*self._ssh, f"mkdir -p {quote(folder)} && tar -x -C {quote(folder)}"]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as ssh:
             assert ssh.stdin is not None and ssh.stderr is not None
-            try:
+            with suppress(BrokenPipeError):
                 with tarfile.open(fileobj=cast(IO[bytes], _Counted(ssh.stdin, progress)), mode="w|") as archive:
                     for path in paths:
                         archive.add(path, path.name, filter=_anonymous)
+            with suppress(BrokenPipeError):  # of what was not yet written: closed it is in any case
                 ssh.stdin.close()
-            except BrokenPipeError:
-                pass
             text = ssh.stderr.read().decode(errors="replace")
-            ssh.stdin = None  # closed, or broken: not to be flushed again
+            ssh.stdin = None  # not to be flushed again
         if ssh.returncode:
             raise self._error(ssh.returncode, text, "")
 
