@@ -71,10 +71,10 @@ class Vehicle:
         command = [*self._ssh, f"mkdir -p {quote(folder)} && tar -x -C {quote(folder)}"]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as ssh:
             assert ssh.stdin is not None and ssh.stderr is not None
-            with suppress(BrokenPipeError):
-                with tarfile.open(fileobj=cast(IO[bytes], _Counted(ssh.stdin, progress)), mode="w|") as archive:
-                    for path in paths:
-                        archive.add(path, path.name, filter=_anonymous)
+            pipe = cast(IO[bytes], _Counted(ssh.stdin, progress))
+            with suppress(BrokenPipeError), tarfile.open(fileobj=pipe, mode="w|") as archive:
+                for path in paths:
+                    archive.add(path, path.name, filter=_anonymous)
             with suppress(BrokenPipeError):  # of what was not yet written: closed it is in any case
                 ssh.stdin.close()
             text = ssh.stderr.read().decode(errors="replace")
