@@ -141,7 +141,7 @@ def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) 
     """
     old, body = vehicle.inertial, assemble_vehicle(vehicle)
     total, before = np.exp(np.concatenate([fit.value("mass"), fit.value("inertia")])), np.diag(body.mass)
-    rigid = max(old.dry_kg, min((old.dry_kg + old.entrained_kg) * float(np.mean(total[:3] / before[:3])), float(total[:3].min())))
+    rigid = max(old.dry_kg, min(old.wet_kg * float(np.mean(total[:3] / before[:3])), float(total[:3].min())))
     turn = min(float(np.mean(total[3:] / before[3:])), float(np.min(total[3:] / np.diag(old.inertia))))
     inertia, gain = old.inertia * turn, float(np.mean(fit.value("gain")))
     inertial = dataclasses.replace(

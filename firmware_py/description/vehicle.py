@@ -51,6 +51,11 @@ class Inertial:
         0.0, unit="m", low=-0.5, high=0.5, help="centre of buoyancy above the centre of mass, entrained water included in both"
     )
 
+    @property
+    def wet_kg(self) -> float:
+        """Mass with the entrained water, kg."""
+        return self.dry_kg + self.entrained_kg
+
     def __post_init__(self) -> None:
         least, middle, most = np.linalg.eigvalsh(self.inertia)
         if not np.array_equal(self.inertia, self.inertia.T) or least <= 0.0 or most > (least + middle) * (1.0 + 1e-9):

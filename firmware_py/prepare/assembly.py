@@ -141,7 +141,7 @@ def _body(
         mass_inv=np.ascontiguousarray(np.linalg.inv(mass)),
         rigid_mass_kg=float(rigid_mass),
         dry_kg=np.array([p.vehicle.inertial.dry_kg for p in placements]),
-        wet_kg=np.array([p.vehicle.inertial.dry_kg + p.vehicle.inertial.entrained_kg for p in placements]),
+        wet_kg=np.array([p.vehicle.inertial.wet_kg for p in placements]),
         righting=sum((_righting(p) for p in placements), np.zeros(3)),
         thrusters=thruster_set([p.vehicle for p in placements], turns, r_bm),
         drag=drag_table.build(placements, com, pitch_m, cache),
@@ -170,7 +170,7 @@ def _reach_m(vehicle: Vehicle, r_bm: np.ndarray) -> float:
 def _righting(placement: Placement) -> np.ndarray:
     """(3,) weight, entrained water included, times the arm from centre of mass up (-z of the module) to that of buoyancy, N m."""
     inertial = placement.vehicle.inertial
-    moment = GRAVITY * (inertial.dry_kg + inertial.entrained_kg) * inertial.righting_arm_m
+    moment = GRAVITY * inertial.wet_kg * inertial.righting_arm_m
     return np.asarray(MATRICES[placement.rotation] @ np.array([0.0, 0.0, -moment]))
 
 
@@ -185,8 +185,7 @@ class _Lump:
 
 def _lumps(placement: Placement, origin: np.ndarray) -> list[_Lump]:
     inertial, turn = placement.vehicle.inertial, MATRICES[placement.rotation]
-    module = inertial.dry_kg + inertial.entrained_kg
-    lumps = [_Lump(module, origin + turn @ inertial.com_m, turn @ inertial.inertia @ turn.T)]
+    lumps = [_Lump(inertial.wet_kg, origin + turn @ inertial.com_m, turn @ inertial.inertia @ turn.T)]
     for payload in placement.vehicle.payload:
         mass, squares = payload.dry_kg + payload.entrained_kg, payload.size_m**2
         inertia = mass / 12.0 * np.diag(squares.sum() - squares)

@@ -172,7 +172,7 @@ def nominal_centre(vehicles: Sequence[Vehicle], places: Sequence[Place]) -> np.n
     mass, moment = 0.0, np.zeros(3)
     for vehicle, seat in zip(vehicles, places, strict=True):
         turn = rotations.to_matrix(seat.quaternion)
-        lumps = [(vehicle.inertial.dry_kg + vehicle.inertial.entrained_kg, vehicle.inertial.com_m)]
+        lumps = [(vehicle.inertial.wet_kg, vehicle.inertial.com_m)]
         lumps += [(p.dry_kg + p.entrained_kg, p.position_m) for p in vehicle.payload]
         for kg, at in lumps:
             mass += kg

@@ -91,7 +91,7 @@ def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> Mo
     return ModuleDraw(
         dry_kg=dry,
         entrained_kg=entrained,
-        com=inertial.com_m + shift * inertial.dry_kg / (inertial.dry_kg + inertial.entrained_kg),
+        com=inertial.com_m + shift * inertial.dry_kg / inertial.wet_kg,
         buoyancy_at=inertial.com_m - np.array([0.0, 0.0, arm]),
         buoyancy_n=(dry + entrained) * spec.gravity + sign * spec.buoyancy_error_n,
         inertia=inertial.inertia * np.outer(root, root),

@@ -86,8 +86,8 @@ def in_parts(body: Body, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return wrench - moment - rest, moment, rest
 
 
-def best_by_clarabel(body: Body, wrench: np.ndarray) -> np.ndarray:
-    """The allocator's problem in clarabel's form: (n + 3,) forces and shares."""
+def best_by_clarabel(body: Body, wrench: np.ndarray) -> tuple[np.ndarray, float]:
+    """The allocator's problem in clarabel's form: (n + 3,) forces and shares, and the least cost."""
     t = body.thrusters
     n = t.f_max.size
     whole = SHARE_WEIGHT * float(t.f_max @ t.f_max)
@@ -101,7 +101,8 @@ def best_by_clarabel(body: Body, wrench: np.ndarray) -> np.ndarray:
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
     solver = clarabel.DefaultSolver(sparse.csc_matrix(np.diag(2 * weights)), -2 * weights * goal, a, b, cones, settings)
-    return np.array(solver.solve().x)
+    x = np.array(solver.solve().x)
+    return x, float(weights @ (x - goal) ** 2)
 
 
 @pytest.mark.parametrize("size", [1.0, 3.0, 10.0])
@@ -113,7 +114,12 @@ def test_saturated_answer_is_the_one_another_solver_finds(body: Body, size: floa
         if thrust.scale == (1.0, 1.0):
             continue
         saturated += 1
-        x = best_by_clarabel(body, wrench)
+        x, cost = best_by_clarabel(body, wrench)
+        force, held, rest = (float(np.linalg.norm(part[:3])) for part in np.array([wrench, *in_parts(body, wrench)])[[0, 1, 3]])
+        shares = np.array([x[-3], thrust.scale[1], (thrust.scale[0] * force - x[-3] * held) / rest if rest > 0.0 else x[-1]])
+        weights = SHARE_WEIGHT * float(body.thrusters.f_max @ body.thrusters.f_max) * PRIORITIES
+        ours = float(thrust.force_n @ thrust.force_n + weights @ (1.0 - shares) ** 2)
+        assert ours <= cost + 1e-4 * (1.0 + cost)
         np.testing.assert_allclose(thrust.force_n, x[:-3], atol=2e-2)
         np.testing.assert_allclose(thrust.achieved, x[-3:] @ in_parts(body, wrench), atol=3e-2)
         assert thrust.scale[1] == pytest.approx(x[-2], abs=1e-4)

@@ -171,7 +171,7 @@ def _lumps(vehicle: Vehicle) -> list[tuple[float, np.ndarray]]:
     """Masses of a module and what it carries, entrained water included, kg, and where, module frame, m."""
     own = vehicle.inertial
     carried = [(load.dry_kg + load.entrained_kg, load.position_m) for load in vehicle.payload]
-    return [(own.dry_kg + own.entrained_kg, own.com_m), *carried]
+    return [(own.wet_kg, own.com_m), *carried]
 
 
 def of_thrusters(name: str, thrusters: ThrusterSet, passive: tuple[int, ...] = (), assumption: str = "") -> Layout:
