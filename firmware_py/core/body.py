@@ -11,6 +11,9 @@ import numpy as np
 
 CRUISE_M_S = 0.2
 """Speed of a robot under way, by which a change of the water's own speed is turned into a change of drag."""
+BUOYANCY_SIGMA_N, ARM_SIGMA_M, TRIM_SIGMA_M = 0.5, 0.003, 0.002
+"""Buoyancy of a module, its righting arm (times its weight with the entrained water a moment) and its trim along each axis (times its
+dry weight) may be off by this much: felt when the body tilts. One sigma of what the bench draws: 5 and 3 mm to either side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,8 +76,8 @@ class Body:
         r_bi: (m, 3) IMUs from the centre of mass.
         mass: (6, 6) rigid, entrained and added mass about the centre of mass; mass_inv: its inverse.
         rigid_mass_kg: dry and entrained mass.
-        dry_kg, wet_kg: (m,) mass of each module without what it carries: dry, and with the entrained water.
         righting: (3,) sum of weight, entrained water included, times (centre of buoyancy - centre of mass), body frame, N m.
+        righting_sigma: (3,) how far that may be off, as arm, trim and buoyancy of each module are.
         thrusters, drag: see there.
         tag_ids: (t,) ids; tag_module: (t,) index within the body; r_bt: (t, 3); q_bt: (t, 4) tag frame to body frame.
         tag_module and r_bt follow the order of tag_ids.
@@ -94,9 +97,8 @@ class Body:
     mass: np.ndarray
     mass_inv: np.ndarray
     rigid_mass_kg: float
-    dry_kg: np.ndarray
-    wet_kg: np.ndarray
     righting: np.ndarray
+    righting_sigma: np.ndarray
     thrusters: ThrusterSet
     drag: DragTable
     tag_ids: np.ndarray

@@ -1,4 +1,4 @@
-"""Stage 2 of a tick: an error-state Kalman filter of pose, velocity, sensor biases and one lumped disturbance.
+"""Stage 2 of a tick: an error-state Kalman filter of pose, velocity, sensor biases, one lumped disturbance, and what turns a body upright.
 
 The filter stands at its anchor: the time of the newest tag picture, or half a second ago when none came. Everything is fused once, in the
 order in which it happened; from the anchor the state is carried to now through the stored thruster wrenches and gyro readings. While no
@@ -23,6 +23,7 @@ from firmware_py.core.alignment import FirstSight, upright
 from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.history import WINDOW_S, History
 from firmware_py.core.propagation import ERRORS, STATES
+from firmware_py.core.rigid_body import restoring_moment
 from firmware_py.core.rotations import heading, multiply, rotate, to_matrix
 from firmware_py.core.topology import Motion
 from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
@@ -47,8 +48,8 @@ STILL_DENSITY = 0.0003
 NORTH_DENSITY = 1e-4
 """Of the noise of the heading before the first tag, rad^2 s: it says where north is, and so is known. What the filter else took for
 knowledge of it was noise: a bump turned the belief by a third of a circle."""
-KEPT, MOVING = np.r_[10:19, 21:25], slice(6, 9)
-"""Of the state: rates, biases, vertical force and moment, which say the same whatever the heading. Of the error: velocity."""
+KEPT, MOVING = np.r_[10:19, 21:25, 26:29], slice(6, 9)
+"""Of the state: rates, biases, vertical force, moment and righting, which say the same whatever the heading. Of the error: velocity."""
 SPEED_SIGMA = 0.5
 """Of one that was adrift, when tags come, m/s: what a module swims at half stick."""
 FELT_LIMIT_NS = 2_000_000_000
@@ -60,7 +61,7 @@ INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
 
 
 class Belief(NamedTuple):
-    """State (26,) and covariance (25, 25) at a time, as core.propagation orders them."""
+    """State (29,) and covariance (28, 28) at a time, as core.propagation orders them."""
 
     x: np.ndarray
     covariance: np.ndarray
@@ -96,9 +97,8 @@ class Estimator:
         self._density = self._process_noise()
         drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
         reach_m = self._body.reach_m
-        weight_n = observation.GRAVITY * float(np.linalg.norm(self._body.wet_kg))  # each module's lever is off on its own
         self._under_way = np.array([
-            drag_walk, drag_walk * reach_m, p.trim_walk * weight_n, p.alpha_turning, p.accel_under_way, p.accel_under_way * reach_m,
+            drag_walk, drag_walk * reach_m, p.alpha_turning, p.accel_under_way, p.accel_under_way * reach_m,
         ])  # fmt: skip
         self._inertial_sigma = np.array([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m])
         self._tag_variance = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2
@@ -173,7 +173,7 @@ class Estimator:
         x[3:7] = pose.q_wb
         x[:3] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
         inertia = np.diag(self._body.mass)
-        sigma = np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1])
+        sigma = np.r_[np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1]), self._body.righting_sigma]
         sigma[18:24] *= inertia
         self._anchor = self._head = Belief(x, np.diag(sigma**2), pose.capture_ns)
         self._last_tag_ns, self._taken_ns = pose.capture_ns, self._history.newest_ns
@@ -312,7 +312,7 @@ class Estimator:
             q_wb=x[3:7].copy(),
             nu=x[7:13].copy(),
             force_w=x[19:22].copy(),
-            moment_b=x[22:25].copy(),
+            moment_b=x[22:25] + restoring_moment(x[26:29].copy(), x[3:7].copy()),
             sigma_p=sigma[:3],
             sigma_q=sigma[3:],
             tag_age_ns=time_ns - self._last_tag_ns,
@@ -323,7 +323,7 @@ class Estimator:
         )
 
     def _process_noise(self) -> np.ndarray:
-        """(25,) spectral density of the process noise of a body at rest, per second."""
+        """(28,) spectral density of the process noise of a body at rest, per second."""
         p = self._p
         inertia = np.diag(self._body.mass)
         density = np.zeros(ERRORS)
@@ -334,4 +334,5 @@ class Estimator:
         density[18:21] = p.force_walk * inertia[:3]
         density[21:24] = p.moment_walk * inertia[3:]
         density[24] = p.depth_bias_walk
+        density[25:] = p.righting_walk * self._body.righting_sigma
         return density**2

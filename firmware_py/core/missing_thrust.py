@@ -12,11 +12,11 @@ import math
 import numpy as np
 from numba import njit
 
-from firmware_py.core.body import CRUISE_M_S, Body
+from firmware_py.core.body import BUOYANCY_SIGMA_N, CRUISE_M_S, Body
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rigid_body import add_restoring
-from firmware_py.core.rotations import M, V, rotate_back, to_matrix
+from firmware_py.core.rotations import M, V, rotate_back
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 
@@ -35,9 +35,6 @@ centre that acts. Of a module that is the 0.15 N measured above, of a BlueROV2 H
 DRIFT_M_S = 0.04
 """Speed of the water, which a body under way meets from another side within seconds: its drag differs by as much as it rises over that.
 It does so at the middle, so that moments tell more of a body under way than forces."""
-UNSURE_LIFT_N, UNSURE_ARM_M, UNSURE_TRIM_M = 0.5, 0.003, 0.002
-"""Buoyancy of a module, its righting arm (times its weight with the entrained water a moment) and its trim along each axis (times its
-dry weight) may be off by this much: felt when the body tilts. One sigma of what the bench draws: 5 and 3 mm to either side."""
 MODEL_SHARE = 0.12
 """What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too."""
 EXPLAINED = 0.8
@@ -68,7 +65,7 @@ class MissingThrust:
         moment = np.hypot(np.array([SIGMA_TILT, SIGMA_TILT, SIGMA_YAW]) * count, GUST_LEVER_M * gust)
         self._healthy = (
             np.r_[np.full(3, max(SIGMA_FORCE_N * np.sqrt(count), gust)), moment],
-            np.r_[UNSURE_LIFT_N * np.sqrt(count), _unsure_levers(body)],
+            np.r_[BUOYANCY_SIGMA_N * np.sqrt(count), body.righting_sigma],
             np.repeat([float(body.mass[0, 0]) * GRAVITY, 0.0], 3),
             np.repeat([DRIFT_M_S * body.drag.cruise_slope / CRUISE_M_S, 0.0], 3),
         )  # fmt: skip
@@ -152,13 +149,6 @@ class MissingThrust:
     def _explain(self, alive: np.ndarray) -> int:
         """The one thruster that explains the change, or -1."""
         return int(explain(self._blocks, self._columns, alive, *self._healthy, self.parameters.lie_share))
-
-
-def _unsure_levers(body: Body) -> np.ndarray:
-    """(3,) how far the sum of each module's buoyancy times where it acts may be off, body axes, N m."""
-    own = [[UNSURE_TRIM_M * dry, UNSURE_TRIM_M * dry, UNSURE_ARM_M * wet] for dry, wet in zip(body.dry_kg, body.wet_kg, strict=True)]
-    turned = [GRAVITY * to_matrix(q) @ lever for q, lever in zip(body.q_bm, own, strict=True)]
-    return np.asarray(np.sqrt(np.square([*turned, *(UNSURE_LIFT_N * body.r_bm)]).sum(axis=0)))
 
 
 DOWN = np.array([0.0, 0.0, GRAVITY])

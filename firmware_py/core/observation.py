@@ -80,9 +80,9 @@ def update(x, covariance, residual, h, variance, shared, gate):  # type: ignore[
     update gives the same (tests) in eight times the time.
 
     Args:
-        x, covariance: (26,) and (25, 25).
-        residual, h, variance: (m,), (m, 25), (m,) of the measurement.
-        shared: (m, 25) covariance of the noise of each row with the error: what moved the state may be what was measured. Only of
+        x, covariance: (29,) and (28, 28).
+        residual, h, variance: (m,), (m, 28), (m,) of the measurement.
+        shared: (m, 28) covariance of the noise of each row with the error: what moved the state may be what was measured. Only of
             errors that no row sees itself (a column of zeros in h), so that the rows stay independent.
         gate: largest normalised innovation squared that is believed. One that is not a number is not.
     """
@@ -119,7 +119,7 @@ def fuse_inertial(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """State and covariance after one sample of gyro, accelerometer and depth, each NaN where it did not come.
 
-    The acceleration that no model foresaw (white, `density` (25,) per second) has moved the body over the `elapsed` seconds of the last
+    The acceleration that no model foresaw (white, `density` (28,) per second) has moved the body over the `elapsed` seconds of the last
     prediction, and the accelerometer has felt it: so the velocity follows what was felt, not what was commanded. What it says of a part
     of its `dt` seconds counts for that part. Under way it feels more than the model tells (`under_way`, as `predict`): mass and drag are
     not as believed.
@@ -131,7 +131,7 @@ def fuse_inertial(  # type: ignore[no-untyped-def]
     if not math.isnan(accel[0]) and elapsed > 0.0:
         first = 0 if math.isnan(gyro[0]) else 3
         speed, rate = squared_speeds(x)
-        moving = under_way[4] ** 2 * speed + under_way[5] ** 2 * rate
+        moving = under_way[3] ** 2 * speed + under_way[4] ** 2 * rate
         for i in range(3):
             shared[first + i, 6 + i] = density[6 + i]
             variance[first + i] = ((variance[first + i] + moving) * dt + density[6 + i]) / elapsed
@@ -177,7 +177,7 @@ def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, gate):  # type: ignor
 
 @njit(f"{STATE}({V},{M},float64,int64,float64)", cache=True)
 def fuse_stillness(x, covariance, variance, axes, heading_variance):  # type: ignore[no-untyped-def]
-    """State (26,) and covariance (25, 25) after measurements that are made up: no speed over ground, and the heading that is believed.
+    """State (29,) and covariance (28, 28) after measurements that are made up: no speed over ground, and the heading that is believed.
 
     Args:
         variance: of the speed, (m/s)^2; axes: 2: of the horizontal speed alone, 3: downwards too.
@@ -200,7 +200,7 @@ def carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance):
     model.
 
     Args:
-        density: (25,) process noise, per second. rate_variance: of the carried attitude, rad^2/s.
+        density: (28,) process noise, per second. rate_variance: of the carried attitude, rad^2/s.
     """
     r = to_matrix(x[3:7].copy())
     f = np.zeros((6, ERRORS))
@@ -225,7 +225,7 @@ def are_finite(a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def is_sound(x, variance):  # type: ignore[no-untyped-def]
-    """Whether every number of a state (26,) is finite, and every variance (6,) finite and not negative."""
+    """Whether every number of a state (29,) is finite, and every variance (6,) finite and not negative."""
     return bool(are_finite(x, variance) and variance.min() >= 0.0)
 
 
@@ -233,7 +233,7 @@ def is_sound(x, variance):  # type: ignore[no-untyped-def]
 def carried(  # type: ignore[no-untyped-def]
     x, covariance, taus, gyros, dt, until_first, density, lag, rate_variance, mass, mass_inv, righting, nodes, rotational, linear
 ):  # fmt: skip
-    """State (26,) now, sigma (6,) of its pose, and whether both are sound. Arguments are those of `carry` and `carried_pose_variance`."""
+    """State (29,) now, sigma (6,) of its pose, and whether both are sound. Arguments are those of `carry` and `carried_pose_variance`."""
     now = carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rotational, linear)
     variance = carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance)
     return now, np.sqrt(variance), is_sound(now, variance)

@@ -21,7 +21,7 @@ PAPER_ALPHA_DENSITY = 0.5
 PAPER_FLIP_RAD = 0.5
 """A tag that jumps further than this is a flip; any working tag tracker refuses it, and begins anew where it stays so."""
 PLACED, TURNED = (np.ix_([*range(i, i + 3), *range(i + 6, i + 9)], [*range(i, i + 3), *range(i + 6, i + 9)]) for i in (0, 3))
-"""Where position with velocity, and attitude with rate, stand in a covariance (25, 25)."""
+"""Where position with velocity, and attitude with rate, stand in a covariance (28, 28)."""
 
 
 class TagOnlyEstimator:

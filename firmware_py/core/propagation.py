@@ -1,9 +1,10 @@
 """The estimator's process model, compiled: the nominal state moved over a step, and the Jacobian of its error.
 
-Nominal state x (26,): position p_wb 0:3, attitude q_wb 3:7, velocity nu 7:13 (body), gyro bias 13:16, accelerometer
-bias 16:19, disturbance force 19:22 (world, N), disturbance moment 22:25 (body, N m), depth bias 25.
-Error state e (25,): the same with the attitude error as a rotation vector in the body frame: dp 0:3, dtheta 3:6, dnu
-6:12, dbg 12:15, dba 15:18, df 18:21, dm 21:24, dbz 24.
+Nominal state x (29,): position p_wb 0:3, attitude q_wb 3:7, velocity nu 7:13 (body), gyro bias 13:16, accelerometer
+bias 16:19, disturbance force 19:22 (world, N), disturbance moment 22:25 (body, N m), depth bias 25, and what the body's righting vector
+is off, 26:29 (body, N m), as arm and trim are: once known it tells the moment at every attitude; a disturbance moment would have to follow.
+Error state e (28,): the same with the attitude error as a rotation vector in the body frame: dp 0:3, dtheta 3:6, dnu
+6:12, dbg 12:15, dba 15:18, df 18:21, dm 21:24, dbz 24, dh 25:28.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
 from firmware_py.core.rotations import M, V, cross, exp, multiply, normalise, rotate_back, skew, to_matrix, turn, turned, turned_back
 
-STATES = 26
-ERRORS = 25
+STATES = 29
+ERRORS = 28
 MOVING = 12
-"""Errors of pose and velocity, which come first; those of biases and disturbance stand still in a prediction."""
+"""Errors of pose and velocity, which come first; those of biases, disturbance and righting stand still in a prediction."""
 N = "float64[:,:,:,::1]"
 PLANT = f"{M},{M},{V},{N},{V},{V}"
 """Types of the body's arrays: mass, mass_inv, righting, drag nodes, rotational and linear damping."""
@@ -62,14 +63,14 @@ def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, l
     external = tau.copy()
     external[:3] += rotate_back(q, x[19:22].copy())
     external[3:] += x[22:25]
-    rate = acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear)
+    rate = acceleration(nu, q, external, mass, mass_inv, righting + x[26:29], nodes, rotational, linear)
     return rate[:3] + cross(nu[3:].copy(), nu[:3].copy())
 
 
 @njit(cache=True)
 def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, work, out):  # type: ignore[no-untyped-def]
-    """Writes to `out` (26,), which is not x, the state after dt seconds; `work`: (6, 6) for what lies between. Allocates nothing."""
-    q, q_mid, nu, nu_mid, external, rate = work[0], work[1], work[2], work[3], work[4], work[5]
+    """Writes to `out` (29,), which is not x, the state after dt seconds; `work`: (7, 6) for what lies between. Allocates nothing."""
+    q, q_mid, nu, nu_mid, external, rate, believed = work[0], work[1], work[2], work[3], work[4], work[5], work[6, :3]
     half = 0.5 * dt
     q[:4] = x[3:7]
     nu[:] = x[7:13]
@@ -77,13 +78,14 @@ def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, w
     external[0], external[1], external[2] = tau[0] + fx, tau[1] + fy, tau[2] + fz
     for i in range(3):
         external[3 + i] = tau[3 + i] + x[22 + i]
-    accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, out, rate)
+        believed[i] = righting[i] + x[26 + i]
+    accelerate(nu, q, external, mass, mass_inv, believed, nodes, rotational, linear, out, rate)
     for i in range(6):
         nu_mid[i] = nu[i] + half * rate[i]
     turn(q, half * nu[3], half * nu[4], half * nu[5], q_mid)
     fx, fy, fz = turned_back(q_mid, x[19], x[20], x[21])
     external[0], external[1], external[2] = tau[0] + fx, tau[1] + fy, tau[2] + fz
-    accelerate(nu_mid, q_mid, external, mass, mass_inv, righting, nodes, rotational, linear, out, rate)
+    accelerate(nu_mid, q_mid, external, mass, mass_inv, believed, nodes, rotational, linear, out, rate)
     vx, vy, vz = turned(q_mid, nu_mid[0], nu_mid[1], nu_mid[2])
     out[:] = x
     out[0] += dt * vx
@@ -100,17 +102,17 @@ def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, w
 
 @njit(cache=True)
 def step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(26,) state after dt seconds under the thruster wrench tau (6,), by the midpoint rule."""
+    """(29,) state after dt seconds under the thruster wrench tau (6,), by the midpoint rule."""
     out = np.empty(STATES)
-    step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, np.empty((6, 6)), out)
+    step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, np.empty((7, 6)), out)
     return out
 
 
 @njit(cache=True)
 def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(12, 25) moving rows of F = I + A dt + (A dt)^2 / 2 of the error over one step, A the Jacobian at x.
+    """(12, 28) moving rows of F = I + A dt + (A dt)^2 / 2 of the error over one step, A the Jacobian at x.
 
-    Biases and disturbance stand still: their rows of F are those of the identity.
+    Biases, disturbance and righting stand still: their rows of F are those of the identity.
     """
     q = x[3:7].copy()
     nu = x[7:13].copy()
@@ -123,22 +125,24 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
     external = tau.copy()
     external[:3] += force_b
     external[3:] += x[22:25]
+    believed = righting + x[26:29]
     base, there, total = np.empty(6), np.empty(6), np.empty(6)
-    accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, total, base)
+    accelerate(nu, q, external, mass, mass_inv, believed, nodes, rotational, linear, total, base)
     step_size = 1e-4
     for i in range(6):
         here = nu[i]
         nu[i] += step_size
-        accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, total, there)
+        accelerate(nu, q, external, mass, mass_inv, believed, nodes, rotational, linear, total, there)
         nu[i] = here
         for j in range(6):
             a[6 + j, 6 + i] = (there[j] - base[j]) / step_size
     linear_part = np.ascontiguousarray(mass_inv[:, :3])
     angular_part = np.ascontiguousarray(mass_inv[:, 3:])
     down = r[2].copy()
-    a[6:12, 3:6] = linear_part @ skew(force_b) - angular_part @ (skew(righting) @ skew(down))
+    a[6:12, 3:6] = linear_part @ skew(force_b) - angular_part @ (skew(believed) @ skew(down))
     a[6:12, 18:21] = linear_part @ np.ascontiguousarray(r.T)
     a[6:12, 21:24] = angular_part
+    a[6:12, 25:28] = angular_part @ skew(down)
     for i in range(3):
         a[3 + i, 9 + i] = 1.0
     f = dt * a + (0.5 * dt * dt) * (np.ascontiguousarray(a[:, :MOVING]) @ a)
@@ -155,18 +159,17 @@ def squared_speeds(x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """State (26,) and covariance (25, 25) after dt seconds: F P F^T + Q.
+    """State (29,) and covariance (28, 28) after dt seconds: F P F^T + Q.
 
     What turned the body unforeseen has turned it for half of the step, as the gyro at its end then tells (Q of a double integrator,
     Bar-Shalom et al. 2001, 6.2.2): without that a body that meets 0.5 rad/s^2 more than its model knows is wrong by 8 deg after a minute
     at 100 Hz. Q is diagonal otherwise: what half a step of unforeseen acceleration moves is nothing that tags would not tell.
 
     Args:
-        density: (25,) process noise of a body at rest, per second.
-        under_way: (6,) what motion adds, as what is not as believed of current, drag, trim and mass is felt in proportion to it: to the
-            random walk of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to that of the disturbance moment N m/sqrt(s)
-            for each rad/s that it tilts; to the angular acceleration rad/s^2/sqrt(Hz) for each rad/s; to the noise of the accelerometer
-            (`observation.fuse_inertial`) m/s^2 for each m/s and for each rad/s.
+        density: (28,) process noise of a body at rest, per second.
+        under_way: (5,) what motion adds, as what is not as believed of current, drag and mass is felt in proportion to it: to the
+            random walk of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz)
+            for each rad/s; to the noise of the accelerometer (`observation.fuse_inertial`) m/s^2 for each m/s and for each rad/s.
     """
     f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
     moved = f @ covariance
@@ -180,9 +183,7 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
     for i in range(ERRORS):
         out[i, i] += density[i] * dt
     speed, rate = squared_speeds(x)
-    turning = under_way[3] ** 2 * rate
-    dx, dy, dz = turned_back(x[3:7], 0.0, 0.0, 1.0)
-    tilting = rate - (x[10] * dx + x[11] * dy + x[12] * dz) ** 2
+    turning = under_way[2] ** 2 * rate
     for i in range(3):
         alpha = density[9 + i] + turning
         out[9 + i, 9 + i] += turning * dt
@@ -190,20 +191,19 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
         out[9 + i, 3 + i] += 0.5 * alpha * dt**2
         out[3 + i, 3 + i] += alpha * dt**3 / 3.0
         out[18 + i, 18 + i] += (under_way[0] ** 2 * speed + under_way[1] ** 2 * rate) * dt
-        out[21 + i, 21 + i] += under_way[2] ** 2 * tilting * dt
     return step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear), out
 
 
 @njit(cache=True)
 def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(26,) state moved from the anchor to now through stored inputs.
+    """(29,) state moved from the anchor to now through stored inputs.
 
     Args:
         taus: (k, 6) mean thruster wrench of each remaining tick; gyros: (k, 3) measured rate at its end, NaN where
             none came.
         dt: tick, s; until_first: what is left of the first tick, s.
     """
-    now, after, work = x.copy(), np.empty(STATES), np.empty((6, 6))
+    now, after, work = x.copy(), np.empty(STATES), np.empty((7, 6))
     for i in range(taus.shape[0]):
         h = until_first if i == 0 else dt
         if h > 0.0:
@@ -217,7 +217,7 @@ def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rota
 
 @njit(cache=True)
 def inject(x, e):  # type: ignore[no-untyped-def]
-    """(26,) state with the (25,) error added."""
+    """(29,) state with the (28,) error added."""
     out = x.copy()
     out[:3] += e[:3]
     out[3:7] = normalise(multiply(x[3:7].copy(), exp(e[3:6].copy())))

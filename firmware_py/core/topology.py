@@ -19,7 +19,7 @@ JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
 
 
 class Motion(NamedTuple):
-    """State of one body's estimator at one time: x (26,) and covariance (25, 25), as core.propagation orders them."""
+    """State of one body's estimator at one time: x (29,) and covariance (28, 28), as core.propagation orders them."""
 
     x: np.ndarray
     covariance: np.ndarray
@@ -40,7 +40,7 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
     first, motion = parts[0]
     x[3:7] = _attitude(first, motion.x, body)
     x[:3] = _position(first, motion.x, body, x[3:7])
-    momentum, force, moment = np.zeros(6), np.zeros(3), np.zeros(3)
+    momentum, force, moment, off = np.zeros(6), np.zeros(3), np.zeros(3), np.zeros(3)
     for part, moved in parts:
         lever_b, turn = _place(part, body)
         h = _transport(lever_b, turn)
@@ -48,8 +48,9 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
         share_b = rotate_back(x[3:7].copy(), moved.x[19:22].copy())
         force += moved.x[19:22]
         moment += turn.T @ moved.x[22:25] + cross(lever_b, share_b)
+        off += turn.T @ moved.x[26:29]
     x[7:13] = body.mass_inv @ momentum
-    x[19:22], x[22:25] = force, moment
+    x[19:22], x[22:25], x[26:29] = force, moment, off
     x[13:19] = np.mean([_biases(part, moved.x, body) for part, moved in parts], axis=0)
     x[25] = np.mean([moved.x[25] for _, moved in parts])
     accepted, tag_ns = min(moved.accepted for _, moved in parts), min(moved.tag_ns for _, moved in parts)
@@ -66,6 +67,7 @@ def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
     share = body.rigid_mass_kg / whole.rigid_mass_kg
     x[19:22] = motion.x[19:22] * share
     x[22:25] = turn @ motion.x[22:25] * share
+    x[26:29] = turn @ motion.x[26:29] * share
     x[13:19] = _biases(whole, motion.x, body)
     return Motion(x, _covariance(motion.covariance, whole, body), motion.accepted, motion.tag_ns)
 
@@ -119,10 +121,12 @@ def _inverse_place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _covariance(old: np.ndarray, before: Body, after: Body) -> np.ndarray:
-    """(25, 25) covariance of the new body: that of the old, uncorrelated, larger by the play of the faces, disturbance by mass."""
+    """(28, 28) covariance of the new body: that of the old, uncorrelated, larger by the play of the faces, disturbance by mass; of its
+    righting nothing is known but the sum."""
     variance = old.diagonal().copy()
     variance[18:21] *= (after.rigid_mass_kg / before.rigid_mass_kg) ** 2
     variance[21:24] *= (np.trace(after.mass[3:, 3:]) / np.trace(before.mass[3:, 3:])) ** 2
+    variance[25:] = after.righting_sigma**2
     variance[:12] += np.repeat(np.array(JOINED_SIGMA), 3) ** 2
     assert variance.size == ERRORS
     return np.diag(variance)

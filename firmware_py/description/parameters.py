@@ -90,8 +90,8 @@ class Estimation:
     moment_walk: float = quantity(
         0.035, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia, of a body at rest", mavlink="DIST_M_WALK"
     )
-    trim_walk: float = quantity(
-        0.0006, unit="m sqrt(s)", low=0, high=1, help="trim and righting arm, felt by a body that tilts", mavlink="DIST_T_WALK"
+    righting_walk: float = quantity(
+        0.007, unit="1/sqrt(s)", low=0, high=1, help="trim and righting arm, over what they are off at first", mavlink="DIST_R_WALK"
     )
     accel_process: float = quantity(
         0.0107, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.core import rotations
-from firmware_py.core.body import Body, ThrusterSet
+from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
@@ -140,9 +140,8 @@ def _body(
         mass=mass,
         mass_inv=np.ascontiguousarray(np.linalg.inv(mass)),
         rigid_mass_kg=float(rigid_mass),
-        dry_kg=np.array([p.vehicle.inertial.dry_kg for p in placements]),
-        wet_kg=np.array([p.vehicle.inertial.wet_kg for p in placements]),
         righting=sum((_righting(p) for p in placements), np.zeros(3)),
+        righting_sigma=_righting_sigma(placements, r_bm),
         thrusters=thruster_set([p.vehicle for p in placements], turns, r_bm),
         drag=drag_table.build(placements, com, pitch_m, cache),
         tag_ids=np.array([tag.id for _, tag in tags], dtype=np.int64),
@@ -172,6 +171,16 @@ def _righting(placement: Placement) -> np.ndarray:
     inertial = placement.vehicle.inertial
     moment = GRAVITY * inertial.wet_kg * inertial.righting_arm_m
     return np.asarray(MATRICES[placement.rotation] @ np.array([0.0, 0.0, -moment]))
+
+
+def _righting_sigma(placements: Sequence[Placement], r_bm: np.ndarray) -> np.ndarray:
+    """(3,) how far the sum of each module's buoyancy times where it acts may be off, N m: each module is off on its own."""
+    parts = [BUOYANCY_SIGMA_N * r_bm]
+    for placement in placements:
+        inertial = placement.vehicle.inertial
+        trim, arm = GRAVITY * inertial.dry_kg * TRIM_SIGMA_M, GRAVITY * inertial.wet_kg * ARM_SIGMA_M
+        parts.append((MATRICES[placement.rotation] @ np.array([trim, trim, arm]))[None])
+    return np.asarray(np.linalg.norm(np.concatenate(parts), axis=0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

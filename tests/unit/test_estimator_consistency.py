@@ -61,7 +61,7 @@ def start_state(p_wb: tuple[float, float, float] = (1.0, -0.5, 0.8)) -> np.ndarr
 def still(body: Body, x: np.ndarray) -> np.ndarray:
     """The thruster wrench that holds a robot in state `x`."""
     up = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, -1.0])
-    return np.r_[0.0, 0.0, 0.0, -np.cross(body.righting, up)]
+    return np.r_[0.0, 0.0, 0.0, -np.cross(body.righting + x[26:29], up)]
 
 
 @dataclass
@@ -78,16 +78,14 @@ class Flight:
 
 
 def process_sigma(body: Body, p: Estimation, x: np.ndarray) -> np.ndarray:
-    """(25,) root spectral density of what the model leaves out of a robot in state x, from the parameters' own words."""
+    """(28,) root spectral density of what the model leaves out of a robot in state x, from the parameters' own words."""
     m, j = np.diag(body.mass)[:3], np.diag(body.mass)[3:]
     rate = np.linalg.norm(x[10:13])
-    tilting = np.linalg.norm(np.cross(x[10:13], Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, 1.0])))
     drag_slope = 2.0 * body.drag.nodes[..., 0].mean() * np.hypot(np.linalg.norm(x[7:10]), body.reach_m * rate)
     force = np.hypot(p.force_walk * m, p.current_walk * drag_slope)
     alpha = np.hypot(p.alpha_process, p.alpha_turning * rate)
-    moment = np.hypot(p.moment_walk * j, p.trim_walk * 9.80665 * np.linalg.norm(body.wet_kg) * tilting)
-    walks = [p.gyro_bias_walk] * 3 + [p.accel_bias_walk] * 3 + list(force) + list(moment)
-    return np.array([0.0] * 6 + [p.accel_process] * 3 + [alpha] * 3 + walks + [p.depth_bias_walk])
+    walks = [p.gyro_bias_walk] * 3 + [p.accel_bias_walk] * 3 + list(force) + list(p.moment_walk * j) + [p.depth_bias_walk]
+    return np.array([0.0] * 6 + [p.accel_process] * 3 + [alpha] * 3 + walks + list(p.righting_walk * body.righting_sigma))
 
 
 def accel_sigma(body: Body, p: Estimation, x: np.ndarray) -> float:
@@ -104,6 +102,7 @@ def fly(
     flight = Flight()
     x = start_state()
     x[13:16], x[16:19], x[25] = rng.normal(scale=0.02, size=3), rng.normal(scale=0.1, size=3), 0.03
+    x[26:29] = body.righting_sigma * rng.normal(size=3)
     tag_sigma = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3])
     count = round(seconds / DT)
     arriving: dict[int, list[BodyPose]] = {}
@@ -144,7 +143,7 @@ class InOrder:
         self.x[:3] = first.p_wt - self._turn(self.x).apply(first.lever_b)
         m, j = np.diag(body.mass)[:3], np.diag(body.mass)[3:]
         sigma = [0.02] * 3 + [0.05] * 3 + [0.2] * 3 + [0.3] * 3 + [0.02] * 3 + [0.1] * 3 + list(0.1 * m) + list(0.3 * j)
-        self.covariance = np.diag(np.r_[sigma, 0.1]) ** 2
+        self.covariance = np.diag(np.r_[sigma, 0.1, body.righting_sigma]) ** 2
         self.body, self.p = body, p
         self.time_ns = first.capture_ns
 
@@ -167,7 +166,7 @@ class InOrder:
         return dt
 
     def _correct(self, residual: Callable[[np.ndarray], np.ndarray], noise: np.ndarray, shared: np.ndarray | None = None) -> None:
-        """shared: (25, m) covariance of error and noise (Anderson and Moore, Optimal Filtering, 1979, section 5.5)."""
+        """shared: (28, m) covariance of error and noise (Anderson and Moore, Optimal Filtering, 1979, section 5.5)."""
         h = 1e-6
         moved = [(propagation.inject(self.x, h * e), propagation.inject(self.x, -h * e)) for e in np.eye(ERRORS)]
         jacobian = np.array([(residual(below) - residual(above)) / (2 * h) for above, below in moved]).T
@@ -263,7 +262,8 @@ def test_late_tags_count_as_if_they_had_come_in_time(body: Body, delay_ms: Calla
     np.testing.assert_allclose(difference(e.q_wb, x[3:7].copy()), 0.0, atol=2e-6)
     np.testing.assert_allclose(e.nu, x[7:13], atol=2e-5)
     np.testing.assert_allclose(e.force_w, x[19:22], atol=1e-4)
-    np.testing.assert_allclose(e.moment_b, x[22:25], atol=1e-4)
+    up = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, -1.0])
+    np.testing.assert_allclose(e.moment_b, x[22:25] + np.cross(x[26:29], up), atol=1e-4)
 
 
 def test_same_inputs_give_the_same_bytes(body: Body) -> None:
@@ -345,5 +345,22 @@ def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
     flight = fly(body, 3.0, 1, lambda n: 45.0, push=6.0)
     right, wrong = (run(each, flight)[1] for each in (body, pushed))
     assert right[-1].rejected == 0
-    forces = [np.mean([np.linalg.norm(e.force_w) for e in each]) for each in (right, wrong)]
-    assert forces[1] > 3.0 * forces[0]
+    settled = flight.truth[SETTLED:]
+    off = [np.mean([np.linalg.norm(e.force_w - x[19:22]) for x, e in zip(settled, each[SETTLED:], strict=True)]) for each in (right, wrong)]
+    assert off[1] > 3.0 * off[0]
+
+
+def test_wrong_arm_and_trim_are_learned_by_tilting(body: Body) -> None:
+    """A robot that pitches up by half a radian and comes back knows the moment of every pitch, nose down too: up to 0.45 N m here."""
+    x, estimator, rng = start_state(), Estimator(body, P, PERIOD), np.random.default_rng(2)
+    x[3:7], x[26:29] = from_euler(0.0, 0.0, 0.0), 2.0 * body.righting_sigma * np.array([1.0, 0.0, -1.0])
+    for k in range(1200):
+        alpha = 0.07 * np.cos(2.0 * np.pi / 12.0 * k * DT)
+        tau = still(body, x) + np.r_[0.0, 0.0, 0.0, body.mass[3:, 3:] @ np.array([0.0, alpha, 0.0])]
+        before, x = x, propagation.step(x, tau, DT, *plant(body))
+        felt = inertial_of(x, propagation.inertial_acceleration(before, tau, *plant(body)), rng, P.accel_sigma)
+        estimator.step(k * PERIOD, felt._replace(tags=[tag_of(x, k * PERIOD)]), tau)
+    known = estimator.motion.x
+    for pitch in (-0.5, 0.0, 0.5):
+        up = Rotation.from_rotvec([0.0, -pitch, 0.0]).apply([0.0, 0.0, -1.0])
+        np.testing.assert_allclose(known[22:25] + np.cross(known[26:29], up), np.cross(x[26:29], up), atol=0.02)

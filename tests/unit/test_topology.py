@@ -48,6 +48,7 @@ def two() -> tuple[Body, Body, Body, np.ndarray, np.ndarray]:
     x_a[:3] = x_t[:3] + q_t.apply(plan.place_t)
     x_t[7:13], x_a[7:13] = rng.normal(size=6), rng.normal(size=6)
     x_t[19:25], x_a[19:25] = rng.normal(size=6), rng.normal(size=6)
+    x_t[26:29], x_a[26:29] = rng.normal(size=3), rng.normal(size=3)
     return target, active, plan.merged, x_t, x_a
 
 
@@ -80,6 +81,14 @@ def test_disturbance_of_a_joined_body_is_the_sum(two: tuple[Body, Body, Body, np
     for x in (x_t, x_a):
         moment_w += rotation(x[3:7]).apply(x[22:25]) + np.cross(x[:3] - joined.x[:3], x[19:22])
     np.testing.assert_allclose(rotation(joined.x[3:7]).apply(joined.x[22:25]), moment_w, atol=1e-9)
+
+
+def test_righting_moment_of_a_joined_body_is_the_sum_at_every_attitude(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
+    target, active, merged, x_t, x_a = two
+    joined = join([(target, Motion(x_t, np.eye(ERRORS), 10, 0)), (active, Motion(x_a, np.eye(ERRORS), 10, 0))], merged)
+    vectors_w = [rotation(x[3:7]).apply(body.righting + x[26:29]) for body, x in ((target, x_t), (active, x_a))]
+    np.testing.assert_allclose(rotation(joined.x[3:7]).apply(merged.righting + joined.x[26:29]), sum(vectors_w), atol=1e-9)
+    np.testing.assert_allclose(joined.covariance.diagonal()[25:], merged.righting_sigma**2)
 
 
 def test_parting_undoes_joining_when_nothing_turns_apart(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
