@@ -134,13 +134,14 @@ def missing(found: list[Finding]) -> dict[str, list[str]]:
 
 
 def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) -> Vehicle:
-    """The vehicle file with what was found.
+    """The vehicle file with what was found. What the vehicle carries stays as it is described.
 
     The dry mass stays as it was weighed. Rigid and added mass appear only as their sum: the sum is shared as the file has it, the
     rigid part alike along all axes. What has no field (trim, gains one by one) stays in the report.
     """
     old, body = vehicle.inertial, assemble_vehicle(vehicle)
-    total, before = np.exp(np.concatenate([fit.value("mass"), fit.value("inertia")])), np.diag(body.mass)
+    whole, own = np.diag(body.mass), np.diag(assemble_vehicle(dataclasses.replace(vehicle, payload=())).mass)
+    total, before = np.exp(np.concatenate([fit.value("mass"), fit.value("inertia")])) - (whole - own), own
     rigid = max(old.dry_kg, min(old.wet_kg * float(np.mean(total[:3] / before[:3])), float(total[:3].min())))
     turn = min(float(np.mean(total[3:] / before[3:])), float(np.min(total[3:] / np.diag(old.inertia))))
     inertia, gain = old.inertia * turn, float(np.mean(fit.value("gain")))

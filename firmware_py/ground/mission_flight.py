@@ -163,11 +163,14 @@ class MissionFlight:
         return True
 
     def go_to(self, latitude_deg: float, longitude_deg: float, altitude_m: float, yaw: float) -> str:
-        """Fly to one place. Returns why not, or nothing."""
+        """Fly to one place inside the fence. Returns why not, or nothing."""
         s = self._system.subject
         if not s.armed:
             return "the vehicle is disarmed"
         place = s.origin.local(latitude_deg, longitude_deg, altitude_m)
+        result, reason = beyond_fence(place, self._parameters().fence)
+        if result:
+            return reason
         if s.progress.state == ACTIVE:
             s.progress.state = PAUSED
         turned = yaw if math.isfinite(yaw) else None

@@ -393,6 +393,19 @@ def test_reposition_to_no_place_is_denied(world: World, client: Client, frame: i
     assert not world.station.jobs()
 
 
+def test_reposition_beyond_the_fence_is_refused_and_what_flew_goes_on(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    client.clear()
+    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, NAN, 302084000, 1201614000, -51.0)
+    world.run(10)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+    assert "reposition refused: 1.00 m beyond FENCE_BOTTOM, 50 m" in client.texts
+    assert not world.station.jobs()
+    world.run(120)
+    assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_ACTIVE
+
+
 def test_mission_that_came_while_another_flew_is_started_from_its_beginning(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)

@@ -11,12 +11,12 @@ import pytest
 
 from firmware_py.core.rotations import exp
 from firmware_py.description.schema import DescriptionError, build, frozen_array, read_toml, to_toml
-from firmware_py.description.vehicle import Vehicle, load_vehicle, vehicle_names
+from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle, vehicle_names
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.scenario import load_scenario
 
-excitation, fit, model, motion, tool = (
-    importlib.import_module(name) for name in ("identify_excitation", "identify_fit", "identify_model", "identify_motion", "identify")
+excitation, fit, model, motion, quantities, tool = (
+    importlib.import_module(f"identify{name}") for name in ("_excitation", "_fit", "_model", "_motion", "_quantities", "")
 )
 
 
@@ -211,3 +211,14 @@ def test_vehicle_that_is_written_is_the_vehicle(name: str, tmp_path: Path) -> No
     table, source = read_toml(file)
     again: Vehicle = build(Vehicle, table, source)
     assert to_toml(again) == to_toml(vehicle)
+
+
+@pytest.mark.parametrize("loads", [0, 1, 2])
+def test_what_a_vehicle_carries_is_written_once(loads: int) -> None:
+    """A fit that found the vehicle as it was gives the vehicle as it was."""
+    box = Payload(name="box", dry_kg=1.5, entrained_kg=0.2, size_m=np.array([0.1, 0.1, 0.2]), position_m=np.array([0.0, 0.05, 0.15]))
+    vehicle = dataclasses.replace(load_vehicle("modcube"), payload=(box,) * loads)
+    found = quantities.fitted_vehicle(SimpleNamespace(value=model.beginning(vehicle).get), vehicle, vehicle.curve, "none")
+    np.testing.assert_allclose(np.diag(assemble_vehicle(found).mass), np.diag(assemble_vehicle(vehicle).mass))
+    np.testing.assert_allclose(found.inertial.added, vehicle.inertial.added, atol=1e-12)
+    assert found.inertial.righting_arm_m == pytest.approx(vehicle.inertial.righting_arm_m)
