@@ -61,7 +61,7 @@ INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
 
 
 class Belief(NamedTuple):
-    """State (29,) and covariance (28, 28) at a time, as core.propagation orders them."""
+    """State (32,) and covariance (28, 28) at a time, as core.propagation orders them."""
 
     x: np.ndarray
     covariance: np.ndarray
@@ -172,6 +172,7 @@ class Estimator:
         x = np.zeros(STATES)
         x[3:7] = pose.q_wb
         x[:3] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
+        x[29:] = to_matrix(x[3:7].copy())[2]
         inertia = np.diag(self._body.mass)
         sigma = np.r_[np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1]), self._body.righting_sigma]
         sigma[18:24] *= inertia

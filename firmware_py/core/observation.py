@@ -80,7 +80,7 @@ def update(x, covariance, residual, h, variance, shared, gate):  # type: ignore[
     update gives the same (tests) in eight times the time.
 
     Args:
-        x, covariance: (29,) and (28, 28).
+        x, covariance: (32,) and (28, 28).
         residual, h, variance: (m,), (m, 28), (m,) of the measurement.
         shared: (m, 28) covariance of the noise of each row with the error: what moved the state may be what was measured. Only of
             errors that no row sees itself (a column of zeros in h), so that the rows stay independent.
@@ -177,7 +177,7 @@ def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, gate):  # type: ignor
 
 @njit(f"{STATE}({V},{M},float64,int64,float64)", cache=True)
 def fuse_stillness(x, covariance, variance, axes, heading_variance):  # type: ignore[no-untyped-def]
-    """State (29,) and covariance (28, 28) after measurements that are made up: no speed over ground, and the heading that is believed.
+    """State (32,) and covariance (28, 28) after measurements that are made up: no speed over ground, and the heading that is believed.
 
     Args:
         variance: of the speed, (m/s)^2; axes: 2: of the horizontal speed alone, 3: downwards too.
@@ -225,7 +225,7 @@ def are_finite(a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def is_sound(x, variance):  # type: ignore[no-untyped-def]
-    """Whether every number of a state (29,) is finite, and every variance (6,) finite and not negative."""
+    """Whether every number of a state (32,) is finite, and every variance (6,) finite and not negative."""
     return bool(are_finite(x, variance) and variance.min() >= 0.0)
 
 
@@ -233,7 +233,7 @@ def is_sound(x, variance):  # type: ignore[no-untyped-def]
 def carried(  # type: ignore[no-untyped-def]
     x, covariance, taus, gyros, dt, until_first, density, lag, rate_variance, mass, mass_inv, righting, nodes, rotational, linear
 ):  # fmt: skip
-    """State (29,) now, sigma (6,) of its pose, and whether both are sound. Arguments are those of `carry` and `carried_pose_variance`."""
+    """State (32,) now, sigma (6,) of its pose, and whether both are sound. Arguments are those of `carry` and `carried_pose_variance`."""
     now = carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rotational, linear)
     variance = carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance)
     return now, np.sqrt(variance), is_sound(now, variance)

@@ -1,8 +1,9 @@
 """The estimator's process model, compiled: the nominal state moved over a step, and the Jacobian of its error.
 
-Nominal state x (29,): position p_wb 0:3, attitude q_wb 3:7, velocity nu 7:13 (body), gyro bias 13:16, accelerometer
+Nominal state x (32,): position p_wb 0:3, attitude q_wb 3:7, velocity nu 7:13 (body), gyro bias 13:16, accelerometer
 bias 16:19, disturbance force 19:22 (world, N), disturbance moment 22:25 (body, N m), depth bias 25, and what the body's righting vector
 is off, 26:29 (body, N m), as arm and trim are: once known it tells the moment at every attitude; a disturbance moment would have to follow.
+29:32 is no state of the robot: down (body) as the gains take it, on a leash (LEASH).
 Error state e (28,): the same with the attitude error as a rotation vector in the body frame: dp 0:3, dtheta 3:6, dnu
 6:12, dbg 12:15, dba 15:18, df 18:21, dm 21:24, dbz 24, dh 25:28.
 """
@@ -18,8 +19,12 @@ from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
 from firmware_py.core.rotations import M, V, cross, exp, multiply, normalise, rotate_back, skew, to_matrix, turn, turned, turned_back
 
-STATES = 29
+STATES = 32
 ERRORS = 28
+LEASH = 0.02
+"""How far down may turn, rad, before the gains of the righting vector follow: one degree. The jitter of a robot that holds its attitude
+goes with the noise that the innovations are made of. Gains that took it for tilting found an arm in it that grew for an hour,
+surer by the minute."""
 MOVING = 12
 """Errors of pose and velocity, which come first; those of biases, disturbance and righting stand still in a prediction."""
 N = "float64[:,:,:,::1]"
@@ -69,7 +74,7 @@ def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, l
 
 @njit(cache=True)
 def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, work, out):  # type: ignore[no-untyped-def]
-    """Writes to `out` (29,), which is not x, the state after dt seconds; `work`: (7, 6) for what lies between. Allocates nothing."""
+    """Writes to `out` (32,), which is not x, the state after dt seconds; `work`: (7, 6) for what lies between. Allocates nothing."""
     q, q_mid, nu, nu_mid, external, rate, believed = work[0], work[1], work[2], work[3], work[4], work[5], work[6, :3]
     half = 0.5 * dt
     q[:4] = x[3:7]
@@ -98,11 +103,19 @@ def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, w
     n = n if q_mid[0] >= 0.0 else -n
     for i in range(4):
         out[3 + i] = q_mid[i] / n
+    dx, dy, dz = turned_back(out[3:7], 0.0, 0.0, 1.0)
+    dx, dy, dz = dx - x[29], dy - x[30], dz - x[31]
+    away = math.sqrt(dx**2 + dy**2 + dz**2)
+    if away > LEASH:
+        pulled = 1.0 - LEASH / away
+        out[29] += pulled * dx
+        out[30] += pulled * dy
+        out[31] += pulled * dz
 
 
 @njit(cache=True)
 def step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(29,) state after dt seconds under the thruster wrench tau (6,), by the midpoint rule."""
+    """(32,) state after dt seconds under the thruster wrench tau (6,), by the midpoint rule."""
     out = np.empty(STATES)
     step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, np.empty((7, 6)), out)
     return out
@@ -142,7 +155,7 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
     a[6:12, 3:6] = linear_part @ skew(force_b) - angular_part @ (skew(believed) @ skew(down))
     a[6:12, 18:21] = linear_part @ np.ascontiguousarray(r.T)
     a[6:12, 21:24] = angular_part
-    a[6:12, 25:28] = angular_part @ skew(down)
+    a[6:12, 25:28] = angular_part @ skew(x[29:32].copy())
     for i in range(3):
         a[3 + i, 9 + i] = 1.0
     f = dt * a + (0.5 * dt * dt) * (np.ascontiguousarray(a[:, :MOVING]) @ a)
@@ -159,7 +172,7 @@ def squared_speeds(x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """State (29,) and covariance (28, 28) after dt seconds: F P F^T + Q.
+    """State (32,) and covariance (28, 28) after dt seconds: F P F^T + Q.
 
     What turned the body unforeseen has turned it for half of the step, as the gyro at its end then tells (Q of a double integrator,
     Bar-Shalom et al. 2001, 6.2.2): without that a body that meets 0.5 rad/s^2 more than its model knows is wrong by 8 deg after a minute
@@ -196,7 +209,7 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
 
 @njit(cache=True)
 def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(29,) state moved from the anchor to now through stored inputs.
+    """(32,) state moved from the anchor to now through stored inputs.
 
     Args:
         taus: (k, 6) mean thruster wrench of each remaining tick; gyros: (k, 3) measured rate at its end, NaN where
@@ -217,9 +230,9 @@ def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rota
 
 @njit(cache=True)
 def inject(x, e):  # type: ignore[no-untyped-def]
-    """(29,) state with the (28,) error added."""
+    """(32,) state with the (28,) error added."""
     out = x.copy()
     out[:3] += e[:3]
     out[3:7] = normalise(multiply(x[3:7].copy(), exp(e[3:6].copy())))
-    out[7:] += e[6:]
+    out[7:29] += e[6:]
     return out

@@ -17,9 +17,14 @@ from firmware_py.core.rotations import conjugate, cross, multiply, normalise, ro
 JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
 """What is added to a joined or parted body's sigma: position m, attitude rad, velocity m/s, rate rad/s. The faces' play, and the shock."""
 
+LEVEL = np.array([1.0, 1.0, 0.0])
+"""Of a force in the world, what does not lift."""
+TURNING = np.ix_(np.r_[21:24, 25:28], np.r_[21:24, 25:28])
+"""Where disturbance moment and righting stand in a covariance (28, 28)."""
+
 
 class Motion(NamedTuple):
-    """State of one body's estimator at one time: x (29,) and covariance (28, 28), as core.propagation orders them."""
+    """State of one body's estimator at one time: x (32,) and covariance (28, 28), as core.propagation orders them."""
 
     x: np.ndarray
     covariance: np.ndarray
@@ -45,16 +50,17 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
         lever_b, turn = _place(part, body)
         h = _transport(lever_b, turn)
         momentum += h.T @ part.mass @ moved.x[7:13]
-        share_b = rotate_back(x[3:7].copy(), moved.x[19:22].copy())
         force += moved.x[19:22]
-        moment += turn.T @ moved.x[22:25] + cross(lever_b, share_b)
-        off += turn.T @ moved.x[26:29]
+        level_b = rotate_back(x[3:7].copy(), moved.x[19:22] * LEVEL)
+        moment += turn.T @ moved.x[22:25] + cross(lever_b, level_b)
+        off += turn.T @ moved.x[26:29] - lever_b * moved.x[21]  # what lifts at a lever turns the body upright
     x[7:13] = body.mass_inv @ momentum
     x[19:22], x[22:25], x[26:29] = force, moment, off
     x[13:19] = np.mean([_biases(part, moved.x, body) for part, moved in parts], axis=0)
     x[25] = np.mean([moved.x[25] for _, moved in parts])
+    x[29:] = _down(x)
     accepted, tag_ns = min(moved.accepted for _, moved in parts), min(moved.tag_ns for _, moved in parts)
-    return Motion(x, _covariance(parts[0][1].covariance, first, body), accepted, tag_ns)
+    return Motion(x, _covariance(motion, first, x, body), accepted, tag_ns)
 
 
 def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
@@ -69,7 +75,8 @@ def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
     x[22:25] = turn @ motion.x[22:25] * share
     x[26:29] = turn @ motion.x[26:29] * share
     x[13:19] = _biases(whole, motion.x, body)
-    return Motion(x, _covariance(motion.covariance, whole, body), motion.accepted, motion.tag_ns)
+    x[29:] = _down(x)
+    return Motion(x, _covariance(motion, whole, x, body), motion.accepted, motion.tag_ns)
 
 
 def _common(a: Body, b: Body) -> tuple[int, int]:
@@ -120,13 +127,26 @@ def _inverse_place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
     return -turn @ lever_b, np.ascontiguousarray(turn.T)
 
 
-def _covariance(old: np.ndarray, before: Body, after: Body) -> np.ndarray:
-    """(28, 28) covariance of the new body: that of the old, uncorrelated, larger by the play of the faces, disturbance by mass; of its
-    righting nothing is known but the sum."""
-    variance = old.diagonal().copy()
+def _down(x: np.ndarray) -> np.ndarray:
+    """(3,) down in the axes of a body in state x."""
+    return np.asarray(to_matrix(x[3:7].copy())[2])
+
+
+def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body) -> np.ndarray:
+    """(28, 28) covariance of the new body in state x: that of the old, uncorrelated, larger by the play of the faces, disturbance by mass.
+
+    How the moment that acts shares out between disturbance and righting is known no more; what acts is.
+    """
+    variance = old.covariance.diagonal().copy()
     variance[18:21] *= (after.rigid_mass_kg / before.rigid_mass_kg) ** 2
-    variance[21:24] *= (np.trace(after.mass[3:, 3:]) / np.trace(before.mass[3:, 3:])) ** 2
-    variance[25:] = after.righting_sigma**2
     variance[:12] += np.repeat(np.array(JOINED_SIGMA), 3) ** 2
-    assert variance.size == ERRORS
-    return np.diag(variance)
+    out = np.diag(variance)
+    assert len(out) == ERRORS
+    acts, lean = np.hstack([np.eye(3), skew(_down(old.x))]), skew(_down(x))
+    grown = (np.trace(after.mass[3:, 3:]) / np.trace(before.mass[3:, 3:])) ** 2
+    acting = (acts @ old.covariance[TURNING] @ acts.T).diagonal() * grown
+    righting = np.diag(after.righting_sigma**2)
+    out[21:24, 21:24], out[25:, 25:] = np.diag(acting) + lean @ righting @ lean.T, righting
+    out[21:24, 25:] = -lean @ righting
+    out[25:, 21:24] = out[21:24, 25:].T
+    return out

@@ -187,7 +187,7 @@ def test_damping_is_against_the_velocity_wanted_now_and_not_ahead(body: Body) ->
 
 
 def fly(body: Body, x: np.ndarray, aim: Setpoint, seconds: float, parameters: Control) -> np.ndarray:
-    """(n, 26) states of an ideal robot (no lag, no limits, state known) under the controller, every 10 ms."""
+    """(n, 32) states of an ideal robot (no lag, no limits, state known) under the controller, every 10 ms."""
     controller, states = Controller(body, parameters), [x]
     for _ in range(round(seconds / 0.01)):
         x = states[-1]

@@ -48,15 +48,16 @@ def plant(body: Body) -> tuple[np.ndarray, ...]:
 def state(seed: int) -> np.ndarray:
     """A fast, tilted robot under a disturbance."""
     rng = np.random.default_rng(seed)
-    x = rng.normal(size=29) * np.repeat([1.0, 1.0, 0.4, 1.0, 0.02, 0.1, 3.0, 0.3, 0.05, 0.3], [3, 4, 3, 3, 3, 3, 3, 3, 1, 3])
+    x = rng.normal(size=32) * np.repeat([1.0, 1.0, 0.4, 1.0, 0.02, 0.1, 3.0, 0.3, 0.05, 0.3], [3, 4, 3, 3, 3, 3, 3, 3, 1, 6])
     x[3:7] /= np.linalg.norm(x[3:7])
+    x[29:] = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, 1.0])
     return x
 
 
 def error_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(28,) e with inject(b, e) = a, by scipy."""
     turn = Rotation.from_quat(b[[4, 5, 6, 3]]).inv() * Rotation.from_quat(a[[4, 5, 6, 3]])
-    return np.r_[a[:3] - b[:3], turn.as_rotvec(), a[7:] - b[7:]]
+    return np.r_[a[:3] - b[:3], turn.as_rotvec(), a[7:29] - b[7:29]]
 
 
 def differences(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, h: float = 1e-5) -> np.ndarray:
@@ -122,7 +123,7 @@ def test_block_of_the_wrong_sign_would_be_noticed(
 
 def test_force_has_moved_the_robot_by_the_end_of_the_step(body: Body) -> None:
     """The second-order block: half a dt squared over the mass."""
-    x = np.zeros(29)
+    x = np.zeros(32)
     x[3] = 1.0
     f = transition(x, 0.01, body, np.zeros(6))
     np.testing.assert_allclose(f[0:3, 18:21], 0.5e-4 * body.mass_inv[:3, :3], atol=1e-12)
@@ -162,7 +163,7 @@ def test_step_follows_the_equations_of_motion(body: Body) -> None:
     np.testing.assert_allclose(y[:3], exact[:3], atol=2e-4)
     np.testing.assert_allclose(difference(np.ascontiguousarray(y[3:7]), exact_turn), 0.0, atol=1e-3)
     np.testing.assert_allclose(y[7:13], exact[7:], atol=3e-3)
-    np.testing.assert_array_equal(y[13:], x[13:], "biases, disturbance and righting stand still")
+    np.testing.assert_array_equal(y[13:29], x[13:29], "biases, disturbance and righting stand still")
 
 
 def test_acceleration_is_force_over_mass_at_rest(body: Body) -> None:
@@ -257,7 +258,7 @@ def test_accelerometer_s_jacobian_is_the_derivative_by_tilt_bias_and_disturbance
 
 def test_accelerometer_of_a_level_robot_at_rest_points_up() -> None:
     """It feels what holds it: -g along z, which is down."""
-    x = np.zeros(29)
+    x = np.zeros(32)
     x[3] = 1.0
     residual, _, _ = observation.inertial(x, np.zeros(3), np.array([0.0, 0.0, -9.80665]), 0.0, np.ones(3), np.zeros(3), np.zeros((3, 3)))
     np.testing.assert_allclose(residual, 0.0)
@@ -268,7 +269,7 @@ def test_accelerometer_of_a_level_robot_at_rest_points_up() -> None:
 
 
 def test_accelerometer_feels_what_moves_the_robot() -> None:
-    x = np.zeros(29)
+    x = np.zeros(32)
     x[3] = 1.0
     pushed = np.array([0.5, 0.0, -9.80665])
     residual, _, _ = observation.inertial(x, np.zeros(3), pushed, 0.0, np.ones(3), np.array([0.5, 0.0, 0.0]), np.zeros((3, 3)))

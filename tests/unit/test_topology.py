@@ -77,18 +77,37 @@ def test_disturbance_of_a_joined_body_is_the_sum(two: tuple[Body, Body, Body, np
     covariance = np.eye(ERRORS)
     joined = join([(target, Motion(x_t, covariance, 10, 0)), (active, Motion(x_a, covariance, 10, 0))], merged)
     np.testing.assert_allclose(joined.x[19:22], x_t[19:22] + x_a[19:22])
-    moment_w = np.zeros(3)
+    moment_w, up = np.zeros(3), np.array([0.0, 0.0, -1.0])
     for x in (x_t, x_a):
         moment_w += rotation(x[3:7]).apply(x[22:25]) + np.cross(x[:3] - joined.x[:3], x[19:22])
-    np.testing.assert_allclose(rotation(joined.x[3:7]).apply(joined.x[22:25]), moment_w, atol=1e-9)
+        moment_w += np.cross(rotation(x[3:7]).apply(x[26:29]), up)
+    at = rotation(joined.x[3:7])
+    np.testing.assert_allclose(at.apply(joined.x[22:25]) + np.cross(at.apply(joined.x[26:29]), up), moment_w, atol=1e-9)
 
 
 def test_righting_moment_of_a_joined_body_is_the_sum_at_every_attitude(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
     target, active, merged, x_t, x_a = two
     joined = join([(target, Motion(x_t, np.eye(ERRORS), 10, 0)), (active, Motion(x_a, np.eye(ERRORS), 10, 0))], merged)
     vectors_w = [rotation(x[3:7]).apply(body.righting + x[26:29]) for body, x in ((target, x_t), (active, x_a))]
+    vectors_w += [-x[21] * (x[:3] - joined.x[:3]) for x in (x_t, x_a)]  # what lifts beside the middle
     np.testing.assert_allclose(rotation(joined.x[3:7]).apply(merged.righting + joined.x[26:29]), sum(vectors_w), atol=1e-9)
+
+
+def test_moment_that_acts_is_known_after_a_dock_as_well_as_before(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
+    """Not how it shares out between disturbance and righting: by two modules' scale, and the righting of either is anybody's guess."""
+    target, active, merged, x_t, x_a = two
+    x_t[3:7], x_a[3:7] = [1.0, 0.0, 0.0, 0.0], merged.q_bm[1]  # level: the righting turns it about x and y
+    acts = np.hstack([np.eye(3), [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+    half = np.random.default_rng(1).normal(size=(6, 6))
+    half[:3] = half[:3] * 1e-3 - acts[:, 3:] @ half[3:]  # of the sum a thousandth, of either a lot
+    at, covariance = np.r_[21:24, 25:28], np.eye(ERRORS)
+    covariance[np.ix_(at, at)] = half @ half.T
+    joined = join([(target, Motion(x_t, covariance, 10, 0)), (active, Motion(x_a, covariance, 10, 0))], merged)
+    before, after = (acts @ c[np.ix_(at, at)] @ acts.T for c in (covariance, joined.covariance))
+    grown = np.trace(merged.mass[3:, 3:]) / np.trace(target.mass[3:, 3:])
+    np.testing.assert_allclose(after.diagonal(), before.diagonal() * grown**2)
     np.testing.assert_allclose(joined.covariance.diagonal()[25:], merged.righting_sigma**2)
+    assert np.linalg.eigvalsh(joined.covariance).min() > 0.0
 
 
 def test_parting_undoes_joining_when_nothing_turns_apart(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
@@ -105,6 +124,8 @@ def test_parting_undoes_joining_when_nothing_turns_apart(two: tuple[Body, Body, 
     p_old, q_old = module_pose(active, x_a, 1)
     np.testing.assert_allclose(p, p_old, atol=1e-9)
     assert (q * q_old.inv()).magnitude() < 1e-9
+    rightings_w = [rotation(x[3:7]).apply(x[26:29]) for x in (joined.x, stays.x, leaves.x)]
+    np.testing.assert_allclose(rightings_w[1] + rightings_w[2], rightings_w[0], atol=1e-9)
 
 
 def test_third_module_docks_to_a_pair_in_an_l() -> None:
