@@ -308,6 +308,17 @@ def test_what_was_learned_upright_stays_when_the_place_is_told() -> None:
     np.testing.assert_allclose(after.moment_b, before.moment_b, atol=0.02)
 
 
+def test_righting_that_was_learned_stays_when_the_place_is_told() -> None:
+    robot, known = Robot(), np.array([0.1, -0.05, 0.2])
+    robot.rest(200)
+    for belief in (robot.estimator._anchor, robot.estimator._head):  # a push to the other side, so that nothing turns
+        belief.x[22:25], belief.x[26:29] = -np.cross(known, turned_back(Q_WB, np.array([0.0, 0.0, -1.0]))), known
+    before = robot.rest(1)
+    after = robot.see(READY_AFTER)
+    np.testing.assert_allclose(robot.estimator.motion.x[26:29], known, atol=0.03)
+    np.testing.assert_allclose(after.moment_b, before.moment_b, atol=0.02)
+
+
 def test_speed_that_was_made_up_is_not_kept_when_the_place_is_told() -> None:
     robot = Robot()
     robot.rest(200)

@@ -183,6 +183,16 @@ def test_biases_of_a_joined_body_are_the_mean_of_both_and_stay_with_their_module
     assert joined.x[25] == pytest.approx(0.2)
 
 
+def test_half_of_a_pair_has_half_of_its_righting_and_knows_where_down_is(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
+    target, active, merged, x_t, x_a = two
+    joined = join([(target, Motion(x_t, np.eye(ERRORS), 10, 0)), (active, Motion(x_a, np.eye(ERRORS), 10, 0))], merged)
+    for i, body in enumerate((target, active)):
+        parted = part_of(merged, joined, body)
+        np.testing.assert_allclose(parted.x[26:29], 0.5 * rotation(merged.q_bm[i]).inv().apply(joined.x[26:29]), atol=1e-9)
+        for x in (joined.x, parted.x):
+            np.testing.assert_allclose(x[29:], rotation(x[3:7]).inv().apply([0.0, 0.0, 1.0]), atol=1e-12)
+
+
 def test_joined_body_is_known_no_better_than_the_worse_of_both(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
     target, active, merged, x_t, x_a = two
     sure, unsure = Motion(x_t, np.eye(ERRORS), 500, 9_000), Motion(x_a, np.eye(ERRORS), 3, 1_000)
