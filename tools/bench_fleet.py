@@ -54,7 +54,7 @@ class FleetInWater:
         self._plant = (body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear)
         self._acts, self._tau = ThrusterLag(t, PERIOD_S), np.zeros(6)
         self.x = np.zeros(STATES)
-        """(29,) true state, as core.propagation orders it."""
+        """(32,) true state, as core.propagation orders it."""
         self.x[:3], self.x[3] = START_W, 1.0
         self.x[19:22], self.x[22:25] = len(modules) * CURRENT_N, len(modules) * TRIM_NM
         self._past: deque[np.ndarray] = deque([self.x], maxlen=TAG_DELAY + 1)

@@ -25,7 +25,7 @@ from firmware_py.core.history import WINDOW_S, History
 from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rigid_body import restoring_moment
 from firmware_py.core.rotations import heading, multiply, rotate, to_matrix
-from firmware_py.core.topology import Motion
+from firmware_py.core.topology import Motion, down_of
 from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 
@@ -172,7 +172,7 @@ class Estimator:
         x = np.zeros(STATES)
         x[3:7] = pose.q_wb
         x[:3] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
-        x[29:] = to_matrix(x[3:7].copy())[2]
+        x[29:] = down_of(x)
         inertia = np.diag(self._body.mass)
         sigma = np.r_[np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1]), self._body.righting_sigma]
         sigma[18:24] *= inertia

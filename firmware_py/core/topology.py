@@ -16,7 +16,6 @@ from firmware_py.core.rotations import conjugate, cross, multiply, normalise, ro
 
 JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
 """What is added to a joined or parted body's sigma: position m, attitude rad, velocity m/s, rate rad/s. The faces' play, and the shock."""
-
 LEVEL = np.array([1.0, 1.0, 0.0])
 """Of a force in the world, what does not lift."""
 TURNING = np.ix_(np.r_[21:24, 25:28], np.r_[21:24, 25:28])
@@ -32,6 +31,11 @@ class Motion(NamedTuple):
     """Tag observations that it rests on."""
     tag_ns: int
     """Time of the newest."""
+
+
+def down_of(x: np.ndarray) -> np.ndarray:
+    """(3,) down in the axes of a body in state x."""
+    return np.asarray(to_matrix(x[3:7].copy())[2])
 
 
 def in_both(mine: Sequence[int], theirs: Sequence[int]) -> list[tuple[int, int]]:
@@ -58,7 +62,7 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
     x[19:22], x[22:25], x[26:29] = force, moment, off
     x[13:19] = np.mean([_biases(part, moved.x, body) for part, moved in parts], axis=0)
     x[25] = np.mean([moved.x[25] for _, moved in parts])
-    x[29:] = _down(x)
+    x[29:] = down_of(x)
     accepted, tag_ns = min(moved.accepted for _, moved in parts), min(moved.tag_ns for _, moved in parts)
     return Motion(x, _covariance(motion, first, x, body), accepted, tag_ns)
 
@@ -75,7 +79,7 @@ def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
     x[22:25] = turn @ motion.x[22:25] * share
     x[26:29] = turn @ motion.x[26:29] * share
     x[13:19] = _biases(whole, motion.x, body)
-    x[29:] = _down(x)
+    x[29:] = down_of(x)
     return Motion(x, _covariance(motion, whole, x, body), motion.accepted, motion.tag_ns)
 
 
@@ -127,11 +131,6 @@ def _inverse_place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
     return -turn @ lever_b, np.ascontiguousarray(turn.T)
 
 
-def _down(x: np.ndarray) -> np.ndarray:
-    """(3,) down in the axes of a body in state x."""
-    return np.asarray(to_matrix(x[3:7].copy())[2])
-
-
 def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body) -> np.ndarray:
     """(28, 28) covariance of the new body in state x: that of the old, uncorrelated, larger by the play of the faces, disturbance by mass.
 
@@ -142,7 +141,7 @@ def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body) -> np.nda
     variance[:12] += np.repeat(np.array(JOINED_SIGMA), 3) ** 2
     out = np.diag(variance)
     assert len(out) == ERRORS
-    acts, lean = np.hstack([np.eye(3), skew(_down(old.x))]), skew(_down(x))
+    acts, lean = np.hstack([np.eye(3), skew(down_of(old.x))]), skew(down_of(x))
     grown = (np.trace(after.mass[3:, 3:]) / np.trace(before.mass[3:, 3:])) ** 2
     acting = (acts @ old.covariance[TURNING] @ acts.T).diagonal() * grown
     righting = np.diag(after.righting_sigma**2)

@@ -14,6 +14,7 @@ from firmware_py.core.controller import Controller
 from firmware_py.core.estimator import Estimator
 from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rotations import difference, exp, from_euler, multiply, to_matrix
+from firmware_py.core.topology import TURNING
 from firmware_py.core.types import BodyPose, Estimate, Measured, Setpoint
 from firmware_py.description.parameters import Control, Estimation
 from firmware_py.description.schema import limits_of
@@ -23,8 +24,6 @@ from firmware_py.prepare.assembly import assemble
 PERIOD = 10_000_000
 DT = 0.01
 LEVER = np.array([0.0, 0.0, -0.105])
-TURNING = np.r_[21:24, 25:28]
-"""Of the error: disturbance moment and righting."""
 P = Estimation()
 
 
@@ -365,7 +364,7 @@ def test_wrong_arm_and_trim_are_learned_by_tilting(body: Body) -> None:
         before, x = x, propagation.step(x, tau, DT, *plant(body))
         felt = inertial_of(x, propagation.inertial_acceleration(before, tau, *plant(body)), rng, P.accel_sigma)
         estimator.step(k * PERIOD, felt._replace(tags=[tag_of(x, k * PERIOD)]), tau)
-    known, covariance = estimator.motion.x, estimator.motion.covariance[np.ix_(TURNING, TURNING)]
+    known, covariance = estimator.motion.x, estimator.motion.covariance[TURNING]
     for pitch in (-0.5, -0.25, 0.0, 0.25, 0.5):
         up = Rotation.from_rotvec([0.0, -pitch, 0.0]).apply([0.0, 0.0, -1.0])
         off = known[22:25] + np.cross(known[26:29], up) - np.cross(x[26:29], up)
