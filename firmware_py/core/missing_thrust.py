@@ -15,8 +15,8 @@ from numba import njit
 from firmware_py.core.body import BUOYANCY_SIGMA_N, CRUISE_M_S, Body
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.observation import GRAVITY
-from firmware_py.core.rigid_body import add_restoring
-from firmware_py.core.rotations import M, V, rotate_back
+from firmware_py.core.rigid_body import add_restoring, take_coriolis
+from firmware_py.core.rotations import M, V, cross, rotate_back
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 
@@ -58,7 +58,6 @@ class MissingThrust:
         t = body.thrusters
         self._body, self.parameters = body, parameters
         self._columns = t.matrix.T.copy()
-        self._inertia = body.mass[3:, 3:].copy()
         self._ticks = max(1, round(BLOCK_NS / period_ns))
         count = len(body.modules)
         gust = GUST_M_S * body.drag.cruise_slope
@@ -119,7 +118,7 @@ class MissingThrust:
             self._sum_a += measured.accel + rotate_back(estimate.q_wb, DOWN)
         self._sum_f += force_n
         self._sum_speed += math.sqrt(nu[0] ** 2 + nu[1] ** 2 + nu[2] ** 2)
-        _add_model(self._inertia, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear, nu, estimate.q_wb, self._sum_model)
+        add_model(b.mass, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear, nu, estimate.q_wb, self._sum_model)
 
     def _close(self, estimate: Estimate) -> bool:
         """Ends the block; whether it is whole."""
@@ -155,14 +154,12 @@ DOWN = np.array([0.0, 0.0, GRAVITY])
 
 
 @njit(f"void({M},{V},float64[:,:,:,::1],{V},{V},{V},{V},{V})", cache=True)
-def _add_model(inertia, righting, nodes, rotational, linear, nu, q_wb, out):  # type: ignore[no-untyped-def]
-    """Adds to `out` (6,) what drag, buoyancy and the (3, 3) inertia's gyroscopic moment do to the body."""
+def add_model(mass, righting, nodes, rotational, linear, nu, q_wb, out):  # type: ignore[no-untyped-def]
+    """Adds to `out` (6,) what drag, buoyancy and Coriolis forces do to the body, against an acceleration as it is felt: dv/dt + w x v."""
     add_drag(nodes, rotational, linear, nu, out)
     add_restoring(righting, q_wb, out)
-    w, h = nu[3:], inertia @ nu[3:]
-    out[3] -= w[1] * h[2] - w[2] * h[1]
-    out[4] -= w[2] * h[0] - w[0] * h[2]
-    out[5] -= w[0] * h[1] - w[1] * h[0]
+    take_coriolis(mass, nu, out)
+    out += np.ascontiguousarray(mass[:, :3]) @ cross(nu[3:], nu[:3])
 
 
 @njit(cache=True)

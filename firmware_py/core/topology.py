@@ -15,7 +15,13 @@ from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rotations import conjugate, cross, multiply, normalise, rotate, rotate_back, skew, to_matrix
 
 JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
-"""What is added to a joined or parted body's sigma: position m, attitude rad, velocity m/s, rate rad/s. The faces' play, and the shock."""
+"""What is added to a joined body's sigma: position m, attitude rad, velocity m/s, rate rad/s. The faces' play, and the shock."""
+PARTED_SIGMA = (0.1, 0.05, 0.1, 0.1)
+"""The same of a parted one: magnets push the pieces apart for as much as a second before they are flown as two (`release_s`)."""
+BIAS_SPREAD = np.repeat([0.005, 0.05, 0.02], [3, 3, 1])
+"""(7,) how far biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, differ between modules, sigma. A body knows the mean of its own."""
+BIASES = np.r_[12:18, 24]
+"""Where they stand in the error."""
 LEVEL = np.array([1.0, 1.0, 0.0])
 """Of a force in the world, what does not lift."""
 TURNING = np.ix_(np.r_[21:24, 25:28], np.r_[21:24, 25:28])
@@ -60,11 +66,12 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
         off += turn.T @ moved.x[26:29] - lever_b * moved.x[21]  # what lifts at a lever turns the body upright
     x[7:13] = body.mass_inv @ momentum
     x[19:22], x[22:25], x[26:29] = force, moment, off
-    x[13:19] = np.mean([_biases(part, moved.x, body) for part, moved in parts], axis=0)
-    x[25] = np.mean([moved.x[25] for _, moved in parts])
+    modules = [len(part.modules) for part, _ in parts]
+    x[13:19] = np.average([_biases(part, moved.x, body) for part, moved in parts], axis=0, weights=modules)
+    x[25] = np.average([moved.x[25] for _, moved in parts], weights=modules)
     x[29:] = down_of(x)
     accepted, tag_ns = min(moved.accepted for _, moved in parts), min(moved.tag_ns for _, moved in parts)
-    return Motion(x, _covariance(motion, first, x, body), accepted, tag_ns)
+    return Motion(x, _covariance(motion, first, x, body, JOINED_SIGMA), accepted, tag_ns)
 
 
 def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
@@ -80,7 +87,9 @@ def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
     x[26:29] = turn @ motion.x[26:29] * share
     x[13:19] = _biases(whole, motion.x, body)
     x[29:] = down_of(x)
-    return Motion(x, _covariance(motion, whole, x, body), motion.accepted, motion.tag_ns)
+    covariance = _covariance(motion, whole, x, body, PARTED_SIGMA)
+    covariance[BIASES, BIASES] += BIAS_SPREAD**2 * (1.0 / len(body.modules) - 1.0 / len(whole.modules))
+    return Motion(x, covariance, motion.accepted, motion.tag_ns)
 
 
 def _common(a: Body, b: Body) -> tuple[int, int]:
@@ -131,14 +140,14 @@ def _inverse_place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
     return -turn @ lever_b, np.ascontiguousarray(turn.T)
 
 
-def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body) -> np.ndarray:
-    """(28, 28) covariance of the new body in state x: that of the old, uncorrelated, larger by the play of the faces, disturbance by mass.
+def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body, shock: Sequence[float]) -> np.ndarray:
+    """(28, 28) covariance of the new body in state x: that of the old, uncorrelated, larger by the shock, disturbance by mass.
 
     How the moment that acts shares out between disturbance and righting is known no more; what acts is.
     """
     variance = old.covariance.diagonal().copy()
     variance[18:21] *= (after.rigid_mass_kg / before.rigid_mass_kg) ** 2
-    variance[:12] += np.repeat(np.array(JOINED_SIGMA), 3) ** 2
+    variance[:12] += np.repeat(np.array(shock), 3) ** 2
     out = np.diag(variance)
     assert len(out) == ERRORS
     acts, lean = np.hstack([np.eye(3), skew(down_of(old.x))]), skew(down_of(x))

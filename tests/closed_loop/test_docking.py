@@ -32,6 +32,24 @@ def test_modules_dock_and_no_command_jumps(fly: Fly, name: str) -> None:
 
 
 @pytest.mark.slow
+def test_both_pieces_know_where_they_are_from_the_first_pictures_after_an_undock(fly: Fly, tmp_path: Path) -> None:
+    """The magnets have pushed them apart for most of a second by then, while they were believed to be one."""
+    fly(load_scenario("dock-undock-dock"), 1)
+    believed = read_signals(tmp_path / "run" / "signals.mcap")
+    truth = read_signals(tmp_path / "run" / "truth.mcap")
+    times = believed["/firmware/body1"]["time_ns"]
+    parted_ns = times[np.flatnonzero(np.diff(times) > 5e8)[0] + 1]
+    for number in range(2):
+        body, module = believed[f"/firmware/body{number}"], truth[f"/plant/module{number}"]
+        _, i, j = np.intersect1d(body["time_ns"], module["time_ns"], return_indices=True)
+        since_s = (body["time_ns"][i] - parted_ns) * 1e-9
+        error_m = np.linalg.norm(body["p_wb"][i] - module["p_wm"][j], axis=1)
+        assert 0.0005 < np.sqrt(np.mean(error_m[(since_s > 0.1) & (since_s < 1.5)] ** 2)) < 0.006
+        refused = body["rejected"][i][(since_s >= 0.0) & (since_s < 1.5)]
+        assert refused[-1] - refused[0] < 10
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("parameters", "both"), [(Parameters(), False), (Parameters(), True), (PAPER, False)])
 def test_both_come_to_meet_each_other_where_that_is_asked_for(fly: Fly, tmp_path: Path, parameters: Parameters, both: bool) -> None:
     scenario = load_scenario("dock")

@@ -8,6 +8,7 @@ import pytest
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
 from firmware_py.core.faults import CLEAR, FaultDetector
+from firmware_py.core.missing_thrust import add_model
 from firmware_py.core.pipeline import BodyPipeline
 from firmware_py.core.preload import preload
 from firmware_py.core.propagation import STATES
@@ -279,6 +280,20 @@ def test_weak_thruster_whose_speed_says_so_does_not_lie_and_one_that_says_too_li
 
 
 # ---------------------------------------------------------------- what follows
+
+
+@pytest.mark.parametrize("name", ["modcube", "bluerov2_heavy", "girona500"])
+def test_motion_of_a_body_whose_water_is_heavier_along_one_axis_than_along_another_misses_no_thrust(name: str) -> None:
+    """What the model leaves out of a healthy body's motion, a Munk moment say, would be blamed on a thruster."""
+    b = assemble_vehicle(load_vehicle(name))
+    plant = (b.mass, b.mass_inv, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear)
+    rng = np.random.default_rng(5)
+    x, tau, modelled = np.zeros(STATES), rng.normal(size=6), np.zeros(6)
+    x[3:7], x[7:13] = from_euler(0.3, -0.2, 0.9), [0.5, 0.2, -0.3, 0.2, -0.1, 0.3]
+    felt = propagation.inertial_acceleration(x, tau, *plant)
+    turning = propagation.acceleration(x[7:13].copy(), x[3:7].copy(), tau, *plant)[3:]
+    add_model(b.mass, *plant[2:], x[7:13].copy(), x[3:7].copy(), modelled)
+    np.testing.assert_allclose(b.mass @ np.r_[felt, turning], tau + modelled, atol=1e-9)
 
 
 @pytest.mark.parametrize("pair", list(itertools.combinations(range(8), 2)), ids=str)

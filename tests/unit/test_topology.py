@@ -180,7 +180,19 @@ def test_biases_of_a_joined_body_are_the_mean_of_both_and_stay_with_their_module
         for i, body in enumerate((target, active)):
             parted = part_of(merged, joined, body)
             np.testing.assert_allclose(parted.x[rows], rotation(merged.q_bm[i]).inv().apply(joined.x[rows]), atol=1e-9)
+            grown = (parted.covariance - joined.covariance).diagonal()
+            np.testing.assert_allclose(grown[[12, 15, 24]], [0.005**2 / 2, 0.05**2 / 2, 0.02**2 / 2], err_msg="it knew the mean")
     assert joined.x[25] == pytest.approx(0.2)
+
+
+def test_sensors_of_a_joined_body_are_off_by_the_mean_of_its_modules_and_not_of_its_parts() -> None:
+    pair = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [VEHICLES[0]] * 2, [0, 1])
+    third = assemble([(0, 0, 0)], [0], [VEHICLES[0]], [2])
+    merged = plan_dock(DockRequest(2, 3, 0, 2), third, pair, VEHICLES).merged
+    of_pair, of_third = np.eye(2, STATES, 3)[0], np.eye(2, STATES, 3)[0]
+    of_pair[13:19], of_third[13:19], of_pair[25], of_third[25] = 0.3, 0.6, 0.03, 0.06
+    joined = join([(pair, Motion(of_pair, np.eye(ERRORS), 10, 0)), (third, Motion(of_third, np.eye(ERRORS), 10, 0))], merged)
+    np.testing.assert_allclose([*joined.x[13:19], joined.x[25]], [*[0.4] * 6, 0.04])
 
 
 def test_half_of_a_pair_has_half_of_its_righting_and_knows_where_down_is(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
