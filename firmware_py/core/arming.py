@@ -36,7 +36,9 @@ class Check(NamedTuple):
 
 
 def _estop(q: Question) -> str:
-    return "e-stop raised" if q.estop_age_ms < q.parameters.supervision.estop_quiet_ms else ""
+    """Raised, or still holding a module: one lets go when it hears, some time after the last frame, that it is disarmed."""
+    raised = q.estop_age_ms < q.parameters.supervision.estop_quiet_ms or q.health.stopped
+    return "e-stop raised" if raised else ""
 
 
 def _answers(q: Question) -> str:

@@ -117,6 +117,8 @@ class DockingStage:
         self._due_ns = [NEVER_NS] * modules
         self._docks: list[_Dock] = []
         self._undocks: list[_Undock] = []
+        self._expected: dict[int, DockRequest] = {}
+        """By body: the newest dock or undock that waits for its plan."""
         self._joints = PairBank([], parameters)
         self._watched: Sequence[Joint] = ()
         self.events: list[Event] = []
@@ -162,11 +164,16 @@ class DockingStage:
 
     def forget(self, bodies: Collection[int]) -> list[int]:
         """Ends every dock that one of these takes part in, bodies that there are no more; returns the active ones."""
+        self._expected = {body: request for body, request in self._expected.items() if body not in bodies}
         ended = [dock for dock in self._docks if dock.active in bodies or dock.target in bodies]
         for dock in ended:
             self._drop(dock)
             self._say(WARNING, f"dock ended: {CHANGED}")
         return [dock.active for dock in ended]
+
+    def expect(self, body: int, requests: Sequence[DockRequest]) -> None:
+        """Plans of these have been asked for, in this order."""
+        self._expected.update((body, request) for request in requests)
 
     def abort(self, body: int, time_ns: int, reason: str) -> None:
         """Ends every dock that a body takes part in."""
@@ -190,13 +197,18 @@ class DockingStage:
         return [Event(WARNING, f"{what} of module {request.module} ended: {NO_LONGER}") for what, request in left]
 
     def step(
-        self, inputs: Inputs, estimates: Mapping[int, tuple[Body, Estimate]], holding: Collection[int] = ()
+        self,
+        inputs: Inputs,
+        estimates: Mapping[int, tuple[Body, Estimate]],
+        holding: Collection[int] = (),
+        resting: Collection[tuple[int, int]] = (),
     ) -> Decisions:
         """One tick.
 
         Args:
             estimates: body and its estimate, by the body's number.
             holding: bodies that hold a place which may be moved: only these come to meet another. Looked at when a dock begins.
+            resting: modules and faces whose magnets are off whatever is wanted.
         """
         self.events, self.records = [], []
         decisions = Decisions({}, [], [], [], {})
@@ -206,7 +218,7 @@ class DockingStage:
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, holding, decisions)
         if self._joints.rows.size:
-            self._joints.step(inputs.time_ns, inputs.modules, poses)
+            self._joints.step(inputs.time_ns, inputs.modules, poses, resting)
         for dock in list(self._docks):
             self._steer(dock, inputs, estimates, poses, decisions)
         for undock in list(self._undocks):
@@ -239,13 +251,16 @@ class DockingStage:
     ) -> None:
         request, plan = prepared.request, prepared.plan
         mine = _body_of(request.module, estimates)
+        newest = self._expected.get(mine)
+        if newest == request:
+            del self._expected[mine]
         under_way = next((dock for dock in self._docks if dock.active == mine), None)
         if under_way is not None and under_way.prepared.request == request and under_way.sequence.stage not in ENDED:
             return
         refusal = self._refusal(prepared, estimates)
         if plan is None or refusal:
             self._say(WARNING, f"dock refused: {refusal}")
-            if under_way is None:
+            if under_way is None and newest in (None, request):
                 decisions.ended.append(mine)
         elif isinstance(plan, UndockPlan):
             self._begin_undock(plan, prepared.chains, time_ns)

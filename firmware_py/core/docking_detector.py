@@ -8,7 +8,7 @@ All pairs that are watched are rows of one array, and one compiled pass a tick s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -87,11 +87,19 @@ class PairBank:
                 there = known[key]
                 self.rows[here], self._rings[here] = before.rows[there], before._rings[there]
 
-    def step(self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses) -> None:
-        """Brings the rows to the tick at `time_ns`, from its inputs alone and what they were before."""
+    def step(
+        self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses, resting: Collection[tuple[int, int]] = ()
+    ) -> None:
+        """Brings the rows to the tick at `time_ns`, from its inputs alone and what they were before.
+
+        Args:
+            resting: modules and faces whose magnets the limiter has switched off: their currents tell nothing.
+        """
         for m in self._watched:
             for dock in modules[m].docks:
                 self._heard_ma[m, dock.first : dock.first + 3] = dock.current_ma
+        for m, face in resting:
+            self._heard_ma[m : m + 1, face] = np.nan  # modules above those that are watched are not in it
         watch(self.rows, self._rings, self._heard_ma, *poses.sightings, time_ns, self._limits)
 
     def status(self, i: int) -> PairStatus:

@@ -119,6 +119,9 @@ class Watch:
         self.level = Level(getattr(parameters, f"{name}_action"))
         self.latched = bool(getattr(parameters, f"{name}_latched"))
         self._told_ns = self._told_ns if self.level == before else None
+        if self.level == Level.NONE:  # it is not looked at any more, and begins anew when it is again
+            self._since_ns = self._gone_ns = self._told_ns = None
+            self.active = False
         self._delay_ns = round(getattr(parameters, f"{name}_delay_s") * 1e9)
         self._clear_ns = round(parameters.clear_s * 1e9)
 

@@ -41,7 +41,7 @@ class Formation:
         """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
         held = [c for c in self.chains if c.supervisor.armed and c.supervisor.mode == Mode.POSHOLD] if inputs.prepared else []
         bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.chains}
-        decisions = self.docking.step(inputs, bodies, [c.body.index for c in held])
+        decisions = self.docking.step(inputs, bodies, [c.body.index for c in held], self._resting())
         self._miss_partners(outputs)
         outputs.docks += self.docking.records
         outputs.joints = self.docking.joints
@@ -70,9 +70,20 @@ class Formation:
                 continue
             chain.health.topology = _words_of([joint for joint in loose if joint.module in chain.body.modules])
             gone = [joint for joint in apart if joint.module in chain.body.modules]
+            chain.parting = chain.parting if gone else []  # what closes for a moment may drop its plan: asked anew when it opens
             if gone and gone != chain.parting and chain.supervisor.armed and chain.supervisor.is_on("partner_lost"):
                 chain.parting = gone
                 outputs.preparations.append(PartRequest(tuple(gone)))
+
+    def _resting(self) -> list[tuple[int, int]]:
+        """Modules and faces whose magnets have used up their time."""
+        return [
+            (module, face)
+            for chain in self.chains
+            if chain.joints
+            for module, magnets in zip(chain.body.modules, chain.limiter.magnets, strict=True)
+            for face in magnets.resting
+        ]
 
     def _steer(self, decisions: Decisions) -> None:
         for chain in self.chains:

@@ -22,6 +22,8 @@ from firmware_py.description.parameters import Parameters
 
 NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 ZERO, DOWN = np.zeros(3), np.array([0.0, 0.0, 1.0])
+STILL_S = 0.1
+"""Between two ticks: after more, the microcontrollers have ended all thrust (DESIGN), and the set-point goes on from the body."""
 NEAR_M, NEAR_RAD = 0.2, 0.35
 """A set-point no farther from the body is gone on from; otherwise the body itself is."""
 
@@ -154,7 +156,7 @@ class Guidance:
     def _enter(self, mode: Mode, time_ns: int, estimate: Estimate) -> None:
         at = self._glider.at
         gap, turn = np.linalg.norm(at.p_wb - estimate.p_wb), np.linalg.norm(difference(at.q_wb, estimate.q_wb))
-        if STEERING[self.mode] != STEERING[Mode.POSHOLD] or gap > NEAR_M or turn > NEAR_RAD:
+        if STEERING[self.mode] != STEERING[Mode.POSHOLD] or not (gap <= NEAR_M and turn <= NEAR_RAD):
             self._glider.put(at_estimate(estimate))
         self._trajectory = self._goal = self._docking = None
         if self._point is not None and time_ns - self._point[0] > self._p.guided_timeout_s * 1e9:
@@ -167,8 +169,15 @@ class Guidance:
         """The set-point at `time_ns`, and the one that the thrusters' force will meet."""
         dt_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) * 1e-9
         self._time_ns = time_ns
+        if dt_s > STILL_S:
+            self._glider.put(at_estimate(estimate))
+            self._start_ns = None if self._start_ns is None else self._start_ns + round(dt_s * 1e9)
+            dt_s = 0.0
         if self.mode == Mode.AUTO and self._trajectory is not None and self._joined(self._trajectory, time_ns):
-            return self._sample(self._trajectory, time_ns)
+            sampled = self._sample(self._trajectory, time_ns)
+            if sampled is not None:
+                return sampled
+            self._trajectory = None  # it has a hole: the body comes to rest before it
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):
             self._glider.put(self._docking)
             return self._docking, ahead_of(self._docking, self._lead_s)
@@ -178,12 +187,15 @@ class Guidance:
             now = self._let_go(now, estimate)
         return now, ahead_of(now, self._lead_s)
 
-    def _sample(self, trajectory: Trajectory, time_ns: int) -> tuple[Setpoint, Setpoint]:
+    def _sample(self, trajectory: Trajectory, time_ns: int) -> tuple[Setpoint, Setpoint] | None:
+        """The trajectory's set-points; None where one of them is not finite."""
         assert self._start_ns is not None
         t = (time_ns - self._start_ns) * 1e-9
-        now = trajectory.sample(t)
+        now, ahead = trajectory.sample(t), trajectory.sample(t + self._lead_s)
+        if not math.isfinite(np.concatenate((*now, *ahead)).sum()):
+            return None
         self._glider.put(now)
-        return now, trajectory.sample(t + self._lead_s)
+        return now, ahead
 
     def _joined(self, trajectory: Trajectory, time_ns: int) -> bool:
         """Whether the trajectory runs; it starts when the set-point is near its start."""

@@ -58,6 +58,8 @@ class Health(NamedTuple):
     """Hottest cabin; NaN before the first reading."""
     cabin_change_pa: float
     """Largest change of a cabin's pressure since its first reading."""
+    stopped: tuple[int, ...]
+    """Fleet indices of modules that say that an e-stop holds them."""
     silent: tuple[int, ...]
     """Fleet indices of modules that did not answer of late."""
     silent_s: float
@@ -105,6 +107,7 @@ class HealthMonitor:
         self._esc_ns = [NEVER_NS] * t.module.size
         self._heard_ns = [0] * count
         self._answered_ns = [NEVER_NS] * count
+        self._stopped = [False] * count
         self._leak, self._wet, self._wet_ns = [False] * count, [False] * count, [NEVER_NS] * count
         self._voltage_share: dict[int, float] = {}
         self._cabin_c: dict[int, float] = {}
@@ -141,6 +144,7 @@ class HealthMonitor:
         for other in before:
             for i, j in in_both(self._modules, other._modules):
                 self._heard_ns[i], self._answered_ns[i] = other._heard_ns[j], other._answered_ns[j]
+                self._stopped[i] = other._stopped[j]
                 self._leak[i], self._wet[i], self._wet_ns[i] = other._leak[j], other._wet[j], other._wet_ns[j]
                 for mine, theirs in zip(self._readings, other._readings, strict=True):
                     if j in theirs:
@@ -182,6 +186,7 @@ class HealthMonitor:
             leak=any(self._leak),
             cabin_c=max(self._cabin_c.values(), default=math.nan),
             cabin_change_pa=max(self._cabin_change_pa.values(), default=math.nan),
+            stopped=tuple(m for m, stopped in zip(self._modules, self._stopped, strict=True) if stopped),
             silent=tuple(self._modules[i] for i in _older(self._answered_ns, now - self._answer_ns)),
             silent_s=_age_s(min(self._heard_ns), now),
             bus_silent_s=_age_s(max(self._heard_ns), now),
@@ -206,6 +211,8 @@ class HealthMonitor:
                 self._heard_ns[index] = self._answered_ns[index] = now
             elif module.heard:
                 self._heard_ns[index] = now
+            if module.mcu_state is not None:
+                self._stopped[index] = module.mcu_state == MCU_ESTOP
             if module.pressure_pa is not None:
                 self._depth_ns, self._depth_heard = now, True
             if module.leak is not None:
@@ -256,6 +263,8 @@ class HealthMonitor:
             self._rejected_share += TAG_SHARE * (1.0 - self._rejected_share)
 
 
+MCU_ESTOP = 4
+"""State of MCU_STATUS."""
 ESC_ALIVE = (0, 2)
 """EscStatus OK and OVERTEMPERATURE."""
 TAG_SHARE = 1.0 / 60.0

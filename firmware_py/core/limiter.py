@@ -170,6 +170,11 @@ class MagnetLimiter:
         """What the magnets that are on take, W."""
         self.retune(parameters)
 
+    @property
+    def resting(self) -> list[int]:
+        """Faces whose magnet is off until its account is half full, whatever is wanted."""
+        return [face for face, rests in enumerate(self._resting) if rests] if True in self._resting else []
+
     def retune(self, parameters: LimiterParameters) -> None:
         """Takes other limits from this tick on; accounts stay."""
         self._p, self._is_cold = parameters, False

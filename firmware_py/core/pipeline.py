@@ -23,7 +23,7 @@ from firmware_py.core.limiter import Limiter
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.motor_test import MotorTest
 from firmware_py.core.paper_estimator import TagOnlyEstimator
-from firmware_py.core.requests import FOR_ALL, sift
+from firmware_py.core.requests import FOR_ALL, follow, sift
 from firmware_py.core.sensor_watch import SensorWatch
 from firmware_py.core.supervisor import WARNING, Decision, Supervisor
 from firmware_py.core.supply import SupplyMeter
@@ -211,12 +211,18 @@ class Pipeline:
         outputs = Outputs(inputs.tick, inputs.time_ns, [IDLE] * self._modules, False, [], [])
         formation, docking = self.formation, self.formation.docking
         estimates = {chain.body.index: chain.measure(inputs) for chain in formation.chains}
+        before = formation.chains
         formation.step(inputs, estimates, outputs)
-        requests, refusals = sift(inputs.requests, {body.index: body for body in formation.bodies})
+        bodies = {body.index: body for body in formation.bodies}
+        changed = formation.chains is not before
+        asked = follow(inputs.requests, {chain.body.index: chain.body for chain in before}, bodies) if changed else inputs.requests
+        requests, refusals = sift(asked, bodies)
         outputs.events += refusals
         self._retune(requests, outputs)
         for chain in formation.chains:
-            outputs.preparations += chain.decide(inputs, estimates[chain.body.index], requests)
+            granted = chain.decide(inputs, estimates[chain.body.index], requests)
+            outputs.preparations += granted
+            docking.expect(chain.body.index, granted)
             outputs.events += [event._replace(body=chain.body.index) for event in chain.supervisor.events]
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
             if docking.under_way:
@@ -231,11 +237,11 @@ class Pipeline:
 
     def _retune(self, requests: Sequence[Request], outputs: Outputs) -> None:
         """Parameters that were set since the last tick. What a ground station's registry let through still may be refused here."""
-        wanted = dict.fromkeys(r.argument for r in requests if r.action == Action.SET_PARAMETER)
+        wanted = dict(r.argument for r in requests if r.action == Action.SET_PARAMETER)
         if not wanted:
             return
         parameters = self.parameters
-        for name, value in wanted:
+        for name, value in wanted.items():
             try:
                 parameters = parameters.replace(name, value)
             except DescriptionError as error:

@@ -125,6 +125,22 @@ def sift(requests: Sequence[Request], bodies: Mapping[int, Body]) -> tuple[list[
     return sound, [Event(WARNING, f"{request.action.name} refused: {why}", request.body) for request, why in refused]
 
 
+def follow(requests: Sequence[Request], before: Mapping[int, Body], bodies: Mapping[int, Body]) -> list[Request]:
+    """The requests of a tick in which bodies joined or parted: DISARM reaches every body that now has a module of the one it named.
+
+    Args:
+        before, bodies: by number, before that and now.
+    """
+    found: list[Request] = []
+    for request in requests:
+        named = [each[request.body].modules for each in (before, bodies) if request.body in each]
+        modules = {module for body in named for module in body}
+        meant = [number for number, body in bodies.items() if not modules.isdisjoint(body.modules)]
+        follows = request.action == Action.DISARM and meant
+        found += [request._replace(body=number) for number in meant] if follows else [request]
+    return found
+
+
 def against_request(request: Request, bodies: Mapping[int, Body]) -> str:
     """Why a request reaches nobody, in words; empty when it does. `bodies` by number."""
     if not SOUND[request.action](request.argument):

@@ -79,14 +79,14 @@ class Supervisor:
         """Runs this tick's triggers in order: e-stop, what has ended by itself, requests, fail-safes.
 
         Args:
-            estop: an ESTOP frame came since the previous tick.
+            estop: an ESTOP frame came since the previous tick. A module that says it is stopped while the body is armed is as good as one.
             health: of this tick.
             requests: for this body, and e-stops for all.
             endings: TEST_OVER while no motor test runs, DOCK_OVER when a dock has ended; nothing is said where they do not apply.
         """
         self.events = []
         decisions: list[Decision | None] = []
-        if estop:
+        if estop or (self.armed and health.stopped):  # a module has heard what the firmware has not
             self._estop_ns = health.time_ns
             decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
         decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger)]
@@ -102,6 +102,8 @@ class Supervisor:
             trigger = Trigger.FORCED_ARM
         decision = self._try(trigger, request.argument, health)
         if decision is not None and trigger in (Trigger.ESTOP, Trigger.CLEAR_ESTOP):
+            if self.raises_estop and trigger == Trigger.CLEAR_ESTOP:  # until now the modules have heard ours
+                self._estop_ns = health.time_ns
             self.raises_estop = trigger == Trigger.ESTOP
         return decision
 
@@ -193,10 +195,11 @@ class Supervisor:
         It holds its place, and fail-safes that were on stay on. Where one of these had taken one of them, it goes on in that one's mode,
         the gravest; else, where one of them was in a mode that needs no place, in the first such mode.
         """
-        states = {other.state for other in before}
+        flown = [other for other in before if not other._testing]  # no test becomes a flight
+        states = {other.state if other in flown or other.state not in ARMED else State.DISARMED for other in before}
         self.state = State.ESTOP if State.ESTOP in states else State.DISARMED if State.DISARMED in states else State.ARMED
         worst = max(before, key=lambda other: other.safety)
-        unplaced = [other.mode for other in before if Need.POSITION not in MODES[other.mode].needs]
+        unplaced = [other.mode for other in flown if Need.POSITION not in MODES[other.mode].needs]
         kept = [worst.mode] if worst.safety > Level.NONE else unplaced
         self.mode, self.level = next(iter(kept), Mode.POSHOLD), worst.level
         self.raises_estop = any(other.raises_estop for other in before)

@@ -19,7 +19,7 @@ JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
 PARTED_SIGMA = (0.1, 0.05, 0.1, 0.1)
 """The same of a parted one: magnets push the pieces apart for as much as a second before they are flown as two (`release_s`)."""
 BIAS_SPREAD = np.repeat([0.005, 0.05, 0.02], [3, 3, 1])
-"""(7,) how far biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, differ between modules, sigma. A body knows the mean of its own."""
+"""(7,) how far biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, differ between modules, sigma. A body knows their mean."""
 BIASES = np.r_[12:18, 24]
 """Where they stand in the error."""
 LEVEL = np.array([1.0, 1.0, 0.0])

@@ -181,7 +181,7 @@ class Supervision:
     estop_quiet_ms: float = quantity(
         200.0,
         unit="ms",
-        low=50,
+        low=200,
         high=5000,
         help="an e-stop is over when no frame came for so long",
         mavlink="ESTOP_QUIET_MS",

@@ -18,6 +18,7 @@ GOOD = Health(
     leak=False,
     cabin_c=30.0,
     cabin_change_pa=0.0,
+    stopped=(),
     silent=(),
     silent_s=0.0,
     bus_silent_s=0.0,

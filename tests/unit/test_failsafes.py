@@ -356,3 +356,17 @@ def test_body_made_of_calm_ones_is_calm() -> None:
     assert after.level == Level.NONE
     (alarm,) = after.step(GOOD._replace(leak=True), Mode.AUTO, False, True)
     assert alarm.begins and not alarm.again
+
+
+def test_fail_safe_that_was_switched_off_begins_anew_when_it_is_switched_on_again() -> None:
+    off = replace(P, battery_critical_action=0, module_silent_action=0)
+    failsafes, low = Failsafes(P), GOOD._replace(voltage_share=0.7, silent_s=1.0)
+    for seconds in (0.0, 0.6):
+        failsafes.step(at(low, seconds), Mode.POSHOLD, False, True)
+    assert failsafes.is_on("module_silent")
+    failsafes.retune(off)
+    failsafes.step(at(GOOD, 1.0), Mode.POSHOLD, False, True)
+    failsafes.retune(P)
+    assert failsafes.level == Level.NONE
+    low = low._replace(silent_s=0.0)
+    assert failsafes.step(at(low, 100.0), Mode.POSHOLD, False, True) == [], "its delay counts from now"

@@ -470,3 +470,42 @@ def test_robot_that_is_told_to_hold_goes_no_farther_to_the_place_that_it_was_sen
     there = flight.run(3.0).p_wb[0]
     flight.do(Effect.ENTER_MODE, Mode.POSHOLD)
     assert flight.run(20.0).p_wb[0] < there + 0.3
+
+
+@pytest.mark.parametrize("mode", [Mode.POSHOLD, Mode.SURFACE, Mode.AUTO])
+def test_loop_that_stood_still_goes_on_from_the_body_and_not_from_where_it_would_be(mode: Mode) -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, mode)
+    if mode == Mode.AUTO:
+        flight.guidance.follow(Ramp())
+    elif mode == Mode.POSHOLD:
+        flight.do(Effect.HOLD_AT, mode, rest_at(np.array([0.6, 0.0, 1.0]), LEVEL))
+    before = flight.run(1.0)
+    flight.time_ns += 5_000_000_000
+    after = flight.run(0.01)
+    assert np.linalg.norm(after.p_wb - before.p_wb) < 0.01
+    later = flight.run(1.0)
+    assert 0.01 < np.linalg.norm(later.p_wb - after.p_wb) < 0.4, "it goes on"
+
+
+def test_trajectory_with_a_hole_is_left_before_it_and_spoils_no_other_mode() -> None:
+    class Torn(Ramp):
+        def sample(self, t_s: float) -> Setpoint:
+            whole = super().sample(t_s)
+            return whole._replace(p_wb=whole.p_wb * math.nan) if 1.0 < t_s < 9.0 else whole
+
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.AUTO)
+    flight.guidance.follow(Torn())
+    flight.run(3.0)
+    assert np.isfinite(np.concatenate([np.concatenate(setpoint) for setpoint in flight.setpoints])).all()
+    assert flight.guidance.finished(flight.time_ns)
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    assert flight.run(1.0).p_wb[2] < 1.0
+
+
+def test_set_point_that_is_no_number_is_not_gone_on_from() -> None:
+    flight = Flight()
+    flight.guidance._glider.put(rest_at(np.full(3, math.nan), LEVEL))
+    flight.do(Effect.ENTER_MODE, Mode.POSHOLD)
+    np.testing.assert_allclose(flight.run(0.01).p_wb, flight.estimate.p_wb)

@@ -327,8 +327,9 @@ def test_magnet_rests_when_its_account_is_just_empty_and_lights_when_it_is_just_
 
 def test_each_magnet_has_its_own_account() -> None:
     magnets = MagnetLimiter(MAGNETS, 0.25)
-    for _ in range(11):
+    for n in range(11):
         magnets.step((1, 0, 0, 0, 0, 0))
+        assert magnets.resting == ([0] if n == 10 else [])
     assert magnets.step((1, 1, 0, 0, 0, 0)) == (0, 1, 0, 0, 0, 0)
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from firmware_py.app.preparation import prepare
@@ -328,3 +329,80 @@ def test_parted_modules_magnets_keep_their_accounts() -> None:
     tank.run(1.0)
     after = [list(chain.limiter.magnets[0]._left_s) for chain in tank.pipeline.formation.chains]
     assert min(before[0]) < 59.0 and min(after[0]) < min(before[0]) and min(after[1]) < min(before[1])
+
+
+def test_joint_that_holds_for_a_moment_and_is_lost_again_is_parted_by_another_plan() -> None:
+    """The first plan comes while nothing is open, and is dropped."""
+    tank = Docked(RING[:2], delay=60)
+    tank.fly()
+    tank.lose(1)
+    while not tank._plans:
+        tank.run(0.01)
+    tank.weak.clear()
+    tank.hidden.clear()
+    tank.run(3.0)
+    assert tank.shape == [(0, 1)]
+    tank.lose(1)
+    tank.run(2.0)
+    assert tank.shape == [(0,), (1,)]
+
+
+def test_disarming_a_body_in_the_tick_in_which_it_parts_reaches_both_pieces() -> None:
+    tank = Docked(RING[:2])
+    tank.fly()
+    tank.run(0.01, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    while tank.shape == [(0, 1)]:
+        (undock,) = tank.pipeline.formation.docking._undocks or [None]
+        parts = undock is not None and len(tank.outputs) * 10_000_000 >= undock.until_ns
+        outputs = tank.run(0.01, *([Request(Action.DISARM, 0)] if parts else []))
+    assert tank.shape == [(0,), (1,)]
+    assert [record.state for record in outputs.records] == [State.DISARMED] * 2
+    assert not np.any([module.thrusters for module in outputs.modules])
+
+
+@pytest.mark.parametrize("hidden", [set(), {1}], ids=["seen", "out of sight"])
+def test_magnets_that_the_limiter_rests_are_no_lost_partner(hidden: set[int]) -> None:
+    """Their currents are gone, and with a partner out of sight nothing else would speak for the joint."""
+    tank = Docked(RING[:2], Parameters().replace("limiter.relay_on_s", 2.0))
+    hear, relays = tank._hear, [(1,) * 6] * 2
+
+    def heard(tick: int) -> list[ModuleInputs]:
+        modules = hear(tick)
+        for m, module in enumerate(modules):
+            sent = tank.outputs[-1].modules[m].relays if tank.outputs else None
+            relays[m] = relays[m] if sent is None else sent
+            module.docks = [replace_current(dock, relays[m]) for dock in module.docks]
+        return modules
+
+    def replace_current(dock: DockFeedback, states: tuple[int, ...]) -> DockFeedback:
+        at = slice(dock.first, dock.first + 3)
+        return DockFeedback(dock.first, tuple(110.0 * state for state in states[at]), states[at])
+
+    tank._hear = heard  # type: ignore[method-assign]
+    tank.fly()
+    tank.hidden |= hidden
+    tank.run(0.1, Request(Action.SET_PARAMETER, 0, ("limiter.relay_duty", 0.5)))
+    tank.run(15.0)
+    rested = [outputs.modules[0].relays for outputs in tank.outputs if outputs.modules[0].relays == (0,) * 6]
+    assert rested and tank.shape == [(0, 1)]
+    assert LOST not in [text for _, text in tank.said]
+
+
+def test_refused_dock_does_not_end_the_one_that_was_asked_for_after_it() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0)], apart=True, delay=20)
+    tank.weak = {0, 1}
+    tank.states[1][1] = 0.6
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 2)))  # a probe against a probe
+    tank.run(0.15, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    outputs = tank.run(1.0)
+    assert tank.when("dock refused") < tank.when("docking module 1 to 0")
+    assert outputs.records[1].mode == Mode.DOCK
+
+
+def test_of_several_values_of_a_parameter_in_a_tick_the_last_counts() -> None:
+    tank = Docked(RING[:2])
+    tank.run(0.1)
+    tank.run(0.01, *(Request(Action.SET_PARAMETER, 0, ("failsafes.leak_action", value)) for value in (4, 1, 4)))
+    assert tank.pipeline.parameters.failsafes.leak_action == 4

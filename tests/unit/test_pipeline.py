@@ -231,7 +231,8 @@ def test_stopped_robot_can_be_cleared_and_armed_again(tank: Tank) -> None:
     tank.run(0.5, Request(Action.ARM))
     tank.run(1.0, Request(Action.ESTOP))
     assert not tank.run(DT, Request(Action.ARM)).modules[0].armed, "not before it is cleared"
-    tank.run(0.1, Request(Action.CLEAR_ESTOP))
+    tank.run(0.19, Request(Action.CLEAR_ESTOP))
+    assert not tank.run(DT, Request(Action.ARM)).modules[0].armed, "not before the modules let go"
     assert tank.run(DT, Request(Action.ARM)).modules[0].armed
 
 

@@ -139,6 +139,28 @@ def test_requested_e_stop_is_raised_on_the_bus_until_it_is_cleared() -> None:
     assert not supervisor.raises_estop and supervisor.state == State.DISARMED
 
 
+def test_robot_that_raised_an_e_stop_itself_is_armed_once_its_modules_have_let_go() -> None:
+    """They let go when no frame came for 200 ms, and only of a robot that is disarmed."""
+    supervisor = supervisor_in()
+    ask(supervisor, Action.ESTOP)
+    ask(supervisor, Action.CLEAR_ESTOP, None, at(GOOD, 1.0))
+    almost = at(GOOD, 1.2)
+    for health in (almost._replace(time_ns=almost.time_ns - 1), almost._replace(stopped=(0,))):
+        assert ask(supervisor, Action.ARM, True, health) == [] and texts(supervisor) == ["FORCED_ARM refused: e-stop raised"]
+        assert not supervisor.may_arm(health)
+    assert ask(supervisor, Action.ARM, None, almost) and supervisor.armed
+
+
+def test_module_that_heard_an_e_stop_which_the_firmware_missed_stops_the_robot() -> None:
+    supervisor = supervisor_in()
+    stopped = GOOD._replace(stopped=(0,))
+    (decision,) = supervisor.step(False, stopped, [])
+    assert decision.trigger == Trigger.ESTOP_FRAME and supervisor.state == State.ESTOP and not supervisor.raises_estop
+    assert ask(supervisor, Action.CLEAR_ESTOP, None, at(stopped, 0.1)) == []
+    assert ask(supervisor, Action.CLEAR_ESTOP, None, at(stopped, 0.2)) and supervisor.state == State.DISARMED
+    assert supervisor.step(False, stopped, []) == [], "a disarmed robot's modules let go by themselves"
+
+
 def test_e_stop_is_cleared_when_the_bus_has_been_quiet() -> None:
     supervisor = supervisor_in()
     supervisor.step(True, GOOD, [Request(Action.ESTOP)])

@@ -112,3 +112,18 @@ def test_fail_safe_of_a_body_that_is_taken_over_is_on_already() -> None:
     after.take_over([before])
     assert (after.mode, after.level) == (Mode.SURFACE, Level.SURFACE) and after.is_on("leak")
     assert after.step(False, at(GOOD._replace(leak=True), 1), []) == [] == after.events
+
+
+def test_motor_test_of_one_body_becomes_no_flight_when_it_is_docked_to() -> None:
+    tested = supervisor_in(State.DISARMED)
+    assert ask(tested, Action.MOTOR_TEST, (0, 0.1, 1.0)) and tested.armed
+    for before in ([tested, supervisor_in(mode=Mode.DOCK)], [supervisor_in(mode=Mode.DOCK), tested], [tested]):
+        joined = Supervisor(P)
+        joined.take_over(before)
+        assert (joined.state, joined.mode) == (State.DISARMED, Mode.POSHOLD)
+    stopped = supervisor_in(State.DISARMED)
+    ask(stopped, Action.MOTOR_TEST, (0, 0.1, 1.0))
+    stopped.step(True, GOOD, [])
+    joined = Supervisor(P)
+    joined.take_over([stopped, supervisor_in()])
+    assert joined.state == State.ESTOP
