@@ -59,6 +59,13 @@ class Result(NamedTuple):
     checks: tuple[Check, ...]
     told: tuple[str, ...] = ()
     """Warnings of the firmware, a line each (hil.metrics.told)."""
+    unusual: tuple[str, ...] = ()
+    """What flew otherwise than the scenario has it: vehicle, controller, sensors."""
+
+    @property
+    def title(self) -> str:
+        """Which flight it was, for people."""
+        return ", ".join([f"seed {self.seed}", *self.unusual])
 
 
 def limit_text(low: float, high: float) -> str:
@@ -91,6 +98,7 @@ def write_result(result: Result, folder: Path) -> Path:
     plain = {
         "scenario": result.scenario,
         "seed": result.seed,
+        "unusual": list(result.unusual),
         "passed": result.passed,
         "metrics": {name: _number(value) for name, value in result.metrics.items()},
         "checks": [

@@ -62,6 +62,12 @@ def check_reaches_others(bus: str, who: str, kinds: tuple[str, ...] = ("virtual:
         raise DescriptionError(f"bus {bus!r} does not reach another process; {who} needs udp:GROUP:PORT or socketcan:IFACE")
 
 
+def unusual_in(vehicle: str, controller: str, sensors: str) -> list[str]:
+    """What of a flight is not as the scenario has it, as part of a folder's name."""
+    given = ((vehicle, ""), (controller, "modcube"), (sensors, "real"))
+    return [Path(chosen).stem for chosen, usual in given if chosen != usual]
+
+
 @app.command()
 def run(
     scenario: ScenarioName,
@@ -82,11 +88,12 @@ def run(
     check_rate(rate_hz)
     chosen = scenario_of(scenario, vehicle, sensors)
     parameters = parameters_of(controller)
-    folder = out if out is not None else Path("runs") / chosen.name
+    unusual = unusual_in(vehicle, controller, sensors)
+    folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual])
     if realtime:
         check_reaches_others(bus, "--realtime", ("virtual:", "slcan:"))  # an adapter serves one process
     with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:
-        result = fly_and_judge(chosen, seed, parameters, folder, bus, rate_hz, progress, realtime)
+        result = fly_and_judge(chosen, seed, parameters, folder, bus, rate_hz, progress, realtime, unusual)
     report = illustrate(chosen, result, folder) if plots else None
     print_result(result, report)
     raise typer.Exit(0 if result.passed else FAILED)
@@ -119,7 +126,7 @@ def campaign(
     from hil.workers import dask_cluster, processes
 
     chosen = scenario_of(scenario, vehicle, sensors)
-    unusual = [Path(given).stem for given, usual in ((vehicle, ""), (controller, "modcube"), (sensors, "real")) if given != usual]
+    unusual = unusual_in(vehicle, controller, sensors)
     folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual, "campaign"])
     parameters, seeds = parameters_of(controller), range(seed, seed + trials)
     with _told_that_it_goes_on(), campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
@@ -128,7 +135,7 @@ def campaign(
     print_campaign(summary)
     for worst in summary["worst_seeds"][:draw]:
         again = folder / f"seed-{worst}"
-        print(f"seed {worst}: {illustrate(chosen, fly_and_judge(chosen, worst, parameters, again, DEFAULT_BUS), again)}")
+        print(f"seed {worst}: {illustrate(chosen, fly_and_judge(chosen, worst, parameters, again, DEFAULT_BUS, unusual=unusual), again)}")
     raise typer.Exit(0 if summary["succeeded"] == summary["trials"] else FAILED)
 
 

@@ -21,6 +21,8 @@ STAGES = ("pre-approach", "align", "approach", "push", "verify", "docked", "rele
 DOCK_PLOT = "docking.png"
 TRUE_GAP = "true gap (near by, until locked)"
 """The plant's own, which has none for modules that are far from each other, or of one body."""
+PAUSE_NS = 1_000_000_000
+"""Between two rows of a pair, from which on the second is of another dock."""
 LAST_S = 0.3
 """How long the last tick of a dock is drawn."""
 
@@ -52,8 +54,10 @@ def docking(docks: Columns, truth: Columns, start_ns: int) -> Any:
     """
     from matplotlib import pyplot
 
-    first = (docks["module_b"] == docks["module_b"][0]) & (docks["module_a"] == docks["module_a"][0])
-    rows = {name: column[first] for name, column in docks.items()}
+    pair = (docks["module_b"] == docks["module_b"][0]) & (docks["module_a"] == docks["module_a"][0])
+    rows = {name: column[pair] for name, column in docks.items()}
+    again = np.flatnonzero(np.diff(rows["time_ns"]) > PAUSE_NS)  # the same two, undocked and docked once more
+    rows = {name: column[: again[0] + 1] if again.size else column for name, column in rows.items()}
     time_s = 1e-9 * (rows["time_ns"] - start_ns)
     figure, (currents, gap, conditions) = pyplot.subplots(
         3, 1, figsize=(9.0, 7.0), sharex=True, layout="constrained", height_ratios=(2, 2, 1.2)

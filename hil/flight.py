@@ -6,7 +6,7 @@ import dataclasses
 import fcntl
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -51,6 +51,7 @@ def fly_and_judge(
     rate_hz: int = 100,
     progress: Callable[[float], None] | None = None,
     realtime: bool = False,
+    unusual: Sequence[str] = (),
 ) -> Result:
     """Flies `scenario`; the logs and result.json are in `out` afterwards, and nothing of an earlier flight is.
 
@@ -65,6 +66,7 @@ def fly_and_judge(
             result = judge_logs(scenario, seed, out, flown.wall_s, flown.deadline_misses, LATE_SHARE)
         else:
             result = judge_logs(scenario, seed, out, fly_scenario(*flight, before_logs=partial(_clear, out)))
+        result = result._replace(unusual=tuple(unusual))
         write_result(result, out)
     return result
 

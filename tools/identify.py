@@ -91,7 +91,7 @@ def check_excitation(path: Path) -> None:
 
 def fly_it(path: Path) -> str:
     """How the scenario in `path` is flown, as a shell takes it."""
-    return f"fly it: modcube hil run {shlex.quote(str(path))}"
+    return f"fly it: .venv/bin/modcube hil run {shlex.quote(str(path))}"
 
 
 def print_findings(found: Sequence[Finding]) -> None:

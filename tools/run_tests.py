@@ -28,6 +28,9 @@ def is_installed(package: str) -> bool:
 
 
 def main() -> int:
+    if options := [word for word in sys.argv[1:] if word.startswith("-")]:
+        print(f"run_tests: {options[0]}: no option is taken, only names of Debian packages", file=sys.stderr)
+        return 2
     left_out = {"jetson": "they take half an hour (make test-flash)"}
     if missing := [package for package in sys.argv[1:] if not is_installed(package)]:
         left_out["vcan"] = f"missing Debian packages: {' '.join(missing)} (make setup-system)"

@@ -49,7 +49,7 @@ class PairStatus(NamedTuple):
     position_error_m: float
     """Distance of the mean relative position from one pitch; NaN without fresh pictures."""
     spread_m: float
-    """Distance between the means of the older and the newer half of the pictures: what `settled` is judged by."""
+    """Distance between the means of the two newest quarters of the pictures: what `settled` is judged by."""
     docked: bool
     """Both hold."""
     fresh: bool

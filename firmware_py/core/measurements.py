@@ -18,7 +18,7 @@ WATER_DENSITY = 1000.0
 ATMOSPHERE_PA = 101_325.0
 """Standard atmosphere; what the weather adds is the estimator's depth bias."""
 FLIP_RAD = 0.35
-"""Tags of one picture that disagree with their median by more are flipped and left out (20 deg; noise is 0.5); so is one that tells
+"""Tags of one picture that disagree by more with the most that agree are flipped and left out (20 deg; noise is 0.5); so is one that tells
 of such a tilt against gravity before any was believed."""
 
 SECOND_HAND = 0

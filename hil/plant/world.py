@@ -1,6 +1,6 @@
 """The world of one run: all modules, the water, and the truth about them. Everything else of the plant asks this.
 
-Time moves only by `advance`. Modules that are docked share a body; one module each to begin with.
+Time moves only by `advance`. Modules that are docked share a body; `groups` says which to begin with.
 """
 
 from __future__ import annotations

@@ -163,7 +163,7 @@ def test_flight_that_only_holds_its_place_is_told_what_to_fly(
     said = capsys.readouterr().out
     assert "missing excitation: fast edge-on, for drag coefficient, edge-on" in said
     assert "missing excitation: turning" in said
-    assert "fly it: modcube hil run" in said
+    assert "fly it: .venv/bin/modcube hil run" in said
     wanted = load_scenario(str(tmp_path / "excite.toml"))
     assert wanted.task.yaw_turns and wanted.task.amplitude_m.any()
 

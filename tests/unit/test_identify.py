@@ -197,7 +197,7 @@ def test_excitation_is_said_how_to_fly_and_writes_over_nothing(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["identify", "--excitation", "first shake.toml"])
     assert tool.main() == 0
-    assert capsys.readouterr().out == "fly it: modcube hil run 'first shake.toml'\n"
+    assert capsys.readouterr().out == "fly it: .venv/bin/modcube hil run 'first shake.toml'\n"
     (tmp_path / "first shake.toml").write_text("mine", encoding="utf-8")
     assert tool.main() == 2
     assert "first shake.toml: there already, and nothing is written over; give another name or delete it" in capsys.readouterr().err
