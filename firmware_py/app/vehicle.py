@@ -152,7 +152,7 @@ def run_vehicle(
             observers.append(recording(recorder, fleet.rate_hz))
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
-        observers.append(telling(teller.say))  # after the recorder, which may have something to say
+        told: list[Observer] = [telling(teller.say)]  # after all others, which may have something to say
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
         side: GroundSide | None = None
         if ground is not None:
@@ -160,13 +160,13 @@ def run_vehicle(
 
             # Like the recorder's and the live view's, its threads start before this one takes its priority, which they would inherit.
             side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY, started=parameters))
-            observers.append(side.observe)
+            told.append(side.observe)
             requests = with_ground(operator, side, lambda: firmware.pipeline.bodies)
         read_libraries()
         for line in stack.enter_context(real_time()):
             teller.say(f"warning: {line}")
         loop = open_loop(stack, firmware, requests)
-        loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier)]
+        loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier), *told]
         use_priority(TICK_PRIORITY)
         move_to_own_processor()
         loop.listen()
