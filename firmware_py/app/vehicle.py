@@ -80,9 +80,8 @@ class Operator:
         """The requests of this tick."""
         self._ticks += 1
         if self.stopping:
-            self.farewell += 1
-            bodies = [record.body for record in last.records] if last is not None else []
-            return [Request(Action.DISARM, body) for body in bodies] if self.farewell == 1 else []
+            self.farewell += 1  # and in each of its ticks all are asked: a body may be new since the one before
+            return [Request(Action.DISARM, record.body) for record in last.records] if last is not None else []
         if not self.to_arm or last is None:
             return []
         self._strike_out(last)
@@ -236,11 +235,12 @@ def with_ground(
     """The operator's requests and those of ground stations; a reboot that was asked for ends the process, the service starts it anew.
 
     Once a ground station disarms or stops the vehicle, the operator arms nobody any more; whom it arms, tests or gives a mode is its own.
+    In the farewell nothing else than a stop is heard.
     """
 
     def requests(time_ns: int, last: Outputs | None) -> list[Request]:
         operator.stopping = operator.stopping or side.reboot_asked
-        asked = side.requests()
+        asked = [request for request in side.requests() if request.action in STOPPED_BY or not operator.stopping]
         if any(request.action in STOPPED_BY for request in asked):
             operator.to_arm.clear()
         taken = {request.body for request in asked if request.action in TAKEN_BY}
