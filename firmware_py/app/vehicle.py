@@ -148,7 +148,7 @@ def run_vehicle(
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
         recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
         if recorder is not None:
-            observers.append(recording(recorder, fleet.rate_hz))
+            observers += [noting_estop(recorder, before.stopped), recording(recorder, fleet.rate_hz)]
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
         told: list[Observer] = [telling(teller.say)]  # after all others, which may have something to say
@@ -284,6 +284,26 @@ def recording(recorder: Recorder, rate_hz: int) -> Observer:
         armed = [command.armed for command in outputs.modules]
         if armed != was_armed or outputs.tick % flush_every == 0:
             was_armed[:] = armed
+            outputs.events += recorder.flush()
+
+    return observe
+
+
+def noting_estop(recorder: Recorder, stands: bool) -> Observer:
+    """An observer that notes for the next process whether an e-stop stands: from one on, and where one stood before this process
+    (`stands`), until a person clears it or arms. It is with the system at once, before any frame of that tick.
+    """
+    noted = False
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        nonlocal stands, noted
+        if stands:
+            cleared = any(request.action == Action.CLEAR_ESTOP for request in inputs.requests)
+            stands = not cleared and not any(command.armed for command in outputs.modules)
+        stands = stands or any(record.state == State.ESTOP for record in outputs.records)
+        if stands != noted:
+            noted = stands
+            recorder.note_estop(stands, outputs.time_ns)
             outputs.events += recorder.flush()
 
     return observe
