@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from firmware_py.app.preparation import prepare
+from firmware_py.app.preparation import prepare, wish_of
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.mapping import InputCollector, OutputEncoder
 from firmware_py.core.pipeline import Pipeline
-from firmware_py.core.types import Inputs, Outputs, Request
+from firmware_py.core.types import Inputs, Outputs, PartRequest, Request
 from firmware_py.description.fleet import Fleet, load_fleet
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
@@ -61,7 +61,8 @@ class Firmware:
         inputs.prepared = self.worker.results()
         outputs = self.pipeline.step(inputs)
         for request in outputs.preparations:
-            self.worker.submit(partial(prepare, request, self.pipeline, self.vehicles, self.fleet.pitch_m))
+            job = partial(prepare, request, self.pipeline, self.vehicles, self.fleet.pitch_m)
+            self.worker.submit(job, wish_of(request, self.pipeline.bodies), first=isinstance(request, PartRequest))
         return outputs
 
 

@@ -13,10 +13,10 @@ from firmware_py.app.firmware import Firmware
 from firmware_py.bus.codec import Codec
 from firmware_py.core.joints import joints_of, sides
 from firmware_py.description.fleet import Fleet
-from firmware_py.description.signals import read_attachment
+from firmware_py.description.signals import last_attachment, read_attachment
 from firmware_py.runtime.flight_log import LoggedFrame, frame_of
 from firmware_py.runtime.log_folder import log_folders
-from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG
+from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, ESTOP, SIGNAL_LOG, STANDS
 
 RECENT_NS = 60_000_000_000
 """A log that was last written longer ago says nothing of now: the vehicle may be out of the water, in somebody's hands."""
@@ -35,6 +35,8 @@ PARTED_SINCE = (
     "where they are apart it has to say so (body, cell); nobody is armed without a person"
 )
 
+STOPPED = "the e-stop of the flight before was not cleared: nobody is armed without a person"
+
 Face = tuple[int, int]
 """Fleet index and face."""
 
@@ -48,6 +50,8 @@ class LastFlight(NamedTuple):
     """Every magnet that pulled."""
     let_go: frozenset[Face] = frozenset()
     """Every magnet that did not; and those of joints that were open before that process, which nobody flew as one."""
+    stopped: bool = False
+    """An e-stop stood at the end, of that process or of one before: since then nobody cleared it, and nobody armed. It grows not old."""
 
     def docked(self, firmware: Firmware) -> frozenset[Face]:
         """Faces that are joined and of no joint of the fleet file."""
@@ -59,30 +63,35 @@ class LastFlight(NamedTuple):
 
 
 def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -> LastFlight:
-    """How the newest log under `out` ends in which anything was sent. Logs that are missing, unreadable or old say nothing.
+    """How the newest log under `out` ends in which anything was sent. Logs that are missing or unreadable say nothing, and
+    old ones only whether an e-stop stands.
 
     Args:
         now_ns: the time of day, to compare with that of the file.
         boot: of this start of the machine, to compare with the log's.
     """
+    stopped = _is_stopped(out)
     for folder in log_folders(out):
         sent = _last_sent(folder, now_ns, TAIL_BYTES * len(fleet.module))
         if sent:
-            return _told(sent, _notes_of(folder), fleet, codec, boot)
-    return LastFlight()
+            return _told(sent, _notes_of(folder), fleet, codec, boot)._replace(stopped=stopped)
+    return LastFlight(stopped=stopped)
 
 
 def to_arm(before: LastFlight, firmware: Firmware, hold: bool, say: Callable[[str], None]) -> set[int]:
     """Modules that are armed without a person: all with `hold`; with REARM, those in whose flight the process before was killed.
 
     With REARM nobody is where modules were docked in flight: the fleet file has them apart, and its relays let go of them. Nobody at all is
-    where they were undocked: the fleet file has them as one body, which they no longer are.
+    where they were undocked: the fleet file has them as one body, which they no longer are; and nobody where an e-stop stands.
     """
     fleet, docked, apart = firmware.fleet, before.docked(firmware), before.apart(firmware)
     for faces, what in ((docked, DOCKED_SINCE), (apart, PARTED_SINCE)):
         if faces:
             modules = ", ".join(map(fleet.label, sorted({module for module, _ in faces})))
             say(f"warning: modules {modules} {what}")
+    if before.stopped and (hold or firmware.parameters.supervision.rearm):
+        say(f"warning: {STOPPED}")
+        return set()
     if hold and not apart:
         return set(range(len(fleet.module)))
     if docked or apart or not firmware.parameters.supervision.rearm:
@@ -122,6 +131,15 @@ def _magnets_rest(notes: dict[str, Any]) -> bool:
 def _joined_faces(firmware: Firmware) -> frozenset[Face]:
     """Both sides of every joint that the fleet file has."""
     return frozenset(side for body in firmware.pipeline.bodies for joint in joints_of(body) for side in sides(joint.request))
+
+
+def _is_stopped(out: Path) -> bool:
+    """Whether the newest log of a process that came to a tick says that an e-stop stands."""
+    for folder in log_folders(out):
+        with suppress(OSError):
+            if (folder / CAN_LOG).stat().st_size:
+                return last_attachment(folder / SIGNAL_LOG, ESTOP) == STANDS
+    return False
 
 
 def _notes_of(folder: Path) -> dict[str, Any]:

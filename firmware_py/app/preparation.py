@@ -15,6 +15,16 @@ from firmware_py.description.vehicle import Vehicle
 from firmware_py.prepare.docking import plan_dock, plan_undock
 
 
+def wish_of(request: DockRequest | PartRequest, bodies: Sequence[Body]) -> tuple[str, int | None]:
+    """What is wanted of which body, by its number: of several requests for the same only the newest still is."""
+    joint = request.joints[0] if isinstance(request, PartRequest) else request
+    of_body = {module: body for body in bodies for module in body.modules}
+    body = of_body.get(joint.module)
+    together = body is of_body.get(joint.target_module)
+    what = "part" if joint is not request else "undock" if together else "dock"
+    return what, None if body is None else body.index
+
+
 def prepare(request: DockRequest | PartRequest, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
     """The plan for `request`, or in words why there is none; never raises for a request that cannot be met.
 

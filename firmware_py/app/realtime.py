@@ -10,12 +10,14 @@ from dataclasses import dataclass, field
 from firmware_py.app.firmware import BusFrame, Firmware
 from firmware_py.app.lockstep import Observer
 from firmware_py.bus.port import Port, PortError, open_port
-from firmware_py.core.types import Outputs, Request
+from firmware_py.core.types import Event, Inputs, Outputs, Request
 from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.rate_keeper import RateKeeper, absolute_sleeper
 
 LISTEN_NS = 200_000_000
 """How long a bus is listened to before the first SYNC: a foreign SYNC refuses the start."""
+WARNING = 4
+"""syslog severity of an observer that failed."""
 
 
 @dataclass(slots=True)
@@ -24,6 +26,7 @@ class RealTimeLoop:
 
     Attributes:
         requests: hands over what people asked for since the last tick, given its outputs and the time of this one.
+        observers: one that raises is dropped, with a warning among the tick's events for those after it.
         unanswered: ticks that closed at half time because a module had not answered.
         last: outputs of the last tick.
     """
@@ -72,10 +75,18 @@ class RealTimeLoop:
         outputs = self.firmware.tick(inputs)
         frames = self.firmware.encoder.frames(outputs)
         self._send(frames)
-        for observer in self.observers:
-            observer(received, sync + frames, inputs, outputs)
+        self._show(received, sync + frames, inputs, outputs)
         self.last = outputs
         return outputs
+
+    def _show(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        """The tick, to every observer. The flight is worth more than any of them."""
+        for observer in self.observers:
+            try:
+                observer(received, sent, inputs, outputs)
+            except Exception as error:
+                self.observers = [other for other in self.observers if other is not observer]
+                outputs.events.append(Event(WARNING, f"no more {_name_of(observer)}: {type(error).__name__}: {error}"))
 
     def _take(self) -> bool:
         """Hands every frame that is there to the collector."""
@@ -88,6 +99,11 @@ class RealTimeLoop:
     def _send(self, frames: Sequence[BusFrame]) -> None:
         for bus, frame in frames:
             self.ports[bus].send(frame)
+
+
+def _name_of(observer: Observer) -> str:
+    """Of the function that made it, or of its class."""
+    return getattr(observer, "__qualname__", type(observer).__name__).partition(".")[0]
 
 
 def open_loop(

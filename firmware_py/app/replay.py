@@ -21,7 +21,7 @@ from firmware_py.runtime.flight_log import FlightLog, LogError, LoggedTick
 from firmware_py.runtime.recorder import candump_lines
 from firmware_py.runtime.request_text import CORE_TYPES, read_request
 from firmware_py.runtime.tick_messages import TickMessages
-from firmware_py.runtime.worker import InlineWorker, Job
+from firmware_py.runtime.worker import InlineWorker
 
 TYPES = {**CORE_TYPES, **{cls.__name__: cls for cls in (Consecutive, Harmonic, Hold, Piecewise)}}
 """What a recorded request may hold: the trajectories, and core's own."""
@@ -39,24 +39,17 @@ class Outcome:
     """Where the log ends too early; empty when it is whole."""
 
 
-class DueWorker:
-    """Does each job at once and hands its result over in the tick in which the recorded flight had it."""
+class DueWorker(InlineWorker):
+    """Does each job on the spot and hands its result over in the tick in which the recorded flight had it."""
 
-    def __init__(self) -> None:
-        self._worker = InlineWorker()
-        self._waiting: list[Any] = []
-        self.due = 0
-        """Results that this tick takes."""
+    due = 0
+    """Results that this tick takes."""
 
-    def submit(self, job: Job) -> None:
-        """Runs the job."""
-        self._worker.submit(job)
-        self._waiting += self._worker.results()
-
-    def results(self) -> list[Any]:
-        """The results that are due."""
-        results, self._waiting = self._waiting[: self.due], self._waiting[self.due :]
-        return results
+    def _finished(self) -> list[Any]:
+        if self.due == 0:
+            return []
+        self.due -= 1
+        return super()._finished()
 
 
 class Replay:

@@ -80,9 +80,8 @@ class Operator:
         """The requests of this tick."""
         self._ticks += 1
         if self.stopping:
-            self.farewell += 1
-            bodies = [record.body for record in last.records] if last is not None else []
-            return [Request(Action.DISARM, body) for body in bodies] if self.farewell == 1 else []
+            self.farewell += 1  # and in each of its ticks all are asked: a body may be new since the one before
+            return [Request(Action.DISARM, record.body) for record in last.records] if last is not None else []
         if not self.to_arm or last is None:
             return []
         self._strike_out(last)
@@ -149,10 +148,10 @@ def run_vehicle(
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
         recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
         if recorder is not None:
-            observers.append(recording(recorder, fleet.rate_hz))
+            observers += [noting_estop(recorder, before.stopped), recording(recorder, fleet.rate_hz)]
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
-        observers.append(telling(teller.say))  # after the recorder, which may have something to say
+        told: list[Observer] = [telling(teller.say)]  # after all others, which may have something to say
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
         side: GroundSide | None = None
         if ground is not None:
@@ -160,13 +159,13 @@ def run_vehicle(
 
             # Like the recorder's and the live view's, its threads start before this one takes its priority, which they would inherit.
             side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY, started=parameters))
-            observers.append(side.observe)
+            told.append(side.observe)
             requests = with_ground(operator, side, lambda: firmware.pipeline.bodies)
         read_libraries()
         for line in stack.enter_context(real_time()):
             teller.say(f"warning: {line}")
         loop = open_loop(stack, firmware, requests)
-        loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier)]
+        loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier), *told]
         use_priority(TICK_PRIORITY)
         move_to_own_processor()
         loop.listen()
@@ -236,11 +235,12 @@ def with_ground(
     """The operator's requests and those of ground stations; a reboot that was asked for ends the process, the service starts it anew.
 
     Once a ground station disarms or stops the vehicle, the operator arms nobody any more; whom it arms, tests or gives a mode is its own.
+    In the farewell nothing else than a stop is heard.
     """
 
     def requests(time_ns: int, last: Outputs | None) -> list[Request]:
         operator.stopping = operator.stopping or side.reboot_asked
-        asked = side.requests()
+        asked = [request for request in side.requests() if request.action in STOPPED_BY or not operator.stopping]
         if any(request.action in STOPPED_BY for request in asked):
             operator.to_arm.clear()
         taken = {request.body for request in asked if request.action in TAKEN_BY}
@@ -284,6 +284,26 @@ def recording(recorder: Recorder, rate_hz: int) -> Observer:
         armed = [command.armed for command in outputs.modules]
         if armed != was_armed or outputs.tick % flush_every == 0:
             was_armed[:] = armed
+            outputs.events += recorder.flush()
+
+    return observe
+
+
+def noting_estop(recorder: Recorder, stands: bool) -> Observer:
+    """An observer that notes for the next process whether an e-stop stands: from one on, and where one stood before this process
+    (`stands`), until a person clears it or arms. It is with the system at once, before any frame of that tick.
+    """
+    noted = False
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        nonlocal stands, noted
+        if stands:
+            cleared = any(request.action == Action.CLEAR_ESTOP for request in inputs.requests)
+            stands = not cleared and not any(command.armed for command in outputs.modules)
+        stands = stands or any(record.state == State.ESTOP for record in outputs.records)
+        if stands != noted:
+            noted = stands
+            recorder.note_estop(stands, outputs.time_ns)
             outputs.events += recorder.flush()
 
     return observe

@@ -101,8 +101,9 @@ class InputCollector:
         """Everything since the call before, as the Inputs of `tick`; the collector is empty afterwards."""
         modules, self._modules = self._modules, [ModuleInputs() for _ in self._modules]
         wanted = tick & 0xFFFF
-        for module, status in zip(modules, self._status_ticks, strict=True):
-            module.answered = status == wanted
+        for index, module in enumerate(modules):
+            module.answered = self._status_ticks[index] == wanted
+            self._status_ticks[index] = None  # it answers once: the same 16 bits come again after 65536 ticks
             if module.tags:
                 module.tags = [tag for tag in module.tags if self._is_timely(tag, time_ns)]
         self._expire_halves()

@@ -223,7 +223,10 @@ class CommandService:
     def _reboot(self, command: Command) -> Answer:
         if int(command.get(1)) not in (1, 3):
             return UNSUPPORTED
-        if self._system.subject.picture.any_armed:  # it is one process for all of them
+        picture = self._system.subject.picture  # of the fleet: it is one process for all of them
+        reason = "a body is armed" if picture.any_armed else "the e-stop is not cleared" if picture.any_stopped else ""
+        if reason:
+            self._system.say(_WARNING, f"reboot refused: {reason}")
             return DENIED
         self.reboot_asked = True
         return ACCEPTED

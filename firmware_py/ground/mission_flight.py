@@ -73,6 +73,8 @@ class _Flight:
     arrivals_s: tuple[float, ...] = ()
     taken: int = 0
     """System.taken when it began."""
+    members: tuple[int, ...] = ()
+    """Fleet indices of the body's modules then: it is planned for these."""
     holds: bool = False
     """The hold in which it waits for its plan was there."""
     started_ns: int | None = None
@@ -228,6 +230,8 @@ class MissionFlight:
         flight.holds = flight.holds or mode == Mode.POSHOLD
         if not s.armed:
             return "the vehicle is disarmed"
+        if s.picture.members(s.body) != flight.members:
+            return "the body is another one"
         if self._system.taken != flight.taken:
             return "paused, or something else was asked for"
         if mode == Mode.POSHOLD or (mode == Mode.AUTO and flight.arrivals_s):
@@ -272,7 +276,7 @@ class MissionFlight:
         s = self._system.subject
         self._serial += 1  # a plan that is still being made is no longer wanted
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
-        self._flight = _Flight(tuple(legs), taken=self._system.taken)
+        self._flight = _Flight(tuple(legs), taken=self._system.taken, members=s.picture.members(s.body))
         self._plan_at_tick, self._hold_by_tick = s.picture.ticks + _SETTLE_TICKS, s.picture.ticks + _HOLD_TICKS
 
     def _end(self, state: int) -> None:

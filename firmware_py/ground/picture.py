@@ -118,6 +118,11 @@ class Picture:
         """Whether any thruster of the fleet may turn."""
         return any(self.is_armed(body) for body in self.records)
 
+    @property
+    def any_stopped(self) -> bool:
+        """Whether the e-stop holds any body of the fleet."""
+        return any(self.is_stopped(body) for body in self.records)
+
     def mode(self, body: int) -> Mode:
         """How it is steered, or would be once armed."""
         record = self.records.get(body)

@@ -128,6 +128,14 @@ def test_reboot_is_denied_while_any_body_of_the_process_is_armed() -> None:
     assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_DENIED and not world.station.reboot_asked
 
 
+def test_reboot_is_denied_while_an_emergency_stop_stands(world: World, client: Client) -> None:
+    ask(world, client, 31012)
+    assert ask(world, client, 246, 1) == mavlink.MAV_RESULT_DENIED and not world.station.reboot_asked
+    assert "reboot refused: the e-stop is not cleared" in client.texts
+    ask(world, client, 31013)
+    assert ask(world, client, 246, 1) == mavlink.MAV_RESULT_ACCEPTED
+
+
 def test_one_refusal_answers_one_command(world: World, client: Client) -> None:
     other = world.client(system=200)
     client.command(176, 1, 1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode, Setpoint
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.geodesy import Origin
@@ -525,6 +526,26 @@ def test_flight_that_is_being_planned_ends_when_a_fail_safe_changes_the_mode(wor
     world.run(3)
     assert "flight ended before it began: the mode is SURFACE" in client.texts
     assert world.robot.mode[0] == Mode.POSHOLD
+
+
+@pytest.mark.parametrize("parts", [False, True])
+def test_flight_that_is_being_planned_ends_when_the_body_becomes_another(parts: bool) -> None:
+    world = World(2)
+    client, apart = world.client(), list(world.robot.bodies)
+    world.robot.state[1] = State.ARMED
+    if parts:
+        world.robot.dock()
+        world.run(1)
+    job = planning(world, client)
+    if parts:
+        world.robot.bodies = apart
+    else:
+        world.robot.dock()
+    world.run(1)
+    come_back(world, job)
+    world.run(3)
+    assert Action.TRACK not in [r.action for r in world.robot.asked]
+    assert client.texts.count("flight ended before it began: the body is another one") == 1
 
 
 def test_way_to_a_place_ends_by_pause_while_it_is_planned(world: World, client: Client) -> None:

@@ -155,6 +155,14 @@ def test_module_answers_a_tick_with_the_status_of_that_tick_alone():
     assert not late.answered
 
 
+def test_module_that_fell_silent_does_not_answer_again_when_the_count_of_ticks_comes_round():
+    robot = Robot()
+    robot.say("MCU_STATUS", (5, 1, 0, 2))
+    assert robot.tick(5).modules[0].answered
+    assert not robot.collector.all_answered(5 + 65_536)
+    assert not robot.tick(5 + 65_536).modules[0].answered
+
+
 def test_fleet_has_answered_when_its_last_module_has():
     robot = Robot(TWO_BUSES)
     answers = []

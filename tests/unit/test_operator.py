@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from firmware_py.app.vehicle import ARM_EVERY_S, REARM_S, Operator, with_ground
+from firmware_py.app.vehicle import ARM_EVERY_S, FAREWELL_TICKS, REARM_S, Operator, with_ground
 from firmware_py.core.transitions import State
 from firmware_py.core.types import NEVER_NS, Action, BodyRecord, Mode, Outputs, Request
 from tests.unit.ground_world import Robot
@@ -134,6 +134,38 @@ def test_other_requests_of_a_ground_station_leave_the_hold_alone() -> None:
     flight.ask(Action.GROUND_ALIVE)
     flight.run(10)
     assert flight.robot.state == [State.ARMED]
+
+
+@pytest.mark.parametrize(("action", "argument"), [(Action.ARM, False), (Action.ARM, True), (Action.MOTOR_TEST, (1, 0.1, 1.0))])
+def test_nothing_is_armed_in_the_farewell(action: Action, argument: object) -> None:
+    flight = Flight()
+    flight.run(10)
+    flight.operator.stopping = True
+    flight.run(1)
+    assert flight.robot.state == [State.DISARMED]
+    flight.ask(action, argument=argument)
+    flight.run(FAREWELL_TICKS - 2)
+    assert flight.operator.is_done(0, flight.last)
+    assert flight.robot.state == [State.DISARMED]
+    assert action not in [request.action for request in flight.robot.asked[1:]], "the first is the operator's"
+
+
+def test_stop_is_heard_in_the_farewell() -> None:
+    flight = Flight()
+    flight.operator.stopping = True
+    flight.ask(Action.ESTOP)
+    assert flight.robot.state == [State.ESTOP]
+
+
+def test_body_that_parts_in_the_tick_of_the_stop_is_disarmed_as_both() -> None:
+    flight = Flight(modules=2, to_arm=set())
+    flight.robot.dock()
+    flight.robot.state = [State.ARMED] * 2
+    flight.run(2)
+    flight.operator.stopping = True
+    flight.robot.bodies = Robot(2).bodies
+    flight.run(2)
+    assert flight.robot.state == [State.DISARMED] * 2
 
 
 def test_operator_without_orders_arms_nobody() -> None:

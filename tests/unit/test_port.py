@@ -316,6 +316,15 @@ class TestSlcan(PortSuite):
         assert faults(other) == {"receive": 1}
 
 
+    def test_line_with_an_id_above_the_largest_is_counted_as_foreign(self, pair, cable):
+        one, other = pair
+        os.write(cable.masters[1], b"t90110011\r")
+        assert poll(lambda: other.receive() or other.faults["foreign"])
+        one.send(FRAMES[1])
+        assert receive(other, 1) == [FRAMES[1]]
+        assert faults(other) == {"foreign": 1}
+
+
 # ------------------------------------------------------------------ opening
 
 
@@ -526,12 +535,14 @@ def test_what_is_no_classic_frame_is_counted_by_kind(port, link):
         can.Message(arbitration_id=0x101, is_extended_id=True),
         can.Message(arbitration_id=0x101, is_extended_id=False, is_remote_frame=True, dlc=4),
         can.Message(arbitration_id=0x101, is_extended_id=False, is_fd=True, data=bytes(12)),
+        can.Message(arbitration_id=0x800, is_extended_id=False, check=False),
+        Frame(0x901, b"one wrong bit in the line of an adapter"),
         can.Message(arbitration_id=0x004, is_extended_id=False, is_error_frame=True, data=bytes(8)),
         can.Message(arbitration_id=0x040, is_extended_id=False, is_error_frame=True, data=bytes(8)),
         can.Message(arbitration_id=0x102, is_extended_id=False, data=b"good"),
     ))
     assert port.receive() == [Frame(0x102, b"good")]
-    assert faults(port) == {"foreign": 3, "error_frame": 1, "bus_off": 1}
+    assert faults(port) == {"foreign": 5, "error_frame": 1, "bus_off": 1}
 
 
 def test_reader_outlives_a_failing_bus_and_reopens_it(link):

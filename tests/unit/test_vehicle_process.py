@@ -13,9 +13,13 @@ import numpy as np
 import pytest
 
 from firmware_py.app import vehicle
-from firmware_py.app.vehicle import Operator, recording, run_vehicle
+from firmware_py.app.firmware import compose
+from firmware_py.app.last_flight import last_flight, to_arm
+from firmware_py.app.vehicle import Operator, noting_estop, recording, run_vehicle
+from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import PortError
-from firmware_py.core.types import Event, Inputs, ModuleCommand, Outputs
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Action, Event, Inputs, ModuleCommand, Outputs, Request
 from firmware_py.description.fleet import Fleet, Module, single
 from firmware_py.description.parameters import Parameters, Supervision
 from firmware_py.runtime import teller
@@ -23,6 +27,7 @@ from firmware_py.runtime.clock import boot_id
 from firmware_py.runtime.flight_log import FlightLog
 from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
+from tests.unit.ground_world import Robot
 from tests.unit.test_last_flight import FLEET, dock_line, lines_of
 
 REARM = Parameters(supervision=Supervision(rearm=1))
@@ -254,6 +259,72 @@ def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
 @pytest.mark.slow
 def test_relays_of_single_modules_are_no_undock(tmp_path: Path) -> None:
     assert fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, UNDOCKED))[0] == HOLDS
+
+
+ARMS_NOBODY = "warning: the e-stop of the flight before was not cleared: nobody is armed without a person"
+OLD_NS = 1_000_000_000 * 86_400
+Told = tuple[State, list[Request]]
+
+
+def stopped(folder: Path, *told: Told, before: bool = False) -> None:
+    """The log of a process whose one body was in such states, each in a tick in which so much was asked for, and which then was killed."""
+    log = make_log_folder(folder)
+    recorder = Recorder(log, {})
+    observers = [noting_estop(recorder, before), recording(recorder, 1)]
+    sync = [(0, Frame(0x020, b"")), (0, Frame(0x020, b""))]
+    for tick, (state, requests) in enumerate(told, 1):
+        _, outputs = Robot().step([])
+        (record,) = outputs.records
+        command = outputs.modules[0]._replace(armed=state == State.ARMED)
+        now = dataclasses.replace(outputs, tick=tick, modules=[command], records=[record._replace(state=int(state))])
+        for observe in observers:
+            observe([], sync, Inputs(tick, now.time_ns, [], requests), now)
+    left = content(log)
+    recorder.close()
+    for name in LOGS:
+        (log / name).write_bytes(left[name])
+    os.utime(log / CAN_LOG, ns=(OLD_NS, OLD_NS))
+
+
+CLEAR = [Request(Action.CLEAR_ESTOP)]
+
+
+@pytest.mark.parametrize(
+    ("told", "arms"),
+    [
+        ([(State.DISARMED, []), (State.ARMED, []), (State.DISARMED, [])], True),
+        ([(State.ARMED, []), (State.ESTOP, [])], False),
+        ([(State.ESTOP, []), (State.ESTOP, CLEAR)], False),
+        ([(State.ESTOP, []), (State.DISARMED, CLEAR)], True),
+        ([(State.ESTOP, []), (State.DISARMED, CLEAR), (State.ESTOP, [])], False),
+    ],
+    ids=["disarmed", "stopped", "clearing-refused", "cleared", "stopped-again"],
+)
+def test_order_to_hold_arms_nobody_after_a_stop_that_was_not_cleared(tmp_path: Path, told: list[Told], arms: bool) -> None:
+    stopped(tmp_path, *told)
+    said: list[str] = []
+    firmware = compose(single(), Parameters())
+    before = last_flight(tmp_path, firmware.fleet, firmware.codec, 2 * OLD_NS, boot_id())
+    assert to_arm(before, firmware, True, said.append) == ({0} if arms else set())
+    assert said == ([] if arms else [ARMS_NOBODY])
+
+
+@pytest.mark.parametrize(
+    ("told", "stands"),
+    [((State.DISARMED, []), True), ((State.DISARMED, CLEAR), False), ((State.ARMED, []), False)], ids=["nothing", "cleared", "armed"],
+)  # fmt: skip
+def test_stop_outlives_every_restart_until_a_person_clears_it_or_arms(tmp_path: Path, told: Told, stands: bool) -> None:
+    stopped(tmp_path, (State.ESTOP, []))
+    stopped(tmp_path, (State.DISARMED, []), told, (State.DISARMED, []), before=True)
+    make_log_folder(tmp_path)  # of a process that came to no tick
+    assert last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped == stands
+
+
+@pytest.mark.slow
+def test_process_started_anew_after_a_stop_holds_nothing_and_says_so(tmp_path: Path) -> None:
+    stopped(tmp_path / "log", (State.ESTOP, []))
+    for _ in range(2):
+        assert ARMS_NOBODY in fly(tmp_path, tmp_path / "log", hold=True)
 
 
 class Tape(Recorder):

@@ -36,6 +36,8 @@ REOPEN_EVERY = 16
 """An interface that is there but does not open is tried again at every so-manieth read."""
 BUS_OFF = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the id of an error frame."""
+LARGEST_ID = 0x7FF
+"""Of a classic frame. The line of an slcan adapter has room for more, and one wrong bit makes it so."""
 
 _DOWN = {errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EADDRNOTAVAIL}
 _GONE = {errno.ENODEV, errno.ENXIO, errno.EBADF, errno.EIO}
@@ -165,10 +167,13 @@ class Port:
                 if item is None:
                     break
                 timeout_s = 0.0
-                if type(item) is Frame:
-                    frames.append(item)
-                elif (frame := self._classic(item)) is not None:
+                frame = item if type(item) is Frame else self._classic(item)
+                if frame is None:
+                    continue
+                if frame[0] <= LARGEST_ID:
                     frames.append(frame)
+                else:
+                    self.faults["foreign"] += 1
         except Exception as error:  # as in send; also what a back end makes of garbage
             self._failed("receive", bus, error)
         if not frames:

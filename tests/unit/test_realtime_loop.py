@@ -1,0 +1,55 @@
+"""Ticks against the clock: whoever watches them may fail, and they go on."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from firmware_py.app.firmware import BusFrame, Firmware, compose
+from firmware_py.app.lockstep import Lockstep, Observer
+from firmware_py.app.realtime import RealTimeLoop, open_loop
+from firmware_py.app.vehicle import telling
+from firmware_py.bus.port import open_port
+from firmware_py.core.types import Inputs, Outputs
+from firmware_py.description.fleet import single
+from firmware_py.description.parameters import Parameters
+
+
+@pytest.fixture
+def firmware(tmp_path: Path) -> Firmware:
+    return compose(single(bus=f"virtual:{tmp_path.name}"), Parameters())
+
+
+@pytest.fixture
+def loop(firmware: Firmware) -> Iterator[RealTimeLoop]:
+    with ExitStack() as stack:
+        yield open_loop(stack, firmware, lambda time_ns, last: [])
+
+
+def breaking(at_tick: int) -> Observer:
+    """An observer that fails from one tick on."""
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        if outputs.tick >= at_tick:
+            raise IndexError("no such id")
+
+    return observe
+
+
+def test_observer_that_fails_is_dropped_with_one_warning_and_the_others_watch_on(loop: RealTimeLoop) -> None:
+    said: list[str] = []
+    ticks: list[int] = []
+    loop.observers = [breaking(2), telling(said.append), lambda received, sent, inputs, outputs: ticks.append(outputs.tick)]
+    loop.run(lambda tick, outputs: tick == 4)
+    assert ticks == [1, 2, 3, 4]
+    (warning,) = [line for line in said if "breaking" in line]
+    assert warning.endswith("no more breaking: IndexError: no such id")
+
+
+def test_observer_that_fails_on_the_bench_ends_the_flight(firmware: Firmware) -> None:
+    with open_port(firmware.fleet.buses[0]) as port:
+        lockstep = Lockstep(firmware, [port], [breaking(1)])
+        lockstep.start_tick(1, 0)
+        with pytest.raises(IndexError, match="no such id"):
+            lockstep.finish_tick(1, 0, [], [])
