@@ -149,10 +149,11 @@ def test_run_passes_only_when_every_check_does() -> None:
 
 def test_result_file_has_the_agreed_shape(tmp_path: Path) -> None:
     metrics = {"position_rmse_m": 0.0026, "nis_mean": math.nan, "ticks": 4001.0}
-    path = write_result(judge("spiral", 3, metrics, LIMITS), tmp_path)
+    path = write_result(judge("spiral", 3, metrics, LIMITS)._replace(unusual=("paper", "ideal")), tmp_path)
     assert json.loads(path.read_text()) == {
         "scenario": "spiral",
         "seed": 3,
+        "unusual": ["paper", "ideal"],
         "passed": False,
         "metrics": {"position_rmse_m": 0.0026, "nis_mean": None, "ticks": 4001},
         "checks": [
