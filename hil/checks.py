@@ -63,8 +63,8 @@ class Result(NamedTuple):
     """What flew otherwise than the scenario has it: vehicle, controller, sensors."""
 
     @property
-    def title(self) -> str:
-        """Which flight it was, for people."""
+    def flown(self) -> str:
+        """Which flight of the scenario it was, for people."""
         return ", ".join([f"seed {self.seed}", *self.unusual])
 
 

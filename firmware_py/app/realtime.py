@@ -10,14 +10,13 @@ from dataclasses import dataclass, field
 from firmware_py.app.firmware import BusFrame, Firmware
 from firmware_py.app.lockstep import Observer
 from firmware_py.bus.port import Port, PortError, open_port
+from firmware_py.core.supervisor import WARNING
 from firmware_py.core.types import Event, Inputs, Outputs, Request
 from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.rate_keeper import RateKeeper, absolute_sleeper
 
 LISTEN_NS = 200_000_000
 """How long a bus is listened to before the first SYNC: a foreign SYNC refuses the start."""
-WARNING = 4
-"""syslog severity of an observer that failed."""
 
 
 @dataclass(slots=True)

@@ -251,8 +251,7 @@ class DockingStage:
     ) -> None:
         request, plan = prepared.request, prepared.plan
         mine = _body_of(request.module, estimates)
-        newest = self._expected.get(mine)
-        if newest == request:
+        if self._expected.get(mine) == request:
             del self._expected[mine]
         under_way = next((dock for dock in self._docks if dock.active == mine), None)
         if under_way is not None and under_way.prepared.request == request and under_way.sequence.stage not in ENDED:
@@ -260,7 +259,7 @@ class DockingStage:
         refusal = self._refusal(prepared, estimates)
         if plan is None or refusal:
             self._say(WARNING, f"dock refused: {refusal}")
-            if under_way is None and newest in (None, request):
+            if under_way is None and mine not in self._expected:
                 decisions.ended.append(mine)
         elif isinstance(plan, UndockPlan):
             self._begin_undock(plan, prepared.chains, time_ns)

@@ -99,7 +99,8 @@ class PairBank:
             for dock in modules[m].docks:
                 self._heard_ma[m, dock.first : dock.first + 3] = dock.current_ma
         for m, face in resting:
-            self._heard_ma[m : m + 1, face] = np.nan  # modules above those that are watched are not in it
+            if m in self._watched:
+                self._heard_ma[m, face] = np.nan
         watch(self.rows, self._rings, self._heard_ma, *poses.sightings, time_ns, self._limits)
 
     def status(self, i: int) -> PairStatus:

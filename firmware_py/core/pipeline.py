@@ -211,12 +211,10 @@ class Pipeline:
         outputs = Outputs(inputs.tick, inputs.time_ns, [IDLE] * self._modules, False, [], [])
         formation, docking = self.formation, self.formation.docking
         estimates = {chain.body.index: chain.measure(inputs) for chain in formation.chains}
-        before = formation.chains
+        before = formation.bodies
         formation.step(inputs, estimates, outputs)
         bodies = {body.index: body for body in formation.bodies}
-        changed = formation.chains is not before
-        asked = follow(inputs.requests, {chain.body.index: chain.body for chain in before}, bodies) if changed else inputs.requests
-        requests, refusals = sift(asked, bodies)
+        requests, refusals = sift(follow(inputs.requests, before, bodies), bodies)
         outputs.events += refusals
         self._retune(requests, outputs)
         for chain in formation.chains:

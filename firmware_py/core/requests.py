@@ -125,20 +125,23 @@ def sift(requests: Sequence[Request], bodies: Mapping[int, Body]) -> tuple[list[
     return sound, [Event(WARNING, f"{request.action.name} refused: {why}", request.body) for request, why in refused]
 
 
-def follow(requests: Sequence[Request], before: Mapping[int, Body], bodies: Mapping[int, Body]) -> list[Request]:
-    """The requests of a tick in which bodies joined or parted: DISARM reaches every body that now has a module of the one it named.
+def follow(requests: Sequence[Request], before: Sequence[Body], bodies: Mapping[int, Body]) -> list[Request]:
+    """The requests of a tick in which bodies may have joined or parted: DISARM reaches every body that has a module of the one it named.
 
     Args:
-        before, bodies: by number, before that and now.
+        before: at the beginning of the tick. bodies: now, by number.
     """
     found: list[Request] = []
     for request in requests:
-        named = [each[request.body].modules for each in (before, bodies) if request.body in each]
-        modules = {module for body in named for module in body}
-        meant = [number for number, body in bodies.items() if not modules.isdisjoint(body.modules)]
-        follows = request.action == Action.DISARM and meant
-        found += [request._replace(body=number) for number in meant] if follows else [request]
+        meant = _holders(request.body, before, bodies) if request.action == Action.DISARM else []
+        found += [request._replace(body=number) for number in meant] or [request]
     return found
+
+
+def _holders(named: int, before: Sequence[Body], bodies: Mapping[int, Body]) -> list[int]:
+    """Numbers of the bodies that hold a module of the one that has this number, or had it at the beginning of the tick."""
+    modules = {module for body in (*before, *bodies.values()) if body.index == named for module in body.modules}
+    return [number for number, body in bodies.items() if not modules.isdisjoint(body.modules)]
 
 
 def against_request(request: Request, bodies: Mapping[int, Body]) -> str:

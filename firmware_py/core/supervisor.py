@@ -196,7 +196,7 @@ class Supervisor:
         the gravest; else, where one of them was in a mode that needs no place, in the first such mode.
         """
         flown = [other for other in before if not other._testing]  # no test becomes a flight
-        states = {other.state if other in flown or other.state not in ARMED else State.DISARMED for other in before}
+        states = {State.DISARMED if other._testing else other.state for other in before}
         self.state = State.ESTOP if State.ESTOP in states else State.DISARMED if State.DISARMED in states else State.ARMED
         worst = max(before, key=lambda other: other.safety)
         unplaced = [other.mode for other in flown if Need.POSITION not in MODES[other.mode].needs]

@@ -18,9 +18,10 @@ JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
 """What is added to a joined body's sigma: position m, attitude rad, velocity m/s, rate rad/s. The faces' play, and the shock."""
 PARTED_SIGMA = (0.07, 0.05, 0.07, 0.1)
 """The same of a parted one: magnets push the pieces apart for as much as a second before they are flown as two (`release_s`). On the bench
-they are 70 mm away by then, at 70 mm/s."""
+each is 70 mm and 0.05 rad away by then, at 70 mm/s and 0.1 rad/s (dock-undock-dock, seed 1)."""
 BIAS_SPREAD = np.repeat([0.005, 0.05, 0.02], [3, 3, 1])
-"""(7,) how far biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, differ between modules, sigma. A body knows their mean."""
+"""(7,) how far biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, differ between modules, sigma (synthetic,
+as the bench draws them). A body knows their mean."""
 BIASES = np.r_[12:18, 24]
 """Where they stand in the error."""
 LEVEL = np.array([1.0, 1.0, 0.0])

@@ -181,7 +181,7 @@ class Supervision:
     estop_quiet_ms: float = quantity(
         200.0,
         unit="ms",
-        low=200,
+        low=200,  # what the modules wait themselves before they let go (docs/mcu.md)
         high=5000,
         help="an e-stop is over when no frame came for so long",
         mavlink="ESTOP_QUIET_MS",

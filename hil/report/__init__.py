@@ -75,10 +75,10 @@ class Scene:
 def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plots: Sequence[Path]) -> Path:
     """Write report.html into `folder`; returns its path. `plots` are PNG files, inlined in their order."""
     parts = {
-        "title": html.escape(f"{scene.title}, {result.title}"),
+        "title": html.escape(f"{scene.title}, {result.flown}"),
         "heading": html.escape(scene.title),
         "description": html.escape(scene.description),
-        "seed": ", ".join([str(result.seed), *result.unusual]),
+        "flight": html.escape(result.flown),
         "verdict": "passed" if result.passed else "failed",
         "verdict_text": "All checks passed" if result.passed else "A check failed",
         "headline": _headline(result, scene),

@@ -236,6 +236,28 @@ def test_stopped_robot_can_be_cleared_and_armed_again(tank: Tank) -> None:
     assert tank.run(DT, Request(Action.ARM)).modules[0].armed
 
 
+def test_robot_stops_when_a_module_says_that_an_e_stop_holds_it_and_is_armed_once_it_has_let_go(tank: Tank) -> None:
+    """The ESTOP frame itself was lost on its way to the firmware."""
+    hear, says = tank._hear, [2]
+
+    def heard(tick: int) -> list[ModuleInputs]:
+        modules = hear(tick)
+        modules[0].mcu_state = says[0] if tick % 10 == 0 else None
+        return modules
+
+    tank._hear = heard  # type: ignore[method-assign]
+    tank.run(0.5)
+    assert tank.run(0.5, Request(Action.ARM)).modules[0].armed
+    says[0] = 4
+    assert tank.run(0.1).records[0].state == State.ESTOP
+    tank.run(0.3)
+    tank.run(0.3, Request(Action.CLEAR_ESTOP))
+    assert tank.run(DT, Request(Action.ARM, 0, True)).records[0].state == State.DISARMED
+    says[0] = 1
+    tank.run(0.1)
+    assert tank.run(DT, Request(Action.ARM)).modules[0].armed
+
+
 def test_motor_test_of_a_disarmed_robot_turns_one_thruster_and_disarms(tank: Tank) -> None:
     tank.run(1.0)
     first = len(tank.outputs)
