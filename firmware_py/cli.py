@@ -28,6 +28,8 @@ REASONS = {errno.EEXIST: "is a file; a folder is needed"}
 """In place of the system's words, where these do not say what would be right."""
 BUS, VEHICLE, RATE_HZ = "socketcan:can0", "modcube", 100
 """Of one module, where the command line does not say."""
+LIVE_HOST, LIVE_PORT = "127.0.0.1", 8765
+"""Where the live view listens, where the command line does not say."""
 
 app = typer.Typer(
     help="Controller of a self-reconfigurable underwater robot.", no_args_is_help=True, pretty_exceptions_enable=False
@@ -69,8 +71,8 @@ def run(
     ] = None,
     stats: Annotated[bool, typer.Option("--stats", help="print how the ticks kept their deadlines")] = False,
     live: Annotated[bool, typer.Option("--live", help="serve a live view for Foxglove")] = False,
-    live_host: Annotated[str, typer.Option(help="address that the live view listens on")] = "127.0.0.1",
-    live_port: Annotated[int, typer.Option(min=1, max=65535, help="and its port")] = 8765,
+    live_host: Annotated[str | None, typer.Option(help="address that the live view listens on", show_default=LIVE_HOST)] = None,
+    live_port: Annotated[int | None, typer.Option(min=1, max=65535, help="and its port", show_default=f"{LIVE_PORT}")] = None,
 ) -> None:
     """Run the vehicle until SIGINT or SIGTERM."""
     from firmware_py.app.deadlines import stats_lines
@@ -78,13 +80,15 @@ def run(
     from firmware_py.app.vehicle import run_vehicle
     from firmware_py.runtime.notify import Notifier
 
+    if not live and (live_host is not None or live_port is not None):
+        raise DescriptionError("--live-host and --live-port tell where the live view listens; give --live with them")
     described = fleet_of(fleet, bus, vehicle, rate_hz)
     chosen = load_parameters(parameters) if parameters is not None else Parameters()
     links = ground_config(ground_file, ground or [], identity, store, out, len(described.module))
     notifier = Notifier.of(os.environ)
     with ExitStack() as stack:
         # Its threads start before this process takes its real-time priority, which they would inherit.
-        view = stack.enter_context(LiveView(live_host, live_port)) if live else None
+        view = stack.enter_context(LiveView(live_host or LIVE_HOST, live_port or LIVE_PORT)) if live else None
         summary = run_vehicle(described, chosen, hold, out, notifier=notifier, ground=links, live=view)
     for line in stats_lines(summary) if stats else ():
         typer.echo(line)

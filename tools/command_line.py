@@ -1,4 +1,4 @@
-"""For the tools: how a command line ends: wrong arguments in one line, and Ctrl-C without a word, in its processes too."""
+"""For the tools: how a command line ends: what is wrong in one line, and Ctrl-C without a word, in its processes too."""
 
 from __future__ import annotations
 
@@ -21,6 +21,13 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog.removesuffix('.py')}: {message}; see --help\n")
+
+
+def in_words(error: Exception) -> str:
+    """What is wrong, in one line; of a file that the system refuses, its name first."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
 
 
 def run_tool(main: Callable[[], int | None]) -> NoReturn:

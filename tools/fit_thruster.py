@@ -19,7 +19,7 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-from command_line import Parser, run_tool
+from command_line import Parser, in_words, run_tool
 from scipy.optimize import nnls
 
 from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of, to_toml
@@ -176,7 +176,7 @@ def main() -> int:
         curve, left_n = fit_curve(points, like, voltage_v, given.zero)
         given.out.write_text(checked_toml(curve, given.out), encoding="utf-8")
     except (DescriptionError, OSError) as error:
-        print(f"fit_thruster: {error}", file=sys.stderr)
+        print(f"fit_thruster: {in_words(error)}", file=sys.stderr)
         return 2
     print(f"{given.out}: {np.sum(curve.forward):.3g} N forward, {np.sum(curve.reverse):.3g} N reverse at {curve.voltage_v:g} V;", end=" ")
     print(f"deadband {curve.deadband_n:.2g} N; residual {left_n:.2g} N RMS")

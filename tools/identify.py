@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from argument_types import make_folder
-from command_line import Parser, run_tool
+from command_line import Parser, in_words, run_tool
 from identify_excitation import MOTIONS, SPACE_M, check_space, excitation
 from identify_fit import Reference, fit
 from identify_log import Recording, read_recording
@@ -71,8 +71,10 @@ def check_hung(weight: Weight, flight: Equations) -> None:
         )
 
 
-def reference_of(recording: Recording, thruster: int, accuracy_percent: float) -> Reference:
-    """The load-cell curve as a reference. Raises DescriptionError."""
+def reference_of(recording: Recording, thruster: int | None, accuracy_percent: float | None) -> Reference:
+    """The load-cell curve as a reference: of the first thruster and good to 2 %, where nothing is said. Raises DescriptionError."""
+    thruster = 1 if thruster is None else thruster
+    accuracy_percent = 2.0 if accuracy_percent is None else accuracy_percent
     count = len(recording.vehicle.thruster)
     if not 1 <= thruster <= count:
         raise DescriptionError(f"--thruster {thruster}: the vehicle has thrusters 1 to {count}")
@@ -118,6 +120,8 @@ def identify(given: argparse.Namespace) -> int:
         return 0
     if given.hung_at and not given.weight:
         raise DescriptionError("--hung-at says where a weight hung; give --weight with it")
+    if given.curve is None and (given.thruster is not None or given.accuracy is not None):
+        raise DescriptionError("--thruster and --accuracy tell of a measured curve; give --curve with them")
     weight = parse_weight(given.weight, given.hung_at) if given.weight else None
     if weight is not None and len(given.logs) > 1:
         raise DescriptionError("--weight says when the weight hung in one log; give one LOG with it")
@@ -159,8 +163,8 @@ def main() -> int:
     parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="*", metavar="LOG", help="folders of flights of one vehicle, one module alone")
     parser.add_argument("--curve", type=Path, metavar="FILE", help="curve of one thruster, from tools/fit_thruster.py")
-    parser.add_argument("--thruster", type=int, default=1, help="which thruster that was, 1 the first")
-    parser.add_argument("--accuracy", type=float, default=2.0, metavar="PERCENT", help="bounds of the load cell's scale")
+    parser.add_argument("--thruster", type=int, help="which thruster that was, 1 the first (default)")
+    parser.add_argument("--accuracy", type=float, metavar="PERCENT", help="bounds of the load cell's scale, 2 by default")
     parser.add_argument("--weight", metavar="NEWTON:KG:FROM:UNTIL", default="", help="a known weight hung on so long")
     parser.add_argument("--hung-at", type=float, nargs=3, metavar="M", help="where, x y z of the body; else the middle of its bottom")
     parser.add_argument("--excitation", type=Path, metavar="FILE", help="where the scenario of the missing motions goes")
@@ -170,7 +174,7 @@ def main() -> int:
     try:
         return identify(parser.parse_args())
     except (DescriptionError, OSError) as error:
-        print(f"identify: {error}", file=sys.stderr)
+        print(f"identify: {in_words(error)}", file=sys.stderr)
         return 2
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from argument_types import make_folder, positive, whole
-from command_line import Parser, run_tool, worker_pool
+from command_line import Parser, in_words, run_tool, worker_pool
 from fit_thruster import fit_curve
 from identify_excitation import MOTIONS, excitation
 from identify_fit import Reference, fit
@@ -121,7 +121,7 @@ def main() -> int:
         make_folder(given.out)
         found = examine_all(range(given.seed, given.seed + given.plants), given.jobs, given.out, given.seconds)
     except (DescriptionError, OSError) as error:
-        print(f"identify_plants: {error}", file=sys.stderr)
+        print(f"identify_plants: {in_words(error)}", file=sys.stderr)
         return 2
     print(json.dumps(found, indent=2))
     return 0 if max(found[kind] for kind in (MASS, DRAG, GAIN)) <= 0.1 and found["covered"] >= 0.85 and not found["stated"] else 1

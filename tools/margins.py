@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from argument_types import make_folder, whole
-from command_line import Parser, run_tool, worker_pool
+from command_line import Parser, in_words, run_tool, worker_pool
 from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure
 from rich import box
 from rich.console import Console
@@ -157,7 +157,7 @@ def main() -> int:
         make_folder(given.out)
         found = measured(given.modules, chosen, given.vehicle, given.jobs)
     except (DescriptionError, OSError) as error:
-        print(f"margins: {error}", file=sys.stderr)
+        print(f"margins: {in_words(error)}", file=sys.stderr)
         return 2
     table_rows = rows(found)
     print_table(table_rows)

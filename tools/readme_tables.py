@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from command_line import Parser, run_tool
+from command_line import Parser, in_words, run_tool
 
 README = Path("README.md")
 SOURCES = {"accept": Path("accept.json"), "bench": Path("bench.json")}
@@ -119,7 +119,7 @@ def main() -> int:
         print(f"readme: {error} is no table of {README}, or no column of its file; there are {', '.join(TABLES)}", file=sys.stderr)
         return 2
     except (ValueError, OSError) as error:
-        print(f"readme: {error}", file=sys.stderr)
+        print(f"readme: {in_words(error)}", file=sys.stderr)
         return 2
     return 0
 

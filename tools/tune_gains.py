@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from argument_types import make_folder, positive, whole
-from command_line import INTERRUPTED, Parser, run_tool
+from command_line import INTERRUPTED, Parser, in_words, run_tool
 from tune_objective import Objective, detuned, load_objective, with_values
 
 from firmware_py.description.parameters import Parameters, load_parameters
@@ -140,7 +140,7 @@ def main() -> int:
             return tune_live(objective, given.live, given.trials, given.seconds, given.out)
         tune(objective, start, given, dask_cluster(given.dask) if given.dask else processes(given.jobs))
     except (DescriptionError, OSError) as error:
-        print(f"tune_gains: {error}", file=sys.stderr)
+        print(f"tune_gains: {in_words(error)}", file=sys.stderr)
         return 2
     except BrokenExecutor:
         print(f"tune_gains: a worker died; the same command with --out {given.out} goes on where it was", file=sys.stderr)

@@ -84,6 +84,7 @@ def test_what_does_not_exist_is_refused_with_what_there_is(
         (["hil", "run", "hover", "--seed", "-1"], "--seed", "greater than or equal to 0"),
         (["hil", "run", "hover", "--seed", "one"], "--seed", "integer"),
         (["hil", "campaign", "hover", "--trials", "0"], "--trials", "greater than or equal to 1"),
+        (["run", "--bus", "virtual:cli", "--live-port", "9000"], "--live-port", "give --live with"),
     ],
 )
 def test_wrong_arguments_are_refused_in_one_line(

@@ -171,6 +171,8 @@ def test_weight_that_neither_came_nor_went_is_refused(from_s: float, until_s: fl
         (["nowhere"], "no can.log"),
         (["a", "b", "--weight", "2:0.2:1:2"], "give one LOG"),
         (["a", "--hung-at", "0", "0", "-0.1"], "--hung-at says where a weight hung; give --weight with it"),
+        (["a", "--thruster", "2"], "--thruster and --accuracy tell of a measured curve; give --curve with them"),
+        (["a", "--accuracy", "5"], "--thruster and --accuracy tell of a measured curve; give --curve with them"),
         (["--excitation", "shake.toml", "--space", "nan", "nan", "nan"], "--space nan nan nan: three distances of 0 m or more"),
         (["--excitation", "shake.toml", "--space", "0.6", "-0.5", "0.3"], "--space 0.6 -0.5 0.3: three distances of 0 m or more"),
         (["--excitation", "shake.toml", "--space", "0.6", "0.5", "inf"], "--space 0.6 0.5 inf: three distances of 0 m or more"),

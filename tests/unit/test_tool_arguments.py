@@ -59,6 +59,7 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
         ("identify_plants", ["--seconds", "nan"], "--seconds: 'nan' is not a number above zero"),
         ("identify", ["--thruster", "first"], "identify: argument --thruster: invalid int value: 'first'; see --help"),
         ("tune_gains", [], "tune_gains: the following arguments are required: objective; see --help"),
+        ("fit_thruster", ["nosuch.csv"], "fit_thruster: nosuch.csv: No such file or directory"),
         ("fit_thruster", [], "fit_thruster: the following arguments are required: csv; see --help"),
         ("characterise", [], "characterise: give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE; see --help"),
         (
