@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -165,8 +166,11 @@ def load_objective(path: Path) -> Objective:
     """The objective in a file, its scenarios checked. Raises DescriptionError, one line."""
     table, source = read_toml(path)
     objective: Objective = build(Objective, table, source)
-    for spec in objective.flight:
-        spec.flown()
-    for wanted in objective.stability:
-        body_of(wanted.modules, objective.vehicle)
+    checks = [("flight", i, spec.flown) for i, spec in enumerate(objective.flight)]
+    checks += [("stability", i, partial(body_of, each.modules, objective.vehicle)) for i, each in enumerate(objective.stability)]
+    for table_name, i, check in checks:
+        try:
+            check()
+        except DescriptionError as error:
+            raise source.error([table_name, i], str(error)) from None
     return objective

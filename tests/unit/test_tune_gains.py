@@ -188,7 +188,7 @@ def test_number_that_makes_no_sense_is_refused_in_one_line(
         ("unseen_seeds = [7]", "unseen_seeds = [1]", "a seed is both in seeds and in unseen_seeds"),
         ("high = 8.0", "high = 80.0", "position_bandwidth: 80.0 is out of range"),
         ("high = 8.0", "high = 0.4", "low 0.5 is not below high 0.4"),
-        ('scenario = "hover"', 'scenario = "hoover"', "scenario 'hoover' is unknown"),
+        ('scenario = "hover"', 'scenario = "hoover"', r"objective\.toml:\d+: flight\[0\]: scenario 'hoover' is unknown"),
         ("unseen_seeds = [7]", "unseen_seeds = []", "unseen_seeds is empty; an objective needs one at least"),
         ("help = \"a valley\"", "help = \"\"\"a\nvalley\"\"\"", "help has more than one line"),
         ("control.position_damping", "control.position_bandwidth", "position_bandwidth is searched twice"),
