@@ -36,7 +36,7 @@ DRIFT_M_S = 0.04
 """Speed of the water, which a body under way meets from another side within seconds: its drag differs by as much as it rises over that.
 It does so at the middle, so that moments tell more of a body under way than forces."""
 MODEL_SHARE = 0.12
-"""What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too. Of what turning takes it is this
+"""What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too. Of the Coriolis wrench it is this
 share and that by which the water's drift changes the speed."""
 EXPLAINED = 0.8
 """Share of the change (squared, in sigmas) that one thruster must explain."""
@@ -44,8 +44,8 @@ RUNNER_UP = 0.5
 """What it leaves unexplained must be less than this share of what the next best leaves."""
 SIGNIFICANT = 20.0
 """Squared sigmas that it must explain."""
-TURNING, FORCES = 15, 21
-"""Columns of a block where the wrench of turning and the thrusters' forces begin; two more follow these."""
+CORIOLIS, FORCES = 15, 21
+"""Columns of a block where the Coriolis wrench and the thrusters' forces begin; two more follow these."""
 FRESH_NS = 500_000_000
 """Age of the newest tag from which on nothing is judged: without tags a robot that tumbles knows its tilt and speed too badly."""
 MOST = 2.6
@@ -88,7 +88,7 @@ class MissingThrust:
         self._first = self._last = gyro
         self._first_n = self._last_n = 0
         self._sum_a, self._sum_f = np.zeros(3), np.zeros(self._columns.shape[0])
-        self._sum_model, self._sum_turning, self._sum_speed = np.zeros(6), np.zeros(6), 0.0
+        self._sum_model, self._sum_coriolis, self._sum_speed = np.zeros(6), np.zeros(6), 0.0
 
     def step(
         self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool
@@ -120,7 +120,7 @@ class MissingThrust:
         self._sum_f += force_n
         self._sum_speed += math.sqrt(nu[0] ** 2 + nu[1] ** 2 + nu[2] ** 2)
         add_model(b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear, nu, estimate.q_wb, self._sum_model)
-        add_turning(b.mass, nu, self._sum_turning)
+        add_coriolis(b.mass, nu, self._sum_coriolis)
 
     def _close(self, estimate: Estimate) -> bool:
         """Ends the block; whether it is whole."""
@@ -132,11 +132,11 @@ class MissingThrust:
         rest, acted = np.full(6, np.nan), self._columns.T @ (self._sum_f / n)
         if whole and self._last is not None and self._first is not None:
             motion = np.r_[self._sum_a / self._accels, (self._last - self._first) / span]
-            rest = self._body.mass @ motion - acted - (self._sum_model + self._sum_turning) / n
+            rest = self._body.mass @ motion - acted - (self._sum_model + self._sum_coriolis) / n
         down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
         self._blocks[:-1] = self._blocks[1:]
         known = [max(estimate.sigma_q.tolist()), self._sum_speed / n]
-        self._blocks[-1] = np.concatenate([rest, acted, down_b, self._sum_turning / n, self._sum_f / n, known])
+        self._blocks[-1] = np.concatenate([rest, acted, down_b, self._sum_coriolis / n, self._sum_f / n, known])
         return whole
 
     def _decide(self, alive: np.ndarray) -> int | None:
@@ -164,7 +164,7 @@ def add_model(righting, nodes, rotational, linear, nu, q_wb, out):  # type: igno
 
 
 @njit(f"void({M},{V},{V})", cache=True)
-def add_turning(mass, nu, out):  # type: ignore[no-untyped-def]
+def add_coriolis(mass, nu, out):  # type: ignore[no-untyped-def]
     """Adds to `out` (6,) what Coriolis forces do to the body, against an acceleration as it is felt: dv/dt + w x v."""
     take_coriolis(mass, nu, out)
     out += np.ascontiguousarray(mass[:, :3]) @ cross(nu[3:], nu[:3])
@@ -186,9 +186,8 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, lie_share):  # ty
     """The one thruster that explains the change of the latest blocks against the oldest, or -1.
 
     Args:
-        blocks: (GAP + BASE, FORCES + n + 2) wrench missing 0:6, wrench that acted 6:12, down in the body 12:15, wrench of turning
-            15:21, forces, sigma of
-            the tilt, speed.
+        blocks: (GAP + BASE, FORCES + n + 2) wrench missing 0:6, wrench that acted 6:12, down in the body 12:15, Coriolis wrench
+            15:21, forces, sigma of the tilt, speed.
         columns: (n, 6) wrench of unit force. alive: (n,) who may be suspected.
         sigma, doubt, drift: (6,) what a healthy body's change may be: noise and model; by each radian of doubt about the tilt; by each
             m/s that it made.
@@ -201,14 +200,14 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, lie_share):  # ty
     if base < LEAST_BASE or recent < RECENT - 1:
         return -1
     change = new - old
-    tx, ty, tz = change[12:TURNING] ** 2
+    tx, ty, tz = change[12:CORIOLIS] ** 2
     lift, lx, ly, lz = tilt**2
     turned = (lift * tx, lift * ty, lift * tz, ly * tz + lz * ty, lz * tx + lx * tz, lx * ty + ly * tx)
     speed = max(old[FORCES + n + 1], new[FORCES + n + 1])
-    turning_share = MODEL_SHARE + DRIFT_M_S / max(speed, DRIFT_M_S)
+    coriolis_share = MODEL_SHARE + DRIFT_M_S / max(speed, DRIFT_M_S)
     y, unsure, total = np.empty(6), np.empty(6), 0.0
     for i in range(6):
-        model = (MODEL_SHARE * change[6 + i]) ** 2 + (turning_share * change[TURNING + i]) ** 2
+        model = (MODEL_SHARE * change[6 + i]) ** 2 + (coriolis_share * change[CORIOLIS + i]) ** 2
         unsure[i] = math.sqrt(sigma[i] ** 2 + model + turned[i] + (doubt[i] * old[FORCES + n]) ** 2 + (drift[i] * speed) ** 2)
         y[i] = change[i] / unsure[i]
         total += y[i] ** 2

@@ -8,7 +8,7 @@ import pytest
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
 from firmware_py.core.faults import CLEAR, FaultDetector
-from firmware_py.core.missing_thrust import FORCES, RECENT, TURNING, MissingThrust, add_model, add_turning
+from firmware_py.core.missing_thrust import CORIOLIS, FORCES, RECENT, MissingThrust, add_coriolis, add_model
 from firmware_py.core.pipeline import BodyPipeline
 from firmware_py.core.preload import preload
 from firmware_py.core.propagation import STATES
@@ -293,19 +293,19 @@ def test_motion_of_a_body_whose_water_is_heavier_along_one_axis_than_along_anoth
     felt = propagation.inertial_acceleration(x, tau, *plant)
     turning = propagation.acceleration(x[7:13].copy(), x[3:7].copy(), tau, *plant)[3:]
     add_model(*plant[2:], x[7:13].copy(), x[3:7].copy(), modelled)
-    add_turning(b.mass, x[7:13].copy(), modelled)
+    add_coriolis(b.mass, x[7:13].copy(), modelled)
     np.testing.assert_allclose(b.mass @ np.r_[felt, turning], tau + modelled, atol=1e-9)
 
 
-@pytest.mark.parametrize("turning", [0.0, 1.0, 10.0])
-def test_a_thruster_is_not_blamed_for_a_change_that_is_small_beside_what_turning_takes(turning: float) -> None:
+@pytest.mark.parametrize("coriolis", [0.0, 1.0, 10.0])
+def test_a_thruster_is_not_blamed_for_a_change_that_is_small_beside_the_coriolis_wrench(coriolis: float) -> None:
     """Masses are known to a tenth, the speed through water that drifts to less: so is what both do on a fast curve."""
     watch = MissingThrust(BODY, Faults(), TICK_NS)
     watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.3
     lost = -3.0 * BODY.thrusters.matrix[:, 2]
     watch._blocks[-RECENT:, :6], watch._blocks[-RECENT:, FORCES + 2] = lost, 3.0
-    watch._blocks[-RECENT:, TURNING:FORCES] = turning * lost
-    assert watch._explain(np.ones(8, bool)) == (-1 if turning == 10.0 else 2)
+    watch._blocks[-RECENT:, CORIOLIS:FORCES] = coriolis * lost
+    assert watch._explain(np.ones(8, bool)) == (-1 if coriolis == 10.0 else 2)
 
 
 @pytest.mark.parametrize("pair", list(itertools.combinations(range(8), 2)), ids=str)
