@@ -3,19 +3,49 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C: 128 and SIGINT, as a shell has it."""
+COMPILING = "modcube: compiles its numeric code, once, in a minute or so"
 
 
 def main() -> None:
     """Runs the command line; what takes a second or more to import is imported here."""
     try:
-        from firmware_py.cli import main as run
+        with compiling_told(sys.stderr):
+            from firmware_py.cli import main as run
 
-        run()
+            run()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+@contextmanager
+def compiling_told(out: TextIO) -> Iterator[None]:
+    """Meanwhile who waits at a terminal is told when numba compiles the first function that it does not find compiled."""
+    if not out.isatty():
+        yield
+        return
+    from numba.core import event
+
+    class FirstCompiled(event.Listener):
+        """Says it once."""
+
+        told = False
+
+        def on_start(self, event: object) -> None:
+            if not self.told:
+                self.told = True
+                print(COMPILING, file=out, flush=True)
+
+        def on_end(self, event: object) -> None:
+            """Nobody waits any more."""
+
+    with event.install_listener("numba:compile", FirstCompiled()):
+        yield
 
 
 if __name__ == "__main__":

@@ -1,0 +1,33 @@
+"""Who waits at a terminal while numba compiles is told so, once; who reads a pipe is not."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from numba import njit
+
+from firmware_py.__main__ import COMPILING, compiling_told
+
+
+class Terminal(io.StringIO):
+    """Somebody looks."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("out", "said"), [(Terminal(), f"{COMPILING}\n"), (io.StringIO(), "")])
+def test_the_first_function_that_is_compiled_is_announced(out, said):
+    with compiling_told(out):
+        for once in (lambda x: x + 1, lambda x: x + 2):
+            njit("int64(int64)")(once)
+    njit("int64(int64)")(lambda x: x + 3)
+    assert out.getvalue() == said
+
+
+def test_a_function_that_is_compiled_already_is_not():
+    add = njit("int64(int64)")(lambda x: x + 1)
+    with compiling_told(out := Terminal()):
+        assert add(1) == 2
+    assert out.getvalue() == ""
