@@ -29,9 +29,9 @@ def compiling_told(out: TextIO) -> Iterator[None]:
     if not out.isatty():
         yield
         return
-    from numba.core import event
+    from numba.core.event import Listener, install_listener
 
-    class FirstCompiled(event.Listener):
+    class FirstCompiled(Listener):
         """Says it once."""
 
         told = False
@@ -44,7 +44,7 @@ def compiling_told(out: TextIO) -> Iterator[None]:
         def on_end(self, event: object) -> None:
             """Nobody waits any more."""
 
-    with event.install_listener("numba:compile", FirstCompiled()):
+    with install_listener("numba:compile", FirstCompiled()):
         yield
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import runpy
 
 import pytest
 from numba import njit
@@ -26,8 +27,10 @@ def test_the_first_function_that_is_compiled_is_announced(out, said):
     assert out.getvalue() == said
 
 
-def test_a_function_that_is_compiled_already_is_not():
-    add = njit("int64(int64)")(lambda x: x + 1)
-    with compiling_told(out := Terminal()):
-        assert add(1) == 2
-    assert out.getvalue() == ""
+def test_a_function_that_an_earlier_process_has_compiled_is_not(tmp_path):
+    file = tmp_path / "adding.py"
+    file.write_text("from numba import njit\n@njit('int64(int64)', cache=True)\ndef add(x):\n    return x + 1\n", encoding="utf-8")
+    for said in (f"{COMPILING}\n", ""):  # the second finds what the first left in the cache beside the file
+        with compiling_told(out := Terminal()):
+            assert runpy.run_path(str(file))["add"](1) == 2
+        assert out.getvalue() == said
