@@ -1,8 +1,9 @@
 """For tools/identify.py: the unknowns that explain recorded flights best, and how well they are known.
 
-Gauss-Newton on the rows of all flights. What the model leaves out, gusts above all, is no white noise: it lasts for seconds. So the
-covariance is the sandwich of Newey and West (1987) over a window of 10 s, and an interval is as much wider than the normal one
-as that window's share of the record asks for (Kiefer and Vogelsang 2005, table 1).
+Gauss-Newton on the rows of all flights. The gusts of each flight are unknowns too, as likely as a Gauss-Markov process makes them; how
+strong they are, and how noisy the rows, is found with them (expectation maximisation: Dempster, Laird and Rubin 1977). What the model
+leaves out even so is no white noise. So the covariance is the sandwich of Newey and West (1987) over a window of 10 s, and an interval
+is as much wider than the normal one as that window's share of the record asks for (Kiefer and Vogelsang 2005, table 1).
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from identify_model import NUISANCES, Equations, beginning, places, unknowns
+from identify_model import NUISANCES, Equations, Unknown, beginning, gust_precision, places, unknowns
 
 MEMORY_S = 10.0
-"""How far apart in time errors still know of one another; gusts last 5 s."""
+"""How far apart in time errors still know of one another."""
+GUST_M_S = 0.02
+"""Standard deviation of gusts with which the search begins."""
 MOST_STEPS = 15
 STILL = 0.05
 """Of a standard error, the largest step after which the search ends."""
@@ -41,9 +44,9 @@ class Fit:
     """What was found.
 
     Attributes:
-        x: (p,) unknowns, those of the vehicle first. places: where each stands, by name.
+        x: (p,) unknowns of the vehicle. places: where each stands, by name.
         covariance: (p, p). critical: half-width of a 95 % interval in standard errors.
-        residual: (6,) root mean square of what is left, m/s^2 and rad/s^2.
+        residual: (6,) standard deviation of what is left, m/s^2 and rad/s^2. gust_m_s: that of the gusts.
         has_scale: whether anything absolute was known: else gains are such that their mean is 1.
     """
 
@@ -52,6 +55,7 @@ class Fit:
     covariance: np.ndarray
     critical: float
     residual: np.ndarray
+    gust_m_s: float
     has_scale: bool
 
     def value(self, name: str) -> np.ndarray:
@@ -74,35 +78,45 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
     """Fits all flights of one vehicle at once; without `reference` and weight the mean gain is 1 by decree."""
     vehicle = flights[0].vehicle
     mine = unknowns(len(vehicle.thruster))
-    shared = places(mine)
-    count = sum(u.count for u in mine)
-    own = [places(NUISANCES, count + k * sum(u.count for u in NUISANCES)) for k in range(len(flights))]
-    first = np.concatenate([*beginning(vehicle).values(), np.zeros(sum(n.count for n in NUISANCES) * len(flights))])
-    parts = [*mine, *(NUISANCES * len(flights))]
+    shared, count = places(mine), sum(u.count for u in mine)
+    parts, own, gusts = list(mine), [], []
+    for flight in flights:
+        nuisances = [*NUISANCES, Unknown("gust", 3 * flight.knots.shape[1], math.inf)]
+        own.append(places(nuisances, sum(u.count for u in parts)))
+        gusts.append(np.kron(gust_precision(flight.knots.shape[1]), np.eye(3)))
+        parts += nuisances
     width = np.concatenate([np.full(u.count, u.width) for u in parts])
     step = np.concatenate([np.full(u.count, u.step) for u in parts])
+    first = np.zeros(len(width))
+    first[:count] = np.concatenate(list(beginning(vehicle).values()))
     scale, pull = _scale_row(shared["gain"], len(first), reference, has_weight)
-    prior = np.diag(width**-2.0) + pull * np.outer(scale, scale)
-    x, sigma = first.copy(), np.ones(6)
+    x, noise, gust = first.copy(), np.zeros(6), GUST_M_S
     for _ in range(MOST_STEPS):
-        rows = [_rows(flight, x, step, shared | nuisances) for flight, nuisances in zip(flights, own, strict=True)]
-        sigma = np.sqrt(np.mean(np.concatenate([residual for residual, _ in rows]) ** 2, axis=0))
+        prior = np.diag(width**-2.0) + pull * np.outer(scale, scale)
+        for at, precision in zip(own, gusts, strict=True):
+            prior[at["gust"], at["gust"]] = precision / gust**2
+        rows = [_rows(flight, x, step, shared | at) for flight, at in zip(flights, own, strict=True)]
+        residual = np.concatenate([each for each, _ in rows])
+        sigma = np.sqrt(np.mean(residual**2, axis=0) + noise)
         flat = [(slopes / sigma[:, None]).reshape(-1, len(x)) for _, slopes in rows]
         information = prior + sum(each.T @ each for each in flat)
-        score = sum(each.T @ (residual / sigma).ravel() for each, (residual, _) in zip(flat, rows, strict=True))
-        score = score - (x - first) / width**2 + pull * scale * (1.0 - scale @ x)
-        move = np.linalg.solve(information, score)
+        inverse = np.linalg.inv(information)
+        score = sum(each.T @ (left / sigma).ravel() for each, (left, _) in zip(flat, rows, strict=True))
+        move = inverse @ (score - prior @ (x - first) + pull * scale * (1.0 - scale @ first))
         x = x + move
-        if np.all(np.abs(move) < STILL / np.sqrt(np.diag(information))):
+        noise = sum(np.einsum("np,pq,nq->n", each, inverse, each, optimize=True).reshape(-1, 6).sum(axis=0) for each in flat)
+        noise = noise * sigma**2 / len(residual)
+        spread = [x[at["gust"]] @ p @ x[at["gust"]] + np.sum(p * inverse[at["gust"], at["gust"]]) for at, p in zip(own, gusts, strict=True)]
+        gust = math.sqrt(sum(spread) / sum(len(p) for p in gusts))
+        if np.all(np.abs(move) < STILL * np.sqrt(np.diag(inverse))):
             break
-    inverse = np.linalg.inv(information)
     share, meat = 0.0, prior.copy()
-    for flight, (residual, slopes) in zip(flights, rows, strict=True):
+    for flight, (left, slopes) in zip(flights, rows, strict=True):
         lags = max(1, round(MEMORY_S / float(np.median(np.diff(flight.time_s)))))
-        meat += _long_run(np.einsum("nki,nk->ni", slopes, residual / sigma**2), lags)
-        share = max(share, lags / len(residual) / len(flights))
-    covariance = inverse @ meat @ inverse
-    return Fit(x, shared, covariance, critical_value(min(share, 1.0)), sigma, reference is not None or has_weight)
+        meat += _long_run(np.einsum("nki,nk->ni", slopes, left / sigma**2), lags)
+        share = max(share, lags / len(left) / len(flights))
+    covariance = (inverse @ meat @ inverse)[:count, :count]
+    return Fit(x[:count], shared, covariance, critical_value(min(share, 1.0)), sigma, gust, reference is not None or has_weight)
 
 
 def critical_value(share: float) -> float:
@@ -124,11 +138,13 @@ def _rows(flight: Equations, x: np.ndarray, step: np.ndarray, where: dict[str, s
     """(n, 6) what was measured less what was expected, and (n, 6, p) slopes of the expectation."""
     expected = flight.predict({name: x[at] for name, at in where.items()})
     slopes = np.zeros((*expected.shape, len(x)))
-    for at in where.values():
-        for i in range(at.start, at.stop):
+    for name, at in where.items():
+        for i in range(at.start, at.stop) if name != "gust" else ():
             ahead = x.copy()
             ahead[i] += step[i]
-            slopes[:, :, i] = (flight.predict({name: ahead[k] for name, k in where.items()}) - expected) / step[i]
+            slopes[:, :, i] = (flight.predict({other: ahead[k] for other, k in where.items()}) - expected) / step[i]
+    mean = slopes[:, :, where["current"]]
+    slopes[:, :, where["gust"]] = (mean[:, :, None, :] * flight.knots[:, None, :, None]).reshape(*expected.shape, -1)
     return flight.measured - expected, slopes
 
 

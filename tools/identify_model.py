@@ -6,7 +6,8 @@ Newton and Euler about the centre of mass, body frame, motion relative to the wa
     I w' =  sum k_i F_i r_i x d_i - (rot |w| + cross c(v)) w - arm x down   - s x a                 - w x (I w) - v x (M v)
 
 a is what the accelerometer feels plus gravity, w' the derivative of the gyro; F_i is the thruster's curve over the commands that went
-out, behind a first-order lag, at the measured voltage; v the velocity less the current's; s the first moment of mass about where the
+out, behind a first-order lag, at the measured voltage; v the velocity less that of the water, which is a mean and a gust in a knot
+every 2.5 s, straight lines between them; s the first moment of mass about where the
 file has the centre. A known weight adds its force, less its mass times a, to the first, and the moment of that where it hangs to the
 second. M, I, s, D, n, arm and k have one factor in common that no motion shows. Both sides are seen through one window of 11 ticks:
 that of a straight line's slope through the gyro.
@@ -15,6 +16,7 @@ that of a straight line's slope through the gyro.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -25,6 +27,7 @@ from scipy.signal import lfilter
 
 from firmware_py.core.drag_lookup import look_up
 from firmware_py.core.observation import GRAVITY
+from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import ThrusterCurve, Vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 
@@ -33,7 +36,12 @@ HALF_WINDOW = 5
 DEADBAND_EDGE_N = 0.01
 """Over which a thruster's deadband ends, so that its place can be searched by slopes."""
 SHORTEST_LAG_S = 0.005
+NO_GUST = np.zeros(0)
 DOWN = np.array([0.0, 0.0, 1.0])
+GUST_S = 5.0
+"""How long gusts last: they forget themselves as exp(-t / GUST_S)."""
+KNOT_S = 2.5
+"""Between two knots of the gusts."""
 
 
 class Unknown(NamedTuple):
@@ -70,7 +78,7 @@ def unknowns(thrusters: int) -> tuple[Unknown, ...]:
 
 
 NUISANCES = (Unknown("current", 3, 0.3), Unknown("bias", 3, 0.3))
-"""What belongs to one flight: the water's velocity, m/s, and the accelerometer's bias, m/s^2."""
+"""What belongs to one flight: the water's mean velocity, m/s, and the accelerometer's bias, m/s^2."""
 
 
 def places(parts: Sequence[Unknown], first: int = 0) -> dict[str, slice]:
@@ -116,15 +124,19 @@ class Equations:
     """The equations over one flight: what was measured, and what it should have been for given unknowns."""
 
     def __init__(self, recording: Recording, motion: Motion, curve: ThrusterCurve, weight: Weight | None = None) -> None:
-        """`curve` is the thrusters' in place of the recording's."""
+        """`curve` is the thrusters' in place of the recording's. Raises DescriptionError where no row is of use."""
         vehicle, window = recording.vehicle, _window(HALF_WINDOW)
         inner = np.arange(HALF_WINDOW, len(recording.time_ns) - HALF_WINDOW, 2 * HALF_WINDOW)
         steady = np.convolve(recording.armed, np.ones(len(window)), "valid") > len(window) - 0.5
-        self._rows = inner[steady[inner - HALF_WINDOW]]
+        wholly_under = motion.p_wb[inner, 2] > 0.5 * np.linalg.norm(vehicle.hull.size_m)
+        self._rows = inner[steady[inner - HALF_WINDOW] & wholly_under]
+        if len(self._rows) < 2:
+            raise DescriptionError(f"{recording.name}: the vehicle was never armed and wholly under water; give the log of a dive")
         self._window, self._period_s = window, recording.period_s
         self._matrix = recording.body.thrusters.matrix
         self.time_s = 1e-9 * (recording.time_ns[self._rows] - recording.time_ns[0])
         self.vehicle, self.name = vehicle, recording.name
+        self.knots = _knots(self.time_s)
         self._w, self._v_w, self._q = motion.w_b[self._rows], motion.v_w[self._rows], motion.q_wb[self._rows]
         down = _each(motion.q_wb, np.broadcast_to(DOWN, motion.v_w.shape))
         self._down = down[self._rows]
@@ -142,11 +154,14 @@ class Equations:
         self._kept: dict[object, tuple[bytes, object]] = {}
 
     def predict(self, x: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(n, 6) acceleration of the centre of mass and derivative of the rate; `x` holds the unknowns and nuisances by name."""
+        """(n, 6) acceleration of the centre of mass and derivative of the rate; `x` holds the unknowns and nuisances by name.
+
+        Where it holds (3 k,) "gust", that is the velocity x, y, z of the water at each of the k knots, more than its mean.
+        """
         thrust = np.column_stack([
             self._once(i, np.array([x["lag"][0], x["deadband"][i], *x["shape"]]), self._thrust) for i in range(len(x["gain"]))
         ])  # fmt: skip
-        v, drags = self._once("drag", x["current"], self._drag)
+        v, drags = self._once("drag", np.concatenate([x["current"], x.get("gust", NO_GUST)]), self._drag)
         w, mass, inertia = self._w, np.exp(x["mass"]), np.exp(x["inertia"])
         tau = (thrust * x["gain"]) @ self._matrix.T
         force = tau[:, :3] + x["drag"][0] * drags[0] + x["drag"][1] * drags[1]
@@ -178,9 +193,10 @@ class Equations:
         keep = np.exp(-self._period_s / lag_s)
         return self._seen(lfilter([1.0 - keep], [1.0, -keep], static * working) * self._scale)
 
-    def _drag(self, key: str, current: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        """(n, 3) velocity through the water, and the (n, 3) force for coefficients (face, edge) of (1, 0) and (0, 1)."""
-        v = _each(self._q, self._v_w - current)
+    def _drag(self, key: str, at: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """(n, 3) velocity through water of a mean (3,) and gusts, and the (n, 3) force for coefficients (1, 0) and (0, 1)."""
+        gusts = at[3:].reshape(-1, 3)
+        v = _each(self._q, self._v_w - at[:3] - self.knots[:, : len(gusts)] @ gusts)
         speed = np.linalg.norm(v, axis=1, keepdims=True)
         return v, [-np.array([look_up(nodes, row)[:1] for row in np.ascontiguousarray(v)]) * speed * v for nodes in self._nodes]
 
@@ -201,6 +217,21 @@ def _each(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(n, 3) a x b, of (n, 3) or (3,): numpy's own takes five times as long."""
     return np.stack([a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=-1)
+
+
+def _knots(time_s: np.ndarray) -> np.ndarray:
+    """(n, k) share of each knot in what the gust is at each time."""
+    count = 2 + int(time_s[-1] / KNOT_S)
+    return np.maximum(0.0, 1.0 - np.abs(time_s[:, None] / KNOT_S - np.arange(count)))
+
+
+def gust_precision(knots: int) -> np.ndarray:
+    """(k, k) inverse covariance of gusts of unit variance at the knots: that of a first-order Gauss-Markov process."""
+    keep = math.exp(-KNOT_S / GUST_S)
+    diagonal = np.full(knots, 1.0 + keep**2)
+    diagonal[[0, -1]] = 1.0
+    beside = np.full(knots - 1, -keep)
+    return np.asarray(np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)) / (1.0 - keep**2)
 
 
 def _window(half: int) -> np.ndarray:

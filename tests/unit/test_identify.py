@@ -104,7 +104,9 @@ def test_weight_that_makes_no_sense_is_refused(text: str) -> None:
         tool.parse_weight(text)
 
 
-def made_up(weight: model.Weight, com_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> model.Equations:
+def made_up(
+    weight: model.Weight | None = None, com_m: tuple[float, float, float] = (0.0, 0.0, 0.0), depth_m: float = 1.5
+) -> model.Equations:
     """Half a minute of tumbling at random commands; nothing is measured yet."""
     vehicle, count, dt = load_vehicle("modcube"), 3001, 0.01
     vehicle = dataclasses.replace(vehicle, inertial=dataclasses.replace(vehicle.inertial, com_m=frozen_array(com_m)))
@@ -116,7 +118,32 @@ def made_up(weight: model.Weight, com_m: tuple[float, float, float] = (0.0, 0.0,
         vehicle=vehicle, body=body, name="made-up", period_s=dt, time_ns=np.arange(count) * 10_000_000, armed=np.ones(count),
         accel=np.zeros((count, 3)), command=command, voltage_v=np.full(count, 12.0),
     )  # fmt: skip
-    return model.Equations(recording, motion.Motion(swum, swum, turned, 0.5 * swum), vehicle.curve, weight)
+    below = np.array([0.0, 0.0, depth_m])
+    return model.Equations(recording, motion.Motion(below + swum, swum, turned, 0.5 * swum), vehicle.curve, weight)
+
+
+def test_gusts_are_found_beside_the_drag_and_leave_it_alone() -> None:
+    flight, rng = made_up(), np.random.default_rng(1)
+    x = model.beginning(flight.vehicle) | {"current": np.array([0.04, 0.0, -0.03]), "bias": np.zeros(3)}
+    covariance = np.linalg.inv(model.gust_precision(flight.knots.shape[1]))
+    assert np.diag(covariance) == pytest.approx(1.0)
+    gusts = 0.05 * np.linalg.cholesky(covariance) @ rng.standard_normal((len(covariance), 3))
+    noise = np.repeat([0.003, 0.006], 3) * rng.standard_normal((len(flight.time_s), 6))
+    for _ in range(20):  # what is expected depends on what was measured
+        flight.measured = flight.predict(x | {"gust": gusts.ravel()}) + noise
+    found = fit.fit([flight], fit.Reference(0, 0.02))
+    assert found.gust_m_s == pytest.approx(0.05, rel=0.35)
+    assert found.residual == pytest.approx(np.repeat([0.003, 0.006], 3), rel=0.15)
+    for i, name in enumerate(("cd_face", "cd_edge")):
+        value, half_width = found.interval(lambda u, i=i: float(u[found.places["drag"]][i]))  # type: ignore[misc]
+        assert abs(value - getattr(flight.vehicle.drag, name)) < 1.5 * half_width
+
+
+def test_rows_at_the_surface_are_left_out_and_a_log_of_nothing_else_is_refused() -> None:
+    under, partly = made_up(), made_up(depth_m=0.2)
+    assert 0 < len(partly.time_s) < len(under.time_s)
+    with pytest.raises(DescriptionError, match=r"made-up: .* wholly under water"):
+        made_up(depth_m=-1.0)
 
 
 def hang(flight: model.Equations, x: dict[str, np.ndarray], lever: np.ndarray, noise: np.ndarray) -> np.ndarray:
