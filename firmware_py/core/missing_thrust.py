@@ -44,8 +44,12 @@ RUNNER_UP = 0.5
 """What it leaves unexplained must be less than this share of what the next best leaves."""
 SIGNIFICANT = 20.0
 """Squared sigmas that it must explain."""
-CORIOLIS, FORCES = 15, 21
-"""Columns of a block where the Coriolis wrench and the thrusters' forces begin; two more follow these."""
+CROSS_SHARE = 1.0 / 9.0
+"""Of a body's reach, squared: what the mean square distance of its hull from a turning axis is, L^2 / 12 for a cube of edge L. A body
+that turns under way meets the water faster on one side than on the other; the drag's slope times this brakes the turn, and no model of
+the firmware has it. Of a module that makes 0.20 N m by m/s and rad/s; tools/identify.py finds 0.14 to 0.21."""
+CORIOLIS, CROSSED, MUNK, FORCES = 15, 21, 24, 27
+"""Columns of a block where these begin: Coriolis wrench, speed across times rate, products of speeds, forces; two more follow."""
 FRESH_NS = 500_000_000
 """Age of the newest tag from which on nothing is judged: without tags a robot that tumbles knows its tilt and speed too badly."""
 MOST = 2.6
@@ -68,8 +72,9 @@ class MissingThrust:
             np.r_[BUOYANCY_SIGMA_N * np.sqrt(count), body.righting_sigma],
             np.repeat([float(body.mass[0, 0]) * GRAVITY, 0.0], 3),
             np.repeat([DRIFT_M_S * body.drag.cruise_slope / CRUISE_M_S, 0.0], 3),
+            np.repeat([CROSS_SHARE * body.reach_m**2 * body.drag.cruise_slope / CRUISE_M_S, MODEL_SHARE * float(body.mass[0, 0])], 3),
         )  # fmt: skip
-        """What `explain` takes as sigma, tilt, doubt and drift."""
+        """What `explain` takes as sigma, tilt, doubt, drift and flow."""
         self._period_s = period_ns * 1e-9
         self.forget()
 
@@ -88,7 +93,7 @@ class MissingThrust:
         self._first = self._last = gyro
         self._first_n = self._last_n = 0
         self._sum_a, self._sum_f = np.zeros(3), np.zeros(self._columns.shape[0])
-        self._sum_model, self._sum_coriolis, self._sum_speed = np.zeros(6), np.zeros(6), 0.0
+        self._sum_model, self._sum_coriolis, self._sum_flow, self._sum_speed = np.zeros(6), np.zeros(6), np.zeros(6), 0.0
 
     def step(
         self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool
@@ -121,6 +126,7 @@ class MissingThrust:
         self._sum_speed += math.sqrt(nu[0] ** 2 + nu[1] ** 2 + nu[2] ** 2)
         add_model(b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear, nu, estimate.q_wb, self._sum_model)
         add_coriolis(b.mass, nu, self._sum_coriolis)
+        add_flow(nu, self._sum_flow)
 
     def _close(self, estimate: Estimate) -> bool:
         """Ends the block; whether it is whole."""
@@ -136,7 +142,8 @@ class MissingThrust:
         down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
         self._blocks[:-1] = self._blocks[1:]
         known = [max(estimate.sigma_q.tolist()), self._sum_speed / n]
-        self._blocks[-1] = np.concatenate([rest, acted, down_b, self._sum_coriolis / n, self._sum_f / n, known])
+        means = [self._sum_coriolis / n, self._sum_flow / n, self._sum_f / n]
+        self._blocks[-1] = np.concatenate([rest, acted, down_b, *means, known])
         return whole
 
     def _decide(self, alive: np.ndarray) -> int | None:
@@ -170,6 +177,16 @@ def add_coriolis(mass, nu, out):  # type: ignore[no-untyped-def]
     out += np.ascontiguousarray(mass[:, :3]) @ cross(nu[3:], nu[:3])
 
 
+@njit(f"void({V},{V})", cache=True)
+def add_flow(nu, out):  # type: ignore[no-untyped-def]
+    """Adds to `out` (6,) for each axis the speed across it times the rate about it, m/s rad/s, and the product of the other two speeds,
+    m^2/s^2: a body whose masses along those differ by 1 kg from what is believed turns by that many N m more (Munk)."""
+    across = abs(nu[0]) + abs(nu[1]) + abs(nu[2])
+    for i in range(3):
+        out[i] += (across - abs(nu[i])) * nu[3 + i]
+        out[3 + i] += nu[(i + 1) % 3] * nu[(i + 2) % 3]
+
+
 @njit(cache=True)
 def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
     """Mean (w,) of those of the blocks (k, w) that are whole, and how many there are; others have NaN for a wrench."""
@@ -181,16 +198,17 @@ def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
     return total / max(count, 1), count
 
 
-@njit(f"int64({M},{M},boolean[::1],{V},{V},{V},{V},float64)", cache=True)
-def explain(blocks, columns, alive, sigma, tilt, doubt, drift, lie_share):  # type: ignore[no-untyped-def]
+@njit(f"int64({M},{M},boolean[::1],{V},{V},{V},{V},{V},float64)", cache=True)
+def explain(blocks, columns, alive, sigma, tilt, doubt, drift, flow, lie_share):  # type: ignore[no-untyped-def]
     """The one thruster that explains the change of the latest blocks against the oldest, or -1.
 
     Args:
         blocks: (GAP + BASE, FORCES + n + 2) wrench missing 0:6, wrench that acted 6:12, down in the body 12:15, Coriolis wrench
-            15:21, forces, sigma of the tilt, speed.
+            15:21, what `add_flow` adds 21:27, forces, sigma of the tilt, speed.
         columns: (n, 6) wrench of unit force. alive: (n,) who may be suspected.
         sigma, doubt, drift: (6,) what a healthy body's change may be: noise and model; by each radian of doubt about the tilt; by each
             m/s that it made.
+        flow: (6,) moment by each unit by which what `add_flow` adds changed.
         tilt: (4,) how far net buoyancy, N, and weight times the lever of buoyancy, N m, along each axis may be off.
         lie_share: least share of its force that a liar has lost.
     """
@@ -208,6 +226,8 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, lie_share):  # ty
     y, unsure, total = np.empty(6), np.empty(6), 0.0
     for i in range(6):
         model = (MODEL_SHARE * change[6 + i]) ** 2 + (coriolis_share * change[CORIOLIS + i]) ** 2
+        if i >= 3:
+            model += (flow[i - 3] * change[CROSSED + i - 3]) ** 2 + (flow[i] * change[MUNK + i - 3]) ** 2
         unsure[i] = math.sqrt(sigma[i] ** 2 + model + turned[i] + (doubt[i] * old[FORCES + n]) ** 2 + (drift[i] * speed) ** 2)
         y[i] = change[i] / unsure[i]
         total += y[i] ** 2

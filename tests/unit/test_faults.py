@@ -8,7 +8,7 @@ import pytest
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
 from firmware_py.core.faults import CLEAR, FaultDetector
-from firmware_py.core.missing_thrust import CORIOLIS, FORCES, RECENT, MissingThrust, add_coriolis, add_model
+from firmware_py.core.missing_thrust import CORIOLIS, CROSSED, FORCES, MUNK, RECENT, MissingThrust, add_coriolis, add_flow, add_model
 from firmware_py.core.pipeline import BodyPipeline
 from firmware_py.core.preload import preload
 from firmware_py.core.propagation import STATES
@@ -304,8 +304,26 @@ def test_a_thruster_is_not_blamed_for_a_change_that_is_small_beside_the_coriolis
     watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.3
     lost = -3.0 * BODY.thrusters.matrix[:, 2]
     watch._blocks[-RECENT:, :6], watch._blocks[-RECENT:, FORCES + 2] = lost, 3.0
-    watch._blocks[-RECENT:, CORIOLIS:FORCES] = coriolis * lost
+    watch._blocks[-RECENT:, CORIOLIS:CROSSED] = coriolis * lost
     assert watch._explain(np.ones(8, bool)) == (-1 if coriolis == 10.0 else 2)
+
+
+@pytest.mark.parametrize(("column", "most"), [(CROSSED, 0.5), (MUNK, 0.2)])
+@pytest.mark.parametrize("sign", [-1.0, 0.0, 1.0])
+def test_a_thruster_is_not_blamed_for_what_the_water_does_to_a_body_that_turns_under_way(column: int, most: float, sign: float) -> None:
+    """Flow across the turn brakes it, and masses that differ from axis to axis turn it: neither is in the model of a cube."""
+    watch = MissingThrust(BODY, Faults(), TICK_NS)
+    watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.3
+    watch._blocks[-RECENT:, :6] = -2.0 * BODY.thrusters.matrix[:, 2]
+    watch._blocks[-RECENT:, FORCES + 2] = 2.0
+    watch._blocks[-RECENT:, column : column + 3] = sign * most
+    assert watch._explain(np.ones(8, bool)) == (2 if sign == 0.0 else -1)
+
+
+def test_flow_is_what_a_turn_under_way_meets() -> None:
+    out = np.zeros(6)
+    add_flow(np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2]), out)
+    np.testing.assert_allclose(out, [0.3 * 0.5, -0.4 * 0.4, 0.5 * 0.2, -0.02, 0.03, -0.06])
 
 
 @pytest.mark.parametrize("pair", list(itertools.combinations(range(8), 2)), ids=str)
