@@ -23,6 +23,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.bench import fly_scenario
+from hil.flight import fly_and_judge
 from hil.fuzz import fuzz_flight
 from hil.safety import (
     ICM_20602,
@@ -62,7 +63,7 @@ def _healthy(seed: int) -> ThrusterFlight:
 def _shaken(seed: int, scenario: Path) -> float:
     folder = scenario.parent / f"shaken-{seed}"
     folder.mkdir()
-    warned = fly_scenario(load_scenario(str(scenario)), seed, Parameters(), folder, f"virtual:shaken-{seed}").metrics["warnings"]
+    warned = fly_and_judge(load_scenario(str(scenario)), seed, Parameters(), folder, f"virtual:shaken-{seed}").metrics["warnings"]
     shutil.rmtree(folder)
     return warned
 
