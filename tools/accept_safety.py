@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -61,11 +62,9 @@ def _healthy(seed: int) -> ThrusterFlight:
 
 
 def _shaken(seed: int, scenario: Path) -> float:
-    folder = scenario.parent / f"shaken-{seed}"
-    folder.mkdir()
-    warned = fly_and_judge(load_scenario(str(scenario)), seed, Parameters(), folder, f"virtual:shaken-{seed}").metrics["warnings"]
-    shutil.rmtree(folder)
-    return warned
+    with TemporaryDirectory(dir=scenario.parent) as folder:
+        flown = fly_and_judge(load_scenario(str(scenario)), seed, Parameters(), Path(folder), f"virtual:shaken-{seed}")
+    return flown.metrics["warnings"]
 
 
 def thrusters_out(folder: Path) -> Values:
