@@ -195,6 +195,8 @@ class Cable:
     def __init__(self, folder):
         ends = [os.openpty() for _ in range(2)]
         self.masters = [master for master, _ in ends]
+        for master in self.masters:
+            os.set_blocking(master, False)
         self.links = [folder / name for name in ("one", "other")]
         for (_, slave), link in zip(ends, self.links, strict=True):
             tty.setraw(slave)
@@ -214,7 +216,12 @@ class Cable:
             for master in ready:
                 *lines, partial[master] = (partial[master] + os.read(master, 4096)).split(b"\r")
                 other = self.masters[master == self.masters[0]]
-                os.write(other, b"".join(line + b"\r" for line in lines if line[:1] == b"t"))
+                rest = b"".join(line + b"\r" for line in lines if line[:1] == b"t")
+                while rest:
+                    stopped, _, _ = select.select([self.stop_read], [other], [])
+                    if stopped:  # also where nobody reads at the other end any more
+                        return
+                    rest = rest[os.write(other, rest) :]
 
     def stop(self):
         """Nothing passes until `go_on`."""
