@@ -142,6 +142,7 @@ def identify(given: argparse.Namespace) -> int:
     print_findings(found)
     wanted = missing(found)
     report = {"logs": given.logs, "has_reference": result.has_scale, "residual": result.residual.tolist(), "missing": wanted}
+    report["gust_m_s"] = result.gust_m_s
     report["found"] = [each._asdict() for each in found]
     (given.out / "identified.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     if not result.has_scale:

@@ -90,9 +90,9 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
     first = np.zeros(len(width))
     first[:count] = np.concatenate(list(beginning(vehicle).values()))
     scale, pull = _scale_row(shared["gain"], len(first), reference, has_weight)
+    prior = np.diag(width**-2.0) + pull * np.outer(scale, scale)  # about `first`, whose gains are 1 as the scale's row wants it
     x, noise, gust = first.copy(), np.zeros(6), GUST_M_S
     for _ in range(MOST_STEPS):
-        prior = np.diag(width**-2.0) + pull * np.outer(scale, scale)
         for at, precision in zip(own, gusts, strict=True):
             prior[at["gust"], at["gust"]] = precision / gust**2
         rows = [_rows(flight, x, step, shared | at) for flight, at in zip(flights, own, strict=True)]
@@ -102,7 +102,7 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
         information = prior + sum(each.T @ each for each in flat)
         inverse = np.linalg.inv(information)
         score = sum(each.T @ (left / sigma).ravel() for each, (left, _) in zip(flat, rows, strict=True))
-        move = inverse @ (score - prior @ (x - first) + pull * scale * (1.0 - scale @ first))
+        move = inverse @ (score - prior @ (x - first))
         x = x + move
         noise = sum(np.einsum("np,pq,nq->n", each, inverse, each, optimize=True).reshape(-1, 6).sum(axis=0) for each in flat)
         noise = noise * sigma**2 / len(residual)
@@ -138,12 +138,12 @@ def _rows(flight: Equations, x: np.ndarray, step: np.ndarray, where: dict[str, s
     """(n, 6) what was measured less what was expected, and (n, 6, p) slopes of the expectation."""
     expected = flight.predict({name: x[at] for name, at in where.items()})
     slopes = np.zeros((*expected.shape, len(x)))
-    for name, at in where.items():
-        for i in range(at.start, at.stop) if name != "gust" else ():
+    for at in (where[name] for name in where if name != "gust"):
+        for i in range(at.start, at.stop):
             ahead = x.copy()
             ahead[i] += step[i]
-            slopes[:, :, i] = (flight.predict({other: ahead[k] for other, k in where.items()}) - expected) / step[i]
-    mean = slopes[:, :, where["current"]]
+            slopes[:, :, i] = (flight.predict({name: ahead[k] for name, k in where.items()}) - expected) / step[i]
+    mean = slopes[:, :, where["current"]]  # a gust acts as the mean does, at its knot's times
     slopes[:, :, where["gust"]] = (mean[:, :, None, :] * flight.knots[:, None, :, None]).reshape(*expected.shape, -1)
     return flight.measured - expected, slopes
 

@@ -7,10 +7,10 @@ Newton and Euler about the centre of mass, body frame, motion relative to the wa
 
 a is what the accelerometer feels plus gravity, w' the derivative of the gyro; F_i is the thruster's curve over the commands that went
 out, behind a first-order lag, at the measured voltage; v the velocity less that of the water, which is a mean and a gust in a knot
-every 2.5 s, straight lines between them; s the first moment of mass about where the
-file has the centre. A known weight adds its force, less its mass times a, to the first, and the moment of that where it hangs to the
-second. M, I, s, D, n, arm and k have one factor in common that no motion shows. Both sides are seen through one window of 11 ticks:
-that of a straight line's slope through the gyro.
+every 2.5 s, straight lines between them; s the first moment of mass about where the file has the centre. A known weight adds its
+force, less its mass times a, to the first, and the moment of that where it hangs to the second. M, I, s, D, n, arm and k have one
+factor in common that no motion shows. Both sides are seen through one window of 11 ticks: that of a straight line's slope through
+the gyro.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class Equations:
         vehicle, window = recording.vehicle, _window(HALF_WINDOW)
         inner = np.arange(HALF_WINDOW, len(recording.time_ns) - HALF_WINDOW, 2 * HALF_WINDOW)
         steady = np.convolve(recording.armed, np.ones(len(window)), "valid") > len(window) - 0.5
-        wholly_under = motion.p_wb[inner, 2] > 0.5 * np.linalg.norm(vehicle.hull.size_m)
+        wholly_under = motion.p_wb[inner, 2] > recording.body.reach_m
         self._rows = inner[steady[inner - HALF_WINDOW] & wholly_under]
         if len(self._rows) < 2:
             raise DescriptionError(f"{recording.name}: the vehicle was never armed and wholly under water; give the log of a dive")
