@@ -312,7 +312,8 @@ class Parameters:
         ok = fits and (value in limits.choices if limits.choices else limits.low <= value <= limits.high)  # type: ignore[operator]
         if not ok:
             raise DescriptionError(f"parameter {dotted}: {value!r} is out of range; permitted: {describe(limits)}")
-        return dataclasses.replace(self, **{group_name: dataclasses.replace(group, **{name: value})})
+        kept = type(getattr(group, name))(value)  # an int where compiled functions want a float would end the tick
+        return dataclasses.replace(self, **{group_name: dataclasses.replace(group, **{name: kept})})
 
 
 PAPER = Parameters(

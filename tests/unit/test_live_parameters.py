@@ -81,3 +81,11 @@ def test_share_of_a_thruster_test_may_be_set_in_flight(flying: Pipeline) -> None
     step(flying, 120, [Request(Action.SET_PARAMETER, 0, ("steering.test_share", 0.1))])
     chain.motor_test.start((2, 1.0, 1.0), 0)
     np.testing.assert_allclose(chain.motor_test.step(0)[2], 0.1 * chain.body.thrusters.f_max[2])
+
+
+def test_whole_numbers_set_in_flight_are_flown_with(flying: Pipeline) -> None:
+    wanted = {"control.attitude_bandwidth": 2, "control.position_bandwidth": 3}
+    outputs = step(flying, 120, [Request(Action.SET_PARAMETER, 0, pair) for pair in wanted.items()])
+    outputs = step(flying, 121, [])
+    assert flying.parameters.control.attitude_bandwidth == 2.0
+    assert np.isfinite(outputs.records[0].commanded_n).all()

@@ -65,6 +65,14 @@ def test_bound_of_every_tunable_is_permitted_and_beyond_is_not(name: str) -> Non
                 Parameters().replace(name, wrong)
 
 
+def test_whole_number_becomes_what_the_tunable_is() -> None:
+    """An int where a float was makes compiled functions of the tick refuse their arguments, in flight."""
+    for name in ("control.attitude_bandwidth", "docking.current_threshold_ma", "failsafes.leak_action"):
+        kind = type(value_of(Parameters(), name))
+        for value in (2, 2.0):
+            assert type(value_of(Parameters().replace(name, value), name)) is kind
+
+
 @pytest.mark.parametrize("wrong", ["fast", 3, ""])
 def test_unknown_word_is_refused(wrong: Any) -> None:
     with pytest.raises(DescriptionError, match=r"parameter control.law: .* permitted: one of model, paper"):
