@@ -79,20 +79,26 @@ class Supervisor:
         """Runs this tick's triggers in order: e-stop, what has ended by itself, requests, fail-safes.
 
         Args:
-            estop: an ESTOP frame came since the previous tick. A module that says it is stopped while the body is armed is as good as one.
+            estop: an ESTOP frame came since the previous tick. A module that says it is stopped while the body is armed is as good as one;
+                and one that holds an e-stop of which this process never knew: it was raised before the start, and nobody cleared it.
             health: of this tick.
             requests: for this body, and e-stops for all.
             endings: TEST_OVER while no motor test runs, DOCK_OVER when a dock has ended; nothing is said where they do not apply.
         """
         self.events = []
         decisions: list[Decision | None] = []
-        if estop or (self.armed and health.stopped):  # a module has heard what the firmware has not
+        if estop or (health.stopped and (self.armed or self._knows_of_no_estop)):  # a module has heard what the firmware has not
             self._estop_ns = health.time_ns
             decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
         decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger)]
         decisions += [self._request(request, health) for request in requests]
         decisions += self._guard(health)
         return [decision for decision in decisions if decision is not None]
+
+    @property
+    def _knows_of_no_estop(self) -> bool:
+        """Whether a disarmed body's modules have no e-stop to let go of that was cleared here."""
+        return self.state == State.DISARMED and self._estop_ns is None
 
     def _request(self, request: Request, health: Health) -> Decision | None:
         trigger = TRIGGERS.get(request.action)

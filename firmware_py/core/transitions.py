@@ -24,7 +24,7 @@ class Trigger(IntEnum):
     """What makes the supervisor look into its table."""
 
     ESTOP_FRAME = 0
-    """An ESTOP frame came from the bus, or a module of an armed body says that it heard one."""
+    """An ESTOP frame came from the bus, or a module says that it heard one that the firmware did not."""
     ESTOP = 1
     CLEAR_ESTOP = 2
     DISARM = 3

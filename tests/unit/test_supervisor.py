@@ -161,6 +161,19 @@ def test_module_that_heard_an_e_stop_which_the_firmware_missed_stops_the_robot()
     assert supervisor.step(False, stopped, []) == [], "a disarmed robot's modules let go by themselves"
 
 
+def test_e_stop_that_was_raised_before_the_process_started_is_latched_until_a_person_clears_it() -> None:
+    """Its modules hold it, and let go by themselves once they hear that the robot is disarmed: nobody cleared it by that."""
+    supervisor = supervisor_in(State.DISARMED)
+    stopped = GOOD._replace(stopped=(0,))
+    (decision,) = supervisor.step(False, stopped, [Request(Action.ARM)])
+    assert decision.trigger == Trigger.ESTOP_FRAME and supervisor.state == State.ESTOP and not supervisor.raises_estop
+    let_go = at(GOOD, 1.0)
+    assert ask(supervisor, Action.ARM, None, let_go) == [] and ask(supervisor, Action.ARM, True, let_go) == []
+    assert ask(supervisor, Action.CLEAR_ESTOP, None, let_go) and supervisor.state == State.DISARMED
+    assert supervisor.step(False, at(stopped, 1.01), []) == [], "once one was cleared here, modules may take their time"
+    assert ask(supervisor, Action.ARM, None, at(GOOD, 1.3)) and supervisor.armed
+
+
 def test_e_stop_is_cleared_when_the_bus_has_been_quiet() -> None:
     supervisor = supervisor_in()
     supervisor.step(True, GOOD, [Request(Action.ESTOP)])
