@@ -26,6 +26,8 @@ PACKAGE = "modcube"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a whole log (MCAP specification)."""
 
+_SPOILT = (McapError, EOFError, ValueError, struct.error, OverflowError, MemoryError)
+"""What reading raises where a log is torn, or where a wrong bit makes a length of it astronomical."""
 _RECORD = struct.Struct("<BQ")
 """Kind and length of a record, before what it holds (MCAP specification)."""
 
@@ -190,7 +192,7 @@ def read_attachment(path: Path, name: str) -> bytes | None:
 def last_attachment(path: Path, name: str) -> bytes | None:
     """The attachment called `name` that came last, or None; messages are passed over unread. Raises OSError."""
     found = None
-    with path.open("rb") as file, suppress(McapError, EOFError, ValueError, struct.error):
+    with path.open("rb") as file, suppress(*_SPOILT):
         file.seek(len(MCAP_MAGIC))
         while len(head := file.read(_RECORD.size)) == _RECORD.size:
             kind, length = _RECORD.unpack(head)
@@ -237,7 +239,7 @@ def log_records(path: Path) -> Iterator[Any]:
 def _records_of(log: IO[bytes]) -> Iterator[Any]:
     try:
         yield from StreamReader(log, validate_crcs=True).records
-    except (McapError, EOFError, ValueError, struct.error):
+    except _SPOILT:
         return  # torn: what came before it stands
 
 

@@ -154,6 +154,18 @@ def test_missing_or_unreadable_log_says_nothing(tmp_path: Path) -> None:
     assert in_flight(Path(__file__)) == set()
 
 
+@pytest.mark.parametrize("value", [0x00, 0x7F, 0xFF])
+def test_start_of_a_log_may_be_spoilt_anywhere(tmp_path: Path, value: int) -> None:
+    """A wrong bit in a length makes it astronomical; a process that ended by that would end at every start."""
+    write(tmp_path, lines_of([True] * 3))
+    whole = (tmp_path / SIGNAL_LOG).read_bytes()
+    for at in range(len(whole)):
+        spoilt = bytearray(whole)
+        spoilt[at] = value
+        (tmp_path / SIGNAL_LOG).write_bytes(spoilt)
+        assert found(tmp_path).armed <= {0, 1, 2}
+
+
 def test_magnets_that_were_told_to_pull_last_pulled(tmp_path: Path) -> None:
     text = dock_line(0, (1, 2, 0, 0, 0, 1)) + dock_line(1, (0, 1, 0, 0, 0, 0)) + dock_line(2, (0, 0, 0, 1, 0, 0))
     write(tmp_path, text + lines_of([True] * 3) + dock_line(1, (0, 2, 0, 0, 0, 0), 2) + dock_line(0, (0,) * 6, 2, "R"))
