@@ -291,7 +291,8 @@ def recording(recorder: Recorder, rate_hz: int) -> Observer:
 
 def noting_estop(recorder: Recorder, stands: bool) -> Observer:
     """An observer that notes for the next process whether an e-stop stands: from one on, and where one stood before this process
-    (`stands`), until a person clears it or arms. It is with the system at once, before any frame of that tick.
+    (`stands`), until a person clears it or arms. It is with the system at once, before any frame of that tick, and soon on the disk: who
+    has pressed a stop pulls the plug next.
     """
     noted = False
 
@@ -304,7 +305,7 @@ def noting_estop(recorder: Recorder, stands: bool) -> Observer:
         if stands != noted:
             noted = stands
             recorder.note_estop(stands, outputs.time_ns)
-            outputs.events += recorder.flush()
+            outputs.events += recorder.flush(to_disk=True)
 
     return observe
 

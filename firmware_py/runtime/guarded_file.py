@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import threading
 from pathlib import Path
 from queue import SimpleQueue
@@ -11,6 +12,8 @@ MOST_WAITING_BYTES = 8_000_000
 """A minute and a half of one module at 100 Hz; a disk that is farther behind ends the log."""
 CLOSE_S = 5.0
 """How long the end of a run waits for a disk."""
+_SYNC = b""
+"""Among what waits for the thread of a QueuedFile: all before it is to be on the disk."""
 
 
 class GuardedFile:
@@ -48,6 +51,18 @@ class GuardedFile:
     def flush(self) -> None:
         """Nothing is held back."""
 
+    def sync(self) -> None:
+        """What was written is to outlive a power cut too."""
+        if self.error is None:
+            try:
+                self._to_disk()
+            except OSError as error:
+                self.error = error
+
+    def _to_disk(self) -> None:
+        if self._file is not None:
+            os.fsync(self._file.fileno())
+
     def close(self) -> None:
         """Close; a second time does nothing."""
         if self._file is not None:
@@ -72,14 +87,18 @@ class QueuedFile(GuardedFile):
         if self._given - self._written > MOST_WAITING_BYTES:
             raise OSError(errno.ENOBUFS, "the disk does not keep up")
         self._given += len(data)
-        self._queue.put(bytes(data))
+        if data:
+            self._queue.put(bytes(data))
+
+    def _to_disk(self) -> None:
+        self._queue.put(_SYNC)
 
     def _run(self) -> None:
         broken = False
         while (data := self._queue.get()) is not None:
             try:
                 if not broken:
-                    super()._append(data)
+                    super()._append(data) if data else super()._to_disk()
             except OSError as error:
                 broken, self.error = True, self.error or error
             self._written += len(data)

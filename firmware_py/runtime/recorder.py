@@ -159,11 +159,17 @@ class Recorder:
         data = STANDS if stands else b""
         self._writer.attach(log_time=time_ns, create_time=time_ns, name=ESTOP, media_type="text/plain", data=data)
 
-    def flush(self) -> list[Event]:
-        """Hand everything so far to the operating system; a warning, once, where that fails."""
+    def flush(self, to_disk: bool = False) -> list[Event]:
+        """Hand everything so far to the operating system; a warning, once, where that fails.
+
+        Args:
+            to_disk: and have it write that, for a power cut: 10 ms and more, which in flight only a `queued` recorder may take.
+        """
         self._can.write("".join(self._lines).encode())
         self._lines.clear()
         self._writer.flush()
+        for file in (self._can, self._mcap) if to_disk else ():
+            file.sync()
         return self._failure()
 
     def check(self) -> None:

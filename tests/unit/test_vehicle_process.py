@@ -286,6 +286,29 @@ def stopped(folder: Path, *told: Told, before: bool = False) -> None:
     os.utime(log / CAN_LOG, ns=(OLD_NS, OLD_NS))
 
 
+@pytest.mark.parametrize("queued", [True, False])
+def test_stop_is_on_the_disk_for_who_pulls_the_plug_next(tmp_path: Path, queued: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    on_disk: dict[str, bytes] = {}
+
+    def sync(number: int) -> None:
+        path = Path(os.readlink(f"/proc/self/fd/{number}"))
+        on_disk[path.name] = path.read_bytes()
+
+    monkeypatch.setattr(os, "fsync", sync)
+    recorder = Recorder(tmp_path, {}, queued=queued)
+    observe = noting_estop(recorder, False)
+    for state in (State.ARMED, State.ESTOP):
+        _, outputs = Robot().step([])
+        recorder.sent(outputs.time_ns, 0, [Frame(0x020, b"")])
+        now = dataclasses.replace(outputs, records=[outputs.records[0]._replace(state=int(state))])
+        observe([], [], Inputs(1, now.time_ns, []), now)
+        assert state == State.ESTOP or not on_disk, "a disk is not troubled otherwise"
+    recorder.close()
+    for name, data in on_disk.items():
+        (tmp_path / name).write_bytes(data)
+    assert on_disk[CAN_LOG] and last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped
+
+
 CLEAR = [Request(Action.CLEAR_ESTOP)]
 
 
