@@ -18,6 +18,11 @@ LOOP_SHARE = 4.0 / 27.0
 """Gain of the way over the bandwidth of the speed: s (s + w)^2 + k w^2 has a double real root just there."""
 
 
+LEASH_M = 1.0
+"""How far a set-point that moves by a given speed may be from the body. A speed that the body cannot make, or one that somebody holds it
+against, would lead it away without end, and the body after it long after it was told to stop. Thrusters saturate at a fifth of this."""
+
+
 class Trajectory(Protocol):
     """A motion over time. Built by `prepare.paths`; sampled in the tick."""
 
@@ -126,6 +131,11 @@ class Glider:
         _glide(*self.at, wish.v_w, wish.w_b, place, attitude, self._w, self._speed, rate, dt_s, out)
         self.at = Setpoint(out[0:3], out[3:7], out[7:10], out[10:13], out[13:16], out[16:19])
         return self.at
+
+
+def leashed(place: np.ndarray, p_wb: np.ndarray) -> np.ndarray:
+    """The place (3,), or the nearest one that is along no axis farther than LEASH_M from the body at `p_wb` (3,)."""
+    return np.asarray(np.clip(place, p_wb - LEASH_M, p_wb + LEASH_M))
 
 
 def ahead_of(setpoint: Setpoint, lead_s: float) -> Setpoint:

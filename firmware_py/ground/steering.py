@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.rotations import from_euler, multiply, normalise, rotate, to_euler
+from firmware_py.core.setpoint import leashed
 from firmware_py.core.types import Action, DockRequest, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.dialect import Message
@@ -233,7 +234,8 @@ class Steering:
         """Where to be: as asked for; on an axis without a place further along its velocity, or as before."""
         start, elapsed_s = self._before(time_ns)
         before = now if start is None else start.p_wb
-        moved = before if velocity is None else before + velocity * elapsed_s
+        at = self._system.subject.record.estimate.p_wb
+        moved = before if velocity is None else leashed(before, at) + velocity * elapsed_s
         return np.asarray(moved if position is None else np.where(np.isnan(position), moved, position))
 
     def _attitude(self, now: np.ndarray, yaw: float | None, rate: float, time_ns: int) -> np.ndarray:

@@ -147,6 +147,16 @@ def test_velocity_setpoints_move_the_place_along(world: World, client: Client) -
     assert setpoints[-1].p_wb[0] - world.robot.p_wb[0][0] == pytest.approx(0.09, abs=0.02)
 
 
+def test_velocity_of_zero_stops_a_body_that_could_not_follow(world: World, client: Client) -> None:
+    fly_by_velocity(world, client)
+    for vx in (*[2.0] * 50, 0.0):
+        send_target(client, 0xDC7, vx=vx)
+        world.run(10)
+    stop = [r.argument for r in world.robot.asked if r.action == Action.SET_POINT][-1]
+    assert stop.v_w == pytest.approx([0, 0, 0])
+    assert 0.5 < stop.p_wb[0] - world.robot.p_wb[0][0] <= 1.0 + 1e-6
+
+
 def test_setpoints_that_are_no_numbers_are_ignored(world: World, client: Client) -> None:
     send_target(client, 0xDF8, x=NAN)
     send_target(client, 0x9F8, x=0.1, yaw=NAN)

@@ -9,7 +9,7 @@ import pytest
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import Health
 from firmware_py.core.rotations import difference, from_euler, heading, rotate, to_matrix
-from firmware_py.core.setpoint import rest_at
+from firmware_py.core.setpoint import LEASH_M, rest_at
 from firmware_py.core.supervisor import Decision
 from firmware_py.core.transitions import Effect, Trigger
 from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
@@ -247,6 +247,18 @@ def test_streamed_points_are_followed_and_a_stream_that_ends_stops_the_robot() -
     assert flight.setpoints[-1].v_w[0] == pytest.approx(0.2, abs=1e-3)
     flight.run(2.5)
     assert np.abs(flight.setpoints[-1].v_w).max() < 1e-3
+
+
+def test_speed_that_the_body_cannot_make_leads_no_set_point_away_that_it_would_run_after() -> None:
+    """Somebody holds it, or 8 m/s were asked for: when the speed ends, so does the motion."""
+    flight, nan = Flight(), np.full(3, np.nan)
+    flight.do(Effect.ENTER_MODE, Mode.GUIDED)
+    for _ in range(50):
+        flight.do(Effect.TAKE_POINT, Mode.GUIDED, Setpoint(nan, np.full(4, np.nan), np.array([8.0, 0.0, 0.0]), ZERO, ZERO, ZERO))
+        flight.run(0.1, follows=False)
+    assert np.abs(flight.setpoints[-1].p_wb - flight.estimate.p_wb).max() < LEASH_M + 0.1
+    flight.run(2.0, follows=False)
+    assert flight.setpoints[-1].p_wb[0] < LEASH_M + 0.1 and np.abs(flight.setpoints[-1].v_w).max() < 1e-3
 
 
 @pytest.mark.parametrize(("silence_s", "north_m"), [(60.0, 0.0), (0.1, 3.0)])
