@@ -257,7 +257,7 @@ def test_speed_that_the_body_cannot_make_leads_no_set_point_away_that_it_would_r
         flight.do(Effect.TAKE_POINT, Mode.GUIDED, Setpoint(nan, np.full(4, np.nan), np.array([8.0, 0.0, 0.0]), ZERO, ZERO, ZERO))
         flight.run(0.1, follows=False)
     assert np.abs(flight.setpoints[-1].p_wb - flight.estimate.p_wb).max() < LEASH_M + 0.1
-    flight.run(2.0, follows=False)
+    flight.run(4.0, follows=False)
     assert flight.setpoints[-1].p_wb[0] < LEASH_M + 0.1 and np.abs(flight.setpoints[-1].v_w).max() < 1e-3
 
 
