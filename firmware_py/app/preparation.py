@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from firmware_py.core.body import Body
-from firmware_py.core.docking import Prepared
+from firmware_py.core.docking_decisions import Prepared
 from firmware_py.core.docking_sequence import UndockPlan
 from firmware_py.core.joints import turned
 from firmware_py.core.pipeline import Pipeline

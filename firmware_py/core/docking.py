@@ -11,82 +11,26 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from firmware_py.core.body import Body
+from firmware_py.core.docking_decisions import Decisions, Join, Part, Prepared
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_sequence import (
     ENDED,
-    RELAY_OFF,
-    RELAY_PULL,
-    RELAY_PUSH,
     DockingSequence,
     DockPlan,
     Stage,
     UndockPlan,
     nearest_pass,
 )
-from firmware_py.core.joints import Joint, modules_of, sides
+from firmware_py.core.joints import Joint, modules_of
+from firmware_py.core.magnet_relays import RELAY_OFF, RELAY_PULL, RELAY_PUSH, MagnetRelays
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
-from firmware_py.core.setpoint import Wish
-from firmware_py.core.types import DockRecord, DockRequest, Estimate, Event, Inputs, Setpoint
+from firmware_py.core.types import DockRecord, DockRequest, Estimate, Event, Inputs
 from firmware_py.description.parameters import Docking
 
 WARNING, INFORMATION = 4, 6
 CHANGED = "the bodies are others than those that it was planned for"
 NO_LONGER = "its body is no longer in DOCK"
-NEVER_NS = -(1 << 60)
-RELAY_PERIOD_NS = 100_000_000
-"""DOCK_CMD goes out at 10 Hz, and at once when a relay changes."""
-
-
-class Prepared(NamedTuple):
-    """An answer of the worker."""
-
-    request: DockRequest
-    plan: DockPlan | UndockPlan | None
-    chains: tuple[Any, ...]
-    """The pipelines of the bodies that there will be, ready to take over."""
-    refusal: str = ""
-    """Why there is no plan."""
-
-
-class Join(NamedTuple):
-    """Two bodies become one, in this tick."""
-
-    target: int
-    """Numbers of the bodies."""
-    active: int
-    chain: Any
-
-
-class Part(NamedTuple):
-    """One body becomes two, in this tick; the leaving one then glides away along `away_w` (3,), m."""
-
-    whole: int
-    stays: Any
-    leaves: Any
-    away_w: np.ndarray
-
-
-class Decisions(NamedTuple):
-    """What the stage wants of the pipeline."""
-
-    setpoints: dict[int, Setpoint | Wish]
-    """By body: steers it in this tick."""
-    joins: list[Join]
-    parts: list[Part]
-    ended: list[int]
-    """Bodies whose dock is over without a join: they hold where they are."""
-    meets: dict[int, np.ndarray]
-    """By body: (3,) how far it comes to meet the other, world, m, from where it holds."""
-
-    @property
-    def joining(self) -> set[int]:
-        """Bodies that take part in a join of this tick."""
-        return {body for join in self.joins for body in (join.active, join.target)}
-
-    def move(self, body: int, by_w: np.ndarray) -> None:
-        """Adds to what a body comes."""
-        self.meets[body] = self.meets.get(body, 0.0) + by_w
 
 
 class _Dock(NamedTuple):
@@ -113,8 +57,7 @@ class DockingStage:
     def __init__(self, parameters: Docking, tags: TagTable, modules: int) -> None:
         self._p = parameters
         self._tags = tags
-        self._relays = np.zeros((modules, 6), dtype=np.int64)
-        self._due_ns = [NEVER_NS] * modules
+        self.relays = MagnetRelays(modules)
         self._docks: list[_Dock] = []
         self._undocks: list[_Undock] = []
         self._expected: dict[int, DockRequest] = {}
@@ -134,7 +77,7 @@ class DockingStage:
         self._watched = joints
         self._joints = PairBank([joint.pair for joint in joints], self._p, self._joints)
         for joint in joints:
-            self._set_relays(RELAY_PULL, joint.request)
+            self.relays.switch(RELAY_PULL, joint.request)
 
     def open_joints(self, least: int) -> list[DockRequest]:
         """Joints that are `least` LOOSE or APART though they should hold, as requests that name their faces. Those that are being
@@ -189,7 +132,7 @@ class DockingStage:
         left: list[tuple[str, DockRequest]] = []
         for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._holds(each.plan)]:
             self._undocks.remove(undock)
-            self._set_relays(RELAY_PULL, *undock.plan.opens)
+            self.relays.switch(RELAY_PULL, *undock.plan.opens)
             left.append(("undock", undock.plan.opens[0]))
         for dock in [each for each in self._docks if each.active == body.index and not armed]:
             self._drop(dock)
@@ -224,20 +167,6 @@ class DockingStage:
         for undock in list(self._undocks):
             self._release(undock, inputs.time_ns, estimates, decisions)
         return decisions
-
-    @property
-    def relays(self) -> list[list[int]]:
-        """By module: the relay states that docks and joints want."""
-        return self._relays.tolist()
-
-    def due(self, time_ns: int) -> list[int]:
-        """Modules whose relay states are to be sent in this tick."""
-        if min(self._due_ns) > time_ns:
-            return []
-        due = [module for module, at_ns in enumerate(self._due_ns) if at_ns <= time_ns]
-        for module in due:
-            self._due_ns[module] = time_ns + RELAY_PERIOD_NS
-        return due
 
     # ------------------------------------------------------------ beginnings
 
@@ -283,7 +212,7 @@ class DockingStage:
     def _drop(self, dock: _Dock) -> None:
         """It is no longer under way, and its magnets let go."""
         self._docks.remove(dock)
-        self._set_relays(RELAY_OFF, dock.prepared.request)
+        self.relays.switch(RELAY_OFF, dock.prepared.request)
 
     def _give_up(self, dock: _Dock, holding: Collection[int], decisions: Decisions) -> None:
         """Ends a dock in whose place another begins; a target that was coming goes back to where it held."""
@@ -330,7 +259,7 @@ class DockingStage:
         before = dock.sequence.stage
         steering = dock.sequence.step(inputs.time_ns, active, target, status)
         stage = dock.sequence.stage
-        self._set_relays(steering.relay, dock.prepared.request)
+        self.relays.switch(steering.relay, dock.prepared.request)
         errors, pair = dock.sequence.errors(active, target), dock.detector.pair
         self.records.append(
             DockRecord(
@@ -361,15 +290,15 @@ class DockingStage:
         plan, request = undock.plan, undock.plan.opens[0]
         if not _fits(plan, estimates):
             self._undocks.remove(undock)
-            self._set_relays(RELAY_PULL if self._holds(plan) else RELAY_OFF, *plan.opens)
+            self.relays.switch(RELAY_PULL if self._holds(plan) else RELAY_OFF, *plan.opens)
             self._say(WARNING, f"undock ended: {CHANGED}")
             return
-        self._set_relays(RELAY_PUSH, *plan.opens)
+        self.relays.switch(RELAY_PUSH, *plan.opens)
         whole = _body_of(request.module, estimates)
         changes = whole in decisions.joining or whole in [part.whole for part in decisions.parts]
         if time_ns < undock.until_ns or changes:  # the next tick has no such body, and ends this
             return
-        self._set_relays(RELAY_OFF, *plan.opens)
+        self.relays.switch(RELAY_OFF, *plan.opens)
         estimate = estimates[whole][1]
         away_w = rotate(estimate.q_wb, plan.axis_b) * self._p.standoff_m
         stays, leaves = undock.chains
@@ -381,11 +310,6 @@ class DockingStage:
         """Whether there still is a joint to be undone."""
         watched = [modules_of(joint.request) for joint in self._watched]
         return any(modules_of(joint) in watched for joint in plan.opens)
-
-    def _set_relays(self, relay: int, *joints: DockRequest) -> None:
-        for module, face in (side for joint in joints for side in sides(joint)):
-            if self._relays[module, face] != relay:
-                self._relays[module, face], self._due_ns[module] = relay, NEVER_NS
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))

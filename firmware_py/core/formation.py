@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from firmware_py.core.body import Body
-from firmware_py.core.docking import Decisions, DockingStage, Join, Part
+from firmware_py.core.docking import DockingStage
+from firmware_py.core.docking_decisions import Decisions, Join, Part
 from firmware_py.core.docking_pairs import APART, LOOSE
 from firmware_py.core.topology import in_both, join, part_of
 from firmware_py.core.types import DockRequest, Estimate, Inputs, Mode, Outputs, PartRequest

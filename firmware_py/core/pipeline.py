@@ -225,7 +225,7 @@ class Pipeline:
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
             if docking.under_way:
                 formation.leave(chain, inputs.time_ns, outputs)
-        wanted, due = docking.relays, docking.due(inputs.time_ns)
+        wanted, due = docking.relays.states, docking.relays.due(inputs.time_ns)
         for chain in formation.chains:
             relays = chain.magnets(wanted, due)
             record, command = chain.control(inputs.time_ns, estimates[chain.body.index])

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.docking import CHANGED, Decisions, Join
+from firmware_py.core.docking import CHANGED
+from firmware_py.core.docking_decisions import Decisions, Join
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.transitions import State
@@ -20,12 +21,12 @@ def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
     tank = Docked(RING[:2])
     tank.fly()
     tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
-    assert any(2 in states for states in tank.pipeline.formation.docking.relays), "magnets push"
+    assert any(2 in states for states in tank.pipeline.formation.docking.relays.states), "magnets push"
     request = Request(Action.SET_MODE, 0, Mode.POSHOLD) if stop == "mode" else Request(Action.DISARM, 0)
     tank.run(0.02, *([] if stop == "e-stop" else [request]), estop=stop == "e-stop")
     outputs = tank.run(3.0)
     assert tank.shape == [(0, 1)] and tank.when("undock of module 1 ended")
-    assert [max(states) for states in tank.pipeline.formation.docking.relays] == [1, 1], "and pull again"
+    assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1], "and pull again"
     assert outputs.records[0].mode == Mode.POSHOLD
 
 
@@ -41,11 +42,11 @@ def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str
     while not (outputs.docks and outputs.docks[0].stage == Stage.APPROACH):
         outputs = tank.run(0.01)
     outputs = tank.run(1.0)
-    assert outputs.records[1].mode == Mode.DOCK and any(any(states) for states in tank.pipeline.formation.docking.relays)
+    assert outputs.records[1].mode == Mode.DOCK and any(any(states) for states in tank.pipeline.formation.docking.relays.states)
     stopping = [] if stop == "e-stop" else [Request(Action.DISARM, 0), Request(Action.DISARM, 1)]
     tank.run(0.02, *stopping, estop=stop == "e-stop")
     outputs = tank.run(5.0)
-    assert outputs.docks == [] and not any(any(states) for states in tank.pipeline.formation.docking.relays)
+    assert outputs.docks == [] and not any(any(states) for states in tank.pipeline.formation.docking.relays.states)
     assert tank.when("dock of module 1 ended")
     tank.run(0.1, Request(Action.CLEAR_ESTOP, 1))
     outputs = tank.run(0.1, Request(Action.ARM, 1))
@@ -70,7 +71,7 @@ def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
     outputs = tank.run(2.0)
     assert [record.stage for outputs in tank.outputs for record in outputs.docks].count(Stage.DOCKED) == 2
     assert tank.shape == [(0, 1), (2,)]
-    assert tank.pipeline.formation.docking.relays == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
+    assert tank.pipeline.formation.docking.relays.states == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
     assert tank.when(f"dock ended: {CHANGED}")
 
@@ -152,7 +153,7 @@ def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> N
     outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 2, 3)))
     assert [(dock.module_a, dock.module_b) for dock in outputs.docks] == [(2, 1)]
     assert tank.when("dock of module 1 ended: another was asked for")
-    assert tank.pipeline.formation.docking.relays[0] == [0] * 6
+    assert tank.pipeline.formation.docking.relays.states[0] == [0] * 6
     assert outputs.records[1].mode == Mode.DOCK
 
 
@@ -163,7 +164,7 @@ def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_ho
     assert tank.shape == [(0,), (1, 2)]
     assert not any("is undocked from 1" in text for _, text in tank.said)
     assert tank.when("undock of module 2 ended")
-    assert tank.pipeline.formation.docking.relays == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
+    assert tank.pipeline.formation.docking.relays.states == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
 
 
 @pytest.mark.slow
@@ -171,12 +172,12 @@ def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> 
     tank = Docked(RING)
     tank.fly()
     tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
-    assert [sum(state == 2 for state in states) for states in tank.pipeline.formation.docking.relays] == [0, 1, 1, 2]
+    assert [sum(state == 2 for state in states) for states in tank.pipeline.formation.docking.relays.states] == [0, 1, 1, 2]
     outputs = tank.run(5.0)
     assert tank.shape == [(0, 1, 2), (3,)]
     rest, corner = (chain.guidance._glider.at.p_wb for chain in tank.pipeline.formation.chains)
     assert outputs.records[1].mode == Mode.POSHOLD and np.linalg.norm(corner - rest) > 0.3
-    assert [max(states) for states in tank.pipeline.formation.docking.relays] == [1, 1, 1, 0]
+    assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1, 1, 0]
 
 
 @pytest.mark.slow

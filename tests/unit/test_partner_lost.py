@@ -7,7 +7,8 @@ import pytest
 
 from firmware_py.app.preparation import prepare
 from firmware_py.core.body import Body
-from firmware_py.core.docking import CHANGED, Prepared
+from firmware_py.core.docking import CHANGED
+from firmware_py.core.docking_decisions import Prepared
 from firmware_py.core.joints import joints_of
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockFeedback, DockRequest, Inputs, Mode, ModuleInputs, Outputs, Request

@@ -162,7 +162,7 @@ def test_place_with_a_hole_in_it_does_not_poison_the_set_point() -> None:
 
 def test_dock_that_cannot_be_prepared_leaves_the_body_holding_its_place() -> None:
     """Probe against probe: known only when it is prepared, after the mode was taken."""
-    from firmware_py.core.docking import Prepared
+    from firmware_py.core.docking_decisions import Prepared
 
     tank = Tank([single(0), single(1)])
     tank.run(0.5)

@@ -8,7 +8,7 @@ import pytest
 
 from firmware_py.app.firmware import Firmware, compose
 from firmware_py.app.replay import DueWorker
-from firmware_py.core.docking import Prepared
+from firmware_py.core.docking_decisions import Prepared
 from firmware_py.core.types import DockRequest, Inputs, ModuleInputs, Outputs, PartRequest
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters

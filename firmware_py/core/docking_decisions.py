@@ -1,0 +1,62 @@
+"""What docking is told and what it wants, as values: the worker's answers, and the joins, parts and set-points of a tick."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from firmware_py.core.docking_sequence import DockPlan, UndockPlan
+from firmware_py.core.setpoint import Wish
+from firmware_py.core.types import DockRequest, Setpoint
+
+
+class Prepared(NamedTuple):
+    """An answer of the worker."""
+
+    request: DockRequest
+    plan: DockPlan | UndockPlan | None
+    chains: tuple[Any, ...]
+    """The pipelines of the bodies that there will be, ready to take over."""
+    refusal: str = ""
+    """Why there is no plan."""
+
+
+class Join(NamedTuple):
+    """Two bodies become one, in this tick."""
+
+    target: int
+    """Numbers of the bodies."""
+    active: int
+    chain: Any
+
+
+class Part(NamedTuple):
+    """One body becomes two, in this tick; the leaving one then glides away along `away_w` (3,), m."""
+
+    whole: int
+    stays: Any
+    leaves: Any
+    away_w: np.ndarray
+
+
+class Decisions(NamedTuple):
+    """What the stage wants of the pipeline."""
+
+    setpoints: dict[int, Setpoint | Wish]
+    """By body: steers it in this tick."""
+    joins: list[Join]
+    parts: list[Part]
+    ended: list[int]
+    """Bodies whose dock is over without a join: they hold where they are."""
+    meets: dict[int, np.ndarray]
+    """By body: (3,) how far it comes to meet the other, world, m, from where it holds."""
+
+    @property
+    def joining(self) -> set[int]:
+        """Bodies that take part in a join of this tick."""
+        return {body for join in self.joins for body in (join.active, join.target)}
+
+    def move(self, body: int, by_w: np.ndarray) -> None:
+        """Adds to what a body comes."""
+        self.meets[body] = self.meets.get(body, 0.0) + by_w

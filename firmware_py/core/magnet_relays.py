@@ -1,0 +1,40 @@
+"""What the relays of all docking faces are wanted to do, and when each module is next told of it (DOCK_CMD)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from firmware_py.core.joints import sides
+from firmware_py.core.types import NEVER_NS, DockRequest
+
+RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
+PERIOD_NS = 100_000_000
+"""DOCK_CMD goes out at 10 Hz, and at once when a relay changes."""
+
+
+class MagnetRelays:
+    """Relay states by module and face. Off at first."""
+
+    def __init__(self, modules: int) -> None:
+        self._states = np.zeros((modules, 6), dtype=np.int64)
+        self._due_ns = [-NEVER_NS] * modules
+
+    @property
+    def states(self) -> list[list[int]]:
+        """Six states of each module of the fleet."""
+        return self._states.tolist()
+
+    def switch(self, state: int, *joints: DockRequest) -> None:
+        """Both faces of each of the joints to `state`."""
+        for module, face in (side for joint in joints for side in sides(joint)):
+            if self._states[module, face] != state:
+                self._states[module, face], self._due_ns[module] = state, -NEVER_NS
+
+    def due(self, time_ns: int) -> list[int]:
+        """Modules whose states are to be sent in this tick."""
+        if min(self._due_ns) > time_ns:
+            return []
+        due = [module for module, at_ns in enumerate(self._due_ns) if at_ns <= time_ns]
+        for module in due:
+            self._due_ns[module] = time_ns + PERIOD_NS
+        return due
