@@ -11,6 +11,7 @@ from numba import njit
 
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare import alpha, drag_table
 from firmware_py.prepare.joints import Placement
 from firmware_py.prepare.projected_area import Solid, areas_and_centroids, box, plane_basis
@@ -55,7 +56,7 @@ def drag_entries() -> list[Entry]:
     def exact(directions: np.ndarray) -> np.ndarray:
         """Drag per squared speed along (n, 3) directions, N s^2/m^2."""
         area = areas_and_centroids(solids, directions)[0]
-        return np.asarray(0.5 * drag_table.WATER_DENSITY * drag_table.coefficient(placements, directions) * area)
+        return np.asarray(0.5 * WATER_DENSITY * drag_table.coefficient(placements, directions) * area)
 
     def build(method: drag_table.Outlines) -> Callable[[], float]:
         return lambda: each_us(lambda: drag_table.build(placements, np.zeros(3), pitch_m, method=method), 1)() * 1e-6

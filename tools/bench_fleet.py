@@ -19,7 +19,7 @@ from command_line import run_tool
 
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
-from firmware_py.core.measurements import ATMOSPHERE_PA, WATER_DENSITY
+from firmware_py.core.measurements import ATMOSPHERE_PA
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.pipeline import CHANNELS, Pipeline
 from firmware_py.core.propagation import STATES
@@ -28,6 +28,7 @@ from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.types import Action, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare.assembly import assemble
 
 PERIOD_NS = 10_000_000

@@ -12,9 +12,8 @@ from firmware_py.core.body import Body
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rotations import M, V, conjugate, cross, difference, exp, multiply, to_matrix
 from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservation
+from firmware_py.description.water import WATER_DENSITY
 
-WATER_DENSITY = 1000.0
-"""kg/m^3, fresh water."""
 ATMOSPHERE_PA = 101_325.0
 """Standard atmosphere; what the weather adds is the estimator's depth bias."""
 FLIP_RAD = 0.35

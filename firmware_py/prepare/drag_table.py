@@ -12,6 +12,7 @@ import numpy as np
 
 from firmware_py.core.body import DragTable
 from firmware_py.core.drag_lookup import node_directions
+from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare import shape_key
 from firmware_py.prepare.drag_cache import DragCache
 from firmware_py.prepare.joints import Placement
@@ -21,9 +22,6 @@ from firmware_py.prepare.shape_key import Part
 
 NODES_PER_RIM = 13
 """6 x 13 x 13 = 1014 nodes; odd, so that the kinks of a cube's outline at zero components fall on nodes."""
-
-WATER_DENSITY = 998.2
-"""kg/m^3, fresh water at 20 degC (IAPWS)."""
 
 _SUBDIVISIONS = 2
 """Each triangle of a hull becomes 4^2 for the damping integral: within 0.2 % for a cube."""

@@ -16,6 +16,7 @@ from firmware_py.core import drag_lookup
 from firmware_py.core.body import DragTable
 from firmware_py.description.schema import frozen_array
 from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle
+from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare import drag_table, lattice, shape_key
 from firmware_py.prepare.alpha import lattice_method
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
@@ -63,7 +64,7 @@ def direct(vehicle: Vehicle, cells: list[tuple[int, int, int]], d: np.ndarray) -
     cd = edge + (face - edge) * 2.0 * (np.sum(d**4, axis=1) - 0.5)
     middle = PITCH * np.mean(cells, axis=0)
     across = middle - (d @ middle)[:, None] * d
-    return 0.5 * drag_table.WATER_DENSITY * cd * areas, centroids - across
+    return 0.5 * WATER_DENSITY * cd * areas, centroids - across
 
 
 # ---------------------------------------------------------------- force
@@ -99,12 +100,12 @@ def test_nearest_of_a_thousand_directions_is_worse(modcube: Vehicle) -> None:
 
 def test_drag_on_a_face_is_half_rho_cd_a(modcube: Vehicle) -> None:
     table = assemble_vehicle(modcube).drag
-    expected = -0.5 * drag_table.WATER_DENSITY * 1.05 * PITCH**2 * 0.3**2
+    expected = -0.5 * WATER_DENSITY * 1.05 * PITCH**2 * 0.3**2
     np.testing.assert_allclose(wrench(table, [0.3, 0, 0, 0, 0, 0]), [expected, 0, 0, 0, 0, 0], atol=1e-12)
 
 
 def test_edge_and_corner_have_their_own_coefficients(modcube: Vehicle) -> None:
-    table, half = assemble_vehicle(modcube).drag, 0.5 * drag_table.WATER_DENSITY * PITCH**2
+    table, half = assemble_vehicle(modcube).drag, 0.5 * WATER_DENSITY * PITCH**2
     for d, cd in (([1.0, 1.0, 0.0], 0.80), ([1.0, -1.0, 1.0], modcube.cd_corner), ([0.0, 0.0, -1.0], 1.05)):
         unit = np.array(d) / np.linalg.norm(d)
         force = drag_lookup.look_up(table.nodes, unit)[0]
@@ -156,7 +157,7 @@ def test_force_does_not_jump_where_sides_of_the_cube_map_meet(modcube: Vehicle) 
 def test_turning_a_cube_meets_the_closed_form_damping(modcube: Vehicle) -> None:
     """Over a cube of half-edge h, the integral of max(n . v, 0) r^2 is 6 h^5 about each axis."""
     table = assemble_vehicle(modcube).drag
-    expected = 0.5 * drag_table.WATER_DENSITY * 1.1 * 6.0 * (PITCH / 2) ** 5
+    expected = 0.5 * WATER_DENSITY * 1.1 * 6.0 * (PITCH / 2) ** 5
     np.testing.assert_allclose(table.rotational, expected, rtol=0.002)
 
 
@@ -170,7 +171,7 @@ def test_longer_body_is_damped_more_and_docked_faces_do_not_count(modcube: Vehic
     # x faces at distance 2h: 2 h int max(-z) (4 h^2 + z^2); long faces: 2 h int over x of x (h^2 + x^2) up to 2 h.
     ends = 2 * 2 * h * (2 * h**2 * h**2 + h**4 / 4)
     sides = 2 * 2 * h * (2 * h**2 * h**2 + 4 * h**4)
-    assert two[1] == pytest.approx(0.5 * drag_table.WATER_DENSITY * 1.1 * (ends + sides), rel=0.005)
+    assert two[1] == pytest.approx(0.5 * WATER_DENSITY * 1.1 * (ends + sides), rel=0.005)
 
 
 # ---------------------------------------------------------------- other vehicles
@@ -194,7 +195,7 @@ def test_payload_adds_to_the_outline(modcube: Vehicle) -> None:
     table = assemble_vehicle(dataclasses.replace(modcube, payload=(tool,))).drag
     bare = assemble_vehicle(modcube).drag
     side, front = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
-    added = 0.5 * drag_table.WATER_DENSITY * 1.05 * 0.3 * 0.05
+    added = 0.5 * WATER_DENSITY * 1.05 * 0.3 * 0.05
     assert drag_lookup.look_up(table.nodes, side)[0] - drag_lookup.look_up(bare.nodes, side)[0] == pytest.approx(added)
     assert drag_lookup.look_up(table.nodes, front)[0] == pytest.approx(drag_lookup.look_up(bare.nodes, front)[0])
 

@@ -9,6 +9,7 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare.assembly import assemble_vehicle
 
 PERIOD_NS = 10_000_000
@@ -19,7 +20,7 @@ LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 def resting(tick: int, requests: list[Request]) -> Inputs:
     """What a module at rest says, every sensor answering."""
     module = ModuleInputs(answered=True, heard=True, gyro=np.zeros(3), accel=-9.80665 * to_matrix(LEVEL)[2].copy())
-    module.pressure_pa = 101325.0 + 9806.65 * PLACE[2]
+    module.pressure_pa = 101325.0 + WATER_DENSITY * 9.80665 * PLACE[2]
     module.tags = [TagObservation(5, 7, tick * PERIOD_NS, np.add(PLACE, [0.0, 0.0, -0.105]), LEVEL)]
     module.voltage_v, module.current_a = 12.0, 1.0
     module.leak, module.cabin_temperature_c, module.cabin_pressure_pa = False, 30.0, 101325.0

@@ -7,10 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body
+from firmware_py.core.drag_lookup import drag_wrench
 from firmware_py.core.measurements import SECOND_HAND, SECOND_HAND_WEIGHT, Measurements
 from firmware_py.core.rotations import difference, exp, from_euler, multiply, to_matrix
 from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservation
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.lattice import MATRICES
 
@@ -264,9 +266,18 @@ def test_depth_is_that_of_the_centre_of_mass_in_any_attitude(
     modules = silent()
     for module in heard:
         z = (P_WB + R_WB.apply(ORIGINS_B[module]))[2]
-        modules[FLEET_INDEX[module]].pressure_pa = 101_325.0 + 1000.0 * 9.80665 * z
+        modules[FLEET_INDEX[module]].pressure_pa = 101_325.0 + WATER_DENSITY * 9.80665 * z
     depth = measurements.fuse(modules, Q_WB).depth_m
     assert depth == pytest.approx(P_WB[2], abs=1e-9)
+
+
+def test_depth_is_told_by_the_density_that_drags() -> None:
+    cube = load_vehicle("modcube")
+    lone = assemble([(0, 0, 0)], [0], [cube], [0])
+    depth = Measurements(lone).fuse([ModuleInputs(pressure_pa=111_325.0)], Q_WB).depth_m
+    drag = -drag_wrench(lone.drag.nodes, np.zeros(3), np.zeros(6), np.array([1.0, 0, 0, 0, 0, 0]))[0]
+    assert depth is not None
+    assert 10_000.0 / (9.80665 * depth) == pytest.approx(2.0 * drag / (cube.drag.cd_face * 0.21**2), rel=1e-9)
 
 
 def test_nothing_heard_is_nothing_measured(measurements: Measurements) -> None:

@@ -15,6 +15,7 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, EscFeedback, Inputs, Mode, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.paths import at_rest, line
 
@@ -86,7 +87,7 @@ class Tank:
                 r_mb = Rotation.from_quat(body.q_bm[k][[1, 2, 3, 0]]).inv()
                 heard = modules[m]
                 heard.gyro, heard.accel = r_mb.apply(x[10:13]), r_mb.apply(felt)
-                heard.pressure_pa = 101_325.0 + 9806.65 * float((x[:3] + world(x).apply(body.r_bi[k]))[2])
+                heard.pressure_pa = 101_325.0 + WATER_DENSITY * 9.80665 * float((x[:3] + world(x).apply(body.r_bi[k]))[2])
                 heard.voltage_v, heard.current_a, heard.leak, heard.cabin_temperature_c = 12.0, 3.0, False, 30.0
                 if tick % 10 == 0:
                     heard.esc = self._escs(n, k)
