@@ -11,9 +11,10 @@ from pathlib import Path
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.firmware import BusFrame, Firmware, compose
 from firmware_py.app.lockstep import PATIENCE_LOOKS, Lockstep, Observer, drain, send
+from firmware_py.app.realtime import LISTEN_NS, OTHER_SYNC
 from firmware_py.app.vehicle import recording
 from firmware_py.bus.codec import Codec
-from firmware_py.bus.port import Port, open_port
+from firmware_py.bus.port import Port, PortError, open_port
 from firmware_py.core.types import Outputs
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters
@@ -30,6 +31,8 @@ from hil.script import Script
 from hil.signals import TruthRecorder
 
 DEFAULT_BUS = "virtual:modcube"
+LOOK_S = 0.005
+"""Between two looks at a bus that is listened to: SYNC comes at 50 Hz at least."""
 Orders = Script | DockScript | ForceScript | ModeScript
 
 
@@ -60,7 +63,10 @@ class Bench:
     def fly(
         self, observers: Sequence[Observer] = (), progress: Callable[[float], None] | None = None, truth: TruthRecorder | None = None
     ) -> float:
-        """Flies to the end of the script; returns the wall time it took, s."""
+        """Flies to the end of the script; returns the wall time it took, s.
+
+        Raises DescriptionError where somebody else answers as one of the simulated modules.
+        """
         lockstep = Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks)
         plant_ports = [self.plant_port]
         period_ns = self.fleet.period_ns
@@ -77,6 +83,8 @@ class Bench:
             self.is_dead = False
             sent += lockstep.start_tick(tick, time_ns)
             heard = drain(plant_ports, sent, self.patience_looks)
+            if tick <= self.fleet.rate_hz:  # later this one was the first
+                self.nodes.refuse_others([frame for _, frame in heard], self.plant_port.address)
             answers = send(plant_ports, [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
             if truth is not None:
                 truth.record_world(tick, self.nodes.world)
@@ -86,6 +94,18 @@ class Bench:
             if progress is not None and tick % self.fleet.rate_hz == 0:
                 progress(time_ns * 1e-9)
         return time.perf_counter() - began
+
+    def listen(self) -> None:
+        """Before the first SYNC, on a bus that reaches others, as the vehicle's process does: a robot there has a leader already.
+
+        Raises PortError where somebody else sends SYNC.
+        """
+        sync = self.firmware.codec.message("SYNC").id_of(0)
+        began = time.perf_counter()
+        while not self.plant_port.address.startswith("virtual:") and time.perf_counter() - began < 1e-9 * LISTEN_NS:
+            if any(frame.id == sync for frame in self.plant_port.receive()):
+                raise PortError(OTHER_SYNC)
+            time.sleep(LOOK_S)
 
     def _without_firmware(self, observers: Sequence[Observer], sent: Sequence[BusFrame]) -> Lockstep:
         """A tick in which the firmware's process is dead; returns the one that will be started in its place."""
@@ -140,6 +160,7 @@ def fly_scenario(
     """
     with writing_to(out), ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, parameters, bus, rate_hz)
+        bench.listen()
         if before_logs is not None:
             before_logs()
         recorder = Recorder(out, configuration_of(bench.firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz))

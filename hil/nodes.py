@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 from firmware_py.bus.codec import Codec, Frame, Received, Receiver
+from firmware_py.description.schema import DescriptionError
 from hil.plant.camera import Camera
 from hil.plant.draw import Noise, stream
 from hil.plant.sensors import Sensors
@@ -242,12 +243,20 @@ class Nodes:
         self.mcus = {number: Mcu(codec, number, module, world, sensors, tick_ns) for number, module in numbers.items()}
         self.cameras = [TagCamera(codec, cameras, numbers, sensors, world)] if cameras else []
         self.faults: WireFaults = NoFaults()
+        self._statuses = {codec.message("MCU_STATUS").id_of(number): number for number in numbers}
 
     def step(self, frames: Iterable[Frame]) -> list[Frame]:
         """One tick of a world that has this one bus: advance a period, take the frames, return the answers."""
         self.world.advance(self.world.period_ns)
         self.watch()
         return self.answer(frames, self.world.time_ns) + self.faults.intruders(self.world.time_ns)
+
+    def refuse_others(self, frames: Iterable[Frame], address: str) -> None:
+        """Raises DescriptionError where one of the frames that came at `address` is the status of an MCU that is simulated here."""
+        for frame in frames:
+            if (number := self._statuses.get(frame.id)) in self.mcus:
+                who = f"somebody else answers as module {number} on {address}"
+                raise DescriptionError(f"{who}: another plant, or the robot itself; end it, or take another --bus")
 
     def answer(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
         """Takes frames off the wire at `time_ns` and puts the answers on it, through whatever is wrong with the wire."""

@@ -64,7 +64,6 @@ class PlantProcess:
         numbers = {module.number: index for index, module in enumerate(scenario.module)}
         codec = Codec.load()
         self._sync = codec.message("SYNC")
-        self._statuses = {codec.message("MCU_STATUS").id_of(number): number for number in numbers}
         self._guarded_ticks = rate_hz
         self._nodes: Nodes = make_nodes(self._world, codec, numbers, scenario, tick_ns=1_000_000_000 // rate_hz)
         self._nodes.faults = Faults(self._nodes, scenario.fault)
@@ -100,15 +99,9 @@ class PlantProcess:
         is_tick = frame.id == self._sync.id_of(0) and len(frame.data) == self._sync.length
         if self._guarded_ticks > 0:
             self._guarded_ticks -= is_tick
-            self._refuse_other(port, frame)
+            self._nodes.refuse_others([frame], port.address)
         answers = self._nodes.answer([frame], self._world.time_ns)
         for answer in answers + self._nodes.faults.intruders(self._world.time_ns) if is_tick else answers:
             port.send(answer)
         if self._truth is not None and is_tick:
             self._truth.record_world(int(self._sync.decode(frame.data)[0]), self._world)
-
-    def _refuse_other(self, port: Port, frame: Frame) -> None:
-        """Raises DescriptionError where `frame` is the status of an MCU that this plant has itself."""
-        if (number := self._statuses.get(frame.id)) in self._nodes.mcus:
-            who = f"somebody else answers as module {number} on {port.address}"
-            raise DescriptionError(f"{who}: another plant, or the robot itself; end it, or take another --bus")

@@ -17,6 +17,7 @@ from firmware_py.runtime.rate_keeper import RateKeeper, absolute_sleeper
 
 LISTEN_NS = 200_000_000
 """How long a bus is listened to before the first SYNC: a foreign SYNC refuses the start."""
+OTHER_SYNC = "another SYNC producer is on the bus: stop it, or use another bus"
 
 
 @dataclass(slots=True)
@@ -48,7 +49,7 @@ class RealTimeLoop:
         self._take()
         self._received.clear()
         if collector.faults["foreign_sync"]:
-            raise PortError("another SYNC producer is on the bus: stop it, or use another bus")
+            raise PortError(OTHER_SYNC)
         self.firmware.forget_heard()
 
     def run(self, stop: Callable[[int, Outputs], bool], first_tick: int = 1) -> None:

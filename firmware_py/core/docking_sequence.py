@@ -248,7 +248,7 @@ class DockingSequence:
             only = "current alone" if status.current else "position alone" if status.position else "neither condition"
             self.reason = f"jam: {only} after {self.stage.name}"
             if self.tries >= self._p.tries:
-                self.reason += f", {self.tries} tries"
+                self.reason += f", {self.tries} {'try' if self.tries == 1 else 'tries'}"
                 self._enter(Stage.FAILED, time_ns)
                 return
         elif self.stage != Stage.RELEASE:

@@ -198,8 +198,8 @@ class Supervisor:
     def take_over(self, before: Sequence[Supervisor]) -> None:
         """Goes on from the bodies that this one is made of, or was part of: armed when all were, stopped when one was.
 
-        It holds its place, and fail-safes that were on stay on. Where one of these had taken one of them, it goes on in that one's mode,
-        the gravest; else, where one of them was in a mode that needs no place, in the first such mode.
+        Fail-safes that were on stay on. Its mode is that of the body whose fail-safe is the gravest; where none is under one, the first
+        mode of them that needs no place; else it holds its place.
         """
         flown = [other for other in before if not other._testing]  # no test becomes a flight
         states = {State.DISARMED if other._testing else other.state for other in before}
@@ -213,7 +213,7 @@ class Supervisor:
         self._failsafes.take_over([other._failsafes for other in before])
 
     def _estop_age_ms(self, health: Health) -> float:
-        return NEVER_S if self._estop_ns is None else (health.time_ns - self._estop_ns) * 1e-6
+        return 1e3 * NEVER_S if self._estop_ns is None else (health.time_ns - self._estop_ns) * 1e-6
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))

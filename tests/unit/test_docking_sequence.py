@@ -376,7 +376,7 @@ def test_push_of_no_time_is_a_jam_at_once() -> None:
     began = dock.tick
     dock.until(Stage.FAILED)
     assert dock.tick - began <= 1
-    assert dock.sequence.reason == "jam: neither condition after PUSH, 1 tries"
+    assert dock.sequence.reason == "jam: neither condition after PUSH, 1 try"
 
 
 def test_push_goes_no_farther_than_it_may() -> None:

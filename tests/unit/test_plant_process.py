@@ -1,12 +1,16 @@
 """The plant in a process of its own: what is wrong on its bus is as wrong as in lockstep, tick for tick."""
 
 import dataclasses
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from firmware_py.bus.codec import Codec, Frame
+from firmware_py.bus.port import PortError, open_port
+from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
+from hil.bench import open_bench
 from hil.faults import Faults
 from hil.nodes import make_nodes
 from hil.plant.fault_spec import Fault
@@ -72,6 +76,35 @@ def test_plant_refuses_a_bus_on_which_somebody_else_answers_as_its_module() -> N
     words = r"^somebody else answers as module 1 on virtual:sent: another plant, or the robot itself; end it, or take another --bus$"
     with pytest.raises(DescriptionError, match=words):
         plant._answer(port, status_of(1, 99))  # type: ignore[arg-type]
+
+
+class Led(Sent):
+    """A bus that reaches others, and on which somebody sends SYNC."""
+
+    address = "udp:239.74.163.5:43999"
+
+    def receive(self) -> list[Frame]:
+        return [status_of(3, 7), CODEC.message("SYNC").encode(0, (7,))]
+
+
+def test_lockstep_refuses_a_bus_that_somebody_else_leads() -> None:
+    with ExitStack() as stack:
+        bench = open_bench(stack, load_scenario("hover"), 0, Parameters(), "virtual:led")
+        bench.plant_port = Led()  # type: ignore[assignment]
+        with pytest.raises(PortError, match="another SYNC producer"):
+            bench.listen()
+
+
+def test_lockstep_refuses_a_bus_on_which_the_robot_itself_answers() -> None:
+    bus = "virtual:with-robot"
+    with ExitStack() as stack:
+        bench = open_bench(stack, load_scenario("hover"), 0, Parameters(), bus)
+        robot = stack.enter_context(open_port(bus))
+        robot.send(status_of(2, 1))
+        robot.send(status_of(1, 1))
+        with pytest.raises(DescriptionError, match=f"somebody else answers as module 1 on {bus}: another plant, or the robot itself"):
+            bench.fly()
+    assert bench.nodes.world.time_ns == 0, "before anything moves"
 
 
 def test_plant_that_serves_already_is_not_ended_by_another_that_comes() -> None:
