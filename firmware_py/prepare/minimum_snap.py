@@ -14,9 +14,9 @@ import numpy as np
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.prepare.piecewise import CHANNELS, Piecewise
-from firmware_py.prepare.snap_limits import InfeasibleError, Limits, planes, solve_limited, worst
+from firmware_py.prepare.snap_limits import InfeasibleError, Limits, crests, planes, solve_limited, worst
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
-from firmware_py.prepare.snap_thrust import divide, usage
+from firmware_py.prepare.snap_thrust import divide, sag, usage
 
 __all__ = ["InfeasibleError", "Limits", "Waypoint", "distinct", "plan"]
 
@@ -30,7 +30,7 @@ MOST_LEAN = 0.2
 """rad by which a body may lean to leave a moment to buoyancy; a fifth of a force along one axis then goes into another."""
 
 _CHECK_POINTS = 48
-"""Points of each piece at which attitude rates and thrusters are checked."""
+"""Points of each piece at which attitude rates and thrusters are checked; what may lie between them is added."""
 
 _LONGEST_STRETCH = 1024.0
 _STRETCH_TOLERANCE = 2e-3
@@ -241,14 +241,15 @@ class _Request:
             raise InfeasibleError(f"attitude turns too far {where} (length {shortest:.2f}); add a waypoint there")
         rate, change = self.limits.angular_rate, self.limits.angular_acceleration
         for bound, columns, unit in ((rate, slice(10, 13), "rad/s"), (change, slice(16, 19), "rad/s^2")):
-            size = np.linalg.norm(grid[..., columns], axis=-1)
-            if bound is not None and size.max() > bound:
-                where = _place(found, int(np.argmax(size)))
-                raise InfeasibleError(f"turning takes {size.max():.3g} {unit} of at most {bound:g} {unit} {where}")
+            if bound is None:
+                continue
+            largest, at = _largest(np.linalg.norm(grid[..., columns], axis=-1))
+            if largest > bound:
+                raise InfeasibleError(f"turning takes {largest:.3g} {unit} of at most {bound:g} {unit} {_place(found, at)}")
 
     def _check_thrusters(self, found: Piecewise, body: Body) -> None:
         motion = found.grid(_CHECK_POINTS)[..., :19].reshape(-1, 19)
-        self._check_motion(body, motion, lambda k: _place(found, k))
+        self._check_motion(body, motion, lambda k: _place(found, k), _CHECK_POINTS + 1)
 
     def check_standing(self) -> None:
         """Refuse attitudes that the body cannot even hold. Raises InfeasibleError."""
@@ -258,8 +259,11 @@ class _Request:
         still[:, 3:7] = self.attitude.value
         self._check_motion(self.body, still, lambda k: f"to stand still at waypoint {k}")
 
-    def _check_motion(self, body: Body, motion: np.ndarray, place: Callable[[int], str]) -> None:
-        """Refuse (k, 19) motion that takes more than thrusters and buoyancy give; `place` tells in words where row k is."""
+    def _check_motion(self, body: Body, motion: np.ndarray, place: Callable[[int], str], run: int = 1) -> None:
+        """Refuse (k, 19) motion that takes more than thrusters and buoyancy give; `place` tells in words where row k is.
+
+        Each `run` of rows is a smooth motion, which is checked between them too.
+        """
         part = divide(body, motion)
         flat = int(np.argmax(np.abs(part.lacking)))
         k, axis = divmod(flat, 6)
@@ -272,7 +276,7 @@ class _Request:
         if lean > MOST_LEAN:
             degrees = f"{math.degrees(lean):.1f} deg, of at most {math.degrees(MOST_LEAN):.1f} deg"
             raise InfeasibleError(f"the robot would lean by {degrees}, for a moment that its thrusters do not give, {place(k)}")
-        share, k = usage(body, part.thrust, self.limits.thruster_share)
+        share, k = usage(body, part.thrust, self.limits.thruster_share, sag(part.thrust, run))
         if share > self.limits.thruster_share:
             raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, place(k)))
 
@@ -298,6 +302,15 @@ def _velocity(waypoints: Sequence[Waypoint], k: int) -> np.ndarray | None:
 def _thrust_message(share: float, limit: float, where: str) -> str:
     used, allowed = f"{100.0 * share:.0f} %", f"{100.0 * limit:.0f} %"
     return f"the thrusters would be used to {used} of their range, of at most {allowed}, {where}"
+
+
+def _largest(size: np.ndarray) -> tuple[float, int]:
+    """The largest of smooth quantities (pieces, points), crests between the points included, and the flat index of the point next to it."""
+    heights, _ = crests(size)
+    piece, i = divmod(int(np.argmax(heights)), heights.shape[1])
+    if heights[piece, i] > size.max():
+        return float(heights[piece, i]), piece * size.shape[1] + i + 1
+    return float(size.max()), int(np.argmax(size))
 
 
 def _place(found: Piecewise, flat: int) -> str:

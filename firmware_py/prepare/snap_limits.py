@@ -1,7 +1,7 @@
 """Minimum snap under limits: velocity, acceleration and corridor as linear rows, solved with OSQP.
 
-Rows stand at a few points of each piece; where the result breaks a limit in between, rows are added there and it is
-solved again, so that the limits hold everywhere and not at samples alone.
+Rows stand at a few points of each piece; where the result breaks a limit in between, a row is added at the crest and it
+is solved again, so that the limits hold everywhere and not at samples alone.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ _FIRST_POINTS = 8
 """Points of each piece that carry rows from the start."""
 
 _CHECK_POINTS = 48
-"""Points of each piece at which the limits are checked."""
+"""Points of each piece between which the crests of a limited quantity are looked for."""
 
 _MARGIN = 2e-3
-"""Share by which rows are tighter than the limit: covers the solver's tolerance and the gaps of the check."""
+"""Share by which rows are tighter than the limit: covers the solver's tolerance, and how far a crest moves when it is pressed down."""
 
 _ROUNDS = 12
 _SOLVER = {
@@ -131,22 +131,43 @@ class _Table:
             np.array([p.bound for p in limits]),
         )
 
-    def excess(self, coefficients: np.ndarray, durations: np.ndarray) -> np.ndarray:
-        """(m, points) |normal . derivative - centre| over bound along each piece, at the check points."""
-        u = np.linspace(0.0, 1.0, _CHECK_POINTS + 1)
-        rows = np.stack([derivative_rows(u, order) for order in range(3)])
-        values = np.einsum("muj,mjc,mc->mu", rows[self.order], coefficients[self.piece], self.normal)
+    def excess(self, coefficients: np.ndarray, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(m,) largest |normal . derivative - centre| over bound on each piece, and (m,) the share of the piece at which it is."""
+        grid = np.linspace(0.0, 1.0, _CHECK_POINTS + 1)
+        rows = np.stack([derivative_rows(grid, order) for order in range(3)])[self.order]
+        sampled = self._used(rows, coefficients, durations)
+        heights, places = crests(sampled)
+        each = np.arange(len(sampled))
+        u = places[each, heights.argmax(axis=1)] / _CHECK_POINTS
+        rows = np.stack([derivative_rows(u, order) for order in range(3)])[self.order, each]
+        crest, at_points = self._used(rows[:, None], coefficients, durations)[:, 0], sampled.max(axis=1)
+        return np.maximum(crest, at_points), np.where(crest > at_points, u, grid[sampled.argmax(axis=1)])
+
+    def _used(self, rows: np.ndarray, coefficients: np.ndarray, durations: np.ndarray) -> np.ndarray:
+        """(m, p) |normal . derivative - centre| over bound, of rows (m, p, 10) over the coefficients in u."""
+        values = np.einsum("muj,mjc,mc->mu", rows, coefficients[self.piece], self.normal)
         values /= durations[self.piece][:, None] ** self.order[:, None]
         return np.asarray(np.abs(values - self.centre[:, None]) / self.bound[:, None])
+
+
+def crests(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The crests between samples (..., n) of smooth functions: (..., n - 2) heights and places, counted in samples.
+
+    Those of the parabola through a sample and its two neighbours; where it has no crest between these, the sample itself.
+    """
+    before, at, after = values[..., :-2], values[..., 1:-1], values[..., 2:]
+    bend, slope = before - 2.0 * at + after, 0.5 * (after - before)
+    offset = np.divide(-slope, bend, out=np.zeros_like(at), where=np.abs(slope) < -bend)
+    return at + 0.5 * slope * offset, np.arange(1, values.shape[-1] - 1) + offset
 
 
 def worst(limits: list[Plane], coefficients: np.ndarray, durations: np.ndarray) -> tuple[float, str]:
     """How far the worst limit is used (1 is the limit), and a sentence about it; (0, "") without limits."""
     if not limits:
         return 0.0, ""
-    excess = _Table.of(limits).excess(coefficients, durations)
-    k, i = (int(x) for x in np.unravel_index(int(np.argmax(excess)), excess.shape))
-    return float(excess[k, i]), _sentence(limits[k], i / _CHECK_POINTS, durations)
+    excess, where = _Table.of(limits).excess(coefficients, durations)
+    k = int(np.argmax(excess))
+    return float(excess[k]), _sentence(limits[k], float(where[k]), durations)
 
 
 def _sentence(plane: Plane, u: float, durations: np.ndarray) -> str:
@@ -172,24 +193,24 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     table = _Table.of(limits)
     problem = _Problem(system, knots, start)
     index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
-    where = np.tile(np.arange(_FIRST_POINTS) * (_CHECK_POINTS // _FIRST_POINTS), len(limits))
+    where = np.tile(np.arange(_FIRST_POINTS) / _FIRST_POINTS, len(limits))
     for _ in range(_ROUNDS):
         try:
-            unknown, conflict = problem.solve(table, index, where / _CHECK_POINTS)
+            unknown, conflict = problem.solve(table, index, where)
         except osqp.OSQPException as error:
             _, what = worst(limits, system.coefficients(knots.value, start), system.durations)
             raise InfeasibleError(f"no trajectory was found that keeps the {what}: OSQP gave up with error {error}") from None
         if conflict >= 0:
-            what = _sentence(limits[index[conflict]], where[conflict] / _CHECK_POINTS, system.durations)
+            what = _sentence(limits[index[conflict]], float(where[conflict]), system.durations)
             raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s keeps the {what}")
-        excess = table.excess(system.coefficients(knots.value, unknown), system.durations)
-        broken = np.flatnonzero(excess.max(axis=1) > 1.0)
+        excess, crest = table.excess(system.coefficients(knots.value, unknown), system.durations)
+        broken = np.flatnonzero(excess > 1.0)
         if not len(broken):
             return unknown
         index = np.concatenate([index, broken])
-        where = np.concatenate([where, excess[broken].argmax(axis=1)])
-    k, i = (int(x) for x in np.unravel_index(int(np.argmax(excess)), excess.shape))
-    what = _sentence(limits[k], i / _CHECK_POINTS, system.durations)
+        where = np.concatenate([where, crest[broken]])
+    k = int(np.argmax(excess))
+    what = _sentence(limits[k], float(crest[k]), system.durations)
     raise InfeasibleError(f"no trajectory was found in {_ROUNDS} rounds that keeps the {what}")
 
 

@@ -113,31 +113,56 @@ def _matters(part: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(part, axis=1) > _OUTSIDE * np.linalg.norm(wanted, axis=1) + _NOTHING)
 
 
-def usage(body: Body, wanted: np.ndarray, least: float = 0.0) -> tuple[float, int]:
+def sag(wanted: np.ndarray, run: int) -> np.ndarray:
+    """(k, 6) by how much the wrench beside a row sags from the line to the next one: an eighth of the second difference.
+
+    Args:
+        wanted: (k, 6) wrenches.
+        run: so many rows in a row are equally spaced samples of a smooth motion; fewer than three are no motion, and sag by nothing.
+    """
+    if run < 3:
+        return np.zeros_like(wanted)
+    rows = wanted.reshape(-1, run, 6)
+    bend = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
+    return np.concatenate([bend[:, :1], bend, bend[:, -1:]], axis=1).reshape(wanted.shape) / -8.0
+
+
+def usage(body: Body, wanted: np.ndarray, least: float = 0.0, sags: np.ndarray | None = None) -> tuple[float, int]:
     """Largest share of the thrusters' range that any of the wrenches takes, and which one it is.
 
     The share of one wrench w is the least s for which forces f with J f = w and s f_min <= f <= s f_max exist. The
     pseudo-inverse bounds it from above; where that exceeds what any lower bound allows, a linear program finds it. The share
     of a wrench outside the thrusters' span is infinite.
 
+    The share is a gauge, convex and in proportion to the wrench, so that of a sum is at most the sum of the shares: between two rows it
+    is at most the larger of theirs, and the share of what the wrench sags from the line between them.
+
     Args:
         body: its thrusters.
         wanted: (k, 6) wrenches.
         least: a largest share below this need not be found; what is returned is then below it too.
+        sags: (k, 6) of `sag`; its shares are added.
     """
     thrusters = body.thrusters
     forces = wanted @ thrusters.pinv.T
-    above = np.maximum(forces / thrusters.f_max, forces / thrusters.f_min).max(axis=1)
+    above = _share(body, forces)
     above[_matters(wanted - forces @ thrusters.matrix.T, wanted)] = np.inf
+    between = np.zeros(len(wanted)) if sags is None else _share(body, sags @ thrusters.pinv.T)
+    above += between
     order = np.argsort(-above, kind="stable")[:_MOST_PROGRAMS]
     best, where = 0.0, int(order[0])
     for k in order:
         if above[k] <= max(best, least):
             break
-        share = least_usage(body, wanted[k])
+        share = least_usage(body, wanted[k]) + float(between[k])
         if share > best:
             best, where = share, int(k)
     return best, where
+
+
+def _share(body: Body, forces: np.ndarray) -> np.ndarray:
+    """(k,) largest share of its range that any thruster gives of forces (k, n), N."""
+    return np.asarray(np.maximum(forces / body.thrusters.f_max, forces / body.thrusters.f_min).max(axis=1))
 
 
 def least_usage(body: Body, wrench: np.ndarray) -> float:

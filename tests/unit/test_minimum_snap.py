@@ -383,19 +383,25 @@ def test_turning_alone_bounds_the_time_of_a_path_that_moves_too() -> None:
     assert np.linalg.norm(grid[..., 10:13], axis=-1).max() == pytest.approx(0.5, rel=0.01)
 
 
+def test_acceleration_keeps_its_limit_between_the_points_where_it_is_checked() -> None:
+    waypoints, limits = [Waypoint(p) for p in walk(5, seed=2)], Limits(acceleration=np.full(3, 0.05), corridor_m=0.2)
+    largest = np.abs(plan(waypoints, None, limits).grid(1000)[..., 13:16]).max()
+    assert 0.99 * 0.05 < largest <= 0.05
+
+
 @pytest.mark.parametrize(
     ("limits", "columns", "bound"),
     [(Limits(angular_rate=0.6), slice(10, 13), 0.6), (Limits(angular_acceleration=0.5), slice(16, 19), 0.5)],
 )
 def test_turning_keeps_its_limit_between_the_points_where_it_is_checked(limits: Limits, columns: slice, bound: float) -> None:
     largest = [np.linalg.norm(plan(poses(3, seed), None, limits).grid(1000)[..., columns], axis=-1).max() for seed in range(12)]
-    assert 0.99 * bound < max(largest) < 1.004 * bound
+    assert 0.99 * bound < max(largest) <= bound
 
 
 @pytest.mark.slow
 def test_thrusters_keep_their_share_between_the_points_where_it_is_checked(one: Body) -> None:
     grids = [plan(poses(3, seed), None, body=one).grid(400)[..., :19].reshape(-1, 19) for seed in range(6)]
-    assert max(usage(one, wrenches(one, grid))[0] for grid in grids) < 1.004 * Limits().thruster_share
+    assert 0.99 * Limits().thruster_share < max(usage(one, wrenches(one, grid))[0] for grid in grids) <= Limits().thruster_share
 
 
 @pytest.mark.parametrize("k", [0, 1, 2])
