@@ -32,8 +32,9 @@ from hil.checks import Result
 from hil.docking_metrics import OUTCOMES
 from hil.flight import fly_and_judge
 from hil.plant.world_parameters import world_parameters
+from hil.replaceable import check_replaceable, is_json_with
 from hil.scenario import Scenario
-from hil.trial_file import TrialFile
+from hil.trial_file import OWNER, TrialFile
 from hil.workers import Pool, deaths
 
 SUMMARY_FILE, TABLE_FILE, TRIALS_FILE = "campaign.json", "trials.csv", "trials.jsonl"
@@ -104,10 +105,11 @@ def run_campaign(
 ) -> dict[str, Any]:
     """Flies every seed that `out` does not hold yet; writes campaign.json and trials.csv there; returns what the first holds.
 
-    Raises DescriptionError where `out` holds another campaign, which `anew` throws away, and for seeds that kill their workers; OSError
-    where the disk takes no more.
+    Raises DescriptionError where `out` holds another campaign, which `anew` throws away, or files that are no campaign's, and for seeds
+    that kill their workers; OSError where the disk takes no more.
     """
     out.mkdir(parents=True, exist_ok=True)
+    check_replaceable(out, (SUMMARY_FILE, TABLE_FILE), is_json_with(out / TRIALS_FILE, OWNER), "campaign")
     with writing_to(out):
         with TrialFile(out / TRIALS_FILE, identity(scenario, parameters), anew=anew) as file:
             missing = [seed for seed in seeds if seed not in file.trials]

@@ -73,7 +73,7 @@ def run(
     scenario: ScenarioName,
     seed: Annotated[int, typer.Option(min=0, help="of the world's every draw")] = 0,
     bus: Annotated[str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")] = DEFAULT_BUS,
-    out: Annotated[Path | None, typer.Option(help="folder for logs, plots and report; those of an earlier flight go")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for logs, plots and report; only an earlier flight is replaced")] = None,
     controller: Controller = "modcube",
     vehicle: Vehicle = "",
     sensors: Sensors = "real",

@@ -22,6 +22,7 @@ from firmware_py.description.vehicle import load_vehicle
 from hil.bench import fly_scenario
 from hil.fault_table import AT_S, NUMBER, PLACED, ROWS, Row
 from hil.metrics import rotation_vectors
+from hil.replaceable import check_replaceable, is_json_with
 from hil.scenario import MODES, Scenario, load_scenario
 from hil.signals import Flight, read_flight
 
@@ -127,8 +128,12 @@ def _blames(told: Sequence[tuple[str, float]]) -> bool:
 def run_fault_campaign(
     jobs: int, out: Path, seed: int = 0, executor: Executor | None = None, progress: Callable[[int, int], None] | None = None
 ) -> list[Cell]:
-    """Flies every cell and writes faults.json into `out`; returns the cells, row by row. `executor` replaces the processes."""
+    """Flies every cell and writes faults.json into `out`; returns the cells, row by row. `executor` replaces the processes.
+
+    Raises DescriptionError where `out` holds a faults.json that is none.
+    """
     out.mkdir(parents=True, exist_ok=True)
+    check_replaceable(out, (RESULT_FILE,), is_json_with(out / RESULT_FILE, "promise"), "campaign of faults")
     cells: list[Cell] = []
     with executor or ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(fly_cell, row, mode, seed) for row in ROWS for mode in MODES]

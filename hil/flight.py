@@ -18,6 +18,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import read_signals
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.runtime.recorder import CAN_LOG
 from hil.bench import DEFAULT_BUS, SCRIPTS, fleet_of, fly_scenario
 from hil.checks import RESULT_FILE, Limit, Result, judge, write_result
 from hil.dock_plot import DOCK_PLOT, write_dock_plot
@@ -27,10 +28,11 @@ from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics, told
 from hil.plant.spec import Tank
 from hil.plots import PLOTS, Window, write_plots
 from hil.realtime import fly_in_real_time
+from hil.replaceable import check_replaceable, is_json_with
 from hil.report import REPORT_FILE, Scene, write_report
 from hil.scenario import Scenario
 from hil.script import Script
-from hil.signals import SIGNAL_LOG, Flight, period_of, read_flight
+from hil.signals import SIGNAL_LOG, TRUTH_LOG, Flight, is_truth_log, period_of, read_flight
 
 LEFT_BEHIND = (RESULT_FILE, REPORT_FILE, DOCK_PLOT, *(f"{name}.png" for name in PLOTS))
 """What an earlier flight may have left in a folder, beside the logs, which are written anew."""
@@ -55,9 +57,10 @@ def fly_and_judge(
 ) -> Result:
     """Flies `scenario`; the logs and result.json are in `out` afterwards, and nothing of an earlier flight is.
 
-    Raises DescriptionError and PortError; what an earlier flight left is then as it was.
+    Raises DescriptionError and PortError; what an earlier flight left, or anybody else, is then as it was.
     """
     out.mkdir(parents=True, exist_ok=True)
+    check_folder(out)
     scenario = scenario.for_seed(seed)
     flight = (scenario, seed, parameters, out, bus, rate_hz, progress)
     with _alone_in(out):
@@ -69,6 +72,12 @@ def fly_and_judge(
         result = result._replace(unusual=tuple(unusual))
         write_result(result, out)
     return result
+
+
+def check_folder(folder: Path) -> None:
+    """Raises DescriptionError where a flight into `folder` would write over what no flight left there."""
+    is_flight = is_truth_log(folder / TRUTH_LOG) or is_json_with(folder / RESULT_FILE, "checks")
+    check_replaceable(folder, (CAN_LOG, SIGNAL_LOG, TRUTH_LOG, *LEFT_BEHIND), is_flight, "flight of the bench")
 
 
 def _clear(folder: Path) -> None:

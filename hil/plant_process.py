@@ -16,8 +16,9 @@ from firmware_py.bus.port import Port, open_port
 from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults
 from hil.nodes import Nodes, make_nodes
+from hil.replaceable import check_replaceable
 from hil.scenario import Scenario, make_world
-from hil.signals import TruthRecorder
+from hil.signals import TRUTH_LOG, TruthRecorder, is_truth_log
 
 CHUNK_NS = 2_500_000
 """The world moves in steps of this; what an MCU samples is at most so old."""
@@ -44,6 +45,7 @@ def serve_until_signal(scenario: Scenario, seed: int, bus: str, rate_hz: int, ou
         signal.signal(number, lambda *_: stop.set())
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
+        check_replaceable(out, (TRUTH_LOG,), is_truth_log(out / TRUTH_LOG), "plant")
     plant = PlantProcess(scenario, seed, rate_hz, out)
     now_ns = started_clock()
     with open_port(bus, reader=True, now_ns=now_ns, arrival=threading.Event()) as port:

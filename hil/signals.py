@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from scipy.spatial.transform import Rotation
 
 from firmware_py.description.signals import Columns, Layout, Signal, read_signals
@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from hil.plant.world import World
 
 TRUTH_LOG = "truth.mcap"
+WRITER = "modcube"
+"""Who wrote it, in the header of the truth's log."""
+HEADER_BYTES = 64
+"""More than magic and header take."""
 SIGNAL_LOG = "signals.mcap"
 REGULAR_TICKS = 50
 """Ticks at the start of a log that its period is read from."""
@@ -71,6 +75,16 @@ def dock_signals(modules: int) -> tuple[Signal, ...]:
     )
 
 
+def is_truth_log(path: Path) -> bool:
+    """Whether a TruthRecorder wrote `path`: by its header, so a torn one too."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(HEADER_BYTES)
+    except OSError:
+        return False
+    return begin.startswith(MCAP0_MAGIC) and WRITER.encode() in begin
+
+
 class TruthRecorder:
     """Writes /plant/moduleN and /plant/bodyN (N: its leader), a message per tick and module or body. A context
     manager. Raises OSError when the disk is full.
@@ -80,7 +94,8 @@ class TruthRecorder:
         """`thrusters` has the number of thrusters of each module of the fleet, in its order."""
         self._file = (folder / TRUTH_LOG).open("wb")
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
-        self._writer.start(profile="", library="modcube")
+        self._writer.start(profile="", library=WRITER)
+        self._file.flush()  # whatever comes, the folder is known as a flight's
         self._sequence = 0
         self._modules = []
         for module, count in enumerate(thrusters):

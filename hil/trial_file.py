@@ -12,6 +12,11 @@ from types import TracebackType
 from firmware_py.description.schema import DescriptionError
 from hil.campaign_summary import Trial
 
+OWNER = "campaign"
+"""Key of the first line, which says whose trials these are."""
+_HEAD = json.dumps({OWNER: ""}).encode()[:-2]
+"""How the first line begins, as far as it was written."""
+
 
 class TrialFile:
     """trials.jsonl: who it belongs to, then a line for each trial, with the disk before the next one is waited for."""
@@ -27,7 +32,7 @@ class TrialFile:
             who: in what another owner may differ, for people.
 
         Raises:
-            DescriptionError: `path` is being written, or holds trials of another owner.
+            DescriptionError: `path` is being written, holds trials of another owner, or none at all but something else.
             OSError: it cannot be written.
         """
         self.trials: dict[int, Trial] = {}
@@ -35,10 +40,10 @@ class TrialFile:
         with ExitStack() as refused:
             self._file = refused.enter_context(path.open("a+b"))
             self._claim(path)
-            stands = self._read(path, {"campaign": owner}, "" if anew else who)
+            stands = self._read(path, {OWNER: owner}, "" if anew else who)
             self._file.truncate(stands)
             if not stands:
-                self._write({"campaign": owner})
+                self._write({OWNER: owner})
             refused.pop_all()
 
     def _claim(self, path: Path) -> None:
@@ -55,6 +60,8 @@ class TrialFile:
         if not lines or _entry(lines[0]) != head:
             if lines[1:] and who:
                 raise DescriptionError(f"{path} holds trials of another {who}; give another --out or delete it")
+            if lines and not (lines[0].startswith(_HEAD) or _HEAD.startswith(lines[0])):
+                raise DescriptionError(f"{path} holds no trials; move what is yours or give another --out")
             return 0
         stands = len(lines[0])
         for line in lines[1:]:

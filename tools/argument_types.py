@@ -13,6 +13,7 @@ import typer
 from typer.exceptions import TyperException
 
 from firmware_py.description.schema import DescriptionError
+from hil.replaceable import check_replaceable, is_json_with
 
 
 def whole(least: int) -> Callable[[str], int]:
@@ -52,6 +53,11 @@ def run_command(app: typer.Typer, name: str) -> None:
 def make_folder(out: Path) -> None:
     """Makes the folder of a tool's results and tries that it takes a file, before the minutes of the work. Raises DescriptionError."""
     _try_folder(out, out)
+
+
+def check_results(out: Path, key: str, *results: str) -> None:
+    """Raises DescriptionError where files of these names are in `out` that no earlier run left; of one the first is JSON with `key`."""
+    check_replaceable(out, results, is_json_with(out / results[0], key), "earlier run")
 
 
 def make_room(out: Path) -> None:

@@ -21,7 +21,7 @@ from typing import Any
 import characterise_blas  # noqa: F401
 import characterise_table as table
 import numpy as np
-from argument_types import make_folder, positive, whole
+from argument_types import check_results, make_folder, positive, whole
 from command_line import Parser, run_tool, worker_pool
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -34,6 +34,7 @@ from firmware_py.prepare.capability.layout import AXES, UNITS, Layout, of_module
 from firmware_py.prepare.capability.summary import DIRECTIONS, Capability, characterise
 
 DATA = Path(__file__).with_name("data")
+ENDINGS = ("json", "csv", "png", "html")
 MODULE_PRICE_USD = 800.0
 """The paper's price of one module."""
 WIDTH = 170
@@ -86,6 +87,9 @@ def run(given: argparse.Namespace) -> None:
     """Does what is asked for. Raises DescriptionError."""
     if given.out:
         make_folder(given.out)
+        stem = "choice" if given.choose is not None else "table1" if given.table1 else "capability"
+        key = "rank_by" if given.choose is not None else "vehicles"
+        check_results(given.out, key, *(f"{stem}.{ending}" for ending in ENDINGS))
     settings = {"count": given.directions, "sizes": {"force": given.force, "torque": given.torque}}
     if given.choose is not None:
         from characterise_choose import choose
@@ -236,7 +240,7 @@ def _write(
         write_report(out / f"{stem}.html", shown, titles, html)
     except OSError as error:
         raise DescriptionError(f"{error.filename}: cannot be written: {error.strerror}") from None
-    for ending in ("csv", "json", "png", "html"):
+    for ending in ENDINGS:
         print(out / f"{stem}.{ending}")
 
 

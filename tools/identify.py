@@ -20,7 +20,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from argument_types import make_folder
+from argument_types import check_results, make_folder
 from command_line import Parser, in_words, run_tool
 from identify_excitation import MOTIONS, SPACE_M, check_space, excitation
 from identify_fit import Reference, fit
@@ -134,6 +134,7 @@ def identify(given: argparse.Namespace) -> int:
     curve = read_curve(given.curve) if given.curve else vehicle.curve
     reference = reference_of(recordings[0], given.thruster, given.accuracy) if given.curve else None
     make_folder(given.out)
+    check_results(given.out, "has_reference", "identified.json", "vehicle.toml", "excite.toml")
     flights = [Equations(recording, smooth(recording), curve, weight) for recording in recordings]
     if weight is not None:
         check_hung(weight, flights[0])

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from argument_types import make_folder, positive, whole
+from argument_types import check_results, make_folder, positive, whole
 from command_line import Parser, in_words, run_tool, worker_pool
 from fit_thruster import fit_curve
 from identify_excitation import MOTIONS, excitation
@@ -29,6 +29,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 from hil.bench import fly_scenario
+from hil.flight import check_folder
 from hil.plant.draw import ModuleDraw, draw_module
 from hil.scenario import load_scenario
 
@@ -65,6 +66,7 @@ def examine(seed: int, folder: Path, duration_s: float = 170.0) -> dict[str, obj
     """
     out = folder / str(seed)
     out.mkdir(parents=True, exist_ok=True)
+    check_folder(out)
     file = out / "shake.toml"
     file.write_text(excitation(list(MOTIONS), "modcube", duration_s=duration_s), encoding="utf-8")
     scenario = load_scenario(str(file))
@@ -119,6 +121,7 @@ def main() -> int:
     given = parser.parse_args()
     try:
         make_folder(given.out)
+        check_results(given.out, "covers", "plants.json")
         found = examine_all(range(given.seed, given.seed + given.plants), given.jobs, given.out, given.seconds)
     except (DescriptionError, OSError) as error:
         print(f"identify_plants: {in_words(error)}", file=sys.stderr)

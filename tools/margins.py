@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from argument_types import make_folder, whole
+from argument_types import check_results, make_folder, whole
 from command_line import Parser, in_words, run_tool, worker_pool
 from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure
 from rich import box
@@ -155,6 +155,7 @@ def main() -> int:
         check_bodies(given.modules, given.vehicle)
         chosen = CONTROLLERS.get(given.controller) or load_parameters(Path(given.controller))
         make_folder(given.out)
+        check_results(given.out, "crossover_rad_s", "margins.json", "margins.png")
         found = measured(given.modules, chosen, given.vehicle, given.jobs)
     except (DescriptionError, OSError) as error:
         print(f"margins: {in_words(error)}", file=sys.stderr)

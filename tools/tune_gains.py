@@ -21,7 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from argument_types import make_folder, positive, whole
+from argument_types import check_results, make_folder, positive, whole
 from command_line import INTERRUPTED, Parser, in_words, run_tool
 from tune_objective import Objective, detuned, load_objective, with_values
 
@@ -138,6 +138,7 @@ def main() -> int:
             from tune_live import tune_live
 
             return tune_live(objective, given.live, given.trials, given.seconds, given.out)
+        check_results(given.out, "search_seed", "tuning.json", "parameters.toml", "steps.png", "bode.png", "search.png")
         tune(objective, start, given, dask_cluster(given.dask) if given.dask else processes(given.jobs))
     except (DescriptionError, OSError) as error:
         print(f"tune_gains: {in_words(error)}", file=sys.stderr)

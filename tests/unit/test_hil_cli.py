@@ -1,5 +1,6 @@
 """The bench's command line: what does not apply is refused in one line, and nothing flies."""
 
+import json
 from importlib import resources
 from pathlib import Path
 
@@ -10,9 +11,11 @@ import hil.fault_campaign
 import hil.plant_process
 from firmware_py.__main__ import INTERRUPTED
 from firmware_py.cli import main
+from firmware_py.description.schema import DescriptionError
 from hil.fault_campaign import Cell
-from hil.flight import LEFT_BEHIND
+from hil.flight import LEFT_BEHIND, check_folder
 from hil.scenario import load_scenario
+from hil.signals import TruthRecorder
 
 OFF = [["--trials", "20"], ["--controller", "modcube"], ["--vehicle", "modcube_sim"], ["--sensors", "real"], ["--dask", "tcp://a:1"]]
 
@@ -163,9 +166,55 @@ def test_refused_flight_leaves_the_one_before_as_it_was(
     Path("no_mesh.toml").write_text(vehicle.read_text(encoding="utf-8").replace("[hull]", '[hull]\nmesh = "none.stl"'), encoding="utf-8")
     files = [Path("run") / name for name in (*LEFT_BEHIND, "can.log", "signals.mcap", "truth.mcap")]
     Path("run").mkdir()
+    before = json.dumps({"checks": [], "of": "the flight before"})
     for file in files:
-        file.write_text("the flight before")
+        file.write_text(before)
     assert status_of(["run", "own.toml", "--out", "run", *realtime, *options], monkeypatch) == 2
     line = capsys.readouterr().err
     assert why in line and line.count("\n") == 1
-    assert {file.read_text() for file in files} == {"the flight before"}
+    assert {file.read_text() for file in files} == {before}
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "run"),
+    [
+        (["run", "hover"], "can.log", "flight of the bench"),
+        (["run", "hover"], "overview.png", "flight of the bench"),
+        (["run", "hover"], "result.json", "flight of the bench"),
+        (["run", "hover"], "truth.mcap", "flight of the bench"),
+        (["campaign", "hover"], "trials.csv", "campaign"),
+        (["campaign", "faults"], "faults.json", "campaign of faults"),
+        (["plant", "hover", "--bus", "udp:239.74.163.9:43119"], "truth.mcap", "plant"),
+    ],
+)
+def test_files_that_no_run_left_are_not_written_over(
+    command: list[str], name: str, run: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text('{"mine": true}')
+    assert status_of([*command, "--out", str(tmp_path)], monkeypatch) == 2
+    line = capsys.readouterr().err
+    assert f"{tmp_path} holds {name}, which no {run} left there; move what is yours or give another --out" in line
+    assert line.count("\n") == 1
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, '{"mine": true}')]
+
+
+def test_trials_that_are_none_are_not_written_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "trials.jsonl").write_text("mine\n")
+    assert status_of(["campaign", "hover", "--out", str(tmp_path)], monkeypatch) == 2
+    assert f"{tmp_path / 'trials.jsonl'} holds no trials; move what is yours or give another --out" in capsys.readouterr().err
+    assert (tmp_path / "trials.jsonl").read_text() == "mine\n"
+
+
+def test_flight_replaces_an_earlier_one_even_if_that_was_killed(tmp_path: Path) -> None:
+    killed, judged = tmp_path / "killed", tmp_path / "judged"
+    for folder in (killed, judged):
+        folder.mkdir()
+        (folder / "can.log").write_text("the flight before")
+    with pytest.raises(DescriptionError):
+        check_folder(killed)
+    (judged / "result.json").write_text('{"checks": []}')
+    check_folder(judged)
+    with TruthRecorder(killed, (8,)):  # and not a tick of it
+        check_folder(killed)

@@ -159,6 +159,26 @@ def test_folder_that_takes_no_file_is_refused_before_the_work_begins(
     assert line.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("tool", "arguments", "name"),
+    [
+        ("margins", [], "margins.png"),
+        ("identify_plants", [], "plants.json"),
+        ("characterise", ["modcube"], "capability.csv"),
+        ("tune_gains", [str(TOOLS / "objectives" / "hover.toml")], "parameters.toml"),
+    ],
+)
+def test_files_that_no_earlier_run_left_are_not_written_over(
+    run: Run, tool: str, arguments: list[str], name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("mine")
+    assert run(tool, *arguments, "--out", str(tmp_path)) == 2
+    line = capsys.readouterr().err
+    assert f"{tmp_path} holds {name}, which no earlier run left there; move what is yours or give another --out" in line
+    assert line.count("\n") == 1
+    assert (tmp_path / name).read_text() == "mine"
+
+
 def test_tables_of_the_readme_need_the_project_s_root(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("readme_tables") == 2
     assert capsys.readouterr().err == f"readme: no README.md in {tmp_path}; run this in the root of the project\n"
