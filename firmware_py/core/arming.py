@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+from firmware_py.core.alignment import SAME_S
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.transitions import MODES, Need
@@ -141,14 +142,19 @@ def against_arming(question: Question, forced: bool) -> list[str]:
     return [reason for reason in dict.fromkeys(reasons) if reason]
 
 
+def _seldom(health: Health) -> str:
+    """In words that tags do come, too far apart to tell a place that is not known."""
+    return f": tags come {health.tag_gap_s:.2f} s apart, {SAME_S:.2f} s permitted to tell a place" if health.tag_gap_s > SAME_S else ""
+
+
 def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:
     """What `mode` needs and does not have, in words."""
     limits, needs = parameters.failsafes, MODES[mode].needs
     reasons = []
     if (Need.ATTITUDE in needs and not health.ready) or (Need.POSITION in needs and not health.placed):
-        reasons.append("no pose yet")
+        reasons.append(f"no pose yet{_seldom(health)}")
     elif Need.POSITION in needs and health.tag_age_s > limits.tag_lost_limit:
-        reasons.append(f"no tag for {health.tag_age_s:.1f} s")
+        reasons.append(f"no tag for {health.tag_age_s:.1f} s{_seldom(health)}")
     depth_age_s = min(health.depth_age_s if health.depth_heard else NEVER_S, health.tag_age_s)
     if Need.DEPTH in needs and depth_age_s > limits.depth_unknown_limit:
         reasons.append("depth unknown")

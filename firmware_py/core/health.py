@@ -87,6 +87,8 @@ class Health(NamedTuple):
     """Every stage has run at least once."""
     topology: str
     """Which docked partner is lost, in words; empty: none."""
+    tag_gap_s: float = math.nan
+    """Between the last two pictures of tags, believed or not; NaN while none come."""
 
     @property
     def placed(self) -> bool:
@@ -121,6 +123,7 @@ class HealthMonitor:
         self._stick = 0.0
         self._nis_ratio, self._rejected_share = 1.0, 0.0
         self._rejected, self._tag_ns = 0, NEVER_NS
+        self._pictures_ns = (NEVER_NS, NEVER_NS)
         self._errors, self._error_rate = 0, 0.0
         self._time_ns: int | None = None
         self._missed_rate = 0.0
@@ -202,6 +205,7 @@ class HealthMonitor:
             lost_axes=faults.lost_axes,
             warm=self.warm,
             topology=self.topology,
+            tag_gap_s=self._tag_gap_s(now),
         )
         return self.now
 
@@ -211,6 +215,9 @@ class HealthMonitor:
                 self._heard_ns[index] = self._answered_ns[index] = now
             elif module.heard:
                 self._heard_ns[index] = now
+            for tag in module.tags:
+                if tag.capture_ns > self._pictures_ns[1]:
+                    self._pictures_ns = self._pictures_ns[1], tag.capture_ns
             if module.mcu_state is not None:
                 self._stopped[index] = module.mcu_state == MCU_ESTOP
             if module.pressure_pa is not None:
@@ -230,6 +237,12 @@ class HealthMonitor:
                 self._cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
             if module.esc:
                 self._hear_escs(self._thruster_at[index], module.esc, now)
+
+    def _tag_gap_s(self, now: int) -> float:
+        """Told as long as another picture is not overdue."""
+        before_ns, last_ns = self._pictures_ns
+        gap_ns = last_ns - before_ns
+        return gap_ns * 1e-9 if before_ns != NEVER_NS and now - last_ns <= 2 * gap_ns else math.nan
 
     def _hear_escs(self, thruster_at: dict[int, int], escs: list[EscFeedback], now: int) -> None:
         for esc in escs:

@@ -165,6 +165,14 @@ def test_robot_that_never_had_a_pose_hears_that_once() -> None:
     assert reasons(BLIND) == ["no pose yet"]
 
 
+@pytest.mark.parametrize(
+    ("health", "why"), [(BLIND, "no pose yet"), (UPRIGHT, "no pose yet"), (GOOD._replace(tag_age_s=30.0), "no tag for 30.0 s")]
+)
+def test_robot_whose_tags_come_too_seldom_to_tell_its_place_says_so(health: Health, why: str) -> None:
+    assert missing(Mode.POSHOLD, health._replace(tag_gap_s=1.5), P) == [f"{why}: tags come 1.50 s apart, 1.00 s permitted to tell a place"]
+    assert missing(Mode.POSHOLD, health._replace(tag_gap_s=1.0), P) == [why]
+
+
 # ---------------------------------------------------------------- what each mode needs
 
 

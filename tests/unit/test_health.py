@@ -10,7 +10,7 @@ from firmware_py.core.faults import ThrusterFaults
 from firmware_py.core.health import NEVER_S, Health, HealthMonitor, is_sticks, outside
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
-from firmware_py.core.types import Action, BodyPose, EscFeedback, Estimate, Inputs, Measured, ModuleInputs, Request, Sticks
+from firmware_py.core.types import Action, BodyPose, EscFeedback, Estimate, Inputs, Measured, ModuleInputs, Request, Sticks, TagObservation
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
@@ -71,6 +71,21 @@ def test_module_that_only_talks_has_not_answered() -> None:
     for _ in range(30):
         health = ear.hear(here(), ModuleInputs(heard=True))
     assert health.silent == (3,) and health.silent_s == 0.0
+
+
+def test_gap_between_pictures_is_told_while_they_come() -> None:
+    ear = Ear()
+
+    def see(capture_ns: int) -> float:
+        seen = [TagObservation(face, 7, capture_ns, ZERO, np.array([1.0, 0, 0, 0])) for face in (0, 5)]
+        return ear.hear(here(tags=seen), here(tags=seen)).tag_gap_s
+
+    assert math.isnan(ear.hear(here(), here()).tag_gap_s) and math.isnan(see(0))
+    ear.wait(1.5)
+    assert see(1_500_000_000) == 1.5
+    assert ear.wait(2.9).tag_gap_s == 1.5
+    assert math.isnan(ear.wait(0.2).tag_gap_s)
+    assert see(4_600_000_000) == pytest.approx(3.1)
 
 
 def test_robot_that_just_started_is_not_long_silent() -> None:
