@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from firmware_py.core.body import Body
+from firmware_py.core.estimator import ADRIFT_NS
 from firmware_py.core.transitions import ARMED, State
-from firmware_py.core.types import BodyRecord, Event, Inputs, Mode, ModuleInputs, Outputs
+from firmware_py.core.types import BodyRecord, Estimate, Event, Inputs, Mode, ModuleInputs, Outputs
 from firmware_py.description.parameters import Supervision
 from firmware_py.ground.times import Times
 
@@ -77,6 +78,8 @@ class Picture:
         self._supervision = supervision
         self.modules = [ModulePicture() for _ in range(modules)]
         self.records: dict[int, BodyRecord] = {}
+        self.restarts: dict[int, int] = {}
+        """How often each body's estimate has begun anew since its first pose: what is told of it has jumped."""
         self.bodies: dict[int, Body] = {}
         self.time_ns = 0
         self.ticks = 0
@@ -96,9 +99,19 @@ class Picture:
         for module, fresh, command in zip(self.modules, inputs.modules, outputs.modules, strict=True):
             module.take(fresh, outputs.time_ns)
             module.command = command.thrusters
+        members = {body.index: body.modules for body in bodies}
+        for record in outputs.records:
+            self._count_restart(record, members.get(record.body, (record.body,)))
         self.records = {record.body: record for record in outputs.records}
         self.bodies = {body.index: body for body in bodies}
         self.events += outputs.events
+
+    def _count_restart(self, record: BodyRecord, members: tuple[int, ...]) -> None:
+        """Where the estimate begins anew in this tick; also when the body is another one, by a joint more or less."""
+        last = self.records.get(record.body)
+        goes_on = last is not None and members == self.members(record.body) and _goes_on(last.estimate, record.estimate)
+        if record.estimate.ready and not goes_on:
+            self.restarts[record.body] = self.restarts.get(record.body, -1) + 1
 
     def members(self, body: int) -> tuple[int, ...]:
         """Fleet indices of a body's modules."""
@@ -146,3 +159,8 @@ class Picture:
         """Whether ARM would be granted."""
         record = self.records.get(body)
         return record is not None and record.may_arm and not self.estop
+
+
+def _goes_on(before: Estimate, now: Estimate) -> bool:
+    """Whether an estimate that is ready follows from that of the tick before. One that was adrift is put where the first tags say."""
+    return before.ready and not before.tag_age_ns > ADRIFT_NS >= now.tag_age_ns

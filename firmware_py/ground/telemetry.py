@@ -181,7 +181,7 @@ def odometry(s: Subject) -> list[Values]:
         "time_usec": s.time_us, "frame_id": _FRAME_LOCAL_NED, "child_frame_id": _FRAME_BODY_FRD,
         "x": e.p_wb[0], "y": e.p_wb[1], "z": e.p_wb[2], "q": e.q_wb.tolist(), "vx": v[0], "vy": v[1], "vz": v[2],
         "rollspeed": w[0], "pitchspeed": w[1], "yawspeed": w[2], "pose_covariance": pose,
-        "velocity_covariance": velocity, "reset_counter": 0, "estimator_type": 2, "quality": quality,
+        "velocity_covariance": velocity, "reset_counter": s.picture.restarts.get(s.body, 0) & 0xFF, "estimator_type": 2, "quality": quality,
     }]  # fmt: skip
 
 

@@ -51,7 +51,7 @@ class Robot:
         self.p_wb = [np.array([0.1 * n, 0.2, 0.5]) for n in range(modules)]
         self.q_wb = [from_euler(0.1, -0.2, 0.3) for _ in range(modules)]
         self.nu = np.array([0.05, 0.0, -0.02, 0.01, 0.02, 0.03])
-        self.tag_age_ns, self.may_arm = 30_000_000, True
+        self.tag_age_ns, self.ready, self.may_arm = 30_000_000, True, True
         self.refuse: dict[Action, str] = {}
         """Reason for each action that is refused."""
         self.asked: list[Request] = []
@@ -107,7 +107,7 @@ class Robot:
     def _record(self, body: int) -> BodyRecord:
         estimate = Estimate(
             self.p_wb[body], self.q_wb[body], self.nu, ZERO, ZERO, np.full(3, 0.002), np.full(3, 0.004),
-            self.tag_age_ns, float("nan"), 0, 0, True,
+            self.tag_age_ns, float("nan"), 0, 0, self.ready,
         )  # fmt: skip
         setpoint = Setpoint(self.p_wb[body], self.q_wb[body], ZERO, ZERO, ZERO, ZERO)
         thrust = Thrust(np.zeros(8), np.zeros(6), (1.0, 1.0), 0.75)

@@ -10,17 +10,23 @@ from pymavlink.dialects.v20 import all as mavlink
 from pymavlink.generator import mavgen
 
 from firmware_py.app.deadlines import times_of
+from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.rotations import rotate
 from firmware_py.core.types import NEVER_NS, Action
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
 from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.identity import px4
+from firmware_py.ground.picture import Picture
 from firmware_py.ground.telemetry import STREAMS
 from firmware_py.ground.times import Times
 from firmware_py.ground.wire import checksum
+from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.runtime.clock import ManualClock
 from firmware_py.runtime.rate_keeper import RateKeeper
 from tests.unit.ground_requests import ask
-from tests.unit.ground_world import Client, World
+from tests.unit.ground_world import PERIOD_NS, Client, World
+from tests.unit.test_live_parameters import resting
 
 # ---------------------------------------------------------------- telemetry
 
@@ -52,6 +58,49 @@ def test_every_streamed_message_arrives_with_the_robots_values(world: World, cli
     assert named["DOCK0+X"] == pytest.approx(0.1) and named["WRENCH_MRG"] == 0.75
     assert client.last("CURRENT_MODE").custom_mode == px4(4, 3)
     assert client.all("DEBUG_FLOAT_ARRAY") == [] and client.last("SYS_STATUS").load == 0  # nobody is late in lockstep
+
+
+def test_odometry_counts_how_often_the_estimate_began_anew() -> None:
+    world = World(2)
+    client = world.client()
+
+    def counted(**changed: object) -> int:
+        for name, value in changed.items():
+            setattr(world.robot, name, value)
+        world.run(20)
+        return int(client.last("ODOMETRY").reset_counter)
+
+    assert counted() == 0
+    assert counted(ready=False) == 0 and counted(ready=True) == 1
+    assert counted(tag_age_ns=9_000_000_000) == counted(tag_age_ns=30_000_000) == 1, "a coasted estimate goes on"
+    assert counted(tag_age_ns=11_000_000_000) == 1 and counted(tag_age_ns=30_000_000) == 2, "one that was adrift is put elsewhere"
+    world.robot.dock()
+    assert counted() == 3, "the middle of two modules is elsewhere"
+    world.station.picture.restarts[0] = 257
+    assert counted() == 1
+
+
+def test_first_pose_is_no_restart() -> None:
+    world = World()
+    world.robot.ready, world.station.picture.restarts, world.station.picture.records = False, {}, {}
+    client = world.client()
+    world.run(20)
+    world.robot.ready = True
+    world.run(20)
+    assert client.last("ODOMETRY").reset_counter == 0
+
+
+@pytest.mark.parametrize(("jump_m", "counted"), [(0.0, 0), (1.0, 1)])
+def test_estimate_that_is_thrown_away_for_what_tags_say_is_counted(jump_m: float, counted: int) -> None:
+    pipeline = Pipeline([assemble_vehicle(load_vehicle("modcube"))], Parameters(), PERIOD_NS)
+    picture = Picture(1, Parameters().supervision)
+    for tick in range(1, 300):
+        inputs = resting(tick, [])
+        tag = inputs.modules[0].tags[0]
+        inputs.modules[0].tags[0] = tag._replace(p_wt=np.add(tag.p_wt, [jump_m if tick > 150 else 0.0, 0.0, 0.0]))
+        picture.observe(inputs, pipeline.step(inputs), pipeline.bodies)
+    assert picture.records[0].estimate.p_wb[0] == pytest.approx(0.1 + jump_m, abs=0.01)
+    assert picture.restarts == {0: counted}
 
 
 def test_robot_on_a_clock_tells_how_its_ticks_keep_their_deadlines(world: World, client: Client) -> None:
