@@ -50,7 +50,7 @@ def accept_table(entries: Entries, groups: Sequence[str], old: str) -> str:
         )
         for e in entries if not groups or e["group"] in groups
     ]  # fmt: skip
-    new = rows(("figure", "measured", "limit", "", "command"), body)
+    new = rows(("figure", "measured", "limit", "result", "command"), body)
     whole = set(groups) <= {e["group"] for e in entries}
     return new if whole else "".join((rows_by_name(old) | rows_by_name(new)).values())
 
