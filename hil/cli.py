@@ -89,7 +89,7 @@ def run(
     chosen = scenario_of(scenario, vehicle, sensors)
     parameters = parameters_of(controller)
     unusual = unusual_in(vehicle, controller, sensors)
-    folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual])
+    folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual, *([f"seed-{seed}"] if seed else [])])
     if realtime:
         check_reaches_others(bus, "--realtime", ("virtual:", "slcan:"))  # an adapter serves one process
     with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:

@@ -1,4 +1,4 @@
-"""Stage 6 of a tick: from a wrench to the force of each thruster (paper, Eq. 5), within limits.
+"""Stage 7 of a tick: from a wrench to the force of each thruster (paper, Eq. 5), within limits.
 
 Where the pseudo-inverse (plus the preload) stays within limits it is the answer. Otherwise a box-constrained
 least-squares problem (box_program) keeps the directions of force and moment, and gives way first in the force beyond what holds a

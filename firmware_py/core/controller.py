@@ -1,4 +1,4 @@
-"""Stage 5 of a tick: PD with model feed-forward (paper, Eq. 3), attitude error on SO(3), gains times the body's mass
+"""Stage 6 of a tick: PD with model feed-forward (paper, Eq. 3), attitude error on SO(3), gains times the body's mass
 matrix.
 
 tau = M (Kp e + Kd de/dt + dnu_d/dt) + C(nu) nu + D(nu) nu + g - disturbance. K_P = M w^2, K_D = 2 z w M.

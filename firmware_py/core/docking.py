@@ -1,4 +1,4 @@
-"""Stage 3b of a tick: all docks of the fleet. Detects, steers what is docking, and says when bodies join or part.
+"""Stage 3 of a tick: all docks of the fleet. Detects, steers what is docking, and says when bodies join or part.
 
 Works on the estimates of this tick; the pipeline carries out the joins and parts that it returns, within the same tick.
 """

@@ -1,4 +1,4 @@
-"""Stage 4 of a tick: what each mode makes of set-points, trajectories and sticks; and what it keeps of the controller's wrench.
+"""Stage 5 of a tick: what each mode makes of set-points, trajectories and sticks; and what it keeps of the controller's wrench.
 
 No change of mode jumps: set-points go on from where they are, and the wrench moves over within `blend_s`.
 """

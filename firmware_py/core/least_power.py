@@ -1,6 +1,6 @@
 """Least power: of all forces that make a wrench, those whose thrusters draw the least electrical power.
 
-Stage 6 of a tick, after the wrench is known to be within limits. The forces may only move within the null space of the
+Stage 7 of a tick, after the wrench is known to be within limits. The forces may only move within the null space of the
 thruster matrix, so the wrench stays. No thruster changes the side that it pushes to, nor comes nearer to zero than its
 deadband, where what it does is not known; on one side power rises smoothly, and a few quadratic programs (daqp), each with
 the power's own slope and curvature, find the least. Work and memory of a tick are fixed; nothing is kept from tick to tick.

@@ -1,4 +1,4 @@
-"""What a request must be before anybody acts on it: a table of arguments, and whom it is for. Stands before stage 3 of a tick.
+"""What a request must be before anybody acts on it: a table of arguments, and whom it is for. Stands before stage 4 of a tick.
 
 Whatever a client sends, what is unsound comes no farther than this file.
 """

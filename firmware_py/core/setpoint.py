@@ -1,6 +1,6 @@
 """What a set-point is made of: trajectories that are sampled, and a glider that moves smoothly to a place or by a speed.
 
-Used by `guidance_modes`, stage 4 of a tick.
+Used by `guidance_modes`, stage 5 of a tick.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Stage 3 of a tick: runs the tables of `transitions` and `failsafes` for one body and says in words what it does and refuses."""
+"""Stage 4 of a tick: runs the tables of `transitions` and `failsafes` for one body and says in words what it does and refuses."""
 
 from __future__ import annotations
 

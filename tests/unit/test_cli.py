@@ -254,3 +254,22 @@ def test_campaigns_of_different_robots_have_folders_of_their_own(
     with pytest.raises((SystemExit, KeyboardInterrupt)):
         main()
     assert taken == [Path("runs") / folder]
+
+
+@pytest.mark.parametrize(("options", "folder"), [([], "hover"), (["--seed", "7"], "hover-seed-7")])
+def test_flights_of_different_seeds_have_folders_of_their_own(
+    options: list[str], folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None replaces the other."""
+    taken: list[object] = []
+
+    def fly(*arguments: object) -> None:
+        taken.append(arguments[3])
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("hil.flight.fly_and_judge", fly)
+    monkeypatch.setattr("sys.argv", ["modcube", "hil", "run", "hover", *options])
+    with pytest.raises((SystemExit, KeyboardInterrupt)):
+        main()
+    assert taken == [Path("runs") / folder]
