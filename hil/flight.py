@@ -60,10 +60,10 @@ def fly_and_judge(
     Raises DescriptionError and PortError; what an earlier flight left, or anybody else, is then as it was.
     """
     out.mkdir(parents=True, exist_ok=True)
-    check_folder(out)
     scenario = scenario.for_seed(seed)
     flight = (scenario, seed, parameters, out, bus, rate_hz, progress)
     with _alone_in(out):
+        check_folder(out)
         if realtime:
             flown = fly_in_real_time(*flight, before_logs=partial(_clear, out))
             result = judge_logs(scenario, seed, out, flown.wall_s, flown.deadline_misses, LATE_SHARE)

@@ -169,7 +169,7 @@ def test_folder_holds_one_flight(fly: Fly, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
     for name in ("report.html", "docking.png", "result.json", "notes.txt"):
-        (folder / name).write_text("of an earlier flight")
+        (folder / name).write_text('{"checks": "of an earlier flight"}')
     handle = os.open(folder, os.O_RDONLY)
     fcntl.flock(handle, fcntl.LOCK_EX)
     with pytest.raises(DescriptionError, match="is being written by another flight; wait for it or give another --out"):
