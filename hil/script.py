@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from firmware_py.app.firmware import vehicles_of
 from firmware_py.core import rotations
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import ARMED
@@ -17,6 +18,7 @@ from firmware_py.core.types import Action, Outputs, Request, Setpoint
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError, frozen_array
 from firmware_py.prepare import paths
+from firmware_py.prepare.assembly import assemble_fleet
 from firmware_py.prepare.waypoints import Mission, read_mission
 from hil.scenario import Scenario, Task
 
@@ -42,7 +44,7 @@ class Script:
         self._task = scenario.task
         start = scenario.module[0].start
         self.start_pose = rest_at(np.array(start.p_wm, dtype=float), np.array(start.q_wm, dtype=float))
-        self.trajectory = TASKS[scenario.task.kind](scenario.task, self.start_pose)
+        self.trajectory = TASKS[scenario.task.kind](scenario.task, self.start_pose, fleet)
         refuse_outside(self.trajectory, scenario)
         self.begin_ns = round(scenario.task.settle_s * 1e9)
         self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
@@ -78,21 +80,21 @@ def refuse_outside(path: paths.Trajectory, scenario: Scenario) -> None:
             raise DescriptionError(f"{what}: the path leaves the tank, a {scenario.tank}, {where}; keep it inside")
 
 
-def _hover(task: Task, start: Setpoint) -> paths.Trajectory:
+def _hover(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
     return paths.hold(paths.at_rest(task.centre_m, start.q_wb), task.duration_s)
 
 
-def _spiral(task: Task, start: Setpoint) -> paths.Trajectory:
+def _spiral(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
     return paths.spiral(task.centre_m, task.radius_m, task.climb_m, task.turns, task.duration_s, attitude=start.q_wb)
 
 
-def _moebius(task: Task, start: Setpoint) -> paths.Trajectory:
+def _moebius(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
     return paths.moebius(
         task.centre_m, task.duration_s, task.radius_m, task.half_width_m, task.turns, ramp_share=MOEBIUS_RAMP_SHARE
     )
 
 
-def _lissajous(task: Task, start: Setpoint) -> paths.Trajectory:
+def _lissajous(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
     turning = (task.yaw_turns, task.roll_turns)
     return paths.lissajous(
         task.centre_m,
@@ -105,12 +107,13 @@ def _lissajous(task: Task, start: Setpoint) -> paths.Trajectory:
     )
 
 
-def _waypoints(task: Task, start: Setpoint) -> paths.Trajectory:
-    """The path of the file as it is: what does not fit its limits, its task or the start is refused, not stretched."""
+def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
+    """The path of the file as it is: what does not fit its limits, the thrusters, its task or the start is refused, not stretched."""
     mission = _from_start(read_mission(task.file_text, task.file), start)
     _refuse_unbounded(mission, task.file)
     try:
-        path = mission.plan(stretch=False)
+        mission.check_bounded()
+        path = mission.plan(assemble_fleet(fleet, vehicles_of(fleet))[0], stretch=False)
     except ValueError as error:
         raise DescriptionError(f"{task.file}: {error}") from None
     first = path.sample(0.0)
@@ -144,7 +147,7 @@ def _from_start(mission: Mission, start: Setpoint) -> Mission:
     return dataclasses.replace(mission, waypoint=(first, *others))
 
 
-TASKS: dict[str, Callable[[Task, Setpoint], paths.Trajectory]] = {
+TASKS: dict[str, Callable[[Task, Setpoint, Fleet], paths.Trajectory]] = {
     "hover": _hover,
     "lissajous": _lissajous,
     "moebius": _moebius,

@@ -92,12 +92,18 @@ def plan(
     if durations_s is not None and not stretch:
         return request.attempt(base)
     request.check_standing()
-    if durations_s is None and not request.bounds_speed():
+    if durations_s is None:
+        check_bounded(waypoints, limits, body)
+    return _fit(request, base, free=durations_s is None)
+
+
+def check_bounded(waypoints: Sequence[Waypoint], limits: Limits, body: Body | None = None) -> None:
+    """Raises ValueError where neither a limit nor the body keeps the duration of the path from vanishing."""
+    if not _Request.of(waypoints, limits, body).bounds_speed():
         raise ValueError(
             "free durations need a limit that this path meets, on velocity or acceleration where it moves, "
             "on angular rate or acceleration where it turns"
         )
-    return _fit(request, base, free=durations_s is None)
 
 
 def distinct(waypoints: Sequence[Waypoint], same: float = _SAME) -> tuple[list[Waypoint], list[int]]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.description.schema import DescriptionError, Source, build, quantity
-from firmware_py.prepare.minimum_snap import Limits, Waypoint, plan
+from firmware_py.prepare.minimum_snap import Limits, Waypoint, check_bounded, plan
 from firmware_py.prepare.piecewise import Piecewise
 
 _POSITION = ("x_m", "y_m", "z_m")
@@ -91,14 +91,26 @@ class Mission:
 
     def plan(self, body: Body | None = None, stretch: bool = True) -> Piecewise:
         """The trajectory. Raises as minimum_snap.plan does."""
+        return plan(self._points, self._durations, self.limits.limits(), body, stretch)
+
+    def check_bounded(self) -> None:
+        """Raises ValueError where the file itself leaves free how long its path takes: no body is to find out how fast it can be."""
+        if self._durations is None:
+            check_bounded(self._points, self.limits.limits())
+
+    @property
+    def _points(self) -> list[Waypoint]:
         points = []
         for w in self.waypoint:
             attitude = w.quaternion if len(w.quaternion) else None
             velocity = w.velocity_m_s if len(w.velocity_m_s) else None
             points.append(Waypoint(w.position_m, attitude, velocity, w.stop))
+        return points
+
+    @property
+    def _durations(self) -> list[float] | float | None:
         each = [w.duration_s for w in self.waypoint[1:]]
-        durations: list[float] | float | None = each if all(each) else self.duration_s or None
-        return plan(points, durations, self.limits.limits(), body, stretch)
+        return each if all(each) else self.duration_s or None
 
 
 def read_mission(text: str, name: str) -> Mission:
