@@ -20,7 +20,7 @@ def test_module_climbs_the_whole_spiral_within_eight_millimetres_and_a_degree_an
     assert result.passed
     assert 0.001 <= result.metrics["position_rmse_m"] <= WORST_SEED_LIMIT_M
     assert result.metrics["attitude_rmse_rad"] <= ATTITUDE_LIMIT_RAD
-    assert result.metrics["duration_s"] == pytest.approx(40.0, abs=0.02)
+    assert result.metrics["duration_s"] == pytest.approx(40.0, abs=1e-9)
     assert result.metrics["deadline_misses"] == 0
 
 
