@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterable
 from pathlib import Path
 
 from firmware_py.bus.codec import Frame
@@ -81,6 +82,10 @@ class CNodes:
         for frame in frames:
             answers += self.take(frame, self.world.time_ns)
         return answers
+
+    def refuse_others(self, frames: Iterable[Frame], address: str) -> None:
+        """As `Nodes.refuse_others`, of the modules that are not C."""
+        self._nodes.refuse_others(frames, address)
 
     def watch(self) -> None:
         """As `Nodes.watch`."""
