@@ -8,8 +8,11 @@ from firmware_py.core.joints import sides
 from firmware_py.core.types import NEVER_NS, DockRequest
 
 RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
+"""States of a relay, as DOCK_CMD has them."""
 PERIOD_NS = 100_000_000
 """DOCK_CMD goes out at 10 Hz, and at once when a relay changes."""
+AT_ONCE_NS = -NEVER_NS
+"""When a module is due whose relays have changed."""
 
 
 class MagnetRelays:
@@ -17,18 +20,18 @@ class MagnetRelays:
 
     def __init__(self, modules: int) -> None:
         self._states = np.zeros((modules, 6), dtype=np.int64)
-        self._due_ns = [-NEVER_NS] * modules
+        self._due_ns = [AT_ONCE_NS] * modules
 
     @property
     def states(self) -> list[list[int]]:
-        """Six states of each module of the fleet."""
+        """Six states of each module of the fleet, by fleet index."""
         return self._states.tolist()
 
     def switch(self, state: int, *joints: DockRequest) -> None:
         """Both faces of each of the joints to `state`."""
         for module, face in (side for joint in joints for side in sides(joint)):
             if self._states[module, face] != state:
-                self._states[module, face], self._due_ns[module] = state, -NEVER_NS
+                self._states[module, face], self._due_ns[module] = state, AT_ONCE_NS
 
     def due(self, time_ns: int) -> list[int]:
         """Modules whose states are to be sent in this tick."""

@@ -20,7 +20,8 @@ LOOP_SHARE = 4.0 / 27.0
 
 LEASH_M = 1.0
 """How far a set-point that moves by a given speed may be from the body. A speed that the body cannot make, or one that somebody holds it
-against, would lead it away without end, and the body after it long after it was told to stop. Thrusters saturate at a fifth of this."""
+against, would lead it away without end, and the body after it long after it was told to stop. The shipped gains ask a module for all that
+it has in its worst direction (22.9 N) at 0.14 m, so a longer leash would not make it any faster."""
 
 
 class Trajectory(Protocol):

@@ -97,7 +97,7 @@ class Supervisor:
 
     @property
     def _knows_of_no_estop(self) -> bool:
-        """Whether a disarmed body's modules have no e-stop to let go of that was cleared here."""
+        """Whether a disarmed body has had no e-stop since the start: then no module is still to let go of one that was cleared here."""
         return self.state == State.DISARMED and self._estop_ns is None
 
     def _request(self, request: Request, health: Health) -> Decision | None:
