@@ -11,21 +11,20 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from hil.plant.bodies import BODIES, MODULES, add_force, add_walls, touches
-from hil.plant.overlap import overlap, turning
+from hil.plant.bodies import BODIES, MODULES, add_walls, touches
+from hil.plant.overlap import faces_that_meet, patch, shared_box
+from hil.plant.pairs import centre_of, pose_of, push_apart, rate_of, turn_apart, turn_into, velocity_at
 from hil.plant.vectors import (
     F2,
     F3,
     F8,
     I1,
-    M3,
-    V3,
     callee,
+    column,
     compiled,
     cross,
     dot,
-    matrix,
-    matrix_of,
+    inlined,
     minus,
     plus,
     times,
@@ -54,70 +53,25 @@ class Faces(NamedTuple):
     stop: np.ndarray
     """(m, m) gap at which a jam holds the pair apart, m; 0: none."""
     outline: np.ndarray
-    """(2, CORNERS, 2) working memory of `overlap`."""
+    """(2, CORNERS, 3) working memory of `overlap.patch`."""
+    planes: np.ndarray
+    """(FACES_OF_TWO, 4) working memory of `overlap.faces_that_meet`."""
     pull: float
     magnet_gap: float
     guide: float
     guide_damping: float
     turning: float
     turning_damping: float
+    jam: float
+    """Stiffness and damping of a probe that is jammed in its funnel, N/m and N s/m."""
+    jam_damping: float
     stiffness: float
+    """Pressure per depth of an overlap of two hulls, N/m^3."""
     damping: float
+    """Pressure per speed, N s/m^3."""
 
 
-FACES = types.NamedTuple((F2, F2, F2, F2, F3, *(F8,) * 8), Faces)
-
-
-@compiled(M3(M3, M3))
-def product(a, b):
-    """a b."""
-    x, y, z = (b[0][0], b[1][0], b[2][0]), (b[0][1], b[1][1], b[2][1]), (b[0][2], b[1][2], b[2][2])
-    return (
-        (dot(a[0], x), dot(a[0], y), dot(a[0], z)),
-        (dot(a[1], x), dot(a[1], y), dot(a[1], z)),
-        (dot(a[2], x), dot(a[2], y), dot(a[2], z)),
-    )
-
-
-@compiled(V3(M3, I8))
-def column(r, k):
-    """Column k of r: axis k of its frame."""
-    return (r[0][k], r[1][k], r[2][k])
-
-
-@callee
-def pose_of(modules, x, m):
-    """Hull centre in the world, and module frame to world."""
-    b = modules.body[m]
-    r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
-    return plus(triple(x, b, 0), turn(r, triple(modules.position, m, 0))), product(r, matrix(modules.turn, m))
-
-
-@callee
-def velocity_at(x, b, p):
-    """Velocity of body b's point that is at p, world."""
-    r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
-    at = turn_back(r, minus(p, triple(x, b, 0)))
-    return turn(r, plus(triple(x, b, 7), cross(triple(x, b, 10), at)))
-
-
-@callee
-def push_apart(wrench, x, i, j, p, f):
-    """Force f (world) on body j at the world point p, and its counter-force on body i."""
-    ri = matrix_of(x[i, 3], x[i, 4], x[i, 5], x[i, 6])
-    rj = matrix_of(x[j, 3], x[j, 4], x[j, 5], x[j, 6])
-    add_force(wrench, j, turn_back(rj, minus(p, triple(x, j, 0))), turn_back(rj, f))
-    add_force(wrench, i, turn_back(ri, minus(p, triple(x, i, 0))), turn_back(ri, times(-1.0, f)))
-
-
-@callee
-def turn_apart(wrench, x, i, j, n):
-    """Moment n (world) on body j, and its counter-moment on body i."""
-    ni = turn_back(matrix_of(x[i, 3], x[i, 4], x[i, 5], x[i, 6]), n)
-    nj = turn_back(matrix_of(x[j, 3], x[j, 4], x[j, 5], x[j, 6]), n)
-    for k in range(3):
-        wrench[j, 3 + k] += nj[k]
-        wrench[i, 3 + k] -= ni[k]
+FACES = types.NamedTuple((F2, F2, F2, F2, F3, F2, *(F8,) * 10), Faces)
 
 
 @callee
@@ -132,60 +86,50 @@ def face_to(r, d):
 
 
 @callee
-def _face_between(modules, r_i, r_j, at, i, j):
-    """Face of module j that looks at module i, whose centre is `at` in j's frame; -1 where one of j's axes parts the hulls."""
-    axis, widest = 0, -math.inf
-    x, y, z = turn_back(r_j, column(r_i, 0)), turn_back(r_j, column(r_i, 1)), turn_back(r_j, column(r_i, 2))
-    size = triple(modules.size, i, 0)
-    for k in range(3):
-        reach = 0.5 * (size[0] * abs(x[k]) + size[1] * abs(y[k]) + size[2] * abs(z[k]) + modules.size[j, k])
-        if abs(at[k]) - reach > widest:
-            axis, widest = k, abs(at[k]) - reach
-    if widest > 0.0:
-        return -1
-    return 2 * axis + (1 if at[axis] < 0.0 else 0)
+def _bear(plane, normal, p, v, w, faces):
+    """Pressure and friction on the second of two hulls, N/m^2, at a point p of the surface between them.
+
+    Args:
+        plane: (4,) the first hull's face, see `overlap.faces_that_meet`. normal: of the surface.
+        v, w: velocity of the second hull, at the first one's centre, and its rate, both as the first one sees them; all in its frame.
+    """
+    depth, slip = plane[3] - (plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2]), plus(v, cross(w, p))
+    out = dot(slip, normal)
+    pressure = max(0.0, 2.0 * faces.stiffness * depth - faces.damping * out)
+    along = minus(slip, times(out, normal))
+    speed = math.sqrt(dot(along, along))
+    rub = min(faces.damping, FRICTION * pressure / speed) if speed > 1e-9 else 0.0
+    return minus(times(pressure, normal), times(rub, along))
 
 
 @callee
-def _press(modules, faces, x, i, j, wrench):
-    """The face of module i that looks at module j is pushed out of the face of j that looks at i, at the corners of their overlap.
+def _press(modules, faces, x, i, j, seats, wrench):
+    """Hulls i and j push each other apart where they overlap.
 
-    The stiffness is that of four corners where all of the smaller face overlaps, less by its area elsewhere. The corners of the
-    overlap share it by the angles at which its outline turns there, so that none comes or goes with a jolt.
+    Each is a bed of springs: the pressure in it rises with the depth below its nearest face. They bear on the surface on which both are
+    equally deep (Elandt et al., A pressure field model, IROS 2019). That pressure is the gradient of an energy, the volume integral over
+    the overlap of the smaller of the two, whichever faces meet at whatever tilt: the springs give back what they took, and no more.
     """
-    p_i, r_i = pose_of(modules, x, i)
-    p_j, r_j = pose_of(modules, x, j)
-    at = turn_back(r_j, minus(p_i, p_j))
-    face = _face_between(modules, r_i, r_j, at, i, j)
-    if face < 0:
+    (p_i, r_i), (p_j, r_j) = seats
+    half, other = times(0.5, triple(modules.size, i, 0)), times(0.5, triple(modules.size, j, 0))
+    r, at = turn_into(r_i, r_j), turn_back(r_i, minus(p_j, p_i))
+    own, count, deepest = faces_that_meet(faces.planes, half, other, r, at)
+    if count == 0:
         return
-    axis, sign = face // 2, 1.0 if face % 2 == 0 else -1.0
-    outward, u, w = times(sign, column(r_j, axis)), column(r_j, (axis + 1) % 3), column(r_j, (axis + 2) % 3)
-    own = face_to(r_i, times(-1.0, outward)) // 2
-    look = times(1.0 if dot(column(r_i, own), outward) < 0.0 else -1.0, column(r_i, own))
-    frame = (u, w, outward)  # turns the world into along the face, along the face, out of it
-    top = plus(p_j, times(0.5 * modules.size[j, axis], outward))
-    middle = turn(frame, minus(plus(p_i, times(0.5 * modules.size[i, own], look)), top))
-    size_u, size_w = modules.size[i, (own + 1) % 3], modules.size[i, (own + 2) % 3]
-    wide, high = modules.size[j, (axis + 1) % 3], modules.size[j, (axis + 2) % 3]
-    first = turn(frame, times(0.5 * size_u, column(r_i, (own + 1) % 3)))
-    second = turn(frame, times(0.5 * size_w, column(r_i, (own + 2) % 3)))
-    n, area = overlap(faces.outline, middle, first, second, 0.5 * wide, 0.5 * high)
-    slope = turn(frame, look)
-    whole, a, b = 4.0 * area / min(size_u * size_w, wide * high), modules.body[i], modules.body[j]
-    for k in range(n if n > 2 else 0):
-        s, t = faces.outline[0, k, 0], faces.outline[0, k, 1]
-        height = middle[2] - (slope[0] * (s - middle[0]) + slope[1] * (t - middle[1])) / slope[2]
-        if height >= 0.0:
-            continue
-        p = plus(top, plus(plus(times(s, u), times(t, w)), times(height, outward)))
-        v = minus(velocity_at(x, a, p), velocity_at(x, b, p))
-        share, out = whole * turning(faces.outline[0], n, k), dot(v, outward)
-        normal = share * max(0.0, -faces.stiffness * height - faces.damping * out)
-        along = minus(v, times(out, outward))
-        speed = math.sqrt(dot(along, along))
-        rub = min(share * faces.damping, FRICTION * normal / speed) if speed > 1e-9 else 0.0
-        push_apart(wrench, x, b, a, p, minus(times(normal, outward), times(rub, along)))
+    middle, room = shared_box(half, other, r, at)
+    first, second = modules.body[i], modules.body[j]
+    v = turn_back(r_i, minus(velocity_at(x, second, p_i), velocity_at(x, first, p_i)))
+    w = turn_back(r_i, minus(rate_of(x, second), rate_of(x, first)))
+    f, moment = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for a in range(own):
+        for b in range(own, count):
+            share, normal, p_1, p_2, p_3 = patch(faces.outline, faces.planes, count, a, b, middle, room, deepest)
+            if share > 0.0:
+                for p in (p_1, p_2, p_3):
+                    push = times(share, _bear(faces.planes[a], normal, p, v, w, faces))
+                    f, moment = plus(f, push), plus(moment, cross(p, push))
+    push_apart(wrench, x, first, second, p_i, turn(r_i, f))
+    turn_apart(wrench, x, first, second, turn(r_i, moment))
 
 
 @compiled(types.UniTuple(F8, 8)(MODULES, FACES, F2, I8, I8))
@@ -215,10 +159,9 @@ def mating(modules, faces, x, i, j):
 
 
 @callee
-def _mate(modules, faces, x, i, j, wrench):
+def _mate(modules, faces, x, i, j, seats, wrench):
     """Magnets, funnel and jam of the two faces that look at each other."""
-    p_i, r_i = pose_of(modules, x, i)
-    p_j, r_j = pose_of(modules, x, j)
+    (p_i, r_i), (p_j, r_j) = seats
     d = minus(p_j, p_i)
     f_i, f_j = face_to(r_i, d), face_to(r_j, times(-1.0, d))
     if faces.kind[i, f_i] * faces.kind[j, f_j] >= 0.0:
@@ -228,7 +171,7 @@ def _mate(modules, faces, x, i, j, wrench):
     n_j = times(1.0 if f_j % 2 == 0 else -1.0, column(r_j, k_j))
     a = plus(p_i, times(0.5 * modules.size[i, k_i], n_i))
     b = plus(p_j, times(0.5 * modules.size[j, k_j], n_j))
-    way, middle, g0 = minus(b, a), times(0.5, plus(a, b)), faces.magnet_gap
+    way, g0 = minus(b, a), faces.magnet_gap
     gap = dot(way, n_i)
     side = minus(way, times(gap, n_i))
     first, second = modules.body[i], modules.body[j]
@@ -236,23 +179,22 @@ def _mate(modules, faces, x, i, j, wrench):
     if coil != 0.0:
         far = math.sqrt((max(0.0, gap) + g0) ** 2 + dot(side, side))  # the gradient of -1/far: a loop takes no work
         pull = coil * faces.pull * g0 * g0 / far**3
-        push_apart(wrench, x, first, second, middle, times(-pull, plus(side, times(max(0.0, gap) + g0, n_i))))
+        push_apart(wrench, x, first, second, b, times(-pull, plus(side, times(max(0.0, gap) + g0, n_i))))
     if faces.inside[i, j] == 0.0:
         return
-    v = minus(velocity_at(x, second, middle), velocity_at(x, first, middle))
+    v = minus(velocity_at(x, second, b), velocity_at(x, first, b))
     sideways = minus(v, times(dot(v, n_i), n_i))
-    spin = minus(turn(matrix_of(x[second, 3], x[second, 4], x[second, 5], x[second, 6]), triple(x, second, 10)),
-                 turn(matrix_of(x[first, 3], x[first, 4], x[first, 5], x[first, 6]), triple(x, first, 10)))  # fmt: skip
+    spin = minus(rate_of(x, second), rate_of(x, first))
     if faces.stop[i, j] > 0.0:  # jammed: neither sideways nor further in
         force = times(-faces.guide_damping, sideways)
         deep = faces.stop[i, j] - gap
         if deep > 0.0:
-            normal = max(0.0, 4.0 * (faces.stiffness * deep - faces.damping * dot(v, n_i)))
+            normal = max(0.0, faces.jam * deep - faces.jam_damping * dot(v, n_i))
             force = plus(force, times(normal, n_i))
-        push_apart(wrench, x, first, second, middle, force)
+        push_apart(wrench, x, first, second, b, force)
         turn_apart(wrench, x, first, second, times(-faces.turning_damping, spin))
         return
-    push_apart(wrench, x, first, second, middle, plus(times(-faces.guide, side), times(-faces.guide_damping, sideways)))
+    push_apart(wrench, x, first, second, b, plus(times(-faces.guide, side), times(-faces.guide_damping, sideways)))
     u, w = column(r_i, (k_i + 1) % 3), column(r_j, (k_j + 1) % 3)
     angle = math.atan2(dot(w, cross(n_i, u)), dot(w, u))
     roll = angle - 0.5 * math.pi * round(angle / (0.5 * math.pi))
@@ -260,16 +202,28 @@ def _mate(modules, faces, x, i, j, wrench):
     turn_apart(wrench, x, first, second, minus(moment, times(faces.turning_damping, spin)))
 
 
+@inlined
+def _is_near(modules, x, i, j):
+    """As `near`."""
+    if modules.body[i] == modules.body[j]:
+        return False
+    d, a, b = minus(centre_of(modules, x, i), centre_of(modules, x, j)), triple(modules.size, i, 0), triple(modules.size, j, 0)
+    reach = 0.5 * (math.sqrt(dot(a, a)) + math.sqrt(dot(b, b))) + NEAR_M
+    return dot(d, d) < reach * reach
+
+
 @compiled(types.boolean(MODULES, F2, I8, I8))
 def near(modules, x, i, j):
     """Whether modules i and j belong to different bodies and are close."""
-    if modules.body[i] == modules.body[j]:
-        return False
-    p_i, _ = pose_of(modules, x, i)
-    p_j, _ = pose_of(modules, x, j)
-    d, a, b = minus(p_i, p_j), triple(modules.size, i, 0), triple(modules.size, j, 0)
-    reach = 0.5 * (math.sqrt(dot(a, a)) + math.sqrt(dot(b, b))) + NEAR_M
-    return dot(d, d) < reach * reach
+    return _is_near(modules, x, i, j)
+
+
+@callee
+def _meet(modules, faces, x, i, j, wrench):
+    """What modules i and j, which are near each other, do to each other."""
+    seats = (pose_of(modules, x, i), pose_of(modules, x, j))
+    _press(modules, faces, x, i, j, seats, wrench)
+    _mate(modules, faces, x, i, j, seats, wrench)
 
 
 @callee
@@ -278,10 +232,8 @@ def interact(bodies, modules, faces, x):
     count = modules.body.shape[0]
     for i in range(count):
         for j in range(i + 1, count):
-            if near(modules, x, i, j):
-                _press(modules, faces, x, i, j, bodies.wrench)
-                _press(modules, faces, x, j, i, bodies.wrench)
-                _mate(modules, faces, x, i, j, bodies.wrench)
+            if _is_near(modules, x, i, j):
+                _meet(modules, faces, x, i, j, bodies.wrench)
 
 
 @compiled(types.void(BODIES, MODULES, FACES, WATER, I1))
@@ -293,7 +245,5 @@ def touch(bodies, modules, faces, water, chosen):
             add_walls(bodies, modules, m, water, x)
     for i in range(count):
         for j in range(i + 1, count):
-            if chosen[i] + chosen[j] > 0 and near(modules, x, i, j):
-                _press(modules, faces, x, i, j, bodies.wrench)
-                _press(modules, faces, x, j, i, bodies.wrench)
-                _mate(modules, faces, x, i, j, bodies.wrench)
+            if chosen[i] + chosen[j] > 0 and _is_near(modules, x, i, j):
+                _meet(modules, faces, x, i, j, bodies.wrench)

@@ -17,7 +17,7 @@ from hil.plant.bodies import Modules
 from hil.plant.contact import Faces, mating, near
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream
-from hil.plant.overlap import CORNERS
+from hil.plant.overlap import CORNERS, FACES_OF_TWO
 
 KINDS = {"P": 1.0, "D": -1.0, "-": 0.0}
 RELAY = (0.0, 1.0, -1.0, 0.0)
@@ -67,9 +67,9 @@ class Docks:
         self.spec, self.jam_rule = spec, jam
         self.faces = Faces(
             np.array([[KINDS[k] for k in v.faces] for v in vehicles]),
-            np.zeros((m, 6)), np.zeros((m, m)), np.zeros((m, m)), np.zeros((2, CORNERS, 2)),
+            np.zeros((m, 6)), np.zeros((m, m)), np.zeros((m, m)), np.zeros((2, CORNERS, 3)), np.zeros((FACES_OF_TWO, 4)),
             spec.pull_n, spec.magnet_gap_m, spec.guide_n_m, spec.guide_ns_m, spec.turn_nm, spec.turn_nms,
-            spec.contact_n_m, spec.contact_ns_m,
+            spec.stop_n_m, spec.stop_ns_m, spec.contact_n_m3, spec.contact_ns_m3,
         )  # fmt: skip
         self.relays = np.zeros((m, 6), dtype=np.int64)
         self.joints: list[Joint] = []

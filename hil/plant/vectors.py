@@ -80,6 +80,12 @@ def turn_back(r, a):
 
 
 @inlined
+def column(r, k):
+    """Column k of r: axis k of its frame."""
+    return (r[0][k], r[1][k], r[2][k])
+
+
+@inlined
 def momenta(mass, v, w):
     """Linear and angular momentum of a body with the velocity v and the rate w."""
     p, spin = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)

@@ -237,12 +237,16 @@ def test_rolled_cubes_do_not_pass_through_each_other(roll_deg: float, y_m: float
 @pytest.mark.parametrize("roll_deg", [0.0, 1e-9, 0.3, 30.0, 45.0])
 @pytest.mark.parametrize("y_m", [0.0, 0.05])
 def test_overlap_of_faces_bears_by_its_area(roll_deg: float, y_m: float) -> None:
+    """To be exact, at every depth by what overlaps of the two squares so far inside their edges; Simpson's rule is exact for that."""
     deep = 2e-4
     world = hulls(0.21 - deep, y_m, roll_deg)
-    squares = [shapely.box(-0.105, -0.105, 0.105, 0.105)]
-    squares.append(shapely.affinity.translate(shapely.affinity.rotate(squares[0], roll_deg), y_m))
-    area = squares[0].intersection(squares[1]).area / squares[0].area
-    np.testing.assert_allclose(world._body_arrays.wrench[1, 0], 8.0 * area * deep * DockSpec().contact_n_m, rtol=1e-9)
+
+    def area(inset_m: float) -> float:
+        square = shapely.box(*(-0.105 + inset_m,) * 2, *(0.105 - inset_m,) * 2)
+        return square.intersection(shapely.affinity.translate(shapely.affinity.rotate(square, roll_deg), y_m)).area
+
+    bears = (area(0.0) + 4.0 * area(0.25 * deep) + area(0.5 * deep)) / 6.0
+    np.testing.assert_allclose(world._body_arrays.wrench[1, 0], bears * deep * DockSpec().contact_n_m3, rtol=1e-9)
 
 
 def test_hulls_of_any_size_stop_each_other() -> None:
@@ -285,7 +289,7 @@ def test_hand_on_one_of_two_loads_their_joint_with_half_its_force(module: int, f
 def test_what_touches_one_of_two_loads_their_joint_with_half_its_force() -> None:
     deep = 2e-4
     world = start_docked(0.42 - deep)
-    assert world._pull_on(world.docks.joints[0]) == pytest.approx(-4.0 * deep * DockSpec().contact_n_m, rel=1e-3)
+    assert world._pull_on(world.docks.joints[0]) == pytest.approx(-0.5 * 0.21**2 * deep * DockSpec().contact_n_m3, rel=2e-3)
 
 
 def test_jet_on_one_of_two_loads_their_joint_as_a_hand_would() -> None:

@@ -1,0 +1,163 @@
+"""Contact of two free bodies may only dissipate: collisions at any tilt, against the energy of the springs reckoned another way."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull, HalfspaceIntersection
+
+from firmware_py.core import rotations
+from firmware_py.description.vehicle import Vehicle, load_vehicle
+from hil.plant.contact import touch
+from hil.plant.dock_spec import DockSpec
+from hil.plant.spec import CALM, Tank, WorldSpec
+from hil.plant.world import STEP_NS, Start, World
+
+PERIOD_NS = 10_000_000
+DEPTH_M = 400.0
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+OCEAN = Tank(kind="box", size_m=np.array([900.0, 900.0, 900.0]))
+MODCUBE = load_vehicle("modcube")
+SLIPPERY = dataclasses.replace(
+    MODCUBE,
+    drag=dataclasses.replace(MODCUBE.drag, cd_face=0.0, cd_edge=0.0, rotational_cd=0.0),
+    inertial=dataclasses.replace(MODCUBE.inertial, righting_arm_m=0.0),
+)
+"""In still water nothing but contact acts on it."""
+HULL = dataclasses.replace(SLIPPERY, faces=("-",) * 6)
+COLLISIONS = 120
+TICKS = 250
+DAMPED, ELASTIC = 1e-9, 1e-4
+"""Share of the energy that the integration may add: where contact dissipates as it does; where nothing is dissipated."""
+
+
+def pair(
+    away_m: np.ndarray, q: np.ndarray, other_q: np.ndarray, vehicle: Vehicle = HULL, step_ns: int = STEP_NS, **springs: float
+) -> World:
+    """Two modules without drag in calm deep water; `springs`: of `contact.Faces`, in place of the scenario's."""
+    first = np.array([0.0, 0.0, DEPTH_M])
+    starts = [Start(first, q), Start(first + away_m, other_q)]
+    world = World(WorldSpec(**CALM), OCEAN, [vehicle] * 2, starts, 0, PERIOD_NS, step_ns)
+    world.docks.faces = world.docks.faces._replace(**springs)
+    return world
+
+
+def thrown(seed: int, **springs: float) -> World:
+    """Two hulls that are about to meet: every third time almost face to face, else at any tilt; off the centres, and turning."""
+    rng = np.random.default_rng(seed)
+    q, other_q = (rotations.normalise(rng.standard_normal(4)) for _ in range(2))
+    way = rng.standard_normal(3)
+    if seed % 3 == 0:
+        other_q, way = rotations.normalise(rotations.multiply(q, rotations.exp(0.1 * rng.standard_normal(3)))), rotations.to_matrix(q)[:, 1]
+    way = way / np.linalg.norm(way)
+    side = np.cross(way, rng.standard_normal(3))
+    side /= np.linalg.norm(side)
+    world = pair(0.38 * way + rng.uniform(0.0, 0.25) * side, q, other_q, **springs)
+    speed = rng.uniform(0.05, 0.3)
+    world.set_motion(0, np.zeros(3), rng.uniform() * rng.standard_normal(3))
+    world.set_motion(1, -speed * way + 0.3 * speed * rng.standard_normal() * side, rng.uniform() * rng.standard_normal(3))
+    return world
+
+
+def flown(world: World) -> np.ndarray:
+    """(ticks,) kinetic energy of both, J, from before they meet until they have parted."""
+    energy = [world.kinetic_energy().sum()]
+    for _ in range(TICKS):
+        world.advance(PERIOD_NS)
+        energy.append(world.kinetic_energy().sum())
+    return np.array(energy)
+
+
+def test_hulls_that_collide_at_any_tilt_gain_no_energy_and_keep_their_momentum() -> None:
+    met = 0
+    for seed in range(COLLISIONS):
+        world = thrown(seed)
+        momentum = world.momentum().sum(axis=0)
+        energy = flown(world)
+        assert energy.max() <= (1.0 + DAMPED) * energy[0], f"collision {seed}"
+        np.testing.assert_allclose(world.momentum().sum(axis=0), momentum, rtol=0, atol=2e-6 * np.abs(momentum).max())
+        met += bool(energy[-1] < 0.99 * energy[0])
+    assert met > 0.8 * COLLISIONS, "they must meet, or the test proves nothing"
+
+
+def test_springs_of_hulls_give_back_what_they_took() -> None:
+    """Without damping, and so without friction: none of the energy is lost, and none won."""
+    met = 0
+    for seed in range(COLLISIONS):
+        world = thrown(seed, damping=0.0)
+        energy = flown(world)
+        assert energy.max() <= (1.0 + ELASTIC) * energy[0], f"collision {seed}"
+        if not world._body_arrays.wrench.any():  # they have parted
+            assert energy[-1] == pytest.approx(energy[0], rel=ELASTIC), f"collision {seed}"
+            met += bool(energy.min() < 0.99 * energy[0])
+    assert met > 0.7 * COLLISIONS, "they must meet, or the test proves nothing"
+
+
+def stored(world: World) -> float:
+    """Energy of the springs, J: pressure per depth, 2 k, times the volume under the smaller depth in either hull, in four dimensions."""
+    planes = []
+    for x in world._body_arrays.state:
+        normals = rotations.to_matrix(x[3:7].copy()).T
+        for normal in np.vstack([normals, -normals]):
+            planes.append([*normal, 1.0, -0.105 - normal @ x[:3]])  # depth <= 0.105 - n.(x - centre)
+    planes.append([0.0, 0.0, 0.0, -1.0, 0.0])
+    planes = np.array(planes)
+    inside = linprog([0, 0, 0, 0, -1], A_ub=np.hstack([planes[:, :4], np.ones((13, 1))]), b_ub=-planes[:, 4], bounds=(None, None)).x[:4]
+    corners = HalfspaceIntersection(planes, inside).intersections
+    return 2.0 * DockSpec().contact_n_m3 * ConvexHull(corners - inside).volume
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_force_and_moment_between_hulls_are_the_slope_of_the_energy_stored(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    q = rotations.normalise(rng.standard_normal(4))
+    other_q = rotations.normalise(rotations.multiply(q, rotations.exp(0.8 * rng.standard_normal(3))))
+    way = rng.standard_normal(3)
+    world = pair(0.22 * way / np.linalg.norm(way), q, other_q)
+    x, chosen = world._body_arrays.state, np.array([0, 1])
+    world._body_arrays.wrench[:] = 0.0
+    touch(world._body_arrays, world._modules, world.docks.faces, world._water, chosen)
+    wrench, before = world._body_arrays.wrench.copy(), x.copy()
+    assert wrench.any(), "they overlap, or the test proves nothing"
+
+    def energy(body: int, axis: int, by: float) -> float:
+        x[:] = before
+        if axis < 3:
+            x[body, :3] += by * rotations.to_matrix(before[body, 3:7].copy())[:, axis]
+        else:
+            x[body, 3:7] = rotations.multiply(before[body, 3:7].copy(), rotations.exp(by * np.eye(3)[axis - 3]))
+        return stored(world)
+
+    step = 2e-6
+    slope = [[(energy(b, k, step) - energy(b, k, -step)) / (2.0 * step) for k in range(6)] for b in (0, 1)]
+    np.testing.assert_allclose(-np.array(slope), wrench, rtol=0, atol=2e-4 * np.abs(wrench).max())
+
+
+@pytest.mark.parametrize(("coil", "guide"), [(1.0, 0.0), (0.0, 2000.0), (1.0, 2000.0)])
+def test_magnets_and_funnel_of_tilted_faces_only_turn_energy_into_motion_and_back(
+    coil: float, guide: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In steps of a quarter of the usual length: the funnel is stiff."""
+    tilt = rotations.exp(np.array([0.0, 0.1, -0.12]))
+    springs = {"guide": guide, "guide_damping": 0.0, "turning": 0.0, "turning_damping": 0.0}
+    world = pair(np.array([0.25, 0.006, -0.004]), LEVEL, tilt, SLIPPERY, STEP_NS // 4, **springs)
+    monkeypatch.setattr(world, "_dock", lambda _: None)  # the faces neither lock nor let go
+    faces = world.docks.faces
+    faces.coil[[0, 1], [0, 1]], faces.inside[0, 1] = coil, 1.0
+    world.set_motion(1, np.array([-0.01, 0.01, 0.0]), np.array([0.0, 0.1, 0.1]))
+
+    def energy() -> float:
+        one, other = world.truth(0), world.truth(1)
+        normal, back = rotations.to_matrix(one.q_wm)[:, 0], rotations.to_matrix(other.q_wm)[:, 0]
+        way = other.p_wm - 0.105 * back - one.p_wm - 0.105 * normal
+        gap = way @ normal
+        assert gap > 0.02, "the hulls must not touch"
+        side = way - gap * normal
+        pull = coil * faces.pull * faces.magnet_gap**2 / np.sqrt((gap + faces.magnet_gap) ** 2 + side @ side)
+        return float(world.kinetic_energy().sum() + 0.5 * guide * side @ side - pull)
+
+    start = energy()
+    for _ in range(30):
+        world.advance(PERIOD_NS)
+        assert energy() == pytest.approx(start, rel=1e-7)
