@@ -161,10 +161,18 @@ class DockedBodies(ABC):
         self._body_arrays.state[body, 7:13] = 0.0
 
     def load(self, body: int) -> np.ndarray:
-        """(6,) wrench about O that the body gives to whatever clamps it, body frame; zeros for a body that swims."""
-        if not self._body_arrays.clamped[body]:
+        """(6,) wrench about O that the body gives to whatever clamps it, body frame; zeros for a body that swims.
+
+        The water that flows around it adds what its momentum asks for: the force of its acceleration, and the Munk moment.
+        """
+        arrays = self._body_arrays
+        if not arrays.clamped[body]:
             return np.zeros(6)
-        return self._body_arrays.wrench[body].copy()
+        turn, added = rotations.to_matrix(arrays.state[body, 3:7].copy()), arrays.added[body]
+        _, gust, target = self._water.flow
+        flow, rate = turn.T @ self._flow(), turn.T @ (target - gust) / self._water.smoothing_s
+        munk = -np.cross(flow, added[:3, :3] @ flow)
+        return np.asarray(arrays.wrench[body] + added[:, :3] @ rate + np.concatenate([np.zeros(3), munk]))
 
     def momentum(self) -> np.ndarray:
         """(b, 6) linear and angular momentum about the world's origin of each body with the water it moves, world."""

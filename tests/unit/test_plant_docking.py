@@ -334,6 +334,20 @@ def test_clamped_body_stays_clamped_when_others_join_and_part() -> None:
     assert world.load(1)[0] == pytest.approx(5.0, rel=1e-3) and not world.load(0).any()
 
 
+def test_load_cell_in_water_that_gathers_speed_feels_what_would_carry_the_body_away() -> None:
+    uneven = dataclasses.replace(VEHICLE, inertial=dataclasses.replace(VEHICLE.inertial, added=np.array([3.0, 9.0, 6.0, 0.01, 0.03, 0.02])))
+    tilted = Start(np.array([0.0, 0.0, 400.0]), rotations.from_euler(0.3, -0.5, 1.1))
+    held, free = (World(WorldSpec(**CALM), OCEAN, [uneven], [tilted], 0, PERIOD_NS) for _ in range(2))
+    held.clamp(0)
+    for world in (held, free):
+        world._water.flow[1:] = [0.1, 0.05, -0.02], [0.5, -0.3, 0.2]
+        world._step(0)
+    body = free._body_arrays
+    carried_away = (body.rigid[0] + body.added[0]) @ free._stage[5, 0, 7:]
+    np.testing.assert_allclose(held.load(0), carried_away, atol=1e-9)
+    assert np.linalg.norm(held.load(0) - held._body_arrays.wrench[0]) > 1.0, "the water's own inertia must show"
+
+
 def test_what_joins_a_clamped_body_stands_still() -> None:
     world = start_docked()
     world.part(world.docks.joints[0])
