@@ -21,11 +21,11 @@ from firmware_py.core import propagation
 from firmware_py.core.body import Body
 from firmware_py.core.measurements import ATMOSPHERE_PA
 from firmware_py.core.observation import GRAVITY
-from firmware_py.core.pipeline import CHANNELS, Pipeline
+from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import multiply, normalise, rotate, to_matrix
 from firmware_py.core.thruster import ThrusterLag
-from firmware_py.core.types import Action, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.core.types import CHANNELS, Action, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.description.water import WATER_DENSITY

@@ -11,7 +11,7 @@ import numpy as np
 
 from firmware_py.bus.codec import Codec, Frame, Receiver, unpack_quaternion
 from firmware_py.bus.codec.receiver import COUNTER, MESSAGE, NUMBER, VALUES
-from firmware_py.core.types import DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.core.types import CHANNELS, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.fleet import Fleet
 
 STALE_NS = 500_000_000
@@ -25,7 +25,6 @@ USABLE_STATUS = (0, 1)
 """Sensor status OK and SATURATED; a stale or failed sensor's values are not passed on."""
 SENSOR_FAULT = 15
 THRUSTERS_OF_A_FRAME = 4
-CHANNELS = 8
 ESTOP_PERIOD_NS = 50_000_000
 """ESTOP goes out at 20 Hz while it is raised."""
 

@@ -23,12 +23,22 @@ from firmware_py.core.docking_sequence import (
     nearest_pass,
 )
 from firmware_py.core.joints import Joint, modules_of
-from firmware_py.core.magnet_relays import RELAY_OFF, RELAY_PULL, RELAY_PUSH, MagnetRelays
+from firmware_py.core.magnet_relays import MagnetRelays
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
-from firmware_py.core.types import DockRecord, DockRequest, Estimate, Event, Inputs
+from firmware_py.core.types import (
+    INFORMATION,
+    RELAY_OFF,
+    RELAY_PULL,
+    RELAY_PUSH,
+    WARNING,
+    DockRecord,
+    DockRequest,
+    Estimate,
+    Event,
+    Inputs,
+)
 from firmware_py.description.parameters import Docking
 
-WARNING, INFORMATION = 4, 6
 CHANGED = "the bodies are others than those that it was planned for"
 NO_LONGER = "its body is no longer in DOCK"
 

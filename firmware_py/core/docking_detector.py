@@ -15,10 +15,8 @@ import numpy as np
 
 from firmware_py.core.docking_pairs import NEVER_NS, PAIR, PICTURES, Limits, place_modules, watch
 from firmware_py.core.rotations import to_matrix
-from firmware_py.core.types import ModuleInputs
+from firmware_py.core.types import FACES, ModuleInputs
 from firmware_py.description.parameters import Docking
-
-FACES = 6
 
 
 class FacePair(NamedTuple):

@@ -15,10 +15,9 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
-from firmware_py.core.magnet_relays import RELAY_OFF, RELAY_PULL, RELAY_PUSH
 from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, rotate_back, to_matrix
 from firmware_py.core.setpoint import Wish
-from firmware_py.core.types import DockRequest, Estimate, Setpoint
+from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest, Estimate, Setpoint
 from firmware_py.description.parameters import Docking
 
 SLOWING_PER_S = 0.5

@@ -13,7 +13,7 @@ from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.thruster import commands, module_power, polynomial, total_power
-from firmware_py.core.types import Room
+from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, RELAY_PUSH, Room
 from firmware_py.description.parameters import Limiter as LimiterParameters
 
 VOLTAGE_EXPONENT = 1.2
@@ -22,11 +22,6 @@ VOLTAGE_RANGE = (0.6, 1.4)
 """Share of the nominal voltage outside of which a reading is not believed, and counts as nominal."""
 POWER_HALVINGS = 12
 """Bisections of the share that meets the supply limit."""
-OFF, FORWARD, REVERSE = 0, 1, 2
-"""States of a docking relay."""
-FACES = 6
-
-
 EASED_STEP_N, EASED_S = 0.8, 0.2
 """Fastest change in a tick while thrusters pass from one body's allocation to another's, and for how long."""
 
@@ -164,7 +159,7 @@ class MagnetLimiter:
         self._dt_s = dt_s
         self._left_s = [parameters.relay_on_s] * FACES
         self._resting = [False] * FACES
-        self.states = (OFF,) * FACES
+        self.states = (RELAY_OFF,) * FACES
         """Relay states of the last tick."""
         self.power_w = 0.0
         """What the magnets that are on take, W."""
@@ -184,12 +179,12 @@ class MagnetLimiter:
         if self._is_cold and not any(wanted):
             return self.states
         full, duty = self._p.relay_on_s, self._p.relay_duty
-        on = [state in (FORWARD, REVERSE) and not resting for state, resting in zip(wanted, self._resting, strict=True)]
+        on = [state in (RELAY_PULL, RELAY_PUSH) and not resting for state, resting in zip(wanted, self._resting, strict=True)]
         for face in range(FACES):
             left_s = min(full, self._left_s[face] + self._dt_s * (duty - on[face]))
             self._resting[face] = left_s < 0.5 * full if self._resting[face] else left_s <= 0.0
             self._left_s[face] = left_s
         self._is_cold = not any(on) and self._left_s == [full] * FACES
         self.power_w = sum(on) * self._p.relay_w
-        self.states = tuple(state if lit else OFF for state, lit in zip(wanted, on, strict=True))
+        self.states = tuple(state if lit else RELAY_OFF for state, lit in zip(wanted, on, strict=True))
         return self.states

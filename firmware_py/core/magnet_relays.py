@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from firmware_py.core.joints import sides
-from firmware_py.core.types import NEVER_NS, DockRequest
+from firmware_py.core.types import FACES, NEVER_NS, DockRequest
 
-RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
-"""States of a relay, as DOCK_CMD has them."""
 PERIOD_NS = 100_000_000
 """DOCK_CMD goes out at 10 Hz, and at once when a relay changes."""
 AT_ONCE_NS = -NEVER_NS
@@ -19,7 +17,7 @@ class MagnetRelays:
     """Relay states by module and face. Off at first."""
 
     def __init__(self, modules: int) -> None:
-        self._states = np.zeros((modules, 6), dtype=np.int64)
+        self._states = np.zeros((modules, FACES), dtype=np.int64)
         self._due_ns = [AT_ONCE_NS] * modules
 
     @property

@@ -25,11 +25,13 @@ from firmware_py.core.motor_test import MotorTest
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.requests import FOR_ALL, follow, sift
 from firmware_py.core.sensor_watch import SensorWatch
-from firmware_py.core.supervisor import WARNING, Decision, Supervisor
+from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.supply import SupplyMeter
 from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.transitions import DOCKING, Effect, State, Trigger
 from firmware_py.core.types import (
+    CHANNELS,
+    WARNING,
     Action,
     BodyRecord,
     DockRequest,
@@ -49,8 +51,6 @@ from firmware_py.description.schema import DescriptionError
 ESTIMATORS: dict[str, type[Estimator] | type[TagOnlyEstimator]] = {"full": Estimator, "paper": TagOnlyEstimator}
 ARMING_EVERY_NS = 100_000_000
 """Between two times that the arming checks are asked for what a record says of them."""
-CHANNELS = 8
-"""Thruster commands that one module's frames carry."""
 
 
 class BodyPipeline:

@@ -14,11 +14,9 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.health import is_sticks
 from firmware_py.core.transitions import MODES
-from firmware_py.core.types import Action, DockRequest, Event, Mode, Request, Setpoint
+from firmware_py.core.types import FACES, WARNING, Action, DockRequest, Event, Mode, Request, Setpoint
 
-WARNING = 4
-"""syslog severity."""
-FACES, QUARTERS = 6, 4
+QUARTERS = 4
 FARTHEST = 1e6
 """m, m/s, rad/s and so on: nothing that is meant is larger."""
 UNIT = 1e-3

@@ -9,10 +9,8 @@ from firmware_py.core.arming import Question, against_arming, missing
 from firmware_py.core.failsafes import Failsafes, Level
 from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.transitions import ARMED, MODES, ROWS, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger
-from firmware_py.core.types import Event, Mode, Request
+from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Event, Mode, Request
 from firmware_py.description.parameters import Parameters
-
-CRITICAL, WARNING, INFORMATION = 2, 4, 6
 
 LADDER = {
     Level.HOLD: (Trigger.FAILSAFE_HOLD, Trigger.FAILSAFE_DEPTH, Trigger.FAILSAFE_SURFACE),
@@ -21,8 +19,6 @@ LADDER = {
     Level.DISARM: (Trigger.FAILSAFE_DISARM,),
 }
 """What a fail-safe tries, one after the other until one is possible."""
-
-
 MODE_LEVEL = {Mode.SURFACE: Level.SURFACE}
 """What a mode is worth as a fail-safe, whoever chose it: a milder one does not end it."""
 
@@ -92,7 +88,7 @@ class Supervisor:
             decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
         decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger)]
         decisions += [self._request(request, health) for request in requests]
-        decisions += self._guard(health)
+        decisions += self._run_failsafes(health)
         return [decision for decision in decisions if decision is not None]
 
     @property
@@ -113,8 +109,8 @@ class Supervisor:
             self.raises_estop = trigger == Trigger.ESTOP
         return decision
 
-    def _guard(self, health: Health) -> list[Decision | None]:
-        """Runs the fail-safes."""
+    def _run_failsafes(self, health: Health) -> list[Decision | None]:
+        """Says what begins and ends, and does what the gravest one asks for."""
         decisions: list[Decision | None] = []
         alarms = self._failsafes.step(health, self.mode, self.level > Level.NONE, self.armed)
         begun = [alarm.level for alarm in alarms if alarm.begins and alarm.level > Level.WARN]

@@ -13,6 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Array = np.ndarray
+CHANNELS, FACES = 8, 6
+"""Thruster commands that one module's frames carry; docking faces of a module, each with its relay."""
+RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
+"""States of a docking relay, as DOCK_CMD has them."""
+CRITICAL, WARNING, INFORMATION = 2, 4, 6
+"""Severities of an `Event`, as syslog and STATUSTEXT have them."""
 NEVER_NS = 1 << 60
 """Age of the last tag before the first one."""
 
@@ -305,7 +311,7 @@ class Event(NamedTuple):
     """Something a person may want to read."""
 
     severity: int
-    """syslog: 2 critical, 4 warning, 6 information."""
+    """CRITICAL, WARNING or INFORMATION."""
     text: str
     body: int | None = None
     """Number of the body that it is about; None: all of them, or none that there is."""

@@ -12,6 +12,8 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet
+from firmware_py.core.observation import GRAVITY
+from firmware_py.core.types import CHANNELS
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
@@ -20,13 +22,7 @@ from firmware_py.prepare.drag_cache import DragCache
 from firmware_py.prepare.joints import Placement, check_joints
 from firmware_py.prepare.lattice import MATRICES, QUATERNIONS
 
-GRAVITY = 9.80665
-"""m/s^2, standard."""
-
 MOST_MODULES = 64
-CHANNELS = 8
-"""Thrusters that one module's frames carry."""
-
 PITCH_M = 0.21
 """Lattice pitch of the paper's module (its docking condition 2)."""
 

@@ -23,7 +23,7 @@ from typing import Any
 import foxglove
 from foxglove.mcap import MCAPWriteOptions
 
-from firmware_py.core.types import Event, Inputs, Outputs
+from firmware_py.core.types import WARNING, Event, Inputs, Outputs
 from firmware_py.description.signals import Layout, TextLayout
 from firmware_py.runtime.guarded_file import GuardedFile, QueuedFile
 from firmware_py.runtime.rate_keeper import RateKeeper
@@ -46,8 +46,6 @@ ESTOP = "estop"
 STANDS = b"stands"
 LIVE_ONLY = ("/scene", "/tf")
 """What is drawn from other channels has no place in a log."""
-WARNING = 4
-"""syslog severity of a log that failed."""
 
 _ID_TEXTS = tuple(f"{frame_id:03X}#" for frame_id in range(2048))
 

@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
 from firmware_py.core.docking_sequence import DockingSequence, Stage, Steering, nearest_pass
-from firmware_py.core.magnet_relays import RELAY_OFF, RELAY_PULL, RELAY_PUSH
 from firmware_py.core.rotations import conjugate, difference, from_euler, multiply, rotate, rotate_back, to_matrix
 from firmware_py.core.setpoint import Wish
-from firmware_py.core.types import DockRequest, Estimate
+from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest, Estimate
 from firmware_py.description.parameters import PAPER, Docking
 from firmware_py.description.vehicle import FACE_NORMALS, load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble

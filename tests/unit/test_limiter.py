@@ -7,17 +7,14 @@ import pytest
 
 from firmware_py.core.body import Body
 from firmware_py.core.limiter import (
-    FACES,
-    FORWARD,
-    OFF,
     POWER_HALVINGS,
-    REVERSE,
     VOLTAGE_EXPONENT,
     VOLTAGE_RANGE,
     Limiter,
     MagnetLimiter,
 )  # fmt: skip
 from firmware_py.core.thruster import total_power
+from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, RELAY_PUSH
 from firmware_py.description import parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -411,7 +408,7 @@ def test_room_is_made_anew_when_something_has_changed_and_only_then(body: Body) 
 
 def test_limits_are_made_of_these_numbers() -> None:
     assert (VOLTAGE_EXPONENT, VOLTAGE_RANGE, FACES) == (1.2, (0.6, 1.4), 6)
-    assert (OFF, FORWARD, REVERSE) == (0, 1, 2)
+    assert (RELAY_OFF, RELAY_PULL, RELAY_PUSH) == (0, 1, 2)
     assert POWER_HALVINGS == 12, "replay compares bytes"
 
 

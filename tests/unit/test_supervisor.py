@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 
 from firmware_py.core.failsafes import Level
-from firmware_py.core.supervisor import INFORMATION, WARNING, Decision, Supervisor
+from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.transitions import ARMED, ROWS, TABLE, Effect, Guard, State, Transition, Trigger
-from firmware_py.core.types import Action, Event, Mode, Request
+from firmware_py.core.types import INFORMATION, WARNING, Action, Event, Mode, Request
 from tests.unit.healths import BLIND, GOOD, at
 from tests.unit.supervisors import DOCK, REQUESTS, STICKS, P, ask, supervisor_in, texts
 

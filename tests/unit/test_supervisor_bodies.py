@@ -4,9 +4,9 @@ import pytest
 
 from firmware_py.core.failsafes import Level
 from firmware_py.core.health import Health
-from firmware_py.core.supervisor import CRITICAL, INFORMATION, WARNING, Supervisor
+from firmware_py.core.supervisor import Supervisor
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, Mode, Request
+from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Mode, Request
 from tests.unit.healths import BLIND, GOOD, UPRIGHT, at
 from tests.unit.supervisors import QUICK, P, ask, supervisor_in, texts
 

@@ -6,9 +6,9 @@ import pytest
 
 from firmware_py.core.failsafes import Level
 from firmware_py.core.health import Health
-from firmware_py.core.supervisor import CRITICAL, INFORMATION, WARNING, Decision, Supervisor
+from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.transitions import Effect, State, Trigger
-from firmware_py.core.types import Action, Event, Mode, Request
+from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Event, Mode, Request
 from tests.unit.healths import BLIND, GOOD, UPRIGHT, at
 from tests.unit.supervisors import QUICK, STICKS, P, ask, supervisor_in, texts
 
