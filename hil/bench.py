@@ -68,26 +68,18 @@ class Bench:
         Raises DescriptionError where somebody else answers as one of the simulated modules.
         """
         lockstep = Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks)
-        plant_ports = [self.plant_port]
-        period_ns = self.fleet.period_ns
         sent: list[BusFrame] = []
         outputs: Outputs | None = None
         began = time.perf_counter()
         for tick in range(1, self.script.ticks + 1):
-            time_ns = tick * period_ns
+            time_ns = tick * self.fleet.period_ns
             if self.faults.process_killed(time_ns):
-                lockstep, outputs, sent = self._without_firmware(observers, sent), None, []
-                if truth is not None:
-                    truth.record_world(tick, self.nodes.world)
+                self._step_plant(tick, sent, truth)
+                lockstep, outputs, sent = self._without_firmware(observers), None, []
                 continue
             self.is_dead = False
             sent += lockstep.start_tick(tick, time_ns)
-            heard = drain(plant_ports, sent, self.patience_looks)
-            if tick <= self.fleet.rate_hz:  # later this one was the first
-                self.nodes.refuse_others([frame for _, frame in heard], self.plant_port.address)
-            answers = send(plant_ports, [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
-            if truth is not None:
-                truth.record_world(tick, self.nodes.world)
+            answers = self._step_plant(tick, sent, truth)
             outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), answers)
             if self.script.is_over(time_ns):
                 break
@@ -109,10 +101,18 @@ class Bench:
                 raise PortError(OTHER_SYNC)
             time.sleep(LOOK_S)
 
-    def _without_firmware(self, observers: Sequence[Observer], sent: Sequence[BusFrame]) -> Lockstep:
-        """A tick in which the firmware's process is dead; returns the one that will be started in its place."""
-        heard = drain([self.plant_port], sent, self.patience_looks)
-        send([self.plant_port], [(0, frame) for frame in self.nodes.step([frame for _, frame in heard])])
+    def _step_plant(self, tick: int, sent: Sequence[BusFrame], truth: TruthRecorder | None) -> list[BusFrame]:
+        """The plant's half of a tick: it hears what was sent, moves on by a period and answers; returns the answers."""
+        heard = [frame for _, frame in drain([self.plant_port], sent, self.patience_looks)]
+        if tick <= self.fleet.rate_hz:  # later this one was the first
+            self.nodes.refuse_others(heard, self.plant_port.address)
+        answers = send([self.plant_port], [(0, frame) for frame in self.nodes.step(heard)])
+        if truth is not None:
+            truth.record_world(tick, self.nodes.world)
+        return answers
+
+    def _without_firmware(self, observers: Sequence[Observer]) -> Lockstep:
+        """After a tick in which the firmware's process is dead; returns the one that will be started in its place."""
         self.firmware_port.receive()
         if not self.is_dead:
             self.is_dead, self.firmware = True, compose(self.fleet, self.parameters)
