@@ -6,7 +6,7 @@ import errno
 import os
 import sys
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,7 @@ from typer.exceptions import TyperException
 from firmware_py.bus.port import PortError
 from firmware_py.description.fleet import Fleet, single
 from firmware_py.description.parameters import Parameters, load_parameters
-from firmware_py.description.schema import DescriptionError
+from firmware_py.description.schema import DescriptionError, explained, to_toml
 from firmware_py.ground.config import GroundConfig, check_store, load_ground
 from firmware_py.ground.identity import IDENTITIES
 from firmware_py.runtime import disk
@@ -152,6 +152,20 @@ def doctor(
         return
     described = fleet_of(fleet, bus, None, None)
     raise typer.Exit(examine(described, out, say=lambda line: typer.echo(line)))
+
+
+@app.command()
+def parameters(
+    group: Annotated[list[str] | None, typer.Argument(help="groups to print; without any all of them")] = None,
+    file: Annotated[Path | None, typer.Option("--parameters", help="values of this file in place of the shipped ones")] = None,
+) -> None:
+    """Print the parameters as a file for --parameters: each with its value, what is permitted, what it does, its name on MAVLink."""
+    chosen = load_parameters(file) if file is not None else Parameters()
+    groups = [field.name for field in fields(chosen)]
+    if unknown := [name for name in group or () if name not in groups]:
+        raise DescriptionError(f"group {unknown[0]!r} is unknown; there are {', '.join(groups)}")
+    texts = [f"[{name}]\n{to_toml(getattr(chosen, name), explained)}" for name in groups if name in (group or groups)]
+    typer.echo("\n".join(texts), nl=False)
 
 
 @app.command()

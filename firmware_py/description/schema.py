@@ -12,7 +12,7 @@ import re
 import tomllib
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -257,18 +257,28 @@ def to_plain(value: Any) -> Any:
     return [to_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
-def to_toml(value: Any) -> str:
-    """The TOML text of a dataclass of scalars, arrays, tables and lists of tables, with units as comments."""
+def unit_of(limits: Limits) -> str:
+    """The comment of a value that says no more than its unit."""
+    return limits.unit
+
+
+def explained(limits: Limits) -> str:
+    """The comment of a value that says all that is known of it."""
+    return "; ".join(filter(None, [limits.help, describe(limits), limits.mavlink and f"MAVLink {limits.mavlink}"]))
+
+
+def to_toml(value: Any, comment: Callable[[Limits], str] = unit_of) -> str:
+    """The TOML text of a dataclass of scalars, arrays, tables and lists of tables, each value with its `comment`."""
     head, tail = [], []
     for field in dataclasses.fields(value):
         item = getattr(value, field.name)
         if dataclasses.is_dataclass(item):
-            tail.append(f"\n[{field.name}]\n{to_toml(item)}")
+            tail.append(f"\n[{field.name}]\n{to_toml(item, comment)}")
         elif isinstance(item, tuple) and item and dataclasses.is_dataclass(item[0]):
-            tail += [f"\n[[{field.name}]]\n{to_toml(each)}" for each in item]
+            tail += [f"\n[[{field.name}]]\n{to_toml(each, comment)}" for each in item]
         else:
-            unit = limits_of(type(value), field.name).unit
-            head.append(f"{field.name} = {_literal(item)}{f'  # {unit}' if unit else ''}\n")
+            note = comment(limits_of(type(value), field.name))
+            head.append(f"{field.name} = {_literal(item)}{f'  # {note}' if note else ''}\n")
     return "".join(head + tail)
 
 
