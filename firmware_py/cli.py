@@ -18,6 +18,7 @@ from firmware_py.bus.port import PortError
 from firmware_py.description.fleet import Fleet, single
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError, explained, to_toml
+from firmware_py.description.vehicle import load_vehicle, vehicle_names
 from firmware_py.ground.config import GroundConfig, check_store, load_ground
 from firmware_py.ground.identity import IDENTITIES
 from firmware_py.runtime import disk
@@ -166,6 +167,14 @@ def parameters(
         raise DescriptionError(f"group {unknown[0]!r} is unknown; there are {', '.join(groups)}")
     texts = [f"[{name}]\n{to_toml(getattr(chosen, name), explained)}" for name in groups if name in (group or groups)]
     typer.echo("\n".join(texts), nl=False)
+
+
+@app.command()
+def vehicle(
+    name: Annotated[str | None, typer.Argument(help="one that comes with modcube, or a file; without one their names are printed")] = None,
+) -> None:
+    """Print what the controller believes about a vehicle as a file for --vehicle: each value with its unit, range and meaning."""
+    typer.echo("\n".join(vehicle_names()) if name is None else to_toml(load_vehicle(name), explained).rstrip())
 
 
 @app.command()

@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+ANYTHING = "a value"
+"""What a field without unit, range and choices may hold."""
 SHOWN_CHARACTERS = 60
 """A value that is longer is cut in an error's line."""
 
@@ -172,7 +174,7 @@ def describe(limits: Limits) -> str:
         return f"{limits.low:g} to {limits.high:g}{unit}"
     if math.isfinite(limits.low) or math.isfinite(limits.high):
         return f"at least {limits.low:g}{unit}" if math.isfinite(limits.low) else f"at most {limits.high:g}{unit}"
-    return f"a value{f' in{unit}' if unit else ''}"
+    return f"{ANYTHING}{f' in{unit}' if unit else ''}"
 
 
 def _value(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[str | int, ...]) -> Any:
@@ -264,7 +266,8 @@ def unit_of(limits: Limits) -> str:
 
 def explained(limits: Limits) -> str:
     """The comment of a value that says all that is known of it."""
-    return "; ".join(filter(None, [limits.help, describe(limits), limits.mavlink and f"MAVLink {limits.mavlink}"]))
+    parts = (limits.help, describe(limits).removeprefix(ANYTHING), limits.mavlink and f"MAVLink {limits.mavlink}")
+    return "; ".join(part for part in parts if part)
 
 
 def to_toml(value: Any, comment: Callable[[Limits], str] = unit_of) -> str:

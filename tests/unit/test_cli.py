@@ -15,7 +15,8 @@ from firmware_py.__main__ import INTERRUPTED
 from firmware_py.__main__ import main as main_from_the_start
 from firmware_py.cli import main
 from firmware_py.description.parameters import Parameters, load_parameters, registry
-from firmware_py.description.schema import describe
+from firmware_py.description.schema import describe, to_toml
+from firmware_py.description.vehicle import load_vehicle, vehicle_names
 from firmware_py.runtime.guarded_file import GuardedFile
 from hil.scenario import scenario_names
 from hil.signals import TruthRecorder
@@ -231,8 +232,8 @@ def test_list_names_every_scenario_with_one_line_of_help(
     assert all(len(line.split()) > 3 for line in lines)
 
 
-def printed_parameters(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    monkeypatch.setattr("sys.argv", ["modcube", "parameters", *arguments])
+def printed(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+    monkeypatch.setattr("sys.argv", ["modcube", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 0
@@ -245,19 +246,33 @@ def test_printed_parameters_are_a_file_of_parameters(
     mine = tmp_path / "mine.toml"
     mine.write_text("[control]\nlead_s = 0.1\n")
     whole = tmp_path / "whole.toml"
-    whole.write_text(printed_parameters(["--parameters", str(mine)], monkeypatch, capsys))
+    whole.write_text(printed(["parameters", "--parameters", str(mine)], monkeypatch, capsys))
     assert load_parameters(whole) == load_parameters(mine) == Parameters().replace("control.lead_s", 0.1)
 
 
 def test_printed_parameters_say_what_each_is_and_may_be(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = printed_parameters([], monkeypatch, capsys).splitlines()
+    lines = printed(["parameters"], monkeypatch, capsys).splitlines()
     for name, limits in registry():
         told = [line for line in lines if line.startswith(f"{name.partition('.')[2]} = ") and limits.help in line]
         assert len(told) == 1 and f"; {describe(limits)}" in told[0] and limits.mavlink in told[0]
 
 
+@pytest.mark.parametrize("name", vehicle_names())
+def test_printed_vehicle_is_the_vehicle(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine = tmp_path / "mine.toml"
+    mine.write_text(printed(["vehicle", name], monkeypatch, capsys))
+    assert printed(["vehicle", str(mine)], monkeypatch, capsys) == mine.read_text()
+    assert to_toml(load_vehicle(str(mine))) == to_toml(load_vehicle(name))
+
+
+def test_vehicles_are_printed_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert printed(["vehicle"], monkeypatch, capsys).split() == vehicle_names()
+
+
 def test_groups_of_parameters_are_printed_alone(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(tomllib.loads(printed_parameters(["fence", "control"], monkeypatch, capsys))) == ["control", "fence"]
+    assert list(tomllib.loads(printed(["parameters", "fence", "control"], monkeypatch, capsys))) == ["control", "fence"]
     line = refusal(["parameters", "fences"], monkeypatch, capsys)
     assert "group 'fences'" in line and "there are control, " in line
 
