@@ -173,7 +173,10 @@ GROUPS: tuple[Group, ...] = (
     ),
     Group(
         "speed", 2, "make bench", timed,
-        (Figure("spiral in lockstep with recorder and real frames, one core", "speed", low=25.0, unit="x real time"),),
+        (
+            Figure("spiral in lockstep with recorder and real frames, one core", "speed", low=25.0, unit="x real time"),
+            Figure("that core meanwhile: ten million additions in plain Python", "additions", unit="s"),
+        ),
     ),
     Group(
         "least-power", 10, "modcube hil campaign mobius-1 --trials 8 --jobs 2 --controller least_power, and without it",

@@ -125,3 +125,11 @@ def _shares(watch: Stopwatch, stages: list[str], wall_s: float) -> dict[str, flo
     shares["firmware: rest of pipeline.step"] = watch.total_s("pipeline.step") / wall_s - inside
     shares["rest of the bench"] = 1.0 - sum(shares.values())
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
+
+
+def time_additions(count: int = 10_000_000) -> float:
+    """Time that so many additions take in plain Python, s: tells a slow machine from slow code."""
+    began, total = perf_counter_ns(), 0
+    for i in range(count):
+        total += i
+    return (perf_counter_ns() - began) * 1e-9
