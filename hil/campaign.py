@@ -29,8 +29,8 @@ from firmware_py.description.vehicle import load_vehicle
 from firmware_py.runtime.disk import writing_to
 from hil.campaign_summary import Trial, summarise, table_of
 from hil.checks import Result
-from hil.docking_metrics import OUTCOMES
 from hil.flight import fly_and_judge
+from hil.metrics import OUTCOMES
 from hil.plant.world_parameters import world_parameters
 from hil.replaceable import check_replaceable, is_json_with
 from hil.scenario import Scenario

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from hil.campaign_summary import surely_not_zero
 from hil.checks import Result
-from hil.metrics import SHOWN, metric_order, shown_limit, shown_value
+from hil.metrics import metric_order, shown, shown_limit, shown_value
 
 TOLD = ("position_rmse_m", "attitude_rmse_rad")
 """Metrics of a campaign for which it is said what they go with."""
@@ -91,7 +91,7 @@ def campaign_table(summary: Mapping[str, Any]) -> Table:
         quantiles = summary["metrics"][name]
         if quantiles["median"] is not None:
             values = (shown_value(name, quantiles[q]) for q in ("min", "median", "q95", "max"))
-            table.add_row(SHOWN[name].label if name in SHOWN else name, *values)
+            table.add_row(shown(name).label, *values)
     return table
 
 
@@ -107,7 +107,7 @@ def print_campaign(summary: Mapping[str, Any], console: Console | None = None) -
     pairs = sum(len(correlations) for correlations in looked_at.values())
     for metric, correlations in looked_at.items():
         if words := what_matters(correlations, pairs):
-            console.print(f"{SHOWN[metric].label} goes with: {words}", highlight=False)
+            console.print(f"{shown(metric).label} goes with: {words}", highlight=False)
 
 
 def what_matters(correlations: Mapping[str, Mapping[str, float]], pairs: int = 0) -> str:
@@ -137,7 +137,7 @@ def result_table(result: Result) -> Table:
         if check is not None:
             limit = shown_limit(name, check.low, check.high)
             verdict = Text("passed", style="green") if check.passed else Text("FAILED", style="bold red")
-        table.add_row(SHOWN[name].label if name in SHOWN else name, shown_value(name, value), limit, verdict)
+        table.add_row(shown(name).label, shown_value(name, value), limit, verdict)
     return table
 
 
@@ -153,7 +153,7 @@ def print_result(result: Result, report: Path | None = None, console: Console | 
     console.print(result_table(result))
     for line in told_lines(result.told):
         console.print(line, highlight=False, markup=False)
-    failed = [SHOWN[c.name].label if c.name in SHOWN else c.name for c in result.checks if not c.passed]
+    failed = [shown(c.name).label for c in result.checks if not c.passed]
     verdict = f"FAILED: {'; '.join(failed)}" if failed else "passed" if result.passed else "FAILED: nothing was checked"
     console.print(verdict, style="green" if result.passed else "bold red", highlight=False)
     if report is not None:

@@ -12,11 +12,10 @@ from firmware_py.core.rotations import rotate
 from firmware_py.description.signals import Columns, read_signals
 from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS
 from hil.dock_plot import STAGES
+from hil.metrics import OUTCOMES
 from hil.scenario import Scenario, Step
 from hil.signals import SIGNAL_LOG, TRUTH_LOG
 
-OUTCOMES = ("docked", "jammed", "unstable control", "refused", "gave up")
-"""What the metric `outcome` counts."""
 DOCKED, JAMMED, UNSTABLE, REFUSED, GAVE_UP = range(len(OUTCOMES))
 DECLARED = STAGES.index("docked")
 """Stage of a dock in the tick in which the firmware takes two bodies for one."""

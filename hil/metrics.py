@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -21,48 +22,52 @@ PAPER_SPIRAL_RMSE_MM = 20.92
 
 
 class Shown(NamedTuple):
-    """How people read a metric: a name, and a unit for which the value is multiplied by `scale`."""
+    """How people read a metric: a name, and a unit for which the value is multiplied by `scale`, or words by number."""
 
     label: str
     unit: str = ""
     scale: float = 1.0
     digits: int = 2
+    words: tuple[str, ...] = ()
 
 
+OUTCOMES = ("as asked", "jammed", "unstable control", "refused", "gave up")
+"""What came of a run's docks, by the number that the metric `outcome` has."""
 SHOWN = {
     "position_rmse_m": Shown("Position RMSE, truth against reference", "mm", 1e3),
-    "position_max_m": Shown("Position error, worst tick", "mm", 1e3),
+    "position_max_m": Shown("Position error, largest", "mm", 1e3),
     "attitude_rmse_rad": Shown("Attitude RMSE, truth against reference", "deg", math.degrees(1.0)),
-    "attitude_max_rad": Shown("Attitude error, worst tick", "deg", math.degrees(1.0)),
+    "attitude_max_rad": Shown("Attitude error, largest", "deg", math.degrees(1.0)),
     "estimate_position_rmse_m": Shown("Position RMSE, estimate against truth", "mm", 1e3),
     "estimate_attitude_rmse_rad": Shown("Attitude RMSE, estimate against truth", "deg", math.degrees(1.0)),
-    "nis_mean": Shown("Tag NIS over its expectation (1: consistent)"),
-    "sigma3_share": Shown("Truth inside 3 sigma, worst of six axes", "%", 100.0, 1),
-    **{f"sigma3_share_{axis}": Shown(f"Truth inside 3 sigma, {axis}", "%", 100.0, 1) for axis in AXES},
-    "thrust_rms_n": Shown("Commanded force of a thruster, RMS", "N"),
-    "thrust_rate_rms_n_s": Shown("Its rate of change, RMS: what wears a thruster", "N/s"),
+    "nis_mean": Shown("Tag NIS per degree of freedom (ideal: 1)"),
+    "sigma3_share": Shown("Truth within 3 sigma, worst axis", "%", 100.0, 1),
+    **{f"sigma3_share_{axis}": Shown(f"Truth within 3 sigma, {axis}", "%", 100.0, 1) for axis in AXES},
+    "thrust_rms_n": Shown("Thruster command, RMS", "N"),
+    "thrust_rate_rms_n_s": Shown("Thruster command, rate of change, RMS", "N/s"),
     "supply_power_w": Shown("Electrical power of all modules, mean", "W"),
-    "wrench_margin_min": Shown("Busiest thruster, worst tick: share of its range left", "%", 100.0, 1),
-    "tags_rejected": Shown("Tag observations refused by the gate", digits=0),
-    "armed_share": Shown("Armed, share of the ticks judged", "%", 100.0, 1),
-    "docked": Shown("Together and apart as asked for (1: yes)", digits=0),
-    "gap_min_m": Shown("Faces that came nearest to each other", "mm", 1e3),
-    "tries": Shown("Meetings of a probe with a funnel", digits=0),
-    "jams": Shown("Jams", digits=0),
-    "outcome": Shown("Outcome (0 docked, 1 jammed, 2 unstable, 3 refused, 4 gave up)", digits=0),
-    "false_declarations": Shown("Docks declared that were none", digits=0),
-    "docked_rmse_m": Shown("Position RMSE of joined bodies", "mm", 1e3),
-    "join_jump_n": Shown("Thruster command's step when bodies join, largest", "N", digits=2),
-    "warnings": Shown("Warnings of the firmware, whole flight", digits=0),
+    "wrench_margin_min": Shown("Thrust reserve, worst thruster and tick", "%", 100.0, 1),
+    "tags_rejected": Shown("Tag observations rejected by the gate", digits=0),
+    "armed_share": Shown("Time armed, share of the judged part", "%", 100.0, 1),
+    "docked": Shown("Docked and undocked as asked", words=("no", "yes")),
+    "gap_min_m": Shown("Gap between facing faces, smallest", "mm", 1e3),
+    "tries": Shown("Contacts of a probe with a funnel", digits=0),
+    "jams": Shown("Jammed contacts", digits=0),
+    "outcome": Shown("Docking outcome", words=OUTCOMES),
+    "false_declarations": Shown("False declarations of a dock", digits=0),
+    "docked_rmse_m": Shown("Position RMSE of docked bodies", "mm", 1e3),
+    "join_jump_n": Shown("Thruster step when bodies join, largest", "N"),
+    "warnings": Shown("Firmware warnings, whole flight", digits=0),
     "duration_s": Shown("Duration of the judged part", "s"),
-    "real_time_factor": Shown("Faster than real time by", "times", digits=1),
+    "real_time_factor": Shown("Simulation speed over real time", "x", digits=1),
     "ticks": Shown("Ticks judged", digits=0),
-    "unmatched_ticks": Shown("Ticks that a log lacks", digits=0),
+    "unmatched_ticks": Shown("Ticks missing from a log", digits=0),
     "deadline_misses": Shown("Deadlines missed", digits=0),
 }
 """Metrics in the order in which tables show them."""
 DOCKING = ("docked", "gap_min_m", "tries", "jams", "outcome", "false_declarations", "docked_rmse_m", "join_jump_n")
 """Those that only a run with [[step]]s has."""
+FORCE_METRIC = re.compile(r"force_(rmse|fit|difference)(\d?)_(?:(\w+)_)?(on|off)(?:_n)?")
 
 
 def metric_order(names: Iterable[str]) -> list[str]:
@@ -71,17 +76,40 @@ def metric_order(names: Iterable[str]) -> list[str]:
     return [name for name in SHOWN if name in given] + [name for name in given if name not in SHOWN]
 
 
+def shown(metric: str) -> Shown:
+    """How people read `metric`; one that has no name but its own keeps its unit too."""
+    return SHOWN.get(metric) or _force_shown(metric) or Shown(metric, digits=4)
+
+
+def _force_shown(metric: str) -> Shown | None:
+    """Those of force tracking (hil.force_metrics), of which there are as many as bodies."""
+    if (match := FORCE_METRIC.fullmatch(metric)) is None:
+        return None
+    what, degree, body, phase = match.groups()
+    jets = f"interference {phase}"
+    if what == "difference":
+        return Shown(f"Force RMSE per module, two modules against one, {jets}", "%", 100.0)
+    of = f"{body} module{'' if body == 'one' else 's'}, {jets}"
+    if what == "rmse":
+        return Shown(f"Force RMSE per module, {of}", "N")
+    return Shown(f"Force fit, degree {degree}, {of}", digits=4)
+
+
 def shown_value(metric: str, value: float) -> str:
-    """The value as people read it: `2.72 mm`. A metric that is not in `SHOWN` keeps its own unit."""
-    how = SHOWN.get(metric, Shown(metric, digits=4))
+    """The value as people read it: `2.72 mm`."""
+    how = shown(metric)
     if not math.isfinite(value):
         return "none"
+    if how.words:
+        return how.words[round(value)]
     return f"{value * how.scale:.{how.digits}f} {how.unit}".rstrip()
 
 
 def shown_limit(metric: str, low: float, high: float) -> str:
-    """The bounds of a check as people read them: `<= 5 mm`."""
-    how = SHOWN.get(metric, Shown(metric))
+    """The bounds of a check as people read them: `<= 5 mm`, or the words that pass."""
+    how = shown(metric)
+    if how.words:
+        return " or ".join(word for number, word in enumerate(how.words) if low <= number <= high)
     low, high = (bound * how.scale if abs(bound) < UNBOUNDED else bound for bound in (low, high))
     return f"{limit_text(low, high)} {how.unit}".rstrip()
 

@@ -213,7 +213,7 @@ def estimate(flight: Flight, window: Window) -> Any:
 
 
 def _innovation(axes: Any, flight: Flight, window: Window) -> None:
-    title = "Tag innovation squared over its expectation"
+    title = "Tag NIS per degree of freedom"
     used = flight.firmware["nis_dof"] > 0
     if not used.any():
         _say_none(axes, title, "this filter tells no innovations")
@@ -230,7 +230,7 @@ def _innovation(axes: Any, flight: Flight, window: Window) -> None:
 def _tag_age(axes: Any, flight: Flight, window: Window) -> None:
     age_ms = flight.firmware["tag_age_ns"] / 1e6
     axes.plot(flight.time_s, np.where(age_ms < 1e4, age_ms, np.nan), color=COMMAND, linewidth=0.8)
-    axes.set_title(f"Age of the last accepted tag; refused: {refused(flight.firmware['rejected'][_inside(flight, window)])}")
+    axes.set_title(f"Age of the last accepted tag; rejected: {refused(flight.firmware['rejected'][_inside(flight, window)])}")
     axes.set(ylabel="ms")
     axes.set_ylim(bottom=0.0)
 

@@ -16,7 +16,7 @@ import numpy as np
 from firmware_py.description.signals import Columns
 from firmware_py.description.vehicle import Vehicle
 from hil.checks import Result
-from hil.metrics import SHOWN, metric_order, rotation_vectors, shown_limit, shown_value
+from hil.metrics import metric_order, rotation_vectors, shown, shown_limit, shown_value
 from hil.plots import Window
 from hil.signals import Flight
 
@@ -176,7 +176,7 @@ def _headline(result: Result, scene: Scene) -> str:
 def _tiles(result: Result) -> str:
     return "\n".join(
         f'<div class="tile"><b>{html.escape(shown_value(name, result.metrics[name]))}</b>'
-        f"<span>{html.escape(SHOWN[name].label)}</span></div>"
+        f"<span>{html.escape(shown(name).label)}</span></div>"
         for name in TILES
         if name in result.metrics
     )
@@ -192,7 +192,7 @@ def _table(result: Result) -> str:
             limit = shown_limit(name, check.low, check.high)
             kind = "passed" if check.passed else "failed"
             verdict = f'<span class="badge {kind}">{kind}</span>'
-        label = SHOWN[name].label if name in SHOWN else name
+        label = shown(name).label
         value = shown_value(name, result.metrics.get(name, float("nan")))
         cells = (f"<td>{html.escape(label)}</td>", f'<td class="n">{html.escape(value)}</td>')
         rows.append(f'<tr>{"".join(cells)}<td class="n">{html.escape(limit)}</td><td>{verdict}</td></tr>')

@@ -15,10 +15,11 @@ from matplotlib import pyplot
 from rich.console import Console
 
 from firmware_py.description.vehicle import load_vehicle
-from hil.checks import Limit, Result, judge
+from hil.checks import UNBOUNDED, Limit, Result, judge
 from hil.console import flight_progress, print_result
 from hil.flight import as_wanted, wanted_in
-from hil.metrics import SHOWN, flight_metrics, metric_order, shown_limit, shown_value, told
+from hil.force_metrics import force_names
+from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, told
 from hil.plots import STYLE, Window, disturbance, estimate, overview, thrusters, write_plots
 from hil.report import CAPTIONS, Scene, animation, write_report
 from hil.scenario import load_scenario
@@ -74,7 +75,7 @@ def test_panel_says_why_it_is_empty_where_the_filter_has_nothing_to_show(flight:
     """The paper's filter tells no innovations and estimates no disturbance."""
     silent = {name: np.zeros_like(flight.firmware[name]) for name in ("nis", "nis_dof", "force_w", "moment_b")}
     for draw, titles, why in (
-        (estimate, ["Tag innovation squared over its expectation: none"], "this filter tells no innovations"),
+        (estimate, ["Tag NIS per degree of freedom: none"], "this filter tells no innovations"),
         (
             disturbance,
             ["Estimated disturbance force, world: none", "Estimated disturbance moment, body: none"],
@@ -138,8 +139,8 @@ def test_plots_judge_a_robot_that_does_not_follow_as_the_table_does(flight: Flig
     assert labels == [f"RMSE {shown_value(name, metrics[name])}" for name in ("position_rmse_m", "attitude_rmse_rad")]
     np.testing.assert_array_equal(shown.firmware["setpoint_p_wb"][before], flight.firmware["setpoint_p_wb"][before])
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in estimate(shown, WINDOW).axes]
-    assert f"Tag innovation squared over its expectation: mean {metrics['nis_mean']:.2f}" in titles
-    assert metrics["tags_rejected"] == 3.0 and "Age of the last accepted tag; refused: 3" in titles
+    assert f"Tag NIS per degree of freedom: mean {metrics['nis_mean']:.2f}" in titles
+    assert metrics["tags_rejected"] == 3.0 and "Age of the last accepted tag; rejected: 3" in titles
     pyplot.close("all")
 
 
@@ -205,6 +206,22 @@ def test_values_are_shown_in_units_that_people_read() -> None:
     assert shown_limit("position_rmse_m", -1e9, 0.005) == "<= 5 mm"
     assert shown_limit("sigma3_share", 0.97, math.inf) == ">= 97 %"
     assert shown_limit("nis_mean", 0.7, 1.4) == "0.7 to 1.4"
+
+
+def test_outcome_of_a_dock_is_shown_in_words_and_so_is_its_limit() -> None:
+    assert [shown_value("outcome", number) for number in range(5)] == ["as asked", "jammed", "unstable control", "refused", "gave up"]
+    assert (shown_value("docked", 0.0), shown_value("docked", 1.0), shown_value("outcome", math.nan)) == ("no", "yes", "none")
+    assert (shown_limit("docked", 1.0, UNBOUNDED), shown_limit("outcome", 3.0, 3.0)) == ("yes", "refused")
+    assert shown_limit("outcome", 0.0, 1.0) == "as asked or jammed"
+
+
+def test_metrics_of_force_tracking_have_names_for_people() -> None:
+    labels = [shown(name).label for name in force_names([1, 2])]
+    assert len(set(labels)) == len(labels)
+    assert labels[:2] == [f"Force RMSE per module, two modules against one, interference {w}" for w in ("off", "on")]
+    assert "Force RMSE per module, one module, interference on" in labels
+    assert "Force fit, degree 3, two modules, interference off" in labels
+    assert (shown_value("force_difference_off", 0.021), shown_value("force_rmse_two_on_n", 0.25)) == ("2.10 %", "0.25 N")
 
 
 def test_every_metric_of_a_flight_has_a_name_for_people(result: Result) -> None:
