@@ -88,7 +88,7 @@ def _force_shown(metric: str) -> Shown | None:
     what, degree, body, phase = match.groups()
     jets = f"interference {phase}"
     if what == "difference":
-        return Shown(f"Force RMSE per module, two modules against one, {jets}", "%", 100.0)
+        return Shown(f"Force RMSE, difference of two modules from one, {jets}", "%", 100.0)
     of = f"{body} module{'' if body == 'one' else 's'}, {jets}"
     if what == "rmse":
         return Shown(f"Force RMSE per module, {of}", "N")

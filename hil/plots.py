@@ -89,14 +89,11 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
     inside = _inside(flight, window)
     _path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m, inside)
     time_s = flight.time_s
-    error_mm = 1e3 * np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
-    angle_deg = np.degrees(
-        np.linalg.norm(rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"]), axis=1)
-    )
+    error_mm, angle_deg = errors(flight)
     for row, (values, unit, what) in enumerate(((error_mm, "mm", "Position"), (angle_deg, "deg", "Attitude"))):
         axes = figure.add_subplot(grid[row, 1])
         rms = float(np.sqrt(np.mean(values[inside] ** 2)))
-        axes.plot(time_s, values, color=TRUTH, linewidth=1.0)
+        axes.plot(time_s, _once_placed(flight, values), color=TRUTH, linewidth=1.0)
         axes.axhline(rms, color=REFERENCE, linestyle="--", linewidth=1.2, label=f"RMSE {rms:.2f} {unit}")
         if row == 0 and paper_rmse_mm is not None:
             paper = f"paper's robot, real tank: RMSE {paper_rmse_mm:g} mm"
@@ -105,7 +102,19 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
         axes.set_ylim(0.0, 1.3 * max(float(values[inside].max()), *(line.get_ydata()[0] for line in axes.lines[1:])))
         _finish_time_axis(axes, flight, window, last=row == 1)
         axes.legend(loc="upper right", ncols=2, fontsize=9)
+        _say_unplaced(axes, flight)
     return figure
+
+
+def errors(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
+    """(k,) distance, mm, and (k,) angle, deg, of the truth from the reference."""
+    error_mm = 1e3 * np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
+    return error_mm, np.degrees(np.linalg.norm(rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"]), axis=1))
+
+
+def _once_placed(flight: Flight, values: np.ndarray) -> np.ndarray:
+    """(k, ...) the values as floats, NaN until the firmware knows its pose."""
+    return np.where(flight.placed.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 
 
 def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray, inside: np.ndarray) -> None:
@@ -146,7 +155,8 @@ def position(flight: Flight, window: Window) -> Any:
     """Position per axis, and beside it what it is off by."""
     figure = _figure(11.0, 6.6)
     cells = figure.subplots(3, 2, sharex=True)
-    truth, wanted, believed = flight.p_wb, flight.firmware["setpoint_p_wb"], flight.firmware["p_wb"]
+    truth = flight.p_wb
+    wanted, believed = (_once_placed(flight, flight.firmware[name]) for name in ("setpoint_p_wb", "p_wb"))
     for axis, name in enumerate(("x (north)", "y (east)", "z (down)")):
         left, right = cells[axis]
         left.plot(flight.time_s, believed[:, axis], color=ESTIMATE, linewidth=3.0, alpha=0.55, label="estimate")
@@ -172,8 +182,9 @@ def attitude(flight: Flight, window: Window) -> Any:
     figure = _figure(11.0, 5.6)
     cells = figure.subplots(3, 1, sharex=True)
     wanted = flight.firmware["setpoint_q_wb"]
-    truth = np.degrees(rotation_vectors(flight.q_wb, wanted))
-    believed = np.degrees(rotation_vectors(flight.firmware["q_wb"], wanted))
+    truth, believed = (
+        _once_placed(flight, np.degrees(rotation_vectors(q_wb, wanted))) for q_wb in (flight.q_wb, flight.firmware["q_wb"])
+    )
     for axis, name in enumerate(("roll x", "pitch y", "yaw z")):
         cells[axis].plot(flight.time_s, believed[:, axis], color=ESTIMATE, linewidth=0.9, label="estimate - reference")
         cells[axis].plot(flight.time_s, truth[:, axis], color=TRUTH, label="truth - reference")
@@ -190,9 +201,10 @@ def estimate(flight: Flight, window: Window) -> Any:
     """Estimation errors inside three standard deviations, and the normalised innovation."""
     figure = _figure(11.0, 7.6)
     cells = figure.subplots(4, 2, sharex=True, gridspec_kw={"height_ratios": (1, 1, 1, 0.9)})
-    off_mm = 1e3 * (flight.firmware["p_wb"] - flight.p_wb)
-    off_deg = np.degrees(rotation_vectors(flight.q_wb, flight.firmware["q_wb"]))
-    bands = 3e3 * flight.firmware["sigma_p"], 3.0 * np.degrees(flight.firmware["sigma_q"])
+    off_mm = _once_placed(flight, 1e3 * (flight.firmware["p_wb"] - flight.p_wb))
+    off_deg = _once_placed(flight, np.degrees(rotation_vectors(flight.q_wb, flight.firmware["q_wb"])))
+    sigmas = 1e3 * flight.firmware["sigma_p"], np.degrees(flight.firmware["sigma_q"])
+    bands = tuple(_once_placed(flight, 3.0 * sigma) for sigma in sigmas)
     names = (("x, mm", "y, mm", "z, mm"), ("roll, deg", "pitch, deg", "yaw, deg"))
     for column, (error, band) in enumerate(zip((off_mm, off_deg), bands, strict=True)):
         for axis in range(3):
@@ -283,7 +295,16 @@ def disturbance(flight: Flight, window: Window) -> Any:
 def _say_none(axes: Any, title: str, why: str) -> None:
     """An empty panel, and why it is empty."""
     axes.set(title=f"{title}: none", yticks=[])
-    axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", va="center")
+    _write_across(axes, why)
+
+
+def _say_unplaced(axes: Any, flight: Flight) -> None:
+    if not flight.placed.any():
+        _write_across(axes, "the firmware never knew its pose")
+
+
+def _write_across(axes: Any, text: str) -> None:
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center")
 
 
 def _figure(width: float, height: float) -> Any:
@@ -298,11 +319,12 @@ def _inside(flight: Flight, window: Window) -> np.ndarray:
 
 
 def _limit_to_window(axes: Any, flight: Flight, window: Window, values: np.ndarray) -> None:
-    """Scale to what is judged: the first seconds, before the first tag, would flatten everything else."""
+    """Scale to what is judged: the take-off would flatten everything else."""
     judged = values[:, _inside(flight, window)]
-    low, high = min(0.0, float(judged.min())), max(0.0, float(judged.max()))
+    low, high = (float(end(judged, initial=0.0, where=np.isfinite(judged))) for end in (np.min, np.max))
     margin = 0.08 * max(high - low, 1e-9)
     axes.set_ylim(low - margin, high + margin)
+    _say_unplaced(axes, flight)
 
 
 def _finish_time_axis(axes: Any, flight: Flight, window: Window, last: bool = False) -> None:

@@ -28,6 +28,8 @@ HEADER_BYTES = 64
 SIGNAL_LOG = "signals.mcap"
 REGULAR_TICKS = 50
 """Ticks at the start of a log that its period is read from."""
+NO_TAG_NS = 1 << 60
+"""Age of the last tag in the firmware's log before there was any."""
 CHUNK_BYTES = 65536
 """About two seconds of one module at 100 Hz; a killed bench loses no more."""
 
@@ -233,6 +235,12 @@ class Flight:
     def q_wb(self) -> np.ndarray:
         """(k, 4) true attitude of the body; that of the module in a log without bodies."""
         return self.truth.get("q_wb", self.truth["q_wm"])
+
+    @property
+    def placed(self) -> np.ndarray:
+        """(k,) whether tags have told heading and place by then: before, what the firmware believes and wants is no pose."""
+        told = self.firmware["ready"] & (self.firmware["tag_age_ns"] < NO_TAG_NS)
+        return np.logical_or.accumulate(told)
 
     def between(self, start_ns: int, end_ns: int) -> Flight:
         """The ticks with start <= time <= end."""

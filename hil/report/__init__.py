@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -16,8 +17,8 @@ import numpy as np
 from firmware_py.description.signals import Columns
 from firmware_py.description.vehicle import Vehicle
 from hil.checks import Result
-from hil.metrics import metric_order, rotation_vectors, shown, shown_limit, shown_value
-from hil.plots import Window
+from hil.metrics import metric_order, shown, shown_limit, shown_value
+from hil.plots import Window, errors
 from hil.signals import Flight
 
 REPORT_FILE = "report.html"
@@ -41,6 +42,9 @@ TILES = (
     "real_time_factor",
 )
 """Metrics that stand beside the headline."""
+DOCK_TILES = ("duration_s", "false_declarations", "tries", "jams", "docked_rmse_m", "join_jump_n", "gap_min_m")
+"""The same of a run that docks."""
+MOST_TILES = 6
 NOT_MEASURED = (
     "Everything here was flown in a simulated tank, by the firmware of the vehicle, over the vehicle's CAN frames. "
     "Nothing of it was measured on hardware. Figures of the paper's robot were measured in a real tank."
@@ -102,15 +106,15 @@ def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plo
 def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
     """What the viewer needs: the scene, and the flight thinned to `FRAMES_HZ`.
 
-    `p`, `q`, `ref_p` and `ref_q` are of the body that was flown; `modules` are all there are, in whichever body.
+    `p`, `q`, `ref_p` and `ref_q` are of the body that was flown; `modules` are all there are, in whichever body. Errors are null
+    until the firmware knows its pose.
     """
     time_s = flight.time_s
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
     keep = slice(None, None, max(1, round(1.0 / (FRAMES_HZ * period_s))))
     firmware = flight.firmware
     member = flight.truth.get("member", np.ones((len(time_s), len(flight.modules))))
-    error_mm = 1e3 * np.linalg.norm(flight.p_wb - firmware["setpoint_p_wb"], axis=1)
-    angle = np.degrees(np.linalg.norm(rotation_vectors(flight.q_wb, firmware["setpoint_q_wb"]), axis=1))
+    error_mm, angle_deg = (np.where(flight.placed, error, np.nan) for error in errors(flight))
     return {
         "tank": {"kind": scene.tank, "low": _short(scene.tank_m[0], 3), "high": _short(scene.tank_m[1], 3)},
         "window": list(scene.window),
@@ -120,8 +124,8 @@ def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
         "q": _short(flight.q_wb[keep], 5),
         "ref_p": _short(firmware["setpoint_p_wb"][keep], 5),
         "ref_q": _short(firmware["setpoint_q_wb"][keep], 5),
-        "error_mm": _short(error_mm[keep], 3),
-        "angle_deg": _short(angle[keep], 3),
+        "error_mm": _known(error_mm[keep]),
+        "angle_deg": _known(angle_deg[keep]),
         "cuts": _cuts(flight, keep),
         "modules": [
             _module(vehicle, truth, member[:, m], keep)
@@ -152,15 +156,26 @@ def _short(values: np.ndarray, digits: int) -> Any:
     return np.round(np.asarray(values, dtype=float), digits).tolist()
 
 
+def _known(values: np.ndarray) -> list[float | None]:
+    """Values, and null where there is none, which JSON has no number for."""
+    return [round(value, 3) if math.isfinite(value) else None for value in values.tolist()]
+
+
 def _asset(name: str) -> str:
     return (resources.files(__name__) / name).read_text(encoding="utf-8")
 
 
 def _headline(result: Result, scene: Scene) -> str:
-    """Our RMSE large; beside the paper's, as bars, where the paper flew the same."""
-    ours_mm = 1e3 * result.metrics.get("position_rmse_m", float("nan"))
-    text = f'<p class="big">{ours_mm:.2f}<span>mm</span></p><p class="under">position RMSE, every tick of the task</p>'
-    if scene.paper_rmse_mm is None:
+    """What the scenario's first check asks for, large; an RMSE beside the paper's, as bars, where the paper flew the same."""
+    name = _asked_first(result)
+    if name == "docked":
+        text = _big("docked" if result.metrics[name] else shown_value("outcome", result.metrics["outcome"]), "", "Docking outcome")
+    else:
+        how, value = shown(name), result.metrics.get(name, math.nan)
+        number = shown_value(name, value).removesuffix(f" {how.unit}")
+        text = _big(number, how.unit if math.isfinite(value) else "", how.label)
+    ours_mm = 1e3 * result.metrics.get("position_rmse_m", math.nan)
+    if scene.paper_rmse_mm is None or name != "position_rmse_m":
         return text
     widest = max(ours_mm, scene.paper_rmse_mm)
     rows = (("this flight, simulated", ours_mm, "ours"), ("paper, real tank", scene.paper_rmse_mm, "paper"))
@@ -173,12 +188,21 @@ def _headline(result: Result, scene: Scene) -> str:
     return f'{text}<div class="bars">{bars}</div>'
 
 
+def _asked_first(result: Result) -> str:
+    return result.checks[0].name if result.checks else "position_rmse_m"
+
+
+def _big(value: str, unit: str, label: str) -> str:
+    return f'<p class="big">{html.escape(value)}<span>{html.escape(unit)}</span></p><p class="under">{html.escape(label)}</p>'
+
+
 def _tiles(result: Result) -> str:
+    names = DOCK_TILES if "outcome" in result.metrics else TILES
+    known = [name for name in names if math.isfinite(result.metrics.get(name, math.nan)) and name != _asked_first(result)]
     return "\n".join(
         f'<div class="tile"><b>{html.escape(shown_value(name, result.metrics[name]))}</b>'
         f"<span>{html.escape(shown(name).label)}</span></div>"
-        for name in TILES
-        if name in result.metrics
+        for name in known[:MOST_TILES]
     )
 
 

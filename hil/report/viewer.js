@@ -62,7 +62,7 @@
     }
     return a;
   };
-  const judged = (i) => data.t[i] >= data.window[0] && data.t[i] <= data.window[1];
+  const judged = (i) => data.t[i] >= data.window[0] && data.t[i] <= data.window[1] && data.error_mm[i] !== null;
   const cuts = new Set(data.cuts);  // modules joined or parted: what is followed is another point, and its line begins anew
   const cut = (p, i) => (cuts.has(i) ? [null, p] : [p]);
   const reference = data.ref_p.flatMap((p, i) => (judged(i) ? cut(p, i) : []));  // before the task there may be none yet
@@ -75,6 +75,7 @@
   const sample = (t) => {
     const i = indexAt(t), j = Math.min(i + 1, data.t.length - 1);
     const s = j > i ? Math.min(1, (t - data.t[i]) / (data.t[j] - data.t[i])) : 0;
+    const known = (name) => (data[name][i] === null || data[name][j] === null ? null : data[name][i] + s * (data[name][j] - data[name][i]));
     const mix = (name) => between(data[name][i], data[name][j], s);
     return {
       i, p: between(magnified(i), magnified(j), s), q: slerp(data.q[i], data.q[j], s), truth: mix("p"),
@@ -83,8 +84,7 @@
         member: module.member[i], faces: faces[m], thrusters: module.thrusters, force: between(module.force[i], module.force[j], s),
         p: between(moduleAt(m, i), moduleAt(m, j), s), q: slerp(module.q[i], module.q[j], s),
       })),
-      error: data.error_mm[i] + s * (data.error_mm[j] - data.error_mm[i]),
-      angle: data.angle_deg[i] + s * (data.angle_deg[j] - data.angle_deg[i]),
+      error: known("error_mm"), angle: known("angle_deg"),  // null until the firmware knows its pose
     };
   };
 
@@ -249,7 +249,10 @@
     g.fillStyle = "rgba(255,255,255,0.06)";
     g.fillRect(x(data.window[0]), pad.top, x(data.window[1]) - x(data.window[0]), h - pad.top - pad.bottom);
     g.beginPath();
-    data.t.forEach((t, i) => { if (i) g.lineTo(x(t), y(data.error_mm[i])); else g.moveTo(x(t), y(data.error_mm[i])); });
+    data.error_mm.forEach((mm, i) => {
+      if (mm === null) return;
+      if (i && data.error_mm[i - 1] !== null) g.lineTo(x(data.t[i]), y(mm)); else g.moveTo(x(data.t[i]), y(mm));
+    });
     g.strokeStyle = "#58b7ff"; g.lineWidth = 1.2; g.lineJoin = "round"; g.stroke();
     g.strokeStyle = "rgba(255,255,255,0.3)"; g.lineWidth = 1;
     g.beginPath(); g.moveTo(pad.left, y(0)); g.lineTo(w - pad.right, y(0)); g.stroke();
@@ -263,6 +266,7 @@
     g.textAlign = "right"; g.fillText(`${end.toFixed(0)} s`, w - pad.right + 8, h - 10);
     g.strokeStyle = "#ffffff"; g.lineWidth = 1.5;
     g.beginPath(); g.moveTo(x(state.t), pad.top - 4); g.lineTo(x(state.t), h - pad.bottom); g.stroke();
+    if (now.error === null) return;
     g.beginPath(); g.arc(x(state.t), y(now.error), 3.5, 0, 7); g.fillStyle = "#ffffff"; g.fill();
   };
 
@@ -271,8 +275,8 @@
     drawStage(now);
     drawTimeline(now);
     byId("hud-time").textContent = `${state.t.toFixed(1)} s`;
-    byId("hud-error").textContent = `${now.error.toFixed(1)} mm`;
-    byId("hud-angle").textContent = `${now.angle.toFixed(2)} deg`;
+    byId("hud-error").textContent = now.error === null ? "no pose yet" : `${now.error.toFixed(1)} mm`;
+    byId("hud-angle").textContent = now.angle === null ? "no pose yet" : `${now.angle.toFixed(2)} deg`;
     byId("hud-depth").textContent = `${now.truth[2].toFixed(3)} m`;
     const apart = now.modules.every((module) => module.member) ? "" : "; other bodies are drawn as they are";
     const scale = `the error is drawn ${state.magnify} times its size; dashed: reference${apart}`;

@@ -14,13 +14,14 @@ import pytest
 from matplotlib import pyplot
 from rich.console import Console
 
+from firmware_py.core.types import NEVER_NS
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED, Limit, Result, judge
 from hil.console import flight_progress, print_result
 from hil.flight import as_wanted, wanted_in
 from hil.force_metrics import force_names
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, told
-from hil.plots import STYLE, Window, disturbance, estimate, overview, thrusters, write_plots
+from hil.plots import STYLE, Window, attitude, disturbance, estimate, overview, position, thrusters, write_plots
 from hil.report import CAPTIONS, Scene, animation, write_report
 from hil.scenario import load_scenario
 from hil.signals import Flight, read_flight
@@ -116,6 +117,53 @@ def test_report_of_a_failed_flight_says_so(flight: Flight, result: Result, tmp_p
     page = write_report(tmp_path, failed, flight, scene(), []).read_text()
     assert "A check failed" in page
     assert "All checks passed" not in page
+
+
+def test_report_of_a_dock_has_its_outcome_as_headline_and_no_rmse_that_nobody_asked_for(
+    flight: Flight, result: Result, tmp_path: Path
+) -> None:
+    asked, near, false = Limit("docked", low=1.0), Limit("gap_min_m", high=0.03), Limit("false_declarations", high=0.0)
+    metrics = result.metrics | {"docked": 1.0, "outcome": 0.0, "gap_min_m": 0.0179, "false_declarations": 2.0}
+    for limit, changed, value, label in (
+        (asked, {}, "docked<span></span>", "Docking outcome"),
+        (asked, {"docked": 0.0, "outcome": 1.0}, "jammed<span></span>", "Docking outcome"),
+        (near, {}, "17.90<span>mm</span>", "Gap between facing faces, smallest"),
+        (near, {"gap_min_m": math.nan}, "none<span></span>", "Gap between facing faces, smallest"),
+        (false, {}, "2<span></span>", "False declarations of a dock"),
+    ):
+        page = write_report(tmp_path, judge("dock", 7, metrics | changed, [limit]), flight, scene(), []).read_text()
+        assert f'<p class="big">{value}</p><p class="under">{label}</p>' in page
+        assert "paper, real tank" not in page
+        assert ("<b>2</b><span>False declarations of a dock</span>" in page) == (limit is not false)
+        assert ("<b>17.90 mm</b>" in page) == (limit is not near)
+
+
+def test_what_the_firmware_believes_before_it_knows_its_pose_is_no_error(flight: Flight) -> None:
+    ticks = np.arange(len(flight.firmware["tick"]))
+    unknown = {"ready": ticks >= 30, "tag_age_ns": np.where(ticks < 50, NEVER_NS, 0)}  # upright by gravity, then placed by tags
+    nowhere = {name: np.where(ticks[:, None] < 50, 0.0, flight.firmware[name]) for name in ("p_wb", "setpoint_p_wb")}
+    lost = {"ready": unknown["ready"] & (ticks != 700)}
+    late = dataclasses.replace(flight, firmware=flight.firmware | unknown | nowhere | lost)
+    assert late.placed.tolist() == [False] * 50 + [True] * (len(ticks) - 50)
+    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+        figures = overview(late, WINDOW, TANK_M, None), *(draw(late, WINDOW) for draw in (position, attitude, estimate))
+    flat = [line for figure in figures for axes in figure.axes if axes.name != "3d" for line in axes.lines]
+    believed = [line.get_ydata() for line in flat if line.get_label() != "truth" and len(line.get_xdata()) == len(ticks)]
+    assert [np.isfinite(values).tolist() for values in believed] == [late.placed.tolist()] * 27
+    pyplot.close("all")
+    shown = animation(late, scene())
+    assert shown["error_mm"][:13] == shown["angle_deg"][:13] == [None] * 13
+    assert None not in shown["error_mm"][13:] + shown["angle_deg"][13:]
+    json.dumps(shown, allow_nan=False)
+
+
+def test_plots_of_a_robot_that_never_knew_its_pose_say_so(flight: Flight) -> None:
+    blind = dataclasses.replace(flight, firmware=flight.firmware | {"ready": np.zeros(len(flight.time_s), bool)})
+    for figure, panels in ((overview(blind, WINDOW, TANK_M, None), 2), (position(blind, WINDOW), 3), (attitude(blind, WINDOW), 3)):
+        said = [text.get_text() for axes in figure.axes for text in axes.texts]
+        assert said == ["the firmware never knew its pose"] * panels
+        pyplot.close(figure)
+    assert set(animation(blind, scene())["error_mm"]) == {None}
 
 
 def test_markup_in_a_title_stays_text(flight: Flight, result: Result, tmp_path: Path) -> None:
@@ -218,7 +266,7 @@ def test_outcome_of_a_dock_is_shown_in_words_and_so_is_its_limit() -> None:
 def test_metrics_of_force_tracking_have_names_for_people() -> None:
     labels = [shown(name).label for name in force_names([1, 2])]
     assert len(set(labels)) == len(labels)
-    assert labels[:2] == [f"Force RMSE per module, two modules against one, interference {w}" for w in ("off", "on")]
+    assert labels[:2] == [f"Force RMSE, difference of two modules from one, interference {w}" for w in ("off", "on")]
     assert "Force RMSE per module, one module, interference on" in labels
     assert "Force fit, degree 3, two modules, interference off" in labels
     assert (shown_value("force_difference_off", 0.021), shown_value("force_rmse_two_on_n", 0.25)) == ("2.10 %", "0.25 N")
