@@ -14,6 +14,7 @@ from hil.signals import SIGNAL_LOG, TRUTH_LOG
 THRESHOLD_MA = 70.0
 """The paper's; what a flight used may differ."""
 FACES = ("#0b63b0", "#c0392b")
+GAP, LATERAL = "#7b3294", "#e69f00"
 HOLDS = "#2e8b57"
 MARK = "#555f6b"
 STAGES = ("pre-approach", "align", "approach", "push", "verify", "docked", "release", "back off", "aborted", "failed")
@@ -23,8 +24,10 @@ TRUE_GAP = "true gap (near by, until locked)"
 """The plant's own, which has none for modules that are far from each other, or of one body."""
 PAUSE_NS = 1_000_000_000
 """Between two rows of a pair, from which on the second is of another dock."""
-LAST_S = 0.3
-"""How long the last tick of a dock is drawn."""
+LAST_SHARE = 0.08
+"""Of the time axis, for the last tick of a dock, with which its last stage begins."""
+LEAST_SHARE = 0.04
+"""Of the time axis, that a stage before the last takes if it is named."""
 
 
 def write_dock_plot(folder: Path, start_ns: int) -> list[Path]:
@@ -74,31 +77,34 @@ def docking(docks: Columns, truth: Columns, start_ns: int) -> Any:
 def _currents(axes: Any, time_s: np.ndarray, current_ma: np.ndarray) -> None:
     for face, colour in enumerate(FACES):
         axes.plot(time_s, current_ma[:, face], color=colour, linewidth=1.1, label=("target's face", "active face")[face])
-    for sign in (1.0, -1.0):
-        axes.axhline(sign * THRESHOLD_MA, color=MARK, linestyle="--", linewidth=0.9, label="threshold" if sign > 0 else None)
-    axes.set(ylabel="mA", title="Relay current of both faces")
+    for sign, label in ((1.0, f"threshold, {THRESHOLD_MA:g} mA"), (-1.0, None)):
+        axes.axhline(sign * THRESHOLD_MA, color=MARK, linestyle="--", linewidth=0.9, label=label)
+    axes.set(ylabel="mA", title="Relay currents of the two faces")
     axes.legend(loc="upper left", ncols=3, fontsize=9)
 
 
 def _gap(axes: Any, time_s: np.ndarray, rows: Columns, truth: Columns, start_ns: int) -> None:
-    axes.plot(time_s, 1e3 * rows["gap_m"], color=FACES[0], linewidth=1.1, label="gap by the estimates")
-    axes.plot(time_s, 1e3 * rows["lateral_m"], color=FACES[1], linewidth=1.0, label="beside the axis, by the estimates")
+    axes.plot(time_s, 1e3 * rows["gap_m"], color=GAP, linewidth=1.1, label="gap, estimated")
+    axes.plot(time_s, 1e3 * rows["lateral_m"], color=LATERAL, linewidth=1.0, label="lateral offset, estimated")
     true_s = 1e-9 * (truth["time_ns"] - start_ns)
     under_way = (true_s >= time_s[0]) & (true_s <= time_s[-1])
     axes.plot(true_s[under_way], 1e3 * truth["gap_m"][under_way], color="black", linestyle=":", linewidth=1.2, label=TRUE_GAP)
-    axes.set(ylabel="mm", title="Between the faces")
+    axes.set(ylabel="mm", title="Gap between the two faces, and lateral offset")
     axes.legend(loc="upper right", ncols=3, fontsize=9)
 
 
 def _conditions(axes: Any, time_s: np.ndarray, rows: Columns) -> None:
+    duration_s = max(time_s[-1] - time_s[0], 1e-9)
+    end_s = time_s[-1] + LAST_SHARE * duration_s
     for level, name in enumerate(("current_holds", "position_holds")):
         holds = np.append(rows[name], rows[name][-1]).astype(float)
-        axes.fill_between(np.append(time_s, time_s[-1] + LAST_S), level, level + 0.8 * holds, step="post", color=HOLDS, linewidth=0)
-    axes.set_yticks([0.4, 1.4], ["current", "position"])
-    axes.set(ylim=(-0.1, 2.6), xlabel="time (s)", title="Condition holds (green); stages")
+        axes.fill_between(np.append(time_s, end_s), level, level + 0.8 * holds, step="post", color=HOLDS, linewidth=0)
+    axes.set_yticks([0.4, 1.4, 2.5], ["current", "position", "stage"])
+    axes.set(xlim=(time_s[0], end_s), ylim=(-0.1, 3.1), xlabel="time (s)", title="Conditions for a dock (green: holds), and its stages")
     starts = np.flatnonzero(np.diff(rows["stage"], prepend=-1))
-    for k, (start, end) in enumerate(zip(starts, [*starts[1:], len(time_s) - 1], strict=True)):
-        middle = 0.5 * (time_s[start] + time_s[end])
-        name = STAGES[int(rows["stage"][start])]
-        if time_s[end] - time_s[start] > 0.04 * (time_s[-1] - time_s[0]):
-            axes.text(middle, 2.05 + 0.25 * (k % 2), f"{name}, try {rows['tries'][start]}", ha="center", va="center", fontsize=8)
+    again = rows["tries"].max() > 1
+    for k, (begin_s, till_s) in enumerate(zip(time_s[starts], [*time_s[starts[1:]], end_s], strict=True)):
+        row = starts[k]
+        name = STAGES[int(rows["stage"][row])] + (f"\ntry {rows['tries'][row]}" if again else "")
+        if row == starts[-1] or till_s - begin_s > LEAST_SHARE * duration_s:
+            axes.text(0.5 * (begin_s + till_s), 2.5, name, ha="center", va="center", fontsize=8)
