@@ -183,7 +183,8 @@ def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
     scenario = scenario.for_seed(result.seed)
     flight = as_wanted(scenario, read_flight(folder))
     scene = _scene(scenario, flight)
-    plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm)
+    numbers = [module.number for module in scenario.module]
+    plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm, numbers)
     plots += write_dock_plot(folder, start_of(flight))
     return write_report(folder, result, flight, scene, plots)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,8 @@ TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
 PLOTS = ("overview", "position", "attitude", "estimate", "thrusters", "disturbance")
 """Names of the files, without .png."""
 ROUNDING_S = 1e-6
+MODULE_COLUMNS = 4
+"""Modules whose thrusters stand side by side."""
 AXIS_COLOURS = ("#cc3311", "#009988", "#0077bb")
 STYLE: dict[str, Any] = {
     "font.size": 10,
@@ -47,6 +50,7 @@ def write_plots(
     tank_m: np.ndarray,
     force_limits_n: np.ndarray,
     paper_rmse_mm: float | None = None,
+    numbers: Sequence[int] = (),
 ) -> list[Path]:
     """Write all plots of a flight into `folder`.
 
@@ -55,6 +59,7 @@ def write_plots(
         tank_m: (2, 3) lowest and highest corner of the tank, world, m.
         force_limits_n: (2,) reverse and forward limit of each thruster, N.
         paper_rmse_mm: what the paper measured in the same task, to stand beside ours.
+        numbers: of the fleet's modules, in its order; from 1 on when left out.
 
     Returns:
         their paths, the overview first.
@@ -67,7 +72,7 @@ def write_plots(
         "position": lambda: position(flight, window),
         "attitude": lambda: attitude(flight, window),
         "estimate": lambda: estimate(flight, window),
-        "thrusters": lambda: thrusters(flight, window, force_limits_n),
+        "thrusters": lambda: thrusters(flight, window, force_limits_n, numbers),
         "disturbance": lambda: disturbance(flight, window),
     }
     paths = []
@@ -247,26 +252,59 @@ def _tag_age(axes: Any, flight: Flight, window: Window) -> None:
     axes.set_ylim(bottom=0.0)
 
 
-def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray) -> Any:
-    """Force of each thruster: commanded after the limiter, and what the plant's thruster gave."""
+def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray, numbers: Sequence[int] = ()) -> Any:
+    """Force of each thruster: commanded after the limiter, and what the plant's thruster gave. Of several modules a column for each.
+
+    Args:
+        numbers: of the fleet's modules, in its order; from 1 on when left out.
+    """
     commanded, given = flight.firmware["commanded_n"], flight.truth["force_n"]
-    rows = -(-commanded.shape[1] // 2)
-    figure = _figure(11.0, 1.0 + 1.45 * rows)
-    cells = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
+    names = _module_names(flight, numbers)
+    per = given.shape[1] // len(names)
+    names += ["Docked for the firmware alone"] * (commanded.shape[1] // per - len(names))
+    layout = _columns_of(len(names), per)
+    figure = _figure(11.0, 1.2 + (1.45 if len(names) == 1 else 1.05) * len(layout))
+    cells = figure.subplots(*layout.shape, sharex=True, sharey=True, squeeze=False)
     widest = 1.15 * max(1.0, *(float(np.nanmax(np.abs(force))) for force in (commanded, given)))  # NaN: not yet in this body
-    for i in range(commanded.shape[1]):
-        cell = cells.flat[i]
-        cell.plot(flight.time_s, commanded[:, i], color=COMMAND, linewidth=2.4, alpha=0.6, label="command")
+    for (row, column), i in np.ndenumerate(layout):
+        cell = cells[row, column]
+        if i < 0:
+            cell.set_axis_off()
+            continue
+        if i < commanded.shape[1]:
+            cell.plot(flight.time_s, commanded[:, i], color=COMMAND, linewidth=2.4, alpha=0.6, label="command")
         if i < given.shape[1]:
             cell.plot(flight.time_s, given[:, i], color=TRUTH, linewidth=1.0, label="truth")
         for limit in force_limits_n:
             cell.axhline(limit, color=AXIS_COLOURS[0], linestyle=":", linewidth=1.0)
-        cell.set(ylabel=f"T{i + 1}, N", ylim=(-widest, widest))
-        _finish_time_axis(cell, flight, window, last=i >= commanded.shape[1] - 2)
+        cell.set(ylabel=f"T{i % per + 1}, N", ylim=(-widest, widest))
+        if len(names) > 1 and i % per == 0:
+            cell.set_title(names[i // per])
+        _finish_time_axis(cell, flight, window, last=row == len(layout) - 1)
     low, high = force_limits_n
-    cells[0, 0].set_title(f"Thruster forces (limits {low:g} and {high:g} N)")
+    figure.suptitle(f"Thruster forces (limits {low:g} and {high:g} N)", x=0.01, ha="left", fontsize=11, fontweight="bold")
     _legends_below(figure, cells[0, :1])
     return figure
+
+
+def _module_names(flight: Flight, numbers: Sequence[int]) -> list[str]:
+    """Of those that were in the body, in the order of its true forces."""
+    member = flight.truth.get("member", np.ones((len(flight.time_s), 1))) > 0.0
+    every = [f"Module {number}" for number in numbers or range(1, 1 + member.shape[1])]
+    return [every[m] + ("" if member[:, m].all() else ", while docked") for m in np.flatnonzero(member.any(axis=0))]
+
+
+def _columns_of(modules: int, per: int) -> np.ndarray:
+    """(rows, columns) thrusters in their panels, -1 in those left empty: one module's over two columns, else a column for each module."""
+    if modules == 1:
+        layout = np.full((-(-per // 2), 2), -1)
+        layout.flat[:per] = range(per)
+        return layout
+    blocks = -(-modules // MODULE_COLUMNS)
+    columns = -(-modules // blocks)
+    index = np.full((blocks * columns, per), -1)
+    index[:modules] = np.arange(modules * per).reshape(modules, per)
+    return index.reshape(blocks, columns, per).swapaxes(1, 2).reshape(-1, columns)
 
 
 def disturbance(flight: Flight, window: Window) -> Any:

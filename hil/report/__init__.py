@@ -29,7 +29,7 @@ CAPTIONS = {
     "position": "Position per axis: reference, truth and estimate, and what they are off by.",
     "attitude": "Attitude error about each body axis.",
     "estimate": "Does the filter know how wrong it is? Its error inside three of its own standard deviations. Titles: the judged part.",
-    "thrusters": "Each thruster: what the firmware commanded after its limiter, and the force that the plant's gave.",
+    "thrusters": "Each thruster, by module: what the firmware commanded after its limiter, and the force that the plant's gave.",
     "disturbance": "Unmodelled force and moment by the filter, the force that was asked for, and the water's velocity.",
     "docking": "The dock: relay currents of both faces, the gap between them, the two conditions, and the stages of each try.",
 }

@@ -21,7 +21,7 @@ from hil.console import flight_progress, print_result
 from hil.flight import as_wanted, wanted_in
 from hil.force_metrics import force_names
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, told
-from hil.plots import STYLE, Window, attitude, disturbance, estimate, overview, position, thrusters, write_plots
+from hil.plots import STYLE, Window, _columns_of, attitude, disturbance, estimate, overview, position, thrusters, write_plots
 from hil.report import CAPTIONS, Scene, animation, write_report
 from hil.scenario import load_scenario
 from hil.signals import Flight, read_flight
@@ -243,6 +243,29 @@ def test_thrusters_that_joined_later_stay_inside_their_axes(dock: Flight) -> Non
         figure = thrusters(dock, Window(0.0, 2.0), np.array([-8.0, 10.0]))
     assert all(axes.get_ylim() == pytest.approx((-3.45, 3.45)) for axes in figure.axes)
     pyplot.close(figure)
+
+
+def test_thrusters_of_each_module_stand_in_a_column_under_its_name(dock: Flight) -> None:
+    figure = thrusters(dock, Window(0.0, 2.0), np.array([-8.0, 10.0]), numbers=(3, 7))
+    columns = {number: [axes for axes in figure.axes if axes.get_subplotspec().colspan.start == number] for number in range(2)}
+    for column, (name, newton) in enumerate((("Module 3", 2.0), ("Module 7, while docked", 3.0))):
+        titles = [axes.get_title(loc="left") or axes.get_title() for axes in columns[column]]
+        assert titles == [name] + [""] * 7
+        assert [axes.get_ylabel() for axes in columns[column]] == [f"T{i}, N" for i in range(1, 9)]
+        for axes in columns[column]:
+            (truth,) = (line.get_ydata() for line in axes.lines if line.get_label() == "truth")
+            assert np.nanmax(truth) == np.nanmin(truth) == newton
+    pyplot.close(figure)
+
+
+@pytest.mark.parametrize(("modules", "shape", "empty"), [(1, (4, 2), 0), (2, (8, 2), 0), (4, (8, 4), 0), (5, (16, 3), 8), (8, (16, 4), 0)])
+def test_every_thruster_has_a_panel_of_its_own(modules: int, shape: tuple[int, int], empty: int) -> None:
+    layout = _columns_of(modules, 8)
+    assert layout.shape == shape
+    assert sorted(layout.flat) == [-1] * empty + list(range(8 * modules))
+    if modules > 1:
+        columns = [column for block in np.split(layout, len(layout) // 8) for column in block.T if column.max() >= 0]
+        assert [column.tolist() for column in columns] == np.arange(8 * modules).reshape(modules, 8).tolist()
 
 
 def test_values_are_shown_in_units_that_people_read() -> None:
