@@ -15,9 +15,12 @@ TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
 """One colour per kind of signal in every plot (Okabe and Ito's palette, safe for colour-blind readers)."""
 PLOTS = ("overview", "position", "attitude", "estimate", "thrusters", "disturbance")
 """Names of the files, without .png."""
+NOT_JUDGED = "before or after the task, not judged"
+"""What grey stands for in every plot over time."""
 ROUNDING_S = 1e-6
 MODULE_COLUMNS = 4
 """Modules whose thrusters stand side by side."""
+GREY = "#e4e9ee"
 AXIS_COLOURS = ("#cc3311", "#009988", "#0077bb")
 STYLE: dict[str, Any] = {
     "font.size": 10,
@@ -89,7 +92,7 @@ def write_plots(
 
 def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: float | None) -> Any:
     """3D path beside the size of position and attitude error."""
-    figure = _figure(11.0, 5.2)
+    figure = _figure(11.0, 5.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0))
     inside = _inside(flight, window)
     _path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m, inside)
@@ -106,8 +109,11 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
         axes.set(title=f"{what} error, truth against reference", ylabel=unit)
         axes.set_ylim(0.0, 1.3 * max(float(values[inside].max()), *(line.get_ydata()[0] for line in axes.lines[1:])))
         _finish_time_axis(axes, flight, window, last=row == 1)
-        axes.legend(loc="upper right", ncols=2, fontsize=9)
+        axes.legend(handles=axes.lines[1:], loc="upper right", ncols=2, fontsize=9)
         _say_unplaced(axes, flight)
+    bands = [patch for patch in figure.axes[-1].patches if patch.get_label() == NOT_JUDGED]
+    if bands:
+        figure.legend(handles=bands[:1], loc="outside lower right")
     return figure
 
 
@@ -370,12 +376,13 @@ def _finish_time_axis(axes: Any, flight: Flight, window: Window, last: bool = Fa
     axes.set_xlim(0.0, end_s)
     for low, high in ((0.0, window.start_s), (window.end_s, end_s)):
         if high - low > 0.05:
-            axes.axvspan(low, high, color="#eef1f4", zorder=0, linewidth=0)
+            axes.axvspan(low, high, color=GREY, zorder=0, linewidth=0, label=NOT_JUDGED)
     if last:
         axes.set_xlabel("time (s)")
 
 
 def _legends_below(figure: Any, cells: Any) -> None:
-    """One legend for the whole figure, under it."""
+    """One legend for the whole figure, under it; grey comes last."""
     handles = {label: handle for cell in cells for handle, label in zip(*cell.get_legend_handles_labels(), strict=True)}
+    handles = dict(sorted(handles.items(), key=lambda item: item[0] == NOT_JUDGED))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))

@@ -25,7 +25,7 @@ REPORT_FILE = "report.html"
 FRAMES_HZ = 25.0
 """Samples of the animation a second; it interpolates between them."""
 CAPTIONS = {
-    "overview": "The whole flight. Grey: before and after the judged part.",
+    "overview": "The whole flight: path in the tank, position and attitude error.",
     "position": "Position per axis: reference, truth and estimate, and what they are off by.",
     "attitude": "Attitude error about each body axis.",
     "estimate": "Does the filter know how wrong it is? Its error inside three of its own standard deviations. Titles: the judged part.",

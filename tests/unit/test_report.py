@@ -21,7 +21,20 @@ from hil.console import flight_progress, print_result
 from hil.flight import as_wanted, wanted_in
 from hil.force_metrics import force_names
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, told
-from hil.plots import STYLE, Window, _columns_of, attitude, disturbance, estimate, overview, position, thrusters, write_plots
+from hil.plots import (
+    GREY,
+    NOT_JUDGED,
+    STYLE,
+    Window,
+    _columns_of,
+    attitude,
+    disturbance,
+    estimate,
+    overview,
+    position,
+    thrusters,
+    write_plots,
+)
 from hil.report import CAPTIONS, Scene, animation, write_report
 from hil.scenario import load_scenario
 from hil.signals import Flight, read_flight
@@ -70,6 +83,16 @@ def test_every_plot_is_written_and_has_a_caption(flight: Flight, tmp_path: Path)
     paths = write_plots(flight, tmp_path, WINDOW, TANK_M, np.array([-8.0, 10.0]), 20.92)
     assert [*(path.stem for path in paths), "docking"] == list(CAPTIONS)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
+
+
+def test_grey_of_every_plot_over_time_is_in_its_legend(flight: Flight) -> None:
+    figures = overview(flight, WINDOW, TANK_M, 20.92), thrusters(flight, WINDOW, np.array([-8.0, 10.0]))
+    for figure in (*figures, *(draw(flight, WINDOW) for draw in (position, attitude, estimate, disturbance))):
+        (legend,) = figure.legends
+        (at,) = (i for i, text in enumerate(legend.get_texts()) if text.get_text() == "before or after the task, not judged")
+        assert legend.legend_handles[at].get_facecolor() == matplotlib.colors.to_rgba(GREY)
+        assert all(NOT_JUDGED in axes.get_legend_handles_labels()[1] for axes in figure.axes if axes.name != "3d")
+        pyplot.close(figure)
 
 
 def test_panel_says_why_it_is_empty_where_the_filter_has_nothing_to_show(flight: Flight) -> None:
