@@ -12,7 +12,7 @@ import argparse
 import io
 import sys
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import as_completed
 from functools import partial
 from pathlib import Path
@@ -37,6 +37,8 @@ DATA = Path(__file__).with_name("data")
 ENDINGS = ("json", "csv", "png", "html")
 MODULE_PRICE_USD = 800.0
 """The paper's price of one module."""
+NOT_PRINTED = ("assumption", f"max_inscribed_ellipsoid_volume[{table.TABLE_NORMALISATION}]")
+"""Metrics that the printed table leaves out: a note says the first, another row the second."""
 WIDTH = 170
 """Characters of a table that does not go to a terminal."""
 LARGEST_BOX = 64
@@ -200,19 +202,21 @@ def _print(found: dict[str, Capability]) -> None:
     shown.add_column("figure")
     for name in found:
         shown.add_column(name, justify="right")
-
-    def add(label: str, value: Callable[[Capability], table.Cell]) -> None:
-        shown.add_row(label, *(table.text(value(c)) for c in found.values()))
-
-    add("thrusters", lambda c: float(c.layout.count))
-    add("rank", lambda c: float(c.rank))
+    rows = [row for row in table.rows_of(found) if row.metric not in NOT_PRINTED]
+    for row in rows:
+        if row.space == "-":
+            shown.add_row(row.label, *(table.text(row.cells[name]) for name in found))
     for k, axis in enumerate(AXES):
         unit = UNITS["force"] if k < 3 else UNITS["torque"]
-        shown.add_row(f"{axis} + / -, {unit}", *(f"{c.axes[k, 0]:.4g} / {c.axes[k, 1]:.4g}" for c in found.values()))
-    for row in table.rows_of(found):
-        if row.metric not in ("thrusters", "rank", "assumption"):
-            label = row.metric if row.space == "-" else f"{row.space} {row.frame} {row.metric}"
-            shown.add_row(label.replace("[", r"\["), *(table.text(row.cells[name]) for name in found))
+        shown.add_row(f"{axis}, most + / -, {unit}", *(f"{c.axes[k, 0]:.4g} / {c.axes[k, 1]:.4g}" for c in found.values()))
+    sizes = {frame: next(iter(found.values())).power[frame].size for frame in UNITS}
+    for frame, unit in UNITS.items():
+        for space, title in (("power", f"power of {sizes[frame]:g} {unit} in any direction"), ("wrench", f"reachable {frame}s, {unit}")):
+            shown.add_section()
+            shown.add_row(f"[bold]{title}[/]")
+            for row in rows:
+                if (row.space, row.frame) == (space, frame):
+                    shown.add_row(f"  {row.label}", *(table.text(row.cells[name]) for name in found))
     console.print(shown)
     for name, result in found.items():
         for note in result.notes:

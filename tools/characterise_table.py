@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.prepare.capability.layout import AXES, FRAMES, NORMALISATIONS
+from firmware_py.prepare.capability.layout import AXES, FRAMES, NORMALISATIONS, UNITS
 from firmware_py.prepare.capability.summary import Capability, Reach, to_plain
 
 DEGENERATE = "degenerate"
@@ -48,6 +48,33 @@ WHY = {
 }
 
 
+_VOLUME = "volume of the inscribed ellipsoid"
+LABELS = {
+    "dirichlet_energy": ("Dirichlet energy", "{}^2"),
+    "dirichlet_energy[scale_free]": ("Dirichlet energy, scale-free", ""),
+    "willmore_energy": ("Willmore energy", ""),
+    "total_power_w": ("power above idle, mean", "W"),
+    "thrust_variance": ("variance of a thruster's force", "N^2"),
+    "residual": ("part of the wrench out of reach, largest", "N and N m"),
+    "share_over_limits": ("directions beyond a thruster's limit, share", ""),
+    "max_inscribed_ellipsoid_volume": (f"{_VOLUME}, unit thrust", "{}^3"),
+    "max_inscribed_ellipsoid_volume[physical]": (_VOLUME, "{}^3"),
+    "max_inscribed_ellipsoid_volume[unit_thrust]": (f"{_VOLUME}, unit thrust", "{}^3"),
+    "max_inscribed_ellipsoid_volume[equal_total_thrust]": (f"{_VOLUME}, equal total thrust", "{}^3"),
+    "max_inscribed_ellipsoid_volume[unit_thrust, passive declared]": (f"{_VOLUME}, unit thrust, without passive axes", "{0}^3 or {0}^2"),
+    "worst_direction[physical]": ("reach in the worst direction", "{}"),
+    "thrusters": ("thrusters", ""),
+    "rank": ("rank of the actuation matrix", ""),
+    "passive": ("passive axes", ""),
+    "assumption": ("assumption", ""),
+    "program_facet_difference": ("linear programs against facets, largest relative difference", ""),
+    "price_usd": ("price", "USD"),
+    "depth_m": ("depth rating", "m"),
+    "size_cm": ("size", "cm"),
+}
+"""Each metric in words, and its unit; {} stands for W in power spaces, else for the unit of the frame."""
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """One metric over all columns."""
@@ -62,6 +89,16 @@ class Row:
     def key(self) -> tuple[str, str, str]:
         """What names the row in table1.csv."""
         return self.space, self.frame, self.metric
+
+    @property
+    def label(self) -> str:
+        """The metric in words, with its unit."""
+        words, unit = LABELS[self.metric]
+        if self.space == "wrench" and "energy" in self.metric:
+            words = f"{words}, unit thrust"
+        own = "W" if self.space == "power" else UNITS.get(self.frame, "")
+        unit = unit.format(f"({own})" if " " in own and "^" in unit else own)
+        return f"{words}, {unit}" if unit else words
 
 
 def rows_of(found: Mapping[str, Capability]) -> list[Row]:

@@ -16,8 +16,7 @@ from firmware_py.prepare.capability.layout import AXES, FRAMES, NORMALISATIONS, 
 from firmware_py.prepare.capability.summary import Capability, Reach
 
 _COLOURS = {table.AGREES: "green", table.DIFFERS: "yellow", table.INCONSISTENT: "red", table.NOTHING: "dim"}
-_SHORT = {"max_inscribed_ellipsoid_volume": "V_MIE", "dirichlet_energy": "E_D", "willmore_energy": "E_W"}
-_SPACES = {"power": "Omega_P", "wrench": "Omega_W"}
+_SPACES = {"power": "power space", "wrench": "wrench space"}
 
 
 def build_rows(found: Mapping[str, Capability], robots: Mapping[str, Any], module_price: float) -> list[table.Row]:
@@ -78,7 +77,7 @@ def show(
     console.print(shown)
     for (space, metric), why in table.WHY.items():
         console.print(
-            f"{_SPACES.get(space, '')} {_SHORT.get(metric, metric)}: {why}".strip(), markup=False, highlight=False
+            f"{_SPACES.get(space, '')} {table.LABELS[metric][0]}: {why}".strip(), markup=False, highlight=False
         )
     console.print("D repeats the paper's Double ModCube; its layout here is an assumption.", highlight=False)
     _further(console, robots, found)
@@ -91,7 +90,7 @@ def show(
 def _label(row: table.Row) -> str:
     arrow = {"lower": " (less is better)", "higher": " (more is better)"}.get(row.better, "")
     space = f"{_SPACES[row.space]} {row.frame}\n" if row.space in _SPACES else ""
-    return f"{space}{_SHORT.get(row.metric, row.metric)}{arrow}"
+    return f"{space}{row.label}{arrow}"
 
 
 def _cell(ours: str, theirs: str, word: str) -> str:
@@ -106,19 +105,20 @@ def _size_cell(robot: Mapping[str, Any]) -> str:
 def _further(console: Console, robots: Mapping[str, Any], found: Mapping[str, Capability]) -> None:
     """Ours alone, one robot a line: all normalisations, passive degrees of freedom declared, worst direction."""
     for frame, unit in UNITS.items():
-        volume = f"V, ({unit})^3" if " " in unit else f"V, {unit}^3"
-        shown = Table(title=f"Ours, {frame} frame", title_justify="left")
+        volume = f"ellipsoid\n({unit})^3" if " " in unit else f"ellipsoid\n{unit}^3"
+        shown = Table(title=f"Ours, {frame} frame: volume of the inscribed ellipsoid, and energies", title_justify="left")
+        shown.caption = "* scale-free Dirichlet energy"
         heads = (
             "robot",
             "n",
             "rank",
             "passive",
             f"{volume}\nphysical",
-            "V\nunit thrust",
-            "V\nequal total",
-            "V unit thrust\npassive declared",
+            "ellipsoid\nunit thrust",
+            "ellipsoid\nequal total",
+            "unit thrust\nno passive",
         )
-        for k, head in enumerate((*heads, f"worst, {unit}\nphysical", "E_D/a00^2\npower", "E_D/a00^2\nwrench")):
+        for k, head in enumerate((*heads, f"worst reach\n{unit}", "Dirichlet*\npower", "Dirichlet*\nwrench")):
             shown.add_column(head, justify="right" if k else "left")
         for robot in (*robots["robot"], *robots["beside"]):
             c = found[robot["column"]]

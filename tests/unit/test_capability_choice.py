@@ -168,6 +168,23 @@ def test_wrong_command_line_is_answered_in_one_line(
     assert shown.out == "" and shown.err.count("\n") == 1, shown.err
 
 
+def test_table_has_labels_with_units_and_no_keys_of_the_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    monkeypatch.setattr(sys, "argv", ["characterise.py", "bluerov2", "--directions", "121", "--force", "2"])
+    importlib.import_module("characterise").main()
+    shown = capsys.readouterr().out
+    assert re.findall(r"\w+_\w+|\w+\[", shown) == []
+    for label in (
+        "surge, most + / -, N", "power of 2 N in any direction", "power above idle, mean, W", "Dirichlet energy, W^2", "passive axes",
+        "reachable torques, N m", "volume of the inscribed ellipsoid, (N m)^3", "reach in the worst direction, N",
+    ):  # fmt: skip
+        assert f" {label} " in shown
+    table = importlib.import_module("characterise_table")
+    layout = of_modules([(0, 0, 0)], [0], [load_vehicle("modcube")])
+    every = {row.metric for row in table.rows_of({"one": summary.characterise(layout, count=121, programs=False)})}
+    assert every | {"price_usd", "depth_m", "size_cm"} == set(table.LABELS)
+
+
 def test_two_vehicles_of_one_name_are_not_one_column(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
