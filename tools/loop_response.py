@@ -245,28 +245,46 @@ class Margins(NamedTuple):
     """Highest frequency at which the gain is one."""
 
 
-def margins(response: Response) -> Margins:
-    """Margins of one loop, interpolated over the logarithm of the frequency; infinite where an axis is not controlled.
+class Readings(NamedTuple):
+    """Where the margins of a loop are read off, frequencies in rad/s."""
 
-    A loop that swings by itself has none, and none can be stated of one that does not cross 0 dB at the frequencies measured. Where the
-    phase reaches -180 degrees above the last frequency, the gain there counts: it is not more by then.
+    gain: list[tuple[float, float]]
+    """Frequency at which the phase is -180 deg or whole turns off it, and gain there, dB."""
+    phase: list[tuple[float, float]]
+    """Frequency at which the gain is one, and phase margin there, deg."""
+
+
+def margins(response: Response) -> Margins:
+    """Margins of one loop; infinite where an axis is not controlled.
+
+    A loop that swings by itself has none, and none can be stated of one that does not cross 0 dB at the frequencies measured.
     """
     if not response.controlled:
         return Margins(math.inf, math.inf, math.nan)
     if response.stray > MOST_STRAY or np.isnan(response.loop).any():
         return Margins(0.0, 0.0, math.nan)
+    gain, phase = read_off(response)
+    if not phase:
+        return Margins(0.0, 0.0, math.nan)
+    return Margins(min((abs(db) for _, db in gain), default=math.inf), min(deg for _, deg in phase), max(w for w, _ in phase))
+
+
+def read_off(response: Response) -> Readings:
+    """All candidates for the margins of one loop, interpolated over the logarithm of the frequency.
+
+    Where the phase reaches -180 degrees above the last frequency, the gain there counts: it is not more by then.
+    """
     x = np.log(response.frequency)
     gain_db = 20.0 * np.log10(np.maximum(np.abs(response.loop), 1e-300))
     crossovers = _crossings(x, gain_db)
     if not crossovers:
-        return Margins(0.0, 0.0, math.nan)
+        return Readings([], [])
     phase = np.unwrap(np.angle(response.loop))
     phase += -2.0 * math.pi * round((phase[int(np.argmin(np.abs(gain_db)))] + math.pi) / (2.0 * math.pi))  # near -180 at crossover
     turns = math.pi * np.array([-3.0, -1.0, 1.0])
-    gains = [np.interp(c, x, gain_db) for turn in turns for c in _crossings(x, phase - turn)]
-    gains += [gain_db[-1]] if phase[-1] > -math.pi else []
-    phases = [abs((math.degrees(np.interp(c, x, phase)) + 360.0) % 360.0 - 180.0) for c in crossovers]
-    return Margins(min((abs(g) for g in gains), default=math.inf), min(phases), math.exp(max(crossovers)))
+    gains = [(math.exp(c), float(np.interp(c, x, gain_db))) for turn in turns for c in _crossings(x, phase - turn)]
+    gains += [(float(response.frequency[-1]), float(gain_db[-1]))] if phase[-1] > -math.pi else []
+    return Readings(gains, [(math.exp(c), abs((math.degrees(np.interp(c, x, phase)) + 360.0) % 360.0 - 180.0)) for c in crossovers])
 
 
 def _crossings(x: np.ndarray, y: np.ndarray) -> list[float]:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from argument_types import check_results, make_folder, whole
 from command_line import Parser, in_words, run_tool, worker_pool
-from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure
+from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure, read_off
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -118,21 +118,42 @@ def draw(path: Path, found: Found) -> None:
             for panel, part in ((gain, 0), (phase, 1)):
                 values = np.array([c[part] for c in curves])
                 panel.fill_between(w, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.15, linewidth=0)
-                panel.plot(w, values[0], color=colour, label=AXES[axis])
+                panel.plot(w, values[0], color=colour)
+            mark(gain, phase, found[modules][NOMINAL][axis], AXES[axis], colour)
         gain.axhline(0.0, color="#30363d", linewidth=0.8)
         phase.axhline(-180.0, color="#30363d", linewidth=0.8)
-        gain.set_title(f"{modules} module{'s' if modules > 1 else ''}")
-        if gain.get_legend_handles_labels()[0]:
-            gain.legend(frameon=False, loc="upper right")
+        gain.set_title(f"{modules} module{'s' if modules > 1 else ''}, {'rotation' if first else 'translation'}")
+        for panel, title in ((gain, "gain margin, where the phase is -180 deg"), (phase, "phase margin, at crossover")):
+            if panel.get_legend_handles_labels()[0]:
+                panel.legend(frameon=False, loc="lower left", fontsize=8, title=title, title_fontsize=8, alignment="left")
         phase.set_xlabel("frequency, rad/s")
     panels[0, 0].set(xscale="log", ylabel="loop gain, dB", ylim=(-40, 45))
     panels[1, 0].set(ylabel="phase, deg", ylim=(-400, -80), yticks=range(-360, -80, 45))
     for panel in panels.flat:
         panel.grid(color="#d8dee4", linewidth=0.6)
-    figure.suptitle(f"Loops broken at the plant's input; bands: mass, inertia and thruster lag +-{SPREAD:.0%}")
+    what = f"Loops broken at the plant's input; bands: mass, inertia and thruster lag +-{SPREAD:.0%}"
+    figure.suptitle(f"{what}\nmarks and bars: crossover and least margins of the nominal plant", fontsize=11)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def mark(gain: Any, phase: Any, response: Response, name: str, colour: str) -> None:
+    """Marks where the least margins of a loop are read off, with a bar for each, and tells them in the legends."""
+    if math.isnan(margins(response).crossover_rad_s):
+        gain.plot([], [], color=colour, label=f"{name}, no margins")
+        return
+    gains, phases = read_off(response)
+    crossover, margin_deg = min(phases, key=lambda at: at[1])
+    label = f"{name}, {margin_deg:.0f} deg at {crossover:.1f} rad/s"
+    phase_deg = np.interp(np.log(crossover), np.log(response.frequency), bode(response)[1])
+    turn = -180.0 + 360.0 * round((phase_deg + 180.0) / 360.0)
+    gain.plot(crossover, 0.0, "o", color=colour, markersize=5)
+    phase.plot([crossover, crossover], [phase_deg, turn], "-o", color=colour, markersize=5, markevery=[0], linewidth=2.0, label=label)
+    if gains:
+        reached, gain_db = min(gains, key=lambda at: abs(at[1]))
+        label = f"{name}, {abs(gain_db):.1f} dB at {reached:.1f} rad/s"
+        gain.plot([reached, reached], [gain_db, 0.0], "-v", color=colour, markersize=5, markevery=[0], linewidth=2.0, label=label)
 
 
 def bode(response: Response) -> tuple[np.ndarray, np.ndarray]:

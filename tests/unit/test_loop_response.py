@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
@@ -72,6 +73,23 @@ def test_controlled_axis_that_never_reaches_0_db_fails(monkeypatch: pytest.Monke
     rows = judged(monkeypatch, ideal(1e-3, 0.01))
     assert [row["axis"] for row in rows if not row["passed"]] == ["pitch", "pitch"]
     assert "FAILED: no crossover" in capsys.readouterr().out
+
+
+def test_picture_marks_crossover_and_margins_where_they_are_read_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    mark = importlib.import_module("margins").mark
+    figure, (gain, phase) = pyplot.subplots(2, 1)
+    mark(gain, phase, ideal(2.0, 0.2), "surge", "black")
+    crossover, gain_bar = (line.get_xydata() for line in gain.lines)
+    (phase_bar,) = (line.get_xydata() for line in phase.lines)
+    assert crossover == pytest.approx(np.array([[2.0, 0.0]]), abs=0.01)
+    assert gain_bar == pytest.approx(np.array([[2.5 * np.pi, 20.0 * np.log10(0.8 / np.pi)], [2.5 * np.pi, 0.0]]), abs=0.02)
+    assert phase_bar == pytest.approx(np.array([[2.0, -90.0 - np.degrees(0.4)], [2.0, -180.0]]), abs=0.05)
+    labels = [label for axes in (gain, phase) for label in axes.get_legend_handles_labels()[1]]
+    assert labels == ["surge, 11.9 dB at 7.9 rad/s", "surge, 67 deg at 2.0 rad/s"]
+    mark(gain, phase, ideal(1e-3, 0.01), "pitch", "red")
+    assert gain.lines[-1].get_label() == "pitch, no margins" and len(phase.lines) == 1
+    pyplot.close(figure)
 
 
 def test_every_sine_is_one_of_its_own() -> None:
