@@ -75,13 +75,13 @@ test-flash: setup ## flash a Debian machine with systemd, break it, pull its plu
 hil: setup ## fly the spiral on the bench and name the report
 	@$(BIN)/modcube hil run spiral --out runs/spiral
 
-accept: setup ## every acceptance figure, long ones too; writes accept.json and README's tables
+accept: setup ## every acceptance figure, long ones too; writes accept.json and the tables of README and docs/figures.md
 	@$(PY) tools/accept.py $(if $(ONLY),--only $(ONLY)); status=$$?; [ $$status = 2 ] || $(PY) tools/readme_tables.py; exit $$status
 
 mutants: setup ## change limiter, supervisor and fail-safes one thing at a time: every mutant must fail its tests
 	@$(PY) tools/mutants.py
 
-bench: setup ## measure the code; writes bench.json and README's tables
+bench: setup ## measure the code; writes bench.json and the tables of README and docs/figures.md
 	-@$(PY) -m pip install --quiet --disable-pip-version-check $(PEERS)
 	@$(PY) tools/bench.py && $(PY) tools/readme_tables.py
 

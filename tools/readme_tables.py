@@ -1,8 +1,9 @@
-"""Writes README.md's tables between their markers, out of accept.json and bench.json: no figure is typed by hand.
+"""Writes the tables of README.md and docs/figures.md between their markers, out of accept.json and bench.json: no figure is typed by hand.
 
 A marker names a table: `<!-- table: accept -->` (all groups), `<!-- table: accept hover spiral -->` (those groups),
-`<!-- table: bench -->`, or `<!-- table: bench WORD -->` (names with WORD in them). Each ends at `<!-- end -->`. A table whose
-file is missing stays as it is, and so does a figure of `accept` while any group of its table has not been measured.
+`<!-- table: bench -->`, or `<!-- table: bench WORD -->` (names with WORD in them); `headlines` in their place takes those of
+HEADLINES. Each ends at `<!-- end -->`. A table whose file is missing stays as it is, and so does a figure of `accept` while any
+group of its table has not been measured.
 """
 
 from __future__ import annotations
@@ -11,15 +12,44 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from command_line import Parser, in_words, run_tool
 
-README = Path("README.md")
+PAGES = (Path("README.md"), Path("docs/figures.md"))
 SOURCES = {"accept": Path("accept.json"), "bench": Path("bench.json")}
 MARKER = re.compile(r"(<!-- table: (?P<kind>\w+)(?P<words>[^>]*?) -->\n)(?P<old>.*?)(<!-- end -->)", re.DOTALL)
+HEADLINE = "headlines"
+HEADLINES = {
+    "accept": (
+        ("hover", "hover, 20 seeds: position RMSE, worst"),
+        ("spiral", "spiral, 20 seeds: position RMSE, median"),
+        ("spiral", "spiral, 20 seeds: position RMSE, worst"),
+        ("spiral", "spiral, 20 seeds: attitude RMSE, worst"),
+        ("paper", "paper's controller, same 20 seeds: position RMSE, median (paper's tank: 20.92 mm)"),
+        ("determinism", "same seed twice: logs that differ, of three"),
+        ("speed", "spiral in lockstep with recorder and real frames, one core"),
+        ("mobius-4", "Moebius strip, 4 modules, real sensors, 10 seeds: position RMSE, worst"),
+        ("polycube", "random polycubes of 2 to 8 modules, 20: position RMSE, worst"),
+        ("dock", "dock, 1000 trials: lower 95 % bound of success"),
+        ("near-miss-passes", "near miss, 10,000 passes through real frames: docks declared"),
+        ("thrusters", "one thruster dead on the spiral, worst of 8: position RMSE"),
+        ("blind", "hover, 5 s without tags, 50 seeds: largest horizontal error, median"),
+        ("blind", "the same: 95 %"),
+    ),
+    "bench": (
+        ("", "firmware's whole tick, p50"),
+        ("", "firmware's whole tick, p99.9"),
+        ("", "pipeline.step, 64 modules docked"),
+        ("", "real time at 100 Hz: tick starts late by, worst"),
+        ("", "drag table of one module"),
+        ("", "allocation, saturated"),
+        ("", "plant step (RK4), 64 worlds on two cores"),
+    ),
+}
+"""Group and name of the figures that README shows, by their file; those of bench.json have no groups."""
 
 Entries = Sequence[dict[str, Any]]
 
@@ -38,7 +68,7 @@ def rows(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
 
 
 def accept_table(entries: Entries, groups: Sequence[str], old: str) -> str:
-    """The figures of these groups, or of all, with limit, verdict and the command that measures them.
+    """The figures of these groups, of all or the headlines, with limit, verdict and the command that measures them.
 
     Args:
         old: the table as it stands; its rows stay where some groups were measured and others were not.
@@ -48,11 +78,19 @@ def accept_table(entries: Entries, groups: Sequence[str], old: str) -> str:
             e["name"], f"{number(e['value'])} {e['unit']}".strip(), e["limit"] and f"{e['limit']} {e['unit']}".strip(),
             e["limit"] and ("passed" if e["passed"] else "**failed**"), f"`{e['command']}`",
         )
-        for e in entries if not groups or e["group"] in groups
+        for e in chosen("accept", entries, groups, lambda e: e["group"] in groups)
     ]  # fmt: skip
     new = rows(("figure", "measured", "limit", "result", "command"), body)
-    whole = set(groups) <= {e["group"] for e in entries}
+    wanted = {group for group, _ in HEADLINES["accept"]} if HEADLINE in groups else set(groups)
+    whole = wanted <= {e["group"] for e in entries}
     return new if whole else "".join((rows_by_name(old) | rows_by_name(new)).values())
+
+
+def chosen(kind: str, entries: Entries, words: Sequence[str], named: Callable[[dict[str, Any]], bool]) -> Entries:
+    """All entries without words, the headlines, or those that are `named` by the words."""
+    if HEADLINE in words:
+        return [e for wanted in HEADLINES[kind] for e in entries if (e.get("group", ""), e["name"]) == wanted]
+    return [e for e in entries if not words or named(e)]
 
 
 def rows_by_name(table: str) -> dict[tuple[str, str, str], str]:
@@ -76,7 +114,7 @@ def bench_table(entries: Entries, words: Sequence[str], old: str) -> str:
             e["name"], f"{number(e['value'])} {e['unit']}", e["peer"] or "",
             f"{number(e['peer_value'])} {e['unit']}" if e["peer_value"] is not None else "", number(e["ratio"]),
         )
-        for e in entries if not words or any(word in e["name"] for word in words)
+        for e in chosen("bench", entries, words, lambda e: any(word in e["name"] for word in words))
     ]  # fmt: skip
     return rows(("what", "measured", "beside", "its figure", "times better"), body)
 
@@ -110,13 +148,13 @@ def read_source(path: Path) -> Entries:
 def main() -> int:
     """The command line."""
     Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
-    if not README.is_file():
-        print(f"readme: no {README} in {Path.cwd()}; run this in the root of the project", file=sys.stderr)
+    if missing := [page for page in PAGES if not page.is_file()]:
+        print(f"readme: no {missing[0]} in {Path.cwd()}; run this in the root of the project", file=sys.stderr)
         return 2
     try:
         write_tables()
     except KeyError as error:
-        print(f"readme: {error} is no table of {README}, or no column of its file; there are {', '.join(TABLES)}", file=sys.stderr)
+        print(f"readme: {error} is no kind of table, or no column of its file; there are {', '.join(TABLES)}", file=sys.stderr)
         return 2
     except (ValueError, OSError) as error:
         print(f"readme: {in_words(error)}", file=sys.stderr)
@@ -125,11 +163,13 @@ def main() -> int:
 
 
 def write_tables() -> None:
-    """Writes README.md; says what is missing. Raises KeyError, ValueError and OSError."""
+    """Writes the pages; says what is missing. Raises KeyError, ValueError and OSError."""
     sources = {kind: read_source(path) for kind, path in SOURCES.items() if path.exists()}
     for kind in set(SOURCES) - set(sources):
         print(f"readme: no {SOURCES[kind]}; its tables stay as they are (make {kind})", file=sys.stderr)
-    README.write_text(filled(README.read_text(encoding="utf-8"), sources), encoding="utf-8")
+    written = {page: filled(page.read_text(encoding="utf-8"), sources) for page in PAGES}
+    for page, text in written.items():
+        page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""README.md: what it names exists, and its tables of figures are written by a tool."""
+"""README.md and docs/figures.md: what they name exists, and their tables of figures are written by a tool."""
 
 import ast
 import importlib.util
@@ -11,7 +11,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PLACES = sorted(set(re.findall(r"`((?:firmware_py|hil|tests|tools|can_dbc)/[^` :]+?)(?::(\w+))?`", README)))
+FIGURES = (ROOT / "docs" / "figures.md").read_text(encoding="utf-8")
+PLACES = sorted(set(re.findall(r"`((?:firmware_py|hil|tests|tools|can_dbc)/[^` :]+?)(?::(\w+))?`", README + FIGURES)))
 
 
 def tool(name: str) -> ModuleType:
@@ -33,9 +34,18 @@ def test_file_and_function_that_the_readme_names_exist(path: str, name: str) -> 
 
 
 def test_links_and_pictures_of_the_readme_lead_to_files() -> None:
-    targets = re.findall(r"\]\(([^)#]+)\)", README)
-    assert any(target.endswith(".png") for target in targets)
-    assert [target for target in targets if "://" not in target and not (ROOT / target).exists()] == []
+    targets = re.findall(r"\]\(([^)#]+)(?:#([^)]+))?\)", README)
+    assert any(target.endswith(".png") for target, _ in targets)
+    assert [target for target, _ in targets if "://" not in target and not (ROOT / target).exists()] == []
+    for target, section in targets:
+        if section:
+            headings = re.findall(r"^#+ (.+)$", (ROOT / target).read_text(encoding="utf-8"), re.MULTILINE)
+            assert section in [heading.lower().replace(" ", "-") for heading in headings]
+
+
+def test_figures_stand_on_their_page_and_readme_has_few_of_them() -> None:
+    assert "](docs/figures.md)" in README
+    assert len(re.findall(r"^\|.*\| (?:passed|\*\*failed\*\*) \|", README, re.MULTILINE)) <= 15
 
 
 def test_picture_stands_on_the_first_screen() -> None:
@@ -87,13 +97,46 @@ def test_figure_that_was_not_measured_stays_as_it_is_while_others_of_its_table_a
     assert [line for line in again.splitlines() if "hover: RMSE" in line] == [line for line in first.splitlines() if "hover: RMSE" in line]
 
 
-def test_every_table_of_the_readme_is_of_a_known_kind_and_filled() -> None:
+@pytest.mark.parametrize("page", [README, FIGURES], ids=["README", "figures"])
+def test_every_table_of_figures_is_of_a_known_kind_and_filled(page: str) -> None:
     readme_tables = tool("readme_tables")
-    found = list(readme_tables.MARKER.finditer(README))
-    assert len(found) == README.count("<!-- table:") == README.count("<!-- end -->")
+    found = list(readme_tables.MARKER.finditer(page))
+    assert len(found) == page.count("<!-- table:") == page.count("<!-- end -->")
     for match in found:
         assert match["kind"] in readme_tables.TABLES
-        assert match[0].count("\n|") >= 2, f"empty table: {match[1].strip()}"
+        assert match[0].count("\n|") > 2, f"empty table: {match[1].strip()}"
+
+
+def test_headlines_of_the_readme_are_rows_of_the_page_of_figures() -> None:
+    readme_tables = tool("readme_tables")
+    for match in readme_tables.MARKER.finditer(README):
+        assert match["words"].split() == ["headlines"]
+        lines = match["old"].splitlines()[2:]
+        assert [line.split(" | ")[0].removeprefix("| ") for line in lines] == [name for _, name in readme_tables.HEADLINES[match["kind"]]]
+        assert [line for line in lines if line not in FIGURES.splitlines()] == []
+
+
+def test_headlines_and_groups_of_the_pages_are_those_that_are_measured() -> None:
+    readme_tables, groups = tool("readme_tables"), {group.name: group for group in tool("accept").GROUPS}
+    for group, name in readme_tables.HEADLINES["accept"]:
+        assert name in [figure.name for figure in groups[group].figures]
+    named = [word for match in readme_tables.MARKER.finditer(FIGURES) if match["kind"] == "accept" for word in match["words"].split()]
+    assert set(named) <= set(groups)
+
+
+def test_headlines_come_in_their_order_and_stay_while_they_are_not_measured() -> None:
+    readme_tables = tool("readme_tables")
+    figures = [{"group": group, "name": name} for group, name in readme_tables.HEADLINES["accept"]]
+    figures.insert(0, {"group": "hover", "name": "hover, 20 seeds: share that passed its checks"})
+    made = [{"value": 1.0 + n, "unit": "", "limit": "", "passed": True, "command": f["group"]} | f for n, f in enumerate(figures)]
+    text = readme_tables.filled("<!-- table: accept headlines -->\n<!-- end -->\n", {"accept": made[::-1]})
+    assert re.findall(r"\| (\d+) \|", text) == [str(n) for n in range(2, len(made) + 1)]
+    again = [entry | {"value": 99.0} for entry in made if entry["group"] == "blind"]
+    assert readme_tables.filled(text, {"accept": again}) == re.sub(r"\| 1[45] \|", "| 99 |", text)
+    timed = {"value": 5.0, "unit": "us", "peer": "", "peer_value": None, "ratio": None}
+    bench = [timed | {"name": name} for name in ("allocation, saturated", "x")]
+    table = readme_tables.filled("<!-- table: bench headlines -->\n<!-- end -->\n", {"bench": bench})
+    assert table.count("5 us") == 1 and "| allocation, saturated | 5 us |" in table
 
 
 PAGES = [ROOT / "README.md", ROOT / "can_dbc" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

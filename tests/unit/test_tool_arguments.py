@@ -1,6 +1,7 @@
 """The tools' command lines: --help says what they do and does nothing, and wrong arguments end with status 2 and no traceback."""
 
 import importlib
+import json
 import os
 import runpy
 import subprocess
@@ -180,8 +181,22 @@ def test_files_that_no_earlier_run_left_are_not_written_over(
 
 
 def test_tables_of_the_readme_need_the_project_s_root(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("readme_tables") == 2
-    assert capsys.readouterr().err == f"readme: no README.md in {tmp_path}; run this in the root of the project\n"
+    for missing in ("README.md", "docs/figures.md"):
+        assert run("readme_tables") == 2
+        assert capsys.readouterr().err == f"readme: no {missing} in {tmp_path}; run this in the root of the project\n"
+        (tmp_path / "README.md").touch()
+
+
+def test_one_run_writes_the_readme_and_the_page_of_figures(run: Run, tmp_path: Path) -> None:
+    name = "spiral, 20 seeds: position RMSE, worst"
+    figure = {"name": name, "value": 2.5, "unit": "mm", "limit": "<= 8", "passed": True, "command": "x", "group": "spiral"}
+    (tmp_path / "accept.json").write_text(json.dumps([figure]))
+    (tmp_path / "docs").mkdir()
+    for page, words in (("README.md", "headlines"), ("docs/figures.md", "spiral")):
+        (tmp_path / page).write_text(f"<!-- table: accept {words} -->\n<!-- end -->\n")
+    assert run("readme_tables") == 0
+    for page in ("README.md", "docs/figures.md"):
+        assert f"| {name} | 2.5 mm | <= 8 mm | passed | `x` |" in (tmp_path / page).read_text()
 
 
 @pytest.mark.parametrize(("text", "refusal"), [("[", "accept.json: no JSON"), ("{}", "accept.json: not a list"), ("[{}]", "'group'")])
@@ -190,6 +205,8 @@ def test_spoilt_measurements_leave_the_readme(
 ) -> None:
     readme = "<!-- table: accept spiral -->\nold\n<!-- end -->\n"
     (tmp_path / "README.md").write_text(readme)
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "figures.md").touch()
     (tmp_path / "bench.json").write_text("[]")
     (tmp_path / "accept.json").write_text(text)
     assert run("readme_tables") == 2
