@@ -181,7 +181,9 @@ def _ends(ticks: np.ndarray) -> np.ndarray:
 
 
 def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> float:
-    """Position of the truth against the set-point over the ticks in which both logs know of a joined body; NaN without any."""
+    """Position of the truth against the set-point over the ticks in which both logs know of a joined body, and the firmware of its pose;
+    NaN without any.
+    """
     squares, thrusters = [np.zeros(0)], truths["/plant/module0"]["force_n"].shape[1]
     for name, true in truths.items():
         believed = signals.get(name.replace("/plant/body", "/firmware/body"))
@@ -190,7 +192,7 @@ def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]
         _, mine, theirs = np.intersect1d(true["tick"], believed["tick"], return_indices=True)
         forces = np.isfinite(believed["commanded_n"][theirs]).sum(axis=1)
         members = (true["member"][mine] > 0.0).sum(axis=1)
-        joined = (members > 1) & (forces == members * thrusters)
+        joined = (members > 1) & (forces == members * thrusters) & (believed["ready"][theirs] > 0)
         gap = true["p_wb"][mine][joined] - believed["setpoint_p_wb"][theirs][joined]
         squares.append(np.sum(gap**2, axis=1))
     everything = np.concatenate(squares)

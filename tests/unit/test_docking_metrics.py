@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from firmware_py.description.signals import Columns
-from hil.docking_metrics import DECLARED, _false_declarations, docking_metrics, is_as_asked, is_obeyed
+from hil.docking_metrics import DECLARED, _docked_rmse_m, _false_declarations, docking_metrics, is_as_asked, is_obeyed
 from hil.scenario import Scenario, Step, load_scenario
 from hil.signals import SIGNAL_LOG, TRUTH_LOG
 
@@ -101,3 +101,13 @@ def test_join_that_no_dock_declared_is_found_by_the_number_of_bodies() -> None:
     signals = {"/firmware/body0": {"tick": TICKS}, "/firmware/body1": {"tick": TICKS[:30]}, "/firmware/body2": {"tick": TICKS}}
     assert _false_declarations(truth_of([APART], PLACES), signals) == 1
     assert _false_declarations(truth_of([APART, PAIR], PLACES), signals) == 1  # thirty ticks in, and true from fifty
+
+
+def test_place_of_a_joined_body_counts_from_when_the_firmware_knows_it() -> None:
+    """A pair that is docked from the start waits for its first tags with a set-point at the origin."""
+    ready = TICKS > 30
+    true = {"tick": TICKS, "member": np.ones((100, 2)), "p_wb": np.tile([0.3, 0.0, 0.4], (100, 1))}
+    setpoint = np.where(ready[:, None], [0.3, 0.002, 0.4], 0.0)
+    believed = {"tick": TICKS, "commanded_n": np.zeros((100, 16)), "setpoint_p_wb": setpoint, "ready": ready.astype(np.uint8)}
+    truths = {"/plant/body0": true, "/plant/module0": {"force_n": np.zeros((100, 8))}}
+    assert _docked_rmse_m(truths, {"/firmware/body0": believed}) == pytest.approx(0.002)
