@@ -126,7 +126,7 @@ def judge_logs(
     if scenario.task.kind == "dock":  # which may end before its time
         metrics |= docking_metrics(scenario, folder)
     else:
-        metrics["unmatched_ticks"] = max(metrics["unmatched_ticks"], float(duration_ns // period_ns - len(flight.firmware["tick"])))
+        metrics["unmatched_ticks"] = max(metrics["unmatched_ticks"], float(ticks_of(scenario, period_ns) - len(flight.firmware["tick"])))
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
     always = [Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"])), *_armed_at_all(scenario, whole, folder)]
@@ -170,7 +170,18 @@ def as_wanted(scenario: Scenario, flight: Flight) -> Flight:
 def begin_of(scenario: Scenario, flight: Flight) -> int:
     """Time of the first tick that is not before the task, ns."""
     period_ns = period_of(flight.ticks)
-    return start_of(flight) + math.ceil(round(scenario.task.settle_s * 1e9) / period_ns) * period_ns
+    return start_of(flight) + _first_tick(scenario, period_ns) * period_ns
+
+
+def ticks_of(scenario: Scenario, period_ns: int) -> int:
+    """Ticks of the task, both ends among them: the one in which it begins and the last of the run."""
+    end_ns = round(scenario.task.settle_s * 1e9) + round(scenario.task.duration_s * 1e9)
+    return end_ns // period_ns - _first_tick(scenario, period_ns) + 1
+
+
+def _first_tick(scenario: Scenario, period_ns: int) -> int:
+    """The first tick that is not before the task."""
+    return -(-round(scenario.task.settle_s * 1e9) // period_ns)
 
 
 def start_of(flight: Flight) -> int:

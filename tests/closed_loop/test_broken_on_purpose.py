@@ -146,7 +146,7 @@ def test_ticks_that_both_logs_lack_are_missed(fly: Fly, tmp_path: Path) -> None:
     hover = shortened("hover", 4.0, 4.0)
     assert fly(hover).passed
     longer = shortened("hover", 4.5, 4.0)
-    assert judge_logs(longer, 0, tmp_path / "run").metrics["unmatched_ticks"] == 49
+    assert judge_logs(longer, 0, tmp_path / "run").metrics["unmatched_ticks"] == 50
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The figures of a flight: known errors give known metrics, and nothing is left out."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil.checks import Limit, check_metrics, judge, write_result
+from hil.flight import ticks_of
 from hil.force_metrics import force_metrics
 from hil.metrics import Poses, body_positions, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
 from hil.scenario import load_scenario
@@ -195,3 +197,10 @@ def test_force_of_a_robot_that_never_pushed_has_no_difference(tmp_path: Path, mo
     logs = {f"/{side}/body{leader}": still for side in ("firmware", "plant") for leader in (0, 1)}
     monkeypatch.setattr("hil.force_metrics.read_signals", lambda path: logs)
     assert np.isnan(force_metrics(scenario, tmp_path, 0)["force_difference_off"])
+
+
+@pytest.mark.parametrize(("settle_s", "duration_s", "ticks"), [(3.0, 4.0, 401), (3.0, 0.1, 11), (3.005, 4.0, 400), (3.005, 4.005, 401)])
+def test_task_has_a_tick_at_either_end(settle_s: float, duration_s: float, ticks: int) -> None:
+    scenario = load_scenario("hover")
+    scenario = dataclasses.replace(scenario, task=dataclasses.replace(scenario.task, settle_s=settle_s, duration_s=duration_s))
+    assert ticks_of(scenario, 10_000_000) == ticks
