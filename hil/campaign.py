@@ -32,7 +32,7 @@ from hil.checks import Result
 from hil.flight import fly_and_judge
 from hil.metrics import OUTCOMES
 from hil.plant.world_parameters import world_parameters
-from hil.replaceable import check_replaceable, is_json_with
+from hil.replaceable import check_replaceable, is_json_with, made
 from hil.scenario import Scenario
 from hil.trial_file import OWNER, TrialFile
 from hil.workers import Pool, deaths
@@ -108,9 +108,8 @@ def run_campaign(
     Raises DescriptionError where `out` holds another campaign, which `anew` throws away, or files that are no campaign's, and for seeds
     that kill their workers; OSError where the disk takes no more.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    check_replaceable(out, (SUMMARY_FILE, TABLE_FILE), is_json_with(out / TRIALS_FILE, OWNER), "campaign")
-    with writing_to(out):
+    with made(out), writing_to(out):
+        check_replaceable(out, (SUMMARY_FILE, TABLE_FILE), is_json_with(out / TRIALS_FILE, OWNER), "campaign")
         with TrialFile(out / TRIALS_FILE, identity(scenario, parameters), anew=anew) as file:
             missing = [seed for seed in seeds if seed not in file.trials]
             for trial in _flown(scenario, parameters, missing, pool):

@@ -22,7 +22,7 @@ from firmware_py.description.vehicle import load_vehicle
 from hil.bench import fly_scenario
 from hil.fault_table import AT_S, NUMBER, PLACED, ROWS, Row
 from hil.metrics import rotation_vectors
-from hil.replaceable import check_replaceable, is_json_with
+from hil.replaceable import check_replaceable, is_json_with, made
 from hil.scenario import MODES, Scenario, load_scenario
 from hil.signals import Flight, read_flight
 
@@ -132,16 +132,16 @@ def run_fault_campaign(
 
     Raises DescriptionError where `out` holds a faults.json that is none.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    check_replaceable(out, (RESULT_FILE,), is_json_with(out / RESULT_FILE, "promise"), "campaign of faults")
-    cells: list[Cell] = []
-    with executor or ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        futures = [pool.submit(fly_cell, row, mode, seed) for row in ROWS for mode in MODES]
-        for future in futures:
-            cells.append(future.result())
-            if progress is not None:
-                progress(len(cells), len(futures))
-    promises = {row.name: row.promise for row in ROWS}
-    entries = [{**cell._asdict(), "promise": promises[cell.fault], "passed": not cell.broken} for cell in cells]
-    (out / RESULT_FILE).write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
+    with made(out):
+        check_replaceable(out, (RESULT_FILE,), is_json_with(out / RESULT_FILE, "promise"), "campaign of faults")
+        cells: list[Cell] = []
+        with executor or ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            futures = [pool.submit(fly_cell, row, mode, seed) for row in ROWS for mode in MODES]
+            for future in futures:
+                cells.append(future.result())
+                if progress is not None:
+                    progress(len(cells), len(futures))
+        promises = {row.name: row.promise for row in ROWS}
+        entries = [{**cell._asdict(), "promise": promises[cell.fault], "passed": not cell.broken} for cell in cells]
+        (out / RESULT_FILE).write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
     return cells

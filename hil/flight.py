@@ -28,7 +28,7 @@ from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics, told
 from hil.plant.spec import Tank
 from hil.plots import PLOTS, Window, write_plots
 from hil.realtime import fly_in_real_time
-from hil.replaceable import check_replaceable, is_json_with
+from hil.replaceable import check_replaceable, is_json_with, made
 from hil.report import REPORT_FILE, Scene, write_report
 from hil.scenario import Scenario
 from hil.script import Script
@@ -57,12 +57,11 @@ def fly_and_judge(
 ) -> Result:
     """Flies `scenario`; the logs and result.json are in `out` afterwards, and nothing of an earlier flight is.
 
-    Raises DescriptionError and PortError; what an earlier flight left, or anybody else, is then as it was.
+    Raises DescriptionError and PortError; what an earlier flight left, or anybody else, is then as it was, and no empty folder is left.
     """
-    out.mkdir(parents=True, exist_ok=True)
     scenario = scenario.for_seed(seed)
     flight = (scenario, seed, parameters, out, bus, rate_hz, progress)
-    with _alone_in(out):
+    with made(out), _alone_in(out):
         check_folder(out)
         if realtime:
             flown = fly_in_real_time(*flight, before_logs=partial(_clear, out))

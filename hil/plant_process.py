@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from firmware_py.bus.codec import Codec, Frame
@@ -16,7 +16,7 @@ from firmware_py.bus.port import Port, open_port
 from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults
 from hil.nodes import Nodes, make_nodes
-from hil.replaceable import check_replaceable
+from hil.replaceable import check_replaceable, made
 from hil.scenario import Scenario, make_world
 from hil.signals import TRUTH_LOG, TruthRecorder, is_truth_log
 
@@ -43,12 +43,13 @@ def serve_until_signal(scenario: Scenario, seed: int, bus: str, rate_hz: int, ou
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        check_replaceable(out, (TRUTH_LOG,), is_truth_log(out / TRUTH_LOG), "plant")
-    plant = PlantProcess(scenario, seed, rate_hz, out)
-    now_ns = started_clock()
-    with open_port(bus, reader=True, now_ns=now_ns, arrival=threading.Event()) as port:
+    with ExitStack() as stack:
+        if out is not None:
+            stack.enter_context(made(out))
+            check_replaceable(out, (TRUTH_LOG,), is_truth_log(out / TRUTH_LOG), "plant")
+        plant = PlantProcess(scenario, seed, rate_hz, out)
+        now_ns = started_clock()
+        port = stack.enter_context(open_port(bus, reader=True, now_ns=now_ns, arrival=threading.Event()))
         print(f"plant of {scenario.name} on {bus}", flush=True)
         plant.serve(port, now_ns, stop.is_set)
 

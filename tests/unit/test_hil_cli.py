@@ -162,8 +162,7 @@ def test_refused_flight_leaves_the_one_before_as_it_was(
     text = (Path(hil.plant_process.__file__).parent / "scenarios" / "hover.toml").read_text(encoding="utf-8")
     Path("own.toml").write_text(text.replace(old, new, 1), encoding="utf-8")
     Path("points.csv").write_text(NORTH, encoding="utf-8")
-    vehicle = Path(str(resources.files("firmware_py"))) / "vehicles" / "modcube.toml"
-    Path("no_mesh.toml").write_text(vehicle.read_text(encoding="utf-8").replace("[hull]", '[hull]\nmesh = "none.stl"'), encoding="utf-8")
+    Path("no_mesh.toml").write_text(with_mesh("none.stl"), encoding="utf-8")
     files = [Path("run") / name for name in (*LEFT_BEHIND, "can.log", "signals.mcap", "truth.mcap")]
     Path("run").mkdir()
     before = json.dumps({"checks": [], "of": "the flight before"})
@@ -173,6 +172,32 @@ def test_refused_flight_leaves_the_one_before_as_it_was(
     line = capsys.readouterr().err
     assert why in line and line.count("\n") == 1
     assert {file.read_text() for file in files} == {before}
+
+
+def with_mesh(mesh: str) -> str:
+    """The text of a vehicle whose hull is in that file."""
+    vehicle = Path(str(resources.files("firmware_py"))) / "vehicles" / "modcube.toml"
+    return vehicle.read_text(encoding="utf-8").replace("[hull]", f'[hull]\nmesh = "{mesh}"')
+
+
+@pytest.mark.parametrize("vehicle", ["nautilus", "none.toml", "no_mesh.toml"])
+@pytest.mark.parametrize("command", [["run"], ["campaign", "--jobs", "1"]], ids=["run", "campaign"])
+def test_refused_vehicle_leaves_no_folder(
+    command: list[str], vehicle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("no_mesh.toml").write_text(with_mesh("none.stl"), encoding="utf-8")
+    Path("there").mkdir()
+    for out in ([], ["--out", "new/run"], ["--out", "there"]):
+        assert status_of([command[0], "hover", *command[1:], "--vehicle", vehicle, *out], monkeypatch) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+        assert sorted(path.name for path in tmp_path.rglob("*")) == ["no_mesh.toml", "there"]
+
+
+def test_plant_whose_bus_is_refused_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    assert status_of(["plant", "hover", "--bus", "socketcan:can9", "--out", str(tmp_path / "new" / "run")], monkeypatch) == 2
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
