@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
+
+from firmware_py.runtime.interrupts import interrupted_once
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C: 128 and SIGINT, as a shell has it."""
@@ -16,10 +19,12 @@ def main() -> None:
     """Runs the command line; what takes a second or more to import is imported here."""
     try:
         with compiling_told(sys.stderr):
-            from firmware_py.cli import main as run
+            with interrupted_once():
+                from firmware_py.cli import main as run
 
             run()
     except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         sys.exit(INTERRUPTED)
 
 

@@ -19,6 +19,7 @@ from firmware_py.core.types import Outputs
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.disk import writing_to
+from firmware_py.runtime.interrupts import held_back
 from firmware_py.runtime.realtime import quiet_garbage
 from firmware_py.runtime.recorder import Recorder
 from hil.dock_script import DockScript
@@ -158,18 +159,20 @@ def fly_scenario(
 ) -> float:
     """Flies `scenario` and leaves the logs in `out`; returns the wall time of the flight, s. Raises OSError where the disk is full.
 
-    `before_logs` is called when nothing is refused any more; until then logs of an earlier flight are as they were.
+    `before_logs` is called when nothing is refused any more; until then logs of an earlier flight are as they were. From then on Ctrl-C
+    waits for the end of a tick: the logs are whole up to that.
     """
     with writing_to(out), ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, parameters, bus, rate_hz)
         bench.listen()
+        check = stack.enter_context(held_back())
         if before_logs is not None:
             before_logs()
         recorder = Recorder(out, configuration_of(bench.firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz))
         stack.callback(recorder.close)
         thrusters = tuple(len(v.thruster) for v in bench.nodes.world.vehicles)
         truth = stack.enter_context(TruthRecorder(out, thrusters))
-        wall_s = bench.fly([recording(recorder, rate_hz)], progress, truth)
+        wall_s = bench.fly([recording(recorder, rate_hz), lambda *_: check()], progress, truth)
         recorder.close()
         recorder.check()
         return wall_s

@@ -12,6 +12,8 @@ import typer
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
+from firmware_py.runtime.interrupts import interrupted_once
+from firmware_py.runtime.recorder import CAN_LOG
 from hil.bench import DEFAULT_BUS
 from hil.plant.world import STEP_NS
 from hil.scenario import Scenario, load_scenario, scenario_names
@@ -92,11 +94,29 @@ def run(
     folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual, *([f"seed-{seed}"] if seed else [])])
     if realtime:
         check_reaches_others(bus, "--realtime", ("virtual:", "slcan:"))  # an adapter serves one process
-    with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:
-        result = fly_and_judge(chosen, seed, parameters, folder, bus, rate_hz, progress, realtime, unusual)
-    report = illustrate(chosen, result, folder) if plots else None
-    print_result(result, report)
+    with _told_where_the_log_is(folder), interrupted_once():
+        with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:
+            result = fly_and_judge(chosen, seed, parameters, folder, bus, rate_hz, progress, realtime, unusual)
+        report = illustrate(chosen, result, folder) if plots else None
+        print_result(result, report)
     raise typer.Exit(0 if result.passed else FAILED)
+
+
+@contextmanager
+def _told_where_the_log_is(folder: Path) -> Iterator[None]:
+    """Says what is left of a run that is interrupted."""
+    log, before = folder / CAN_LOG, written_at(folder / CAN_LOG)
+    try:
+        yield
+    except KeyboardInterrupt:
+        left = f"the log up to then is in {folder}" if written_at(log) != before else "nothing was flown"
+        print(f"modcube: interrupted; {left}", file=sys.stderr)
+        raise
+
+
+def written_at(path: Path) -> int | None:
+    """When a file was written last, ns; None where there is none."""
+    return path.stat().st_mtime_ns if path.exists() else None
 
 
 @app.command()

@@ -24,6 +24,7 @@ from firmware_py.core.types import Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime.clock import MonotonicClock
+from firmware_py.runtime.interrupts import held_back, out_of_reach
 from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, read_libraries, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from hil.bench import fleet_of, script_of
@@ -110,7 +111,8 @@ def fly_in_real_time(
     plant = context.Process(target=serve, args=arguments, name="plant", daemon=True)
     read_libraries()
     with ExitStack() as stack:
-        plant.start()
+        with out_of_reach():
+            plant.start()
         stack.callback(plant.join)
         stack.callback(handshake.begin.set)
         stack.callback(handshake.stop.set)
@@ -118,6 +120,7 @@ def fly_in_real_time(
         while not handshake.ready.wait(timeout=1.0):
             if not plant.is_alive():
                 raise RuntimeError("the plant's process ended before it was ready")
+        check = stack.enter_context(held_back())
         if before_logs is not None:
             before_logs()
         recorder = Recorder(out, configuration_of(firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz), queued=True)
@@ -139,7 +142,8 @@ def fly_in_real_time(
 
         refused = stack.enter_context(real_time())
         loop = open_loop(stack, firmware, requests)
-        loop.observers = [recording(recorder, rate_hz), recording_times(recorder, loop.rate_keeper, rate_hz), *observers]
+        times = recording_times(recorder, loop.rate_keeper, rate_hz)
+        loop.observers = [recording(recorder, rate_hz), times, lambda *_: check(), *observers]
         use_priority(TICK_PRIORITY)
         stack.enter_context(quiet_garbage())
         handshake.begin.set()

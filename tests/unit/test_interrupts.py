@@ -1,0 +1,121 @@
+"""Ctrl-C, pressed once and again: where it comes about and where it waits."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+
+import pytest
+
+from firmware_py.runtime.interrupts import held_back, interrupted_once, out_of_reach
+
+
+@pytest.fixture(autouse=True)
+def handler() -> Iterator[None]:
+    """The usual one, and after the test that of before."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def press() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def test_only_the_first_press_interrupts_and_those_while_it_ends_do_nothing() -> None:
+    ended = []
+    with pytest.raises(KeyboardInterrupt), interrupted_once():
+        try:
+            press()
+        finally:
+            press()
+            ended.append("orderly")
+    press()
+    assert ended == ["orderly"] and signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # a handler of Python's would be gone before it is
+
+
+def test_what_a_library_makes_of_an_interrupt_is_one() -> None:
+    """Compiled code that calls Python back says: SystemError: returned a result with an exception set."""
+    with pytest.raises(KeyboardInterrupt), interrupted_once():
+        try:
+            press()
+        except KeyboardInterrupt:
+            raise SystemError("returned a result with an exception set") from None
+
+
+def test_interrupt_that_somebody_swallowed_comes_about_at_the_end() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt), interrupted_once():
+        with suppress(KeyboardInterrupt):
+            press()
+        done.append("all of it")
+    assert done == ["all of it"]
+
+
+def test_errors_that_nobody_pressed_stay_what_they_are() -> None:
+    with pytest.raises(SystemError), interrupted_once():
+        raise SystemError
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_press_waits_until_it_is_asked_for() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt), held_back() as check:
+        check()
+        press()
+        press()
+        done.append("the tick")
+        check()
+        done.append("another")
+    assert done == ["the tick"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_press_that_nobody_asked_for_comes_about_at_the_end() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt):
+        with held_back():
+            press()
+            done.append("all of it")
+        done.append("more")
+    assert done == ["all of it"]
+
+
+def test_press_that_waited_counts_as_the_first() -> None:
+    with pytest.raises(KeyboardInterrupt), interrupted_once():
+        try:
+            with held_back() as check:
+                press()
+                check()
+        finally:
+            press()
+
+
+def test_other_threads_and_ignored_interrupts_are_left_alone() -> None:
+    failed: list[BaseException] = []
+
+    def elsewhere() -> None:
+        try:
+            with interrupted_once(), held_back() as check:
+                check()
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts what it runs in the background
+    with interrupted_once(), held_back() as check:
+        press()
+        check()
+    assert failed == [] and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+def test_process_that_is_begun_out_of_reach_is_spared_and_this_one_hears_of_it_later() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt):
+        with out_of_reach():
+            press()
+            done.append("begun")
+        done.append("more")
+    assert done == ["begun"]
