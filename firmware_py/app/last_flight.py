@@ -1,4 +1,6 @@
-"""How the process before this one ended, by the log that it left: who was in flight, which magnets pulled; and who is armed for that."""
+"""How the process before this one ended, by what it left: who was in flight, which magnets pulled, whether an e-stop stood; and who is
+armed for that.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +11,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from firmware_py.app.estop_note import estop_stands
 from firmware_py.app.firmware import Firmware
 from firmware_py.bus.codec import Codec
 from firmware_py.core.joints import joints_of, sides
 from firmware_py.description.fleet import Fleet
-from firmware_py.description.signals import last_attachment, read_attachment
+from firmware_py.description.signals import read_attachment
 from firmware_py.runtime.flight_log import LoggedFrame, frame_of
 from firmware_py.runtime.log_folder import log_folders
-from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, ESTOP, SIGNAL_LOG, STANDS
+from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG
 
 RECENT_NS = 60_000_000_000
 """A log that was last written longer ago says nothing of now: the vehicle may be out of the water, in somebody's hands."""
@@ -63,14 +66,14 @@ class LastFlight(NamedTuple):
 
 
 def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -> LastFlight:
-    """How the newest log under `out` ends in which anything was sent. Logs that are missing or unreadable say nothing, and
-    old ones only whether an e-stop stands.
+    """How the newest log under `out` ends in which anything was sent, and whether an e-stop stands, by the note there. Logs that are
+    missing, unreadable or old say nothing.
 
     Args:
         now_ns: the time of day, to compare with that of the file.
         boot: of this start of the machine, to compare with the log's.
     """
-    stopped = _is_stopped(out)
+    stopped = estop_stands(out)
     for folder in log_folders(out):
         sent = _last_sent(folder, now_ns, TAIL_BYTES * len(fleet.module))
         if sent:
@@ -131,15 +134,6 @@ def _magnets_rest(notes: dict[str, Any]) -> bool:
 def _joined_faces(firmware: Firmware) -> frozenset[Face]:
     """Both sides of every joint that the fleet file has."""
     return frozenset(side for body in firmware.pipeline.bodies for joint in joints_of(body) for side in sides(joint.request))
-
-
-def _is_stopped(out: Path) -> bool:
-    """Whether the newest log of a process that came to a tick says that an e-stop stands."""
-    for folder in log_folders(out):
-        with suppress(OSError):
-            if (folder / CAN_LOG).stat().st_size:
-                return last_attachment(folder / SIGNAL_LOG, ESTOP) == STANDS
-    return False
 
 
 def _notes_of(folder: Path) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import Summary, recording_times, summary_of
+from firmware_py.app.estop_note import EstopNote, noting_estop
 from firmware_py.app.firmware import BusFrame, Firmware, compose, vehicles_of
 from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight, to_arm
 from firmware_py.app.live_view import LiveView
@@ -148,7 +149,11 @@ def run_vehicle(
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
         recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
         if recorder is not None:
-            observers += [noting_estop(recorder, before.stopped), recording(recorder, fleet.rate_hz)]
+            observers.append(recording(recorder, fleet.rate_hz))
+        if out is not None:
+            note = EstopNote(out)
+            stack.callback(note.close)
+            observers.append(noting_estop(note, before.stopped, recorder))
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
         told: list[Observer] = [telling(teller.say)]  # after all others, which may have something to say
@@ -285,27 +290,6 @@ def recording(recorder: Recorder, rate_hz: int) -> Observer:
         if armed != was_armed or outputs.tick % flush_every == 0:
             was_armed[:] = armed
             outputs.events += recorder.flush()
-
-    return observe
-
-
-def noting_estop(recorder: Recorder, stands: bool) -> Observer:
-    """An observer that notes for the next process whether an e-stop stands: from one on, and where one stood before this process
-    (`stands`), until a person clears it or arms. It is with the system at once, before any frame of that tick, and soon on the disk: who
-    has pressed a stop pulls the plug next.
-    """
-    noted = False
-
-    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        nonlocal stands, noted
-        if stands:
-            cleared = any(request.action == Action.CLEAR_ESTOP for request in inputs.requests)
-            stands = not cleared and not any(command.armed for command in outputs.modules)
-        stands = stands or any(record.state == State.ESTOP for record in outputs.records)
-        if stands != noted:
-            noted = stands
-            recorder.note_estop(stands, outputs.time_ns)
-            outputs.events += recorder.flush(to_disk=True)
 
     return observe
 

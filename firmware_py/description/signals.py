@@ -5,10 +5,8 @@ A channel is an MCAP topic with one protobuf message per tick. Firmware and benc
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
@@ -16,9 +14,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
@@ -28,8 +24,6 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 _SPOILT = (McapError, EOFError, ValueError, struct.error, OverflowError, MemoryError)
 """What reading raises where a log is torn, or where a wrong bit makes a length of it astronomical."""
-_RECORD = struct.Struct("<BQ")
-"""Kind and length of a record, before what it holds (MCAP specification)."""
 
 Columns = dict[str, np.ndarray]
 """One array per signal of a channel, (k,) or (k, n) over its k messages, and `log_time`, (k,) int64 ns."""
@@ -187,21 +181,6 @@ def read_attachment(path: Path, name: str) -> bytes | None:
     with path.open("rb") as file:
         attachments = (record for record in _records_of(file) if isinstance(record, Attachment))
         return next((bytes(attachment.data) for attachment in attachments if attachment.name == name), None)
-
-
-def last_attachment(path: Path, name: str) -> bytes | None:
-    """The attachment called `name` that came last, or None; messages are passed over unread. Raises OSError."""
-    found = None
-    with path.open("rb") as file, suppress(*_SPOILT):
-        file.seek(len(MCAP_MAGIC))
-        while len(head := file.read(_RECORD.size)) == _RECORD.size:
-            kind, length = _RECORD.unpack(head)
-            if kind != Opcode.ATTACHMENT:
-                file.seek(length, os.SEEK_CUR)
-                continue
-            attachment = Attachment.read(ReadDataStream(BytesIO(file.read(length))))
-            found = bytes(attachment.data) if attachment.name == name else found
-    return found
 
 
 def read_signals(path: Path) -> dict[str, Columns]:

@@ -6,7 +6,7 @@ Format, enough for a replay:
   that of the tick which took or sent it (never a wall clock), `canN` is the fleet's bus N, R is received, T sent. Lines
   stand in the order of the frames. canplayer and python-can read it.
 - `signals.mcap`: protobuf messages, those of `tick_messages`; log_time is the tick's time. The attachment
-  `configuration.json` is what the caller gave, `estop` whether an e-stop stands.
+  `configuration.json` is what the caller gave.
 
 The same run writes the same bytes. The files are whole up to the last `flush`, whatever happens after.
 """
@@ -41,9 +41,6 @@ from firmware_py.runtime.tick_messages import (
 CAN_LOG = "can.log"
 SIGNAL_LOG = "signals.mcap"
 CONFIGURATION = "configuration.json"
-ESTOP = "estop"
-"""Attachment: STANDS or nothing, whenever it changes. A log without one is of a process that knew of no e-stop."""
-STANDS = b"stands"
 LIVE_ONLY = ("/scene", "/tf")
 """What is drawn from other channels has no place in a log."""
 
@@ -151,11 +148,6 @@ class Recorder:
         """How the ticks that are done kept their deadlines. Real time only: another run is never the same."""
         data = self._times.row().encode(times_values(tick, time_ns, keeper))
         self._channel(TIMES, self._times).log(data, log_time=time_ns)
-
-    def note_estop(self, stands: bool, time_ns: int) -> None:
-        """An e-stop stands from now on, or no longer; for the next process."""
-        data = STANDS if stands else b""
-        self._writer.attach(log_time=time_ns, create_time=time_ns, name=ESTOP, media_type="text/plain", data=data)
 
     def flush(self, to_disk: bool = False) -> list[Event]:
         """Hand everything so far to the operating system; a warning, once, where that fails.

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from firmware_py.app import vehicle
+from firmware_py.app.estop_note import NOTE, EstopNote, noting_estop
 from firmware_py.app.firmware import compose
 from firmware_py.app.last_flight import last_flight, to_arm
-from firmware_py.app.vehicle import Operator, noting_estop, recording, run_vehicle
+from firmware_py.app.vehicle import Operator, recording, run_vehicle
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import PortError
 from firmware_py.core.transitions import State
@@ -111,12 +112,12 @@ def test_log_of_the_process_before_is_kept(tmp_path: Path) -> None:
     out = tmp_path / "log"
     fly(tmp_path, out)
     first = content(out)
-    assert sorted(first) == [*LOGS]
+    assert sorted(first) == sorted([*LOGS, NOTE])
     fly(tmp_path, out)
     fly(tmp_path, out)
     kept = content(out)
-    assert sorted(kept) == sorted([*LOGS, *(f"{n}/{name}" for n in ("0002", "0003") for name in LOGS)])
-    assert {name: kept[name] for name in LOGS} == first
+    assert sorted(kept) == sorted([*first, *(f"{n}/{name}" for n in ("0002", "0003") for name in LOGS)])
+    assert {name: kept[name] for name in first} == first
     assert all(list(FlightLog(out / number).ticks()) for number in ("0002", "0003"))
 
 
@@ -270,7 +271,8 @@ def stopped(folder: Path, *told: Told, before: bool = False) -> None:
     """The log of a process whose one body was in such states, each in a tick in which so much was asked for, and which then was killed."""
     log = make_log_folder(folder)
     recorder = Recorder(log, {})
-    observers = [noting_estop(recorder, before), recording(recorder, 1)]
+    note = EstopNote(folder)
+    observers = [recording(recorder, 1), noting_estop(note, before, recorder)]
     sync = [(0, Frame(0x020, b"")), (0, Frame(0x020, b""))]
     for tick, (state, requests) in enumerate(told, 1):
         _, outputs = Robot().step([])
@@ -279,34 +281,12 @@ def stopped(folder: Path, *told: Told, before: bool = False) -> None:
         now = dataclasses.replace(outputs, tick=tick, modules=[command], records=[record._replace(state=int(state))])
         for observe in observers:
             observe([], sync, Inputs(tick, now.time_ns, [], requests), now)
+    note.close()
     left = content(log)
     recorder.close()
     for name in LOGS:
         (log / name).write_bytes(left[name])
     os.utime(log / CAN_LOG, ns=(OLD_NS, OLD_NS))
-
-
-@pytest.mark.parametrize("queued", [True, False])
-def test_stop_is_on_the_disk_for_who_pulls_the_plug_next(tmp_path: Path, queued: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    on_disk: dict[str, bytes] = {}
-
-    def sync(number: int) -> None:
-        path = Path(os.readlink(f"/proc/self/fd/{number}"))
-        on_disk[path.name] = path.read_bytes()
-
-    monkeypatch.setattr(os, "fsync", sync)
-    recorder = Recorder(tmp_path, {}, queued=queued)
-    observe = noting_estop(recorder, False)
-    for state in (State.ARMED, State.ESTOP):
-        _, outputs = Robot().step([])
-        recorder.sent(outputs.time_ns, 0, [Frame(0x020, b"")])
-        now = dataclasses.replace(outputs, records=[outputs.records[0]._replace(state=int(state))])
-        observe([], [], Inputs(1, now.time_ns, []), now)
-        assert state == State.ESTOP or not on_disk, "a disk is not troubled otherwise"
-    recorder.close()
-    for name, data in on_disk.items():
-        (tmp_path / name).write_bytes(data)
-    assert on_disk[CAN_LOG] and last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped
 
 
 CLEAR = [Request(Action.CLEAR_ESTOP)]
@@ -341,6 +321,13 @@ def test_stop_outlives_every_restart_until_a_person_clears_it_or_arms(tmp_path: 
     stopped(tmp_path, (State.DISARMED, []), told, (State.DISARMED, []), before=True)
     make_log_folder(tmp_path)  # of a process that came to no tick
     assert last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped == stands
+
+
+def test_stop_is_known_however_spoilt_the_log_is_in_which_it_came(tmp_path: Path) -> None:
+    stopped(tmp_path, (State.ARMED, []), (State.ESTOP, []))
+    for name in LOGS:
+        (tmp_path / name).write_bytes(b"\xff" * 2000)
+    assert last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped
 
 
 @pytest.mark.slow

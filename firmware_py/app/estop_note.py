@@ -1,0 +1,122 @@
+"""Whether an e-stop stands, for the next process: one small file in the folder of the logs, which no full disk, spoilt log or pulled plug
+takes away.
+
+It has one length whatever it says: a disk that is full has no room for more, but what is there can be written over.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from queue import SimpleQueue
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.app.lockstep import Observer
+from firmware_py.core.transitions import State
+from firmware_py.core.types import WARNING, Action, Event, Inputs, Outputs
+from firmware_py.runtime.recorder import Recorder
+
+NOTE = "estop.txt"
+STANDS, CLEAR = b"stands\n", b"clear \n"
+CLOSE_S = 5.0
+"""How long the end of a run waits for a disk."""
+
+
+def estop_stands(folder: Path) -> bool:
+    """Whether the note in `folder` says so. One that says neither, or cannot be read, does: who cannot tell arms nobody."""
+    try:
+        return (folder / NOTE).read_bytes() != CLEAR
+    except (FileNotFoundError, NotADirectoryError):
+        return False  # no process that logged here came to a tick
+    except OSError:
+        return True
+
+
+def write_note(folder: Path, stands: bool) -> None:
+    """Notes in `folder` that an e-stop stands, or that none does; when this returns it is on the disk. Raises OSError."""
+    path, data = folder / NOTE, STANDS if stands else CLEAR
+    try:
+        with path.open("r+b", buffering=0) as file:
+            file.write(data)
+            file.truncate(len(data))
+            os.fsync(file.fileno())
+    except FileNotFoundError:
+        _make(path, data)
+
+
+def _make(path: Path, data: bytes) -> None:
+    """Whole or not at all."""
+    fresh = path.with_name(path.name + ".new")
+    try:
+        with fresh.open("wb", buffering=0) as file:
+            file.write(data)
+            os.fsync(file.fileno())
+        os.replace(fresh, path)
+    except OSError:
+        with suppress(OSError):
+            fresh.unlink()
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+class EstopNote:
+    """Writes the note by a thread of its own: no tick waits for a disk. To be made before this process takes its real-time priority."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._queue: SimpleQueue[bool | None] = SimpleQueue()
+        self._failed: SimpleQueue[OSError] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="e-stop note", daemon=True)
+        self._thread.start()
+
+    def write(self, stands: bool) -> None:
+        """As soon as the disk takes it."""
+        self._queue.put(stands)
+
+    def failures(self) -> list[Event]:
+        """A warning for each that could not be written since the call before."""
+        if self._failed.empty():
+            return []
+        return [Event(WARNING, f"the next start will not know of an e-stop: {NOTE}: {self._failed.get().strerror}")]
+
+    def close(self) -> None:
+        """Writes what waits, for CLOSE_S at the most; a second time does nothing."""
+        self._queue.put(None)
+        self._thread.join(CLOSE_S)
+
+    def _run(self) -> None:
+        while (stands := self._queue.get()) is not None:
+            try:
+                write_note(self._folder, stands)
+            except OSError as error:
+                self._failed.put(error)
+
+
+def noting_estop(note: EstopNote, stands: bool, recorder: Recorder | None = None) -> Observer:
+    """An observer that notes for the next process whether an e-stop stands: from one on, and where one stood before this process
+    (`stands`), until a person clears it or arms. The note is there from the first tick on, for a disk that is full later; it and the log
+    (`recorder`) are soon on the disk when one is raised: who has pressed a stop pulls the plug next.
+    """
+    noted: bool | None = None
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        nonlocal stands, noted
+        if stands:
+            cleared = any(request.action == Action.CLEAR_ESTOP for request in inputs.requests)
+            stands = not cleared and not any(command.armed for command in outputs.modules)
+        stands = stands or any(record.state == State.ESTOP for record in outputs.records)
+        if stands != noted:
+            note.write(stands)
+            if recorder is not None and (stands or noted is not None):
+                outputs.events += recorder.flush(to_disk=True)
+            noted = stands
+        outputs.events += note.failures()
+
+    return observe

@@ -1,0 +1,111 @@
+"""The note of an e-stop that stands: on the disk before the plug is pulled, on a disk that is full, and however it was spoilt."""
+
+import dataclasses
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from firmware_py.app import estop_note
+from firmware_py.app.estop_note import CLEAR, NOTE, STANDS, EstopNote, estop_stands, noting_estop, write_note
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Event, Inputs, Outputs
+from firmware_py.runtime.guarded_file import GuardedFile
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
+from tests.unit.ground_world import Robot
+
+
+class Flight:
+    """Ticks in some state, one after the other, noted in a folder."""
+
+    def __init__(self, folder: Path, recorder: Recorder | None = None, stands: bool = False) -> None:
+        self.note = EstopNote(folder)
+        self._observe = noting_estop(self.note, stands, recorder)
+        self._recorder = recorder
+        self._robot = Robot()
+
+    def tick(self, state: State) -> Outputs:
+        _, outputs = self._robot.step([])
+        now = dataclasses.replace(outputs, records=[outputs.records[0]._replace(state=int(state))], events=[])
+        if self._recorder is not None:
+            self._recorder.sent(now.time_ns, 0, [(0x020, b"")])
+        self._observe([], [], Inputs(now.tick, now.time_ns, []), now)
+        return now
+
+    def end(self) -> list[Event]:
+        self.note.close()
+        return self.note.failures()
+
+
+def refuse_room(*_: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("queued", [True, False])
+def test_stop_and_what_led_to_it_are_on_the_disk_for_who_pulls_the_plug_next(
+    tmp_path: Path, queued: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_disk: dict[str, bytes] = {}
+
+    def sync(number: int) -> None:
+        path = Path(os.readlink(f"/proc/self/fd/{number}"))
+        on_disk[path.name] = path.read_bytes() if path.is_file() else b""
+
+    monkeypatch.setattr(os, "fsync", sync)
+    recorder = Recorder(tmp_path, {}, queued=queued)
+    flight = Flight(tmp_path, recorder)
+    flight.tick(State.ARMED)
+    assert CAN_LOG not in on_disk, "a disk is not troubled otherwise"
+    flight.tick(State.ESTOP)
+    assert flight.end() == []
+    recorder.close()
+    assert on_disk[NOTE] == STANDS and on_disk[CAN_LOG] and SIGNAL_LOG in on_disk
+
+
+def test_stop_is_noted_on_a_disk_that_was_full_before_it_came(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = Recorder(tmp_path, {})
+    flight = Flight(tmp_path, recorder)
+    flight.tick(State.ARMED)
+    flight.note.close()
+    flight.note = EstopNote(tmp_path)
+    monkeypatch.setattr(GuardedFile, "_append", refuse_room)  # no log takes another byte,
+    monkeypatch.setattr(estop_note, "_make", refuse_room)  # and no file can be made
+    flight._observe = noting_estop(flight.note, False, recorder)
+    events = [event.text for event in flight.tick(State.ESTOP).events]
+    recorder.close()
+    assert flight.end() == [] and events == ["no more log: can.log: No space left on device"]
+    assert estop_stands(tmp_path)
+
+
+def test_note_never_changes_its_length(tmp_path: Path) -> None:
+    """Or a full disk would have no room for it."""
+    assert len(STANDS) == len(CLEAR)
+    for stands in (False, True, False):
+        write_note(tmp_path, stands)
+        assert estop_stands(tmp_path) == stands
+        assert [path.name for path in tmp_path.iterdir()] == [NOTE]
+
+
+def test_note_that_cannot_be_made_is_said_once_and_the_flight_goes_on(tmp_path: Path) -> None:
+    flight = Flight(tmp_path / "missing")
+    flight.tick(State.ARMED)
+    flight.note.close()
+    assert [event.text for event in flight.tick(State.ARMED).events] == [
+        "the next start will not know of an e-stop: estop.txt: No such file or directory"
+    ]
+    assert flight.tick(State.ARMED).events == []
+
+
+@pytest.mark.parametrize(("text", "stands"), [(STANDS, True), (CLEAR, False), (b"", True), (b"\x00" * 7, True), (b"clear", True)])
+def test_note_that_says_neither_counts_as_a_stop(tmp_path: Path, text: bytes, stands: bool) -> None:
+    (tmp_path / NOTE).write_bytes(text)
+    assert estop_stands(tmp_path) == stands
+    write_note(tmp_path, False)
+    assert not estop_stands(tmp_path)
+
+
+def test_folder_without_a_note_knows_of_no_stop_and_one_that_cannot_be_read_may_hold_one(tmp_path: Path) -> None:
+    assert not estop_stands(tmp_path) and not estop_stands(tmp_path / "missing") and not estop_stands(Path(__file__))
+    (tmp_path / NOTE).mkdir()
+    assert estop_stands(tmp_path)
