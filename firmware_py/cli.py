@@ -190,6 +190,19 @@ def replay(
     raise typer.Exit(replay_and_say(log, tolerance, say=lambda line: typer.echo(line)))
 
 
+@app.command("clear-estop")
+def clear_estop(out: Annotated[Path, typer.Argument(help="folder for the logs, as `modcube run --out` has it")]) -> None:
+    """Clear the e-stop in which the last flight ended, where no ground station does: the next start may arm by itself again.
+
+    For a person at the vehicle, who sees that it may move; no script and no service should.
+    """
+    from firmware_py.app.estop_note import clear
+
+    was_stopped = clear(out)
+    typer.echo(f"{out}: the e-stop is cleared; modcube run arms by --hold and REARM from its next start on" if was_stopped else
+               f"{out}: no e-stop stands; nothing to do")  # fmt: skip
+
+
 @log_app.command()
 def recover(log: Annotated[Path, typer.Argument(help="folder that a run left: can.log and signals.mcap")]) -> None:
     """Mend a log that kill -9 or a pulled plug has torn: every whole tick stays; what was torn is kept as NAME.torn."""
@@ -206,7 +219,7 @@ def logs() -> None:
 
 def main() -> None:
     """Runs the command line; wrong input ends in one line on stderr and status 2."""
-    own = {command.callback.__name__ for command in app.registered_commands if command.callback is not None}
+    own = {command.name or command.callback.__name__ for command in app.registered_commands if command.callback is not None}
     if own.isdisjoint(sys.argv[1:2]):  # the vehicle's process has no room for the bench
         for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):
             app.add_typer(entry.load(), name=entry.name)

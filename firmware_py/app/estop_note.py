@@ -17,6 +17,7 @@ from firmware_py.app.firmware import BusFrame
 from firmware_py.app.lockstep import Observer
 from firmware_py.core.transitions import State
 from firmware_py.core.types import WARNING, Action, Event, Inputs, Outputs
+from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime.recorder import Recorder
 
 NOTE = "estop.txt"
@@ -45,6 +46,15 @@ def write_note(folder: Path, stands: bool) -> None:
             os.fsync(file.fileno())
     except FileNotFoundError:
         _make(path, data)
+
+
+def clear(folder: Path) -> bool:
+    """Notes in `folder` that no e-stop stands, for a person; returns whether one did. Raises DescriptionError and OSError."""
+    if not (folder / NOTE).exists():
+        raise DescriptionError(f"{folder} holds no {NOTE}: no vehicle has logged there; give the folder of modcube run --out")
+    stood = estop_stands(folder)
+    write_note(folder, False)
+    return stood
 
 
 def _make(path: Path, data: bytes) -> None:

@@ -38,7 +38,10 @@ PARTED_SINCE = (
     "where they are apart it has to say so (body, cell); nobody is armed without a person"
 )
 
-STOPPED = "the e-stop of the flight before was not cleared: nobody is armed without a person"
+STOPPED = (
+    "the e-stop of the flight before was not cleared: nobody is armed without a person, "
+    "who arms, sends CLEAR_ESTOP, or without a ground station types modcube clear-estop FOLDER (that of --out) before the next start"
+)
 
 Face = tuple[int, int]
 """Fleet index and face."""

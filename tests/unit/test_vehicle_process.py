@@ -19,6 +19,7 @@ from firmware_py.app.last_flight import last_flight, to_arm
 from firmware_py.app.vehicle import Operator, recording, run_vehicle
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import PortError
+from firmware_py.cli import main
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Inputs, ModuleCommand, Outputs, Request
 from firmware_py.description.fleet import Fleet, Module, single
@@ -262,7 +263,10 @@ def test_relays_of_single_modules_are_no_undock(tmp_path: Path) -> None:
     assert fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, UNDOCKED))[0] == HOLDS
 
 
-ARMS_NOBODY = "warning: the e-stop of the flight before was not cleared: nobody is armed without a person"
+ARMS_NOBODY = (
+    "warning: the e-stop of the flight before was not cleared: nobody is armed without a person, "
+    "who arms, sends CLEAR_ESTOP, or without a ground station types modcube clear-estop FOLDER (that of --out) before the next start"
+)
 OLD_NS = 1_000_000_000 * 86_400
 Told = tuple[State, list[Request]]
 
@@ -328,6 +332,32 @@ def test_stop_is_known_however_spoilt_the_log_is_in_which_it_came(tmp_path: Path
     for name in LOGS:
         (tmp_path / name).write_bytes(b"\xff" * 2000)
     assert last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped
+
+
+def test_person_without_a_ground_station_clears_a_stop_by_hand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stopped(tmp_path, (State.ESTOP, []))
+    for said in ("the e-stop is cleared; modcube run arms by --hold and REARM from its next start on", "no e-stop stands; nothing to do"):
+        monkeypatch.setattr("sys.argv", ["modcube", "clear-estop", str(tmp_path)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert (ended.value.code, capsys.readouterr().out) == (0, f"{tmp_path}: {said}\n")
+        assert not last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped
+
+
+@pytest.mark.parametrize("folder", ["", "missing"])
+def test_folder_in_which_no_vehicle_logged_has_no_stop_to_clear(
+    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["modcube", "clear-estop", str(tmp_path / folder)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == (
+        f"modcube: {tmp_path / folder} holds no estop.txt: no vehicle has logged there; give the folder of modcube run --out\n"
+    )
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
