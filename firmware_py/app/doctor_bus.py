@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from firmware_py.app.doctor import FAILED, OK, WARNING, Finding
@@ -17,6 +17,8 @@ TICKS = 60
 """SYNCs sent: every slow message of a module comes at least once in 200 ms but HEARTBEAT."""
 STATES = ("boot", "disarmed", "armed", "time-out of commands", "e-stop", "fault")
 ERRORS = ("bad CRC", "bad counter", "bad length", "command time-out", "sensor fault", "relay fault")
+TOO_MANY = 1.5
+"""Commands of a module for each SYNC, which are more than one controller sends, however many of either were missed."""
 TIME_OUT = 1 << 3
 """Of MCU_STATUS: nobody commands while the doctor looks, so it is no fault."""
 
@@ -29,6 +31,8 @@ class Seen:
     bits: int = 0
     frames: int = 0
     sync: int = 0
+    commands: dict[int, int] = field(default_factory=dict)
+    """By number of the module: how often it was commanded, by its THRUSTER_CMD_A."""
     estop: set[int] = field(default_factory=set)
     status: dict[int, tuple[int, int, int]] = field(default_factory=dict)
     """By module: version, errors, state."""
@@ -73,6 +77,8 @@ def take(port: Port, receiver: Receiver, seen: Seen) -> None:
             continue
         name = received.message.name
         seen.sync += name == "SYNC"
+        if name == "THRUSTER_CMD_A":
+            seen.commands[received.number] = seen.commands.get(received.number, 0) + 1
         if name == "ESTOP":
             seen.estop.add(received.number)
         if name == "MCU_STATUS":
@@ -93,6 +99,7 @@ def judge(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec
     if seen.estop:
         who = ", ".join(str(number) for number in sorted(seen.estop))
         findings.append(Finding(title, WARNING, f"e-stop raised by number {who}", "release it where it was raised"))
+    findings += judge_commands(title, seen)
     if seen.sync:
         findings.append(Finding(title, OK, "a controller runs on it: looked on, sent nothing"))
     if not any("TAG_POSITION" in messages for messages in seen.messages.values()):
@@ -101,6 +108,16 @@ def judge(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec
         text = ", ".join(f"{number} {kind}" for kind, number in seen.dropped.items())
         findings.append(Finding(title, WARNING, f"bad frames: {text}", "wiring, or a node with another DBC"))
     return [*findings, judge_load(title, seen, numbers, rate_hz, codec)]
+
+
+def judge_commands(title: str, seen: Seen) -> Iterator[Finding]:
+    """Modules that are commanded by somebody who is not the one controller of the bus: that one commands once after each SYNC."""
+    commanded = sorted(number for number, count in seen.commands.items() if count > TOO_MANY * seen.sync)
+    if not commanded:
+        return
+    numbers = ", ".join(str(number) for number in commanded)
+    who = "two controllers command" if seen.sync else "somebody who sends no SYNC commands"
+    yield Finding(title, WARNING, f"{who} module {numbers}", "a vehicle, script or canplayer that still runs; one controller a bus")
 
 
 def judge_module(title: str, number: int, seen: Seen, codec: Codec) -> Finding:

@@ -168,6 +168,22 @@ def test_raised_estop_and_bad_frames_are_told(nodes: Nodes, far_end: Port) -> No
     assert "e-stop raised by number 30" in text and "bad frames" in text
 
 
+@pytest.mark.parametrize(("syncs", "controllers", "says"), [
+    (0, 1, "somebody who sends no SYNC commands module 1"), (1, 1, ""), (1, 2, "two controllers command module 1"), (1, 0, ""),
+])  # fmt: skip
+def test_modules_that_somebody_else_commands_are_told(syncs: int, controllers: int, says: str, nodes: Nodes, far_end: Port) -> None:
+    ticks = iter(range(1_000))
+
+    def wait(seconds: float) -> None:
+        tick = next(ticks)
+        sync = [CODEC.message("SYNC").encode(0, (tick,))] * syncs
+        counters = [tick & 15, tick + 5 & 15][:controllers]
+        answer(nodes, far_end, sync + [CODEC.message("THRUSTER_CMD_A").encode(1, (0.0, 0.0, 0.0, 0.0, 0), c) for c in counters])
+
+    texts = [finding.text for finding in check_bus(far_end.address, [1], 100, CODEC, wait) if finding.state == WARNING]
+    assert [text for text in texts if "command" in text] == ([says] if says else [])
+
+
 def test_bus_that_will_be_too_full_is_told() -> None:
     finding = judge("bus", Seen(seconds=1.0), [1, 2, 3, 4], 400, CODEC)[-1]
     assert finding.state == WARNING
