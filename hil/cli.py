@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
-from firmware_py.description.schema import DescriptionError
+from firmware_py.description.schema import DescriptionError, meant
 from firmware_py.runtime.interrupts import interrupted_once
 from firmware_py.runtime.recorder import CAN_LOG
 from hil.bench import DEFAULT_BUS
@@ -37,7 +37,8 @@ def parameters_of(controller: str) -> Parameters:
         return load_parameters(Path(controller))
     if controller not in CONTROLLERS:
         known = ", ".join(CONTROLLERS)
-        raise DescriptionError(f"controller {controller!r} is unknown; there are {known}, or give a .toml file")
+        question = meant(controller, CONTROLLERS)
+        raise DescriptionError(f"controller {controller!r} is unknown; {question}there are {known}, or give a .toml file")
     return CONTROLLERS[controller]
 
 

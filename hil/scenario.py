@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.core import rotations
-from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, quantity, read_toml
+from firmware_py.description.fleet import check_cell
+from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, meant, quantity, read_text, read_toml
 from firmware_py.description.vehicle import FACE_NAMES, Vehicle, find_vehicles, load_vehicle
 from hil.plant.build import nominal_centre
 from hil.plant.dock_spec import DockSpec, JamRule
@@ -44,6 +45,9 @@ class ModuleStart:
     rotation: int = quantity(0, low=0, high=23, help="which of the 24 rotations of the cube it has in its body")
 
     clamped: bool = quantity(False, help="a load cell holds its body")
+
+    def __post_init__(self) -> None:
+        check_cell(self.cell)
 
     @property
     def start(self) -> Start:
@@ -307,7 +311,7 @@ def load_scenario(name: str) -> Scenario:
         path = Path(str(resources.files("hil") / "scenarios" / f"{name}.toml"))
     else:
         raise DescriptionError(
-            f"scenario {name!r} is unknown; there are {', '.join(scenario_names())}, or give a .toml file"
+            f"scenario {name!r} is unknown; {meant(name, scenario_names())}there are {', '.join(scenario_names())}, or give a .toml file"
         )
     table, source = read_toml(path)
     scenario: Scenario = build(Scenario, table, source)
@@ -323,7 +327,7 @@ def _with_file_text(scenario: Scenario, folder: Path, source: Source) -> Scenari
         return scenario
     path = folder / scenario.task.file
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, ValueError) as error:
-        raise source.error(("task", "file"), f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        text = read_text(path)
+    except DescriptionError as error:
+        raise source.error(("task", "file"), str(error)) from None
     return dataclasses.replace(scenario, task=dataclasses.replace(scenario.task, file_text=text))

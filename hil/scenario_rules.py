@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from firmware_py.description.schema import limits_of
+from firmware_py.description.schema import limits_of, meant
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
@@ -166,7 +166,8 @@ def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
     names = metric_names(scenario)
     for i, check in enumerate(scenario.check):
         if check.metric not in names:
-            yield ("check", i, "metric"), f"{check.metric!r} is unknown; a run of the kind {scenario.task.kind} has {', '.join(names)}"
+            known = f"a run of the kind {scenario.task.kind} has {', '.join(names)}"
+            yield ("check", i, "metric"), f"{check.metric!r} is unknown; {meant(check.metric, names)}{known}"
         first = next(k for k, other in enumerate(scenario.check) if other.metric == check.metric)
         if first < i:
             yield ("check", i, "metric"), f"{check.metric} is checked by another [[check]] already; give low and high in one"

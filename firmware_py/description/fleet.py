@@ -27,6 +27,15 @@ class Module:
     cell: np.ndarray = quantity([0, 0, 0], unit="lattice", low=-64, high=64, shape=(3,), help="place in its body")
     rotation: int = quantity(0, low=0, high=23, help="which of the 24 rotations of the cube (prepare.lattice)")
 
+    def __post_init__(self) -> None:
+        check_cell(self.cell)
+
+
+def check_cell(cell: np.ndarray) -> None:
+    """Raises DescriptionError for a place (3,) between those of the lattice."""
+    if not np.array_equal(cell, np.round(cell)):
+        raise DescriptionError(f"cell {cell.tolist()} is between places of the lattice; it needs whole numbers")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fleet:

@@ -7,12 +7,14 @@ Used once at start, by whoever reads a vehicle, fleet, parameter or scenario fil
 from __future__ import annotations
 
 import dataclasses
+import difflib
+import io
 import math
 import re
 import tomllib
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,10 +98,14 @@ class Source:
 
     path: str
     text: str
+    line: int = 0
+    """Of all keys, where they do not stand in `text`; 0: they do."""
 
     def line_of(self, keys: Sequence[str | int]) -> int:
         """1-based line of the key or table that `keys` lead to; the nearest enclosing one when it is not written out.
         """
+        if self.line:
+            return self.line
         best_line, best_depth = 1, 0
         table: tuple[str | int, ...] = ()
         count: dict[tuple[str | int, ...], int] = {}
@@ -114,7 +120,10 @@ class Source:
                 path = (*table, *match["name"].replace('"', "").split("."))
             else:
                 continue
-            if len(path) > best_depth and path == tuple(keys[: len(path)]):
+            wanted = tuple(keys)
+            if path[: len(wanted)] == wanted:  # the key itself, or the first table of a list that is meant as one
+                path = wanted
+            if len(path) > best_depth and path == wanted[: len(path)]:
                 best_line, best_depth = number, len(path)
         return best_line
 
@@ -130,15 +139,38 @@ def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
     Raises:
         DescriptionError: the file is missing or is no TOML.
     """
+    text = read_text(path)
+    return parse_toml(text, str(path)), Source(str(path), text)
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, lines ended alike; a byte order mark is no part of it. Raises DescriptionError."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        data = path.read_bytes()
+    except (OSError, ValueError) as error:  # the latter: a name that no file can have
         raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     try:
-        return tomllib.loads(text), Source(str(path), text)
+        return io.StringIO(data.decode("utf-8-sig"), newline=None).read()
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        what = f"cannot be read: byte 0x{data[error.start]:02x} is no text in UTF-8; save it as such"
+        raise DescriptionError(f"{path}:{line}: {what}") from None
+
+
+def parse_toml(text: str, path: str) -> dict[str, Any]:
+    """The table in the text of the file at `path`. Raises DescriptionError."""
+    try:
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, and what Python itself refuses to read
         match = re.search(r"line (\d+)", str(error))
         raise DescriptionError(f"{path}:{match.group(1) if match else 1}: not valid TOML: {str(error).splitlines()[0]}") from None
+
+
+def meant(word: str, known: Iterable[str]) -> str:
+    """A question after the one of `known` that `word` is likely to be; empty where none is like it."""
+    names = list(known)
+    near = [name for name in names if name.startswith(f"{word}_")] or difflib.get_close_matches(word, names, 1)  # the unit was left out
+    return f"did you mean {near[0]}? " if near else ""
 
 
 def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str | int, ...] = ()) -> Any:
@@ -152,13 +184,13 @@ def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str |
     for key in table:
         if key not in fields:
             known = ", ".join(sorted(fields))
-            raise source.error((*keys, key), f"unknown key; permitted here: {known}")
+            raise source.error((*keys, key), f"unknown key; {meant(key, fields)}permitted here: {known}")
     values: dict[str, Any] = {}
     for name, field in fields.items():
         if name in table:
             values[name] = _value(hints[name], limits_of(cls, name), table[name], source, (*keys, name))
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise source.error((*keys, name), f"missing key; it needs {describe(limits_of(cls, name))}")
+            raise source.error((*keys, name), f"missing key; it needs {_needed(hints[name], limits_of(cls, name), name)}")
     try:
         return cls(**values)
     except DescriptionError as error:
@@ -177,6 +209,16 @@ def describe(limits: Limits) -> str:
     return f"{ANYTHING}{f' in{unit}' if unit else ''}"
 
 
+def _needed(hint: Any, limits: Limits, name: str) -> str:
+    """What a field of that type needs, in words."""
+    if dataclasses.is_dataclass(hint):
+        return f"a table, [{name}]"
+    if typing.get_origin(hint) is tuple:
+        is_table = dataclasses.is_dataclass(typing.get_args(hint)[0])
+        return f"tables, each [[{name}]]" if is_table else "a list"
+    return "text" if hint is str and not limits.choices else describe(limits)
+
+
 def _value(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[str | int, ...]) -> Any:
     origin = typing.get_origin(hint)
     if origin in (types.UnionType, typing.Union):
@@ -184,12 +226,12 @@ def _value(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[st
         origin = typing.get_origin(hint)
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, Mapping):
-            raise source.error(keys, "must be a table")
+            raise source.error(keys, f"must be a table, [{keys[-1]}], and one alone")
         return build(typing.cast(type, hint), value, source, keys)
     if origin is tuple:
         item = typing.get_args(hint)[0]
         if not isinstance(value, list):
-            raise source.error(keys, "must be a list")
+            raise source.error(keys, f"must be a list{f' of tables, each [[{keys[-1]}]]' if dataclasses.is_dataclass(item) else ''}")
         return tuple(_value(item, limits, v, source, (*keys, i)) for i, v in enumerate(value))
     if hint is np.ndarray or origin is np.ndarray:
         return _array(limits, value, source, keys)
@@ -223,24 +265,34 @@ def _is_numeric(value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """The value as it stands in a line of words."""
-    text = repr(value)
+    """The value as it stands in a line of words, or in TOML."""
+    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    if hasattr(value, "isoformat"):  # a date or a time
+        text = value.isoformat()
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."
 
 
+_KINDS: Mapping[Any, tuple[str, Any]] = {
+    bool: ("true or false", bool), str: ("text", str), int: ("a whole number", int), float: ("a number", int | float),
+}  # fmt: skip
+"""By a field's type: what it needs, in words, and what TOML may have there."""
+
+
+def _permitted(limits: Limits) -> str:
+    """What a field that has limits may hold, after what is wrong with it."""
+    return f"; permitted: {describe(limits)}" if limits.choices or math.isfinite(limits.low) or math.isfinite(limits.high) else ""
+
+
 def _scalar(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[str | int, ...]) -> Any:
-    if hint is bool or isinstance(value, bool):
-        if hint is not bool or not isinstance(value, bool):
-            raise source.error(keys, f"{_shown(value)} is not {'true or false' if hint is bool else describe(limits)}")
+    kind, fits = _KINDS[hint]
+    if not isinstance(value, fits) or (isinstance(value, bool) and hint is not bool):
+        raise source.error(keys, f"{_shown(value)} is not {kind}{_permitted(limits)}")
+    if hint is bool:
         return value
     if hint is str:
-        if not isinstance(value, str):
-            raise source.error(keys, f"{_shown(value)} is not text")
         if limits.choices and value not in limits.choices:
-            raise source.error(keys, f"{_shown(value)} is unknown; permitted: {describe(limits)}")
+            raise source.error(keys, f"{_shown(value)} is unknown; {meant(value, limits.choices)}permitted: {describe(limits)}")
         return value
-    if not isinstance(value, int | float) or (hint is int and not isinstance(value, int)):
-        raise source.error(keys, f"{_shown(value)} is not {'a whole number' if hint is int else 'a number'}")
     try:
         if limits.low <= value <= limits.high and math.isfinite(float(value)):
             return hint(value)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, meant, quantity, read_toml
 
 _Module = TypeVar("_Module", bound=Any)
 
@@ -229,7 +229,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
         path = Path(str(resources.files("firmware_py") / "vehicles" / f"{name}.toml"))
     else:
         raise DescriptionError(
-            f"vehicle {name!r} is unknown; there are {', '.join(vehicle_names())}, or give a .toml file"
+            f"vehicle {name!r} is unknown; {meant(name, vehicle_names())}there are {', '.join(vehicle_names())}, or give a .toml file"
         )
     table, source = read_toml(path)
     vehicle: Vehicle = build(Vehicle, table, source)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import csv
 import io
-import tomllib
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.description.schema import DescriptionError, Source, build, quantity
+from firmware_py.description.schema import DescriptionError, Source, build, meant, parse_toml, quantity
 from firmware_py.prepare.minimum_snap import Limits, Waypoint, check_bounded, plan
 from firmware_py.prepare.piecewise import Piecewise
 
@@ -23,6 +23,8 @@ _ATTITUDE = ("qw", "qx", "qy", "qz")
 _VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
 _COLUMNS = (*_POSITION, *_ATTITUDE, *_VELOCITY, "stop", "duration_s")
 _UNIT_TOLERANCE = 0.01
+_SHOWN = 60
+"""Characters of what is wrong that are shown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,32 +125,38 @@ def read_mission(text: str, name: str) -> Mission:
         return _read_csv(text, name)
     if not name.lower().endswith(".toml"):
         raise DescriptionError(f"{name}: a waypoint file ends in .csv or .toml")
-    try:
-        table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DescriptionError(f"{name}: not valid TOML: {error}") from None
-    mission: Mission = build(Mission, table, Source(name, text))
+    mission: Mission = build(Mission, parse_toml(text, name), Source(name, text))
     return mission
 
 
 def _read_csv(text: str, path: str) -> Mission:
     reader = csv.DictReader(io.StringIO(text), skipinitialspace=True, restkey="")
-    header = [name.strip() for name in reader.fieldnames or []]
-    reader.fieldnames = header
-    unknown = [name for name in header if name not in _COLUMNS]
-    missing = [name for name in _POSITION if name not in header]
-    if unknown or missing:
-        what = f"column {unknown[0]!r} is unknown" if unknown else f"column {missing[0]!r} is missing"
-        raise DescriptionError(f"{path}:1: {what}; columns are {', '.join(_COLUMNS)}")
-    rows = tuple(_waypoint(row, f"{path}:{reader.line_num}") for row in reader)
+    try:
+        reader.fieldnames = _header([name.strip() for name in reader.fieldnames or []], path)
+        rows = tuple(_waypoint(row, path, reader.line_num) for row in reader)
+    except csv.Error as error:
+        raise DescriptionError(f"{path}:{reader.line_num + 1}: not valid CSV: {error}") from None
     try:
         return Mission(waypoint=rows)
     except DescriptionError as error:
         raise DescriptionError(f"{path}: {error}") from None
 
 
-def _waypoint(row: dict[str, str], place: str) -> WaypointTable:
+def _header(header: list[str], path: str) -> list[str]:
+    """The names of the columns. Raises DescriptionError where one is unknown, missing or there twice."""
+    unknown = [name for name in header if name not in _COLUMNS]
+    missing = [name for name in _POSITION if name not in header]
+    twice = [name for at, name in enumerate(header) if name in header[:at]]
+    what = f"column {unknown[0][:_SHOWN]!r} is unknown; {meant(unknown[0][:_SHOWN], _COLUMNS)}" if unknown else ""
+    what = what or (f"column {missing[0]!r} is missing; " if missing else f"column {twice[0]!r} is there twice; " if twice else "")
+    if what:
+        raise DescriptionError(f"{path}:1: {what}columns are {', '.join(_COLUMNS)}, commas between them")
+    return header
+
+
+def _waypoint(row: dict[str, str], path: str, line: int) -> WaypointTable:
     table: dict[str, object] = {}
+    place = f"{path}:{line}"
     if "" in row:
         raise DescriptionError(f"{place}: has more columns than the header; decimals need a point")
     for key, names in (("position_m", _POSITION), ("quaternion", _ATTITUDE), ("velocity_m_s", _VELOCITY)):
@@ -160,15 +168,18 @@ def _waypoint(row: dict[str, str], place: str) -> WaypointTable:
     if (row.get("duration_s") or "").strip():
         table["duration_s"] = _number(row["duration_s"], "duration_s", place)
     table["stop"] = _truth(row.get("stop") or "0", "stop", place)
-    waypoint: WaypointTable = build(WaypointTable, table, Source(place, ""))
+    waypoint: WaypointTable = build(WaypointTable, table, Source(path, "", line))
     return waypoint
 
 
 def _number(text: str, name: str, place: str) -> float:
     try:
-        return float(text)
+        value = float(text)
     except ValueError:
-        raise DescriptionError(f"{place}: {name}: {text.strip()!r} is not a number") from None
+        raise DescriptionError(f"{place}: {name}: {text.strip()[:_SHOWN]!r} is not a number") from None
+    if not math.isfinite(value):
+        raise DescriptionError(f"{place}: {name}: {text.strip()[:_SHOWN]!r} is not a finite number")
+    return value
 
 
 def _truth(text: str, name: str, place: str) -> bool:

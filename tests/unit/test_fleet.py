@@ -83,6 +83,9 @@ WRONG = {
     "too fast": ("rate_hz = 401\n[[module]]\nnumber = 2\n", r"rate_hz: 401 is out of range; permitted: 50 to 400 Hz"),
     "rotation": ("[[module]]\nnumber = 2\nrotation = 24\n", r"fleet.toml:4: module\[0\].rotation: 24 is out of range"),
     "half a rate": ("rate_hz = 99.5\n[[module]]\nnumber = 2\n", r"rate_hz: 99.5 is not a whole number"),
+    "half a cell": ("[[module]]\nnumber = 2\ncell = [0.5, 0, 0]\n", r"cell \[0.5, 0.0, 0.0\] is between places of the lattice"),
+    "one table": ("[module]\nnumber = 2\n", r"fleet.toml:2: module: must be a list of tables, each \[\[module\]\]"),
+    "like another": ("[[module]]\nnummer = 2\n", r"module\[0\].nummer: unknown key; did you mean number\? permitted here: "),
     "cell": ("[[module]]\nnumber = 2\ncell = [1, 2]\n", r"module\[0\].cell: has shape \(2,\); needs \(3,\)"),
 }
 

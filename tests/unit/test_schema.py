@@ -119,6 +119,15 @@ WRONG = {
         TOP + "[[fin]]\nangle = 0.1\n\n[[fin]]\nangle = 0.1\nchord = 2\n",
         "8: fin[1].chord: unknown key; permitted here: angle, span_m",
     ),
+    "unknown key like another": (TOP + "craw = 3\n", f"3: craw: unknown key; did you mean crew? permitted here: {KNOWN}"),
+    "unknown word like another": (TOP + 'rig = "slop"\n', "3: rig: 'slop' is unknown; did you mean sloop? permitted: one of sloop, ketch"),
+    "unit left out": (
+        TOP + "[keel]\nangle = 0.1\nspan = 2\n",
+        "5: keel.span: unknown key; did you mean span_m? permitted here: angle, span_m",
+    ),
+    "truth for a whole number": (TOP + "crew = true\n", "3: crew: true is not a whole number"),
+    "tables for a table": (TOP + "[[keel]]\nangle = 0.1\n", "3: keel: must be a table, [keel], and one alone"),
+    "missing text": ("length_m = 7.5\n", "1: name: missing key; it needs text"),
     "missing": (NAME, "1: length_m: missing key; it needs 0.1 to 100 m"),
     "missing in a table": (
         TOP + "crew = 2\n[keel]\nspan_m = [1, 2]\n",
@@ -135,20 +144,20 @@ WRONG = {
     "too small": (NAME + "\nlength_m = -1\n", "3: length_m: -1 is out of range; permitted: 0.1 to 100 m"),
     "NaN": (NAME + "length_m = nan\n", "2: length_m: nan is out of range; permitted: 0.1 to 100 m"),
     "infinite": (NAME + "length_m = inf\n", "2: length_m: inf is out of range; permitted: 0.1 to 100 m"),
-    "text for a number": (NAME + 'length_m = "7"\n', "2: length_m: '7' is not a number"),
-    "truth for a number": (NAME + "length_m = true\n", "2: length_m: True is not 0.1 to 100 m"),
+    "text for a number": (NAME + 'length_m = "7"\n', "2: length_m: '7' is not a number; permitted: 0.1 to 100 m"),
+    "truth for a number": (NAME + "length_m = true\n", "2: length_m: true is not a number; permitted: 0.1 to 100 m"),
     "number for truth": (TOP + "sails = 1\n", "3: sails: 1 is not true or false"),
     "number for text": ("name = 3\nlength_m = 7.5\n", "1: name: 3 is not text"),
     "fraction for a whole number": (TOP + "crew = 1.5\n", "3: crew: 1.5 is not a whole number"),
-    "date for a number": (TOP + "crew = 2020-01-01\n", "3: crew: datetime.date(2020, 1, 1) is not a whole number"),
+    "date for a number": (TOP + "crew = 2020-01-01\n", "3: crew: 2020-01-01 is not a whole number"),
     "unknown word": (TOP + 'rig = "junk"\n', "3: rig: 'junk' is unknown; permitted: one of sloop, ketch"),
     "unknown word in a list": (
         TOP + 'flags = ["red", "blue"]\n',
         "3: flags[1]: 'blue' is unknown; permitted: one of red, green",
     ),
     "word for a list": (TOP + 'flags = "red"\n', "3: flags: must be a list"),
-    "number for a table": (TOP + "keel = 3\n", "3: keel: must be a table"),
-    "table for a list": (TOP + "[fin]\nangle = 0.1\n", "3: fin: must be a list"),
+    "number for a table": (TOP + "keel = 3\n", "3: keel: must be a table, [keel], and one alone"),
+    "table for a list": (TOP + "[fin]\nangle = 0.1\n", "3: fin: must be a list of tables, each [[fin]]"),
     "wrong shape": (TOP + "inertia = [1, 2]\n", "3: inertia: has shape (2,); needs (2, 2) (-1: any)"),
     "ragged": (TOP + "inertia = [[1], [2, 3]]\n", "3: inertia: must be numbers only, in rows of equal length"),
     "NaN in an array": (TOP + "depths = [1, nan]\n", "3: depths: must be finite numbers, not NaN or infinity"),
@@ -204,8 +213,8 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
 
 
 def test_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "boat.toml").write_bytes(b"name = \"\xff\xfe\"")
-    with pytest.raises(DescriptionError, match=r"boat\.toml: cannot be read"):
+    (tmp_path / "boat.toml").write_bytes(b"name = \"Ann\"\nrig = \"\xff\xfe\"")
+    with pytest.raises(DescriptionError, match=r"boat\.toml:2: cannot be read: byte 0xff is no text in UTF-8; save it as such"):
         read_toml(tmp_path / "boat.toml")
 
 
