@@ -15,8 +15,8 @@ from firmware_py.core.body import Body
 from firmware_py.core.drag_lookup import drag_wrench
 from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
 
-_MOST_PROGRAMS = 60
-"""Points, the worst by the pseudo-inverse, whose usage is found exactly."""
+_FULL = 1e-6
+"""Share of a thruster's range within which it gives all that it may."""
 
 RANK_TOLERANCE = 1e-6
 """Share of the largest singular value below which an axis is outside the thrusters' span."""
@@ -131,8 +131,9 @@ def usage(body: Body, wanted: np.ndarray, least: float = 0.0, sags: np.ndarray |
     """Largest share of the thrusters' range that any of the wrenches takes, and which one it is.
 
     The share of one wrench w is the least s for which forces f with J f = w and s f_min <= f <= s f_max exist. The
-    pseudo-inverse bounds it from above; where that exceeds what any lower bound allows, a linear program finds it. The share
-    of a wrench outside the thrusters' span is infinite.
+    pseudo-inverse bounds it from above; where that exceeds what any lower bound allows, a linear program finds it, whose forces,
+    divided alike, bound those of its neighbours. So a few programs do for a path, and no wrench is passed over. The share of one
+    outside the thrusters' span is infinite.
 
     The share is a gauge, convex and in proportion to the wrench, so that of a sum is at most the sum of the shares: between two rows it
     is at most the larger of theirs, and the share of what the wrench sags from the line between them.
@@ -143,21 +144,38 @@ def usage(body: Body, wanted: np.ndarray, least: float = 0.0, sags: np.ndarray |
         least: a largest share below this need not be found; what is returned is then below it too.
         sags: (k, 6) of `sag`; its shares are added.
     """
-    thrusters = body.thrusters
-    forces = wanted @ thrusters.pinv.T
-    above = _share(body, forces)
-    above[_matters(wanted - forces @ thrusters.matrix.T, wanted)] = np.inf
-    between = np.zeros(len(wanted)) if sags is None else _share(body, sags @ thrusters.pinv.T)
-    above += between
-    order = np.argsort(-above, kind="stable")[:_MOST_PROGRAMS]
-    best, where = 0.0, int(order[0])
-    for k in order:
-        if above[k] <= max(best, least):
-            break
-        share = least_usage(body, wanted[k]) + float(between[k])
-        if share > best:
-            best, where = share, int(k)
+    pinv = body.thrusters.pinv
+    between = np.zeros(len(wanted)) if sags is None else _share(body, sags @ pinv.T)
+    above = _bound(body, wanted, pinv) + between
+    best, where = 0.0, int(np.argmax(above))
+    while above[k := int(np.argmax(above))] > max(best, least):
+        share, forces = _least(body, wanted[k])
+        if share + between[k] > best:
+            best, where = share + float(between[k]), k
+        above = np.minimum(above, _bound(body, wanted, _division(body, share, forces)) + between)
+        above[k] = -np.inf
     return best, where
+
+
+def _bound(body: Body, wanted: np.ndarray, division: np.ndarray) -> np.ndarray:
+    """(k,) upper bounds of the shares of wrenches (k, 6): of the forces that `division` (n, 6) makes of them, infinite where these do not
+    make the wrench.
+    """
+    forces = wanted @ division.T
+    above = _share(body, forces)
+    above[_matters(wanted - forces @ body.thrusters.matrix.T, wanted)] = np.inf
+    return above
+
+
+def _division(body: Body, share: float, forces: np.ndarray) -> np.ndarray:
+    """(n, 6) the linear division of which `forces` (n,), the least for one wrench, are the case: those thrusters that give all of their
+    `share` go on giving alike, the others what is left to them.
+    """
+    thrusters = body.thrusters
+    limits = np.where(forces > 0.0, thrusters.f_max, thrusters.f_min)
+    full = np.abs(forces - share * limits) <= _FULL * np.abs(limits)
+    basis = np.column_stack([np.eye(len(forces))[:, ~full], np.where(full, limits, 0.0)])
+    return np.asarray(basis @ np.linalg.pinv(thrusters.matrix @ basis))
 
 
 def _share(body: Body, forces: np.ndarray) -> np.ndarray:
@@ -166,7 +184,12 @@ def _share(body: Body, forces: np.ndarray) -> np.ndarray:
 
 
 def least_usage(body: Body, wrench: np.ndarray) -> float:
-    """The share of one wrench (6,), by linear program (HiGHS); infinite for a wrench outside the thrusters' span."""
+    """The share of one wrench (6,); infinite for a wrench outside the thrusters' span."""
+    return _least(body, wrench)[0]
+
+
+def _least(body: Body, wrench: np.ndarray) -> tuple[float, np.ndarray]:
+    """The same, and forces (n,) with which it is reached, N, by linear program (HiGHS)."""
     thrusters = body.thrusters
     n = thrusters.matrix.shape[1]
     cost = np.zeros(n + 1)
@@ -183,4 +206,4 @@ def least_usage(body: Body, wrench: np.ndarray) -> float:
         bounds=[(None, None)] * n + [(0.0, None)],
         method="highs",
     )
-    return float(result.x[-1]) if result.success else float("inf")
+    return (float(result.x[-1]), result.x[:-1]) if result.success else (float("inf"), np.zeros(n))

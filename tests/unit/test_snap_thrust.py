@@ -17,9 +17,10 @@ from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Allocation, Control
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.ground.mission_flight import Leg, Plan, PlanJob
+from firmware_py.prepare import snap_thrust
 from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.prepare.minimum_snap import MOST_LEAN, InfeasibleError, Limits, Waypoint, plan
-from firmware_py.prepare.snap_thrust import divide, usage, wrenches
+from firmware_py.prepare.snap_thrust import divide, least_usage, usage, wrenches
 
 START, NORTH, EAST = np.array([0.0, 0.0, 2.0]), np.array([2.0, 0.0, 2.0]), np.array([0.0, 2.0, 2.0])
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -160,3 +161,48 @@ def test_wrench_outside_the_span_is_used_infinitely_whatever_the_pseudo_inverse_
     wanted = np.zeros((2, 6))
     wanted[0, 3] = wanted[1, 4] = 2.0
     assert usage(bluerov2, wanted[order]) == (math.inf, order.index(1))
+
+
+@pytest.fixture(scope="module")
+def modcube() -> Body:
+    return assemble_vehicle(load_vehicle("modcube"))
+
+
+def by_pseudo_inverse(body: Body, wanted: np.ndarray) -> np.ndarray:
+    """(k,) shares of wrenches (k, 6) that the pseudo-inverse asks for."""
+    forces = wanted @ body.thrusters.pinv.T
+    return np.asarray(np.maximum(forces / body.thrusters.f_max, forces / body.thrusters.f_min).max(axis=1))
+
+
+def test_wrench_that_takes_too_much_is_found_among_any_number_that_only_look_worse(modcube: Body) -> None:
+    """By the pseudo-inverse, which uses thrusters that the best division would spare."""
+    wanted = np.random.default_rng(3).normal(size=(400, 6)) * [10.0, 10.0, 10.0, 1.0, 1.0, 1.0]
+    exact = np.array([least_usage(modcube, w) for w in wanted])
+    looks = by_pseudo_inverse(modcube, wanted) / exact
+    order = np.argsort(-looks)
+    decoys, bad = order[:100], order[-1]
+    wanted[decoys] *= 0.79 / exact[decoys, None]
+    wanted[bad] *= 0.81 / exact[bad]
+    assert np.all(by_pseudo_inverse(modcube, wanted[decoys]) > by_pseudo_inverse(modcube, wanted[bad][None]))
+    share, where = usage(modcube, np.vstack([wanted[decoys], wanted[bad]]), 0.8)
+    assert share == pytest.approx(0.81) and where == 100
+
+
+@pytest.mark.parametrize("name", ["modcube", "bluerov2", "girona500", "chasing_m2"])
+def test_usage_is_that_of_the_worst_wrench_exactly(name: str) -> None:
+    body = assemble_vehicle(load_vehicle(name))
+    wanted = np.random.default_rng(4).normal(size=(60, body.thrusters.f_max.size)) @ body.thrusters.matrix.T
+    exact = [least_usage(body, w) for w in wanted]
+    share, where = usage(body, wanted)
+    assert share == pytest.approx(max(exact), rel=1e-6) and where == int(np.argmax(exact))
+
+
+def test_few_linear_programs_do_for_a_whole_path(modcube: Body, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, solved = np.random.default_rng(2), []
+    waypoints = [Waypoint(rng.uniform(-0.5, 0.5, 3), rotations.from_euler(*rng.uniform(-0.6, 0.6, 3))) for _ in range(6)]
+    motion = plan(waypoints, 8.0).grid(48)[..., :19].reshape(-1, 19)
+    solve = snap_thrust.linprog
+    monkeypatch.setattr(snap_thrust, "linprog", lambda *a, **k: solved.append(a) or solve(*a, **k))
+    share, where = usage(modcube, wrenches(modcube, motion))
+    assert len(solved) <= 20
+    assert share == pytest.approx(least_usage(modcube, wrenches(modcube, motion)[where])) and 0.1 < share < math.inf
