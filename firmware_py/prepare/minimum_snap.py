@@ -276,9 +276,9 @@ class _Request:
         if lacking := abs(float(part.lacking[k, axis])):
             what = f"{lacking:.2g} {'N along' if axis < 3 else 'N m about'} the robot's {'xyz'[axis % 3]}"
             raise _UnreachableError(f"neither thrusters nor buoyancy give {what}, which it takes {place(k)}")
-        k = int(np.argmax(part.lean))
-        if (lean := float(part.lean[k])) == math.inf:
-            raise InfeasibleError(f"neither thrusters nor buoyancy keep the robot from falling over {place(k)}")
+        if (falling := np.flatnonzero(np.isinf(part.lean))).size:
+            raise InfeasibleError(f"neither thrusters nor buoyancy keep the robot from falling over {place(int(falling[0]))}")
+        lean, k = _largest(part.lean.reshape(-1, run))
         if lean > MOST_LEAN:
             degrees = f"{math.degrees(lean):.1f} deg, of at most {math.degrees(MOST_LEAN):.1f} deg"
             raise InfeasibleError(f"the robot would lean by {degrees}, for a moment that its thrusters do not give, {place(k)}")
@@ -312,6 +312,8 @@ def _thrust_message(share: float, limit: float, where: str) -> str:
 
 def _largest(size: np.ndarray) -> tuple[float, int]:
     """The largest of smooth quantities (pieces, points), crests between the points included, and the flat index of the point next to it."""
+    if size.shape[1] < 3:
+        return float(size.max()), int(np.argmax(size))
     heights, _ = crests(size)
     piece, i = divmod(int(np.argmax(heights)), heights.shape[1])
     if heights[piece, i] > size.max():

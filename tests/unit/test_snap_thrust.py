@@ -163,6 +163,16 @@ def test_wrench_outside_the_span_is_used_infinitely_whatever_the_pseudo_inverse_
     assert usage(bluerov2, wanted[order]) == (math.inf, order.index(1))
 
 
+def test_lean_is_checked_between_the_points_where_it_is_looked_at(bluerov2: Body) -> None:
+    rng = np.random.default_rng(0)
+    waypoints = [Waypoint(p) for p in (START, *(START + np.append(rng.uniform(-2.0, 2.0, 2), 0.0) for _ in range(3)))]
+    path = plan(waypoints, 30.19)
+    at_points, between = (divide(bluerov2, path.grid(points)[..., :19].reshape(-1, 19)).lean.max() for points in (48, 2000))
+    assert at_points < MOST_LEAN < between
+    with pytest.raises(InfeasibleError, match=r"lean by 11.5 deg, of at most 11.5 deg, .* between waypoints 2 and 3"):
+        plan(waypoints, 30.19, Limits(thruster_share=1.0), bluerov2, stretch=False)
+
+
 @pytest.fixture(scope="module")
 def modcube() -> Body:
     return assemble_vehicle(load_vehicle("modcube"))
