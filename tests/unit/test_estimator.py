@@ -154,6 +154,42 @@ def test_robot_that_was_carried_away_is_found_again_after_half_a_second(body: Bo
     assert_rests(estimate, there)
 
 
+def rest_pushed(body: Body, ticks: int, q_wb: np.ndarray = Q_WB) -> tuple[Robot, Estimate]:
+    """A robot that stands as Q_WB, held against a moment that its description has not, and seen as `q_wb`; and what it believes then."""
+    robot = Robot(body)
+    robot.tau = robot.tau - np.r_[np.zeros(3), PUSH]
+    for _ in range(ticks):
+        seen = [tag(robot.time_ns - DELAY_TICKS * PERIOD, P_WB, q_wb)] if robot.tick % 2 else []
+        estimate = robot.step(sensors(P_WB, Q_WB, *seen))
+    return robot, estimate
+
+
+PUSH = np.array([0.09, -0.045, 0.02])
+"""N m, such as of an arm and a trim that nobody has measured."""
+
+
+def test_robot_that_was_carried_away_still_knows_what_pushes_it(body: Body) -> None:
+    """The place is lost, and no more: its controller would let the arm turn it until all was learnt anew."""
+    robot, estimate = rest_pushed(body, 1000)
+    np.testing.assert_allclose(estimate.moment_b, PUSH, atol=2e-3)
+    there = P_WB + np.array([0.8, -0.6, 0.3])
+    for n in range(200):
+        estimate = robot.step(sensors(there, Q_WB, tag(robot.time_ns - PERIOD, there)))
+        np.testing.assert_allclose(estimate.moment_b, PUSH, atol=2e-3, err_msg=f"after {n} tags")
+    assert_rests(estimate, there)
+
+
+@pytest.mark.parametrize("ticks", [20, 60, 200])
+def test_robot_that_was_seen_askew_is_upright_at_once_when_it_is_seen_well(body: Body, ticks: int) -> None:
+    """Tags that had another tilt than gravity: biases took up what did not fit, and would tilt what comes."""
+    robot, _ = rest_pushed(body, ticks, multiply(Q_WB, exp(np.array([0.3, 0.0, 0.0]))))
+    for _ in range(RESET_AFTER):
+        estimate = robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD)))
+    assert estimate.rejected >= RESET_AFTER
+    for _ in range(100):
+        assert_rests(robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD))))
+
+
 def test_good_tags_between_bad_ones_keep_the_pose(body: Body) -> None:
     robot = Robot(body)
     robot.rest(100)
