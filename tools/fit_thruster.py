@@ -22,7 +22,8 @@ import numpy as np
 from command_line import Parser, in_words, run_tool
 from scipy.optimize import nnls
 
-from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of, to_toml
+from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of
+from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
 DEGREE = 5

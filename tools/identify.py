@@ -32,7 +32,8 @@ from rich import box as box_style
 from rich.console import Console
 from rich.table import Table
 
-from firmware_py.description.schema import DescriptionError, build, read_toml, to_toml
+from firmware_py.description.schema import DescriptionError, build, read_toml
+from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
 FARTHEST_M = 10.0

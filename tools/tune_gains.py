@@ -26,7 +26,8 @@ from command_line import INTERRUPTED, Parser, in_words, run_tool
 from tune_objective import Objective, detuned, load_objective, with_values
 
 from firmware_py.description.parameters import Parameters, load_parameters
-from firmware_py.description.schema import DescriptionError, to_toml
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.toml_text import to_toml
 from hil.campaign import TRIALS_FILE, code_digest, identity, run_campaign
 from hil.trial_file import TrialFile
 from hil.workers import Pool, dask_cluster, kept, processes

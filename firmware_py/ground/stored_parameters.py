@@ -9,7 +9,8 @@ from operator import attrgetter
 from pathlib import Path
 
 from firmware_py.description.parameters import Parameters, registry
-from firmware_py.description.schema import build, read_toml, to_plain, to_toml
+from firmware_py.description.schema import build, read_toml
+from firmware_py.description.toml_text import to_plain, to_toml
 
 _FEW = 8
 """Names of stored parameters that one line holds."""

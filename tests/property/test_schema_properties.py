@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_py.description.parameters import Parameters, load_parameters, registry
-from firmware_py.description.schema import DescriptionError, to_toml
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.toml_text import to_toml
 
 always = settings(derandomize=True, deadline=None, database=None, max_examples=60)
 REGISTRY = dict(registry())

@@ -15,7 +15,8 @@ from firmware_py.__main__ import INTERRUPTED
 from firmware_py.__main__ import main as main_from_the_start
 from firmware_py.cli import main
 from firmware_py.description.parameters import Parameters, load_parameters, registry
-from firmware_py.description.schema import describe, to_toml
+from firmware_py.description.schema import describe
+from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import load_vehicle, vehicle_names
 from firmware_py.runtime.guarded_file import GuardedFile
 from hil.scenario import scenario_names

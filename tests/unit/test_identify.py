@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from firmware_py.core.rotations import exp
-from firmware_py.description.schema import DescriptionError, build, frozen_array, read_toml, to_toml
+from firmware_py.description.schema import DescriptionError, build, frozen_array, read_toml
+from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle, vehicle_names
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.scenario import load_scenario

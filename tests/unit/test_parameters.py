@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters, registry
-from firmware_py.description.schema import DescriptionError, Limits, to_toml
+from firmware_py.description.schema import DescriptionError, Limits
+from firmware_py.description.toml_text import to_toml
 
 REGISTRY = dict(registry())
 

@@ -10,7 +10,8 @@ from firmware_py.app import ground_station
 from firmware_py.app.vehicle import run_vehicle
 from firmware_py.description.fleet import single
 from firmware_py.description.parameters import Control, Parameters
-from firmware_py.description.schema import DescriptionError, to_toml
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.toml_text import to_toml
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.parameters import ParameterStore
 from firmware_py.ground.stored_parameters import laid_over, stored_line

@@ -1,0 +1,59 @@
+"""Dataclasses of `schema` as TOML text, each value with a comment of its own, and as what JSON can hold."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from firmware_py.description.schema import ANYTHING, Limits, describe, limits_of
+
+
+def to_plain(value: Any) -> Any:
+    """The lists, dicts and scalars of a dataclass, as JSON takes them; `build` reads them back. A field that is None is left out."""
+    if dataclasses.is_dataclass(value):
+        items = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value) if field.init)
+        return {name: to_plain(item) for name, item in items if item is not None}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [to_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def unit_of(limits: Limits) -> str:
+    """The comment of a value that says no more than its unit."""
+    return limits.unit
+
+
+def explained(limits: Limits) -> str:
+    """The comment of a value that says all that is known of it."""
+    parts = (limits.help, describe(limits).removeprefix(ANYTHING), limits.mavlink and f"MAVLink {limits.mavlink}")
+    return "; ".join(part for part in parts if part)
+
+
+def to_toml(value: Any, comment: Callable[[Limits], str] = unit_of) -> str:
+    """The TOML text of a dataclass of scalars, arrays, tables and lists of tables, each value with its `comment`."""
+    head, tail = [], []
+    for field in dataclasses.fields(value):
+        item = getattr(value, field.name)
+        if dataclasses.is_dataclass(item):
+            tail.append(f"\n[{field.name}]\n{to_toml(item, comment)}")
+        elif isinstance(item, tuple) and item and dataclasses.is_dataclass(item[0]):
+            tail += [f"\n[[{field.name}]]\n{to_toml(each, comment)}" for each in item]
+        else:
+            note = comment(limits_of(type(value), field.name))
+            head.append(f"{field.name} = {_literal(item)}{f'  # {note}' if note else ''}\n")
+    return "".join(head + tail)
+
+
+def _literal(item: Any) -> str:
+    if isinstance(item, bool):
+        return "true" if item else "false"
+    if isinstance(item, np.ndarray):
+        return repr(item.tolist())
+    if isinstance(item, str):
+        return '"' + item.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(item, tuple):
+        return f"[{', '.join(_literal(each) for each in item)}]"
+    return repr(item)
