@@ -50,8 +50,9 @@ NORTH_DENSITY = 1e-4
 knowledge of it was noise: a bump turned the belief by a third of a circle."""
 KEPT, MOVING = np.r_[10:19, 21:25, 26:29], slice(6, 9)
 """Of the state: rates, biases, vertical force, moment and righting, which say the same whatever the heading. Of the error: velocity."""
-LEARNT = np.r_[22:25, 26:29]
-"""Of the state: moment and righting, which a lost place does not spoil. Biases and vertical force take up what was refused meanwhile."""
+LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[22:25, 26:29], np.r_[21:24, 25:28], 5.0
+"""Of the state, and of its error: moment and righting, which a lost place does not spoil, as far as a filter that begins could believe them.
+What is farther off may be why tags were refused. Biases and vertical force take up what was refused meanwhile."""
 SPEED_SIGMA = 0.5
 """Of one that was adrift, when tags come, m/s: what a module swims at half stick."""
 FELT_LIMIT_NS = 2_000_000_000
@@ -270,7 +271,8 @@ class Estimator:
         if self._refused_in_row >= RESET_AFTER:
             learnt = self._anchor.x[LEARNT]
             self._start(pose)
-            self._anchor.x[LEARNT] = learnt
+            sigma = np.sqrt(np.diag(self._anchor.covariance)[LEARNT_ERRORS])
+            self._anchor.x[LEARNT] = np.where(np.abs(learnt) <= LEARNT_SIGMAS * sigma, learnt, 0.0)
 
     # ------------------------------------------------------------ from the anchor to now
 

@@ -179,6 +179,20 @@ def test_robot_that_was_carried_away_still_knows_what_pushes_it(body: Body) -> N
     assert_rests(estimate, there)
 
 
+@pytest.mark.parametrize("spoilt", [5.0, -5.0, np.nan])
+def test_moment_that_nobody_could_believe_is_forgotten_with_the_place(body: Body, spoilt: float) -> None:
+    """It may be why the tags were refused."""
+    robot = Robot(body)
+    robot.rest(100)
+    there = P_WB + np.array([0.8, -0.6, 0.3])
+    for _ in range(RESET_AFTER):
+        robot.estimator._anchor.x[22:25] = spoilt
+        robot.step(sensors(there, Q_WB, tag(robot.time_ns - PERIOD, there)))
+    for _ in range(100):
+        estimate = robot.step(sensors(there, Q_WB, tag(robot.time_ns - PERIOD, there)))
+    assert_rests(estimate, there)
+
+
 @pytest.mark.parametrize("ticks", [20, 60, 200])
 def test_robot_that_was_seen_askew_is_upright_at_once_when_it_is_seen_well(body: Body, ticks: int) -> None:
     """Tags that had another tilt than gravity: biases took up what did not fit, and would tilt what comes."""
