@@ -51,8 +51,8 @@ knowledge of it was noise: a bump turned the belief by a third of a circle."""
 KEPT, MOVING = np.r_[10:19, 21:25, 26:29], slice(6, 9)
 """Of the state: rates, biases, vertical force, moment and righting, which say the same whatever the heading. Of the error: velocity."""
 LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[22:25, 26:29], np.r_[21:24, 25:28], 5.0
-"""Of the state, and of its error: moment and righting, which a lost place does not spoil, as far as a filter that begins could believe them.
-What is farther off may be why tags were refused. Biases and vertical force take up what was refused meanwhile."""
+"""Of the state, and of its error: moment and righting. A lost place does not spoil them as far as a filter that begins could believe them;
+what is farther off may be why tags were refused. Biases and vertical force take up what was refused meanwhile."""
 SPEED_SIGMA = 0.5
 """Of one that was adrift, when tags come, m/s: what a module swims at half stick."""
 FELT_LIMIT_NS = 2_000_000_000
