@@ -341,6 +341,6 @@ def test_scenario_carries_its_own_name_and_can_be_built(name: str) -> None:
 
 
 def test_unknown_scenario_is_refused_with_what_there_is() -> None:
-    with pytest.raises(DescriptionError, match=r"'hoover' is unknown; there are .*hover.*spiral") as refusal:
+    with pytest.raises(DescriptionError, match=r"'hoover' is unknown; did you mean hover\? there are .*hover.*spiral") as refusal:
         load_scenario("hoover")
     assert "\n" not in str(refusal.value)
