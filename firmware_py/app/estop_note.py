@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 
 from firmware_py.app.firmware import BusFrame
 from firmware_py.app.lockstep import Observer
@@ -24,6 +24,8 @@ NOTE = "estop.txt"
 STANDS, CLEAR = b"stands\n", b"clear \n"
 CLOSE_S = 5.0
 """How long the end of a run waits for a disk."""
+AGAIN_S = 1.0
+"""How long after a note could not be written it is tried again."""
 
 
 def estop_stands(folder: Path) -> bool:
@@ -44,7 +46,7 @@ def write_note(folder: Path, stands: bool) -> None:
             file.write(data)
             file.truncate(len(data))
             os.fsync(file.fileno())
-    except FileNotFoundError:
+    except OSError:  # there is none, it is somebody else's, or this disk has no room to write over it
         _make(path, data)
 
 
@@ -58,8 +60,9 @@ def clear(folder: Path) -> bool:
 
 
 def _make(path: Path, data: bytes) -> None:
-    """Whole or not at all."""
+    """Whole or not at all; its folder too, which somebody may have removed."""
     fresh = path.with_name(path.name + ".new")
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with fresh.open("wb", buffering=0) as file:
             file.write(data)
@@ -87,7 +90,7 @@ class EstopNote:
         self._thread.start()
 
     def write(self, stands: bool) -> None:
-        """As soon as the disk takes it."""
+        """As soon as the disk takes it: what it does not take is tried again, until something else is to be written."""
         self._queue.put(stands)
 
     def failures(self) -> list[Event]:
@@ -102,11 +105,21 @@ class EstopNote:
         self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
-        while (stands := self._queue.get()) is not None:
+        waiting: bool | None = None
+        ended = False
+        while not ended:
+            fresh = False
+            with suppress(Empty):
+                told = self._queue.get(timeout=None if waiting is None else AGAIN_S)
+                fresh, ended = told is not None, told is None
+                waiting = waiting if ended else told
             try:
-                write_note(self._folder, stands)
+                if waiting is not None:
+                    write_note(self._folder, waiting)
+                waiting = None
             except OSError as error:
-                self._failed.put(error)
+                if fresh:
+                    self._failed.put(error)
 
 
 def noting_estop(note: EstopNote, stands: bool, recorder: Recorder | None = None) -> Observer:

@@ -3,6 +3,9 @@
 import dataclasses
 import errno
 import os
+import shutil
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -88,13 +91,77 @@ def test_note_never_changes_its_length(tmp_path: Path) -> None:
 
 
 def test_note_that_cannot_be_made_is_said_once_and_the_flight_goes_on(tmp_path: Path) -> None:
-    flight = Flight(tmp_path / "missing")
+    (tmp_path / "taken").touch()
+    flight = Flight(tmp_path / "taken")
     flight.tick(State.ARMED)
     flight.note.close()
     assert [event.text for event in flight.tick(State.ARMED).events] == [
-        "the next start will not know of an e-stop: estop.txt: No such file or directory"
+        "the next start will not know of an e-stop: estop.txt: File exists"
     ]
     assert flight.tick(State.ARMED).events == []
+
+
+def test_stop_that_a_full_disk_did_not_take_is_noted_as_soon_as_there_is_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estop_note, "AGAIN_S", 0.01)
+    tried, room = threading.Event(), threading.Event()
+    make = estop_note._make
+
+    def make_where_there_is_room(path: Path, data: bytes) -> None:
+        tried.set()
+        if not room.is_set():
+            refuse_room()
+        make(path, data)
+
+    monkeypatch.setattr(estop_note, "_make", make_where_there_is_room)
+    flight = Flight(tmp_path)
+    flight.tick(State.ESTOP)
+    assert tried.wait(10)
+    room.set()
+    while not (tmp_path / NOTE).exists():
+        time.sleep(0.01)
+    assert [event.text for event in flight.end()] == ["the next start will not know of an e-stop: estop.txt: No space left on device"]
+    assert estop_stands(tmp_path)
+
+
+def test_last_chance_of_a_note_is_the_end_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make = estop_note._make
+    refused = threading.Event()
+
+    def refuse(*_: object) -> None:
+        refused.set()
+        refuse_room()
+
+    monkeypatch.setattr(estop_note, "_make", refuse)
+    flight = Flight(tmp_path)
+    flight.tick(State.ESTOP)
+    assert refused.wait(10)
+    monkeypatch.setattr(estop_note, "_make", make)
+    flight.end()
+    assert estop_stands(tmp_path)
+
+
+def test_stop_is_noted_in_a_folder_that_was_removed_in_flight(tmp_path: Path) -> None:
+    flight = Flight(tmp_path / "log")
+    flight.tick(State.ARMED)
+    flight.note.close()
+    shutil.rmtree(tmp_path / "log")
+    write_note(tmp_path / "log", True)
+    assert estop_stands(tmp_path / "log")
+
+
+def test_note_of_somebody_else_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as of root, who ran the vehicle once."""
+    write_note(tmp_path, False)
+    opened = Path.open
+
+    def refuse(path: Path, mode: str = "r", *others: object, **more: object) -> object:
+        if path.name == NOTE and mode == "r+b":
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return opened(path, mode, *others, **more)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(Path, "open", refuse)
+    write_note(tmp_path, True)
+    assert estop_stands(tmp_path)
 
 
 @pytest.mark.parametrize(("text", "stands"), [(STANDS, True), (CLEAR, False), (b"", True), (b"\x00" * 7, True), (b"clear", True)])
