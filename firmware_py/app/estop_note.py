@@ -125,17 +125,20 @@ class EstopNote:
 def noting_estop(note: EstopNote, stands: bool, recorder: Recorder | None = None) -> Observer:
     """An observer that notes for the next process whether an e-stop stands: from one on, and where one stood before this process
     (`stands`), until a person clears it or arms. The note is there from the first tick on, for a disk that is full later; it and the log
-    (`recorder`) are soon on the disk when one is raised: who has pressed a stop pulls the plug next.
+    (`recorder`) are soon on the disk when one is raised: who has pressed a stop pulls the plug next. Each that is raised is noted, also
+    while one stands: a person may have cleared that by hand meanwhile.
     """
     noted: bool | None = None
+    raised = False
 
     def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        nonlocal stands, noted
+        nonlocal stands, noted, raised
         if stands:
             cleared = any(request.action == Action.CLEAR_ESTOP for request in inputs.requests)
             stands = not cleared and not any(command.armed for command in outputs.modules)
-        stands = stands or any(record.state == State.ESTOP for record in outputs.records)
-        if stands != noted:
+        was_raised, raised = raised, any(record.state == State.ESTOP for record in outputs.records)
+        stands = stands or raised
+        if stands != noted or (raised and not was_raised):
             note.write(stands)
             if recorder is not None and (stands or noted is not None):
                 outputs.events += recorder.flush(to_disk=True)

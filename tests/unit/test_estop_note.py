@@ -164,6 +164,16 @@ def test_note_of_somebody_else_is_replaced(tmp_path: Path, monkeypatch: pytest.M
     assert estop_stands(tmp_path)
 
 
+def test_each_stop_is_noted_for_a_person_may_have_cleared_the_one_before_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the process went on, which still knows of it."""
+    written: list[bool] = []
+    monkeypatch.setattr(EstopNote, "write", lambda note, stands: written.append(stands))
+    flight = Flight(tmp_path, stands=True)
+    for state in (State.DISARMED, State.DISARMED, State.ESTOP, State.ESTOP, State.DISARMED, State.ESTOP):
+        flight.tick(state)
+    assert written == [True, True, True]
+
+
 @pytest.mark.parametrize(("text", "stands"), [(STANDS, True), (CLEAR, False), (b"", True), (b"\x00" * 7, True), (b"clear", True)])
 def test_note_that_says_neither_counts_as_a_stop(tmp_path: Path, text: bytes, stands: bool) -> None:
     (tmp_path / NOTE).write_bytes(text)
