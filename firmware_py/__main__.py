@@ -8,10 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from firmware_py.runtime.interrupts import interrupted_once
+from firmware_py.runtime.interrupts import INTERRUPTED, ended_at_once
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C: 128 and SIGINT, as a shell has it."""
 COMPILING = "modcube: compiles its numeric code, once, in a minute or so"
 
 
@@ -19,7 +17,7 @@ def main() -> None:
     """Runs the command line; what takes a second or more to import is imported here."""
     try:
         with compiling_told(sys.stderr):
-            with interrupted_once():
+            with ended_at_once():
                 from firmware_py.cli import main as run
 
             run()

@@ -23,6 +23,7 @@ from firmware_py.description.vehicle import load_vehicle, vehicle_names
 from firmware_py.ground.config import GroundConfig, check_store, load_ground
 from firmware_py.ground.identity import IDENTITIES
 from firmware_py.runtime import disk
+from firmware_py.runtime.interrupts import ended_at_once
 
 CANNOT_RUN = 2
 """Exit status when nothing could be started: wrong usage, no such bus, a file that is wrong."""
@@ -223,7 +224,9 @@ def main() -> None:
     own = {command.name or command.callback.__name__ for command in app.registered_commands if command.callback is not None}
     if own.isdisjoint(sys.argv[1:2]):  # the vehicle's process has no room for the bench
         for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):
-            app.add_typer(entry.load(), name=entry.name)
+            with ended_at_once():
+                command = entry.load()
+            app.add_typer(command, name=entry.name)
     try:
         status = app(prog_name="modcube", standalone_mode=False)
     except TyperException as error:

@@ -12,7 +12,7 @@ import typer
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError, meant
-from firmware_py.runtime.interrupts import interrupted_once
+from firmware_py.runtime.interrupts import ended_at_once, interrupted_once
 from firmware_py.runtime.recorder import CAN_LOG
 from hil.bench import DEFAULT_BUS
 from hil.plant.world import STEP_NS
@@ -85,8 +85,9 @@ def run(
     realtime: Annotated[bool, typer.Option("--realtime", help="two processes, each on its own clock")] = False,
 ) -> None:
     """Fly one scenario; prints a table and leaves logs, plots, report.html and result.json."""
-    from hil.console import flight_progress, print_result
-    from hil.flight import fly_and_judge, illustrate
+    with ended_at_once():
+        from hil.console import flight_progress, print_result
+        from hil.flight import fly_and_judge, illustrate
 
     check_rate(rate_hz)
     chosen = scenario_of(scenario, vehicle, sensors)
@@ -141,10 +142,11 @@ def campaign(
     if scenario == "faults":
         _check_fault_options(context)
         raise typer.Exit(_fly_faults(jobs, seed, out))
-    from hil.campaign import run_campaign
-    from hil.console import campaign_progress, print_campaign
-    from hil.flight import fly_and_judge, illustrate
-    from hil.workers import dask_cluster, processes
+    with ended_at_once():
+        from hil.campaign import run_campaign
+        from hil.console import campaign_progress, print_campaign
+        from hil.flight import fly_and_judge, illustrate
+        from hil.workers import dask_cluster, processes
 
     chosen = scenario_of(scenario, vehicle, sensors)
     unusual = unusual_in(vehicle, controller, sensors)

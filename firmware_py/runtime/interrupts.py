@@ -2,11 +2,31 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C: 128 and SIGINT, as a shell has it."""
+
+
+@contextmanager
+def ended_at_once() -> Iterator[None]:
+    """Ctrl-C inside ends the process there and then, without a word: for imports, which leave nothing behind.
+
+    While compiled code is loaded LLVM calls Python back; an exception in there is swallowed, and the process crashes (SIGSEGV).
+    """
+    if not _is_heard():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -57,6 +57,16 @@ class Presser:
             press_twice()
 sys.meta_path.insert(0, Presser())
 """
+AT_LOADING = """
+from numba.core.codegen import CPUCodeLibrary
+load, calls = CPUCodeLibrary._object_getbuffer_hook.__func__, []
+def loaded(library, module):
+    calls.append(module)
+    if len(calls) == {call}:
+        press_twice()
+    return load(library, module)
+CPUCodeLibrary._object_getbuffer_hook = classmethod(loaded)
+"""
 
 
 def run(folder: Path, how: str, *options: str) -> str:
@@ -84,6 +94,12 @@ def test_flight_that_is_interrupted_twice_says_where_its_log_is_and_keeps_it_who
 def test_run_that_is_interrupted_while_it_is_imported_leaves_nothing(module: str, tmp_path: Path) -> None:
     assert run(tmp_path, AT_IMPORT.format(module=module)) == ""
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", [3, 40])
+def test_run_that_is_interrupted_while_its_compiled_code_is_loaded_does_not_crash(call: int, tmp_path: Path) -> None:
+    assert run(tmp_path, AT_LOADING.format(call=call)) == ""
 
 
 @pytest.mark.slow
