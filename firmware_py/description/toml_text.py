@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -53,7 +54,7 @@ def _literal(item: Any) -> str:
     if isinstance(item, np.ndarray):
         return repr(item.tolist())
     if isinstance(item, str):
-        return '"' + item.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")  # as TOML escapes it, but for DEL
     if isinstance(item, tuple):
         return f"[{', '.join(_literal(each) for each in item)}]"
     return repr(item)

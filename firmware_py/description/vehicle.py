@@ -235,7 +235,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     vehicle: Vehicle = build(Vehicle, table, source)
     _check_drag(vehicle.drag, source)
     if vehicle.hull.mesh:
-        mesh = path.parent / vehicle.hull.mesh
+        mesh = (path.parent / vehicle.hull.mesh).absolute()  # for logs, and for who prints it as a file elsewhere
         if not mesh.is_file():
             raise source.error(("hull", "mesh"), f"{mesh}: there is no such mesh")
         vehicle = dataclasses.replace(vehicle, hull=dataclasses.replace(vehicle.hull, mesh=str(mesh)))

@@ -1,5 +1,6 @@
 """Vehicle files: thrusters as published, turned from FLU into FRD where the source is FLU; tags on their faces."""
 
+import dataclasses
 import itertools
 from importlib import resources
 from pathlib import Path
@@ -10,6 +11,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from firmware_py.description.schema import DescriptionError
+from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import (
     FACE_NAMES,
     FACE_NORMALS,
@@ -271,3 +273,19 @@ def test_unknown_vehicle_is_answered_with_the_known_ones() -> None:
 def test_vehicle_file_may_lie_anywhere(tmp_path: Path) -> None:
     path = changed(tmp_path, 'name = "modcube"', 'name = "mine"')
     assert load_vehicle(str(path)).name == load_vehicle(path.name, tmp_path).name == "mine"
+
+
+def test_vehicle_whose_texts_have_lines_and_whose_hull_is_a_mesh_is_printed_as_a_file_for_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("from").mkdir()
+    Path("to").mkdir()
+    Path("from/hull.stl").touch()
+    modcube = load_vehicle("modcube")
+    assumption = 'two\nlines,\t"quoted"\\ and \x7f'
+    made = dataclasses.replace(modcube, assumption=assumption, hull=dataclasses.replace(modcube.hull, mesh="hull.stl"))
+    Path("from/odd.toml").write_text(to_toml(made), encoding="utf-8")
+    Path("to/odd.toml").write_text(to_toml(load_vehicle("from/odd.toml")), encoding="utf-8")
+    again = load_vehicle("to/odd.toml")
+    assert (again.assumption, again.hull.mesh) == (assumption, str(tmp_path / "from" / "hull.stl"))
