@@ -169,7 +169,7 @@ def _headline(result: Result, scene: Scene) -> str:
     """What the scenario's first check asks for, large; an RMSE beside the paper's, as bars, where the paper flew the same."""
     name = _asked_first(result)
     if name == "docked":
-        text = _big("docked" if result.metrics[name] else shown_value("outcome", result.metrics["outcome"]), "", "Docking outcome")
+        text = _big(shown_value("outcome", result.metrics["outcome"]), "", shown("outcome").label)  # a task may end with an undock
     else:
         how, value = shown(name), result.metrics.get(name, math.nan)
         number = shown_value(name, value).removesuffix(f" {how.unit}")

@@ -148,7 +148,7 @@ def test_report_of_a_dock_has_its_outcome_as_headline_and_no_rmse_that_nobody_as
     asked, near, false = Limit("docked", low=1.0), Limit("gap_min_m", high=0.03), Limit("false_declarations", high=0.0)
     metrics = result.metrics | {"docked": 1.0, "outcome": 0.0, "gap_min_m": 0.0179, "false_declarations": 2.0}
     for limit, changed, value, label in (
-        (asked, {}, "docked<span></span>", "Docking outcome"),
+        (asked, {}, "as asked<span></span>", "Docking outcome"),
         (asked, {"docked": 0.0, "outcome": 1.0}, "jammed<span></span>", "Docking outcome"),
         (near, {}, "17.90<span>mm</span>", "Gap between facing faces, smallest"),
         (near, {"gap_min_m": math.nan}, "none<span></span>", "Gap between facing faces, smallest"),
