@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import Summary, recording_times, summary_of
-from firmware_py.app.estop_note import EstopNote, noting_estop
+from firmware_py.app.estop_note import EstopNote, estop_stands, noting_estop
 from firmware_py.app.firmware import BusFrame, Firmware, compose, vehicles_of
 from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight, to_arm
 from firmware_py.app.live_view import LiveView
@@ -24,6 +24,7 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.stored_parameters import laid_over, stored_line
 from firmware_py.runtime.clock import boot_id, unix_ns
@@ -51,6 +52,7 @@ FAREWELL_TICKS = 10
 """Ticks that go on saying `disarmed` after a stop was asked for."""
 ARM_EVERY_S = 1.0
 """How often arming is tried again with `--hold`, once the pose is known."""
+FORGETFUL = "warning: --hold without --out: an e-stop in this run will not be known at the next start"
 FLUSH_EVERY_S = 0.5
 MISUSED = (FileExistsError, NotADirectoryError, PermissionError)
 """A folder for logs that is none, or not ours: whoever starts the vehicle is told. What else a disk may fail in, it flies without."""
@@ -154,6 +156,8 @@ def run_vehicle(
             note = EstopNote(out)
             stack.callback(note.close)
             observers.append(noting_estop(note, before.stopped, recorder))
+        elif hold:
+            teller.say(FORGETFUL)
         if live is not None:
             observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
         told: list[Observer] = [telling(teller.say)]  # after all others, which may have something to say
@@ -174,6 +178,8 @@ def run_vehicle(
         use_priority(TICK_PRIORITY)
         move_to_own_processor()
         loop.listen()
+        if out is not None and estop_stands(out) and not before.stopped:
+            raise DescriptionError(f"{out}: an e-stop was raised while this process started, by one that ran until then; start it again")
         stack.enter_context(_stopping_by_signal(operator))
         stack.enter_context(quiet_garbage())
         teller.say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")

@@ -5,7 +5,6 @@ import errno
 import os
 import shutil
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -103,7 +102,7 @@ def test_note_that_cannot_be_made_is_said_once_and_the_flight_goes_on(tmp_path: 
 
 def test_stop_that_a_full_disk_did_not_take_is_noted_as_soon_as_there_is_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estop_note, "AGAIN_S", 0.01)
-    tried, room = threading.Event(), threading.Event()
+    tried, room, made = threading.Event(), threading.Event(), threading.Event()
     make = estop_note._make
 
     def make_where_there_is_room(path: Path, data: bytes) -> None:
@@ -111,14 +110,14 @@ def test_stop_that_a_full_disk_did_not_take_is_noted_as_soon_as_there_is_room(tm
         if not room.is_set():
             refuse_room()
         make(path, data)
+        made.set()
 
     monkeypatch.setattr(estop_note, "_make", make_where_there_is_room)
     flight = Flight(tmp_path)
     flight.tick(State.ESTOP)
     assert tried.wait(10)
     room.set()
-    while not (tmp_path / NOTE).exists():
-        time.sleep(0.01)
+    assert made.wait(10)
     assert [event.text for event in flight.end()] == ["the next start will not know of an e-stop: estop.txt: No space left on device"]
     assert estop_stands(tmp_path)
 

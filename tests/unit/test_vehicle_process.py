@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from firmware_py.app import vehicle
-from firmware_py.app.estop_note import NOTE, EstopNote, noting_estop
+from firmware_py.app.estop_note import NOTE, EstopNote, estop_stands, noting_estop, write_note
 from firmware_py.app.firmware import compose
 from firmware_py.app.last_flight import last_flight, to_arm
-from firmware_py.app.vehicle import Operator, recording, run_vehicle
+from firmware_py.app.realtime import RealTimeLoop
+from firmware_py.app.vehicle import FORGETFUL, Operator, recording, run_vehicle
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import PortError
 from firmware_py.cli import main
@@ -24,6 +25,7 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Inputs, ModuleCommand, Outputs, Request
 from firmware_py.description.fleet import Fleet, Module, single
 from firmware_py.description.parameters import Parameters, Supervision
+from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime import teller
 from firmware_py.runtime.clock import boot_id
 from firmware_py.runtime.flight_log import FlightLog
@@ -365,6 +367,23 @@ def test_process_started_anew_after_a_stop_holds_nothing_and_says_so(tmp_path: P
     stopped(tmp_path / "log", (State.ESTOP, []))
     for _ in range(2):
         assert ARMS_NOBODY in fly(tmp_path, tmp_path / "log", hold=True)
+
+
+@pytest.mark.slow
+def test_stop_that_another_process_notes_while_this_one_starts_keeps_it_from_starting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "log"
+    monkeypatch.setattr(RealTimeLoop, "listen", lambda loop: write_note(out, True))
+    with pytest.raises(DescriptionError, match="an e-stop was raised while this process started"):
+        fly(tmp_path, out, hold=True)
+    assert estop_stands(out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("hold", "told"), [(True, True), (False, False)])
+def test_who_holds_without_a_folder_for_logs_is_told_that_no_stop_is_remembered(hold: bool, told: bool, tmp_path: Path) -> None:
+    assert (FORGETFUL in fly(tmp_path, hold=hold)) == told
 
 
 class Tape(Recorder):
