@@ -176,6 +176,7 @@ GROUPS: tuple[Group, ...] = (
         (
             Figure("spiral in lockstep with recorder and real frames, one core", "speed", low=25.0, unit="x real time"),
             Figure("that core meanwhile: ten million additions in plain Python", "additions", unit="s"),
+            Figure("that core meanwhile: a load out of 8 MB that waits for the one before", "load", unit="ns"),
         ),
     ),
     Group(

@@ -151,13 +151,16 @@ def repeated(folder: Path) -> Values:
 
 def timed(folder: Path) -> Values:
     """Lockstep's speed on one core, out of `make bench`'s own measurement, and how fast that core was meanwhile."""
-    code = "from bench_flight import measure_flight, time_additions; [print(measure_flight(0).speed, time_additions()) for _ in range(5)]"
+    code = (
+        "from bench_flight import measure_flight, time_additions, time_load\n"
+        "for _ in range(5): print(measure_flight(0).speed, time_additions(), time_load())"
+    )
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     core = min(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
-    pinned = f"import os; os.sched_setaffinity(0, {{{core}}}); " if core is not None else ""
+    pinned = f"import os; os.sched_setaffinity(0, {{{core}}})\n" if core is not None else ""
     done = subprocess.run(
         [sys.executable, "-c", pinned + code], check=True, capture_output=True, text=True, env=environment,
         cwd=Path(__file__).parent,
     )  # fmt: skip
-    speeds, additions = zip(*([float(word) for word in line.split()] for line in done.stdout.splitlines()), strict=True)
-    return {"speed": median(speeds), "additions": median(additions)}
+    speeds, additions, loads = zip(*([float(word) for word in line.split()] for line in done.stdout.splitlines()), strict=True)
+    return {"speed": median(speeds), "additions": median(additions), "load": median(loads)}

@@ -26,7 +26,7 @@ from bench_docking import DetectorBench
 from bench_drag import drag_entries
 from bench_entry import REPETITIONS, Entry, compare, each_us
 from bench_fleet import TIMED_TICKS, Hold, cube_of
-from bench_flight import FlightTimes, measure_flight, time_additions
+from bench_flight import FlightTimes, measure_flight, time_additions, time_load
 from bench_ground import ground_entries
 from bench_lateness import lateness_entries
 from command_line import Parser, run_tool
@@ -54,7 +54,7 @@ PERMITTED_DETECTION_US = 20.0
 
 def flight_entries() -> list[Entry]:
     """Lockstep speed, durations of a tick, and where the time goes."""
-    flights, additions = zip(*((measure_flight(seed), time_additions()) for seed in range(FLIGHTS)), strict=True)
+    flights, additions, loads = zip(*((measure_flight(seed), time_additions(), time_load()) for seed in range(FLIGHTS)), strict=True)
     detailed: FlightTimes = measure_flight(0, detailed=True)
     speed = median(f.speed for f in flights)
     entries = [
@@ -64,6 +64,7 @@ def flight_entries() -> list[Entry]:
         )
     ]  # fmt: skip
     entries.append(Entry("that core meanwhile: ten million additions in plain Python", median(additions), "s"))
+    entries.append(Entry("that core meanwhile: a load out of 8 MB that waits for the one before", median(loads), "ns"))
     for name, ticks_us in (("pipeline.step", flights[0].pipeline_us), ("firmware's whole tick", flights[0].tick_us)):
         for label, q in (("p50", 50.0), ("p99", 99.0), ("p99.9", 99.9)):
             value = float(np.percentile(ticks_us, q))

@@ -15,6 +15,7 @@ from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
+from numba import njit
 
 from firmware_py.app.firmware import compose
 from firmware_py.app.lockstep import Lockstep
@@ -28,6 +29,8 @@ from hil.nodes import Nodes
 from hil.scenario import Scenario, load_scenario
 from hil.signals import TruthRecorder
 
+LINE = 8
+"""Numbers of 8 bytes in a line of the cache."""
 STAGE_METHODS = ("fuse", "step")
 """What a stage of the pipeline does its work in."""
 
@@ -128,8 +131,31 @@ def _shares(watch: Stopwatch, stages: list[str], wall_s: float) -> dict[str, flo
 
 
 def time_additions(count: int = 10_000_000) -> float:
-    """Time that so many additions take in plain Python, s: tells a slow machine from slow code."""
+    """Time that so many additions take in plain Python, s: tells a slow processor from slow code."""
     began, total = perf_counter_ns(), 0
     for i in range(count):
         total += i
     return (perf_counter_ns() - began) * 1e-9
+
+
+def time_load(size: int = 1 << 20, count: int = 1_000_000) -> float:
+    """Time of one load out of 8 MB that waits for the one before, ns: tells a slow cache, such as others use too, from slow code.
+
+    A tick's code and data are more than a core's own cache holds, and fit into the shared one.
+    """
+    lines = np.random.default_rng(0).permutation(size // LINE) * LINE
+    following = np.zeros(size, np.int64)
+    following[lines] = np.roll(lines, -1)
+    _follow(following, 1)
+    began = perf_counter_ns()
+    _follow(following, count)
+    return (perf_counter_ns() - began) / count
+
+
+@njit("int64(int64[::1], int64)")
+def _follow(following, count):
+    """Where a chain of indices is after so many steps."""
+    at = 0
+    for _ in range(count):
+        at = following[at]
+    return at
