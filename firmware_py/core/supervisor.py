@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from firmware_py.core.arming import Question, against_arming, missing
 from firmware_py.core.failsafes import Failsafes, Level
-from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.health import Health
 from firmware_py.core.transitions import ARMED, MODES, ROWS, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Event, Mode, Request
 from firmware_py.description.parameters import Parameters
@@ -209,7 +210,7 @@ class Supervisor:
         self._failsafes.take_over([other._failsafes for other in before])
 
     def _estop_age_ms(self, health: Health) -> float:
-        return 1e3 * NEVER_S if self._estop_ns is None else (health.time_ns - self._estop_ns) * 1e-6
+        return math.inf if self._estop_ns is None else (health.time_ns - self._estop_ns) * 1e-6
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))
