@@ -107,16 +107,16 @@ def run(
 @contextmanager
 def _told_where_the_log_is(folder: Path) -> Iterator[None]:
     """Says what is left of a run that is interrupted."""
-    log, before = folder / CAN_LOG, written_at(folder / CAN_LOG)
+    log, before = folder / CAN_LOG, _written_at(folder / CAN_LOG)
     try:
         yield
     except KeyboardInterrupt:
-        left = f"the log up to then is in {folder}" if written_at(log) != before else "nothing was flown"
+        left = f"the log up to then is in {folder}" if _written_at(log) != before else "nothing was flown"
         print(f"modcube: interrupted; {left}", file=sys.stderr)
         raise
 
 
-def written_at(path: Path) -> int | None:
+def _written_at(path: Path) -> int | None:
     """When a file was written last, ns; None where there is none."""
     return path.stat().st_mtime_ns if path.exists() else None
 

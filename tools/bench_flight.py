@@ -139,7 +139,7 @@ def time_additions(count: int = 10_000_000) -> float:
 
 
 def time_load(size: int = 1 << 20, count: int = 1_000_000) -> float:
-    """Time of one load out of 8 MB that waits for the one before, ns: tells a slow cache, such as others use too, from slow code.
+    """Time of one load out of `size` numbers (8 MB) that waits for the one before, ns: tells a slow cache from slow code.
 
     A tick's code and data are more than a core's own cache holds, and fit into the shared one.
     """
@@ -152,7 +152,7 @@ def time_load(size: int = 1 << 20, count: int = 1_000_000) -> float:
     return (perf_counter_ns() - began) / count
 
 
-@njit("int64(int64[::1], int64)")
+@njit("int64(int64[::1], int64)", cache=True)
 def _follow(following, count):
     """Where a chain of indices is after so many steps."""
     at = 0

@@ -18,6 +18,7 @@ from firmware_py.app.lockstep import Observer
 from firmware_py.core.transitions import State
 from firmware_py.core.types import WARNING, Action, Event, Inputs, Outputs
 from firmware_py.description.schema import DescriptionError
+from firmware_py.ground.files import write_atomically
 from firmware_py.runtime.recorder import Recorder
 
 NOTE = "estop.txt"
@@ -47,7 +48,7 @@ def write_note(folder: Path, stands: bool) -> None:
             file.truncate(len(data))
             os.fsync(file.fileno())
     except OSError:  # there is none, it is somebody else's, or this disk has no room to write over it
-        _make(path, data)
+        write_atomically(path, data)
 
 
 def clear(folder: Path) -> bool:
@@ -57,26 +58,6 @@ def clear(folder: Path) -> bool:
     stood = estop_stands(folder)
     write_note(folder, False)
     return stood
-
-
-def _make(path: Path, data: bytes) -> None:
-    """Whole or not at all; its folder too, which somebody may have removed."""
-    fresh = path.with_name(path.name + ".new")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with fresh.open("wb", buffering=0) as file:
-            file.write(data)
-            os.fsync(file.fileno())
-        os.replace(fresh, path)
-    except OSError:
-        with suppress(OSError):
-            fresh.unlink()
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 class EstopNote:
@@ -94,7 +75,7 @@ class EstopNote:
         self._queue.put(stands)
 
     def failures(self) -> list[Event]:
-        """A warning for each that could not be written since the call before."""
+        """A warning for one that could not be written, where there is any that was not told of."""
         if self._failed.empty():
             return []
         return [Event(WARNING, f"the next start will not know of an e-stop: {NOTE}: {self._failed.get().strerror}")]

@@ -72,7 +72,7 @@ def test_stop_is_noted_on_a_disk_that_was_full_before_it_came(tmp_path: Path, mo
     flight.note.close()
     flight.note = EstopNote(tmp_path)
     monkeypatch.setattr(GuardedFile, "_append", refuse_room)  # no log takes another byte,
-    monkeypatch.setattr(estop_note, "_make", refuse_room)  # and no file can be made
+    monkeypatch.setattr(estop_note, "write_atomically", refuse_room)  # and no file can be made
     flight._observe = noting_estop(flight.note, False, recorder)
     events = [event.text for event in flight.tick(State.ESTOP).events]
     recorder.close()
@@ -103,7 +103,7 @@ def test_note_that_cannot_be_made_is_said_once_and_the_flight_goes_on(tmp_path: 
 def test_stop_that_a_full_disk_did_not_take_is_noted_as_soon_as_there_is_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estop_note, "AGAIN_S", 0.01)
     tried, room, made = threading.Event(), threading.Event(), threading.Event()
-    make = estop_note._make
+    make = estop_note.write_atomically
 
     def make_where_there_is_room(path: Path, data: bytes) -> None:
         tried.set()
@@ -112,7 +112,7 @@ def test_stop_that_a_full_disk_did_not_take_is_noted_as_soon_as_there_is_room(tm
         make(path, data)
         made.set()
 
-    monkeypatch.setattr(estop_note, "_make", make_where_there_is_room)
+    monkeypatch.setattr(estop_note, "write_atomically", make_where_there_is_room)
     flight = Flight(tmp_path)
     flight.tick(State.ESTOP)
     assert tried.wait(10)
@@ -123,18 +123,18 @@ def test_stop_that_a_full_disk_did_not_take_is_noted_as_soon_as_there_is_room(tm
 
 
 def test_last_chance_of_a_note_is_the_end_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    make = estop_note._make
+    make = estop_note.write_atomically
     refused = threading.Event()
 
     def refuse(*_: object) -> None:
         refused.set()
         refuse_room()
 
-    monkeypatch.setattr(estop_note, "_make", refuse)
+    monkeypatch.setattr(estop_note, "write_atomically", refuse)
     flight = Flight(tmp_path)
     flight.tick(State.ESTOP)
     assert refused.wait(10)
-    monkeypatch.setattr(estop_note, "_make", make)
+    monkeypatch.setattr(estop_note, "write_atomically", make)
     flight.end()
     assert estop_stands(tmp_path)
 
