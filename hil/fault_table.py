@@ -95,6 +95,9 @@ ROWS = (
         "another SYNC producer", "surfaces", _fault("foreign_sync"), ends=_to("SURFACE", *MODES), within_s=0.1,
         says="somebody else sends SYNC",
     ),
+    Row(
+        "another commander of relays", "warns; 20 mm", _fault("foreign_command"), error_m=0.020, says="somebody else commands modules",
+    ),
     Row("e-stop on the bus", "stops, latched", _fault("estop", until_s=AT_S + 1.0), ends=_to("ESTOP", *MODES), within_s=0.02),
     Row(
         "IMU frozen", "holds the place; 30 mm", _fault("imu_frozen"), ends=_to("POSHOLD", *_all_but("SURFACE")), within_s=1.0,

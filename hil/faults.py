@@ -109,7 +109,14 @@ class Faults:
             "jets": lambda fault, mcu: setattr(self._world, "jet_strength", fault.value),
             "push": self._push,
         }
-        self._estop_due_ns = 0
+        self._intruders: dict[str, Callable[[int], list[Frame]]] = {
+            "estop": self._press_estop,
+            "foreign_sync": lambda time_ns: [SYNC],
+            "foreign_command": lambda time_ns: self._command_relays(),
+        }
+        """What each says in a tick; the number that is lower wins the bus."""
+        self._estop_due_ns = self._commands = 0
+        self._dock_command = nodes.codec.message("DOCK_CMD")
         for camera in nodes.cameras:
             camera.change = self._change_tag
 
@@ -147,14 +154,20 @@ class Faults:
     def intruders(self, time_ns: int) -> list[Frame]:
         """Frames of nodes that should not be there, and what the others answer to them."""
         kinds = {f.kind for f in self._on}
-        frames = []
-        if "estop" in kinds and time_ns >= self._estop_due_ns:
-            self._estop_due_ns = time_ns + ESTOP_PERIOD_NS
-            frames.append(ESTOP)
-        if "foreign_sync" in kinds:
-            frames.append(SYNC)
+        frames = [frame for kind, speak in self._intruders.items() if kind in kinds for frame in speak(time_ns)]
         frames += [answer for frame in frames for answer in self._nodes.take(frame, time_ns)]
         return self._from_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
+
+    def _press_estop(self, time_ns: int) -> list[Frame]:
+        if time_ns < self._estop_due_ns:
+            return []
+        self._estop_due_ns = time_ns + ESTOP_PERIOD_NS
+        return [ESTOP]
+
+    def _command_relays(self) -> list[Frame]:
+        """Another controller, which wants every relay off."""
+        self._commands += 1
+        return [self._dock_command.encode(number, [0] * FACES, self._commands & 15) for number in self._nodes.mcus]
 
     # ------------------------------------------------------------ in the plant
 

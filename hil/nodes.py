@@ -237,7 +237,7 @@ class Nodes:
             numbers: number on this bus -> index of the module in the world.
             tick_ns: period of SYNC; 0: the world's.
         """
-        self.world = world
+        self.world, self.codec = world, codec
         tick_ns = tick_ns or world.period_ns
         self.receiver = Receiver(codec)
         self.mcus = {number: Mcu(codec, number, module, world, sensors, tick_ns) for number, module in numbers.items()}

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from firmware_py.app.preparation import prepare, wish_of
-from firmware_py.app.strangers import Strangers
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.mapping import InputCollector, OutputEncoder
 from firmware_py.core.pipeline import Pipeline
@@ -37,7 +36,6 @@ class Firmware:
     vehicles: Sequence[Vehicle]
     """By fleet index."""
     worker: Worker
-    strangers: Strangers = field(default_factory=Strangers)
 
     def sync(self, tick: int, time_ns: int) -> list[BusFrame]:
         """The SYNC frames that start tick `tick` on each bus."""
@@ -62,7 +60,6 @@ class Firmware:
         """Steps the fleet; what it wants prepared goes to the worker, what the worker has done enters `inputs`."""
         inputs.prepared = self.worker.results()
         outputs = self.pipeline.step(inputs)
-        outputs.events += self.strangers.events(self.collector.faults["foreign_command"], inputs.time_ns)
         for request in outputs.preparations:
             job = partial(prepare, request, self.pipeline, self.vehicles, self.fleet.pitch_m)
             self.worker.submit(job, wish_of(request, self.pipeline.bodies), first=isinstance(request, PartRequest))

@@ -50,7 +50,7 @@ class InputCollector:
         self._sync_ns: list[int | None] = [None] * REMEMBERED_TICKS
         self._halves: dict[tuple[int, float], tuple[Row, int]] = {}
         self._collections = 0
-        self._estop = False
+        self._estop = self._foreign_command = False
         kinds = ("module", "tag_unpaired", "tag_stale", "tag_future", "sensor", "foreign_sync", "foreign_command")
         self.faults: dict[str, int] = dict.fromkeys(kinds, 0)
         self.heartbeats: dict[tuple[int, int], int] = {}
@@ -107,9 +107,10 @@ class InputCollector:
                 module.tags = [tag for tag in module.tags if self._is_timely(tag, time_ns)]
         self._expire_halves()
         estop, self._estop = self._estop, False
+        foreign_command, self._foreign_command = self._foreign_command, False
         dropped = sum([receiver.dropped_in_all for receiver in self._receivers])
-        foreign = self.faults["foreign_sync"] > 0
-        return Inputs(tick, time_ns, modules, list(requests), estop, dropped, foreign)
+        foreign_sync = self.faults["foreign_sync"] > 0
+        return Inputs(tick, time_ns, modules, list(requests), estop, dropped, foreign_sync, foreign_command)
 
     def _make_handlers(self) -> dict[str, Callable[[int, ModuleInputs, Row], None]]:
         handlers: dict[str, Callable[[int, ModuleInputs, Row], None]] = {
@@ -133,8 +134,11 @@ class InputCollector:
             self._estop = True
         elif name == "HEARTBEAT":
             self.heartbeats[bus, int(row[NUMBER])] = int(row[VALUES])
+        elif name == "SYNC":
+            self.faults["foreign_sync"] += 1
         else:
-            self.faults["foreign_sync" if name == "SYNC" else "foreign_command"] += 1
+            self._foreign_command = True
+            self.faults["foreign_command"] += 1
 
     def _take_gyro(self, index: int, module: ModuleInputs, row: Row) -> None:
         if self._is_usable(row[VALUES + 3]):

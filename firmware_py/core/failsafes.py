@@ -64,6 +64,7 @@ TABLE = (
     Row("leak", "water in a cabin", attrgetter("leak")),
     Row("bus_silent", "bus silent for {:.1f} s", attrgetter("bus_silent_s")),
     Row("foreign_sync", "somebody else sends SYNC", attrgetter("foreign_sync")),
+    Row("foreign_command", "somebody else commands modules", attrgetter("foreign_command")),
     Row("battery_critical", "battery critical: {:.0%} of its voltage", attrgetter("voltage_share"), below=True),
     Row("cabin_hot", "cabin at {:.0f} degC", attrgetter("cabin_c")),
     Row("cabin_pressure", "cabin pressure off by {:.0f} Pa", attrgetter("cabin_change_pa")),

@@ -28,6 +28,8 @@ MEAN_S = 1.0
 """Time over which rates and shares are averaged."""
 DRY_NS = 3_000_000_000
 """A cabin that was wet in two readings running is dry when its sensor has been for so long: water in it moves. ArduSub waits as long."""
+FOREIGN_NS = 1_000_000_000
+"""So long a command of somebody else is remembered: one that sends as slowly as once a second is one stranger."""
 VOLTAGE_SHARE = 0.2
 """Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
 
@@ -71,6 +73,8 @@ class Health(NamedTuple):
     frame_errors_per_s: float
     missed_ticks_per_s: float
     foreign_sync: bool
+    foreign_command: bool
+    """Somebody else commanded modules in the last second."""
     ground_age_s: float
     """NaN before a ground station was heard."""
     pilot_age_s: float
@@ -116,6 +120,7 @@ class HealthMonitor:
         self._cabin_start_pa: dict[int, float] = {}
         self._cabin_change_pa: dict[int, float] = {}
         self._readings = (self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa)
+        self._foreign_ns = NEVER_NS
         self._depth_ns = self._imu_ns = 0
         self._depth_heard = False
         self._ground_ns: int | None = None
@@ -156,6 +161,7 @@ class HealthMonitor:
                     self._esc_ns[thruster] = other._esc_ns[other._thruster_at[j][channel]]
         self._depth_ns, self._imu_ns = max(other._depth_ns for other in before), max(other._imu_ns for other in before)
         self._depth_heard = any(other._depth_heard for other in before)
+        self._foreign_ns = max(other._foreign_ns for other in before)
         self._time_ns = max((other._time_ns for other in before if other._time_ns is not None), default=None)
         self._ground_ns = max((other._ground_ns for other in before if other._ground_ns is not None), default=None)
         self._pilot_ns = max((other._pilot_ns for other in before if other._pilot_ns is not None), default=None)
@@ -172,6 +178,8 @@ class HealthMonitor:
         self._listen([inputs.modules[m] for m in self._modules], now)
         if self.imu_heard:
             self._imu_ns = now
+        if inputs.foreign_command:
+            self._foreign_ns = now
         self._people(requests, now)
         self._rates(inputs, estimate, dt_s)
         self._time_ns = now
@@ -197,6 +205,7 @@ class HealthMonitor:
             frame_errors_per_s=self._error_rate,
             missed_ticks_per_s=self._missed_rate,
             foreign_sync=inputs.foreign_sync,
+            foreign_command=now - self._foreign_ns <= FOREIGN_NS,
             ground_age_s=_age_s(self._ground_ns, now, math.nan),
             pilot_age_s=_age_s(self._pilot_ns, now, math.nan),
             stick=self._stick,

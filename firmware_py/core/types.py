@@ -189,7 +189,9 @@ class Inputs:
     dropped_frames: int = 0
     """Frames dropped by the codec so far, all kinds."""
     foreign_sync: bool = False
-    """Somebody else sends SYNC on one of our buses."""
+    """Somebody else sends SYNC on one of our buses, or did."""
+    foreign_command: bool = False
+    """A THRUSTER_CMD or DOCK_CMD of somebody else came since the previous tick."""
     prepared: list[Any] = field(default_factory=list)
     """Results of the worker: docking.Prepared."""
 

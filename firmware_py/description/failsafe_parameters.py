@@ -33,6 +33,10 @@ class Failsafes:
     foreign_sync_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_SYNC_S")
     foreign_sync_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_SYNC_ACT")
     foreign_sync_latched: int = quantity(1, low=0, high=1, help=LATCHED, mavlink="FS_SYNC_LAT")
+    # somebody else sends THRUSTER_CMD or DOCK_CMD
+    foreign_command_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_CMD_S")
+    foreign_command_action: int = quantity(1, low=0, high=5, help=ACTION, mavlink="FS_CMD_ACT")
+    foreign_command_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_CMD_LAT")
     # battery nearly empty
     battery_critical_limit: float = quantity(
         0.8, low=0.3, high=1.2, help="voltage below this share of the nominal one", mavlink="FS_BATC_LIM"

@@ -52,6 +52,7 @@ TAKES: Mapping[str, Takes] = {
     "babble": Takes(1.0, LARGEST, whole=True, one_module=False, directions=("both", "from_plant")),
     "estop": OF_ALL,
     "foreign_sync": OF_ALL,
+    "foreign_command": OF_ALL,
     "imu_frozen": Takes(),
     "tag_flip": Takes(0.0, 1.0, idle=0.0),
     "tag_jump": ANY_SIZE,

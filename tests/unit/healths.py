@@ -26,6 +26,7 @@ GOOD = Health(
     frame_errors_per_s=0.0,
     missed_ticks_per_s=0.0,
     foreign_sync=False,
+    foreign_command=False,
     ground_age_s=math.nan,
     pilot_age_s=0.1,
     stick=0.0,

@@ -17,7 +17,8 @@ ROWS = {row.name: row for row in TABLE}
 POSE_MODES = {Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK}
 
 FIELDS: dict[str, str] = {
-    "leak": "leak", "bus_silent": "bus_silent_s", "foreign_sync": "foreign_sync", "battery_critical": "voltage_share",
+    "leak": "leak", "bus_silent": "bus_silent_s", "foreign_sync": "foreign_sync",
+    "foreign_command": "foreign_command", "battery_critical": "voltage_share",
     "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
     "tag_gone": "tag_age_s", "partner_lost": "topology", "estimator": "nis_ratio", "rejected": "rejected_share",
     "tag_lost": "tag_age_s", "tag_late": "tag_age_s", "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
@@ -25,7 +26,9 @@ FIELDS: dict[str, str] = {
     "thruster_lost": "dead", "battery_low": "voltage_share",
 }  # fmt: skip
 """Which figure of Health each fail-safe judges; depth_unknown needs two."""
-YES: dict[str, Any] = {"leak": True, "foreign_sync": True, "axis_lost": 1, "partner_lost": "0 and 1", "thruster_lost": (3,)}
+YES: dict[str, Any] = {
+    "leak": True, "foreign_sync": True, "foreign_command": True, "axis_lost": 1, "partner_lost": "0 and 1", "thruster_lost": (3,),
+}  # fmt: skip
 
 
 def spoilt(name: str, value: float) -> Health:
@@ -222,6 +225,7 @@ WORDS = {
     "leak": "water in a cabin",
     "bus_silent": "bus silent for 2.0 s",
     "foreign_sync": "somebody else sends SYNC",
+    "foreign_command": "somebody else commands modules",
     "battery_critical": "battery critical: 80% of its voltage",
     "cabin_hot": "cabin at 70 degC",
     "cabin_pressure": "cabin pressure off by 20000 Pa",

@@ -30,6 +30,7 @@ class Ear:
         self.tick = 0
         self.time_ns = 0
         self.dropped = 0
+        self.foreign_command = False
 
     def hear(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: object) -> Health:
         self.tick += 1
@@ -40,7 +41,7 @@ class Ear:
             np.full(3, 0.002), 30_000_000, 6.0, 6, 0, True,
         )  # fmt: skip
         estimate = estimate._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
-        inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped)
+        inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, foreign_command=self.foreign_command)
         return self.monitor.step(inputs, estimate, list(requests), ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6)))
 
     def wait(self, seconds: float, **more: object) -> Health:
@@ -264,3 +265,21 @@ def test_robot_that_stands_by_gravity_alone_is_nowhere_but_ready() -> None:
     health = Ear().hear(tag_age_ns=1 << 60)  # type: ignore[arg-type]
     assert health.ready and not health.placed and math.isnan(health.outside_m)
     assert Ear().hear().placed and not Ear().hear(ready=False).placed  # type: ignore[arg-type]
+
+
+def test_command_of_somebody_else_is_remembered_for_a_second() -> None:
+    ear = Ear()
+    assert not ear.hear().foreign_command
+    ear.foreign_command = True
+    assert ear.hear().foreign_command
+    ear.foreign_command = False
+    assert [ear.hear().foreign_command for _ in range(101)] == [True] * 100 + [False]
+
+
+def test_joined_body_remembers_a_command_that_one_of_its_parts_heard() -> None:
+    one, other, both = Ear(), Ear(), Ear()
+    other.foreign_command = True
+    for ear in (one, other):
+        ear.hear()
+    both.monitor.take_over([one.monitor, other.monitor])
+    assert both.hear().foreign_command

@@ -317,12 +317,16 @@ def test_estop_of_anybody_in_any_length_enters_the_tick(frame):
     assert robot.tick(0).estop
 
 
-def test_other_controllers_on_the_bus_are_counted():
+def test_other_controllers_on_the_bus_are_counted_and_enter_the_tick():
     robot = Robot()
+    assert not robot.tick(0).foreign_command
     robot.say("SYNC", (5,), number=0)
     robot.say("THRUSTER_CMD_A", (0, 0, 0, 0, 1))
     robot.say("DOCK_CMD", (0,) * 6)
     assert robot.faults == {"foreign_sync": 1, "foreign_command": 2}
+    here, gone = robot.tick(1), robot.tick(2)
+    assert (here.foreign_sync, here.foreign_command) == (True, True)
+    assert (gone.foreign_sync, gone.foreign_command) == (True, False)
 
 
 def test_module_that_is_not_in_the_fleet_changes_nothing():

@@ -350,6 +350,15 @@ def test_every_node_answers_a_foreign_sync_too() -> None:
     assert ticks == [n for tick in range(100, 120) for n in (tick, 0)]
 
 
+def test_another_controller_switches_the_relays_off() -> None:
+    nodes = nodes_with(Fault(kind="foreign_command", at_s=0.1))
+    nodes.world.set_relays(0, [1] * 6)
+    commands = [frame for frame in fly(nodes, 20) if frame.id >> 5 == CODEC.message("DOCK_CMD").function]
+    assert len(commands) == 11
+    assert all(not isinstance(received, str) for received in Receiver(CODEC).judge(commands))
+    assert nodes.world.docks.relays[0].tolist() == [0] * 6
+
+
 def test_box_and_second_leader_speak_in_an_order_that_depends_on_nothing() -> None:
     """The number that is lower wins the bus."""
     for kinds in (("estop", "foreign_sync"), ("foreign_sync", "estop")):

@@ -26,6 +26,8 @@ from hil.script import Script
 
 FOLDER = Path(load_scenario.__code__.co_filename).parent / "scenarios"
 Load = Callable[..., Scenario]
+WHOLE_BUS = ("estop", "foreign_sync", "foreign_command", "process_killed")
+"""Faults that are of no module."""
 DOCK_STEP = '[[step]]\ndo = "dock"\nmodule = 2\nface = "-x"\ntarget_module = 1\ntarget_face = "+x"\n'
 SECOND = '[[module]]              # the active one, on the right\nnumber = 2\nvehicle = "modcube"\nposition_m = [0.40, 0.0, 0.38]\n'
 
@@ -101,7 +103,7 @@ def load(tmp_path: Path) -> Load:
             ('"tag_absent"\nvalue = 0.5', "value: 0.5 is not for tag_absent, which takes none"),
             ('"thruster_dead"\nvalue = 0.5', "value: 0.5 is not for thruster_dead, which takes none"),
             ('"babble"\nvalue = 5.0\nmodule = 1', "module: babble is not of one module, as of 1; leave it out"),
-            *((f'"{kind}"\nmodule = 1', f"module: {kind} is not of one module") for kind in ("estop", "foreign_sync", "process_killed")),
+            *((f'"{kind}"\nmodule = 1', f"module: {kind} is not of one module") for kind in WHOLE_BUS),
         )),
         ("dock", "", '[[fault]]\nkind = "jets"\nvalue = 0.5\nmodule = 1', "fault[0].module: jets is not of one module, as of 1"),
         ("hover", "", '[[step]]\ndo = "wait"', "step[0]: a task of the kind hover runs no steps"),
