@@ -15,6 +15,8 @@ from command_line import run_tool
 CLIENTS = Path(".venv-clients/.stamp")
 """There once every client is installed."""
 PYTEST = [sys.executable, "-m", "pytest"]
+ALL = [*PYTEST, "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
+"""A file's fixtures are set up in one process; the files with the long flights come first."""
 VCAN = [*PYTEST, "--capture=no", "-rs", "-m", "vcan", "tests/vcan"]
 
 
@@ -40,7 +42,7 @@ def main() -> int:
         if not CLIENTS.exists():
             left_out["clients"] = f"{CLIENTS.parent} is not complete (make setup-clients)"
         markers = " and ".join(f"not {marker}" for marker in sorted({"vcan", *left_out}))
-        status = subprocess.run([*PYTEST, "-n", "2", "--dist", "loadgroup", "-m", markers]).returncode
+        status = subprocess.run([*ALL, "-m", markers]).returncode
         if beside is not None:
             print("tests marked vcan, in the virtual machine:", flush=True)
             status = max(status, beside.wait())

@@ -9,7 +9,7 @@ import pytest
 from tests.clients.bench_process import CLIENT_PYTHON, ROOT, flying_bench, free_port
 from tests.figures import figure
 
-pytestmark = [pytest.mark.clients, pytest.mark.slow, pytest.mark.xdist_group("mavsdk")]  # one session, in one process
+pytestmark = [pytest.mark.clients, pytest.mark.slow]
 
 SESSION_S = 420
 MISSION_RMSE_MM = 10.0

@@ -96,7 +96,6 @@ def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("campaign")
 def test_campaign_killed_with_all_its_processes_goes_on_to_the_same_bytes(whole: list[bytes], scenario: Path, tmp_path: Path) -> None:
     process = campaign(scenario, tmp_path, "--jobs", "1")
     wait_for(tmp_path, 2, process)
@@ -108,7 +107,6 @@ def test_campaign_killed_with_all_its_processes_goes_on_to_the_same_bytes(whole:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("campaign")
 def test_dask_cluster_that_loses_a_worker_gives_the_same_table_as_this_machine(whole: list[bytes], scenario: Path, tmp_path: Path) -> None:
     remote = tmp_path / "remote"
     with cluster(tmp_path) as (address, (worker, _, _)):
@@ -120,7 +118,6 @@ def test_dask_cluster_that_loses_a_worker_gives_the_same_table_as_this_machine(w
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("campaign")
 def test_lost_scheduler_is_said_in_one_line_and_the_campaign_goes_on_elsewhere(whole: list[bytes], scenario: Path, tmp_path: Path) -> None:
     remote, said = tmp_path / "remote", tmp_path / "said"
     with cluster(tmp_path) as (address, (_, _, scheduler)), said.open("wb") as errors:
@@ -147,7 +144,6 @@ def fly(scenario, parameters, seed, bus, code):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("campaign")
 def test_seed_that_kills_its_process_costs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "deadly.py").write_text(DEADLY)
     monkeypatch.syspath_prepend(tmp_path)

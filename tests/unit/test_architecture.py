@@ -76,13 +76,6 @@ def test_import_contracts_are_kept() -> None:
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_tests_are_found_by_a_pytest_without_xdist_too() -> None:
-    grouped = "tests/closed_loop/test_campaign_workers.py"
-    words = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-p", "no:cacheprovider", "--collect-only", "-q", grouped]
-    result = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
-    assert result.returncode == 0, result.stdout + result.stderr
-
-
 def test_no_contract_has_ignores() -> None:
     assert "ignore_imports" not in (ROOT / "pyproject.toml").read_text()
 
