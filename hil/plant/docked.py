@@ -14,7 +14,7 @@ from hil.plant.build import fill_body, make_bodies, make_modules, seat_thrusters
 from hil.plant.contact import touch
 from hil.plant.docking import DISK_M, Docks, Joint, joints_between
 from hil.plant.draw import ModuleDraw
-from hil.plant.joining import centre_of, force_needed, motion_of, pieces, seats_after_join
+from hil.plant.joining import Hanging, centre_of, force_needed, hanging, motion_of, pieces, seats_after_join
 from hil.plant.lattice import QUATERNIONS, Place, nearest
 from hil.plant.spec import WorldSpec
 from hil.plant.thrusters import Thrusters
@@ -39,6 +39,8 @@ class DockedBodies(ABC):
     _held: set[int]
     """A module of each body that a load cell holds."""
     _stage: np.ndarray
+    _hanging: dict[Joint, Hanging | None]
+    """By joint, once it was asked for and as long as no other opens or closes; None: other joints hold as well."""
     _hands: np.ndarray
     """(m, 6) what jets and hands do to each module, about O of its body, body frame."""
 
@@ -61,6 +63,7 @@ class DockedBodies(ABC):
         self._external = np.zeros((len(self.bodies), 6))
         self._hands = np.zeros((len(self.vehicles), 6))
         self._thrust = np.zeros((len(self.bodies), 6))
+        self._hanging = {}
 
     def join(self, joint: Joint) -> None:
         """Makes one body of the two that `joint` links, and closes whatever else then meets. Momentum stays as it is, unless clamped."""
@@ -97,6 +100,7 @@ class DockedBodies(ABC):
         """Opens a joint; what no other joint holds becomes a body of its own, moving as it did."""
         b = int(self._modules.body[joint.module])
         self.docks.parted(joint)
+        self._hanging = {}
         parts = pieces(self.bodies[b], self.docks.joints)
         if len(parts) == 1:
             return
@@ -130,21 +134,28 @@ class DockedBodies(ABC):
 
         A moment that bends the joint counts as a force at the disk's rim; one about the face's normal is borne by the pins.
         """
-        b = int(self._modules.body[joint.module])
-        parts = pieces(self.bodies[b], [j for j in self.docks.joints if j != joint])
-        if len(parts) == 1:
+        if joint not in self._hanging:
+            self._hanging[joint] = self._find_hanging(joint)
+        far = self._hanging[joint]
+        if far is None:
             return 0.0
-        far = next(piece for piece in parts if joint.other in piece)
-        need = force_needed(
-            self._draws, self._modules, far, self._body_arrays.state[b], self._stage[5, b], self.spec.gravity
-        )
-        for t in np.flatnonzero(np.isin(self._thrusters.module, far)):
-            need -= self._thrusters.column[t] * self._thrusters.force[t]
-        need -= self._hands[list(far)].sum(axis=0) + self._touch_on(far)[b]
+        b = int(self._modules.body[joint.module])
+        need = force_needed(far, self._body_arrays.state[b], self._stage[5, b])
+        for m in far.members:
+            pushing = slice(*np.searchsorted(self._thrusters.module, (m, m + 1)))
+            need -= self._thrusters.force[pushing] @ self._thrusters.column[pushing] + self._hands[m]
+        need -= self._touch_on(far.members)[b]
         outward = self._modules.turn[joint.module] @ FACE_NORMALS[joint.face]
         at = self._modules.position[joint.module] + 0.5 * self._modules.size[joint.module, joint.face // 2] * outward
-        bending = np.cross(outward, need[3:] - np.cross(at, need[:3]))
+        bending = rotations.cross(outward, need[3:] - rotations.cross(at, need[:3]))
         return float(-outward @ need[:3] + np.linalg.norm(bending) / DISK_M)
+
+    def _find_hanging(self, joint: Joint) -> Hanging | None:
+        """What hangs on `joint` alone, on its other side; None where other joints hold that too."""
+        parts = pieces(self.bodies[int(self._modules.body[joint.module])], [j for j in self.docks.joints if j != joint])
+        if len(parts) == 1:
+            return None
+        return hanging(self._draws, self._modules, next(piece for piece in parts if joint.other in piece), self.spec.gravity)
 
     def _touch_on(self, members: Sequence[int]) -> np.ndarray:
         """(b, 6) what walls and other bodies do to these modules of one body, in that body's row, body frame."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,24 +74,40 @@ def centre_of(bodies: Bodies, b: int) -> np.ndarray:
     return np.array([rigid[5, 1], rigid[3, 2], rigid[4, 0]]) / rigid[0, 0]
 
 
-def force_needed(
-    draws: Sequence[ModuleDraw], modules: Modules, members: Sequence[int], x: np.ndarray, rate: np.ndarray, gravity: float
-) -> np.ndarray:
+class Hanging(NamedTuple):
+    """What of a body hangs on one joint alone: some of its modules, and what they weigh. Body frame, about O."""
+
+    members: tuple[int, ...]
+    mass: np.ndarray
+    """(6, 6) rigid and added."""
+    weight_n: float
+    """In water."""
+    weight_at: np.ndarray
+    """(3,) N m: its moment is that of `weight_at` and the direction down."""
+
+
+def hanging(draws: Sequence[ModuleDraw], modules: Modules, members: Sequence[int], gravity: float) -> Hanging:
+    """These modules of a body."""
+    mass, weight_n, weight_at = np.zeros((6, 6)), 0.0, np.zeros(3)
+    for m in members:
+        d, r, turn = draws[m], modules.position[m], modules.turn[m]
+        mass += carried(d.rigid + np.diag(d.added), r, turn)
+        w = d.mass * gravity
+        weight_n += w - d.buoyancy_n
+        weight_at += w * (r + turn @ d.com) - d.buoyancy_n * (r + turn @ d.buoyancy_at)
+    return Hanging(tuple(members), mass, weight_n, weight_at)
+
+
+def force_needed(part: Hanging, x: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """(6,) wrench about O, body frame, that these modules of a body need besides their weight to move as they do.
 
     x, rate: (13,) state of the body and its derivative. Still water; drag is left out: it is shared by all and small at
     the speeds of docking.
     """
-    mass = np.zeros((6, 6))
     down = rotations.to_matrix(x[3:7].copy())[2]
-    weight = np.zeros(6)
-    for m in members:
-        d, r, turn = draws[m], modules.position[m], modules.turn[m]
-        mass += carried(d.rigid + np.diag(d.added), r, turn)
-        w = d.mass * gravity
-        weight[:3] += (w - d.buoyancy_n) * down
-        weight[3:] += np.cross(w * (r + turn @ d.com) - d.buoyancy_n * (r + turn @ d.buoyancy_at), down)
-    p = mass @ x[7:13]
-    v, omega = x[7:10], x[10:13]
-    gyroscopic = np.concatenate([np.cross(omega, p[:3]), np.cross(omega, p[3:]) + np.cross(v, p[:3])])
-    return np.asarray(mass @ rate[7:13] + gyroscopic - weight)
+    p = part.mass @ x[7:13]
+    v, omega = x[7:10].copy(), x[10:13].copy()
+    need = part.mass @ rate[7:13]
+    need[:3] += rotations.cross(omega, p[:3]) - part.weight_n * down
+    need[3:] += rotations.cross(omega, p[3:]) + rotations.cross(v, p[:3]) - rotations.cross(part.weight_at, down)
+    return np.asarray(need)
