@@ -16,7 +16,7 @@ from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
 from hil.bench import open_bench
-from hil.scenario import Scenario, load_scenario
+from hil.scenario import Scenario
 from tests.closed_loop.flights import shortened
 
 UDP = f"udp:239.74.163.4:{40_000 + os.getpid() % 20_000}"
@@ -48,14 +48,8 @@ def sent(logs: dict[str, bytes]) -> list[bytes]:
 
 
 @pytest.mark.slow
-def test_short_spiral_over_udp_is_the_spiral_over_virtual_byte_for_byte(tmp_path: Path) -> None:
-    scenario = shortened("spiral", duration_s=5.0, settle_s=2.0)
-    assert fly(scenario, UDP, tmp_path / "udp") == fly(scenario, f"virtual:{tmp_path.name}", tmp_path / "virtual")
-
-
-@pytest.mark.slow
-def test_whole_spiral_over_udp_is_the_spiral_over_virtual_byte_for_byte(tmp_path: Path) -> None:
-    scenario = load_scenario("spiral")
+def test_spiral_over_udp_is_the_spiral_over_virtual_byte_for_byte(tmp_path: Path) -> None:
+    scenario = shortened("spiral", duration_s=12.0, settle_s=3.0)
     assert fly(scenario, UDP, tmp_path / "udp") == fly(scenario, f"virtual:{tmp_path.name}", tmp_path / "virtual")
 
 
