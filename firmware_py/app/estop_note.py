@@ -6,6 +6,7 @@ It has one length whatever it says: a disk that is full has no room for more, bu
 
 from __future__ import annotations
 
+import fcntl
 import os
 import threading
 from collections.abc import Sequence
@@ -52,19 +53,35 @@ def write_note(folder: Path, stands: bool) -> None:
 
 
 def clear(folder: Path) -> bool:
-    """Notes in `folder` that no e-stop stands, for a person; returns whether one did. Raises DescriptionError and OSError."""
+    """Notes in `folder` that no e-stop stands, for a person; returns whether one did. Raises DescriptionError and OSError.
+
+    Refused while a vehicle runs there: its own e-stop would stand on.
+    """
     if not (folder / NOTE).exists():
         raise DescriptionError(f"{folder} holds no {NOTE}: no vehicle has logged there; give the folder of modcube run --out")
-    stood = estop_stands(folder)
-    write_note(folder, False)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        stood = estop_stands(folder)
+        write_note(folder, False)
+    except BlockingIOError:
+        raise DescriptionError(f"a vehicle that runs logs into {folder}: end it first, or send it CLEAR_ESTOP") from None
+    finally:
+        os.close(handle)
     return stood
 
 
 class EstopNote:
-    """Writes the note by a thread of its own: no tick waits for a disk. To be made before this process takes its real-time priority."""
+    """Writes the note by a thread of its own: no tick waits for a disk. To be made before this process takes its real-time priority.
+    Until `close`, nobody else clears it.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._handle: int | None = None
+        with suppress(OSError):  # a folder that cannot be opened is said by the first note that it does not take
+            self._handle = os.open(folder, os.O_RDONLY)
+            fcntl.flock(self._handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
         self._queue: SimpleQueue[bool | None] = SimpleQueue()
         self._failed: SimpleQueue[OSError] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="e-stop note", daemon=True)
@@ -84,6 +101,9 @@ class EstopNote:
         """Writes what waits, for CLOSE_S at the most; a second time does nothing."""
         self._queue.put(None)
         self._thread.join(CLOSE_S)
+        if self._handle is not None:
+            os.close(self._handle)
+            self._handle = None
 
     def _run(self) -> None:
         waiting: bool | None = None

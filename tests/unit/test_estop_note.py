@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from firmware_py.app import estop_note
-from firmware_py.app.estop_note import CLEAR, NOTE, STANDS, EstopNote, estop_stands, noting_estop, write_note
+from firmware_py.app.estop_note import CLEAR, NOTE, STANDS, EstopNote, clear, estop_stands, noting_estop, write_note
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Event, Inputs, Outputs
+from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime.guarded_file import GuardedFile
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
 from tests.unit.ground_world import Robot
@@ -171,6 +172,17 @@ def test_each_stop_is_noted_for_a_person_may_have_cleared_the_one_before_by_hand
     for state in (State.DISARMED, State.DISARMED, State.ESTOP, State.ESTOP, State.DISARMED, State.ESTOP):
         flight.tick(state)
     assert written == [True, True, True]
+
+
+def test_nobody_clears_a_stop_by_hand_while_vehicles_run(tmp_path: Path) -> None:
+    """Two may log into one folder."""
+    write_note(tmp_path, True)
+    notes = [EstopNote(tmp_path), EstopNote(tmp_path)]
+    for note in notes:
+        with pytest.raises(DescriptionError, match="end it first, or send it CLEAR_ESTOP"):
+            clear(tmp_path)
+        note.close()
+    assert clear(tmp_path) and not estop_stands(tmp_path)
 
 
 @pytest.mark.parametrize(("text", "stands"), [(STANDS, True), (CLEAR, False), (b"", True), (b"\x00" * 7, True), (b"clear", True)])
