@@ -1,7 +1,8 @@
 """Run every test that this machine can run; name what was left out, and why, in the last lines.
 
 Arguments: the Debian packages that the tests marked `vcan` need. Those run in a virtual machine, beside all others and beside the setup
-of the clients. The exit status is pytest's, the worse of both.
+of the clients; beside that, too, numba compiles what is not compiled yet, so that not both of pytest's processes do. The exit status is
+pytest's, the worse of both.
 """
 
 import os
@@ -17,6 +18,8 @@ CLIENTS = Path(".venv-clients/.stamp")
 PYTEST = [sys.executable, "-m", "pytest"]
 ALL = [*PYTEST, "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
 """A file's fixtures are set up in one process; the files with the long flights come first."""
+COMPILE = [sys.executable, "-c", "import hil.batch, hil.cli"]
+"""Nearly everything that numba compiles is compiled when it is imported."""
 VCAN = [*PYTEST, "--capture=no", "-rs", "-m", "vcan", "tests/vcan"]
 
 
@@ -38,7 +41,8 @@ def main() -> int:
         left_out["vcan"] = f"missing Debian packages: {' '.join(missing)} (make setup-system)"
     with tempfile.TemporaryFile("w+") as report:
         beside = None if missing else subprocess.Popen(VCAN, stdout=report, stderr=subprocess.STDOUT)
-        subprocess.run([os.environ.get("MAKE", "make"), "--no-print-directory", "setup-clients"])
+        with subprocess.Popen(COMPILE, stdout=subprocess.DEVNULL):
+            subprocess.run([os.environ.get("MAKE", "make"), "--no-print-directory", "setup-clients"])
         if not CLIENTS.exists():
             left_out["clients"] = f"{CLIENTS.parent} is not complete (make setup-clients)"
         markers = " and ".join(f"not {marker}" for marker in sorted({"vcan", *left_out}))

@@ -11,7 +11,7 @@ FOLDER = str(Path(__file__).parent)
 # Plug-ins cost seconds of import in the guest.
 WITHOUT = [f"-pno:{name}" for name in ("cacheprovider", "hypothesispytest", "xdist", "xdist.looponfail")]
 PYTEST = [sys.executable, "-m", "pytest", FOLDER, *WITHOUT]
-TIMEOUT_S = 10_800 if FULL_LENGTH in os.environ else 1200
+TIMEOUT_S = 10_800 if FULL_LENGTH in os.environ else 2400
 
 
 def test_everything_on_real_socketcan_passes_in_the_guest(guest: Guest) -> None:
