@@ -1,4 +1,4 @@
-"""For tools/accept.py: the figures of flights in which something breaks (hil/safety.py, hil/fuzz.py), over all seeds."""
+"""For tools/accept.py: flights in which something breaks (hil/safety.py, hil/fuzz.py, hil/random_operator.py), over all seeds."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,6 +28,7 @@ from firmware_py.prepare.assembly import assemble_vehicle
 from hil.bench import fly_scenario
 from hil.flight import fly_and_judge
 from hil.fuzz import fuzz_flight
+from hil.random_operator import fly_with_random_operator
 from hil.safety import (
     ICM_20602,
     Imu,
@@ -40,9 +42,11 @@ from hil.safety import (
 from hil.scenario import load_scenario
 from hil.workers import processes
 
-HEALTHY, SHAKEN, STOPPED, BLIND, LOSSY = range(100), range(40), range(1000), range(50), range(5)
+HEALTHY, SHAKEN, STOPPED, BLIND, LOSSY, OPERATED = range(100), range(40), range(1000), range(50), range(5), range(200)
 """Seeds, as the issue counts them; of lossy spirals as many as take a minute."""
 FUZZED_FRAMES = 1_000_000
+OPERATED_S = 30.0
+"""Length of each flight with a random operator."""
 LOGGED_S = 600.0
 """Length of the log that is replayed."""
 MOST_SIGMAS, SQUARES = 4.0, (0.5, 2.0)
@@ -106,6 +110,13 @@ def stopped(folder: Path) -> Values:
     """E-stops at random ticks."""
     flights = _all(fly_to_estop, STOPPED)
     return {"violations": sum(f.violations for f in flights), "armed": sum(f.was_armed for f in flights)}
+
+
+def operated(folder: Path) -> Values:
+    """Flights whose operator asks for anything while anything breaks."""
+    flights = _all(functools.partial(fly_with_random_operator, duration_s=OPERATED_S), OPERATED)
+    modes = sum((flight.modes for flight in flights), Counter[str]())
+    return {"broken": sum(flight.broken.total() for flight in flights), "modes": len(modes), "armed": modes.total() / 100.0}
 
 
 def blind(folder: Path, imu: Imu | None = None) -> Values:
@@ -179,6 +190,14 @@ SAFETY: tuple[Group, ...] = (
         (
             Figure("1000 e-stops: ticks after it with a command, or without the frames that say none", "violations", high=0.0),
             Figure("the same: flights that were armed when it came", "armed", low=500.0),
+        ),
+    ),
+    Group(
+        "operator", 7, "make accept ONLY=operator", operated,
+        (
+            Figure("200 flights with a random operator and anything broken: rules broken", "broken", high=0.0),
+            Figure("the same: modes flown", "modes", low=9.0),
+            Figure("the same: time armed, all modules", "armed", low=1000.0, unit="s"),
         ),
     ),
     Group(

@@ -15,7 +15,7 @@ from hil.plant.spec import WorldSpec
 SOURCES = (
     "gusts", "buoyancy", "righting", "trim", "mass", "inertia", "drag", "gain", "deadband", "gyro", "accel", "depth",
     "tag_phase", "tag_noise", "tag_loss", "tag_flip", "power", "rpm", "dock", "contact", "faults",
-    "shape", "jam", "load", "start", "fuzz", "estop", "push",
+    "shape", "jam", "load", "start", "fuzz", "estop", "push", "operator",
 )  # fmt: skip
 """Names of the streams. New ones go to the end: the order is part of what a seed means."""
 

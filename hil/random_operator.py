@@ -1,0 +1,194 @@
+"""Somebody who asks for anything at any time while anything breaks, and the rules that no tick may break whatever is asked.
+
+Requests come as a ground station's do: arms, modes, places, docks, motor tests, parameters, e-stops and their release, in any order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.transitions import ARMED, State
+from firmware_py.core.types import CHANNELS, FACES, Action, BodyRecord, DockRequest, Inputs, Mode, ModuleCommand, Outputs, Request, Sticks
+from firmware_py.description.parameters import Parameters, registry
+from firmware_py.description.vehicle import FACE_NAMES
+from firmware_py.prepare import paths
+from hil.bench import Bench, open_bench
+from hil.fault_table import ROWS
+from hil.plant.draw import stream
+from hil.plant.fault_spec import Fault
+from hil.scenario import load_scenario
+
+SCENARIOS = ("dock", "mobius-2", "hover")
+"""Two bodies that may become one, one of two modules that may be parted, and one alone."""
+ASK_EVERY, STREAM_EVERY = 25, 5
+"""Ticks from one request to the next, and from one look at the sticks and sign of life of the ground station to the next."""
+LEAVES = 0.01
+"""Chance that the ground station falls silent, or is back, each time it would be heard."""
+FACING = (FACE_NAMES.index("-x"), FACE_NAMES.index("+x"))
+"""Faces with which the second module of these scenarios meets the first."""
+MOST_FAULTS = 5
+BREAKS = [row.fault for row in ROWS if row.fault is not None and row.fault.kind != "process_killed"]
+"""What may break: all of the fault matrix but the process itself, which forgets what it was asked."""
+SOON = 2
+"""Ticks within which a request is acted on."""
+
+
+class RandomOperator:
+    """The orders of one flight of a fleet; seeded."""
+
+    def __init__(self, rng: np.random.Generator, modules: int, ticks: int) -> None:
+        self.ticks = ticks
+        self.asked = dict.fromkeys(Action, -math.inf)
+        """Tick in which each action was asked for last."""
+        self._rng, self._modules, self._registry, self._is_there = rng, modules, list(registry()), True
+
+    def is_over(self, time_ns: int) -> bool:
+        """The time is flown to its end."""
+        return False
+
+    def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
+        """What is asked for in the tick after `last`."""
+        if last is None:
+            return []
+        body, tick, asked = int(self._rng.choice([record.body for record in last.records])), last.tick + 1, list[Request]()
+        if tick % STREAM_EVERY == 0:
+            self._is_there ^= self._rng.random() < LEAVES
+            if self._is_there:
+                asked += [Request(Action.GROUND_ALIVE), Request(Action.STICKS, body, self._sticks())]
+        if tick % ASK_EVERY == 0:
+            action = Action(int(self._rng.choice(list(WEIGHTS), p=list(WEIGHTS.values()))))
+            asked.append(Request(action, body, self._argument(action)))
+        self.asked |= {request.action: tick for request in asked}
+        return asked
+
+    def _argument(self, action: Action) -> Any:
+        rng = self._rng
+        match action:
+            case Action.ARM | Action.DISARM:
+                return bool(rng.random() < 0.3)
+            case Action.SET_MODE:
+                return Mode(int(rng.choice(list(Mode))))
+            case Action.HOLD | Action.SET_POINT:
+                turned = np.array([math.cos(half := rng.uniform(-1.0, 1.0)), 0.0, 0.0, math.sin(half)])
+                return rest_at(rng.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 0.65]), turned)
+            case Action.MOTOR_TEST:
+                return (int(rng.integers(CHANNELS + 1)), float(rng.uniform(-1.0, 1.0)), float(rng.uniform(0.0, 3.0)))
+            case Action.SET_PARAMETER:
+                name, limits = self._registry[int(rng.integers(len(self._registry)))]
+                value = float(limits.low + min(10.0, limits.high - limits.low) * rng.uniform(-0.05, 1.05))
+                return (name, round(value) if rng.random() < 0.5 else value)
+            case Action.TRACK:
+                return paths.circle(np.array([0.0, 0.0, 0.38]), float(rng.uniform(0.1, 0.4)), 1.0, float(rng.uniform(5.0, 20.0)))
+            case Action.DOCK | Action.UNDOCK:
+                module, target = rng.integers(self._modules, size=2).tolist()
+                face, target_face = FACING if rng.random() < 0.7 else rng.integers(FACES, size=2).tolist()
+                return DockRequest(module, face, target, target_face, both_approach=bool(rng.random() < 0.3))
+        return None
+
+    def _sticks(self) -> Sticks:
+        """Let go of, two times of three."""
+        pushed = self._rng.uniform(-1.0, 1.0, 6) * (self._rng.random() < 0.33)
+        return Sticks(tuple(pushed[:3].tolist()), tuple(pushed[3:].tolist()))
+
+
+WEIGHTS: Mapping[Action, float] = {
+    Action.ARM: 0.38, Action.DISARM: 0.05, Action.HOLD: 0.05, Action.ESTOP: 0.02, Action.CLEAR_ESTOP: 0.08, Action.SET_MODE: 0.12,
+    Action.SET_POINT: 0.05, Action.TRACK: 0.03, Action.SET_PARAMETER: 0.05, Action.DOCK: 0.08, Action.UNDOCK: 0.04, Action.MOTOR_TEST: 0.05,
+}  # fmt: skip
+"""How often each is asked for: mostly to arm, for who is disarmed breaks no rule."""
+
+
+class Seen(NamedTuple):
+    """One module in one tick."""
+
+    flown_by: int
+    """Number of bodies that say that it is theirs."""
+    record: BodyRecord
+    """Of its body."""
+    command: ModuleCommand
+    before: int
+    """State of its body in the tick before."""
+    was_armed: bool
+    """Its body holds a module that was armed in the tick before: it, or one that it has docked to."""
+    told_ago: Mapping[Action, float]
+    """Ticks since each action was asked for."""
+
+
+def _is_finite(record: BodyRecord) -> bool:
+    signals = (*record.estimate[:5], *record.setpoint, record.wrench, record.thrust.force_n, record.commanded_n)
+    return all(np.isfinite(signal).all() for signal in signals)
+
+
+RULES: Mapping[str, Callable[[Seen], bool]] = {
+    "flown by one body": lambda s: s.flown_by == 1,
+    "commands are shares": lambda s: bool((np.abs(s.command.thrusters) <= 1.0).all()),
+    "who is not armed turns nothing": lambda s: s.record.state in ARMED or not (s.command.armed or s.command.thrusters.any()),
+    "nobody arms unasked": lambda s: (
+        s.record.state not in ARMED or s.was_armed or min(s.told_ago[Action.ARM], s.told_ago[Action.MOTOR_TEST]) <= SOON
+    ),
+    "an e-stop stands until it is cleared": lambda s: (
+        s.before != State.ESTOP or s.record.state == State.ESTOP or s.told_ago[Action.CLEAR_ESTOP] <= SOON
+    ),
+    "signals are numbers": lambda s: _is_finite(s.record),
+}  # fmt: skip
+"""What holds of each module in every tick."""
+
+
+class Operated(NamedTuple):
+    """One flight with a random operator."""
+
+    broken: Counter[str]
+    """Modules and ticks by the rule that they broke."""
+    modes: Counter[str]
+    """Ticks of each module armed, by its mode."""
+    ticks: int
+
+
+def fly_with_random_operator(seed: int, duration_s: float) -> Operated:
+    """Flies for so long, with faults and orders of the seed's. What the firmware raises comes through."""
+    rng, base = stream(seed, "operator"), load_scenario(SCENARIOS[seed % len(SCENARIOS)])
+    scenario = dataclasses.replace(base, fault=tuple(_fault(rng, duration_s) for _ in range(rng.integers(MOST_FAULTS + 1))))
+    operated = Operated(Counter(), Counter(), round(100 * duration_s))
+    operator = RandomOperator(rng, len(scenario.module), operated.ticks)
+    with ExitStack() as stack:
+        bench = open_bench(stack, scenario, seed, Parameters(), f"virtual:operator{seed}")
+        bench.script = operator  # type: ignore[assignment]
+        before: dict[int, int] = {}
+
+        def watch(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+            nonlocal before
+            seen = _seen(bench, operator, outputs, before)
+            before = {module: each.record.state for module, each in seen.items()}
+            for each in seen.values():
+                operated.broken.update(rule for rule, holds in RULES.items() if not holds(each))
+                operated.modes.update([Mode(each.record.mode).name] if each.record.state in ARMED else [])
+
+        bench.fly([watch])
+    return operated
+
+
+def _fault(rng: np.random.Generator, duration_s: float) -> Fault:
+    at_s = float(rng.uniform(0.0, duration_s))
+    return dataclasses.replace(BREAKS[int(rng.integers(len(BREAKS)))], at_s=at_s, until_s=at_s + float(rng.uniform(0.1, 10.0)))
+
+
+def _seen(bench: Bench, operator: RandomOperator, outputs: Outputs, before: Mapping[int, int]) -> dict[int, Seen]:
+    """By module."""
+    bodies, told_ago = bench.firmware.pipeline.bodies, {action: outputs.tick - tick for action, tick in operator.asked.items()}
+    records = {record.body: record for record in outputs.records}
+    seen = {}
+    for module, command in enumerate(outputs.modules):
+        holders = [body for body in bodies if module in body.modules]
+        was_armed = any(before.get(other) in ARMED for other in holders[0].modules)
+        record, state = records[holders[0].index], before.get(module, State.DISARMED)
+        seen[module] = Seen(len(holders), record, command, state, was_armed, told_ago)
+    return seen
