@@ -84,7 +84,10 @@ class RandomOperator:
                 return (int(rng.integers(CHANNELS + 1)), float(rng.uniform(-1.0, 1.0)), float(rng.uniform(0.0, 3.0)))
             case Action.SET_PARAMETER:
                 name, limits = self._registry[int(rng.integers(len(self._registry)))]
-                value = float(limits.low + min(10.0, limits.high - limits.low) * rng.uniform(-0.05, 1.05))
+                if limits.choices:
+                    return (name, str(rng.choice(limits.choices)))
+                low = max(limits.low, -10.0)
+                value = float(low + min(20.0, limits.high - low) * rng.uniform(-0.05, 1.05))
                 return (name, round(value) if rng.random() < 0.5 else value)
             case Action.TRACK:
                 return paths.circle(np.array([0.0, 0.0, 0.38]), float(rng.uniform(0.1, 0.4)), 1.0, float(rng.uniform(5.0, 20.0)))
