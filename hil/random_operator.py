@@ -17,10 +17,23 @@ import numpy as np
 from firmware_py.app.firmware import BusFrame
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import ARMED, State
-from firmware_py.core.types import CHANNELS, FACES, Action, BodyRecord, DockRequest, Inputs, Mode, ModuleCommand, Outputs, Request, Sticks
+from firmware_py.core.types import (
+    CHANNELS,
+    FACES,
+    Action,
+    BodyRecord,
+    DockRequest,
+    Inputs,
+    Mode,
+    ModuleCommand,
+    Outputs,
+    Request,
+    Setpoint,
+    Sticks,
+)
 from firmware_py.description.parameters import Parameters, registry
 from firmware_py.description.vehicle import FACE_NAMES
-from firmware_py.prepare import paths
+from firmware_py.prepare.paths import Trajectory, circle
 from hil.bench import Bench, open_bench
 from hil.fault_table import ROWS
 from hil.plant.draw import stream
@@ -38,6 +51,7 @@ FACING = (FACE_NAMES.index("-x"), FACE_NAMES.index("+x"))
 MOST_FAULTS = 5
 BREAKS = [row.fault for row in ROWS if row.fault is not None and row.fault.kind != "process_killed"]
 """What may break: all of the fault matrix but the process itself, which forgets what it was asked."""
+REGISTRY = tuple(registry())
 SOON = 2
 """Ticks within which a request is acted on."""
 
@@ -49,7 +63,7 @@ class RandomOperator:
         self.ticks = ticks
         self.asked = dict.fromkeys(Action, -math.inf)
         """Tick in which each action was asked for last."""
-        self._rng, self._modules, self._registry, self._is_there = rng, modules, list(registry()), True
+        self._rng, self._modules, self._is_there = rng, modules, True
 
     def is_over(self, time_ns: int) -> bool:
         """The time is flown to its end."""
@@ -66,36 +80,9 @@ class RandomOperator:
                 asked += [Request(Action.GROUND_ALIVE), Request(Action.STICKS, body, self._sticks())]
         if tick % ASK_EVERY == 0:
             action = Action(int(self._rng.choice(list(WEIGHTS), p=list(WEIGHTS.values()))))
-            asked.append(Request(action, body, self._argument(action)))
+            asked.append(Request(action, body, ARGUMENTS[action](self._rng, self._modules)))
         self.asked |= {request.action: tick for request in asked}
         return asked
-
-    def _argument(self, action: Action) -> Any:
-        rng = self._rng
-        match action:
-            case Action.ARM | Action.DISARM:
-                return bool(rng.random() < 0.3)
-            case Action.SET_MODE:
-                return Mode(int(rng.choice(list(Mode))))
-            case Action.HOLD | Action.SET_POINT:
-                turned = np.array([math.cos(half := rng.uniform(-1.0, 1.0)), 0.0, 0.0, math.sin(half)])
-                return rest_at(rng.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 0.65]), turned)
-            case Action.MOTOR_TEST:
-                return (int(rng.integers(CHANNELS + 1)), float(rng.uniform(-1.0, 1.0)), float(rng.uniform(0.0, 3.0)))
-            case Action.SET_PARAMETER:
-                name, limits = self._registry[int(rng.integers(len(self._registry)))]
-                if limits.choices:
-                    return (name, str(rng.choice(limits.choices)))
-                low = max(limits.low, -10.0)
-                value = float(low + min(20.0, limits.high - low) * rng.uniform(-0.05, 1.05))
-                return (name, round(value) if rng.random() < 0.5 else value)
-            case Action.TRACK:
-                return paths.circle(np.array([0.0, 0.0, 0.38]), float(rng.uniform(0.1, 0.4)), 1.0, float(rng.uniform(5.0, 20.0)))
-            case Action.DOCK | Action.UNDOCK:
-                module, target = rng.integers(self._modules, size=2).tolist()
-                face, target_face = FACING if rng.random() < 0.7 else rng.integers(FACES, size=2).tolist()
-                return DockRequest(module, face, target, target_face, both_approach=bool(rng.random() < 0.3))
-        return None
 
     def _sticks(self) -> Sticks:
         """Let go of, two times of three."""
@@ -108,6 +95,56 @@ WEIGHTS: Mapping[Action, float] = {
     Action.SET_POINT: 0.05, Action.TRACK: 0.03, Action.SET_PARAMETER: 0.05, Action.DOCK: 0.08, Action.UNDOCK: 0.04, Action.MOTOR_TEST: 0.05,
 }  # fmt: skip
 """How often each is asked for: mostly to arm, for who is disarmed breaks no rule."""
+
+
+def _forced(rng: np.random.Generator, modules: int) -> bool:
+    return bool(rng.random() < 0.3)
+
+
+def _mode(rng: np.random.Generator, modules: int) -> Mode:
+    return Mode(int(rng.choice(list(Mode))))
+
+
+def _place(rng: np.random.Generator, modules: int) -> Setpoint:
+    turned = np.array([math.cos(half := rng.uniform(-1.0, 1.0)), 0.0, 0.0, math.sin(half)])
+    return rest_at(rng.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 0.65]), turned)
+
+
+def _path(rng: np.random.Generator, modules: int) -> Trajectory:
+    return circle(np.array([0.0, 0.0, 0.38]), float(rng.uniform(0.1, 0.4)), 1.0, float(rng.uniform(5.0, 20.0)))
+
+
+def _motor(rng: np.random.Generator, modules: int) -> tuple[int, float, float]:
+    """One more than there are, too."""
+    return (int(rng.integers(CHANNELS + 1)), float(rng.uniform(-1.0, 1.0)), float(rng.uniform(0.0, 3.0)))
+
+
+def _parameter(rng: np.random.Generator, modules: int) -> tuple[str, float | str]:
+    """Any that there is, now and then out of its range."""
+    name, limits = REGISTRY[int(rng.integers(len(REGISTRY)))]
+    if limits.choices:
+        return (name, str(rng.choice(limits.choices)))
+    low = max(limits.low, -10.0)
+    value = float(low + min(20.0, limits.high - low) * rng.uniform(-0.05, 1.05))
+    return (name, round(value) if rng.random() < 0.5 else value)
+
+
+def _faces(rng: np.random.Generator, modules: int) -> DockRequest:
+    module, target = rng.integers(modules, size=2).tolist()
+    face, target_face = FACING if rng.random() < 0.7 else rng.integers(FACES, size=2).tolist()
+    return DockRequest(module, face, target, target_face, both_approach=bool(rng.random() < 0.3))
+
+
+def _nothing(rng: np.random.Generator, modules: int) -> None:
+    return None
+
+
+ARGUMENTS: Mapping[Action, Callable[[np.random.Generator, int], Any]] = {
+    Action.ARM: _forced, Action.DISARM: _forced, Action.SET_MODE: _mode, Action.HOLD: _place, Action.SET_POINT: _place, Action.TRACK: _path,
+    Action.MOTOR_TEST: _motor, Action.SET_PARAMETER: _parameter, Action.DOCK: _faces, Action.UNDOCK: _faces, Action.ESTOP: _nothing,
+    Action.CLEAR_ESTOP: _nothing,
+}  # fmt: skip
+"""What each is asked for with, given how many modules there are."""
 
 
 class Seen(NamedTuple):
