@@ -54,7 +54,11 @@ class Firmware:
             self.collector.take(bus, [frame for at, frame in received if at == bus])
         inputs = self.collector.collect(tick, time_ns, requests)
         outputs = self.tick(inputs)
-        return inputs, outputs, self.encoder.frames(outputs)
+        return inputs, outputs, self.frames(outputs)
+
+    def frames(self, outputs: Outputs) -> list[BusFrame]:
+        """What is sent of a tick. A module's thrusters are not commanded before it has said how it is."""
+        return self.encoder.frames(outputs, self.collector.unmet)
 
     def tick(self, inputs: Inputs) -> Outputs:
         """Steps the fleet; what it wants prepared goes to the worker, what the worker has done enters `inputs`."""

@@ -72,7 +72,7 @@ class RealTimeLoop:
         received, self._received = self._received, []
         inputs = collector.collect(tick, time_ns, list(self.requests(time_ns, self.last)))
         outputs = self.firmware.tick(inputs)
-        frames = self.firmware.encoder.frames(outputs)
+        frames = self.firmware.frames(outputs)
         self._send(frames)
         self._show(received, sync + frames, inputs, outputs)
         self.last = outputs

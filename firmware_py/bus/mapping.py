@@ -5,13 +5,13 @@ Stands at both ends of a tick, between the ports and the pipeline. No clock: the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
 from firmware_py.bus.codec import Codec, Frame, Receiver, unpack_quaternion
 from firmware_py.bus.codec.receiver import COUNTER, MESSAGE, NUMBER, VALUES
-from firmware_py.core.types import CHANNELS, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.core.types import CHANNELS, MCU_ESTOP, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.fleet import Fleet
 
 STALE_NS = 500_000_000
@@ -40,6 +40,7 @@ class InputCollector:
             `tag_unpaired`, `tag_stale`, `tag_future`, `sensor` (its status says fault or stale), `foreign_sync` and
             `foreign_command` (somebody else controls this bus).
         heartbeats: last node state by (bus, number).
+        unmet: fleet indices of modules that have not said yet how they are.
     """
 
     def __init__(self, fleet: Fleet, codec: Codec) -> None:
@@ -50,10 +51,11 @@ class InputCollector:
         self._sync_ns: list[int | None] = [None] * REMEMBERED_TICKS
         self._halves: dict[tuple[int, float], tuple[Row, int]] = {}
         self._collections = 0
-        self._estop = self._foreign_command = False
+        self._estop = self._foreign_sync = self._foreign_command = False
         kinds = ("module", "tag_unpaired", "tag_stale", "tag_future", "sensor", "foreign_sync", "foreign_command")
         self.faults: dict[str, int] = dict.fromkeys(kinds, 0)
         self.heartbeats: dict[tuple[int, int], int] = {}
+        self.unmet = set(range(len(fleet.module)))
         named = self._make_handlers()
         self._handlers = [named.get(message.name) for message in codec.messages]
         self._names = [message.name for message in codec.messages]
@@ -107,9 +109,9 @@ class InputCollector:
                 module.tags = [tag for tag in module.tags if self._is_timely(tag, time_ns)]
         self._expire_halves()
         estop, self._estop = self._estop, False
+        foreign_sync, self._foreign_sync = self._foreign_sync, False
         foreign_command, self._foreign_command = self._foreign_command, False
         dropped = sum([receiver.dropped_in_all for receiver in self._receivers])
-        foreign_sync = self.faults["foreign_sync"] > 0
         return Inputs(tick, time_ns, modules, list(requests), estop, dropped, foreign_sync, foreign_command)
 
     def _make_handlers(self) -> dict[str, Callable[[int, ModuleInputs, Row], None]]:
@@ -135,6 +137,7 @@ class InputCollector:
         elif name == "HEARTBEAT":
             self.heartbeats[bus, int(row[NUMBER])] = int(row[VALUES])
         elif name == "SYNC":
+            self._foreign_sync = True
             self.faults["foreign_sync"] += 1
         else:
             self._foreign_command = True
@@ -167,7 +170,9 @@ class InputCollector:
         tick, _, errors, state = row[VALUES : VALUES + 4]
         self._status_ticks[index] = int(tick)
         module.mcu_errors |= int(errors)
-        module.mcu_state = int(state)
+        if module.mcu_state != MCU_ESTOP:  # of two statuses in one tick the later does not hide that an e-stop held it
+            module.mcu_state = int(state)
+        self.unmet.discard(index)
 
     def _take_tag(self, index: int, module: ModuleInputs, row: Row) -> None:
         """Halves of one observation share the counter, and nothing else says that they belong together."""
@@ -249,8 +254,12 @@ class OutputEncoder:
         frame = self._sync.encode(0, (tick & 0xFFFFFFFF,))
         return [(bus, frame) for bus in self._buses]
 
-    def frames(self, outputs: Outputs) -> list[tuple[int, Frame]]:
-        """Frames of one tick: ESTOP when due, then of every module its thrusters and, when due, its docking relays."""
+    def frames(self, outputs: Outputs, unmet: Collection[int] = ()) -> list[tuple[int, Frame]]:
+        """Frames of one tick: ESTOP when due, then of every module its thrusters and, when due, its docking relays.
+
+        Args:
+            unmet: modules whose thrusters are not commanded yet: at a command they would let go of an e-stop that nobody here knows of.
+        """
         frames: list[tuple[int, Frame]] = []
         if self._estop_is_due(outputs):
             frames += [(bus, self._estop.encode(0)) for bus in self._buses]
@@ -260,8 +269,9 @@ class OutputEncoder:
             mode = int(command.armed)
             shares = command.thrusters.tolist()
             shares += [0.0] * (CHANNELS - len(shares))
-            frames.append((bus, half_a.encode(number, (*shares[:THRUSTERS_OF_A_FRAME], mode), counter)))
-            frames.append((bus, half_b.encode(number, (*shares[THRUSTERS_OF_A_FRAME:], mode), counter)))
+            if index not in unmet:
+                frames.append((bus, half_a.encode(number, (*shares[:THRUSTERS_OF_A_FRAME], mode), counter)))
+                frames.append((bus, half_b.encode(number, (*shares[THRUSTERS_OF_A_FRAME:], mode), counter)))
             if command.relays is not None:
                 frames.append((bus, self._dock.encode(number, command.relays, self._dock_counters[index])))
                 self._dock_counters[index] = self._dock_counters[index] + 1 & 15

@@ -16,7 +16,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults, by_channel
 from firmware_py.core.topology import in_both
-from firmware_py.core.types import Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
+from firmware_py.core.types import MCU_ESTOP, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 
@@ -29,7 +29,7 @@ MEAN_S = 1.0
 DRY_NS = 3_000_000_000
 """A cabin that was wet in two readings running is dry when its sensor has been for so long: water in it moves. ArduSub waits as long."""
 FOREIGN_NS = 1_000_000_000
-"""So long a command of somebody else is remembered: one that sends as slowly as once a second is one stranger."""
+"""So long a frame of somebody else is remembered: one that sends as slowly as once a second is one stranger."""
 VOLTAGE_SHARE = 0.2
 """Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
 
@@ -74,7 +74,7 @@ class Health(NamedTuple):
     missed_ticks_per_s: float
     foreign_sync: bool
     foreign_command: bool
-    """Somebody else commanded modules in the last second."""
+    """Somebody else sent SYNC, commanded modules, in the last second."""
     ground_age_s: float
     """NaN before a ground station was heard."""
     pilot_age_s: float
@@ -120,7 +120,7 @@ class HealthMonitor:
         self._cabin_start_pa: dict[int, float] = {}
         self._cabin_change_pa: dict[int, float] = {}
         self._readings = (self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa)
-        self._foreign_ns = NEVER_NS
+        self._foreign_sync_ns = self._foreign_command_ns = NEVER_NS
         self._depth_ns = self._imu_ns = 0
         self._depth_heard = False
         self._ground_ns: int | None = None
@@ -161,7 +161,8 @@ class HealthMonitor:
                     self._esc_ns[thruster] = other._esc_ns[other._thruster_at[j][channel]]
         self._depth_ns, self._imu_ns = max(other._depth_ns for other in before), max(other._imu_ns for other in before)
         self._depth_heard = any(other._depth_heard for other in before)
-        self._foreign_ns = max(other._foreign_ns for other in before)
+        self._foreign_sync_ns = max(other._foreign_sync_ns for other in before)
+        self._foreign_command_ns = max(other._foreign_command_ns for other in before)
         self._time_ns = max((other._time_ns for other in before if other._time_ns is not None), default=None)
         self._ground_ns = max((other._ground_ns for other in before if other._ground_ns is not None), default=None)
         self._pilot_ns = max((other._pilot_ns for other in before if other._pilot_ns is not None), default=None)
@@ -178,8 +179,8 @@ class HealthMonitor:
         self._listen([inputs.modules[m] for m in self._modules], now)
         if self.imu_heard:
             self._imu_ns = now
-        if inputs.foreign_command:
-            self._foreign_ns = now
+        self._foreign_sync_ns = now if inputs.foreign_sync else self._foreign_sync_ns
+        self._foreign_command_ns = now if inputs.foreign_command else self._foreign_command_ns
         self._people(requests, now)
         self._rates(inputs, estimate, dt_s)
         self._time_ns = now
@@ -204,8 +205,8 @@ class HealthMonitor:
             esc_missing=_older(self._esc_ns, now - self._esc_fresh_ns),
             frame_errors_per_s=self._error_rate,
             missed_ticks_per_s=self._missed_rate,
-            foreign_sync=inputs.foreign_sync,
-            foreign_command=now - self._foreign_ns <= FOREIGN_NS,
+            foreign_sync=now - self._foreign_sync_ns <= FOREIGN_NS,
+            foreign_command=now - self._foreign_command_ns <= FOREIGN_NS,
             ground_age_s=_age_s(self._ground_ns, now, math.nan),
             pilot_age_s=_age_s(self._pilot_ns, now, math.nan),
             stick=self._stick,
@@ -285,8 +286,6 @@ class HealthMonitor:
             self._rejected_share += TAG_SHARE * (1.0 - self._rejected_share)
 
 
-MCU_ESTOP = 4
-"""State of MCU_STATUS."""
 ESC_ALIVE = (0, 2)
 """EscStatus OK and OVERTEMPERATURE."""
 TAG_SHARE = 1.0 / 60.0

@@ -17,6 +17,8 @@ CHANNELS, FACES = 8, 6
 """Thruster commands that one module's frames carry; docking faces of a module, each with its relay."""
 RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
 """States of a docking relay, as DOCK_CMD has them."""
+MCU_ESTOP = 4
+"""State of MCU_STATUS: an e-stop holds the module."""
 CRITICAL, WARNING, INFORMATION = 2, 4, 6
 """Severities of an `Event`, as syslog and STATUSTEXT have them."""
 NEVER_NS = 1 << 60
@@ -189,7 +191,7 @@ class Inputs:
     dropped_frames: int = 0
     """Frames dropped by the codec so far, all kinds."""
     foreign_sync: bool = False
-    """Somebody else sends SYNC on one of our buses, or did."""
+    """A SYNC of somebody else came since the previous tick."""
     foreign_command: bool = False
     """A THRUSTER_CMD or DOCK_CMD of somebody else came since the previous tick."""
     prepared: list[Any] = field(default_factory=list)

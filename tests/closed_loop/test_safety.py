@@ -3,11 +3,23 @@
 Thrusters that die or lie on the spiral, lost frames, e-stops at any tick, tags that stay away, a million frames that nobody should send.
 """
 
+import dataclasses
+from collections.abc import Sequence
+from contextlib import ExitStack
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from firmware_py.app.firmware import BusFrame
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Inputs, Outputs
+from firmware_py.description.parameters import Parameters
+from hil.bench import open_bench
 from hil.fuzz import fuzz_flight
+from hil.plant.fault_spec import Fault
 from hil.safety import ICM_20602, command_outlives_frames_ms, fly_to_estop, hover_blind, spiral_through_loss, spiral_with
+from hil.scenario import load_scenario
 
 TICK_MS = 10.0
 
@@ -69,6 +81,25 @@ def test_after_an_e_stop_nothing_turns_whatever_else_happens(seed: int) -> None:
     assert flight.violations == 0
     assert flight.ticks > 10
     assert flight.was_armed
+
+
+def test_stop_that_was_raised_before_the_start_stands_though_the_first_answers_of_the_modules_are_lost() -> None:
+    """A module lets go of it at the first command that says disarmed: none may be sent before it is known."""
+    silence = Fault(kind="frame_loss", value=1.0, at_s=0.0, until_s=0.035, direction="from_plant")
+    scenario = dataclasses.replace(load_scenario("dock"), fault=(silence,))
+    states: list[list[State]] = []
+    with ExitStack() as stack:
+        bench = open_bench(stack, scenario, 0, Parameters(), "virtual:stopped")
+        for mcu in bench.nodes.mcus.values():
+            mcu.estop(-1_000_000_000)
+        bench.script = SimpleNamespace(ticks=100, is_over=lambda time_ns: False, requests=lambda time_ns, last: [])  # type: ignore[assignment]
+
+        def watch(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+            states.append([State(record.state) for record in outputs.records])
+
+        bench.fly([watch])
+    assert states[0] == [State.DISARMED] * 2, "nothing has been heard yet"
+    assert states[10:] == [[State.ESTOP] * 2] * (len(states) - 10)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import pytest
 
 from firmware_py.bus.codec import Codec, Frame, Receiver, pack_quaternion
 from firmware_py.bus.mapping import InputCollector, OutputEncoder
-from firmware_py.core.types import Action, ModuleCommand, ModuleInputs, Outputs, Request
+from firmware_py.core.types import MCU_ESTOP, Action, ModuleCommand, ModuleInputs, Outputs, Request
 from firmware_py.description.fleet import Fleet, Module, single
 
 MS = 1_000_000
@@ -326,7 +326,16 @@ def test_other_controllers_on_the_bus_are_counted_and_enter_the_tick():
     assert robot.faults == {"foreign_sync": 1, "foreign_command": 2}
     here, gone = robot.tick(1), robot.tick(2)
     assert (here.foreign_sync, here.foreign_command) == (True, True)
-    assert (gone.foreign_sync, gone.foreign_command) == (True, False)
+    assert (gone.foreign_sync, gone.foreign_command) == (False, False)
+
+
+def test_stop_that_held_a_module_is_not_hidden_by_its_next_status_in_the_same_tick():
+    robot = Robot()
+    for tick, state in ((0, 4), (1, 1)):
+        robot.say("MCU_STATUS", (tick, 1, 0, state))
+    assert robot.tick(1).modules[0].mcu_state == MCU_ESTOP
+    robot.say("MCU_STATUS", (2, 1, 0, 1))
+    assert robot.tick(2).modules[0].mcu_state == 1
 
 
 def test_module_that_is_not_in_the_fleet_changes_nothing():
@@ -368,6 +377,17 @@ def test_every_module_is_told_its_thrusters_in_every_tick():
     assert sent(frames) == [(bus, half, number) for bus, number in ((0, 1), (1, 1), (1, 2)) for half in halves]
     modes = [CODEC.by_id(frame.id).decode(frame.data)[-1] for _, frame in frames]
     assert modes == [1, 1, 0, 0, 1, 1]
+
+
+def test_no_module_is_commanded_before_it_has_said_how_it_is():
+    """At a command that says disarmed it would let go of an e-stop that was raised before the start."""
+    robot, encoder = Robot(TWO_BUSES), OutputEncoder(TWO_BUSES, CODEC)
+    robot.say("GYRO", (0.0, 0.0, 0.0, 0), number=1, bus=1)
+    robot.say("MCU_STATUS", (0, 1, 0, 4), number=2, bus=1)
+    frames = encoder.frames(outputs(*[command(armed=False, relays=(0,) * 6)] * 3), robot.collector.unmet)
+    commanded = [(bus, number) for bus, name, number in sent(frames) if name.startswith("THRUSTER")]
+    assert commanded == [(1, 2)] * 2
+    assert sum(name == "DOCK_CMD" for _, name, _ in sent(frames)) == 3
 
 
 def test_thruster_commands_keep_their_order_and_counter():
