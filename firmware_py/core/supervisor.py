@@ -175,7 +175,10 @@ class Supervisor:
         if guard == Guard.MODE_NEEDS:
             return missing(mode, health, self._p)
         if guard == Guard.MODE_PERMITTED:
-            return missing(mode, health, self._p) or self._failsafes.against(mode, health)
+            reasons = missing(mode, health, self._p) or self._failsafes.against(mode, health)
+            if self._testing:  # and nobody has asked yet whether it may fly
+                reasons = reasons or self._reasons(Guard.ARMING_CHECKS, mode, health)
+            return reasons
         if guard == Guard.ESTOP_QUIET and self._estop_age_ms(health) < self._p.supervision.estop_quiet_ms:
             return ["the e-stop is still raised"]
         if guard == Guard.IN_MOTOR_DETECT and self.mode != Mode.MOTOR_DETECT:

@@ -65,7 +65,7 @@ class Guard(IntEnum):
     FORCED_CHECKS = 2
     """Those arming checks that may not be skipped, and what the chosen mode needs."""
     MODE_PERMITTED = 3
-    """The wanted mode has what it needs, and no fail-safe forbids it."""
+    """The wanted mode has what it needs, and no fail-safe forbids it; of a body that a motor test has armed, every arming check too."""
     MODE_NEEDS = 4
     """The wanted mode has what it needs."""
     ESTOP_QUIET = 5

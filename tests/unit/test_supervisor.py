@@ -221,6 +221,18 @@ def test_mode_taken_during_a_motor_test_ends_it_without_disarming() -> None:
     assert supervisor.step(False, GOOD, [], [Trigger.TEST_OVER]) == [] and supervisor.armed
 
 
+@pytest.mark.parametrize(("action", "argument"), [(Action.SET_MODE, Mode.MANUAL), (Action.HOLD, None), (Action.TRACK, None)])
+def test_motor_test_is_no_way_round_the_arming_checks(action: Action, argument: object) -> None:
+    """It passes over those that may be skipped, as a forced ARM does; nobody has said that the robot is to be flown so."""
+    bad = GOOD._replace(frame_errors_per_s=1e6)
+    supervisor = supervisor_in(State.DISARMED)
+    assert ask(supervisor, Action.MOTOR_TEST, (0, 0.1, 1.0), bad) and supervisor.armed
+    assert ask(supervisor, action, argument, bad) == []
+    assert "bad frames" in texts(supervisor)[0]
+    supervisor.step(False, bad, [], [Trigger.TEST_OVER])
+    assert not supervisor.armed
+
+
 def test_disarming_ends_a_motor_test() -> None:
     supervisor = supervisor_in(State.DISARMED)
     ask(supervisor, Action.MOTOR_TEST, (0, 0.1, 1.0))
