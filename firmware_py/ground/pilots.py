@@ -1,4 +1,6 @@
-"""Who has the sticks of one system: one sender at a time, until it is silent. Buttons are kept by sender: two streams do not mix."""
+"""Whose sticks and set-points one system follows: one sender's at a time, until it is silent. Buttons are kept by sender: two streams do
+not mix.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +13,34 @@ Sender = tuple[int, int]
 """System id, component id."""
 
 
+class Turn:
+    """Whose messages of one kind are taken: one sender's at a time.
+
+    Args of the constructor:
+        has: what a sender that takes over has, for people.
+        timeout_s: after so much silence another may take over.
+    """
+
+    def __init__(self, system: System, has: str, timeout_s: Callable[[], float]) -> None:
+        self._system, self._has, self._timeout_s = system, has, timeout_s
+        self._sender: Sender | None = None
+        self._heard_ns = 0
+
+    def is_over(self, time_ns: int) -> bool:
+        """Whether it is nobody's."""
+        return self._sender is None or time_ns - self._heard_ns > self._timeout_s() * NS_PER_S
+
+    def is_of(self, arrival: Arrival) -> bool:
+        """Whether it is the sender's, now that it was heard."""
+        sender = sender_of(arrival)
+        if sender != self._sender and not self.is_over(arrival.time_ns):
+            return False
+        if self._sender not in (None, sender):
+            self._system.say(_NOTICE, f"ground station {sender[0]}/{sender[1]} has the {self._has}")
+        self._sender, self._heard_ns = sender, arrival.time_ns
+        return True
+
+
 class Pilots:
     """Everybody who sends sticks to one system.
 
@@ -20,24 +50,17 @@ class Pilots:
     """
 
     def __init__(self, system: System, may_steer: Callable[[int, int], bool], timeout_s: Callable[[], float]) -> None:
-        self._system, self._may_steer, self._timeout_s = system, may_steer, timeout_s
-        self._pilot: Sender | None = None
-        self._heard_ns = 0
+        self._may_steer = may_steer
+        self._turn = Turn(system, "sticks", timeout_s)
         self._pressed: dict[Sender, int] = {}
 
     def are_silent(self, time_ns: int) -> bool:
         """Whether nobody has the sticks."""
-        return self._pilot is None or time_ns - self._heard_ns > self._timeout_s() * NS_PER_S
+        return self._turn.is_over(time_ns)
 
     def steers(self, arrival: Arrival) -> bool:
         """Whether a sender of sticks has them, now that it was heard."""
-        sender = sender_of(arrival)
-        if not self._may_steer(*sender) or (sender != self._pilot and not self.are_silent(arrival.time_ns)):
-            return False
-        if self._pilot not in (None, sender):
-            self._system.say(_NOTICE, f"ground station {sender[0]}/{sender[1]} has the sticks")
-        self._pilot, self._heard_ns = sender, arrival.time_ns
-        return True
+        return self._may_steer(*sender_of(arrival)) and self._turn.is_of(arrival)
 
     def freshly_pressed(self, arrival: Arrival, buttons: int) -> int:
         """The buttons that the sender did not hold in its message before."""

@@ -17,7 +17,7 @@ from firmware_py.core.setpoint import leashed
 from firmware_py.core.types import Action, DockRequest, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.dialect import Message
-from firmware_py.ground.pilots import Pilots, Sender, sender_of
+from firmware_py.ground.pilots import Pilots, Sender, Turn, sender_of
 from firmware_py.ground.system import NS_PER_S, STOPPING, Arrival, Handler, System
 
 _FULL, _MIDDLE_UP = 1000.0, 500.0
@@ -103,6 +103,7 @@ class Steering:
         self._pilots = Pilots(system, may_steer, lambda: parameters().steering.stick_timeout_s)
         self._sticks = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self._overrides: dict[Sender, list[_Override]] = {}
+        self._turn = Turn(system, "set-points", lambda: parameters().ground.setpoint_fresh_s)
         self._setpoint_ns: int | None = None
         self._setpoint: Setpoint | None = None
 
@@ -226,7 +227,7 @@ class Steering:
         zero, rate = np.zeros(3), np.array([0.0, 0.0, wanted.rate])
         v_w = zero if wanted.velocity is None else wanted.velocity
         a_w = zero if wanted.acceleration is None else wanted.acceleration
-        self._stream(Setpoint(p_wb, q_wb, v_w, rate, a_w, zero), arrival.time_ns)
+        self._stream(Setpoint(p_wb, q_wb, v_w, rate, a_w, zero), arrival)
 
     def _place(
         self, now: np.ndarray, position: np.ndarray | None, velocity: np.ndarray | None, time_ns: int
@@ -266,11 +267,13 @@ class Steering:
         start, _ = self._before(arrival.time_ns)
         p_wb = (start or self._system.subject.record.setpoint).p_wb
         zero = np.zeros(3)
-        self._stream(Setpoint(p_wb, np.asarray(normalise(q)), zero, zero, zero, zero), arrival.time_ns)
+        self._stream(Setpoint(p_wb, np.asarray(normalise(q)), zero, zero, zero, zero), arrival)
 
-    def _stream(self, setpoint: Setpoint, time_ns: int) -> None:
-        self._setpoint, self._setpoint_ns = setpoint, time_ns
-        self._system.ask(Action.SET_POINT, setpoint)
+    def _stream(self, setpoint: Setpoint, arrival: Arrival) -> None:
+        """Follow it, where it is the sender's turn."""
+        if self._turn.is_of(arrival):
+            self._setpoint, self._setpoint_ns = setpoint, arrival.time_ns
+            self._system.ask(Action.SET_POINT, setpoint)
 
 
 def _axis(value: float) -> float:

@@ -66,6 +66,29 @@ def test_sticks_pass_to_another_only_after_the_timeout() -> None:
     assert "ground station 77/190 has the sticks" in other.texts
 
 
+def places(world: World) -> list[float]:
+    """x of every set-point that was taken."""
+    return [r.argument.p_wb[0] for r in world.robot.asked if r.action == Action.SET_POINT]
+
+
+def test_set_points_of_two_do_not_mix_and_pass_to_the_other_after_the_first_is_silent() -> None:
+    """The other may be an attitude, too, and a companion computer that is not the watched station."""
+    world = World(config=GroundConfig(watch_system=255))
+    first, other = world.client(254), world.client(255)
+    for _ in range(10):
+        first.send("SET_POSITION_TARGET_LOCAL_NED", 0, 1, 1, 1, 0xDF8, 0.3, 0.1, 0.4, *[0.0] * 8)
+        other.send("SET_POSITION_TARGET_LOCAL_NED", 0, 1, 1, 1, 0xDF8, -0.3, 0.1, 0.4, *[0.0] * 8)
+        other.send("SET_ATTITUDE_TARGET", 0, 1, 1, 0x7, [1.0, 0.0, 0.0, 0.0], 0, 0, 0, 0.5)
+        world.run(1)
+    assert places(world) == pytest.approx([0.3] * 10)
+    world.run(round(world.parameters.ground.setpoint_fresh_s * 100) + 1)
+    for client, x in ((other, -0.3), (first, 0.3)):
+        client.send("SET_POSITION_TARGET_LOCAL_NED", 0, 1, 1, 1, 0xDF8, x, 0.1, 0.4, *[0.0] * 8)
+    world.run(1)
+    assert places(world)[10:] == pytest.approx([-0.3])
+    assert "ground station 255/190 has the set-points" in other.texts
+
+
 def test_button_that_was_held_before_the_sticks_passed_is_not_pressed_by_that() -> None:
     world = World()
     pilot, other = world.client(255), world.client(77)
