@@ -228,7 +228,8 @@ def _seen(bench: Bench, operator: RandomOperator, outputs: Outputs, before: Mapp
     seen = {}
     for module, command in enumerate(outputs.modules):
         holders = [body for body in bodies if module in body.modules]
-        was_armed = any(before.get(other) in ARMED for other in holders[0].modules)
-        record, state = records[holders[0].index], before.get(module, State.DISARMED)
+        holder = holders[0] if holders else bodies[0]  # one that is nobody's breaks the first rule, whatever the others say
+        was_armed = any(before.get(other) in ARMED for other in holder.modules)
+        record, state = records[holder.index], before.get(module, State.DISARMED)
         seen[module] = Seen(len(holders), record, command, state, was_armed, told_ago)
     return seen
