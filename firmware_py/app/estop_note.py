@@ -59,29 +59,43 @@ def clear(folder: Path) -> bool:
     """
     if not (folder / NOTE).exists():
         raise DescriptionError(f"{folder} holds no {NOTE}: no vehicle has logged there; give the folder of modcube run --out")
-    handle = os.open(folder, os.O_RDONLY)
+    handle = hold(folder)
+    if handle is None:
+        raise DescriptionError(f"a vehicle that runs logs into {folder}: end it first, or send it CLEAR_ESTOP")
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         stood = estop_stands(folder)
         write_note(folder, False)
-    except BlockingIOError:
-        raise DescriptionError(f"a vehicle that runs logs into {folder}: end it first, or send it CLEAR_ESTOP") from None
     finally:
         os.close(handle)
     return stood
 
 
+def hold(folder: Path) -> int | None:
+    """A handle, to be closed to let go of `folder`; until then nobody else has it. None where somebody else does. Raises OSError."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        return None
+    except OSError:
+        os.close(handle)
+        raise
+    return handle
+
+
 class EstopNote:
     """Writes the note by a thread of its own: no tick waits for a disk. To be made before this process takes its real-time priority.
-    Until `close`, nobody else clears it.
+    Until `close`, nobody else writes it. Raises DescriptionError where somebody else has the folder.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._handle: int | None = None
         with suppress(OSError):  # a folder that cannot be opened is said by the first note that it does not take
-            self._handle = os.open(folder, os.O_RDONLY)
-            fcntl.flock(self._handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            self._handle = hold(folder)
+            if self._handle is None:
+                raise DescriptionError(f"another vehicle that runs logs into {folder}: end it first, or give this one another --out")
         self._queue: SimpleQueue[bool | None] = SimpleQueue()
         self._failed: SimpleQueue[OSError] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="e-stop note", daemon=True)
@@ -118,6 +132,8 @@ class EstopNote:
                 if waiting is not None:
                     write_note(self._folder, waiting)
                 waiting = None
+                if self._handle is None:  # there was no folder before
+                    self._handle = hold(self._folder)
             except OSError as error:
                 if fresh:
                     self._failed.put(error)

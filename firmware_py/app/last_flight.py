@@ -69,8 +69,8 @@ class LastFlight(NamedTuple):
 
 
 def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -> LastFlight:
-    """How the newest log under `out` ends in which anything was sent, and whether an e-stop stands, by the note there. Logs that are
-    missing, unreadable or old say nothing.
+    """How the newest log under `out` ends in which anything was sent, and whether an e-stop stands, by the note there. One that is
+    unreadable or old, or ends before its flight, says nothing; nor do those before it.
 
     Args:
         now_ns: the time of day, to compare with that of the file.
@@ -79,9 +79,18 @@ def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -
     stopped = estop_stands(out)
     for folder in log_folders(out):
         sent = _last_sent(folder, now_ns, TAIL_BYTES * len(fleet.module))
+        if sent is None:
+            break
         if sent:
             return _told(sent, _notes_of(folder), fleet, codec, boot)._replace(stopped=stopped)
     return LastFlight(stopped=stopped)
+
+
+def outdate(out: Path) -> None:
+    """A process that keeps no log flies after those under `out`: none of them says how the last flight ended."""
+    for folder in log_folders(out):
+        with suppress(OSError):
+            os.utime(folder / CAN_LOG, ns=(0, 0))
 
 
 def to_arm(before: LastFlight, firmware: Firmware, hold: bool, say: Callable[[str], None]) -> set[int]:
@@ -147,16 +156,22 @@ def _notes_of(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _last_sent(folder: Path, now_ns: int, most_bytes: int) -> list[LoggedFrame]:
-    """The frames that the end of a log says were sent; half a line at either end is left out."""
+def _last_sent(folder: Path, now_ns: int, most_bytes: int) -> list[LoggedFrame] | None:
+    """The frames that the end of a log says were sent; half a line at either end is left out. None where it says nothing of now."""
+    try:
+        with (folder / CAN_LOG).open("rb") as file:
+            status = os.fstat(file.fileno())
+            file.seek(max(0, status.st_size - most_bytes))
+            lines = file.read().decode("ascii", errors="replace").splitlines(keepends=True)
+    except FileNotFoundError:
+        return []  # that process was ended while it started
+    except OSError:
+        return None
+    if not 0 <= now_ns - status.st_mtime_ns < RECENT_NS:
+        return None
     sent = []
-    with suppress(OSError), (folder / CAN_LOG).open("rb") as file:
-        status = os.fstat(file.fileno())
-        if not 0 <= now_ns - status.st_mtime_ns < RECENT_NS:
-            return []
-        file.seek(max(0, status.st_size - most_bytes))
-        for line in file.read().decode("ascii", errors="replace").splitlines(keepends=True):
-            with suppress(ValueError):
-                if line.endswith(" T\n"):
-                    sent.append(frame_of(line))
+    for line in lines:
+        with suppress(ValueError):
+            if line.endswith(" T\n"):
+                sent.append(frame_of(line))
     return sent

@@ -14,7 +14,7 @@ from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import Summary, recording_times, summary_of
 from firmware_py.app.estop_note import EstopNote, estop_stands, noting_estop
 from firmware_py.app.firmware import BusFrame, Firmware, compose, vehicles_of
-from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight, to_arm
+from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight, outdate, to_arm
 from firmware_py.app.live_view import LiveView
 from firmware_py.app.lockstep import Observer
 from firmware_py.app.realtime import open_loop
@@ -198,8 +198,12 @@ def _open_recorder(
     if folder is None and live is None:
         return None
     recorder = Recorder(folder, configuration, live.context if live is not None else None, queued=True)
-    if folder is not None:
+    if folder is not None and out is not None:
         stack.callback(_forget_failed_start, recorder, folder, out)
+        try:
+            recorder.check()
+        except OSError:
+            outdate(out)
     stack.callback(recorder.close)
     for body in firmware.pipeline.bodies:
         recorder.expect(body.index, body.thrusters.f_max.size)
@@ -214,10 +218,11 @@ def _log_folder(out: Path, say: Callable[[str], None]) -> Path | None:
         raise
     except OSError as error:
         say(f"warning: no log: {error.filename or out}: {error.strerror}")
+        outdate(out)
         return None
 
 
-def _forget_failed_start(recorder: Recorder, folder: Path, out: Path | None) -> None:
+def _forget_failed_start(recorder: Recorder, folder: Path, out: Path) -> None:
     """A start that came to no tick leaves no log: a service that waits for its bus starts again and again."""
     if recorder.ticks:
         return

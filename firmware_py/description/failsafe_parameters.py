@@ -79,7 +79,9 @@ class Failsafes:
     tag_gone_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_TAGG_LAT")
     # a docked partner is lost
     partner_lost_delay_s: float = quantity(0.4, unit="s", low=0, high=600, help=DELAY, mavlink="FS_PART_S")
-    partner_lost_action: int = quantity(2, low=0, high=5, help=ACTION, mavlink="FS_PART_ACT")
+    partner_lost_action: int = quantity(
+        2, low=0, high=5, help=f"{ACTION}; with 0 a body that has come apart is flown on as one", mavlink="FS_PART_ACT"
+    )
     partner_lost_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_PART_LAT")
     # sensors and model disagree
     estimator_limit: float = quantity(

@@ -5,6 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import threading
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -12,12 +15,12 @@ MOST_WAITING_BYTES = 8_000_000
 """A minute and a half of one module at 100 Hz; a disk that is farther behind ends the log."""
 CLOSE_S = 5.0
 """How long the end of a run waits for a disk."""
-_SYNC = b""
-"""Among what waits for the thread of a QueuedFile: all before it is to be on the disk."""
 
 
 class GuardedFile:
-    """A file whose errors are kept instead of raised: after the first one it takes everything and writes nothing."""
+    """A file whose errors are kept instead of raised: after the first one it takes everything and writes nothing, and is dated back to the
+    beginning of time: it ends before what it tells of, and who goes by its end is not to take it for news.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -36,6 +39,7 @@ class GuardedFile:
                 self._append(data)
             except OSError as error:
                 self.error = error
+                self._date_back()
         self._position += len(data)
         return len(data)
 
@@ -58,10 +62,16 @@ class GuardedFile:
                 self._to_disk()
             except OSError as error:
                 self.error = error
+                self._date_back()
 
     def _to_disk(self) -> None:
         if self._file is not None:
             os.fsync(self._file.fileno())
+
+    def _date_back(self) -> None:
+        if self._file is not None:
+            with suppress(OSError):
+                os.utime(self._file.fileno(), ns=(0, 0))
 
     def close(self) -> None:
         """Close; a second time does nothing."""
@@ -78,31 +88,39 @@ class QueuedFile(GuardedFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self._queue: SimpleQueue[bytes | None] = SimpleQueue()
+        self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._given = self._written = 0
+        self._broken = False
         self._thread = threading.Thread(target=self._run, name=f"log {path.name}", daemon=True)
         self._thread.start()
 
     def _append(self, data: bytes | bytearray) -> None:
         if self._given - self._written > MOST_WAITING_BYTES:
             raise OSError(errno.ENOBUFS, "the disk does not keep up")
-        self._given += len(data)
-        if data:
-            self._queue.put(bytes(data))
+        kept = bytes(data)
+        self._given += len(kept)
+        self._queue.put(partial(self._try, partial(super()._append, kept), len(kept)))
 
     def _to_disk(self) -> None:
-        self._queue.put(_SYNC)
+        self._queue.put(partial(self._try, super()._to_disk))
+
+    def _date_back(self) -> None:
+        self._queue.put(super()._date_back)
 
     def _run(self) -> None:
-        broken = False
-        while (data := self._queue.get()) is not None:
-            try:
-                if not broken:
-                    super()._append(data) if data else super()._to_disk()
-            except OSError as error:
-                broken, self.error = True, self.error or error
-            self._written += len(data)
+        while (job := self._queue.get()) is not None:
+            job()
         super().close()
+
+    def _try(self, job: Callable[[], None], length: int = 0) -> None:
+        """By the thread: what the disk does not take ends the log."""
+        try:
+            if not self._broken:
+                job()
+        except OSError as error:
+            self._broken, self.error = True, self.error or error
+            super()._date_back()
+        self._written += length
 
     def close(self) -> None:
         """Writes what waits, for CLOSE_S at the most; a second time does nothing."""

@@ -174,15 +174,29 @@ def test_each_stop_is_noted_for_a_person_may_have_cleared_the_one_before_by_hand
     assert written == [True, True, True]
 
 
-def test_nobody_clears_a_stop_by_hand_while_vehicles_run(tmp_path: Path) -> None:
-    """Two may log into one folder."""
-    write_note(tmp_path, True)
-    notes = [EstopNote(tmp_path), EstopNote(tmp_path)]
-    for note in notes:
-        with pytest.raises(DescriptionError, match="end it first, or send it CLEAR_ESTOP"):
-            clear(tmp_path)
-        note.close()
-    assert clear(tmp_path) and not estop_stands(tmp_path)
+@pytest.mark.parametrize("is_there", [True, False])
+def test_folder_is_one_vehicle_s_while_that_runs(tmp_path: Path, is_there: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whose e-stop nobody else clears; also where the vehicle itself had to make the folder."""
+    folder, held, hold = tmp_path / "log", threading.Event(), estop_note.hold
+
+    def hold_and_tell(path: Path) -> int | None:
+        handle = hold(path)
+        held.set()
+        return handle
+
+    monkeypatch.setattr(estop_note, "hold", hold_and_tell)
+    if is_there:
+        write_note(folder, True)
+    first = EstopNote(folder)
+    first.write(True)
+    assert held.wait(10)
+    with pytest.raises(DescriptionError, match="end it first, or send it CLEAR_ESTOP"):
+        clear(folder)
+    with pytest.raises(DescriptionError, match=r"another vehicle that runs logs into .*: end it first, or give this one another --out"):
+        EstopNote(folder)
+    first.close()
+    assert clear(folder) and not estop_stands(folder)
+    EstopNote(folder).close()
 
 
 @pytest.mark.parametrize(("text", "stands"), [(STANDS, True), (CLEAR, False), (b"", True), (b"\x00" * 7, True), (b"clear", True)])

@@ -1,5 +1,6 @@
 """How the process before ended, by what its can.log says was sent last: the frames are the codec's own, the file is torn as it comes."""
 
+import errno
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,9 +8,11 @@ from typing import Any
 
 import pytest
 
-from firmware_py.app.last_flight import RECENT_NS, TAIL_BYTES, LastFlight, last_flight
+from firmware_py.app.last_flight import RECENT_NS, TAIL_BYTES, LastFlight, last_flight, outdate
 from firmware_py.bus.codec import Codec
 from firmware_py.description.fleet import Fleet, Module
+from firmware_py.runtime.clock import unix_ns
+from firmware_py.runtime.guarded_file import GuardedFile, QueuedFile
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder, candump_lines
 
 CODEC = Codec.load()
@@ -113,6 +116,36 @@ def test_log_of_a_process_that_sent_nothing_says_nothing_and_the_one_before_coun
     write(tmp_path / "0003", "")
     write(tmp_path / "0004", lines_of([False] * 3).replace(" T\n", " R\n"))
     assert in_flight(tmp_path) == {0, 1, 2}
+
+
+@pytest.mark.parametrize("queued", [True, False])
+def test_log_that_a_full_disk_ended_before_its_flight_says_nothing_nor_do_those_before_it(
+    tmp_path: Path, queued: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it lacks may be a DISARM."""
+    write(tmp_path, lines_of([True] * 3), unix_ns())
+    (tmp_path / "0002").mkdir()
+    append = GuardedFile._append
+
+    def append_until_full(file: GuardedFile, data: bytes) -> None:
+        if b"0.020000" in data:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(file, data)
+
+    monkeypatch.setattr(GuardedFile, "_append", append_until_full)
+    file = (QueuedFile if queued else GuardedFile)(tmp_path / "0002" / CAN_LOG)
+    for tick, armed in ((1, True), (2, False)):
+        file.write(lines_of([armed] * 3, tick).encode())
+    file.close()
+    assert file.error is not None and (tmp_path / "0002" / CAN_LOG).read_text() == lines_of([True] * 3)
+    assert in_flight(tmp_path, unix_ns()) == set()
+
+
+def test_flight_that_left_no_log_makes_those_before_it_old(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "0002"):
+        write(folder, lines_of([True] * 3))
+    outdate(tmp_path)
+    assert in_flight(tmp_path) == set()
 
 
 @pytest.mark.parametrize("boot", ["another-start", ""])
