@@ -1,6 +1,7 @@
-"""Which thrusters are dead or lie: by what their ESCs report, and by the motion that is missing. Between estimate and supervisor.
+"""Which thrusters are dead or lie: by what their ESCs report, by the motion that is missing, and by a module that falls silent. Between
+estimate and supervisor.
 
-What is found stays out until the body is disarmed.
+What is found stays out until the body is disarmed; those of a silent module until it is heard again.
 """
 
 from __future__ import annotations
@@ -35,6 +36,10 @@ FAST_MARGIN = 0.25
 """Share of full speed that it must be off besides: below, deadband and lag explain it."""
 CLEAR = 4.0
 """A propeller that stands still again where this many times the least force is believed counts twice: it is not about to start."""
+SILENT_NS = 500_000_000
+"""After so much silence the thrusters of a module are left out, if the others can make every wrench without: where it hears nothing either
+they have stood still since 100 ms, and where it hears they then do so too.
+"""
 TELLS = 0.3
 """Weight of one feedback in what an ESC tells of its thruster's force. Ten come in a second (DESIGN's bus), so that 0.3 s are remembered:
 less than the half second of motion that core.missing_thrust judges."""
@@ -89,6 +94,12 @@ class FaultDetector:
         self._motion = MissingThrust(body, parameters, period_ns)
         self.retune(parameters)
         n = t.f_max.size
+        self._obeys = np.ones(n, dtype=bool)
+        """Those that nothing was found about."""
+        self._silent_after = max(1, SILENT_NS // period_ns)
+        self._silence = np.zeros(len(body.modules), dtype=np.int64)
+        """Ticks since each module was heard."""
+        self._mute: list[int] = []
         self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
         self._heard, self._share = np.zeros((n, 2)), np.ones(n)
@@ -96,7 +107,7 @@ class FaultDetector:
         """What was found in this tick, for people."""
         self.changed = False
         """Whether `now` changed in this tick."""
-        self.now = self._judge(np.ones(n, dtype=bool))
+        self.now = self._judge(self._obeys)
 
     def retune(self, parameters: Faults) -> None:
         """Takes other limits from this tick on; what is known stays."""
@@ -106,19 +117,21 @@ class FaultDetector:
 
     def take_over(self, before: Sequence[FaultDetector]) -> None:
         """Goes on from the bodies that this one is made of, or was part of: what is left out stays out."""
-        alive = self.now.alive.copy()
         for other in before:
             for i, j in in_both(self._modules, other._modules):
+                self._silence[i] = other._silence[j]
                 for channel, thruster in self._thruster_at[i].items():
-                    alive[thruster] = other.now.alive[other._thruster_at[j][channel]]
-        self.now = self._judge(alive)
+                    self._obeys[thruster] = other._obeys[other._thruster_at[j][channel]]
+        self._mute = self._silent()
+        self.now = self._left()
 
     def reset(self) -> None:
         """All thrusters are trusted again."""
         self._counts[:] = 0
         self._motion.reset()
         self.changed = not self.now.alive.all()
-        self.now = self._judge(np.ones(self.now.alive.size, dtype=bool))
+        self._obeys[:], self._mute = True, []
+        self.now = self._judge(self._obeys)
 
     def step(
         self, modules: list[ModuleInputs], measured: Measured, estimate: Estimate, force_n: np.ndarray, mean_n: np.ndarray, armed: bool
@@ -135,9 +148,36 @@ class FaultDetector:
         found = self._motion.step(measured, estimate, mean_n * self._share, self.now.alive, armed)
         if found is not None:
             self._lose(found, "does not push as it says")
+        own = [modules[m] for m in self._modules]
+        self._silence = (self._silence + 1) * [not module.heard for module in own]
         if armed:
-            self._hear([modules[m] for m in self._modules], force_n)
+            self._hear(own, force_n)
+            self._miss()
         return self.now
+
+    def _silent(self) -> list[int]:
+        """Modules that have been silent for too long, by their index in the body."""
+        return np.flatnonzero(self._silence >= self._silent_after).tolist()
+
+    def _miss(self) -> None:
+        """Leaves out the thrusters of modules that have fallen silent, and takes them back from those that are heard again."""
+        before, self._mute = self._mute, self._silent()
+        if self._mute == before:
+            return
+        alive, self.now = self.now.alive, self._left()
+        if not np.array_equal(alive, self.now.alive):
+            self.changed = True
+            self._motion.forget()
+            silent = ", ".join(str(self._modules[i]) for i in self._mute)
+            self.words.append(f"thrusters of silent module {silent} are left out" if silent else "no module is silent any more")
+
+    def _left(self) -> ThrusterFaults:
+        """What may be used: all that obey, less those of silent modules where the others do without."""
+        obeying = self._judge(self._obeys)
+        if not self._mute:
+            return obeying
+        heard = self._judge(self._obeys & ~np.isin(self._t.module, self._mute))
+        return heard if heard.lost_axes == obeying.lost_axes else obeying
 
     def _hear(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
         """Every ESC's feedback against what its thruster is believed to give."""
@@ -161,13 +201,13 @@ class FaultDetector:
         return float(believed_rpm(force_n, full_n[i], rpm_at_full[i]))
 
     def _lose(self, i: int, why: str) -> None:
-        alive = self.now.alive.copy()
-        alive[i] = False
-        self.now, self.changed = self._judge(alive), True
+        self._obeys[i] = False
+        self.now, self.changed = self._left(), True
         self._motion.forget()
         self.words.append(f"thruster {i + 1} {why}: left out")
 
-    def _judge(self, alive: np.ndarray) -> ThrusterFaults:
+    def _judge(self, usable: np.ndarray) -> ThrusterFaults:
+        alive = usable.copy()
         u, values, _ = np.linalg.svd(self._t.matrix * alive, full_matrices=False)
         rank = int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1e-12)))
         dead = tuple(int(i) for i in np.flatnonzero(~alive))

@@ -11,6 +11,7 @@ from numba import njit
 from firmware_py.core.body import Body
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rotations import M, V, conjugate, cross, difference, exp, multiply, to_matrix
+from firmware_py.core.sensor_offsets import SensorOffsets
 from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservation
 from firmware_py.description.water import WATER_DENSITY
 
@@ -28,6 +29,10 @@ CENTRED_M = 1e-9
 """IMUs whose mean is nearer to the centre of mass stand around it: what is left is rounding."""
 ALPHA_S = 0.03
 """Time over which the gyro's differences are averaged: over 0.3 m of lever their noise makes 0.02 m/s^2, without it 0.1 at 100 Hz."""
+TURN_NS = 100_000_000
+"""Within so long each pressure sensor is heard, ten times a second at the slowest; who is not is silent."""
+STILL_RAD_S = 0.05
+"""Slower than that the place of an IMU in the body makes no difference: 0.75 mm/s^2 over 0.3 m."""
 
 
 Seen = list[tuple[TagObservation, int]]
@@ -46,6 +51,17 @@ class Measurements:
         self._centred = bool(np.abs(self._mean_r_bi).max() < CENTRED_M)
         self._share = 1.0 - math.exp(-period_ns * 1e-9 / ALPHA_S)
         self._gain = self._share / (period_ns * 1e-9) if period_ns else 0.0
+        count = len(body.modules)
+        self._apart = np.kron(np.ones((count, 1)), -self._mean_of_all)
+        """(3 count, 3 count) readings of all modules -> how each differs from their mean, body frame."""
+        for i in range(count):
+            self._apart[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += self._rotations[:, i]
+        self._gyro_offsets, self._accel_offsets = (SensorOffsets(count, 3, period_ns) for _ in range(2))
+        self._depth_offsets = SensorOffsets(count, 1, period_ns)
+        self._turn = max(1, TURN_NS // max(1, period_ns))
+        self._depths_m, self._depth_age = np.zeros(count), np.full(count, self._turn)
+        """Last depth of each sensor, and ticks with a depth since then."""
+        self._is_still = False
         self._last_gyro: np.ndarray | None = None
         self._alpha = np.zeros(3)
         self._tags = {(int(m), int(i)): k for k, (m, i) in enumerate(zip(body.tag_module, body.tag_ids, strict=True))}
@@ -60,22 +76,26 @@ class Measurements:
             q_wb: (4,) latest attitude, for the height of each pressure sensor above the centre of mass.
         """
         mine = [modules[i] for i in self._modules]
-        gyro = self._mean([m.gyro for m in mine])
+        gyro = self._mean([m.gyro for m in mine], self._gyro_offsets)
+        self._is_still = len(mine) > 1 and gyro is not None and float(gyro @ gyro) < STILL_RAD_S**2
         return Measured(gyro, self._accel([m.accel for m in mine], gyro), self._depth(mine, q_wb), self._poses(mine, q_wb))
 
-    def _mean(self, readings: list[np.ndarray | None]) -> np.ndarray | None:
-        """Mean over the modules that were heard, body frame."""
+    def _mean(self, readings: list[np.ndarray | None], offsets: SensorOffsets) -> np.ndarray | None:
+        """Mean over all modules, body frame; where not all were heard, what it would be by the offsets of those that were."""
         heard = [value for value in readings if value is not None]
         if not heard:
             return None
-        mean = self._mean_of_all
+        stacked = heard[0] if len(heard) == 1 else np.concatenate(heard)
         if len(heard) < len(readings):
-            mean = self._rotations[:, [value is not None for value in readings]].reshape(3, -1) / len(heard)
-        return np.asarray(mean @ (heard[0] if len(heard) == 1 else np.concatenate(heard)))
+            which = [value is not None for value in readings]
+            return np.asarray(self._rotations[:, which].reshape(3, -1) @ stacked / len(heard) - offsets.of(which))
+        if self._is_still:
+            offsets.learn((self._apart @ stacked).reshape(-1, 3))
+        return np.asarray(self._mean_of_all @ stacked)
 
     def _accel(self, readings: list[np.ndarray | None], gyro: np.ndarray | None) -> np.ndarray | None:
         """Mean specific force (3,) less what turning adds at the mean place of those heard, as far as a gyro tells it."""
-        accel, heard = self._mean(readings), [value is not None for value in readings]
+        accel, heard = self._mean(readings, self._accel_offsets), [value is not None for value in readings]
         if not self._centred or len(heard) > 1:
             self._follow(gyro)
         if accel is None or gyro is None or (self._centred and all(heard)):
@@ -99,9 +119,25 @@ class Measurements:
         heard = [m.pressure_pa for m in mine if m.pressure_pa is not None]
         if not heard:
             return None
-        lever = self._lever([m.pressure_pa is not None for m in mine])
-        pressure, below = sum(heard) / len(heard), float(lever @ to_matrix(q_wb)[2])
-        return (pressure - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - below
+        which, down = [m.pressure_pa is not None for m in mine], to_matrix(q_wb)[2]
+        pressure, below = sum(heard) / len(heard), float(self._lever(which) @ down)
+        depth_m = (pressure - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - below
+        if len(mine) > 1:
+            each_m = (np.array(heard) - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - self._r_bi[which] @ down
+            depth_m -= self._depth_offset(which, each_m)
+        return depth_m
+
+    def _depth_offset(self, which: list[bool], each_m: np.ndarray) -> float:
+        """By how much the mean of the sensors that were heard in this tick is off that of all, where some are silent. Healthy ones come in
+        turns, a few ticks apart, and the estimator has learnt what they tell on the mean.
+        """
+        self._depth_age += 1
+        self._depth_age[which], self._depths_m[which] = 0, each_m
+        if self._depth_age.max() > self._turn:
+            return float(self._depth_offsets.of(which)[0])
+        if self._is_still:
+            self._depth_offsets.learn((self._depths_m - self._depths_m.mean()).reshape(-1, 1))
+        return 0.0
 
     def _poses(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> list[BodyPose]:
         """One pose for each picture, oldest first."""

@@ -4,18 +4,17 @@ Thrusters that die or lie on the spiral, lost frames, e-stops at any tick, tags 
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from firmware_py.app.firmware import BusFrame
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Inputs, Outputs
+from firmware_py.core.types import Action, Mode, Outputs, Request
 from firmware_py.description.parameters import Parameters
-from hil.bench import open_bench
+from hil.bench import Bench, open_bench
 from hil.fuzz import fuzz_flight
 from hil.plant.fault_spec import Fault
 from hil.safety import ICM_20602, command_outlives_frames_ms, fly_to_estop, hover_blind, spiral_through_loss, spiral_with
@@ -86,20 +85,47 @@ def test_after_an_e_stop_nothing_turns_whatever_else_happens(seed: int) -> None:
 def test_stop_that_was_raised_before_the_start_stands_though_the_first_answers_of_the_modules_are_lost() -> None:
     """A module lets go of it at the first command that says disarmed: none may be sent before it is known."""
     silence = Fault(kind="frame_loss", value=1.0, at_s=0.0, until_s=0.035, direction="from_plant")
-    scenario = dataclasses.replace(load_scenario("dock"), fault=(silence,))
-    states: list[list[State]] = []
-    with ExitStack() as stack:
-        bench = open_bench(stack, scenario, 0, Parameters(), "virtual:stopped")
+
+    def press(bench: Bench) -> None:
         for mcu in bench.nodes.mcus.values():
             mcu.estop(-1_000_000_000)
-        bench.script = SimpleNamespace(ticks=100, is_over=lambda time_ns: False, requests=lambda time_ns, last: [])  # type: ignore[assignment]
 
-        def watch(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-            states.append([State(record.state) for record in outputs.records])
-
-        bench.fly([watch])
+    states: list[list[State]] = []
+    fly("dock", 1.0, silence, press, lambda bench, outputs: states.append([State(record.state) for record in outputs.records]))
     assert states[0] == [State.DISARMED] * 2, "nothing has been heard yet"
     assert states[10:] == [[State.ESTOP] * 2] * (len(states) - 10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("direction", ["both", "from_plant"])
+def test_docked_module_that_falls_silent_is_carried_in_place_by_the_other(direction: str) -> None:
+    """With its bias of another, what is left of the mean IMU drove the pair 25 mm off."""
+    silence = Fault(kind="frame_loss", value=1.0, at_s=6.0, module=2, direction=direction)
+    off_m: list[float] = []
+
+    def watch(bench: Bench, outputs: Outputs) -> None:
+        (record,) = outputs.records
+        if outputs.tick > 600:
+            assert (record.state, record.mode) == (State.ARMED, Mode.POSHOLD)
+            off_m.append(float(np.linalg.norm(bench.nodes.world.body_truth(0).p_wb - record.setpoint.p_wb)))
+
+    fly("mobius-2", 18.0, silence, lambda bench: None, watch)
+    assert 0.001 < np.sqrt(np.mean(np.square(off_m))) < 0.005
+    assert max(off_m) < 0.010
+
+
+def fly(scenario: str, seconds: float, fault: Fault, prepare: Callable[[Bench], None], watch: Callable[[Bench, Outputs], None]) -> None:
+    """Flies the bodies of a scenario, which arm at 3 s and hold; `watch` is called once a tick."""
+
+    def requests(time_ns: int, last: Outputs | None) -> list[Request]:
+        return [Request(Action.ARM, record.body) for record in last.records] if last and time_ns == 3_000_000_000 else []
+
+    with ExitStack() as stack:
+        bench = open_bench(stack, dataclasses.replace(load_scenario(scenario), fault=(fault,)), 1, Parameters(), "virtual:one-fault")
+        prepare(bench)
+        script = SimpleNamespace(ticks=round(100 * seconds), is_over=lambda time_ns: False, requests=requests)
+        bench.script = script  # type: ignore[assignment]
+        bench.fly([lambda received, sent, inputs, outputs: watch(bench, outputs)])
 
 
 @pytest.mark.slow

@@ -271,6 +271,67 @@ def test_depth_is_that_of_the_centre_of_mass_in_any_attitude(
     assert depth == pytest.approx(P_WB[2], abs=1e-9)
 
 
+BIASES = np.array([
+    [0.01, -0.02, 0.005, 0.05, -0.06, 0.03, 0.02], [0.0, 0.01, -0.01, -0.02, 0.04, 0.01, -0.03], [-0.02, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0],
+])  # fmt: skip
+"""Of each module's gyro, accelerometer, both in the axes of the body, and depth."""
+
+
+def biased(measurements: Measurements, heard: tuple[int, ...], rate: np.ndarray) -> np.ndarray:
+    """(7,) measured of a body that turns at `rate`, whose sensors have biases, less what is true."""
+    modules = silent()
+    for module in heard:
+        here, (gyro, accel, depth_m) = modules[FLEET_INDEX[module]], np.split(BIASES[module], [3, 6])
+        here.gyro = in_module(module, rate + gyro)
+        here.accel = in_module(module, PUSHED + np.cross(rate, np.cross(rate, ORIGINS_B[module])) + accel)
+        z = (P_WB + R_WB.apply(ORIGINS_B[module]))[2] + depth_m[0]
+        here.pressure_pa = 101_325.0 + WATER_DENSITY * 9.80665 * z
+    measured = measurements.fuse(modules, Q_WB)
+    assert measured.gyro is not None and measured.accel is not None and measured.depth_m is not None
+    return np.r_[measured.gyro - rate, measured.accel - PUSHED, measured.depth_m - P_WB[2]]
+
+
+@pytest.mark.parametrize("heard", SUBSETS)
+def test_mean_keeps_its_bias_when_modules_fall_silent(body: Body, heard: tuple[int, ...]) -> None:
+    """Which the estimator has learnt by then, while the body stood still."""
+    measurements = Measurements(body, PERIOD)
+    for _ in range(100):
+        before = biased(measurements, (0, 1, 2), np.zeros(3))
+    np.testing.assert_allclose(before, BIASES.mean(axis=0), atol=1e-9)
+    after = [biased(measurements, heard, np.zeros(3)) for _ in range(30)]
+    np.testing.assert_allclose([of_imu[:6] for of_imu in after], np.tile(before[:6], (30, 1)), atol=1e-3)
+    np.testing.assert_allclose(after[-1][6], before[6], atol=1e-3)  # whether a pressure sensor is silent shows after its turn
+
+
+def test_pressure_sensors_that_are_heard_in_turns_are_told_apart(body: Body) -> None:
+    """Until one falls silent, each is taken as it comes: the estimator knows what they tell on the mean."""
+    measurements, each = Measurements(body, PERIOD), BIASES[:, 6]
+
+    def hear(module: int) -> float:
+        modules = silent()
+        z = (P_WB + R_WB.apply(ORIGINS_B[module]))[2] + each[module]
+        modules[FLEET_INDEX[module]].pressure_pa = 101_325.0 + WATER_DENSITY * 9.80665 * z
+        for m in modules:
+            m.gyro = np.zeros(3)
+        depth_m = measurements.fuse(modules, Q_WB).depth_m
+        assert depth_m is not None
+        return depth_m - P_WB[2]
+
+    for tick in range(300):
+        assert hear(tick % 3) == pytest.approx(each[tick % 3], abs=1e-9)
+    left = [hear(tick % 2) for tick in range(30)][-2:]
+    assert left == pytest.approx([each.mean()] * 2, abs=1e-3)
+
+
+def test_body_that_turns_tells_nothing_of_how_its_sensors_differ(body: Body) -> None:
+    """What turning adds at the place of each is no bias."""
+    measurements = Measurements(body, PERIOD)
+    for _ in range(100):
+        biased(measurements, (0, 1, 2), RATE)
+    measurements.fuse(silent(), Q_WB)  # or it would tell of the turn's sudden end
+    np.testing.assert_allclose(biased(measurements, (1,), np.zeros(3)), BIASES[1], atol=1e-3)
+
+
 def test_depth_is_told_by_the_density_that_drags() -> None:
     cube = load_vehicle("modcube")
     lone = assemble([(0, 0, 0)], [0], [cube], [0])

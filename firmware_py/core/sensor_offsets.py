@@ -1,0 +1,31 @@
+"""How the sensors of each module differ from the mean of the body's: so that the mean does not jump when some of them fall silent.
+
+Each has a bias of its own. The estimator learns that of the mean, slowly; what is left of the mean brings another one, and a robot that
+takes it for a push leans and drifts until it has learnt that too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+REMEMBERED_S = 30.0
+"""Over which differences are averaged: biases walk by less than a tenth of how much they differ in that time."""
+
+
+class SensorOffsets:
+    """Of one kind of sensor."""
+
+    def __init__(self, modules: int, numbers: int, period_ns: int) -> None:
+        """For readings of so many numbers each. `period_ns`: between two of them."""
+        self._longest = max(1, round(REMEMBERED_S * 1e9 / max(1, period_ns)))
+        self._count = 0
+        self._offsets = np.zeros((modules, numbers))
+
+    def learn(self, differences: np.ndarray) -> None:
+        """(modules, numbers) how each reading differs from the mean of all, in the body's axes, in one tick."""
+        self._count = min(self._count + 1, self._longest)
+        self._offsets += (differences - self._offsets) / self._count
+
+    def of(self, heard: list[bool]) -> np.ndarray:
+        """(numbers,) by how much the mean of those that were heard is off the mean of all."""
+        return np.asarray(self._offsets[heard].mean(axis=0))
