@@ -293,7 +293,7 @@ class Thrust(NamedTuple):
     achieved: Array
     """(6,) wrench that these forces give."""
     scale: tuple[float, float]
-    """Share of the wanted force and moment that is kept, 0 to 1."""
+    """Share of the wanted force and moment that is kept, 0 to 1, as far as the thrusters that are left can make them (faults.keep)."""
     margin: float = math.nan
     """Share of its range that the busiest thruster has left, 0 to 1; NaN while single motors are tested."""
 

@@ -213,7 +213,9 @@ def add_walls(bodies, modules, m, water, x):
     b = modules.body[m]
     r, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), matrix(modules.turn, m)
     position, size, origin = triple(modules.position, m, 0), triple(modules.size, m, 0), triple(x, b, 0)
-    lift = 0.25 * water.density * water.gravity * size[0] * size[1]
+    down = turn_back(inside, r[2])
+    plane = size[1] * size[2] * down[0] ** 2 + size[2] * size[0] * down[1] ** 2 + size[0] * size[1] * down[2] ** 2
+    lift = 0.25 * water.density * water.gravity * plane
     for k in range(8):
         corner = (
             size[0] * (0.5 if k & 1 else -0.5),

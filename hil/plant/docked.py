@@ -66,7 +66,9 @@ class DockedBodies(ABC):
         self._hanging = {}
 
     def join(self, joint: Joint) -> None:
-        """Makes one body of the two that `joint` links, and closes whatever else then meets. Momentum stays as it is, unless clamped."""
+        """Makes one body of the two that `joint` links, and closes whatever else then meets. Momentum and centre of mass stay as they are;
+        of a body that is clamped, place and attitude.
+        """
         a, b = sorted((int(self._modules.body[joint.module]), int(self._modules.body[joint.other])))
         old, total = self._body_arrays, self.momentum()
         kept = joint.module if joint.module in self.bodies[a] else joint.other
@@ -76,7 +78,12 @@ class DockedBodies(ABC):
         lattice = QUATERNIONS[nearest(q_ab)].copy()
         off = rotations.log(rotations.multiply(q_ab, rotations.conjugate(lattice)))
         masses = old.rigid[[a, b], 0, 0]
-        centre = np.average([self._to_world(k, centre_of(old, k)) for k in (a, b)], axis=0, weights=masses)
+        share = masses[1] / masses.sum()
+        stays_w = np.average([self._to_world(k, centre_of(old, k)) for k in (a, b)], axis=0, weights=masses)
+        held = next((k for k in (a, b) if old.clamped[k]), None)
+        if held is not None:
+            anchor = self.bodies[held][0]
+            share, stays_w = float(held == b), self._to_world(held, self.places[anchor].position)
         groups = [g for k, g in enumerate(self.bodies) if k not in (a, b)]
         groups = sorted([*groups, tuple(sorted((*self.bodies[a], *self.bodies[b])))])
         states = {g[0]: old.state[k].copy() for k, g in enumerate(self.bodies)}
@@ -85,8 +92,9 @@ class DockedBodies(ABC):
         self._restore(states)
         new = groups.index(next(g for g in groups if g[0] == leader))
         x = self._body_arrays.state[new]
-        x[3:7] = rotations.normalise(rotations.multiply(q_a, rotations.exp(off * masses[1] / masses.sum())))
-        x[:3] = centre - rotations.rotate(x[3:7].copy(), centre_of(self._body_arrays, new))
+        x[3:7] = rotations.normalise(rotations.multiply(q_a, rotations.exp(off * share)))
+        stays = centre_of(self._body_arrays, new) if held is None else self.places[anchor].position
+        x[:3] = stays_w - rotations.rotate(x[3:7].copy(), stays)
         motion_of(self._body_arrays, new, total[a] + total[b], self._flow())
         if self._body_arrays.clamped[new]:
             x[7:13] = 0.0
@@ -145,17 +153,18 @@ class DockedBodies(ABC):
             pushing = slice(*np.searchsorted(self._thrusters.module, (m, m + 1)))
             need -= self._thrusters.force[pushing] @ self._thrusters.column[pushing] + self._hands[m]
         need -= self._touch_on(far.members)[b]
-        outward = self._modules.turn[joint.module] @ FACE_NORMALS[joint.face]
+        outward, side = self._modules.turn[joint.module] @ FACE_NORMALS[joint.face], 1.0 if joint.other in far.members else -1.0
         at = self._modules.position[joint.module] + 0.5 * self._modules.size[joint.module, joint.face // 2] * outward
         bending = rotations.cross(outward, need[3:] - rotations.cross(at, need[:3]))
-        return float(-outward @ need[:3] + np.linalg.norm(bending) / DISK_M)
+        return float(-side * outward @ need[:3] + np.linalg.norm(bending) / DISK_M)
 
     def _find_hanging(self, joint: Joint) -> Hanging | None:
-        """What hangs on `joint` alone, on its other side; None where other joints hold that too."""
+        """What hangs on `joint` alone, on its other side, or on this one where a clamp holds the other; None where others hold it too."""
         parts = pieces(self.bodies[int(self._modules.body[joint.module])], [j for j in self.docks.joints if j != joint])
         if len(parts) == 1:
             return None
-        return hanging(self._draws, self._modules, next(piece for piece in parts if joint.other in piece), self.spec.gravity)
+        free = [piece for piece in parts if self._held.isdisjoint(piece)] or parts
+        return hanging(self._draws, self._modules, next((p for p in free if joint.other in p), free[0]), self.spec.gravity)
 
     def _touch_on(self, members: Sequence[int]) -> np.ndarray:
         """(b, 6) what walls and other bodies do to these modules of one body, in that body's row, body frame."""

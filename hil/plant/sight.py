@@ -56,7 +56,8 @@ def look(eye, axis, cos_view, poses, tags, boxes, out):
         eye, axis: lens and optical axis, world; cos_view: cosine of half the cone in which it sees.
         poses: (m, 7) hull centre and quaternion of every module, world.
         tags: (t, 7) module, centre (3) and outward normal (3) in the module frame.
-        boxes: (k, 7) module, centre (3) in the module frame, half edges (3): hulls and payloads.
+        boxes: (k, 7) module, centre (3) in the module frame, half edges (3): of each module its hull, which does not hide its own tags,
+            and then its payloads.
     """
     for t in range(tags.shape[0]):
         m = int(tags[t, 0])
@@ -70,7 +71,8 @@ def look(eye, axis, cos_view, poses, tags, boxes, out):
         if out[t] <= 0.0:
             continue
         for k in range(boxes.shape[0]):
-            if int(boxes[k, 0]) != m and crosses(p, eye, boxes, k, poses):
+            is_own_hull = int(boxes[k, 0]) == m and (k == 0 or int(boxes[k - 1, 0]) != m)
+            if not is_own_hull and crosses(p, eye, boxes, k, poses):
                 out[t] = OUT_OF_SIGHT
                 break
 

@@ -167,6 +167,20 @@ def test_light_module_floats_at_the_surface() -> None:
     assert world.truth(0).p_wm[2] == pytest.approx(0.105 - shown, abs=2e-4)
 
 
+@pytest.mark.parametrize("q", [LEVEL, rotations.from_euler(math.pi / 2, 0.0, 0.0), rotations.from_euler(0.0, math.pi / 2, 0.3)])
+def test_long_hull_that_is_lifted_out_loses_the_buoyancy_of_what_shows(q: np.ndarray) -> None:
+    """On whichever side it lies: by the box's own geometry."""
+    body, out_m = load_vehicle("bluerov2_heavy"), 0.02
+    faces = np.array([body.hull.size_m[1] * body.hull.size_m[2], body.hull.size_m[2] * body.hull.size_m[0], np.prod(body.hull.size_m[:2])])
+    up = np.argmax(np.abs(rotations.to_matrix(q)[2]))
+    lift = []
+    for depth_m in (5.0, 0.5 * body.hull.size_m[up] - out_m):
+        world = World(WorldSpec(**CALM), OCEAN, [body], [Start(np.array([0.0, 0.0, depth_m]), q)], 0, PERIOD_NS)
+        world._step(0)
+        lift.append(rotations.rotate(q, world._body_arrays.wrench[0, :3].copy())[2])
+    assert lift[1] - lift[0] == pytest.approx(998.2 * 9.81 * faces[up] * out_m, rel=1e-6)
+
+
 @pytest.mark.parametrize("kind", ["box", "cylinder"])
 def test_module_stays_inside_the_tank_and_gains_no_energy_at_its_walls(kind: str) -> None:
     tank = Tank(kind=kind, radius_m=0.7, depth_m=0.8)

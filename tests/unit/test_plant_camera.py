@@ -9,7 +9,7 @@ import pytest
 
 from firmware_py.bus.codec import Codec
 from firmware_py.core import rotations
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import Payload, load_vehicle
 from hil.nodes import make_nodes
 from hil.plant.camera import Camera, Sighting, tag_pose
 from hil.plant.sight import crosses
@@ -93,6 +93,14 @@ def test_module_above_hides_the_one_below() -> None:
     assert [s.module for s in look(stacked, camera(2))] == [0]
     docked = world_of(at(0.0, 0.0, 0.3), at(0.0, 0.0, 0.51))
     assert [s.module for s in look(docked, camera(2))] == [0]
+
+
+def test_payload_hides_the_tag_behind_it_and_its_own_hull_does_not() -> None:
+    lid = Payload(name="lid", dry_kg=0.1, size_m=np.array([0.3, 0.3, 0.02]), position_m=np.array([0.0, 0.0, -0.2]))
+    for payload, seen in (((), 1), ((lid,), 0), ((dataclasses.replace(lid, position_m=np.array([0.0, 0.4, -0.2])),), 1)):
+        laden = dataclasses.replace(VEHICLE, payload=payload)
+        world = World(WorldSpec(**CALM), Tank(), [laden], [at(0.0, 0.0, 0.4)], 0, PERIOD_NS)
+        assert len(look(world, Camera(ABOVE, SensorSpec(**IDEAL), [laden], (5,), 0))) == seen
 
 
 def test_segment_and_box() -> None:

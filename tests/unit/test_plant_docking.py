@@ -286,6 +286,22 @@ def test_hand_on_one_of_two_loads_their_joint_with_half_its_force(module: int, f
     assert world._pull_on(world.docks.joints[0]) == pytest.approx(abs(force) / 2 * np.sign(force if module else -force), rel=1e-6)
 
 
+@pytest.mark.parametrize("cells", [(0, 1, 2), (2, 1, 0), (2, 0, 1), (0, 2, 1)])
+def test_joints_of_a_row_that_is_clamped_at_one_end_carry_all_of_a_pull_at_the_other(cells: tuple[int, ...]) -> None:
+    """However its modules are counted: the clamp is on the first, and the load cell bears what it holds."""
+    start, along = Start(np.array([0.0, 0.0, 400.0]), LEVEL), np.array([0.21, 0.0, 0.0])
+    places = [Place((cell - cells[0]) * along, LEVEL.copy()) for cell in cells]
+    world = World(WorldSpec(**CALM), OCEAN, [SLIPPERY] * 3, [start] * 3, 0, PERIOD_NS, groups=[(0, 1, 2)], places=places, jam=NEVER)
+    world.clamp(0)
+    end = int(np.argmax(np.abs(np.subtract(cells, cells[0]))))
+    world.push[end, 0] = pull = 50.0 * np.sign(cells[end] - cells[0])
+    world._step(0)
+    beyond = [joint for joint in world.docks.joints if end in (joint.module, joint.other) or abs(cells[end] - cells[0]) == 2]
+    assert len(beyond) == (2 if abs(cells[end] - cells[0]) == 2 else 1)
+    assert [world._pull_on(joint) for joint in beyond] == pytest.approx([50.0] * len(beyond), abs=1e-9)
+    assert world.load(0)[0] == pytest.approx(pull)
+
+
 def test_what_touches_one_of_two_loads_their_joint_with_half_its_force() -> None:
     deep = 2e-4
     world = start_docked(0.42 - deep)
@@ -357,6 +373,20 @@ def test_what_joins_a_clamped_body_stands_still() -> None:
     assert not world.truth(1).v_w.any() and world._body_arrays.clamped.tolist() == [1, 0]
     world.part(world.docks.joints[0])
     assert world._body_arrays.clamped.tolist() == [1, 0, 0]
+
+
+@pytest.mark.parametrize("held", [0, 1])
+def test_clamped_body_stays_where_it_is_when_another_locks_to_it_askew(held: int) -> None:
+    """Which gives way, and sits in the lattice."""
+    world = two(6e-4, 8e-4, q=rotations.from_euler(0.0, 0.002, -0.004))
+    world.clamp(held)
+    before = world.truth(held)
+    world.join(Joint(0, 0, 1, 1))
+    after, others = world.truth(held), [world.truth(m) for m in (0, 1)]
+    np.testing.assert_allclose(after.p_wm, before.p_wm, atol=1e-15)
+    np.testing.assert_allclose(after.q_wm, before.q_wm, atol=1e-15)
+    between = rotations.rotate_back(others[0].q_wm, others[1].p_wm - others[0].p_wm)
+    np.testing.assert_allclose(between, [0.21, 0.0, 0.0], atol=1e-12)
 
 
 def test_magnets_do_no_work_around_a_loop() -> None:
