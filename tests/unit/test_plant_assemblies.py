@@ -1,25 +1,36 @@
-"""Docked bodies of the plant: the lattice, masses by its own sums, drag with shelter. The controller's figures are only compared."""
+"""Docked bodies of the plant: lattice, masses by its own sums, motion, drag with shelter. The controller's figures are only compared."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from firmware_py.core import rotations
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.schema import DescriptionError, frozen_array
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import Vehicle, load_vehicle
 from firmware_py.prepare import lattice as controllers_lattice
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.projected_area import areas_and_centroids, box
 from hil.plant import shelter
 from hil.plant.draw import skew, stream
-from hil.plant.lattice import QUATERNIONS, is_connected
+from hil.plant.lattice import QUATERNIONS, is_connected, place
 from hil.plant.polycube import grow
+from hil.plant.spec import CALM, Tank, WorldSpec
+from hil.plant.world import STEP_NS, Start, World
 from hil.scenario import Scenario, load_scenario, make_world
 
 PERIOD_NS = 10_000_000
+OCEAN = Tank(kind="box", size_m=np.array([900.0, 900.0, 900.0]))
 VEHICLE = load_vehicle("modcube")
+UNEVEN = dataclasses.replace(
+    VEHICLE,
+    inertial=dataclasses.replace(
+        VEHICLE.inertial, added=np.array([3.0, 9.0, 6.0, 0.01, 0.03, 0.02]), com_m=np.array([0.01, -0.02, 0.015]), righting_arm_m=0.0
+    ),
+)
+"""Of uneven added mass, its weight off the middle; nothing rights it."""
 SHAPES = {
     "line": [[0, 0, 0], [1, 0, 0]],
     "L": [[0, 0, 0], [1, 0, 0], [1, 1, 0]],
@@ -136,3 +147,95 @@ def test_body_whose_cells_do_not_touch_is_refused() -> None:
     apart = dataclasses.replace(scenario.module[1], cell=frozen_array([2, 0, 0]))
     with pytest.raises(DescriptionError, match="modules 1, 2"):
         dataclasses.replace(scenario, module=(scenario.module[0], apart))
+
+
+# ---------------------------------------------------------------- motion
+
+
+def docked(cells: list[list[int]], vehicle: Vehicle, turns: tuple[int, ...] = (), step_ns: int = STEP_NS, **world: float) -> World:
+    """Modules that start docked, tilted, in calm deep water; the first one in the origin of its body."""
+    places = [place(np.array(c), r, 0.21, np.array(cells[0])) for c, r in zip(cells, turns or (0,) * len(cells), strict=True)]
+    starts = [Start(np.array([0.0, 0.0, 400.0]), rotations.from_euler(0.4, -0.7, 1.9))] * len(cells)
+    spec, period_ns = WorldSpec(**{**CALM, **world}), max(step_ns, PERIOD_NS // 1000)
+    return World(spec, OCEAN, [vehicle] * len(cells), starts, 0, period_ns, step_ns, groups=[tuple(range(len(cells)))], places=places)
+
+
+def test_current_only_moves_the_frame_of_docked_modules() -> None:
+    """Towed in still water and held in a steady current are the same relative to the water (Galilei), whatever the shape."""
+    moving, still = (docked(SHAPES["L"], UNEVEN, (0, 4, 12), current_m_s=speed) for speed in (0.3, 0.0))
+    current = moving.truth(0).current_w
+    assert np.linalg.norm(current) == pytest.approx(0.3)
+    moving.set_motion(0, np.array([0.2, -0.1, 0.3]) + current, np.array([0.5, -1.0, 0.8]))
+    still.set_motion(0, np.array([0.2, -0.1, 0.3]), np.array([0.5, -1.0, 0.8]))
+    for _ in range(100):
+        moving.advance(PERIOD_NS)
+        still.advance(PERIOD_NS)
+    for m in range(3):
+        np.testing.assert_allclose(moving.truth(m).p_wm - current, still.truth(m).p_wm, atol=1e-9)
+        np.testing.assert_allclose(moving.truth(m).q_wm, still.truth(m).q_wm, atol=1e-9)
+
+
+def test_neutral_docked_modules_are_carried_along_by_accelerating_water_and_not_turned() -> None:
+    """Without drag a body that weighs what it displaces, where it displaces it, follows the water (Froude-Krylov and added mass)."""
+    smooth = dataclasses.replace(UNEVEN, drag=dataclasses.replace(UNEVEN.drag, cd_face=0.0, cd_edge=0.0, rotational_cd=0.0))
+    world = docked(SHAPES["L"], smooth, (0, 4, 12), gust_m_s=0.3, gust_time_s=2.0, gust_smoothing_s=0.5)
+    world.set_motion(0, world.truth(0).current_w, np.zeros(3))
+    before = world.truth(0).current_w
+    for _ in range(100):
+        world.advance(PERIOD_NS)
+    assert np.linalg.norm(world.truth(0).current_w - before) > 0.05, "the water must have changed its speed, or the test proves nothing"
+    for m in range(3):
+        np.testing.assert_allclose(world.truth(m).v_w, world.truth(m).current_w, atol=1e-7)
+        np.testing.assert_allclose(world.truth(m).w_b, 0.0, atol=1e-7)
+
+
+def test_accelerometer_of_every_docked_module_feels_what_its_own_motion_says() -> None:
+    """Specific forces against differences of the hulls' velocities, while a body tumbles and a hand turns it."""
+    world = docked(SHAPES["L"], UNEVEN, (0, 4, 12), step_ns=10_000)
+    world.push[2] = [1.5, 1.0, -2.0, 0.25, 0.15, -0.3]
+    world.set_motion(0, np.array([0.2, -0.1, 0.3]), np.array([0.3, -0.6, 0.5]))
+    before = [world.truth(m) for m in range(3)]
+    world.advance(10_000)
+    assert world.bodies == [(0, 1, 2)]
+    after = [world.truth(m) for m in range(3)]
+    for now, then in zip(before, after, strict=True):
+        acceleration = (then.v_w - now.v_w) / 1e-5
+        felt = rotations.rotate_back(now.q_wm, acceleration - np.array([0.0, 0.0, 9.81]))
+        np.testing.assert_allclose(0.5 * (now.specific_force + then.specific_force), felt, atol=1e-4)
+
+
+# ---------------------------------------------------------------- drag
+
+
+def drag_on(world: World, v_b: np.ndarray, w_b: np.ndarray) -> np.ndarray:
+    """(6,) force and moment of still water about the origin of a neutral body that moves so, body frame."""
+    world.set_motion(0, rotations.rotate(world.body_truth(0).q_wb, v_b), w_b)
+    moving = world._body_arrays.wrench[0].copy()
+    world.set_motion(0, np.zeros(3), np.zeros(3))
+    return moving - world._body_arrays.wrench[0]
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_drag_acts_where_the_middle_of_the_outline_is(name: str) -> None:
+    world, cells = docked(SHAPES[name], VEHICLE), SHAPES[name]
+    directions = np.random.default_rng(6).standard_normal((40, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    solids = [box(np.full(3, 0.21)).placed(np.eye(3), 0.21 * np.array(c, dtype=float)) for c in cells]
+    _, middles = areas_and_centroids(solids, directions)
+    for d, middle in zip(directions, middles, strict=True):
+        drag = drag_on(world, 0.5 * d, np.zeros(3))
+        off_m = np.linalg.norm(drag[3:] - np.cross(middle, drag[:3])) / np.linalg.norm(drag[:3])
+        assert off_m < 0.002
+
+
+def test_sides_that_a_line_of_two_covers_do_not_brake_its_turning() -> None:
+    """About the first module's middle: strips of its own sides and the other's, and the other's way through the water; by quadrature."""
+    half, reach, cd = 0.105, 0.21, VEHICLE.drag
+    open_sides = quad(lambda y: abs(y) * y * y, -half, half)[0]
+    across_x = 0.5 * open_sides  # one of each two is covered
+    near = open_sides + across_x
+    far = quad(lambda y: abs(reach + y) * (reach + y) * y, -half, half)[0] + across_x
+    turning = 0.5 * WorldSpec().density * cd.rotational_cd * 0.21 * (near + far)
+    pushed = 0.5 * WorldSpec().density * cd.cd_face * 0.21**2 * reach**2 * reach
+    drag = drag_on(docked(SHAPES["line"], VEHICLE), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    assert drag[5] == pytest.approx(-(turning + pushed), rel=1e-3)
