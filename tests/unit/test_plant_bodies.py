@@ -78,6 +78,18 @@ def test_symmetric_top_precesses_at_eulers_rate() -> None:
     np.testing.assert_allclose(world.truth(0).w_b, [0.4 * math.cos(angle), 0.4 * math.sin(angle), 2.0], atol=1e-7)
 
 
+def test_lopsided_module_is_turned_about_other_axes_than_the_hands() -> None:
+    """By its products of inertia, which a draw spreads with the moments: their share of these stays."""
+    inertia = np.array([[0.08, 0.02, -0.015], [0.02, 0.06, 0.01], [-0.015, 0.01, 0.07]])
+    world = ocean(frictionless(added=np.zeros(6), inertia=inertia), inertia_spread=0.3)
+    drawn = np.diag(np.diag(world.draw(0).inertia) / np.diag(inertia)) ** 0.5
+    assert np.abs(np.diag(drawn) - 1.0).max() > 0.02
+    moment = np.array([0.3, -0.2, 0.4])
+    world.push[0, 3:] = moment
+    world.advance(PERIOD_NS)
+    np.testing.assert_allclose(world.truth(0).w_b / 0.01, np.linalg.solve(drawn @ inertia @ drawn, moment), rtol=0.01)
+
+
 def test_buoyant_module_rises_along_the_closed_form() -> None:
     body = vehicle()
     world = ocean(body, buoyancy_error_n=0.5)

@@ -11,7 +11,7 @@ from firmware_py.core import rotations
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.plant.contact import touch
 from hil.plant.dock_spec import DockSpec, JamRule
-from hil.plant.docking import Joint
+from hil.plant.docking import DISK_M, Joint
 from hil.plant.lattice import Place
 from hil.plant.spec import CALM, Tank, WorldSpec
 from hil.plant.world import Start, World
@@ -322,6 +322,66 @@ def test_jet_on_one_of_two_loads_their_joint_as_a_hand_would() -> None:
     world.push[1, :3], world.push[1, 3:] = jet[:3], jet[3:] - np.cross([0.21, 0.0, 0.0], jet[:3])
     world._step(0)
     assert world._pull_on(world.docks.joints[0]) == pytest.approx(load, abs=1e-9)
+
+
+def impulse(world: World, module: int) -> np.ndarray:
+    """(6,) momentum and angular momentum about the world's origin of one module with the still water that it moves, world."""
+    truth, draw = world.truth(module), world.draw(module)
+    v, w = rotations.rotate_back(truth.q_wm, truth.v_w), truth.w_b
+    robot = draw.mass * (v + np.cross(w, draw.com))
+    p = robot + draw.added[:3] * v
+    spin = np.cross(draw.com, robot) + draw.inertia @ w + draw.added[3:] * w
+    p_w = rotations.rotate(truth.q_wm, p)
+    return np.concatenate([p_w, rotations.rotate(truth.q_wm, spin) + np.cross(truth.p_wm, p_w)])
+
+
+def test_joint_of_a_tumbling_pair_bears_what_changes_the_momentum_of_the_other_one() -> None:
+    """Newton and Euler about the world's origin: what weight, buoyancy and an off-axis hand do not give to module 1, the joint gives."""
+    uneven = {"added": np.array([3.0, 9.0, 6.0, 0.01, 0.03, 0.02]), "com_m": np.array([0.01, -0.02, 0.015]), "righting_arm_m": 0.01}
+    vehicle = dataclasses.replace(SLIPPERY, inertial=dataclasses.replace(VEHICLE.inertial, **uneven))
+    places = [Place(np.zeros(3), LEVEL), Place(np.array([0.21, 0.0, 0.0]), rotations.from_euler(np.pi / 2, 0.0, 0.0))]
+    starts = [Start(np.array([0.3, -0.2, 2.0]), rotations.from_euler(0.4, -0.7, 1.9))] * 2
+    world = World(WorldSpec(**CALM), OCEAN, [vehicle] * 2, starts, 0, PERIOD_NS, 10_000, groups=[(0, 1)], places=places)
+    world.push[1] = hand = np.array([1.5, -4.0, 2.5, 0.2, -0.3, 0.4])
+    world.set_motion(0, [0.5, -0.4, 0.6], [0.8, -1.1, 1.4])
+    before = impulse(world, 1)
+    world._step(1)
+    pull, middle, near = world._pull_on(world.docks.joints[0]), world.truth(1), world.truth(0)
+    world._step(1)
+    need = (impulse(world, 1) - before) / 2e-5
+    draw, down = world.draw(1), np.array([0.0, 0.0, 1.0])
+    acts = [
+        (rotations.rotate(middle.q_wm, hand[:3].copy()), np.zeros(3)),
+        (draw.mass * 9.81 * down, draw.com),
+        (-draw.buoyancy_n * down, draw.buoyancy_at),
+    ]
+    for force, at in acts:
+        need -= np.concatenate([force, np.cross(middle.p_wm + rotations.rotate(middle.q_wm, at), force)])
+    need[3:] -= rotations.rotate(middle.q_wm, hand[3:].copy())
+    outward = rotations.rotate(near.q_wm, np.array([1.0, 0.0, 0.0]))
+    bending = np.cross(outward, need[3:] - np.cross(near.p_wm + 0.105 * outward, need[:3]))
+    assert np.linalg.norm(bending) > 0.1, "it must bend, or the test proves nothing"
+    assert pull == pytest.approx(-outward @ need[:3] + np.linalg.norm(bending) / DISK_M, abs=1e-5)
+
+
+@pytest.mark.parametrize("heavy", [0, 1])
+def test_lighter_of_two_that_lock_is_turned_more(heavy: int) -> None:
+    """Each by the other's share of their mass, and so that they fit: of a twist of 9 mrad a third of the mass takes 6."""
+    inertial = VEHICLE.inertial
+    twice = dataclasses.replace(inertial, dry_kg=2.0 * inertial.dry_kg, entrained_kg=2.0 * inertial.entrained_kg)
+    vehicles = [VEHICLE, VEHICLE]
+    vehicles[heavy] = dataclasses.replace(VEHICLE, inertial=twice)
+    tilted, twist = rotations.from_euler(0.3, -0.2, 1.0), np.array([0.006, -0.006, 0.003])
+    reach = rotations.rotate(tilted, np.array([0.21, 0.0, 0.0]))
+    places = [np.array([0.0, 0.0, 400.0]), np.array([0.0, 0.0, 400.0]) + reach]
+    starts = [Start(places[0], tilted), Start(places[1], rotations.multiply(tilted, rotations.exp(twist)))]
+    world = World(WorldSpec(**CALM), OCEAN, vehicles, starts, 0, PERIOD_NS)
+    before = [world.truth(m).q_wm for m in range(2)]
+    world.join(Joint(0, 0, 1, 1))
+    np.testing.assert_allclose(rotations.difference(world.truth(0).q_wm, world.truth(1).q_wm), 0.0, atol=1e-12)
+    turned = [rotations.difference(world.truth(m).q_wm, before[m]) for m in range(2)]
+    np.testing.assert_allclose(np.linalg.norm(turned[heavy]), 0.003, rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(turned[1 - heavy]), 0.006, rtol=1e-9)
 
 
 def test_current_of_a_lone_module_dies_away_as_it_rose() -> None:

@@ -5,12 +5,14 @@ import math
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_continuous_lyapunov
 
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.batch import fly
 from hil.plant.jets import add_jets, in_the_way
 from hil.plant.spec import CALM, Tank, WorldSpec
+from hil.plant.water import Gusts
 from hil.plant.world import Start, World
 from hil.scenario import load_scenario, make_world
 
@@ -247,6 +249,16 @@ def test_gusts_have_the_wanted_strength_and_smoothness() -> None:
     np.testing.assert_allclose(flow.std(axis=0), 0.015, rtol=0.15)
     # variance of the acceleration of noise through two lags: sigma^2 / (T1 T2)
     np.testing.assert_allclose(np.diff(flow, axis=0).std(axis=0) / 0.01, 0.015 / math.sqrt(2.0 * 0.5), rtol=0.1)
+
+
+def test_gusts_begin_as_they_go_on() -> None:
+    """Gust and where it tends, over many seeds: the covariance that two lags driven by white noise keep (Lyapunov, by scipy)."""
+    sigma, t1, t2 = 0.3, 5.0, 1.0
+    spec = WorldSpec(**{**CALM, "gust_m_s": sigma, "gust_time_s": t1, "gust_smoothing_s": t2})
+    gusts = [Gusts(spec, np.random.default_rng(seed), 1e-3) for seed in range(2000)]
+    starts, tends = np.concatenate([g.start for g in gusts]), np.concatenate([g.step() for g in gusts])
+    kept = solve_continuous_lyapunov(np.array([[-1.0 / t2, 1.0 / t2], [0.0, -1.0 / t1]]), -np.diag([0.0, 1.0]))
+    np.testing.assert_allclose(np.cov(starts, tends), sigma**2 * kept / kept[0, 0], rtol=0.08)
 
 
 def test_step_that_does_not_divide_the_tick_is_refused() -> None:
