@@ -183,6 +183,35 @@ def test_damping_is_against_the_velocity_wanted_now_and_not_ahead(body: Body) ->
     np.testing.assert_allclose(extra, damping * body.mass[:, 0], atol=1e-9)
 
 
+def without_drag(body: Body) -> Body:
+    return replace(body, drag=replace(body.drag, nodes=0.0 * body.drag.nodes, rotational=np.zeros(3)))
+
+
+@pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
+def test_wanted_rates_are_turned_from_the_attitude_that_is_wanted_into_the_one_that_is(body: Body, q_wb: np.ndarray) -> None:
+    """A quarter turn off its set-point, the robot is to turn about the same axes of the world all the same."""
+    aim = rest_at(np.zeros(3), multiply(q_wb, from_euler(0.0, 0.0, 0.5 * math.pi)))
+    turning = aim._replace(w_b=np.array([0.3, -0.2, 0.5]))
+    still, c = believed(np.zeros(3), q_wb, np.zeros(6)), Control()
+    controller = Controller(without_drag(body), c)
+    extra = controller.step(turning, aim, still) - controller.step(aim, aim, still)
+    damping = 2.0 * c.attitude_damping * c.attitude_bandwidth * np.array([0.2, 0.3, 0.5])  # its x is the robot's y, its y the robot's -x
+    np.testing.assert_allclose(extra, body.mass @ np.r_[np.zeros(3), damping], atol=1e-9)
+
+
+@pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
+def test_feed_forward_of_a_turn_is_told_in_the_attitude_that_is(body: Body, q_wb: np.ndarray) -> None:
+    """Euler's equations about the centre of mass of the wanted turn, a quarter turn off it, by numpy."""
+    aim = rest_at(np.zeros(3), multiply(q_wb, from_euler(0.0, 0.0, 0.5 * math.pi)))
+    turning = aim._replace(w_b=np.array([0.3, -0.2, 0.5]), alpha_b=np.array([-0.7, 0.4, 0.9]))
+    controller, still = Controller(without_drag(body), Control()), believed(np.zeros(3), q_wb, np.zeros(6))
+    extra = controller.step(aim, turning, still) - controller.step(aim, aim, still)
+    w, alpha = np.array([0.2, 0.3, 0.5]), np.array([-0.4, -0.7, 0.9])  # its x is the robot's y, its y the robot's -x
+    momentum = body.mass[:, 3:] @ w
+    euler = body.mass[:, 3:] @ alpha + np.r_[np.cross(w, momentum[:3]), np.cross(w, momentum[3:])]
+    np.testing.assert_allclose(extra, euler, atol=1e-12)
+
+
 # ---------------------------------------------------------------- closed loop
 
 

@@ -147,6 +147,20 @@ def test_pair_that_still_moves_is_not_settled(row: Row) -> None:
         assert not bank.status(0).position
 
 
+def test_drift_of_a_pair_is_between_the_means_of_its_newest_pictures_and_those_before(row: Row) -> None:
+    """Eight and eight of the thirty-two whose mean is the error."""
+    bank, rng, gaps_m = PairBank(ROW[:1], P), np.random.default_rng(2), list[float]()
+    while len(gaps_m) < 100:
+        row.gaps_m[0] = rng.uniform(0.0, 0.004)
+        row.watch(bank, 0.01)
+        if row.tick % 2 == 0:
+            gaps_m.append(row.gaps_m[0])
+        if len(gaps_m) >= 32:
+            status = bank.status(0)
+            assert status.position_error_m == pytest.approx(np.mean(gaps_m[-32:]), abs=1e-9)
+            assert status.spread_m == pytest.approx(abs(np.mean(gaps_m[-8:]) - np.mean(gaps_m[-16:-8])), abs=1e-9)
+
+
 def test_pair_that_jammed_four_millimetres_short_is_not_docked_in_a_minute_of_noise(row: Row) -> None:
     row.noise_m, row.gaps_m[0] = 0.002, 0.0045
     bank = PairBank(ROW[:1], P)

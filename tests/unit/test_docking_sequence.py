@@ -38,6 +38,25 @@ def begin(parameters: Docking, gap_m: float, comes: bool = True) -> tuple[Dockin
     return sequence, np.zeros(3), place + np.array([gap_m, 0.0, 0.0])
 
 
+@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
+@pytest.mark.parametrize(("target_face", "face", "target_turn"), [(0, 1, 0), (4, 5, 7), (2, 1, 18)])
+def test_quarter_turns_are_counted_about_the_targets_face_outwards(
+    quarter_turns: int, target_face: int, face: int, target_turn: int
+) -> None:
+    """From the least rotation that lays the active face on the target's: none for opposite faces, else the shortest way."""
+    vehicles = [load_vehicle("modcube")] * 2
+    target, active = assemble([(0, 0, 0)], [target_turn], vehicles[:1], [0]), assemble([(0, 0, 0)], [4], vehicles[:1], [1])
+    plan = plan_dock(DockRequest(1, face, 0, target_face, quarter_turns), active, target, vehicles)
+    outward, looks = (np.array(FACE_NORMALS[f], dtype=float) for f in (target_face, face))
+    least = Rotation.from_rotvec(0.5 * np.pi * np.cross(looks, -outward))
+    wanted = Rotation.from_rotvec(0.5 * np.pi * quarter_turns * outward) * least
+    np.testing.assert_allclose(wanted.apply(looks), -outward, atol=1e-12)
+    np.testing.assert_allclose(to_matrix(plan.q_ta), wanted.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(plan.axis_t, outward)
+    q_t, q_a = (Rotation.from_quat(q[[1, 2, 3, 0]]) for q in plan.merged.q_bm)
+    np.testing.assert_allclose((q_t.inv() * q_a).as_matrix(), wanted.as_matrix(), atol=1e-12)
+
+
 @pytest.mark.parametrize("gap_m", [0.02, 0.12, 0.2, 0.6])
 @pytest.mark.parametrize("parameters", [Docking(), PAPER.docking])
 def test_dock_that_fails_ends_apart_however_near_it_began(parameters: Docking, gap_m: float) -> None:
