@@ -221,6 +221,16 @@ def test_righting_moments_of_the_modules_add_up(modcube: Vehicle) -> None:
     np.testing.assert_allclose(pair.righting, 0.0, atol=1e-12)
 
 
+def test_doubt_of_the_righting_moment_lies_along_the_modules_own_axes(modcube: Vehicle) -> None:
+    """A level module and one on its side: arm along z of each, trim along x and y, and buoyancy off by 0.5 N where each sits."""
+    on_its_side = next(i for i, m in enumerate(lattice.MATRICES) if np.array_equal(m, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    body = assemble([(0, 0, 0), (1, 0, 0)], [0, on_its_side], [modcube] * 2)
+    arm, trim, lever = GRAVITY * 9.3 * 0.003, GRAVITY * 2.6 * 0.002, 0.5 * 0.105
+    assert arm > 5.0 * trim
+    expected = [math.sqrt(2.0 * (trim**2 + lever**2)), math.hypot(trim, arm), math.hypot(trim, arm)]
+    np.testing.assert_allclose(body.righting_sigma, expected, rtol=1e-12)
+
+
 def test_supply_of_each_module_is_what_its_electronics_leave(modcube: Vehicle) -> None:
     np.testing.assert_allclose(assemble(SHAPES["2x2"], [0] * 4, [modcube] * 4).supply_power_w, 12.0 * 10.0 - 8.0)
 

@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from firmware_py.prepare.capability import summary
@@ -91,6 +93,19 @@ def test_standing_still_needs_no_wrench_and_drag_needs_one() -> None:
     assert required_wrench(body, paths.at_rest([0.0, 0.0, 1.0])) == pytest.approx(np.zeros(6))
     moving = paths.at_rest([0.0, 0.0, 1.0])._replace(v_w=np.array([0.5, 0.0, 0.0]))
     assert required_wrench(body, moving) == pytest.approx([13.7 * 0.5 + 141.0 * 0.25, 0, 0, 0, 0, 0])
+
+
+def test_steady_circle_asks_for_the_pull_towards_its_middle_and_for_drag() -> None:
+    """With added mass, m v^2 / r; the robot turns with its way, so nothing else changes in its own frame."""
+    body, attitude = assemble_vehicle(load_vehicle("modcube")), Rotation.from_euler("xyz", [0.4, -0.3, 1.1])
+    body, v, w = dataclasses.replace(body, righting=np.zeros(3)), np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.0, 0.8])
+    circling = paths.at_rest([0.0, 0.0, 1.0])._replace(
+        q_wb=attitude.as_quat()[[3, 0, 1, 2]], v_w=attitude.apply(v), w_b=w, a_w=attitude.apply(np.cross(w, v))
+    )
+    half_rho = 0.5 * WATER_DENSITY
+    drag, damping = half_rho * 1.05 * 0.21**2 * 0.5**2, half_rho * 1.1 * 6.0 * 0.105**5 * 0.8**2
+    pull = (2.6 + 6.7 + 6.2) * 0.5**2 / (0.5 / 0.8)
+    np.testing.assert_allclose(required_wrench(body, circling), [drag, pull, 0.0, 0.0, 0.0, damping], rtol=2e-3, atol=1e-9)
 
 
 def test_trajectory_asks_for_momentums_change() -> None:

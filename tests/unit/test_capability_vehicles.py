@@ -1,6 +1,7 @@
 """Vehicle files of the paper's robots: axes, sources, measured curves; and files that are refused."""
 
 import csv
+import dataclasses
 import re
 from pathlib import Path
 
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 
 from firmware_py.core.thruster import polynomial
-from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import flu_to_frd, is_right_handed, load_vehicle
-from firmware_py.prepare.assembly import assemble_vehicle
+from firmware_py.description.schema import DescriptionError, frozen_array
+from firmware_py.description.vehicle import Payload, flu_to_frd, is_right_handed, load_vehicle
+from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from firmware_py.prepare.capability.curves import fit_thruster, rising_polynomial
 from firmware_py.prepare.capability.layout import of_modules, of_vehicle
+from firmware_py.prepare.lattice import MATRICES
 from tests.unit.capability_layouts import DATA, LINE, ROOT, SQUARE, published
 
 KILOGRAM_FORCE = 9.80665
@@ -119,13 +121,33 @@ def test_fit_returns_a_rising_polynomial_as_it_is() -> None:
 
 
 def test_layout_of_docked_modules_is_that_of_the_assembled_body() -> None:
-    from firmware_py.prepare.assembly import assemble
-
     vehicle = load_vehicle("modcube")
     for cells in (LINE, SQUARE):
         count = len(cells)
         body = assemble(cells, [0] * count, [vehicle] * count)
         assert of_modules(cells, [0] * count, [vehicle] * count).matrix == pytest.approx(body.thrusters.matrix)
+
+
+def test_thrusters_of_turned_modules_push_about_what_they_and_their_loads_weigh_together() -> None:
+    """Lumps summed one by one: two of the three modules carry a load, all weigh off their middle."""
+    plain = load_vehicle("modcube")
+    off = dataclasses.replace(plain.inertial, com_m=frozen_array([0.012, -0.007, 0.02]))
+    load = Payload(
+        name="weight", dry_kg=0.8, entrained_kg=0.3, size_m=frozen_array([0.05, 0.04, 0.03]), position_m=frozen_array([0.06, 0.02, -0.05])
+    )
+    bare = dataclasses.replace(plain, inertial=off)
+    vehicles = [dataclasses.replace(bare, payload=(load,)), bare, dataclasses.replace(bare, payload=(load,))]
+    cells, turns = [(0, 0, 0), (1, 0, 0), (1, 1, 0)], [0, 4, 12]
+    lumps, rows = [], []
+    for cell, turn, vehicle in zip(cells, turns, vehicles, strict=True):
+        place, matrix = 0.21 * np.array(cell), MATRICES[turn]
+        lumps += [(9.3, place + matrix @ off.com_m), *((1.1, place + matrix @ each.position_m) for each in vehicle.payload)]
+        rows += [(place + matrix @ p, matrix @ d) for p, d in zip(vehicle.positions, vehicle.directions, strict=True)]
+    centre = sum(kg * at for kg, at in lumps) / sum(kg for kg, _ in lumps)
+    expected = np.array([np.r_[d, np.cross(p - centre, d)] for p, d in rows]).T
+    layout = of_modules(cells, turns, vehicles)
+    np.testing.assert_allclose(layout.matrix, expected, atol=1e-12)
+    np.testing.assert_allclose(layout.matrix, assemble(cells, turns, vehicles).thrusters.matrix, atol=1e-12)
 
 
 def altered(tmp_path: Path, change: tuple[str, str]) -> Path:

@@ -189,6 +189,20 @@ def test_published_damping_is_used_in_place_of_areas(modcube: Vehicle) -> None:
         np.testing.assert_allclose(wrench(table, nu), expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("columns", [[1, 2, 0], [2, 0, 1]])
+def test_published_damping_turns_with_its_module(columns: list[int], modcube: Vehicle) -> None:
+    """The module's x lies along another axis of the body, its y along the third: each axis takes its own damping along."""
+    quadratic, linear = frozen_array([18.18, 21.66, 36.99, 1.55, 2.56, 3.57]), frozen_array([4.0, 6.0, 5.0, 0.1, 0.2, 0.3])
+    drag = dataclasses.replace(modcube.drag, quadratic=quadratic, linear=linear)
+    rotation = next(i for i, m in enumerate(lattice.MATRICES) if np.array_equal(m, np.eye(3)[columns]))
+    table = assemble([(0, 0, 0)], [rotation], [dataclasses.replace(modcube, drag=drag)]).drag
+    for axis in range(6):
+        along = 3 * (axis // 3) + columns.index(axis % 3)  # in the body
+        expected = np.zeros(6)
+        expected[along] = quadratic[axis] * 0.25 + linear[axis] * 0.5
+        np.testing.assert_allclose(wrench(table, -0.5 * np.eye(6)[along]), expected, atol=1e-12)
+
+
 def test_payload_adds_to_the_outline(modcube: Vehicle) -> None:
     size, centre = frozen_array([0.3, 0.05, 0.05]), frozen_array([0.255, 0.0, 0.0])
     tool = Payload(name="arm", dry_kg=0.0, size_m=size, position_m=centre)

@@ -6,6 +6,8 @@ import re
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
+from scipy.spatial.transform import Rotation
 
 from firmware_py.app.mission_plan import plan_mission
 from firmware_py.core import propagation, rotations
@@ -97,6 +99,33 @@ def test_lean_is_the_angle_at_which_buoyancy_gives_the_moment(bluerov2: Body) ->
     np.testing.assert_array_equal(found.lacking, 0.0)
     righting = float(np.linalg.norm(bluerov2.righting))
     np.testing.assert_allclose(found.thrust[1, 3:], [righting * math.sin(0.3), 0.0, 0.0], atol=1e-6)
+
+
+def asked_of(body: Body, attitude: Rotation, v_w: np.ndarray, w_w: np.ndarray, a_w: np.ndarray, alpha_w: np.ndarray) -> np.ndarray:
+    """(6,) wrench, body frame, of a motion of the world in water without drag: Kirchhoff and the moment of buoyancy, by numpy."""
+    v, w, a, alpha, up = (attitude.inv().apply(each) for each in (v_w, w_w, a_w, alpha_w, [0.0, 0.0, -1.0]))
+    momentum = body.mass @ np.r_[v, w]
+    change = body.mass @ np.r_[a - np.cross(w, v), alpha]
+    turning = np.r_[np.cross(w, momentum[:3]), np.cross(w, momentum[3:]) + np.cross(v, momentum[:3])]
+    return np.asarray(change + turning - np.r_[np.zeros(3), np.cross(body.righting, up)])
+
+
+def test_vehicle_that_leans_goes_on_turning_about_the_same_axes_of_the_world(passive: Body) -> None:
+    """What its wheeling adds to the stiffness of buoyancy counts in the lean, and in what is left to the thrusters."""
+    drag = dataclasses.replace(passive.drag, nodes=0.0 * passive.drag.nodes, rotational=np.zeros(3), linear=np.zeros(6))
+    body = dataclasses.replace(passive, drag=drag)
+    attitude = Rotation.from_euler("xyz", [0.05, -0.04, 0.9])
+    moves = [np.array(m) for m in ([0.2, -0.1, 0.05], [0.1, -0.2, 1.2], [0.1, 0.2, 0.0], [0.3, 0.2, -0.5])]
+    v_w, w_w, a_w, alpha_w = moves
+    motion = np.r_[np.zeros(3), attitude.as_quat()[[3, 0, 1, 2]], v_w, attitude.inv().apply(w_w), a_w, attitude.inv().apply(alpha_w)]
+    found = divide(body, motion[None])
+    missing = null_space(body.thrusters.matrix.T)[:, 0]
+    upright, step = asked_of(body, attitude, *moves), 1e-4
+    ends = [asked_of(body, attitude * Rotation.from_rotvec(side * step * missing[3:]), *moves) for side in (1.0, -1.0)]
+    slope = (ends[0] - ends[1]) / (2.0 * step)
+    share = -float(missing @ upright) / float(missing @ slope)
+    np.testing.assert_allclose(found.lean, [abs(share) * np.linalg.norm(missing[3:])], rtol=1e-6)
+    np.testing.assert_allclose(found.thrust[0], upright + share * slope, atol=1e-5)
 
 
 def test_what_is_left_to_thrusters_is_within_their_span(passive: Body) -> None:
