@@ -17,7 +17,7 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from argument_types import check_results, make_folder
@@ -38,6 +38,8 @@ from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
 FARTHEST_M = 10.0
 """From the hull's middle, as the vehicle file permits of its parts."""
+RESULTS = ("identified.json", "vehicle.toml", "excite.toml")
+"""Files that a run may leave in --out."""
 
 
 def read_curve(path: Path) -> ThrusterCurve:
@@ -107,6 +109,15 @@ def print_findings(found: Sequence[Finding]) -> None:
     Console(width=None if sys.stdout.isatty() else 120).print(table)
 
 
+def write_results(out: Path, texts: Mapping[str, str]) -> None:
+    """Writes those of RESULTS that are in `texts`; the others, of an earlier run, go: what lies there together is of one run."""
+    for name in RESULTS:
+        if name in texts:
+            (out / name).write_text(texts[name], encoding="utf-8")
+        else:
+            (out / name).unlink(missing_ok=True)
+
+
 def identify(given: argparse.Namespace) -> int:
     """Fits, prints and writes; the exit status. Raises DescriptionError and OSError."""
     check_space(given.space)
@@ -135,7 +146,7 @@ def identify(given: argparse.Namespace) -> int:
     curve = read_curve(given.curve) if given.curve else vehicle.curve
     reference = reference_of(recordings[0], given.thruster, given.accuracy) if given.curve else None
     make_folder(given.out)
-    check_results(given.out, "has_reference", "identified.json", "vehicle.toml", "excite.toml")
+    check_results(given.out, "has_reference", *RESULTS)
     flights = [Equations(recording, smooth(recording), curve, weight) for recording in recordings]
     if weight is not None:
         check_hung(weight, flights[0])
@@ -146,11 +157,13 @@ def identify(given: argparse.Namespace) -> int:
     report = {"logs": given.logs, "has_reference": result.has_scale, "residual": result.residual.tolist(), "missing": wanted}
     report["gust_m_s"] = result.gust_m_s
     report["found"] = [each._asdict() for each in found]
-    (given.out / "identified.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    texts = {"identified.json": json.dumps(report, indent=2) + "\n"}
+    if result.has_scale and not wanted:
+        texts["vehicle.toml"] = to_toml(fitted_vehicle(result, vehicle, curve, logs))
+    write_results(given.out, texts)
     if not result.has_scale:
         print(f"refused: {NO_SCALE}")
-    elif not wanted:
-        (given.out / "vehicle.toml").write_text(to_toml(fitted_vehicle(result, vehicle, curve, logs)), encoding="utf-8")
+    if "vehicle.toml" in texts:
         print(given.out / "vehicle.toml")
     for motion, needing in wanted.items():
         print(f"missing excitation: {motion}, for {', '.join(needing)}")

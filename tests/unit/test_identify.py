@@ -234,6 +234,13 @@ def test_excitation_is_said_how_to_fly_and_writes_over_nothing(
     assert (tmp_path / "first shake.toml").read_text(encoding="utf-8") == "mine"
 
 
+def test_result_of_an_earlier_log_does_not_stay_beside_that_of_another(tmp_path: Path) -> None:
+    tool.write_results(tmp_path, {"identified.json": "{}", "vehicle.toml": "of the first"})
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    tool.write_results(tmp_path, {"identified.json": "{}", "excite.toml": "of the second"})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["excite.toml", "identified.json", "notes.txt"]
+
+
 @pytest.mark.parametrize("name", vehicle_names())
 def test_vehicle_that_is_written_is_the_vehicle(name: str, tmp_path: Path) -> None:
     vehicle, file = load_vehicle(name), tmp_path / "again.toml"
