@@ -12,6 +12,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -60,7 +61,7 @@ def check_machine(folder: Path, look: Look = read_file) -> list[Finding]:
         check_governor(look),
         check_throttle(look, os.cpu_count() or 1),
         check_clock(look, time.gmtime().tm_year),
-        check_disk(folder, shutil.disk_usage(folder).free),
+        check_logs(folder),
         check_cache(),
     ]
 
@@ -117,6 +118,19 @@ def check_clock(look: Look, year: int) -> Finding:
     if year < EARLIEST_YEAR:
         return Finding("clock", WARNING, f"the year is {year}", "set the date; a battery or chrony keeps it")
     return Finding("clock", OK, f"source {source}")
+
+
+def check_logs(folder: Path) -> Finding:
+    """Whether logs can go to `folder`; where it is not there yet a run makes it, so the one is looked at that it would lie in."""
+    place = next(each for each in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(each))
+    if not place.is_dir():
+        return Finding("disk", FAILED, f"{place} is a file; logs need a folder", "give another with --out")
+    try:
+        tempfile.TemporaryFile(dir=place).close()  # leaves nothing
+    except OSError as error:
+        advice = "let the user that runs modcube write there, or log elsewhere with --out"
+        return Finding("disk", FAILED, f"no log can be written in {place}: {error.strerror}", advice)
+    return check_disk(folder, shutil.disk_usage(place).free)
 
 
 def check_disk(folder: Path, free_bytes: int) -> Finding:

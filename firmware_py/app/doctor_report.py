@@ -19,7 +19,7 @@ UNFIT = 1
 
 
 def examine(fleet: Fleet, folder: Path, say: Callable[[str], None], wait: Callable[[float], None] = time.sleep) -> int:
-    """Prints what was found; returns the exit status. Raises OSError where there is no such folder."""
+    """Prints what was found; returns the exit status."""
     codec = Codec.load()
     findings = check_machine(folder)
     for index, address in enumerate(fleet.buses):

@@ -23,6 +23,7 @@ from firmware_py.app.doctor import (
     check_governor,
     check_interface,
     check_kernel,
+    check_logs,
     check_throttle,
     lines_of,
 )
@@ -110,6 +111,18 @@ def test_clock_that_is_slow_or_stands_in_1970_is_warned_of(source: str, year: in
 @pytest.mark.parametrize(("free", "state"), [(10**10, OK), (10**9, WARNING), (10**7, FAILED)])
 def test_full_disk_is_told(free: int, state: str) -> None:
     assert check_disk(Path(), free).state == state
+
+
+def test_folder_that_is_not_there_yet_is_judged_by_the_one_it_would_lie_in(tmp_path: Path) -> None:
+    folder = tmp_path / "logs" / "today"
+    assert f"GB free for logs in {folder}" in check_logs(folder).text
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("place", "says"), [(__file__, "is a file"), (f"{__file__}/logs", "is a file"), ("/proc", "no log can be")])
+def test_place_that_takes_no_logs_is_told_and_not_taken_for_full(place: str, says: str) -> None:
+    finding = check_logs(Path(place))
+    assert finding.state == FAILED and says in finding.text and "remove old logs" not in finding.advice and "--out" in finding.advice
 
 
 def test_every_complaint_comes_with_advice_beneath_it() -> None:
