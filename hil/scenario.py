@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -15,16 +13,16 @@ import numpy as np
 from firmware_py.core import rotations
 from firmware_py.description.fleet import check_cell
 from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, meant, quantity, read_text, read_toml
-from firmware_py.description.vehicle import FACE_NAMES, Vehicle, find_vehicles, load_vehicle
-from hil.plant.build import nominal_centre
+from firmware_py.description.vehicle import FACE_NAMES, find_vehicles, load_vehicle
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
-from hil.plant.lattice import is_connected, place
+from hil.plant.lattice import is_connected
 from hil.plant.polycube import grow
 from hil.plant.spec import CALM, HALF_A_COUNT, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
 from hil.scenario_rules import mistakes
+from hil.starts import places_of, refuse_outside, refuse_overlap, starts_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -249,52 +247,20 @@ class Scenario:
         return dataclasses.replace(self, world=dataclasses.replace(self.world, **CALM))  # type: ignore[arg-type]
 
 
-PITCH_M = 0.21
-"""Lattice pitch of docked modules (the paper's)."""
-
-
 def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
     """The world of a scenario at time 0. Raises DescriptionError."""
     vehicles = [load_vehicle(m.vehicle) for m in scenario.module]
     groups = scenario.groups
-    places = [place(m.cell, m.rotation, PITCH_M, _origin(scenario, groups, i)) for i, m in enumerate(scenario.module)]
-    starts = [m.start for m in scenario.module]
-    for members in groups:
-        start = scenario.start.shifted(starts[members[0]], seed, members[0])
-        centre = nominal_centre([vehicles[m] for m in members], [places[m] for m in members])
-        if len(members) == 1:
-            centre = np.zeros(3)
-        for m in members:
-            lever = rotations.rotate(start.q_wm, places[m].position - centre)
-            q_wm = rotations.multiply(start.q_wm, places[m].quaternion)
-            starts[m] = Start(start.p_wm + lever, q_wm)
-    _refuse_overlap(scenario, vehicles, starts, seed)
+    bodies = [scenario.start.shifted(scenario.module[members[0]].start, seed, members[0]) for members in groups]
+    starts = starts_of(scenario, vehicles, bodies)
+    refuse_outside(scenario, vehicles, starts, seed)
+    refuse_overlap(scenario, vehicles, starts, seed)
     spec = (scenario.world, scenario.tank, vehicles, starts, seed, period_ns)
-    world = World(*spec, groups=groups, places=places, dock=scenario.dock, jam=scenario.jam)
+    world = World(*spec, groups=groups, places=places_of(scenario), dock=scenario.dock, jam=scenario.jam)
     for body, members in enumerate(world.bodies):
         if any(scenario.module[m].clamped for m in members):
             world.clamp(body)
     return world
-
-
-def _refuse_overlap(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:
-    """Raises DescriptionError where two bodies would start one inside the other: balls that fit into their hulls overlap."""
-    radii = [0.5 * float(vehicle.hull.size_m.min()) for vehicle in vehicles]
-    docked = {pair for members in scenario.groups for pair in itertools.combinations(members, 2)}
-    for (i, one), (j, other) in itertools.combinations(enumerate(starts), 2):
-        apart_m = float(np.linalg.norm(one.p_wm - other.p_wm))
-        if (i, j) not in docked and apart_m < radii[i] + radii[j]:
-            numbers = f"{scenario.module[i].number} and {scenario.module[j].number}"
-            raise DescriptionError(
-                f"{scenario.name}: in seed {seed} modules {numbers} start {apart_m:.3g} m apart, one inside the other; "
-                f"{radii[i] + radii[j]:.3g} m is the least"
-            )
-
-
-def _origin(scenario: Scenario, groups: Sequence[Sequence[int]], module: int) -> np.ndarray:
-    """Cell of the module that leads the body of `module`."""
-    leader = next(members[0] for members in groups if module in members)
-    return np.array(scenario.module[leader].cell)
 
 
 def scenario_names() -> list[str]:

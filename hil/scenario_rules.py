@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from firmware_py.description.schema import limits_of, meant
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN
+from hil.starts import hulls_in_walls
 
 if TYPE_CHECKING:
     from hil.scenario import Scenario
 
+YAWS = 37
+"""Headings that are looked at between the ends of what a seed may draw: 10 deg apart at the most."""
 Mistake = tuple[tuple[str | int, ...], str]
 """The keys that lead to what is wrong, and what is wrong with it."""
 
@@ -106,6 +112,9 @@ def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
         if not scenario.tank.holds(place):
             where = f"{place.tolist()} m is outside the tank, a {scenario.tank}"
             yield (table, i, "position_m"), f"{where} with its surface's centre at [0, 0, 0]"
+    for i, where in hulls_in_walls(scenario, np.zeros((1, 3)), np.zeros(1)):
+        leader = next(members[0] for members in scenario.groups if i in members)
+        yield ("module", leader, "position_m"), f"the hull of module {scenario.module[i].number} is {where}; move it in by that"
 
 
 def _in_start(scenario: Scenario) -> Iterator[Mistake]:
@@ -117,6 +126,9 @@ def _in_start(scenario: Scenario) -> Iterator[Mistake]:
                 where = f"a seed may start module {scenario.module[members[0]].number} at {place.round(3).tolist()} m"
                 yield ("start", "position_m"), f"{where}, outside the tank, a {scenario.tank}"
                 return
+    shifts_m = scenario.start.position_m * list(itertools.product((-1.0, 1.0), repeat=3))
+    for i, where in hulls_in_walls(scenario, shifts_m, math.radians(scenario.start.yaw_deg) * np.linspace(-1.0, 1.0, YAWS)):
+        yield ("start",), f"a seed may start the hull of module {scenario.module[i].number} {where}; let it draw less, or move it in"
 
 
 def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:

@@ -25,7 +25,8 @@ from firmware_py.prepare.assembly import assemble_fleet
 from hil.bench import fleet_of
 from hil.nodes import make_nodes
 from hil.plant.draw import stream
-from hil.scenario import PITCH_M, RandomStart, Scenario, load_scenario, make_world
+from hil.scenario import RandomStart, Scenario, load_scenario, make_world
+from hil.starts import PITCH_M
 
 PASS_S = 2.5
 PERIOD_NS = 10_000_000

@@ -62,6 +62,14 @@ def load(tmp_path: Path) -> Load:
         ("hover", "[0.0, 0.0, 0.38]", "[0.0, 0.61, 0.38]", "[0.0, 0.61, 0.38] m is outside the tank, a box of 1.3 x 1.2 x 0.76 m"),
         ("mobius-1", "[1.3, 0.0, 1.5]", "[2.5, 2.5, 1.5]", "is outside the tank, a cylinder of 3.5 m radius and 3 m depth"),
         ("dock-moving", "[-0.3, 0.25, 0.38]", "[-0.3, 0.25, 0.8]", "step[0].position_m: [-0.3, 0.25, 0.8] m is outside the tank"),
+        ("hover", "[0.0, 0.0, 0.38]", "[0.0, 0.55, 0.38]", "module[0].position_m: the hull of module 1 is 0.055 m into the wall at +y of"),
+        ("hover", "[0.0, 0.0, 0.38]", "[-0.6, 0.0, 0.38]", "the hull of module 1 is 0.055 m into the wall at -x of the tank, a box of 1.3"),
+        ("hover", "[0.0, 0.0, 0.38]", "[0.0, 0.0, 0.7]", "the hull of module 1 is 0.045 m into the bottom of the tank"),
+        ("hover", '"modcube"', '"girona500"', "the hull of module 1 is 0.12 m into the bottom of the tank"),
+        ("mobius-1", "[1.3, 0.0, 1.5]", "[2.4, 2.4, 1.5]", "the hull of module 1 is 0.0426 m into the wall of the tank, a cylinder"),
+        ("mobius-2", "[1.3, 0.0, 1.5]", "[0.0, -3.3, 1.5]", "module[0].position_m: the hull of module 1 is 0.0116 m into the wall of the"),
+        ("hover", "", "[start]\nposition_m = [0.0, 0.5, 0.0]", "start: a seed may start the hull of module 1 0.005 m into the wall at +y"),
+        ("hover", "[0.0, 0.0, 0.38]", "[0.0, 0.48, 0.38]\n[start]\nyaw_deg = 45", "a seed may start the hull of module 1 0.0285 m into"),
         ("dock", "number = 2", "number = 1", "module[1].number: 1 is the number of another module too"),
         ("hover", "position_rmse_m", "position_rsme_m", "check[0].metric: 'position_rsme_m' is unknown; did you mean position_rmse_m? a"),
         ("hover", "position_rmse_m", "docked", "'docked' is unknown; a run of the kind hover has position_rmse_m, "),
@@ -165,7 +173,7 @@ def test_robot_that_is_not_to_be_seen_is_flown(load: Load, lone_tag: str, tmp_pa
 
 
 def test_vehicle_without_tags_is_flown(load: Load) -> None:
-    assert load("hover", '"modcube"', '"girona500"').module[0].vehicle == "girona500"
+    assert load("mobius-1", '"modcube"', '"girona500"').module[0].vehicle == "girona500"
 
 
 def test_line_of_the_mistake_is_named(load: Load, tmp_path: Path) -> None:
@@ -306,6 +314,20 @@ def test_bodies_that_would_start_one_inside_the_other_are_refused() -> None:
     near = dataclasses.replace(scenario.module[1], position_m=scenario.module[0].position_m)
     with pytest.raises(DescriptionError, match=r"modules 1 and 2 start 0\.\d+ m apart, one inside the other; 0\.2"):
         make_world(dataclasses.replace(scenario, module=(scenario.module[0], near)), 0, 10_000_000)
+
+
+@pytest.mark.parametrize("place", ["[0.545, -0.495, 0.655]", "[0.0, 0.0, 0.0]"], ids=["touches_three_walls", "floats"])
+def test_hull_that_touches_a_wall_or_floats_is_put_into_the_water(load: Load, place: str) -> None:
+    make_world(load("hover", "[0.0, 0.0, 0.38]", place), 0, 10_000_000)
+
+
+def test_no_shape_that_a_seed_draws_starts_in_a_wall(load: Load) -> None:
+    polycube = load_scenario("polycube")
+    for seed in range(20):
+        make_world(polycube.for_seed(seed), seed, 10_000_000)
+    low = load("polycube", "[0.0, 0.0, 1.5]", "[0.0, 0.0, 2.85]")
+    with pytest.raises(DescriptionError, match=r"polycube: in seed 1 the hull of module 1 starts 0\.\d+ m into the bottom of the tank"):
+        make_world(low.for_seed(1), 1, 10_000_000)
 
 
 def test_vehicle_file_is_looked_up_beside_the_scenario_s(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,107 @@
+"""Where every module of a scenario is put into the water, and whether it can be there: in the tank, and in no other's place."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from firmware_py.core import rotations
+from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import Vehicle, load_vehicle
+from hil.plant.build import nominal_centre
+from hil.plant.lattice import Place, place
+from hil.plant.spec import Tank
+from hil.plant.world import Start
+
+if TYPE_CHECKING:
+    from hil.scenario import Scenario
+
+PITCH_M = 0.21
+"""Lattice pitch of docked modules (the paper's)."""
+CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+"""(8, 3) of a box, in its edges."""
+TOUCHING_M = 1e-9
+"""What rounding may put a hull into a wall that it touches."""
+
+
+def places_of(scenario: Scenario) -> list[Place]:
+    """Where each module sits in its body, whose frame starts at its leader's cell."""
+    leaders = {m: members[0] for members in scenario.groups for m in members}
+    return [place(m.cell, m.rotation, PITCH_M, np.array(scenario.module[leaders[i]].cell)) for i, m in enumerate(scenario.module)]
+
+
+def starts_of(scenario: Scenario, vehicles: Sequence[Vehicle], bodies: Sequence[Start]) -> list[Start]:
+    """Pose at time 0 of each module, where its body, one of `bodies` for each of the scenario's groups, starts like this."""
+    places = places_of(scenario)
+    starts = [m.start for m in scenario.module]
+    for members, start in zip(scenario.groups, bodies, strict=True):
+        centre = nominal_centre([vehicles[m] for m in members], [places[m] for m in members]) if len(members) > 1 else np.zeros(3)
+        for m in members:
+            lever = rotations.rotate(start.q_wm, places[m].position - centre)
+            starts[m] = Start(start.p_wm + lever, rotations.multiply(start.q_wm, places[m].quaternion))
+    return starts
+
+
+def hull_of(vehicle: Vehicle, start: Start) -> np.ndarray:
+    """(8, 3) corners of a module's hull, world, m."""
+    return start.p_wm + CORNERS * vehicle.hull.size_m @ rotations.to_matrix(start.q_wm).T
+
+
+def in_wall(tank: Tank, points: np.ndarray) -> str:
+    """How far into which wall the farthest of points (..., 3) is, in words; empty where all are between walls and bottom.
+
+    The surface is no wall: who sticks out of the water floats.
+    """
+    x, y, z = (points[..., axis] for axis in range(3))
+    if tank.kind == "box":
+        length, width, depth = tank.size_m.tolist()
+        beyond = {"wall at +x": x - 0.5 * length, "wall at -x": -x - 0.5 * length}
+        beyond |= {"wall at +y": y - 0.5 * width, "wall at -y": -y - 0.5 * width}
+    else:
+        beyond, depth = {"wall": np.hypot(x, y) - tank.radius_m}, tank.depth_m
+    deepest = {name: float(np.max(by)) for name, by in (beyond | {"bottom": z - depth}).items()}
+    wall = max(deepest, key=deepest.__getitem__)
+    return f"{deepest[wall]:.3g} m into the {wall} of the tank, a {tank}" if deepest[wall] > TOUCHING_M else ""
+
+
+def hulls_in_walls(scenario: Scenario, shifts_m: np.ndarray, yaws: np.ndarray) -> Iterator[tuple[int, str]]:
+    """Of each module whose hull would start in a wall its index, and in words how far into which; the farthest of all that a body is off.
+
+    Args:
+        shifts_m: (n, 3) by which a body is off its place, world.
+        yaws: (k,) by which it is turned, rad.
+    """
+    vehicles = [load_vehicle(module.vehicle) for module in scenario.module]
+    bodies = [scenario.module[members[0]].start for members in scenario.groups]
+    starts = starts_of(scenario, vehicles, bodies)
+    turns = np.array([rotations.to_matrix(rotations.from_euler(0.0, 0.0, yaw)) for yaw in yaws.tolist()])
+    for members, body in zip(scenario.groups, bodies, strict=True):
+        for m in members:
+            levers = hull_of(vehicles[m], starts[m]) - body.p_wm
+            hulls = body.p_wm + np.einsum("kij,cj->kci", turns, levers)
+            if where := in_wall(scenario.tank, shifts_m[:, None, None] + hulls):
+                yield m, where
+
+
+def refuse_outside(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:
+    """Raises DescriptionError where a hull would start in a wall."""
+    for module, vehicle, start in zip(scenario.module, vehicles, starts, strict=True):
+        if where := in_wall(scenario.tank, hull_of(vehicle, start)):
+            raise DescriptionError(f"{scenario.name}: in seed {seed} the hull of module {module.number} starts {where}; move it in")
+
+
+def refuse_overlap(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:
+    """Raises DescriptionError where two bodies would start one inside the other: balls that fit into their hulls overlap."""
+    radii = [0.5 * float(vehicle.hull.size_m.min()) for vehicle in vehicles]
+    docked = {pair for members in scenario.groups for pair in itertools.combinations(members, 2)}
+    for (i, one), (j, other) in itertools.combinations(enumerate(starts), 2):
+        apart_m = float(np.linalg.norm(one.p_wm - other.p_wm))
+        if (i, j) not in docked and apart_m < radii[i] + radii[j]:
+            numbers = f"{scenario.module[i].number} and {scenario.module[j].number}"
+            raise DescriptionError(
+                f"{scenario.name}: in seed {seed} modules {numbers} start {apart_m:.3g} m apart, one inside the other; "
+                f"{radii[i] + radii[j]:.3g} m is the least"
+            )
