@@ -14,9 +14,9 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare import paths
 from hil.scenario import Scenario, Step
+from hil.scenario_rules import ARM_FROM_S
 from hil.script import refuse_outside
 
-ARM_FROM_S = 1.0
 ARM_EVERY_S = 0.5
 NOBODY = -1
 """Index of a module that a step is not about."""

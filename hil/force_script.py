@@ -9,8 +9,8 @@ from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Mode, Outputs, Request, Sticks
 from firmware_py.description.fleet import Fleet
 from hil.scenario import Scenario
+from hil.scenario_rules import ARM_FROM_S
 
-ARM_FROM_S = 1.0
 ARM_EVERY_S = 0.5
 STICKS_EVERY_S = 0.02
 WAVES = ((0.6, 0.1), (0.4, 0.25))

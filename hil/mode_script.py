@@ -13,8 +13,9 @@ from firmware_py.core.types import Action, Mode, Outputs, Request, Setpoint, Sti
 from firmware_py.description.fleet import Fleet
 from firmware_py.prepare import paths
 from hil.scenario import Scenario
+from hil.scenario_rules import ARM_FROM_S
 
-ARM_FROM_S, ARM_EVERY_S = 1.0, 0.5
+ARM_EVERY_S = 0.5
 STREAM_EVERY_S = 0.1
 """Sticks and set-points."""
 PILOTED = (Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD)

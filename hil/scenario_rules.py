@@ -19,6 +19,10 @@ from hil.starts import hulls_in_walls
 if TYPE_CHECKING:
     from hil.scenario import Scenario
 
+ARM_FROM_S = 1.0
+"""First attempt to arm, by whoever flies the scenario: the pose needs a few tags."""
+ARMED_WITHIN_S = 0.1
+"""The answer comes a tick or two later, of 20 ms at the most."""
 YAWS = 37
 """Headings that are looked at between the ends of what a seed may draw: 10 deg apart at the most."""
 Mistake = tuple[tuple[str | int, ...], str]
@@ -81,6 +85,12 @@ def _in_steps(scenario: Scenario) -> Iterator[Mistake]:
         yield ("step", 0), f"a task of the kind {kind} runs no steps; only dock does"
     if kind == "dock" and not scenario.step:
         yield ("task", "kind"), "dock runs the [[step]]s, and there are none"
+
+
+def _in_settling(scenario: Scenario) -> Iterator[Mistake]:
+    if scenario.task.settle_s < ARM_FROM_S + ARMED_WITHIN_S:
+        what = f"the robot is armed after {ARM_FROM_S:g} s, and the task needs it armed; {ARM_FROM_S + ARMED_WITHIN_S:g} s are the least"
+        yield ("task", "settle_s"), f"{scenario.task.settle_s:g} s; {what}"
 
 
 def _in_file(scenario: Scenario) -> Iterator[Mistake]:
@@ -190,7 +200,7 @@ def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
 
 
 RULES = (
-    _in_name, _in_numbers, _in_polycube, _in_steps, _in_file, _in_bodies, _in_tank, _in_start, _in_mentions, _in_tags,
-    _in_faults, _in_checks,
+    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_tank, _in_start, _in_mentions,
+    _in_tags, _in_faults, _in_checks,
 )  # fmt: skip
 """The first that finds a mistake is heard first."""

@@ -21,9 +21,8 @@ from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble_fleet
 from firmware_py.prepare.waypoints import Mission, read_mission
 from hil.scenario import Scenario, Task
+from hil.scenario_rules import ARM_FROM_S
 
-ARM_FROM_S = 1.0
-"""First attempt to arm: the pose needs a few tags."""
 MOEBIUS_RAMP_SHARE = 0.25
 """Share of the time over which the speed rises, and falls again: 0.25 keeps the peak at 4/3 of the mean, so drag errors stay small."""
 ARM_EVERY_S = 0.5

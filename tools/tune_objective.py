@@ -16,6 +16,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
 from hil.metrics import SHOWN
 from hil.scenario import Scenario, load_scenario
+from hil.scenario_rules import mistakes
 
 FAILED_COST = 1e6
 """Cost of a flight that could not be judged."""
@@ -36,7 +37,10 @@ class FlightSpec:
         scenario = load_scenario(self.scenario)
         times = {name: value for name in ("settle_s", "duration_s") if (value := getattr(self, name)) > 0.0}
         scenario = dataclasses.replace(scenario, task=dataclasses.replace(scenario.task, **times))
-        return scenario.with_vehicle(self.vehicle) if self.vehicle else scenario
+        scenario = scenario.with_vehicle(self.vehicle) if self.vehicle else scenario
+        for keys, what in mistakes(scenario):
+            raise DescriptionError(f"{self.scenario} as flown here: {'.'.join(map(str, keys))}: {what}")
+        return scenario
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

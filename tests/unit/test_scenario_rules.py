@@ -114,6 +114,8 @@ def load(tmp_path: Path) -> Load:
             *((f'"{kind}"\nmodule = 1', f"module: {kind} is not of one module") for kind in WHOLE_BUS),
         )),
         ("dock", "", '[[fault]]\nkind = "jets"\nvalue = 0.5\nmodule = 1', "fault[0].module: jets is not of one module, as of 1"),
+        ("hover", "settle_s = 15.0", "settle_s = 1.0", "1 s; the robot is armed after 1 s, and the task needs it armed; 1.1"),
+        ("faults", "settle_s = 3.0", "settle_s = 0.0", "task.settle_s: 0 s; the robot is armed after 1 s"),
         ("hover", "", '[[step]]\ndo = "wait"', "step[0]: a task of the kind hover runs no steps"),
         ("hover", 'kind = "hover"', 'kind = "hover"\nfile = "none.csv"', "task.file: a task of the kind hover flies no file"),
         ("waypoints", 'file = "waypoints.csv"', "", "task.kind: waypoints flies a file, and there is none"),

@@ -189,6 +189,7 @@ def test_number_that_makes_no_sense_is_refused_in_one_line(
         ("high = 8.0", "high = 80.0", "position_bandwidth: 80.0 is out of range"),
         ("high = 8.0", "high = 0.4", "low 0.5 is not below high 0.4"),
         ('scenario = "hover"', 'scenario = "hoover"', r"objective\.toml:\d+: flight\[0\]: scenario 'hoover' is unknown"),
+        ('"spiral"', '"spiral", settle_s = 0.5', r"flight\[1\]: spiral as flown here: task\.settle_s: 0\.5 s; the robot"),
         ("unseen_seeds = [7]", "unseen_seeds = []", "unseen_seeds is empty; an objective needs one at least"),
         ("help = \"a valley\"", "help = \"\"\"a\nvalley\"\"\"", "help has more than one line"),
         ("control.position_damping", "control.position_bandwidth", "position_bandwidth is searched twice"),
