@@ -225,7 +225,8 @@ def _value(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[st
         origin = typing.get_origin(hint)
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, Mapping):
-            raise source.error(keys, f"must be a table, [{keys[-1]}], and one alone")
+            needed = f"[[{keys[-2]}]]" if isinstance(keys[-1], int) else f"[{keys[-1]}], and one alone"
+            raise source.error(keys, f"must be a table, {needed}")
         return build(typing.cast(type, hint), value, source, keys)
     if origin is tuple:
         item = typing.get_args(hint)[0]
@@ -250,10 +251,26 @@ def _array(limits: Limits, value: Any, source: Source, keys: tuple[str | int, ..
     if not np.all(np.isfinite(array)):
         raise source.error(keys, "must be finite numbers, not NaN or infinity")
     if shape and (array.ndim != len(shape) or any(s not in (-1, n) for s, n in zip(shape, array.shape, strict=True))):
-        raise source.error(keys, f"has shape {array.shape}; needs {shape} (-1: any)")
+        raise source.error(keys, f"has {_counted(array.shape)}; needs {_counted(shape)}")
     if array.size and (array.min() < limits.low or array.max() > limits.high):
         raise source.error(keys, f"{_shown(value)} is out of range; permitted: {describe(limits)}")
     return array
+
+
+def _counted(shape: tuple[int, ...]) -> str:
+    """How many numbers an array of that shape has, in words; -1 is any number of them."""
+    if not shape:
+        return "one number alone"
+    if len(shape) > 2:
+        return f"{len(shape)} lists one in the other"
+    numbers = _many(shape[-1], "number")
+    if len(shape) == 2:
+        return f"{_many(shape[0], 'row')} of {numbers}"
+    return numbers if shape[0] >= 0 else f"a list of {numbers}"
+
+
+def _many(count: int, thing: str) -> str:
+    return f"{thing}s" if count < 0 else f"{count} {thing}{'s' * (count != 1)}"
 
 
 def _is_numeric(value: Any) -> bool:

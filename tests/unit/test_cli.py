@@ -110,7 +110,7 @@ def test_wrong_arguments_are_refused_in_one_line(
         ("radius_m = 0.30", "radius_m = 'wide'", "radius_m: 'wide' is not a number", "spiral.toml:"),
         ("radius_m = 0.30", "radius_m = 0.30\nradius_m = 0.20", "not valid TOML", "line "),
         ("duration_s = 40.0", "", "duration_s: missing key", "0.1 to 7200 s"),
-        ("size_m = [1.3, 1.2, 0.76]", "size_m = [1.3, 1.2]", "size_m: has shape (2,)", "(3,)"),
+        ("size_m = [1.3, 1.2, 0.76]", "size_m = [1.3, 1.2]", "size_m: has 2 numbers", "needs 3 numbers"),
         ('vehicle = "modcube"', 'vehicle = "modcub"', "module[0].vehicle: vehicle 'modcub' is unknown", "modcube, "),
     ],
 )

@@ -86,7 +86,7 @@ WRONG = {
     "half a cell": ("[[module]]\nnumber = 2\ncell = [0.5, 0, 0]\n", r"cell \[0.5, 0.0, 0.0\] is between places of the lattice"),
     "one table": ("[module]\nnumber = 2\n", r"fleet.toml:2: module: must be a list of tables, each \[\[module\]\]"),
     "like another": ("[[module]]\nnummer = 2\n", r"module\[0\].nummer: unknown key; did you mean number\? permitted here: "),
-    "cell": ("[[module]]\nnumber = 2\ncell = [1, 2]\n", r"module\[0\].cell: has shape \(2,\); needs \(3,\)"),
+    "cell": ("[[module]]\nnumber = 2\ncell = [1, 2]\n", r"module\[0\].cell: has 2 numbers; needs 3 numbers"),
 }
 
 
