@@ -11,7 +11,7 @@ from pathlib import Path
 
 from firmware_py.description.failsafe_parameters import Failsafes, Faults, Fence
 from firmware_py.description.ground_parameters import Ground
-from firmware_py.description.schema import DescriptionError, Limits, build, describe, limits_of, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, Limits, build, describe, limits_of, meant, quantity, read_toml
 from firmware_py.description.steering_parameters import Steering
 
 
@@ -302,8 +302,8 @@ class Parameters:
         range.
         """
         group_name, _, name = dotted.partition(".")
-        if dotted not in dict(registry()):
-            raise DescriptionError(f"parameter {dotted!r} is unknown; there are {', '.join(n for n, _ in registry())}")
+        if dotted not in (known := dict(registry())):
+            raise DescriptionError(f"parameter {dotted!r} is unknown; {meant(dotted, known)}`modcube parameters` prints them all")
         group = getattr(self, group_name)
         limits = limits_of(type(group), name)
         if isinstance(getattr(group, name), int) and isinstance(value, float) and value.is_integer():

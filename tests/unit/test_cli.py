@@ -275,7 +275,7 @@ def test_vehicles_are_printed_by_name(monkeypatch: pytest.MonkeyPatch, capsys: p
 def test_groups_of_parameters_are_printed_alone(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert list(tomllib.loads(printed(["parameters", "fence", "control"], monkeypatch, capsys))) == ["control", "fence"]
     line = refusal(["parameters", "fences"], monkeypatch, capsys)
-    assert "group 'fences'" in line and "there are control, " in line
+    assert "group 'fences'" in line and "did you mean fence? there are control, " in line
 
 
 @pytest.mark.parametrize(

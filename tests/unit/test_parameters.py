@@ -86,9 +86,14 @@ def test_word_for_a_number_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["control.nothing", "nothing.law", "law", "", ".", "control.", "control"])
-def test_unknown_tunable_is_answered_with_the_known_ones(name: str) -> None:
-    with pytest.raises(DescriptionError, match=r"is unknown; there are control\.law, "):
+def test_unknown_tunable_is_answered_with_how_to_see_the_known_ones(name: str) -> None:
+    with pytest.raises(DescriptionError, match=r"is unknown; .*`modcube parameters` prints them all$"):
         Parameters().replace(name, 1.0)
+
+
+def test_unknown_tunable_is_answered_with_the_one_that_is_like_it() -> None:
+    with pytest.raises(DescriptionError, match=r"'control\.position_bandwith' is unknown; did you mean control\.position_bandwidth\? "):
+        Parameters().replace("control.position_bandwith", 1.0)
 
 
 def test_file_may_leave_everything_out(tmp_path: Path) -> None:
