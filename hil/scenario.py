@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.core import rotations
-from firmware_py.description.fleet import check_cell
+from firmware_py.description.fleet import check_cell, overlaps
 from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, meant, quantity, read_text, read_toml
 from firmware_py.description.vehicle import FACE_NAMES, find_vehicles, load_vehicle
 from hil.plant.dock_spec import DockSpec, JamRule
@@ -87,7 +87,7 @@ class Step:
 
     def __post_init__(self) -> None:
         if self.do in ("dock", "undock") and self.module == self.target_module:
-            raise DescriptionError(f"module and target_module are both {self.module}; a {self.do} is of two modules")
+            raise DescriptionError(f"module and target_module are both {self.module}; a {self.do} is of two modules", "target_module")
 
     @property
     def modules(self) -> tuple[int, ...]:
@@ -144,7 +144,7 @@ class Polycube:
 
     def __post_init__(self) -> None:
         if self.fewest > self.most:
-            raise DescriptionError("fewest is above most")
+            raise DescriptionError("fewest is above most", "fewest")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,12 +180,15 @@ class Scenario:
 
     def __post_init__(self) -> None:
         if not self.module:
-            raise DescriptionError("has no [[module]] table; a scenario needs at least one")
+            raise DescriptionError("has no [[module]] table; a scenario needs at least one", "module")
         for members in self.groups:
-            cells = np.array([self.module[m].cell for m in members])
-            if len(members) > 1 and not is_connected(cells):
-                numbers = ", ".join(str(self.module[m].number) for m in members)
-                raise DescriptionError(f"modules {numbers} share a body, but their cells do not hang together")
+            cells = [tuple(int(c) for c in self.module[m].cell) for m in members]
+            numbers = [self.module[m].number for m in members]
+            for i, what in overlaps(cells, numbers):
+                raise DescriptionError(what, "module", members[i], "cell")
+            if not is_connected(np.array(cells)):
+                what = f"modules {', '.join(map(str, numbers))} share a body, but their cells do not hang together"
+                raise DescriptionError(what, "module", members[0], "body")
 
     @property
     def groups(self) -> list[tuple[int, ...]]:

@@ -13,7 +13,7 @@ import numpy as np
 from loop_response import BODIES, Scale, body_of, margins, measure
 
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, build, meant, quantity, read_toml, repeated
 from hil.metrics import SHOWN
 from hil.scenario import Scenario, load_scenario
 from hil.scenario_rules import mistakes
@@ -96,25 +96,30 @@ class Objective:
     def __post_init__(self) -> None:
         for name in ("flight", "search", "term", "seeds", "unseen_seeds"):
             if not getattr(self, name):
-                raise DescriptionError(f"{name} is empty; an objective needs one at least")
+                raise DescriptionError(f"{name} is empty; an objective needs one at least", name)
         if "\n" in self.help:
-            raise DescriptionError("help has more than one line")
-        names = [search.parameter for search in self.search]
-        if twice := {name for name in names if names.count(name) > 1}:
-            raise DescriptionError(f"parameter {min(twice)} is searched twice")
-        for term in self.term:
+            raise DescriptionError("help has more than one line", "help")
+        for i in repeated([search.parameter for search in self.search]):
+            raise DescriptionError(f"parameter {self.search[i].parameter} is searched twice", "search", i, "parameter")
+        for i, term in enumerate(self.term):
             if term.metric not in SHOWN:
-                raise DescriptionError(f"metric '{term.metric}' is unknown; there are {', '.join(SHOWN)}")
+                known = meant(term.metric, SHOWN).rstrip() or f"there are {', '.join(SHOWN)}"
+                raise DescriptionError(f"metric '{term.metric}' is unknown; {known}", "term", i, "metric")
         if set(self.seeds) & set(self.unseen_seeds):
-            raise DescriptionError("a seed is both in seeds and in unseen_seeds; the comparison needs worlds of its own")
-        for search in self.search:
+            raise DescriptionError("a seed is both in seeds and in unseen_seeds; the comparison needs worlds of its own", "unseen_seeds")
+        for i, search in enumerate(self.search):
             if not search.low < search.high:
-                raise DescriptionError(f"parameter {search.parameter}: low {search.low:g} is not below high {search.high:g}")
-            Parameters().replace(search.parameter, search.low)
-            Parameters().replace(search.parameter, search.high)
-        for wanted in self.stability:
+                what = f"parameter {search.parameter}: low {search.low:g} is not below high {search.high:g}"
+                raise DescriptionError(what, "search", i, "low")
+            for bound in (search.low, search.high):
+                try:
+                    Parameters().replace(search.parameter, bound)
+                except DescriptionError as error:
+                    raise DescriptionError(str(error), "search", i, "parameter") from None
+        for i, wanted in enumerate(self.stability):
             if wanted.modules not in BODIES:
-                raise DescriptionError(f"stability of {wanted.modules} modules; there are bodies of {', '.join(map(str, BODIES))}")
+                what = f"stability of {wanted.modules} modules; there are bodies of {', '.join(map(str, BODIES))}"
+                raise DescriptionError(what, "stability", i, "modules")
 
     def cost(self, spec: FlightSpec, metrics: Mapping[str, float | None]) -> float:
         """Of one flight. A metric that is missing costs the most."""

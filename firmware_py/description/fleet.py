@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
-from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml, repeated
 from firmware_py.description.vehicle import find_vehicles
-
-_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,7 +31,12 @@ class Module:
 def check_cell(cell: np.ndarray) -> None:
     """Raises DescriptionError for a place (3,) between those of the lattice."""
     if not np.array_equal(cell, np.round(cell)):
-        raise DescriptionError(f"cell {cell.tolist()} is between places of the lattice; it needs whole numbers")
+        raise DescriptionError(f"cell {cell.tolist()} is between places of the lattice; it needs whole numbers", "cell")
+
+
+def overlaps(cells: Sequence[tuple[int, ...]], modules: Sequence[object]) -> Iterator[tuple[int, str]]:
+    """Of each of `cells` that another module has before it, which, and what is wrong; `modules` are what errors name them by."""
+    return ((i, f"modules {modules[cells.index(cells[i])]} and {modules[i]} overlap in cell {cells[i]}") for i in repeated(cells))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,14 +53,17 @@ class Fleet:
 
     def __post_init__(self) -> None:
         if not self.module:
-            raise DescriptionError("has no [[module]] table; a fleet needs at least one")
-        if twice := _first_twice(self.buses):
-            raise DescriptionError(f"buses has {twice} twice; each bus stands there once, and modules share it by its index")
-        for module in self.module:
+            raise DescriptionError("has no [[module]] table; a fleet needs at least one", "module")
+        for i in repeated(self.buses):
+            what = f"buses has {self.buses[i]} twice; each bus stands there once, and modules share it by its index"
+            raise DescriptionError(what, "buses")
+        for i, module in enumerate(self.module):
             if module.bus >= len(self.buses):
-                raise DescriptionError(f"module number {module.number} is on bus {module.bus}; `buses` has {len(self.buses)}, from 0 on")
-        if again := _first_twice([(m.bus, m.number) for m in self.module]):
-            raise DescriptionError(f"two modules have the number {again[1]} on {self.buses[again[0]]}; each needs one of its own there")
+                what = f"module number {module.number} is on bus {module.bus}; `buses` has {len(self.buses)}, from 0 on"
+                raise DescriptionError(what, "module", i, "bus")
+        for i in repeated([(m.bus, m.number) for m in self.module]):
+            what = f"two modules have the number {self.module[i].number} on {self.buses[self.module[i].bus]}"
+            raise DescriptionError(f"{what}; each needs one of its own there", "module", i, "number")
 
     @property
     def period_ns(self) -> int:
@@ -78,11 +83,6 @@ def load_fleet(path: Path) -> Fleet:
         raise source.error(("buses",), 'missing key; it needs the bus of each index, such as ["socketcan:can0"]')
     fleet: Fleet = build(Fleet, table, source)
     return dataclasses.replace(fleet, module=find_vehicles(fleet.module, source))
-
-
-def _first_twice(items: Sequence[_Item]) -> _Item | None:
-    """The first item that was there before; None where all differ."""
-    return next((item for at, item in enumerate(items) if item in items[:at]), None)
 
 
 def single(vehicle: str = "modcube", bus: str = "virtual:modcube", rate_hz: int = 100) -> Fleet:

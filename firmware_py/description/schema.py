@@ -13,7 +13,7 @@ import re
 import tomllib
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,15 @@ SHOWN_CHARACTERS = 60
 
 
 class DescriptionError(ValueError):
-    """A description is wrong; the message is one line: where, what, and what would be right."""
+    """A description is wrong; the message is one line: where, what, and what would be right.
+
+    Attributes:
+        keys: from the dataclass that refuses to the value that is to blame, where that is known: `build` names its line.
+    """
+
+    def __init__(self, what: str, *keys: str | int) -> None:
+        super().__init__(what)
+        self.keys = keys
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +134,10 @@ class Source:
                 best_line, best_depth = number, len(path)
         return best_line
 
-    def error(self, keys: Sequence[str | int], what: str) -> DescriptionError:
-        """The error for `keys`: `file:line: a.b: what`."""
+    def error(self, keys: Sequence[str | int], what: str, within: Sequence[str | int] = ()) -> DescriptionError:
+        """The error for `keys`: `file:line: a.b: what`; the line is that of the keys `within` them."""
         name = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
-        return DescriptionError(f"{self.path}:{self.line_of(keys)}: {name}{': ' if name else ''}{what}")
+        return DescriptionError(f"{self.path}:{self.line_of((*keys, *within))}: {name}{': ' if name else ''}{what}")
 
 
 def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
@@ -162,7 +170,8 @@ def parse_toml(text: str, path: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, and what Python itself refuses to read
         match = re.search(r"line (\d+)", str(error))
-        raise DescriptionError(f"{path}:{match.group(1) if match else 1}: not valid TOML: {str(error).splitlines()[0]}") from None
+        last = len(text.splitlines()) if "at end of document" in str(error) else 1
+        raise DescriptionError(f"{path}:{match.group(1) if match else last}: not valid TOML: {str(error).splitlines()[0]}") from None
 
 
 def meant(word: str, known: Iterable[str]) -> str:
@@ -170,6 +179,11 @@ def meant(word: str, known: Iterable[str]) -> str:
     names = list(known)
     near = [name for name in names if name.startswith(f"{word}_")] or difflib.get_close_matches(word, names, 1)  # the unit was left out
     return f"did you mean {near[0]}? " if near else ""
+
+
+def repeated(items: Sequence[object]) -> Iterator[int]:
+    """Indices of those that were there before."""
+    return (i for i, item in enumerate(items) if item in items[:i])
 
 
 def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str | int, ...] = ()) -> Any:
@@ -193,7 +207,7 @@ def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str |
     try:
         return cls(**values)
     except DescriptionError as error:
-        raise source.error(keys, str(error)) from None
+        raise source.error(keys, str(error), error.keys) from None
 
 
 def describe(limits: Limits) -> str:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, meant, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, meant, quantity, read_toml, repeated
 
 _Module = TypeVar("_Module", bound=Any)
 
@@ -61,7 +61,8 @@ class Inertial:
         if not np.array_equal(self.inertia, self.inertia.T) or least <= 0.0 or most > (least + middle) * (1.0 + 1e-9):
             raise DescriptionError(
                 f"inertia {self.inertia.tolist()} is none that a body can have: "
-                "it must be symmetric and positive, no principal moment above the sum of the others"
+                "it must be symmetric and positive, no principal moment above the sum of the others",
+                "inertia",
             )
 
 
@@ -115,7 +116,8 @@ class ThrusterCurve:
     def __post_init__(self) -> None:
         for name in ("forward", "reverse"):
             if not _rises(getattr(self, name), 1.0):
-                raise DescriptionError(f"{name} {getattr(self, name).tolist()} falls somewhere in 0..1; force must rise with the command")
+                what = f"{name} {getattr(self, name).tolist()} falls somewhere in 0..1; force must rise with the command"
+                raise DescriptionError(what, name)
 
 
 def _rises(coefficients: np.ndarray, end: float) -> bool:
@@ -133,7 +135,7 @@ class Thruster:
 
     def __post_init__(self) -> None:
         if abs(float(np.linalg.norm(self.direction)) - 1.0) > 0.01:
-            raise DescriptionError(f"direction {self.direction.tolist()} has not length 1")
+            raise DescriptionError(f"direction {self.direction.tolist()} has not length 1", "direction")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -146,7 +148,7 @@ class Tag:
 
     def __post_init__(self) -> None:
         if abs(float(np.linalg.norm(self.quaternion)) - 1.0) > 1e-3:
-            raise DescriptionError(f"quaternion {self.quaternion.tolist()} has not length 1")
+            raise DescriptionError(f"quaternion {self.quaternion.tolist()} has not length 1", "quaternion")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -184,16 +186,20 @@ class Vehicle:
 
     def __post_init__(self) -> None:
         if not self.thruster:
-            raise DescriptionError("has no [[thruster]] table; a vehicle needs at least one")
+            raise DescriptionError("has no [[thruster]] table; a vehicle needs at least one", "thruster")
         if len(self.faces) != 6 or set(self.faces) - set("PD-"):
-            raise DescriptionError(f"faces {self.faces!r} needs six letters out of P, D and -")
-        if len({tag.id for tag in self.tag}) != len(self.tag):
-            raise DescriptionError("two [[tag]] tables have the same id")
-        for name, side, full in (("forward", self.curve.forward, self.force_max_n), ("reverse", self.curve.reverse, -self.force_min_n)):
+            raise DescriptionError(f"faces {self.faces!r} needs six letters out of P, D and -", "faces")
+        for i in repeated([tag.id for tag in self.tag]):
+            raise DescriptionError("two [[tag]] tables have the same id", "tag", i, "id")
+        sides = (("forward", "force_max_n", self.force_max_n), ("reverse", "force_min_n", -self.force_min_n))
+        for name, limit, full in sides:
+            side = getattr(self.curve, name)
             if full > float(np.sum(side)) * (1.0 + 1e-9):
-                raise DescriptionError(f"the {name} limit of {full:g} N is above the {np.sum(side):g} N of curve.{name} at full command")
+                what = f"the {name} limit of {full:g} N is above the {np.sum(side):g} N of curve.{name} at full command"
+                raise DescriptionError(what, limit)
             if not _rises(getattr(self.curve, f"power_{name}"), full):
-                raise DescriptionError(f"curve.power_{name} falls somewhere in 0..{full:g} N; power must rise with the force")
+                what = f"curve.power_{name} falls somewhere in 0..{full:g} N; power must rise with the force"
+                raise DescriptionError(what, "curve", f"power_{name}")
 
     @property
     def positions(self) -> np.ndarray:

@@ -33,11 +33,12 @@ class GroundConfig:
 
     def __post_init__(self) -> None:
         if not self.links:
-            raise DescriptionError("has no links; a ground side needs at least one")
+            raise DescriptionError("has no links; a ground side needs at least one", "links")
         if len(self.dock_button) not in (0, 4):
-            raise DescriptionError("dock_button needs four numbers: module, face, target module, target face")
+            raise DescriptionError("dock_button needs four numbers: module, face, target module, target face", "dock_button")
         if wrong := [face for face in self.dock_button[1::2] if face >= len(FACE_NAMES)]:
-            raise DescriptionError(f"dock_button names face {wrong[0]}; faces are 0 to {len(FACE_NAMES) - 1}: {', '.join(FACE_NAMES)}")
+            what = f"dock_button names face {wrong[0]}; faces are 0 to {len(FACE_NAMES) - 1}: {', '.join(FACE_NAMES)}"
+            raise DescriptionError(what, "dock_button")
 
     def watches(self, system: int, component: int) -> bool:
         """Whether a ground station may be the one that must not be lost, and steer."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from firmware_py.description.fleet import overlaps
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import FACE_NAMES, Vehicle
 from firmware_py.prepare.lattice import MATRICES, face_towards
@@ -39,11 +40,10 @@ def check_joints(placements: Sequence[Placement], modules: Sequence[object], pit
         DescriptionError: two modules in one cell, a payload in another's cell, a probe that meets no drogue, or a
             module that no joint leads to.
     """
+    for _, what in overlaps([placement.cell for placement in placements], modules):
+        raise DescriptionError(what)
     at: dict[Cell, int] = {}
     for i, placement in enumerate(placements):
-        if placement.cell in at:
-            other = modules[at[placement.cell]]
-            raise DescriptionError(f"modules {other} and {modules[i]} overlap in cell {placement.cell}")
         if not 0 <= placement.rotation < 24:
             raise DescriptionError(f"module {modules[i]}: rotation {placement.rotation} is none of 0 to 23")
         at[placement.cell] = i

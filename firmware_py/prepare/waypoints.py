@@ -40,9 +40,9 @@ class WaypointTable:
     def __post_init__(self) -> None:
         for name, values, length in (("quaternion", self.quaternion, 4), ("velocity_m_s", self.velocity_m_s, 3)):
             if len(values) not in (0, length):
-                raise DescriptionError(f"{name} needs {length} numbers, not {len(values)}")
+                raise DescriptionError(f"{name} needs {length} numbers, not {len(values)}", name)
         if len(self.quaternion) and abs(float(np.linalg.norm(self.quaternion)) - 1.0) > _UNIT_TOLERANCE:
-            raise DescriptionError(f"quaternion {self.quaternion.tolist()} has not length 1")
+            raise DescriptionError(f"quaternion {self.quaternion.tolist()} has not length 1", "quaternion")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,7 +59,7 @@ class LimitsTable:
     def __post_init__(self) -> None:
         for name, values in (("velocity_m_s", self.velocity_m_s), ("acceleration_m_s2", self.acceleration_m_s2)):
             if len(values) not in (0, 3):
-                raise DescriptionError(f"{name} needs 3 numbers, not {len(values)}")
+                raise DescriptionError(f"{name} needs 3 numbers, not {len(values)}", name)
 
     def limits(self) -> Limits:
         """As minimum_snap takes them."""
@@ -87,9 +87,9 @@ class Mission:
         given = [w.duration_s > 0.0 for w in self.waypoint[1:]]
         if any(given) and not all(given):
             lacking = given.index(False) + 1
-            raise DescriptionError(f"waypoint {lacking} lacks duration_s; give it for every piece or for none")
+            raise DescriptionError(f"waypoint {lacking} lacks duration_s; give it for every piece or for none", "waypoint", lacking)
         if all(given) and self.duration_s > 0.0:
-            raise DescriptionError("duration_s is given for the whole and for every piece; leave one out")
+            raise DescriptionError("duration_s is given for the whole and for every piece; leave one out", "duration_s")
 
     def plan(self, body: Body | None = None, stretch: bool = True) -> Piecewise:
         """The trajectory. Raises as minimum_snap.plan does."""

@@ -131,7 +131,7 @@ def test_trajectory_task_ranks_by_the_wrench_along_it(tmp_path: Path) -> None:
     [
         ('name = "x"\n', "either `wrench` rows or a [trajectory] table"),
         ('name = "x"\nwrench = [[0, 0, 0, 0, 0, 0]]\n', "row 0 is zero"),
-        ('name = "x"\nwrench = [[1, 0, 0]]\n', "shape"),
+        ('name = "x"\nwrench = [[1, 0, 0]]\n', "has 1 row of 3 numbers; needs rows of 6 numbers"),
         ('name = "x"\nrank_by = "luck"\nwrench = [[1, 0, 0, 0, 0, 0]]\n', "margin, power, variance"),
     ],
 )

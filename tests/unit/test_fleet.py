@@ -73,10 +73,10 @@ def test_single_module_is_number_one_on_its_bus() -> None:
 WRONG = {
     "no module": ("rate_hz = 100\n", r"fleet.toml:1: module: missing key"),
     "empty": ("module = []\n", r"has no \[\[module\]\] table; a fleet needs at least one"),
-    "two of a kind": ("[[module]]\nnumber = 2\n[[module]]\nnumber = 2\n", r"fleet.toml:1: two modules have the number 2 on virtual:a"),
+    "two of a kind": ("[[module]]\nnumber = 2\n[[module]]\nnumber = 2\n", r"fleet.toml:5: two modules have the number 2 on virtual:a"),
     "bus twice": ('buses = ["udp:a", "udp:b", "udp:a"]\n[[module]]\nnumber = 2\n', "fleet.toml:1: buses has udp:a twice"),
     "no bus": ("buses = []\n[[module]]\nnumber = 2\n", "`buses` has 0"),
-    "bus beyond": ("[[module]]\nnumber = 2\nbus = 1\n", "module number 2 is on bus 1; `buses` has 1, from 0 on"),
+    "bus beyond": ("[[module]]\nnumber = 2\nbus = 1\n", "fleet.toml:4: module number 2 is on bus 1; `buses` has 1, from 0 on"),
     "firmware's number": ("[[module]]\nnumber = 0\n", r"fleet.toml:3: module\[0\].number: 0 is out of range; .*29"),
     "e-stop's number": ("[[module]]\nnumber = 30\n", r"module\[0\].number: 30 is out of range; .* 1 to 29"),
     "too slow": ("rate_hz = 49\n[[module]]\nnumber = 2\n", r"fleet.toml:2: rate_hz: 49 is out of range; .* to 400 Hz"),

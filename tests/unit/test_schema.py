@@ -18,7 +18,7 @@ class Fin:
 
     def __post_init__(self) -> None:
         if self.angle == 0.5:
-            raise DescriptionError("angle must not be one half")
+            raise DescriptionError("angle must not be one half", "angle")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,7 +38,7 @@ class Boat:
 
     def __post_init__(self) -> None:
         if self.mate == self.name:
-            raise DescriptionError("mate must not be the captain")
+            raise DescriptionError("mate must not be the captain", "mate")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -159,14 +159,16 @@ WRONG = {
     "number for an array": (TOP + "depths = 3\n", "3: depths: has one number alone; needs a list of numbers"),
     "text in an array": (TOP + 'depths = [1, "2"]\n', "3: depths: must be numbers only, in rows of equal length"),
     "truth in an array": (TOP + "inertia = [[1, 0], [true, 1]]\n", "3: inertia: must be numbers only, in rows of equal length"),
+    "list without end": (TOP + "depths = [1,\n", "3: not valid TOML: "),
+    "text without end": (TOP + 'rig = """a\n', "3: not valid TOML: "),
     "huge number": (NAME + f"length_m = 1{'0' * 400}\n", f"2: length_m: 1{'0' * 56}... is out of range; permitted: 0.1 to 100 m"),
     "huge number in an array": (TOP + f"depths = [1{'0' * 400}]\n", "3: depths: must be finite numbers, not NaN or infinity"),
     "number that no computer can read": (NAME + f"length_m = 1{'0' * 5000}\n", "1: not valid TOML: Exceeds the limit"),
     "brackets without end": (NAME + "length_m = " + "[" * 5000 + "\n", "1: not valid TOML: "),
     "long array out of range": (TOP + f"depths = {[51] * 99}\n", f"3: depths: {str([51] * 99)[:57]}... is out of range"),
-    "its own rule at the top": (TOP + 'mate = "Ann"\n', "1: mate must not be the captain"),
-    "its own rule": (TOP + "[keel]\nangle = 0.5\n", "3: keel: angle must not be one half"),
-    "its own rule in a row": (TOP + "[[fin]]\nangle = 0\n\n[[fin]]\nangle = 0.5\n", "6: fin[1]: angle must not"),
+    "its own rule at the top": (TOP + 'mate = "Ann"\n', "3: mate must not be the captain"),
+    "its own rule": (TOP + "[keel]\nspan_m = [1, 2]\nangle = 0.5\n", "5: keel: angle must not be one half"),
+    "its own rule in a row": (TOP + "[[fin]]\nangle = 0\n\n[[fin]]\nangle = 0.5\n", "7: fin[1]: angle must not"),
 }
 
 

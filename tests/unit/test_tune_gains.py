@@ -187,13 +187,14 @@ def test_number_that_makes_no_sense_is_refused_in_one_line(
     [
         ("unseen_seeds = [7]", "unseen_seeds = [1]", "a seed is both in seeds and in unseen_seeds"),
         ("high = 8.0", "high = 80.0", "position_bandwidth: 80.0 is out of range"),
+        ("control.position_damping", "control.position_dampin", r"toml:7: .* unknown; did you mean control\.position_damping\? `mod"),
         ("high = 8.0", "high = 0.4", "low 0.5 is not below high 0.4"),
         ('scenario = "hover"', 'scenario = "hoover"', r"objective\.toml:\d+: flight\[0\]: scenario 'hoover' is unknown"),
         ('"spiral"', '"spiral", settle_s = 0.5', r"flight\[1\]: spiral as flown here: task\.settle_s: 0\.5 s; the robot"),
         ("unseen_seeds = [7]", "unseen_seeds = []", "unseen_seeds is empty; an objective needs one at least"),
         ("help = \"a valley\"", "help = \"\"\"a\nvalley\"\"\"", "help has more than one line"),
         ("control.position_damping", "control.position_bandwidth", "position_bandwidth is searched twice"),
-        ("position_rmse_m", "position_rmse", "metric 'position_rmse' is unknown; there are position_rmse_m, position_max_m"),
+        ("position_rmse_m", "position_rmse", r"objective\.toml:11: metric 'position_rmse' is unknown; did you mean position_rmse_m\?$"),
         ("term = [", f"stability = [{{ modules = 3, {MARGINS} }}]\nterm = [", "stability of 3 modules; there are bodies of 1, 2, 4"),
     ],
 )

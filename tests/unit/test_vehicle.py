@@ -219,8 +219,8 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
     [
         ("direction = [0.7071067811865476, -0", "direction = [0.9, -0", r":\d+: thruster\[0\]: .* has not length 1"),
         ("quaternion = [1.0, 0.0, 0.0", "quaternion = [1.0, 0.5, 0.0", r":\d+: tag\[5\]: .* has not length 1"),
-        ("id = 3", "id = 2", r"two \[\[tag\]\] tables have the same id"),
-        ('faces = "PDPDPD"', 'faces = "PDPD"', "needs six letters out of P, D and -"),
+        ("id = 3", "id = 2", r"odd.toml:90: two \[\[tag\]\] tables have the same id"),
+        ('faces = "PDPDPD"', 'faces = "PDPD"', "odd.toml:5: faces 'PDPD' needs six letters out of P, D and -"),
         ('faces = "PDPDPD"', 'faces = "PDPDPX"', "needs six letters out of P, D and -"),
         ("dry_kg = 2.6", "dry_kg = 0.0", r"inertial.dry_kg: 0.0 is out of range; permitted: 0.01 to 5000 kg"),
         ("force_min_n = -8.0", "force_min_n = 8.0", r"force_min_n: 8.0 is out of range"),
@@ -229,8 +229,8 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
         ("inertia = [[0.068, 0.0", "inertia = [[0.068, 0.01", "it must be symmetric and positive"),
         ("0.0, 0.068, 0.0], [0.0, 0.0, 0.068", "0.0, 0.068, 0.0], [0.0, 0.0, 0.2", "no principal moment above the sum of the others"),
         ("forward = [1.5, 9.0, -0.5", "forward = [1.5, 9.0, -20.5", r":\d+: curve: forward .* falls somewhere in 0..1"),
-        ("power_reverse = [2.6, 0.52", "power_reverse = [2.6, -0.52", r"curve.power_reverse falls somewhere in 0..8 N"),
-        ("force_max_n = 10.0", "force_max_n = 30.0", "forward limit of 30 N is above the 10 N of curve.forward"),
+        ("power_reverse = [2.6, 0.52", "power_reverse = [2.6, -0.52", r"odd.toml:31: curve.power_reverse falls somewhere in 0..8 N"),
+        ("force_max_n = 10.0", "force_max_n = 30.0", "odd.toml:6: the forward limit of 30 N is above the 10 N of curve.forward"),
         ("cd_edge = 0.80", "cd_edge = 0.80\nquadratic = [1, 2, 3]", r"toml:24: drag.quadratic: has 3 numbers; it needs six, .* or none"),
         (
             "cd_face = 1.05\ncd_edge = 0.80", "cd_face = 5\ncd_edge = 0.1",

@@ -63,7 +63,7 @@ class Task:
         if (self.wrench.size > 0) == (self.trajectory is not None):
             raise DescriptionError("needs either `wrench` rows or a [trajectory] table, not both")
         if self.wrench.size and not np.all(np.any(self.wrench != 0.0, axis=1)):
-            raise DescriptionError(f"wrench row {int(np.argmin(np.any(self.wrench != 0.0, axis=1)))} is zero")
+            raise DescriptionError(f"wrench row {int(np.argmin(np.any(self.wrench != 0.0, axis=1)))} is zero", "wrench")
 
 
 def load_task(path: Path) -> Task:
