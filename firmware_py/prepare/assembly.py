@@ -75,9 +75,9 @@ def assemble_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle], cache: DragCac
 
 def check_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> None:
     """Refuse modules that cannot be docked so, and thrusters that no frame carries. Raises DescriptionError, which names numbers."""
-    for vehicle in vehicles.values():
+    for name, vehicle in vehicles.items():
         if len(vehicle.thruster) > CHANNELS:
-            raise DescriptionError(f"vehicle {vehicle.name}: {len(vehicle.thruster)} thrusters; a module's frames carry {CHANNELS}")
+            raise DescriptionError(f"vehicle {name}: {len(vehicle.thruster)} thrusters; a module's frames carry {CHANNELS}")
     for members in _groups(fleet):
         check_joints(_placements(*_described(fleet, members, vehicles)), [fleet.label(i) for i in members], fleet.pitch_m)
 

@@ -320,6 +320,6 @@ def test_fleet_starts_as_its_file_says(modcube: Vehicle) -> None:
 
 
 def test_vehicle_with_more_thrusters_than_its_frames_carry_cannot_fly(modcube: Vehicle) -> None:
-    crowded = dataclasses.replace(modcube, name="crowded", thruster=(*modcube.thruster, modcube.thruster[0]))
-    with pytest.raises(DescriptionError, match="vehicle crowded: 9 thrusters; a module's frames carry 8"):
-        assemble_fleet(Fleet(module=(Module(number=1),)), {"modcube": crowded})
+    crowded = dataclasses.replace(modcube, thruster=(*modcube.thruster, modcube.thruster[0]))
+    with pytest.raises(DescriptionError, match=r"vehicle crowded\.toml: 9 thrusters; a module's frames carry 8"):
+        assemble_fleet(Fleet(module=(Module(number=1, vehicle="crowded.toml"),)), {"crowded.toml": crowded})
