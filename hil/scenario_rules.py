@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from firmware_py.description.schema import limits_of, meant
+from firmware_py.description.schema import is_file_name, limits_of, meant
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
@@ -51,9 +51,8 @@ def module_numbers(scenario: Scenario) -> list[int]:
 
 
 def _in_name(scenario: Scenario) -> Iterator[Mistake]:
-    name = scenario.name
-    if name in ("", ".", "..") or "/" in name or "\\" in name or not name.isprintable():
-        yield ("name",), f"{name!r} cannot be the name of a folder; give one without separators, as in the file's name"
+    if not is_file_name(scenario.name):
+        yield ("name",), f"{scenario.name!r} cannot be the name of a folder; give one without separators, as in the file's name"
 
 
 def _in_numbers(scenario: Scenario) -> Iterator[Mistake]:

@@ -181,6 +181,11 @@ def meant(word: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]}? " if near else ""
 
 
+def is_file_name(name: str) -> bool:
+    """Whether a file or a folder can be called that, alone and anywhere."""
+    return name not in ("", ".", "..") and name.isprintable() and not set(name) & set("/\\")
+
+
 def repeated(items: Sequence[object]) -> Iterator[int]:
     """Indices of those that were there before."""
     return (i for i, item in enumerate(items) if item in items[:i])

@@ -15,7 +15,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, meant, quantity, read_toml, repeated
+from firmware_py.description.schema import (
+    DescriptionError,
+    Source,
+    build,
+    frozen_array,
+    is_file_name,
+    limits_of,
+    meant,
+    quantity,
+    read_toml,
+    repeated,
+)
 
 _Module = TypeVar("_Module", bound=Any)
 
@@ -239,6 +250,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
         )
     table, source = read_toml(path)
     vehicle: Vehicle = build(Vehicle, table, source)
+    _check_body(vehicle, source)
     _check_drag(vehicle.drag, source)
     if vehicle.hull.mesh:
         mesh = (path.parent / vehicle.hull.mesh).absolute()  # for logs, and for who prints it as a file elsewhere
@@ -246,6 +258,20 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
             raise source.error(("hull", "mesh"), f"{mesh}: there is no such mesh")
         vehicle = dataclasses.replace(vehicle, hull=dataclasses.replace(vehicle.hull, mesh=str(mesh)))
     return vehicle
+
+
+def _check_body(vehicle: Vehicle, source: Source) -> None:
+    """Raises DescriptionError, which names the line, where no robot is like that, or no file can have its name."""
+    passive, com, half = vehicle.passive_dof, vehicle.inertial.com_m, 0.5 * vehicle.hull.size_m
+    if not is_file_name(vehicle.name):
+        raise source.error(("name",), f"{vehicle.name!r} cannot be the name of a file; give one without separators")
+    for i in repeated(passive):
+        raise source.error(("passive_dof",), f"{passive[i]} is there twice; name each degree of freedom once")
+    if len(passive) == len(limits_of(Vehicle, "passive_dof").choices):
+        raise source.error(("passive_dof",), "all six are left to buoyancy; a vehicle steers one at least")
+    if not vehicle.hull.mesh and np.any(np.abs(com) > half):
+        what = f"{com.tolist()} m is outside the hull, a box of {' x '.join(f'{edge:g}' for edge in vehicle.hull.size_m)} m about [0, 0, 0]"
+        raise source.error(("inertial", "com_m"), what)
 
 
 def _check_drag(drag: Drag, source: Source) -> None:

@@ -238,6 +238,12 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
         ),
         ("cd_face = 1.05\ncd_edge = 0.80", "cd_face = 1.0\ncd_edge = 0.25", "must be above cd_face / 4, here 0.25"),
         ("[hull]\n", '[hull]\nmesh = "hull.stl"\n', r"odd.toml:\d+: hull.mesh: .*/hull.stl: there is no such mesh"),
+        ('name = "modcube"', 'name = ""', r"odd.toml:2: name: '' cannot be the name of a file"),
+        ('name = "modcube"', 'name = "../modcube"', r"odd.toml:2: name: '../modcube' cannot be"),
+        ('name = "modcube"', r'name = "mod\ncube"', r"odd.toml:2: name: 'mod.ncube' cannot be"),
+        ('faces = "P', 'passive_dof = ["roll", "pitch", "roll"]\nfaces = "P', r"odd.toml:5: passive_dof: roll is there twice"),
+        ('faces = "P', f'passive_dof = {["surge", "sway", "heave", "roll", "pitch", "yaw"]}\nfaces = "P', "passive_dof: all six are left"),
+        ("com_m = [0.0, 0.0, 0.0]", "com_m = [0, 0, 0.11]", r"toml:16: inertial.com_m: \[0.0, 0.0, 0.11\] m is outside the hull"),
         ("id = 0", "id = 16", r"tag\[0\].id: 16 is out of range; permitted: 0 to 15"),
     ],
 )  # fmt: skip
