@@ -28,6 +28,7 @@ from tune_objective import Objective, detuned, load_objective, with_values
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.toml_text import to_toml
+from firmware_py.runtime.interrupts import interrupted_once
 from hil.campaign import TRIALS_FILE, code_digest, identity, run_campaign
 from hil.trial_file import TrialFile
 from hil.workers import Pool, dask_cluster, kept, processes
@@ -140,7 +141,8 @@ def main() -> int:
 
             return tune_live(objective, given.live, given.trials, given.seconds, given.out)
         check_results(given.out, "search_seed", "tuning.json", "parameters.toml", "steps.png", "bode.png", "search.png")
-        tune(objective, start, given, dask_cluster(given.dask) if given.dask else processes(given.jobs))
+        with interrupted_once():
+            tune(objective, start, given, dask_cluster(given.dask) if given.dask else processes(given.jobs))
     except (DescriptionError, OSError) as error:
         print(f"tune_gains: {in_words(error)}", file=sys.stderr)
         return 2

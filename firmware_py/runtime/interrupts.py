@@ -1,4 +1,4 @@
-"""Ctrl-C: it ends a command in one line, however often it is pressed, and leaves a log that is whole."""
+"""Ctrl-C, and SIGTERM as it: it ends a command in one line, however often it is pressed, and leaves a log that is whole."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from types import FrameType
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C: 128 and SIGINT, as a shell has it."""
+ENDINGS = (signal.SIGINT, signal.SIGTERM)
+"""What somebody ends a command with: at its terminal, and from elsewhere."""
 
 
 @contextmanager
@@ -31,7 +33,7 @@ def ended_at_once() -> Iterator[None]:
 
 @contextmanager
 def interrupted_once() -> Iterator[None]:
-    """The first Ctrl-C inside raises KeyboardInterrupt, and no other does, nor any after that: who was interrupted is ending.
+    """The first Ctrl-C or SIGTERM inside raises KeyboardInterrupt, and no other does, nor any after that: who was interrupted is ending.
 
     What a library has made of it (compiled code that was called back knows only that something failed) leaves as KeyboardInterrupt too,
     and at the end one that was lost on the way.
@@ -44,10 +46,7 @@ def interrupted_once() -> Iterator[None]:
             pressed = True
             raise KeyboardInterrupt
 
-    if not _is_heard():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, press)
+    before = {number: signal.signal(number, press) for number in ENDINGS if _is_heard(number) or _would_kill(number)}
     try:
         yield
     except Exception:
@@ -58,40 +57,51 @@ def interrupted_once() -> Iterator[None]:
         if pressed:
             raise KeyboardInterrupt
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN if pressed else before)
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_IGN if pressed else handler)
 
 
 @contextmanager
 def held_back() -> Iterator[Callable[[], None]]:
-    """Ctrl-C inside waits for the next call of what this gives, or for the end, and comes about there: nothing is left half written."""
+    """Ctrl-C inside waits for the next call of what this gives, or for the end, and comes about there: nothing is left half written.
+
+    So does SIGTERM inside `interrupted_once`; elsewhere it kills, as ever.
+    """
     pressed: list[int] = []
-    if not _is_heard():
-        yield lambda: None
-        return
-    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    handlers = {number: signal.getsignal(number) for number in ENDINGS if _is_heard(number)}
+    for number in handlers:
+        signal.signal(number, lambda number, frame: pressed.append(number))
 
     def check() -> None:
         """Raises KeyboardInterrupt where Ctrl-C was pressed."""
-        if pressed and callable(before):
-            before(signal.SIGINT, None)
+        for number in pressed[:1]:
+            handler = handlers[signal.Signals(number)]
+            assert callable(handler)
+            handler(number, None)
 
     try:
         yield check
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     check()
 
 
 @contextmanager
 def out_of_reach() -> Iterator[None]:
-    """A process that is started inside never hears of Ctrl-C; this one hears of it afterwards."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """A process that is started inside never hears of Ctrl-C and SIGTERM; this one hears of them afterwards."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _is_heard() -> bool:
-    """Whether Ctrl-C comes to this thread's Python: others get no signals, and what a shell runs in the background ignores it."""
-    return threading.current_thread() is threading.main_thread() and callable(signal.getsignal(signal.SIGINT))
+def _is_heard(number: signal.Signals = signal.SIGINT) -> bool:
+    """Whether a signal comes to this thread's Python: others get none, and what a shell runs in the background ignores Ctrl-C."""
+    return threading.current_thread() is threading.main_thread() and callable(signal.getsignal(number))
+
+
+def _would_kill(number: signal.Signals) -> bool:
+    """Whether a signal would end this process before this thread's Python hears of it."""
+    return threading.current_thread() is threading.main_thread() and signal.getsignal(number) is signal.SIG_DFL

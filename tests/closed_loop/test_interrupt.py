@@ -1,4 +1,6 @@
-"""`modcube hil run` that somebody stops with Ctrl-C, and again at once, as impatient people do: one line, and the log is whole."""
+"""`modcube hil run` that somebody stops with Ctrl-C, and again at once, as impatient people do, or with SIGTERM: one line, and the log is
+whole.
+"""
 
 import signal
 import subprocess
@@ -21,14 +23,14 @@ check = [{ metric = "position_rmse_m", high = 0.1 }]
 task = { kind = "hover", settle_s = 3.0, duration_s = 6000.0, centre_m = [0.0, 0.0, 0.4] }
 """
 PRESSED_TICK = 200
-PROCESS = f"""
+PROCESS = """
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
-{DIE_WITH_TEST}
+{die}
 def press_twice():
     for _ in range(2):
-        os.killpg(0, signal.SIGINT)  # as a terminal does, which tells all its processes
-%s
+        os.killpg(0, signal.{ending})  # as a terminal does, which tells all its processes
+{how}
 from firmware_py.__main__ import main
 main()
 """
@@ -69,19 +71,21 @@ CPUCodeLibrary._object_getbuffer_hook = classmethod(loaded)
 """
 
 
-def run(folder: Path, how: str, *options: str) -> str:
-    """What a run that is interrupted twice says on stderr."""
+def run(folder: Path, how: str, *options: str, ending: str = "SIGINT") -> str:
+    """What a run that is told twice to end says on stderr."""
     (folder / "long.toml").write_text(LONG)
-    words = [sys.executable, "-c", PROCESS % how, "hil", "run", "long.toml", "--out", "run", *options]
+    program = PROCESS.format(ending=ending, die=DIE_WITH_TEST, how=how)
+    words = [sys.executable, "-c", program, "hil", "run", "long.toml", "--out", "run", *options]
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, start_new_session=True, timeout=DEADLINE_S)
     assert done.returncode == 128 + signal.SIGINT, done.stderr
     return done.stderr
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("ending", ["SIGINT", "SIGTERM"])
 @pytest.mark.parametrize("realtime", [False, True], ids=["lockstep", "realtime"])
-def test_flight_that_is_interrupted_twice_says_where_its_log_is_and_keeps_it_whole(realtime: bool, tmp_path: Path) -> None:
-    said = run(tmp_path, IN_FLIGHT, *(["--realtime", "--bus", free_group()] if realtime else []))
+def test_flight_that_is_interrupted_twice_says_where_its_log_is_and_keeps_it_whole(realtime: bool, ending: str, tmp_path: Path) -> None:
+    said = run(tmp_path, IN_FLIGHT, *(["--realtime", "--bus", free_group()] if realtime else []), ending=ending)
     assert said == "modcube: interrupted; the log up to then is in run\n"
     flown = FlightLog(tmp_path / "run")
     assert [logged.tick for logged in flown.ticks()][-1] == PRESSED_TICK and flown.torn == ""

@@ -12,14 +12,15 @@ from firmware_py.runtime.interrupts import held_back, interrupted_once, out_of_r
 
 @pytest.fixture(autouse=True)
 def handler() -> Iterator[None]:
-    """The usual one, and after the test that of before."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """The usual ones, and after the test those of before."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler), signal.signal(signal.SIGTERM, signal.SIG_DFL)
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, usual in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+        signal.signal(number, usual)
 
 
-def press() -> None:
-    signal.raise_signal(signal.SIGINT)
+def press(number: signal.Signals = signal.SIGINT) -> None:
+    signal.raise_signal(number)
 
 
 def test_only_the_first_press_interrupts_and_those_while_it_ends_do_nothing() -> None:
@@ -32,6 +33,26 @@ def test_only_the_first_press_interrupts_and_those_while_it_ends_do_nothing() ->
             ended.append("orderly")
     press()
     assert ended == ["orderly"] and signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # a handler of Python's would be gone before it is
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_termination_from_elsewhere_is_a_press_that_waits_as_any(background: bool) -> None:
+    if background:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts what it runs in the background
+    done = []
+    with pytest.raises(KeyboardInterrupt), interrupted_once(), held_back() as check:
+        press(signal.SIGTERM)
+        done.append("the tick")
+        check()
+        done.append("another")
+    press(signal.SIGTERM)
+    assert done == ["the tick"]
+
+
+def test_termination_stays_as_it_was_where_nobody_sent_it() -> None:
+    with interrupted_once(), held_back():
+        pass
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_what_a_library_makes_of_an_interrupt_is_one() -> None:
@@ -111,11 +132,12 @@ def test_other_threads_and_ignored_interrupts_are_left_alone() -> None:
     assert failed == [] and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
-def test_process_that_is_begun_out_of_reach_is_spared_and_this_one_hears_of_it_later() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_process_that_is_begun_out_of_reach_is_spared_and_this_one_hears_of_it_later(number: signal.Signals) -> None:
     done = []
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt), interrupted_once():
         with out_of_reach():
-            press()
+            press(number)
             done.append("begun")
         done.append("more")
     assert done == ["begun"]

@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import re
+import signal
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
@@ -180,6 +181,19 @@ def test_number_that_makes_no_sense_is_refused_in_one_line(
         tune_gains.main()
     assert refusal.value.code == 2
     assert "is not a" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_search_that_is_terminated_from_elsewhere_says_that_it_goes_on(
+    tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import tune_gains
+
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    monkeypatch.setattr(tune_gains, "tune", lambda *_: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr("sys.argv", ["tune_gains.py", str(ROOT / "tools" / "objectives" / "hover.toml"), "--out", str(tmp_path)])
+    assert tune_gains.main() == tune_gains.INTERRUPTED
+    signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err == f"tune_gains: interrupted; the same command with --out {tmp_path} goes on where it was\n"
 
 
 @pytest.mark.parametrize(
