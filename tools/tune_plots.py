@@ -61,12 +61,19 @@ def draw_steps(path: Path, steps: Mapping[str, np.ndarray]) -> None:
     time_s = 1e-9 * PERIOD_NS * np.arange(1, STEP_TICKS + 1)
     for k, (axis, panel) in enumerate(zip(SHOWN, panels.flat, strict=True)):
         for name, moved in steps.items():
-            panel.plot(time_s, np.clip(moved[k], -1.0, 3.0), color=COLOURS[name], label=name)
+            above = {"linestyle": "--", "zorder": 3} if name == "start" else {}  # seen where the others agree with it
+            panel.plot(time_s, np.clip(moved[k], -1.0, 3.0), color=COLOURS[name], label=name, **above)
         panel.axhline(1.0, color=GREY, linewidth=0.8)
-        panel.set(title=AXES[axis], xlabel="time, s", ylim=(-0.2, 1.8))
+        panel.set(title=AXES[axis], xlabel="time, s", ylim=steps_range(steps))
     panels[0, 0].set_ylabel("share of the step")
     panels[0, 0].legend(frameon=False, loc="lower right")
     _save(figure, path, "One module: step of the set-point, 50 mm and 5 deg, as estimated; no noise, with thruster lag, tick and tag delay")
+
+
+def steps_range(steps: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """Lowest and highest share that the axes show: all that is made of the steps, but of what swings away 0.2 below and 0.8 above."""
+    made = np.array(list(steps.values()))
+    return max(min(float(made.min()) - 0.05, -0.05), -0.2), min(max(float(made.max()) + 0.05, 1.1), 1.8)
 
 
 def draw_bode(path: Path, loops: Mapping[str, list[Response]]) -> None:
@@ -83,8 +90,8 @@ def draw_bode(path: Path, loops: Mapping[str, list[Response]]) -> None:
                 panel.axvline(found.crossover_rad_s, color=COLOURS[name], linewidth=0.8, linestyle=":")
         gain.axhline(0.0, color=GREY, linewidth=0.8)
         phase.axhline(-180.0, color=GREY, linewidth=0.8)
-        gain.set_title(AXES[axis])
-        gain.legend(frameon=False, loc="upper right", fontsize=8)
+        title = {"title": AXES[axis], "title_fontsize": "large"}
+        gain.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), borderaxespad=0.2, fontsize=8, **title)
         phase.set_xlabel("frequency, rad/s")
     panels[0, 0].set(xscale="log", ylabel="loop gain, dB", ylim=(-40, 50))
     panels[1, 0].set(ylabel="phase, deg", ylim=(-400, -80), yticks=range(-360, -80, 45))

@@ -235,6 +235,48 @@ def test_detuned_gains_are_off_by_up_to_three_and_within_the_bounds(tools: tuple
     assert 1 / 3 <= min(factors) < 0.4 and 2.5 < max(factors) <= 3.0
 
 
+@pytest.fixture
+def drawn(tools: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What tune_plots would save, with everything in its place."""
+    import matplotlib
+    import tune_plots
+
+    figures: list[Any] = []
+
+    def keep(figure: Any, path: Path, title: str) -> None:
+        figure.suptitle(title)
+        figure.tight_layout()
+        figure.canvas.draw()
+        figures.append(figure)
+
+    matplotlib.use("Agg")
+    monkeypatch.setattr(tune_plots, "_save", keep)
+    return figures
+
+
+def test_legends_of_the_bode_plot_stand_where_no_line_runs(drawn: list[Any]) -> None:
+    from loop_response import Response
+    from tune_plots import draw_bode
+
+    w = np.geomspace(0.1, 100.0, 50)
+    draw_bode(Path(), {name: [Response(w, gain * np.exp(-0.1j * w) / (1j * w))] * 6 for name, gain in (("shipped", 2.0), ("tuned", 4.0))})
+    legends = [(panel, panel.get_legend()) for panel in drawn[0].axes if panel.get_legend() is not None]
+    assert len(legends) == 4
+    assert all(legend.get_window_extent().y0 >= panel.get_window_extent().y1 - 0.5 for panel, legend in legends)
+
+
+@pytest.mark.parametrize(("most", "top"), [(1.0, 1.1), (1.3, 1.35), (9.0, 1.8)])
+def test_steps_fill_their_plot_and_the_start_is_seen_where_the_others_agree_with_it(drawn: list[Any], most: float, top: float) -> None:
+    from loop_response import STEP_TICKS
+    from tune_plots import SHOWN, draw_steps
+
+    draw_steps(Path(), dict.fromkeys(("start", "shipped", "tuned"), np.tile(np.linspace(0.0, most, STEP_TICKS), (len(SHOWN), 1))))
+    panel = drawn[0].axes[0]
+    assert panel.get_ylim() == pytest.approx((-0.05, top))
+    lines = {line.get_label(): line for line in panel.get_lines()}
+    assert lines["start"].get_linestyle() == "--" and lines["start"].get_zorder() > lines["tuned"].get_zorder()
+
+
 @pytest.mark.parametrize("before", [0.5, 1.5, 1.6, 2.5, 4.4, 4.5, 9.0])
 def test_refused_live_step_does_not_come_twice(tools: tuple[Any, Any], before: float) -> None:
     import tune_live
