@@ -31,6 +31,13 @@ Vehicle = Annotated[str, typer.Option(help="vehicle in place of the scenario's")
 Sensors = Annotated[str, typer.Option(help="real, or ideal: no noise, no delay")]
 
 
+def folder_of(text: str) -> Path:
+    """The folder called `text`; nothing, as an unset variable of a shell gives, is none."""
+    if not text:
+        raise typer.BadParameter("'' is no folder; give one, or . for this one")
+    return Path(text)
+
+
 def parameters_of(controller: str) -> Parameters:
     """The parameters called `controller`, or those in that file. Raises DescriptionError."""
     if controller.endswith(".toml"):
@@ -76,7 +83,10 @@ def run(
     scenario: ScenarioName,
     seed: Annotated[int, typer.Option(min=0, help="of the world's every draw")] = 0,
     bus: Annotated[str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")] = DEFAULT_BUS,
-    out: Annotated[Path | None, typer.Option(help="folder for logs, plots and report; only an earlier flight is replaced")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(parser=folder_of, metavar="DIR", help="folder for logs, plots and report; only an earlier flight is replaced"),
+    ] = None,
     controller: Controller = "modcube",
     vehicle: Vehicle = "",
     sensors: Sensors = "real",
@@ -129,7 +139,10 @@ def campaign(
     jobs: Annotated[int, typer.Option(min=1, help="processes")] = 2,
     dask: Annotated[str, typer.Option(metavar="ADDRESS", help="scheduler of a dask cluster, tcp://HOST:PORT, in place of processes")] = "",
     seed: Annotated[int, typer.Option(min=0, help="first seed")] = 0,
-    out: Annotated[Path | None, typer.Option(help="folder for trials.jsonl, trials.csv, campaign.json; a campaign in it goes on")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(parser=folder_of, metavar="DIR", help="folder for trials.jsonl, trials.csv, campaign.json; a campaign in it goes on"),
+    ] = None,
     controller: Controller = "modcube",
     vehicle: Vehicle = "",
     sensors: Sensors = "real",
@@ -204,7 +217,7 @@ def plant(
     bus: Annotated[str, typer.Option(help="udp:GROUP:PORT or socketcan:IFACE")],
     seed: Annotated[int, typer.Option(min=0, help="of the world's every draw")] = 0,
     rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="ticks a second of the firmware")] = 100,
-    out: Annotated[Path | None, typer.Option(help="folder for the truth's log")] = None,
+    out: Annotated[Path | None, typer.Option(parser=folder_of, metavar="DIR", help="folder for the truth's log")] = None,
 ) -> None:
     """Run the simulated plant alone, in real time, until SIGINT or SIGTERM: the other end of `modcube run`."""
     from hil.plant_process import serve_until_signal

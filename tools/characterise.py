@@ -41,6 +41,8 @@ NOT_PRINTED = ("assumption", f"max_inscribed_ellipsoid_volume[{table.TABLE_NORMA
 """Metrics that the printed table leaves out: a note says the first, another row the second."""
 WIDTH = 170
 """Characters of a table that does not go to a terminal."""
+MODULE = "modcube"
+"""What an assembly is made of, where --module does not say."""
 LARGEST_BOX = 64
 """Modules of an assembly."""
 LEAST_DIRECTIONS, MOST_DIRECTIONS = 121, 100_000
@@ -64,7 +66,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--assembly", metavar="SHAPE", help="AxBxC modules, cells such as '0,0,0 1,0,0', or a fleet file"
     )
-    parser.add_argument("--module", default="modcube", help="vehicle of every module of an assembly")
+    parser.add_argument("--module", metavar="VEHICLE", help=f"of every module of an assembly of AxBxC or of cells; {MODULE} by default")
     parser.add_argument("--table1", action="store_true", help="the paper's seven robots beside its Table I")
     parser.add_argument("--choose", type=whole(1), metavar="N", help="rank all shapes of N modules, 1 to 5")
     parser.add_argument("--task", type=Path, metavar="FILE", help="task file for --choose")
@@ -78,6 +80,8 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     if sum([bool(given.vehicle), given.assembly is not None, given.table1, given.choose is not None]) != 1:
         parser.error("give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE")
+    if given.module is not None and (given.assembly is None or given.assembly.endswith(".toml")):
+        parser.error("--module tells of what an --assembly of AxBxC or of cells is made; give one with it")
     if (given.choose is None) != (given.task is None):
         parser.error("--choose N and --task FILE go together")
     if not LEAST_DIRECTIONS <= given.directions <= MOST_DIRECTIONS:
@@ -101,7 +105,7 @@ def run(given: argparse.Namespace) -> None:
         _table1(settings, given.jobs, given.out)
     else:
         layouts = [of_vehicle(load_vehicle(name)) for name in given.vehicle]
-        layouts += _assemblies(given.assembly, load_vehicle(given.module)) if given.assembly is not None else []
+        layouts += _assemblies(given.assembly, load_vehicle(given.module or MODULE)) if given.assembly is not None else []
         found = _all(_by_name(layouts), settings, given.jobs)
         _print(found)
         if given.out:

@@ -35,6 +35,8 @@ from hil.workers import Pool, dask_cluster, kept, processes
 
 DETUNED = 3.0
 """Largest factor by which --detune puts each gain off."""
+LOOK_S = 20.0
+"""How long --live looks at each step, where --seconds does not say."""
 
 
 def unseen_costs(objective: Objective, parameters: Parameters, pool: Pool, folder: Path) -> list[float]:
@@ -122,9 +124,12 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seed", type=whole(0), default=0, help="of the search itself")
     parser.add_argument("--no-plots", action="store_true", help="leave the plots out")
     parser.add_argument("--live", metavar="mavlink:ADDRESS", help="tune the vehicle there, step by step, in place of the bench")
-    parser.add_argument("--seconds", type=positive, default=20.0, help="--live: how long each step is looked at")
+    parser.add_argument("--seconds", type=positive, metavar="SECONDS", help=f"--live: how long each step is looked at, {LOOK_S:g}")
     parser.add_argument("--out", type=Path, default=Path("runs/tune"), metavar="DIR", help="for trials, parameters.toml and tuning.json")
-    return parser.parse_args()
+    given = parser.parse_args()
+    if given.seconds is not None and not given.live:
+        parser.error("--seconds tells how long each step on a vehicle is looked at; give --live with it")
+    return given
 
 
 def main() -> int:
@@ -139,7 +144,7 @@ def main() -> int:
         if given.live:
             from tune_live import tune_live
 
-            return tune_live(objective, given.live, given.trials, given.seconds, given.out)
+            return tune_live(objective, given.live, given.trials, given.seconds or LOOK_S, given.out)
         check_results(given.out, "search_seed", "tuning.json", "parameters.toml", "steps.png", "bode.png", "search.png")
         with interrupted_once():
             tune(objective, start, given, dask_cluster(given.dask) if given.dask else processes(given.jobs))

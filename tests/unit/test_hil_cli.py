@@ -88,6 +88,18 @@ def test_help_names_every_bus_that_a_flight_takes(monkeypatch: pytest.MonkeyPatc
     assert [kind for kind in ("virtual:", "udp:", "socketcan:", "slcan:") if kind not in shown] == []
 
 
+@pytest.mark.parametrize("command", [["run", "hover"], ["campaign", "hover"], ["plant", "hover", "--bus", "udp:239.74.163.9:43119"]])
+def test_folder_without_a_name_is_refused(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As an unset variable of a shell gives it; it is not the working directory."""
+    monkeypatch.chdir(tmp_path)
+    assert status_of([*command, "--out", ""], monkeypatch) == 2
+    line = capsys.readouterr().err
+    assert "'' is no folder; give one, or . for this one" in line and line.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
 def test_plant_alone_refuses_a_bus_that_nobody_else_reaches(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     served: list[object] = []
     monkeypatch.setattr(hil.plant_process, "serve_until_signal", lambda *arguments: served.append(arguments))

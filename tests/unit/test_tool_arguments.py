@@ -63,6 +63,9 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
         ("fit_thruster", ["nosuch.csv"], "fit_thruster: nosuch.csv: No such file or directory"),
         ("fit_thruster", [], "fit_thruster: the following arguments are required: csv; see --help"),
         ("characterise", [], "characterise: give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE; see --help"),
+        ("tune_gains", ["hover.toml", "--seconds", "20"], "tune_gains: --seconds tells how long each step on a vehicle is looked at"),
+        ("characterise", ["modcube", "--module", "modcube_sim"], "characterise: --module tells of what an --assembly of AxBxC or of cells"),
+        ("characterise", ["--assembly", "fleet.toml", "--module", "modcube"], "characterise: --module tells of what an --assembly of"),
         (
             "margins", ["--vehicle", "bluerov2"],
             "margins: 2 of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --modules 1",
