@@ -97,7 +97,7 @@ class FaultDetector:
         self._obeys = np.ones(n, dtype=bool)
         """Those that nothing was found about."""
         self._silent_after = max(1, SILENT_NS // period_ns)
-        self._silence = np.zeros(len(body.modules), dtype=np.int64)
+        self._silence = [0] * len(body.modules)
         """Ticks since each module was heard."""
         self._mute: list[int] = []
         self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
@@ -149,7 +149,7 @@ class FaultDetector:
         if found is not None:
             self._lose(found, "does not push as it says")
         own = [modules[m] for m in self._modules]
-        self._silence = (self._silence + 1) * [not module.heard for module in own]
+        self._silence = [0 if module.heard else ticks + 1 for module, ticks in zip(own, self._silence, strict=True)]
         if armed:
             self._hear(own, force_n)
             self._miss()
@@ -157,7 +157,7 @@ class FaultDetector:
 
     def _silent(self) -> list[int]:
         """Modules that have been silent for too long, by their index in the body."""
-        return np.flatnonzero(self._silence >= self._silent_after).tolist()
+        return [i for i, ticks in enumerate(self._silence) if ticks >= self._silent_after]
 
     def _miss(self) -> None:
         """Leaves out the thrusters of modules that have fallen silent, and takes them back from those that are heard again."""
