@@ -22,6 +22,7 @@ from firmware_py.prepare.assembly import assemble_fleet
 from firmware_py.prepare.waypoints import Mission, read_mission
 from hil.scenario import Scenario, Task
 from hil.scenario_rules import ARM_FROM_S
+from hil.starts import hull_levers, in_wall
 
 MOEBIUS_RAMP_SHARE = 0.25
 """Share of the time over which the speed rises, and falls again: 0.25 keeps the peak at 4/3 of the mean, so drag errors stay small."""
@@ -45,6 +46,7 @@ class Script:
         self.start_pose = rest_at(np.array(start.p_wm, dtype=float), np.array(start.q_wm, dtype=float))
         self.trajectory = TASKS[scenario.task.kind](scenario.task, self.start_pose, fleet)
         refuse_outside(self.trajectory, scenario)
+        refuse_in_wall(self.trajectory, scenario)
         self.begin_ns = round(scenario.task.settle_s * 1e9)
         self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
         self.ticks = self.end_ns // fleet.period_ns
@@ -77,6 +79,17 @@ def refuse_outside(path: paths.Trajectory, scenario: Scenario) -> None:
             where = f"after {time_s:.3g} s, at {place.round(3).tolist()} m"
             what = scenario.task.file or f"{scenario.name}: task"
             raise DescriptionError(f"{what}: the path leaves the tank, a {scenario.tank}, {where}; keep it inside")
+
+
+def refuse_in_wall(path: paths.Trajectory, scenario: Scenario) -> None:
+    """Raises DescriptionError where a hull of the first body would have to go into a wall."""
+    members = scenario.groups[0]
+    hulls = np.concatenate([levers for m, (_, levers) in hull_levers(scenario).items() if m in members])
+    for time_s in np.linspace(0.0, path.duration_s, LOOKS).tolist():
+        wanted = path.sample(time_s)
+        if where := in_wall(scenario.tank, wanted.p_wb + hulls @ rotations.to_matrix(wanted.q_wb).T):
+            what = scenario.task.file or f"{scenario.name}: task"
+            raise DescriptionError(f"{what}: after {time_s:.3g} s, at {wanted.p_wb.round(3).tolist()} m, a hull is {where}; keep it inside")
 
 
 def _hover(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:

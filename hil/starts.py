@@ -67,6 +67,18 @@ def in_wall(tank: Tank, points: np.ndarray) -> str:
     return f"{deepest[wall]:.3g} m into the {wall} of the tank, a {tank}" if deepest[wall] > TOUCHING_M else ""
 
 
+def hull_levers(scenario: Scenario) -> dict[int, tuple[Start, np.ndarray]]:
+    """By each module's index, body after body: where its body starts, and (8, 3) the corners of its hull from there, body frame, m."""
+    vehicles = [load_vehicle(module.vehicle) for module in scenario.module]
+    bodies = [scenario.module[members[0]].start for members in scenario.groups]
+    starts = starts_of(scenario, vehicles, bodies)
+    return {
+        m: (body, (hull_of(vehicles[m], starts[m]) - body.p_wm) @ rotations.to_matrix(body.q_wm))
+        for members, body in zip(scenario.groups, bodies, strict=True)
+        for m in members
+    }
+
+
 def hulls_in_walls(scenario: Scenario, shifts_m: np.ndarray, yaws: np.ndarray) -> Iterator[tuple[int, str]]:
     """Of each module whose hull would start in a wall its index, and in words how far into which; the farthest of all that a body is off.
 
@@ -74,16 +86,11 @@ def hulls_in_walls(scenario: Scenario, shifts_m: np.ndarray, yaws: np.ndarray) -
         shifts_m: (n, 3) by which a body is off its place, world.
         yaws: (k,) by which it is turned, rad.
     """
-    vehicles = [load_vehicle(module.vehicle) for module in scenario.module]
-    bodies = [scenario.module[members[0]].start for members in scenario.groups]
-    starts = starts_of(scenario, vehicles, bodies)
     turns = np.array([rotations.to_matrix(rotations.from_euler(0.0, 0.0, yaw)) for yaw in yaws.tolist()])
-    for members, body in zip(scenario.groups, bodies, strict=True):
-        for m in members:
-            levers = hull_of(vehicles[m], starts[m]) - body.p_wm
-            hulls = body.p_wm + np.einsum("kij,cj->kci", turns, levers)
-            if where := in_wall(scenario.tank, shifts_m[:, None, None] + hulls):
-                yield m, where
+    for m, (start, levers) in hull_levers(scenario).items():
+        hull = start.p_wm + np.einsum("kij,cj->kci", turns, levers @ rotations.to_matrix(start.q_wm).T)
+        if where := in_wall(scenario.tank, shifts_m[:, None, None] + hull):
+            yield m, where
 
 
 def refuse_outside(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:

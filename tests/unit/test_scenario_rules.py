@@ -283,6 +283,7 @@ def test_scenario_flies_the_same_path_where_its_file_is_not(tmp_path: Path) -> N
         ("path.csv", "-0.3,", "-0.28,", "path.csv: the path begins 0.02 m and 0 deg away from the robot's start at [-0.3, -0.25, 0.55] m"),
         ("path.csv", "0.55,,,,,", "0.55,0.9990482,0,0,0.0436194,", "the path begins 0 m and 5 deg away"),
         ("path.csv", "0.2,0.1,0.4", "0.2,0.7,0.4", "path.csv: the path leaves the tank, a box of 1.3 x 1.2 x 0.76 m, after "),
+        ("path.csv", "0.2,0.1,0.4", "0.2,0.51,0.4", "m into the wall at +y of the tank, a box of 1.3 x 1.2 x 0.76 m; keep it inside"),
         ("path.csv", ",24", ",24.1", "path.csv: the path takes 44.1 s, longer than task.duration_s, 44 s"),
         ("path.csv", ",20", ",0.9", "path.csv: the thrusters would be used to "),
         ("path.csv", "0.1,-0.2", "0.1,north", "path.csv:3: y_m: 'north' is not a number"),
