@@ -51,7 +51,7 @@ class ThrusterFaults(NamedTuple):
     alive: np.ndarray
     """(n,) bool: may be used."""
     dead: tuple[int, ...]
-    """Those that may not."""
+    """Those that were found dead or lying."""
     lost_axes: int
     """Rank that is missing because of them."""
     keep: np.ndarray
@@ -120,9 +120,9 @@ class FaultDetector:
         for other in before:
             for i, j in in_both(self._modules, other._modules):
                 self._silence[i] = other._silence[j]
+                self._mute += [i] if j in other._mute else []
                 for channel, thruster in self._thruster_at[i].items():
                     self._obeys[thruster] = other._obeys[other._thruster_at[j][channel]]
-        self._mute = self._silent()
         self.now = self._left()
 
     def reset(self) -> None:
@@ -149,19 +149,19 @@ class FaultDetector:
         if found is not None:
             self._lose(found, "does not push as it says")
         own = [modules[m] for m in self._modules]
-        self._silence = [0 if module.heard else ticks + 1 for module, ticks in zip(own, self._silence, strict=True)]
         if armed:
             self._hear(own, force_n)
-            self._miss()
+        self._miss([module.heard for module in own], armed)
         return self.now
 
-    def _silent(self) -> list[int]:
-        """Modules that have been silent for too long, by their index in the body."""
-        return [i for i, ticks in enumerate(self._silence) if ticks >= self._silent_after]
-
-    def _miss(self) -> None:
-        """Leaves out the thrusters of modules that have fallen silent, and takes them back from those that are heard again."""
-        before, self._mute = self._mute, self._silent()
+    def _miss(self, heard: list[bool], armed: bool) -> None:
+        """Leaves out the thrusters of modules that have fallen silent, and takes them back once those are heard again for as long."""
+        before = self._mute
+        for i, is_heard in enumerate(heard):
+            ticks = self._silence[i]
+            self._silence[i] = min(ticks + 1, self._silent_after) if not is_heard else ticks - 1 if i in before and ticks else 0
+        quiet = [i for i, ticks in enumerate(self._silence) if ticks >= self._silent_after or (i in before and ticks)]
+        self._mute = quiet if armed else []
         if self._mute == before:
             return
         alive, self.now = self.now.alive, self._left()
@@ -169,7 +169,8 @@ class FaultDetector:
             self.changed = True
             self._motion.forget()
             silent = ", ".join(str(self._modules[i]) for i in self._mute)
-            self.words.append(f"thrusters of silent module {silent} are left out" if silent else "no module is silent any more")
+            less = bool((self.now.alive < self._obeys).any())
+            self.words.append(f"thrusters of silent module {silent} are left out" if less else "thrusters of every module are used again")
 
     def _left(self) -> ThrusterFaults:
         """What may be used: all that obey, less those of silent modules where the others do without."""
@@ -177,7 +178,7 @@ class FaultDetector:
         if not self._mute:
             return obeying
         heard = self._judge(self._obeys & ~np.isin(self._t.module, self._mute))
-        return heard if heard.lost_axes == obeying.lost_axes else obeying
+        return heard._replace(dead=obeying.dead) if heard.lost_axes == obeying.lost_axes else obeying
 
     def _hear(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
         """Every ESC's feedback against what its thruster is believed to give."""

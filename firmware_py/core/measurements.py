@@ -29,6 +29,9 @@ CENTRED_M = 1e-9
 """IMUs whose mean is nearer to the centre of mass stand around it: what is left is rounding."""
 ALPHA_S = 0.03
 """Time over which the gyro's differences are averaged: over 0.3 m of lever their noise makes 0.02 m/s^2, without it 0.1 at 100 Hz."""
+GYRO_BIASES, ACCEL_BIASES, DEPTH_BIASES = 0.1, 1.0, 0.5
+"""By how much a sensor may be off the mean of all, rad/s, m/s^2, m: twenty sigmas of what biases are drawn with. One that fails tells zeros
+or its limit: gravity off, for as long as it takes to be found."""
 TURN_NS = 100_000_000
 """Within so long each pressure sensor is heard, ten times a second at the slowest; who is not is silent."""
 STILL_RAD_S = 0.05
@@ -56,8 +59,9 @@ class Measurements:
         """(3 count, 3 count) readings of all modules -> how each differs from their mean, body frame."""
         for i in range(count):
             self._apart[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += self._rotations[:, i]
-        self._gyro_offsets, self._accel_offsets = (SensorOffsets(count, 3, period_ns) for _ in range(2))
-        self._depth_offsets = SensorOffsets(count, 1, period_ns)
+        self._gyro_offsets = SensorOffsets(count, 3, GYRO_BIASES, period_ns)
+        self._accel_offsets = SensorOffsets(count, 3, ACCEL_BIASES, period_ns)
+        self._depth_offsets = SensorOffsets(count, 1, DEPTH_BIASES, period_ns)
         self._turn = max(1, TURN_NS // max(1, period_ns))
         self._depths_m, self._depth_age = np.zeros(count), np.full(count, self._turn)
         """Last depth of each sensor, and ticks with a depth since then."""

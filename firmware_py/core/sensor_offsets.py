@@ -15,14 +15,19 @@ REMEMBERED_S = 30.0
 class SensorOffsets:
     """Of one kind of sensor."""
 
-    def __init__(self, modules: int, numbers: int, period_ns: int) -> None:
-        """For readings of so many numbers each. `period_ns`: between two of them."""
+    def __init__(self, modules: int, numbers: int, most: float, period_ns: int) -> None:
+        """For readings of so many numbers each. `most`: no two biases differ by more. `period_ns`: between two readings."""
+        self._most = most
         self._longest = max(1, round(REMEMBERED_S * 1e9 / max(1, period_ns)))
         self._count = 0
         self._offsets = np.zeros((modules, numbers))
 
     def learn(self, differences: np.ndarray) -> None:
-        """(modules, numbers) how each reading differs from the mean of all, in the body's axes, in one tick."""
+        """(modules, numbers) how each reading differs from the mean of all, in the body's axes, in one tick. Where a sensor tells of more
+        than a bias, it has failed, and nothing is learnt from any.
+        """
+        if float(np.abs(differences).max()) > self._most:
+            return
         self._count = min(self._count + 1, self._longest)
         self._offsets += (differences - self._offsets) / self._count
 

@@ -386,10 +386,23 @@ def test_thrusters_of_a_module_that_falls_silent_are_left_out_until_it_is_heard_
     pair = Pair()
     assert pair.hear(1.0, 0, 1) == [] == pair.hear(0.49, 0)
     assert pair.hear(0.5, 0) == ["thrusters of silent module 1 are left out"]
-    assert pair.used == {0} and pair.detector.now.lost_axes == 0
+    assert pair.used == {0} and (pair.detector.now.lost_axes, pair.detector.now.dead) == (0, ()), "nothing was found about them"
     pair.detector._lose(3, "stands still")
-    assert pair.hear(0.01, 0, 1) == ["no module is silent any more"]
-    assert pair.detector.now.dead == (3,), "what was found meanwhile stays found"
+    assert pair.hear(0.49, 0, 1) == [] and pair.hear(0.02, 0, 1) == ["thrusters of every module are used again"]
+    assert pair.detector.now.dead == (3,) and pair.used == {1}, "what was found meanwhile stays found"
+
+
+def test_module_that_is_heard_now_and_then_is_left_out_once() -> None:
+    pair = Pair()
+    said = [words for _ in range(5) for words in pair.hear(0.55, 0) + pair.hear(0.05, 0, 1)]
+    assert said == ["thrusters of silent module 1 are left out"]
+    assert pair.used == {0}
+
+
+def test_module_that_falls_silent_after_all_others_is_used_blindly_and_that_is_said() -> None:
+    pair = Pair()
+    assert pair.hear(1.0, 0) == ["thrusters of silent module 1 are left out"]
+    assert pair.hear(1.0) == ["thrusters of every module are used again"] and pair.used == {0, 1}
 
 
 def test_thrusters_that_no_others_can_stand_in_for_are_used_blindly() -> None:
@@ -404,6 +417,15 @@ def test_silence_of_a_disarmed_body_leaves_nothing_out_and_what_was_left_out_is_
     assert pair.hear(0.02, 0) == ["thrusters of silent module 1 are left out"]
     pair.detector.reset()
     assert pair.detector.changed and pair.used == {0, 1}
+
+
+def test_module_that_was_left_out_is_used_again_once_its_body_is_disarmed() -> None:
+    pair, other = Pair(), Pair()
+    pair.hear(1.0, 0)
+    other.detector.take_over([pair.detector])
+    assert other.used == {0}
+    other.hear(0.01, 0, armed=False)
+    assert other.used == {0, 1}
 
 
 def test_body_that_is_made_of_others_leaves_out_the_modules_that_were_silent_in_them() -> None:

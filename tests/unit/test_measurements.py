@@ -277,13 +277,14 @@ BIASES = np.array([
 """Of each module's gyro, accelerometer, both in the axes of the body, and depth."""
 
 
-def biased(measurements: Measurements, heard: tuple[int, ...], rate: np.ndarray) -> np.ndarray:
-    """(7,) measured of a body that turns at `rate`, whose sensors have biases, less what is true."""
+def biased(measurements: Measurements, heard: tuple[int, ...], rate: np.ndarray, failed: int | None = None) -> np.ndarray:
+    """(7,) measured of a body that turns at `rate`, whose sensors have biases, less what is true; the accelerometer of one has failed."""
     modules = silent()
     for module in heard:
         here, (gyro, accel, depth_m) = modules[FLEET_INDEX[module]], np.split(BIASES[module], [3, 6])
         here.gyro = in_module(module, rate + gyro)
-        here.accel = in_module(module, PUSHED + np.cross(rate, np.cross(rate, ORIGINS_B[module])) + accel)
+        felt = PUSHED + np.cross(rate, np.cross(rate, ORIGINS_B[module])) + accel
+        here.accel = in_module(module, felt) if module != failed else np.zeros(3)
         z = (P_WB + R_WB.apply(ORIGINS_B[module]))[2] + depth_m[0]
         here.pressure_pa = 101_325.0 + WATER_DENSITY * 9.80665 * z
     measured = measurements.fuse(modules, Q_WB)
@@ -321,6 +322,18 @@ def test_pressure_sensors_that_are_heard_in_turns_are_told_apart(body: Body) -> 
         assert hear(tick % 3) == pytest.approx(each[tick % 3], abs=1e-9)
     left = [hear(tick % 2) for tick in range(30)][-2:]
     assert left == pytest.approx([each.mean()] * 2, abs=1e-3)
+
+
+@pytest.mark.parametrize("after", [0, 200])
+def test_imu_that_fails_teaches_nothing_before_it_is_found(body: Body, after: int) -> None:
+    """It tells zeros until the watch before this stage takes it away: gravity off, which is no bias."""
+    measurements = Measurements(body, PERIOD)
+    for _ in range(after):
+        biased(measurements, (0, 1, 2), np.zeros(3))
+    for _ in range(10):
+        biased(measurements, (0, 1, 2), np.zeros(3), failed=0)
+    wanted = BIASES[:, 3:6].mean(axis=0) if after else BIASES[[1, 2], 3:6].mean(axis=0)
+    np.testing.assert_allclose(biased(measurements, (1, 2), np.zeros(3))[3:6], wanted, atol=1e-3)
 
 
 def test_body_that_turns_tells_nothing_of_how_its_sensors_differ(body: Body) -> None:
