@@ -30,6 +30,7 @@ from firmware_py.runtime.recorder import Recorder
 from hil.bench import fleet_of, script_of
 from hil.plant_process import CHUNK_NS, PlantProcess, check_served
 from hil.scenario import Scenario, make_world
+from hil.workers import end_with_parent
 
 
 class RealTimeFlight(NamedTuple):
@@ -58,6 +59,7 @@ class Handshake(NamedTuple):
 def serve_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, handshake: Handshake) -> None:
     """The plant's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     plant = PlantProcess(scenario, seed, rate_hz, out)
     try:
         with real_time(PLANT_PRIORITY - 1):

@@ -22,11 +22,11 @@ Pool = Callable[[], AbstractContextManager[Executor]]
 
 def processes(jobs: int) -> Pool:
     """So many processes of this machine, which end with this one, however it ends."""
-    return lambda: ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_end_with_parent)
+    return lambda: ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=end_with_parent)
 
 
-def _end_with_parent() -> None:
-    """In a worker: a parent that is killed tells nobody, and its workers would wait for work for ever."""
+def end_with_parent() -> None:
+    """In a child: a parent that is killed tells nobody, and its children would go on for ever."""
 
     def wait() -> None:
         if parent := parent_process():

@@ -71,13 +71,13 @@ CPUCodeLibrary._object_getbuffer_hook = classmethod(loaded)
 """
 
 
-def run(folder: Path, how: str, *options: str, ending: str = "SIGINT") -> str:
-    """What a run that is told twice to end says on stderr."""
+def run(folder: Path, how: str, *options: str, ending: str = "SIGINT", status: int = 128 + signal.SIGINT) -> str:
+    """What a run that is told twice to end says on stderr, until the last of its processes has closed that."""
     (folder / "long.toml").write_text(LONG)
     program = PROCESS.format(ending=ending, die=DIE_WITH_TEST, how=how)
     words = [sys.executable, "-c", program, "hil", "run", "long.toml", "--out", "run", *options]
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, start_new_session=True, timeout=DEADLINE_S)
-    assert done.returncode == 128 + signal.SIGINT, done.stderr
+    assert done.returncode == status, done.stderr
     return done.stderr
 
 
@@ -91,6 +91,12 @@ def test_flight_that_is_interrupted_twice_says_where_its_log_is_and_keeps_it_who
     assert [logged.tick for logged in flown.ticks()][-1] == PRESSED_TICK and flown.torn == ""
     assert (tmp_path / "run" / TRUTH_LOG).read_bytes().endswith(b"\x89MCAP0\r\n")
     assert not (tmp_path / "run" / "result.json").exists()
+
+
+@pytest.mark.slow
+def test_plant_of_a_flight_that_is_killed_ends_with_it(tmp_path: Path) -> None:
+    killed = IN_FLIGHT.replace("press_twice()", "os.kill(os.getpid(), signal.SIGKILL)")
+    run(tmp_path, killed, "--realtime", "--bus", free_group(), status=-signal.SIGKILL)
 
 
 @pytest.mark.slow
