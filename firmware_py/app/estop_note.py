@@ -132,11 +132,12 @@ class EstopNote:
                 if waiting is not None:
                     write_note(self._folder, waiting)
                 waiting = None
-                if self._handle is None:  # there was no folder before
-                    self._handle = hold(self._folder)
             except OSError as error:
                 if fresh:
                     self._failed.put(error)
+            if self._handle is None:  # there was no folder before
+                with suppress(OSError):
+                    self._handle = hold(self._folder)
 
 
 def noting_estop(note: EstopNote, stands: bool, recorder: Recorder | None = None) -> Observer:

@@ -86,11 +86,16 @@ def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -
     return LastFlight(stopped=stopped)
 
 
-def outdate(out: Path) -> None:
+def outdate(out: Path, now_ns: int) -> None:
     """A process that keeps no log flies after those under `out`: none of them says how the last flight ended."""
     for folder in log_folders(out):
         with suppress(OSError):
-            os.utime(folder / CAN_LOG, ns=(0, 0))
+            if _is_recent((folder / CAN_LOG).stat(), now_ns):
+                os.utime(folder / CAN_LOG, ns=(0, 0))
+
+
+def _is_recent(status: os.stat_result, now_ns: int) -> bool:
+    return 0 <= now_ns - status.st_mtime_ns < RECENT_NS
 
 
 def to_arm(before: LastFlight, firmware: Firmware, hold: bool, say: Callable[[str], None]) -> set[int]:
@@ -167,7 +172,7 @@ def _last_sent(folder: Path, now_ns: int, most_bytes: int) -> list[LoggedFrame] 
         return []  # that process was ended while it started
     except OSError:
         return None
-    if not 0 <= now_ns - status.st_mtime_ns < RECENT_NS:
+    if not _is_recent(status, now_ns):
         return None
     sent = []
     for line in lines:

@@ -203,7 +203,7 @@ def _open_recorder(
         try:
             recorder.check()
         except OSError:
-            outdate(out)
+            outdate(out, unix_ns())
     stack.callback(recorder.close)
     for body in firmware.pipeline.bodies:
         recorder.expect(body.index, body.thrusters.f_max.size)
@@ -218,7 +218,7 @@ def _log_folder(out: Path, say: Callable[[str], None]) -> Path | None:
         raise
     except OSError as error:
         say(f"warning: no log: {error.filename or out}: {error.strerror}")
-        outdate(out)
+        outdate(out, unix_ns())
         return None
 
 

@@ -24,6 +24,7 @@ class Turn:
     def __init__(self, system: System, has: str, timeout_s: Callable[[], float]) -> None:
         self._system, self._has, self._timeout_s = system, has, timeout_s
         self._sender: Sender | None = None
+        self._refused: set[Sender] = set()
         self._heard_ns = 0
 
     def is_over(self, time_ns: int) -> bool:
@@ -34,11 +35,20 @@ class Turn:
         """Whether it is the sender's, now that it was heard."""
         sender = sender_of(arrival)
         if sender != self._sender and not self.is_over(arrival.time_ns):
+            if sender not in self._refused:
+                self._say_who_has_it()
+                self._refused.add(sender)
             return False
-        if self._sender not in (None, sender):
-            self._system.say(_NOTICE, f"ground station {sender[0]}/{sender[1]} has the {self._has}")
-        self._sender, self._heard_ns = sender, arrival.time_ns
+        before, self._sender, self._heard_ns = self._sender, sender, arrival.time_ns
+        if before not in (None, sender):
+            self._refused.clear()
+            self._say_who_has_it()
         return True
+
+    def _say_who_has_it(self) -> None:
+        assert self._sender is not None
+        system, component = self._sender
+        self._system.say(_NOTICE, f"ground station {system}/{component} has the {self._has}")
 
 
 class Pilots:

@@ -81,6 +81,7 @@ def test_set_points_of_two_do_not_mix_and_pass_to_the_other_after_the_first_is_s
         other.send("SET_ATTITUDE_TARGET", 0, 1, 1, 0x7, [1.0, 0.0, 0.0, 0.0], 0, 0, 0, 0.5)
         world.run(1)
     assert places(world) == pytest.approx([0.3] * 10)
+    assert other.texts.count("ground station 254/190 has the set-points") == 1
     world.run(round(world.parameters.ground.setpoint_fresh_s * 100) + 1)
     for client, x in ((other, -0.3), (first, 0.3)):
         client.send("SET_POSITION_TARGET_LOCAL_NED", 0, 1, 1, 1, 0xDF8, x, 0.1, 0.4, *[0.0] * 8)

@@ -144,7 +144,9 @@ def test_log_that_a_full_disk_ended_before_its_flight_says_nothing_nor_do_those_
 def test_flight_that_left_no_log_makes_those_before_it_old(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "0002"):
         write(folder, lines_of([True] * 3))
-    outdate(tmp_path)
+    outdate(tmp_path, WRITTEN_NS + RECENT_NS)
+    assert in_flight(tmp_path) == {0, 1, 2}, "an old one keeps its date"
+    outdate(tmp_path, NOW_NS)
     assert in_flight(tmp_path) == set()
 
 
