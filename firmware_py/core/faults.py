@@ -98,7 +98,7 @@ class FaultDetector:
         """Those that nothing was found about."""
         self._silent_after = max(1, SILENT_NS // period_ns)
         self._silence = [0] * len(body.modules)
-        """Ticks since each module was heard."""
+        """Ticks that each module has been silent, counted down again while one that is left out is heard."""
         self._mute: list[int] = []
         self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
