@@ -22,7 +22,7 @@ from hil.plant.polycube import grow
 from hil.plant.spec import CALM, HALF_A_COUNT, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
 from hil.scenario_rules import mistakes
-from hil.starts import places_of, refuse_outside, refuse_overlap, starts_of
+from hil.starts import places_of, refuse_in_walls, refuse_overlap, starts_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -256,7 +256,7 @@ def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
     groups = scenario.groups
     bodies = [scenario.start.shifted(scenario.module[members[0]].start, seed, members[0]) for members in groups]
     starts = starts_of(scenario, vehicles, bodies)
-    refuse_outside(scenario, vehicles, starts, seed)
+    refuse_in_walls(scenario, vehicles, starts, seed)
     refuse_overlap(scenario, vehicles, starts, seed)
     spec = (scenario.world, scenario.tank, vehicles, starts, seed, period_ns)
     world = World(*spec, groups=groups, places=places_of(scenario), dock=scenario.dock, jam=scenario.jam)

@@ -93,7 +93,7 @@ def hulls_in_walls(scenario: Scenario, shifts_m: np.ndarray, yaws: np.ndarray) -
             yield m, where
 
 
-def refuse_outside(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:
+def refuse_in_walls(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:
     """Raises DescriptionError where a hull would start in a wall."""
     for module, vehicle, start in zip(scenario.module, vehicles, starts, strict=True):
         if where := in_wall(scenario.tank, hull_of(vehicle, start)):

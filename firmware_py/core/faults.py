@@ -37,9 +37,8 @@ FAST_MARGIN = 0.25
 CLEAR = 4.0
 """A propeller that stands still again where this many times the least force is believed counts twice: it is not about to start."""
 SILENT_NS = 500_000_000
-"""After so much silence the thrusters of a module are left out, if the others can make every wrench without: where it hears nothing either
-they have stood still since 100 ms, and where it hears they then do so too.
-"""
+"""After so much silence, when the fail-safe `module_silent` acts too, the thrusters of a module are left out, if the others can make every
+wrench without: where it hears nothing either they have stood still since 100 ms (DESIGN's bus), and where it hears they then do so too."""
 TELLS = 0.3
 """Weight of one feedback in what an ESC tells of its thruster's force. Ten come in a second (DESIGN's bus), so that 0.3 s are remembered:
 less than the half second of motion that core.missing_thrust judges."""
@@ -151,16 +150,18 @@ class FaultDetector:
         own = [modules[m] for m in self._modules]
         if armed:
             self._hear(own, force_n)
-        self._miss([module.heard for module in own], armed)
+        self._miss(own, armed)
         return self.now
 
-    def _miss(self, heard: list[bool], armed: bool) -> None:
+    def _miss(self, modules: list[ModuleInputs], armed: bool) -> None:
         """Leaves out the thrusters of modules that have fallen silent, and takes them back once those are heard again for as long."""
         before = self._mute
-        for i, is_heard in enumerate(heard):
-            ticks = self._silence[i]
-            self._silence[i] = min(ticks + 1, self._silent_after) if not is_heard else ticks - 1 if i in before and ticks else 0
-        quiet = [i for i, ticks in enumerate(self._silence) if ticks >= self._silent_after or (i in before and ticks)]
+        for i, module in enumerate(modules):
+            if not module.heard:
+                self._silence[i] = min(self._silence[i] + 1, self._silent_after)
+            elif self._silence[i]:
+                self._silence[i] = self._silence[i] - 1 if i in before else 0
+        quiet = [i for i, ticks in enumerate(self._silence) if ticks == self._silent_after or (ticks and i in before)]
         self._mute = quiet if armed else []
         if self._mute == before:
             return

@@ -30,10 +30,10 @@ CENTRED_M = 1e-9
 ALPHA_S = 0.03
 """Time over which the gyro's differences are averaged: over 0.3 m of lever their noise makes 0.02 m/s^2, without it 0.1 at 100 Hz."""
 GYRO_BIASES, ACCEL_BIASES, DEPTH_BIASES = 0.1, 1.0, 0.5
-"""By how much a sensor may be off the mean of all, rad/s, m/s^2, m: twenty sigmas of what biases are drawn with. One that fails tells zeros
-or its limit: gravity off, for as long as it takes to be found."""
+"""By how much a sensor may be off the mean of all, rad/s, m/s^2, m: twenty sigmas and more of the bench's draw of biases. One that fails
+tells zeros or its limit: gravity off, for as long as it takes to be found."""
 TURN_NS = 100_000_000
-"""Within so long each pressure sensor is heard, ten times a second at the slowest; who is not is silent."""
+"""Within so long each pressure sensor is heard, five times over (DEPTH comes at 50 Hz, DESIGN's bus); who is not is silent."""
 STILL_RAD_S = 0.05
 """Slower than that the place of an IMU in the body makes no difference: 0.75 mm/s^2 over 0.3 m."""
 
@@ -132,8 +132,11 @@ class Measurements:
         return depth_m
 
     def _depth_offset(self, which: list[bool], each_m: np.ndarray) -> float:
-        """By how much the mean of the sensors that were heard in this tick is off that of all, where some are silent. Healthy ones come in
-        turns, a few ticks apart, and the estimator has learnt what they tell on the mean.
+        """By how much the mean of the sensors that were heard in this tick is off that of all, m, where some are silent. Healthy ones come
+        in turns, a few ticks apart, and the estimator has learnt what they tell on the mean.
+
+        Args:
+            which: of each module of the body, whether its sensor was heard. each_m: (heard,) what those tell of the centre of mass.
         """
         self._depth_age += 1
         self._depth_age[which], self._depths_m[which] = 0, each_m

@@ -174,6 +174,18 @@ def test_each_stop_is_noted_for_a_person_may_have_cleared_the_one_before_by_hand
     assert written == [True, True, True]
 
 
+def test_note_is_taken_where_folders_have_no_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As over some networks: nothing has failed that an operator is to hear of."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(estop_note.fcntl, "flock", refuse)
+    flight = Flight(tmp_path)
+    flight.tick(State.ESTOP)
+    assert flight.end() == [] and estop_stands(tmp_path)
+
+
 @pytest.mark.parametrize("is_there", [True, False])
 def test_folder_is_one_vehicle_s_while_that_runs(tmp_path: Path, is_there: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whose e-stop nobody else clears; also where the vehicle itself had to make the folder."""

@@ -18,7 +18,7 @@ from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.assembly import assemble, assemble_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
 
 BODY = assemble_vehicle(load_vehicle("modcube"))
 PUSH = preload(BODY.thrusters, np.ones(8, dtype=bool), 0.6)
@@ -351,88 +351,6 @@ def test_healthy_robot_that_lacks_an_axis_makes_the_force_that_it_can(wanted: li
     thrust = chain._allocate(np.array(wanted, dtype=np.float64), 0)
     np.testing.assert_allclose(thrust.achieved[:2], np.array(made), rtol=0.02)
     assert np.abs(thrust.achieved[3:]).max() < 0.02 * made[0]
-
-
-# ---------------------------------------------------------------- a module that falls silent
-
-
-class Pair:
-    """Two docked modules, of which a detector hears some."""
-
-    def __init__(self, count: int = 2) -> None:
-        cube = load_vehicle("modcube")
-        self.body = assemble([(n, 0, 0) for n in range(count)], [0] * count, [cube] * count, list(range(count)))
-        self.detector = FaultDetector(self.body, Faults(), TICK_NS)
-
-    def hear(self, seconds: float, *heard: int, armed: bool = True) -> list[str]:
-        """Words of that time."""
-        said, n = [], self.body.thrusters.f_max.size
-        modules = [ModuleInputs(heard=m in heard) for m in range(len(self.body.modules))]
-        estimate = Estimate(ZERO, np.eye(1, 4)[0], np.zeros(6), ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, True)
-        for _ in range(round(seconds / DT)):
-            self.detector.step(modules, Measured(None, None, None, []), estimate, np.zeros(n), np.zeros(n), armed)
-            assert self.detector.changed == bool(self.detector.words)
-            said += self.detector.words
-        return said
-
-    @property
-    def used(self) -> set[int]:
-        """Modules whose thrusters all are."""
-        alive, module = self.detector.now.alive, self.body.thrusters.module
-        return {m for m in range(len(self.body.modules)) if alive[module == m].all()}
-
-
-def test_thrusters_of_a_module_that_falls_silent_are_left_out_until_it_is_heard_again() -> None:
-    pair = Pair()
-    assert pair.hear(1.0, 0, 1) == [] == pair.hear(0.49, 0)
-    assert pair.hear(0.5, 0) == ["thrusters of silent module 1 are left out"]
-    assert pair.used == {0} and (pair.detector.now.lost_axes, pair.detector.now.dead) == (0, ()), "nothing was found about them"
-    pair.detector._lose(3, "stands still")
-    assert pair.hear(0.49, 0, 1) == [] and pair.hear(0.02, 0, 1) == ["thrusters of every module are used again"]
-    assert pair.detector.now.dead == (3,) and pair.used == {1}, "what was found meanwhile stays found"
-
-
-def test_module_that_is_heard_now_and_then_is_left_out_once() -> None:
-    pair = Pair()
-    said = [words for _ in range(5) for words in pair.hear(0.55, 0) + pair.hear(0.05, 0, 1)]
-    assert said == ["thrusters of silent module 1 are left out"]
-    assert pair.used == {0}
-
-
-def test_module_that_falls_silent_after_all_others_is_used_blindly_and_that_is_said() -> None:
-    pair = Pair()
-    assert pair.hear(1.0, 0) == ["thrusters of silent module 1 are left out"]
-    assert pair.hear(1.0) == ["thrusters of every module are used again"] and pair.used == {0, 1}
-
-
-def test_thrusters_that_no_others_can_stand_in_for_are_used_blindly() -> None:
-    """The bus may be broken in one direction alone; where all of it is, the modules stop by themselves, and a fail-safe disarms."""
-    for pair, heard in ((Pair(1), ()), (Pair(2), ())):
-        assert pair.hear(1.0, *heard) == [] and pair.detector.now.dead == ()
-
-
-def test_silence_of_a_disarmed_body_leaves_nothing_out_and_what_was_left_out_is_back_when_it_disarms() -> None:
-    pair = Pair()
-    assert pair.hear(1.0, 0, armed=False) == []
-    assert pair.hear(0.02, 0) == ["thrusters of silent module 1 are left out"]
-    pair.detector.reset()
-    assert pair.detector.changed and pair.used == {0, 1}
-
-
-def test_module_that_was_left_out_is_used_again_once_its_body_is_disarmed() -> None:
-    pair, other = Pair(), Pair()
-    pair.hear(1.0, 0)
-    other.detector.take_over([pair.detector])
-    assert other.used == {0}
-    other.hear(0.01, 0, armed=False)
-    assert other.used == {0, 1}
-
-
-def test_body_that_is_made_of_others_leaves_out_the_modules_that_were_silent_in_them() -> None:
-    three, pair = Pair(3), Pair(2)
-    three.hear(1.0, 0, 2)
-    pair.detector.take_over([three.detector])
-    assert pair.used == {0} and pair.hear(0.1, 0) == []
 
 
 def test_robot_that_is_armed_anew_trusts_its_thrusters_again(water: Water) -> None:
