@@ -6,23 +6,25 @@ import math
 
 import numpy as np
 import pytest
-from blind_floor import PERIOD_S, PLACE, WATER, floor, model, without_tags
+from blind_floor import PERIOD_S, PLACE, STATES, WATER, floor, model, without_tags
 
 from firmware_py.description.vehicle import load_vehicle
 from hil.plant.spec import SensorSpec, WorldSpec
 from hil.safety import ICM_20602
 
 BLIND_S = 5.0
+UNKNOWN_N_M = 0.1
+"""As if nothing was known of the moments: the gyro alone tells the turning."""
 
 
 def test_what_feels_nothing_drifts_as_the_water_does() -> None:
     world = WorldSpec(gust_smoothing_s=0.05, current_m_s=0.0)
-    axis = model(world, SensorSpec(gyro_sigma=0.0, gyro_walk=0.0, accel_walk=0.0), load_vehicle("modcube"))
-    covariance = np.zeros((8, 8))
+    axis = model(world, SensorSpec(gyro_walk=0.0, accel_sigma=10.0, accel_walk=0.0), load_vehicle("modcube"), 0.0)
+    covariance = np.zeros((STATES, STATES))
     covariance[WATER : WATER + 2, WATER : WATER + 2] = (
         world.gust_m_s**2
     )  # nobody knows the gust at the last tag, only the robot's own speed
-    _, after = without_tags(axis, covariance, 1e6, BLIND_S)
+    _, after = without_tags(axis, covariance, BLIND_S)
     tau, t = world.gust_time_s, BLIND_S
     decay = math.exp(-t / tau)
     integral_of_change = 2.0 * tau**2 * (t / tau - 1.0 + decay) + t**2 - 2.0 * t * tau * (1.0 - decay)
@@ -31,8 +33,8 @@ def test_what_feels_nothing_drifts_as_the_water_does() -> None:
 
 def test_in_water_of_which_nothing_is_known_noise_is_integrated_twice() -> None:
     sensors = SensorSpec(gyro_walk=0.0, accel_walk=0.0)
-    axis = model(WorldSpec(gust_m_s=1.0), sensors, load_vehicle("modcube"))
-    _, after = without_tags(axis, np.zeros((8, 8)), sensors.accel_sigma, BLIND_S)
+    axis = model(WorldSpec(gust_m_s=1.0), sensors, load_vehicle("modcube"), UNKNOWN_N_M)
+    _, after = without_tags(axis, np.zeros((STATES, STATES)), BLIND_S)
     accel = sensors.accel_sigma**2 * PERIOD_S * BLIND_S**3 / 3.0
     tilt = 9.81**2 * sensors.gyro_sigma**2 * PERIOD_S * BLIND_S**5 / 20.0
     assert math.sqrt(after[PLACE, PLACE]) == pytest.approx(math.sqrt(accel + tilt), rel=0.02)
@@ -42,3 +44,9 @@ def test_quieter_imu_keeps_the_place_better() -> None:
     (median, most), (quiet_median, quiet_most) = floor(), floor(ICM_20602)
     assert quiet_median < 0.7 * median < 0.7 * most
     assert quiet_most < 0.7 * most
+
+
+def test_who_knows_the_moments_knows_the_tilt_and_keeps_the_place_better() -> None:
+    (unknown, _), (known, _), (nearly, _) = floor(unforeseen_n_m=UNKNOWN_N_M), floor(unforeseen_n_m=0.0), floor()
+    assert known < 0.7 * unknown
+    assert nearly == pytest.approx(unknown, rel=0.05)
