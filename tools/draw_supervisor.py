@@ -21,13 +21,13 @@ from firmware_py.description.parameters import Parameters
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "supervisor.md"
 NEEDS = """\
-The attitude is known by tags, or until the first by gravity: a second after a start without any the body stands upright, and ten tags
-that tell the same give place and heading. Only tags tell a position. SURFACE without an attitude lifts along the body. A pilot is missing
-who was heard and fell silent. Where none was ever heard, sticks are neutral, and the first that come count."""
+Attitude comes from tags, or from gravity until the first tag: one second after a start without tags roll and pitch are known, and ten tags
+that agree give position and heading. Position comes from tags only. SURFACE without an attitude lifts along the body. A pilot is missing
+who was heard and then fell silent; where none was ever heard, the sticks are neutral, and the first that arrive count."""
 WHILE_TESTED = """\
-In MOTOR_DETECT a body is disarmed instead, whatever the action, where a motor test has armed it or where it never saw a tag: it may lie
-on a bench. A cause that comes back before its fail-safe is over acts again when it has lasted its delay. A body that is disarmed or stopped
-keeps the mode that a person chose for it; out of a motor test, a dock or a fail-safe's mode it goes to POSHOLD."""
+In MOTOR_DETECT a body is disarmed instead, whatever the action, if a motor test armed it or it never saw a tag: it may lie on a bench. A
+cause that returns before its fail-safe has ended acts again after its delay. A disarmed or stopped body keeps the mode that a person chose;
+after a motor test, a dock or a fail-safe's mode it goes to POSHOLD."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -121,7 +121,7 @@ def page() -> str:
     lines = [
         "# Supervisor", "",
         "Drawn from the tables in `firmware_py/core` by `.venv/bin/python tools/draw_supervisor.py`; do not edit.", "",
-        "## States", "", *diagram(), "Every transition there is; what has no row is refused in words.", "", *transitions(),
+        "## States", "", *diagram(), "All transitions; a request without a row is refused with a text.", "", *transitions(),
         "## Modes", "", *modes(), "## Arming checks", "", *arming(),
         "## Fail-safes", "", "Gravest first, with the default parameters (`failsafes.NAME_limit`, `_delay_s`, `_action`, `_latched`).", "",
         *failsafes(), "### Actions", "", *permitted(), WHILE_TESTED,

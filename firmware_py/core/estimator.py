@@ -8,7 +8,7 @@ Until the first tags come it stands upright by gravity (`alignment`): attitude b
 adrift: it makes up that it stands still, and believes only tags that tell the same ten times.
 
 The body moves by the model of `propagation`, and the accelerometer measures what that model left out (`observation.fuse_inertial`): so the
-velocity follows the robot and not the command, which is worth 15 degrees of phase (docs/tuning.md).
+velocity follows the robot and not the command, which is worth 15 degrees of phase (docs/estimator.md).
 """
 
 from __future__ import annotations
