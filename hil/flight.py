@@ -113,14 +113,8 @@ def judge_logs(
     begin_ns = begin_of(scenario, whole)
     flight = whole.between(begin_ns, begin_ns + duration_ns)
     share = len(flight.firmware["tick"]) / len(whole.firmware["tick"])
-    vehicle = load_vehicle(scenario.module[0].vehicle)
-    metrics = flight_metrics(
-        flight,
-        wanted=wanted_in(scenario, flight, begin_ns),
-        com_m=vehicle.inertial.com_m,
-        wall_s=wall_s * share,
-        deadline_misses=deadline_misses,
-    )
+    wanted = wanted_in(scenario, flight, begin_ns)
+    metrics = flight_metrics(flight, wanted=wanted, wall_s=wall_s * share, deadline_misses=deadline_misses)
     metrics["armed_share"] = float(np.isin(flight.firmware["state"], list(ARMED)).mean()) if share else math.nan
     if scenario.task.kind == "dock":  # which may end before its time
         metrics |= docking_metrics(scenario, folder)

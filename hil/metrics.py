@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.core.rotations import rotate
 from firmware_py.description.signals import Columns
 from hil.checks import UNBOUNDED, limit_text
 from hil.signals import Flight
@@ -129,19 +128,6 @@ def rotation_vectors(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (sign * factor)[:, None] * v
 
 
-def body_positions(flight: Flight, com_m: np.ndarray) -> np.ndarray:
-    """(k, 3) true positions of the point that the firmware controls: the body's nominal centre of mass, world, m.
-
-    A log without bodies has one module: `com_m` (3,) is that point in its frame.
-    """
-    if "p_wb" in flight.truth:
-        return flight.truth["p_wb"]
-    p_wm, q_wm = flight.truth["p_wm"], flight.truth["q_wm"]
-    if not np.any(com_m):
-        return p_wm
-    return p_wm + np.array([rotate(q, com_m) for q in np.ascontiguousarray(q_wm)])
-
-
 class Poses(NamedTuple):
     """Of one body, tick by tick."""
 
@@ -155,7 +141,6 @@ def flight_metrics(
     flight: Flight,
     *,
     wanted: Poses | None = None,
-    com_m: np.ndarray | None = None,
     wall_s: float = 0.0,
     deadline_misses: int = 0,
 ) -> dict[str, float]:
@@ -164,7 +149,6 @@ def flight_metrics(
     Args:
         flight: the ticks of the trajectory, from its start to its end (`Flight.between`). Of none nothing is a number.
         wanted: where the task wants the body in each of them; the firmware's own set-point, which may be any, when left out.
-        com_m: (3,) nominal centre of mass in the module frame, m; the hull's centre when left out.
         wall_s: time that the machine took for the same ticks, s; 0 where it is not known gives a real-time factor of 0.
         deadline_misses: ticks that began late; 0 in lockstep.
     """
@@ -172,10 +156,9 @@ def flight_metrics(
     if not len(firmware["tick"]):
         return dict.fromkeys((name for name in SHOWN if name not in DOCKING), math.nan)
     wanted = wanted or Poses(firmware["setpoint_p_wb"], firmware["setpoint_q_wb"])
-    position = body_positions(flight, np.zeros(3) if com_m is None else com_m)
-    error = np.linalg.norm(position - wanted.p_wb, axis=1)
+    error = np.linalg.norm(flight.p_wb - wanted.p_wb, axis=1)
     angle = np.linalg.norm(rotation_vectors(flight.q_wb, wanted.q_wb), axis=1)
-    estimate_error = firmware["p_wb"] - position
+    estimate_error = firmware["p_wb"] - flight.p_wb
     estimate_angle = rotation_vectors(flight.q_wb, firmware["q_wb"])
     time_s = flight.time_s
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0

@@ -156,8 +156,6 @@ def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray, inside: np.ndarray) 
 
 def _apart(flight: Flight) -> list[np.ndarray]:
     """(k, 3) paths of the modules that are not in the body all the time; NaN while they are."""
-    if "member" not in flight.truth:
-        return []
     outside = flight.truth["member"] == 0.0
     return [np.where(outside[:, [m]], module["p_wm"], np.nan) for m, module in enumerate(flight.modules) if outside[:, m].any()]
 
@@ -295,7 +293,7 @@ def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray, number
 
 def _module_names(flight: Flight, numbers: Sequence[int]) -> list[str]:
     """Of those that were in the body, in the order of its true forces."""
-    member = flight.truth.get("member", np.ones((len(flight.time_s), 1))) > 0.0
+    member = flight.truth["member"] > 0.0
     every = [f"Module {number}" for number in numbers or range(1, 1 + member.shape[1])]
     return [every[m] + ("" if member[:, m].all() else ", while docked") for m in np.flatnonzero(member.any(axis=0))]
 

@@ -207,7 +207,7 @@ class Flight:
     """One body over the ticks that both logs hold, row by row; `lost_ns` are the times of ticks that one of them lacks.
 
     `truth` has the columns of the body's leading module (its `force_n` and `power_w` those of all its modules), and with them
-    `member`, `p_wb`, `q_wb`, `v_wb`, `w_bb` of the body where the log has them. `modules` has `p_wm`, `q_wm`, `force_n` and
+    `member`, `p_wb`, `q_wb`, `v_wb`, `w_bb` of the body. `modules` has `p_wm`, `q_wm`, `force_n` and
     `power_w` of every module of the fleet, in its order, whichever body it is in.
     """
 
@@ -226,15 +226,13 @@ class Flight:
 
     @property
     def p_wb(self) -> np.ndarray:
-        """(k, 3) where the point that the firmware steers really is, world, m; the hull's centre in a log without
-        bodies.
-        """
-        return self.truth.get("p_wb", self.truth["p_wm"])
+        """(k, 3) where the point that the firmware steers, the body's nominal centre of mass, really is, world, m."""
+        return self.truth["p_wb"]
 
     @property
     def q_wb(self) -> np.ndarray:
-        """(k, 4) true attitude of the body; that of the module in a log without bodies."""
-        return self.truth.get("q_wb", self.truth["q_wm"])
+        """(k, 4) true attitude of the body."""
+        return self.truth["q_wb"]
 
     @property
     def placed(self) -> np.ndarray:
@@ -253,18 +251,17 @@ class Flight:
         return Flight(pick, truth, self.events, self.ticks, lost_ns, modules)
 
 
-def read_flight(folder: Path, body: int = 0, module: int = 0) -> Flight:
-    """The flight whose logs are in `folder`.
+def read_flight(folder: Path) -> Flight:
+    """The flight of the body that module 0 leads, whose logs are in `folder`.
 
     Raises:
-        OSError: a log is missing. ValueError: a log holds nothing of this body or module, or they share no tick.
+        OSError: a log is missing. ValueError: a log holds nothing of the body, or they share no tick.
     """
     signals, truths = read_signals(folder / SIGNAL_LOG), read_signals(folder / TRUTH_LOG)
-    firmware, truth = signals.get(f"/firmware/body{body}"), truths.get(f"/plant/module{module}")
-    if firmware is None or truth is None:
-        raise ValueError(f"{folder}: no signals of body {body} or no truth of module {module} in the logs")
-    thrusters = truth["force_n"].shape[1]
-    truth = _joined(truth, truths.get(f"/plant/body{body}"), truths)
+    if "/firmware/body0" not in signals or "/plant/body0" not in truths:
+        raise ValueError(f"{folder}: no signals or no truth of body 0 in the logs")
+    firmware, thrusters = signals["/firmware/body0"], truths["/plant/module0"]["force_n"].shape[1]
+    truth = _joined(truths)
     _, mine, theirs = np.intersect1d(firmware["tick"], truth["tick"], return_indices=True)
     if not len(mine):
         raise ValueError(f"{folder}: the two logs share no tick")
@@ -291,10 +288,9 @@ def _fleet(truths: Mapping[str, Columns], ticks: np.ndarray) -> tuple[Columns, .
     return tuple({name: _at(module, ticks, name) for name in ("p_wm", "q_wm", "force_n", "power_w")} for module in modules)
 
 
-def _joined(module: Columns, body: Columns | None, truths: Mapping[str, Columns]) -> Columns:
-    """The module's truth with that of the body it leads, over the ticks of both."""
-    if body is None:
-        return module
+def _joined(truths: Mapping[str, Columns]) -> Columns:
+    """The truth of module 0 with that of the body it leads, over the ticks of both."""
+    module, body = truths["/plant/module0"], truths["/plant/body0"]
     _, mine, theirs = np.intersect1d(module["tick"], body["tick"], return_indices=True)
     joined = {name: column[mine] for name, column in module.items()}
     joined |= {name: body[name][theirs] for name in ("member", "p_wb", "q_wb")}
@@ -320,8 +316,6 @@ def _tell_of_same_body(firmware: Columns, truth: Columns, thrusters: int) -> Non
 
     That is the leading module and what hung rigidly on it: as its body was when it last had that many modules, or next has.
     """
-    if "member" not in truth:
-        return
     believed = np.isfinite(firmware["commanded_n"]).sum(axis=1) // thrusters
     actual = (truth["member"] > 0.0).sum(axis=1)
     for count in np.unique(believed[believed != actual]):

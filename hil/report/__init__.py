@@ -113,7 +113,7 @@ def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
     keep = slice(None, None, max(1, round(1.0 / (FRAMES_HZ * period_s))))
     firmware = flight.firmware
-    member = flight.truth.get("member", np.ones((len(time_s), len(flight.modules))))
+    member = flight.truth["member"]
     error_mm, angle_deg = (np.where(flight.placed, error, np.nan) for error in errors(flight))
     return {
         "tank": {"kind": scene.tank, "low": _short(scene.tank_m[0], 3), "high": _short(scene.tank_m[1], 3)},

@@ -66,6 +66,7 @@ def write_flight(
             p_wm = wanted + np.array(offset_m) + error[tick]
             q_wm = exp(np.array(tilt_rad) + tilt[tick])
             truth.record(tick, time_ns, 0, p_wm, q_wm, speed, np.zeros(3), thrust[tick], np.array([0.04, 0.03, 0.0]), POWER_W)
+            truth.record_body(tick, time_ns, (0,), p_wm, q_wm, speed, np.zeros(3))
             zero = np.zeros(3)
             tagged = tick % 2 == 0
             estimate = Estimate(

@@ -29,7 +29,7 @@ def held(mode: Mode = Mode.POSHOLD) -> Flight:
         "tag_age_ns": np.zeros(TICKS, np.int64), "commanded_n": np.ones((TICKS, 8)),
     }  # fmt: skip
     events = {"log_time": np.zeros(0, np.int64), "severity": np.zeros(0, np.int64), "text": np.zeros(0, str)}
-    return Flight(firmware, {"p_wm": np.zeros((TICKS, 3)), "q_wm": q}, events, {}, np.zeros(0))
+    return Flight(firmware, {"p_wb": np.zeros((TICKS, 3)), "q_wb": q}, events, {}, np.zeros(0))
 
 
 def broken(row: str, change: Change = lambda flight: None, mode: str = "POSHOLD") -> tuple[str, ...]:
@@ -83,10 +83,10 @@ def test_promise_that_is_kept_is_not_broken() -> None:
         (STOPS, both(after(1.0, "state", int(State.ESTOP)), after(1.0, "commanded_n", 0.0)), "took 1.00 s"),
         (STOPS, after(0.01, "state", int(State.ESTOP)), "a thruster turned while stopped"),
         (STOPS, lambda flight: None, "ended in POSHOLD, not ESTOP"),
-        (AS_BEFORE, after(5.0, "p_wm", 0.2), "346 mm off"),
+        (AS_BEFORE, after(5.0, "p_wb", 0.2), "346 mm off"),
         (AS_BEFORE, after(5.0, "setpoint_p_wb", math.nan), "inf mm off"),
-        (HALF_FORCE, after(5.0, "q_wm", [0.5, 0.5, 0.5, 0.5]), "120 deg off"),
-        (HALF_FORCE, after(5.0, "q_wm", math.nan), "inf deg off"),
+        (HALF_FORCE, after(5.0, "q_wb", [0.5, 0.5, 0.5, 0.5]), "120 deg off"),
+        (HALF_FORCE, after(5.0, "q_wb", math.nan), "inf deg off"),
         (HALF_FORCE, said("thruster 6 stands still: left out"), "blamed thruster 6"),
         (AS_BEFORE, said("thruster 2 does not obey: left out"), "blamed thruster 2"),
         ("thruster dead", said("thruster 6 stands still: left out, and thruster 3 does not obey"), "blamed thruster 3"),

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from firmware_py.runtime.recorder import Recorder
 from hil.checks import Limit, check_metrics, judge, write_result
 from hil.flight import ticks_of
 from hil.force_metrics import force_metrics
-from hil.metrics import Poses, body_positions, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
+from hil.metrics import Poses, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
 from hil.scenario import load_scenario
-from hil.signals import Flight, read_flight
+from hil.signals import Flight, TruthRecorder, read_flight
 from tests.unit.flights import MARGIN, POWER_W, START_NS, write_flight, write_pair
 
 LIMITS = (Limit("position_rmse_m", high=0.005), Limit("nis_mean", 0.7, 1.4))
@@ -104,7 +105,7 @@ def test_rate_of_a_sine_is_its_frequency_times_its_rms_and_thrusters_that_fell_s
 
 def test_one_bad_tick_is_seen_in_the_worst_error(tmp_path: Path) -> None:
     flight = spiral_of(tmp_path, noise=0.0)
-    flight.truth["p_wm"][100, 2] += 0.5
+    flight.truth["p_wb"][100, 2] += 0.5
     metrics = flight_metrics(flight)
     assert metrics["position_max_m"] == pytest.approx(0.5)
     assert metrics["position_rmse_m"] == pytest.approx(0.5 / math.sqrt(501))
@@ -135,12 +136,6 @@ def test_attitude_error_is_the_short_way_round() -> None:
     np.testing.assert_allclose(rotation_vectors(tiny, q), [[1e-13, 0.0, 0.0]], rtol=1e-6)
 
 
-def test_off_centre_mass_moves_with_the_module(tmp_path: Path) -> None:
-    flight = spiral_of(tmp_path, tilt_rad=(0.0, 0.0, math.pi / 2), noise=0.0)
-    moved = body_positions(flight, np.array([0.1, 0.0, 0.0])) - flight.truth["p_wm"]
-    np.testing.assert_allclose(moved, np.tile([0.0, 0.1, 0.0], (501, 1)), atol=1e-12)
-
-
 def test_run_passes_only_when_every_check_does() -> None:
     good = {"position_rmse_m": 0.005, "nis_mean": 1.0}
     assert judge("spiral", 3, good, LIMITS).passed
@@ -166,9 +161,10 @@ def test_result_file_has_the_agreed_shape(tmp_path: Path) -> None:
 
 
 def test_missing_truth_is_said_and_not_passed_over(tmp_path: Path) -> None:
-    write_flight(tmp_path, duration_s=1.0)
-    with pytest.raises(ValueError, match="no truth of module 3"):
-        read_flight(tmp_path, module=3)
+    with TruthRecorder(tmp_path, (8,)):
+        Recorder(tmp_path).close()
+    with pytest.raises(ValueError, match="no truth of body 0"):
+        read_flight(tmp_path)
     with pytest.raises(OSError):
         read_flight(tmp_path / "elsewhere")
 

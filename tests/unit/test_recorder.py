@@ -200,6 +200,7 @@ def test_flight_joins_firmware_and_plant_by_tick(tmp_path: Path) -> None:
         for tick in range(3, 90):
             q = np.array([1.0, 0.0, 0.0, 0.0])
             truth.record(tick, tick * PERIOD_NS, 0, np.full(3, float(tick)), q, zero, zero, np.zeros(8), zero)
+            truth.record_body(tick, tick * PERIOD_NS, (0,), np.full(3, float(tick)), q, zero, zero)
     flight = read_flight(tmp_path)
     assert flight.firmware["tick"].tolist() == flight.truth["tick"].tolist() == list(range(3, 90))
     np.testing.assert_array_equal(np.sort(flight.lost_ns), PERIOD_NS * np.r_[0:3, 90:100])
