@@ -10,9 +10,9 @@ from pathlib import Path
 
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.firmware import BusFrame, Firmware, compose
-from firmware_py.app.lockstep import PATIENCE_LOOKS, Lockstep, Observer, drain, send
+from firmware_py.app.lockstep import PATIENCE_LOOKS, Lockstep, drain, send
+from firmware_py.app.observers import Observer, recording
 from firmware_py.app.realtime import LISTEN_NS, OTHER_SYNC
-from firmware_py.app.vehicle import recording
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.port import Port, PortError, open_port
 from firmware_py.core.types import Outputs

@@ -16,9 +16,8 @@ from typing import Literal, NamedTuple
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import recording_times
 from firmware_py.app.firmware import compose
-from firmware_py.app.lockstep import Observer
+from firmware_py.app.observers import Observer, recording
 from firmware_py.app.realtime import open_loop
-from firmware_py.app.vehicle import recording
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Outputs, Request
 from firmware_py.description.parameters import Parameters

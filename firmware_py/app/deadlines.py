@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.app.lockstep import Observer
+from firmware_py.app.observers import Observer
 from firmware_py.app.realtime import RealTimeLoop
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.ground.times import Times

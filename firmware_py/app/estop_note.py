@@ -15,7 +15,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.app.lockstep import Observer
+from firmware_py.app.observers import Observer
 from firmware_py.core.transitions import State
 from firmware_py.core.types import WARNING, Action, Event, Inputs, Outputs
 from firmware_py.description.schema import DescriptionError

@@ -30,7 +30,7 @@ from foxglove.messages import (
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.app.lockstep import Observer
+from firmware_py.app.observers import Observer
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.core.types import BodyRecord, Inputs, Outputs

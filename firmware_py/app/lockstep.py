@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from firmware_py.app.firmware import BusFrame, Firmware
+from firmware_py.app.observers import Observer
 from firmware_py.bus.port import Port
-from firmware_py.core.types import Inputs, Outputs, Request
+from firmware_py.core.types import Outputs, Request
 
-Observer = Callable[[Sequence[BusFrame], Sequence[BusFrame], Inputs, Outputs], None]
-"""Called after each tick with the frames received and sent, the inputs and the outputs."""
 PATIENCE_LOOKS = 20_000
 """Looks at the sockets before frames count as lost by the bus: about half a second; not reached on a working bus."""
 

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from firmware_py.app.firmware import BusFrame, Firmware
-from firmware_py.app.lockstep import Observer
+from firmware_py.app.observers import Observer
 from firmware_py.bus.port import Port, PortError, open_port
 from firmware_py.core.types import WARNING, Event, Inputs, Outputs, Request
 from firmware_py.runtime.clock import MonotonicClock

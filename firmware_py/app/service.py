@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.app.lockstep import Observer
+from firmware_py.app.observers import Observer
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.rate_keeper import RateKeeper

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import Summary, recording_times, summary_of
 from firmware_py.app.estop_note import EstopNote, estop_stands, noting_estop
-from firmware_py.app.firmware import BusFrame, Firmware, compose, vehicles_of
+from firmware_py.app.firmware import Firmware, compose, vehicles_of
 from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight, outdate, to_arm
 from firmware_py.app.live_view import LiveView
-from firmware_py.app.lockstep import Observer
+from firmware_py.app.observers import Observer, recording, telling
 from firmware_py.app.realtime import open_loop
 from firmware_py.app.service import reporting
 from firmware_py.core.body import Body
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, Event, Inputs, Outputs, Request
+from firmware_py.core.types import Action, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
@@ -53,7 +53,6 @@ FAREWELL_TICKS = 10
 ARM_EVERY_S = 1.0
 """How often arming is tried again with `--hold`, once the pose is known."""
 FORGETFUL = "warning: --hold without --out: an e-stop in this run will not be known at the next start"
-FLUSH_EVERY_S = 0.5
 MISUSED = (FileExistsError, NotADirectoryError, PermissionError)
 """A folder for logs that is none, or not ours: whoever starts the vehicle is told. What else a disk may fail in, it flies without."""
 STOPPED_BY = frozenset({Action.DISARM, Action.ESTOP})
@@ -264,45 +263,6 @@ def with_ground(
         return [*operator.requests(time_ns, last), *asked]
 
     return requests
-
-
-def telling(say: Callable[[str], None]) -> Observer:
-    """An observer that says every event."""
-
-    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        for event in outputs.events:
-            say(event_line(outputs.time_ns, event))
-
-    return observe
-
-
-def event_line(time_ns: int, event: Event) -> str:
-    """One event as a line."""
-    return f"{time_ns * 1e-9:9.3f} s  {event.text}"
-
-
-def recording(recorder: Recorder, rate_hz: int) -> Observer:
-    """An observer that writes every tick to `recorder`, in the order in which frames went over the bus.
-
-    Who is armed is with the system at once: a process that is killed then knows it when it comes back.
-    """
-    flush_every = max(1, round(FLUSH_EVERY_S * rate_hz))
-    was_armed: list[bool] = []
-
-    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        buses = sorted({bus for bus, _ in sent})
-        syncs = len(buses)
-        for bus in buses:
-            recorder.sent(outputs.time_ns, bus, [f for b, f in sent[:syncs] if b == bus])
-            recorder.received(outputs.time_ns, bus, [f for b, f in received if b == bus])
-            recorder.sent(outputs.time_ns, bus, [f for b, f in sent[syncs:] if b == bus])
-        recorder.record(inputs, outputs)
-        armed = [command.armed for command in outputs.modules]
-        if armed != was_armed or outputs.tick % flush_every == 0:
-            was_armed[:] = armed
-            outputs.events += recorder.flush()
-
-    return observe
 
 
 @contextmanager

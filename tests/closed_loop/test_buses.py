@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.app.vehicle import recording
+from firmware_py.app.observers import recording
 from firmware_py.bus.codec import Frame
 from firmware_py.bus.port import Port, open_port
 from firmware_py.core.transitions import ARMED

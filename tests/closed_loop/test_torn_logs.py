@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from firmware_py.app.firmware import BusFrame
+from firmware_py.app.observers import recording
 from firmware_py.app.replay import replay
-from firmware_py.app.vehicle import recording
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.signals import is_closed
@@ -33,7 +33,7 @@ import os, signal, sys
 from contextlib import ExitStack
 from pathlib import Path
 from firmware_py.app.configuration import configuration_of
-from firmware_py.app.vehicle import recording
+from firmware_py.app.observers import recording
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.recorder import Recorder
 from hil.bench import open_bench

@@ -17,7 +17,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from firmware_py.app.firmware import Firmware, compose, vehicles_of
 from firmware_py.app.live_view import LiveView, LiveViewError, towards
-from firmware_py.app.vehicle import recording
+from firmware_py.app.observers import recording
 from firmware_py.core import rotations
 from firmware_py.core.types import Inputs, ModuleInputs, Outputs
 from firmware_py.description.fleet import single

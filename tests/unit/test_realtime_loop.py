@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from firmware_py.app.firmware import BusFrame, Firmware, compose
-from firmware_py.app.lockstep import Lockstep, Observer
+from firmware_py.app.lockstep import Lockstep
+from firmware_py.app.observers import Observer, telling
 from firmware_py.app.realtime import RealTimeLoop, open_loop
-from firmware_py.app.vehicle import telling
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.fleet import single

@@ -16,8 +16,9 @@ from firmware_py.app import vehicle
 from firmware_py.app.estop_note import NOTE, EstopNote, estop_stands, noting_estop, write_note
 from firmware_py.app.firmware import compose
 from firmware_py.app.last_flight import last_flight, to_arm
+from firmware_py.app.observers import recording
 from firmware_py.app.realtime import RealTimeLoop
-from firmware_py.app.vehicle import FORGETFUL, Operator, recording, run_vehicle
+from firmware_py.app.vehicle import FORGETFUL, Operator, run_vehicle
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import PortError
 from firmware_py.cli import main

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from firmware_py.app.lockstep import Observer
-from firmware_py.app.vehicle import recording
+from firmware_py.app.observers import Observer, recording
 from firmware_py.bus.codec import Frame
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.recorder import Recorder

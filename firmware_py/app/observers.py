@@ -1,0 +1,52 @@
+"""Who looks on after each tick, in lockstep and in real time: the log, and whoever is told what happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from firmware_py.app.firmware import BusFrame
+from firmware_py.core.types import Event, Inputs, Outputs
+from firmware_py.runtime.recorder import Recorder
+
+Observer = Callable[[Sequence[BusFrame], Sequence[BusFrame], Inputs, Outputs], None]
+"""Called after each tick with the frames received and sent, the inputs and the outputs."""
+FLUSH_EVERY_S = 0.5
+
+
+def telling(say: Callable[[str], None]) -> Observer:
+    """An observer that says every event."""
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        for event in outputs.events:
+            say(event_line(outputs.time_ns, event))
+
+    return observe
+
+
+def event_line(time_ns: int, event: Event) -> str:
+    """One event as a line."""
+    return f"{time_ns * 1e-9:9.3f} s  {event.text}"
+
+
+def recording(recorder: Recorder, rate_hz: int) -> Observer:
+    """An observer that writes every tick to `recorder`, in the order in which frames went over the bus.
+
+    Who is armed is with the system at once: a process that is killed then knows it when it comes back.
+    """
+    flush_every = max(1, round(FLUSH_EVERY_S * rate_hz))
+    was_armed: list[bool] = []
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        buses = sorted({bus for bus, _ in sent})
+        syncs = len(buses)
+        for bus in buses:
+            recorder.sent(outputs.time_ns, bus, [f for b, f in sent[:syncs] if b == bus])
+            recorder.received(outputs.time_ns, bus, [f for b, f in received if b == bus])
+            recorder.sent(outputs.time_ns, bus, [f for b, f in sent[syncs:] if b == bus])
+        recorder.record(inputs, outputs)
+        armed = [command.armed for command in outputs.modules]
+        if armed != was_armed or outputs.tick % flush_every == 0:
+            was_armed[:] = armed
+            outputs.events += recorder.flush()
+
+    return observe
