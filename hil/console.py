@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -23,60 +24,28 @@ TOLD_LINES = 6
 """Warnings of a run that are shown."""
 
 
-class Advance(Protocol):
-    """Tells how far a run is."""
-
-    def __call__(self, done_s: float) -> None:
-        """`done_s` of simulated time have been flown."""
-        ...
+@contextmanager
+def flight_progress(title: str, duration_s: float, console: Console | None = None) -> Iterator[Callable[[float], None]]:
+    """A progress bar over simulated time; it is to be told how much was flown, s."""
+    columns = (TextColumn("{task.completed:5.1f} of {task.total:.1f} s flown"), TimeElapsedColumn())
+    with _bar(title, duration_s, columns, console) as update:
+        yield lambda done_s: update(completed=done_s)
 
 
 @contextmanager
-def flight_progress(title: str, duration_s: float, console: Console | None = None) -> Iterator[Advance]:
-    """A progress bar over simulated time. It leaves one line; where the output is no terminal, it shows nothing."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:5.1f} of {task.total:.1f} s flown"),
-        TimeElapsedColumn(),
-    )
-    console = console or Console()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task(title, total=duration_s)
-
-        def advance(done_s: float) -> None:
-            progress.update(task, completed=done_s)
-
-        yield advance
-
-
-class Count(Protocol):
-    """Tells how many of a campaign's trials are done."""
-
-    def __call__(self, done: int, total: int) -> None:
-        """`done` of `total` trials have been flown."""
-        ...
+def campaign_progress(title: str, trials: int, console: Console | None = None) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar over trials; it is to be told how many were flown, and of how many."""
+    columns = (TextColumn("{task.completed:.0f} of {task.total:.0f} flown"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    with _bar(title, trials, columns, console) as update:
+        yield lambda done, total: update(completed=done, total=total)
 
 
 @contextmanager
-def campaign_progress(title: str, trials: int, console: Console | None = None) -> Iterator[Count]:
-    """A progress bar over trials; where the output is no terminal, it shows nothing."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f} of {task.total:.0f} flown"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
+def _bar(title: str, total: float, columns: Sequence[ProgressColumn], console: Console | None) -> Iterator[Callable[..., None]]:
+    """A bar that leaves one line; where the output is no terminal, it shows nothing. Yields what updates it, as rich's `update` does."""
     console = console or Console()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task(title, total=trials)
-
-        def count(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
-        yield count
+    with Progress(TextColumn("{task.description}"), BarColumn(), *columns, console=console, disable=not console.is_terminal) as progress:
+        yield partial(progress.update, progress.add_task(title, total=total))
 
 
 def campaign_table(summary: Mapping[str, Any]) -> Table:
