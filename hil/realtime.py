@@ -6,12 +6,13 @@ import multiprocessing
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from multiprocessing.context import ForkContext, SpawnContext
+from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event as ProcessEvent
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import recording_times
@@ -105,18 +106,9 @@ def fly_in_real_time(
     open_port(bus).close()  # a bus that cannot be opened,
     fleet = fleet_of(scenario, bus, rate_hz)
     script = script_of(scenario, fleet)  # a path that cannot be flown
-    spawn, fork = multiprocessing.get_context("spawn"), multiprocessing.get_context("fork")
-    context: SpawnContext | ForkContext = fork if start_method == "fork" else spawn
-    handshake = Handshake(context.Event(), context.Event(), context.Event())
-    arguments = (scenario, seed, bus, rate_hz, out, handshake)
-    plant = context.Process(target=serve, args=arguments, name="plant", daemon=True)
     read_libraries()
     with ExitStack() as stack:
-        with out_of_reach():
-            plant.start()
-        stack.callback(plant.join)
-        stack.callback(handshake.begin.set)
-        stack.callback(handshake.stop.set)
+        plant, handshake = stack.enter_context(_started(start_method, serve, scenario, seed, bus, rate_hz, out))
         firmware = compose(fleet, parameters)
         while not handshake.ready.wait(timeout=1.0):
             if not plant.is_alive():
@@ -152,12 +144,25 @@ def fly_in_real_time(
         start_ns = loop.clock.now_ns()
         loop.rate_keeper.start(start_ns + fleet.period_ns)
         loop.run(stop_at_end)
+    keeper, late = loop.rate_keeper, loop.rate_keeper.lateness
+    lateness_ns = {"p50": late.quantile_ns(0.5), "p99": late.quantile_ns(0.99), "worst": late.worst_ns}
+    return RealTimeFlight(script.ticks / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness_ns, refused)
+
+
+@contextmanager
+def _started(start_method: str, serve: Callable[..., None], *arguments: Any) -> Iterator[tuple[BaseProcess, Handshake]]:
+    """The plant's process, which serves inside. Raises RuntimeError at the end where it failed."""
+    spawn, fork = multiprocessing.get_context("spawn"), multiprocessing.get_context("fork")
+    context: SpawnContext | ForkContext = fork if start_method == "fork" else spawn
+    handshake = Handshake(context.Event(), context.Event(), context.Event())
+    plant = context.Process(target=serve, args=(*arguments, handshake), name="plant", daemon=True)
+    with out_of_reach():
+        plant.start()
+    try:
+        yield plant, handshake
+    finally:
+        handshake.stop.set()
+        handshake.begin.set()
+        plant.join()
     if plant.exitcode:
         raise RuntimeError(f"the plant's process ended with status {plant.exitcode}")
-    keeper = loop.rate_keeper
-    lateness = {
-        "p50": keeper.lateness.quantile_ns(0.5),
-        "p99": keeper.lateness.quantile_ns(0.99),
-        "worst": keeper.lateness.worst_ns,
-    }
-    return RealTimeFlight(script.ticks / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness, refused)
