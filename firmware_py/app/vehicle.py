@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +27,7 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.stored_parameters import laid_over, stored_line
 from firmware_py.runtime.clock import boot_id, unix_ns
+from firmware_py.runtime.interrupts import handled
 from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.rate_keeper import RateKeeper
@@ -106,6 +106,10 @@ class Operator:
             self.to_arm.clear()
             self.say(f"not armed again: the vehicle could not within {self.limit_s:g} s (REARM)")
 
+    def stop(self, *_: object) -> None:
+        """Somebody asks for the end, by a signal."""
+        self.stopping = True
+
     def is_done(self, tick: int, outputs: Outputs) -> bool:
         """Whether every module has been told for long enough."""
         return self.farewell >= FAREWELL_TICKS
@@ -179,7 +183,7 @@ def run_vehicle(
         loop.listen()
         if out is not None and estop_stands(out) and not before.stopped:
             raise DescriptionError(f"{out}: an e-stop was raised while this process started, by one that ran until then; start it again")
-        stack.enter_context(_stopping_by_signal(operator))
+        stack.enter_context(handled(operator.stop))  # SIGINT and SIGTERM
         stack.enter_context(quiet_garbage())
         teller.say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
         loop.run(operator.is_done)
@@ -263,18 +267,3 @@ def with_ground(
         return [*operator.requests(time_ns, last), *asked]
 
     return requests
-
-
-@contextmanager
-def _stopping_by_signal(operator: Operator) -> Iterator[None]:
-    """SIGINT and SIGTERM ask for a stop instead of killing the process."""
-
-    def stop(number: int, frame: object) -> None:
-        operator.stopping = True
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

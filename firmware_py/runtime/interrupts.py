@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -16,19 +16,24 @@ ENDINGS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
+def handled(handler: Callable[[int, FrameType | None], object], numbers: Iterable[signal.Signals] = ENDINGS) -> Iterator[None]:
+    """These signals go to `handler` inside, and afterwards to whoever had them."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler_before in before.items():
+            signal.signal(number, handler_before)
+
+
+@contextmanager
 def ended_at_once() -> Iterator[None]:
     """Ctrl-C inside ends the process there and then, without a word: for imports, which leave nothing behind.
 
     While compiled code is loaded LLVM calls Python back; an exception in there is swallowed, and the process crashes (SIGSEGV).
     """
-    if not _is_heard():
+    with handled(lambda number, frame: os._exit(INTERRUPTED), [signal.SIGINT] if _is_heard() else []):
         yield
-        return
-    before = signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
@@ -69,8 +74,6 @@ def held_back() -> Iterator[Callable[[], None]]:
     """
     pressed: list[int] = []
     handlers = {number: signal.getsignal(number) for number in ENDINGS if _is_heard(number)}
-    for number in handlers:
-        signal.signal(number, lambda number, frame: pressed.append(number))
 
     def check() -> None:
         """Raises KeyboardInterrupt where Ctrl-C was pressed."""
@@ -79,11 +82,8 @@ def held_back() -> Iterator[Callable[[], None]]:
             assert callable(handler)
             handler(number, None)
 
-    try:
+    with handled(lambda number, frame: pressed.append(number), handlers):
         yield check
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
     check()
 
 
