@@ -39,11 +39,6 @@ class PairStatus(NamedTuple):
     """Condition 1 holds, debounced."""
     position: bool
     """Condition 2 holds, debounced."""
-    current_since_ns: int
-    """Since when condition 1 has been as it is."""
-    position_since_ns: int
-    current_margin_ma: float
-    """How far the weaker of the two currents is beyond the threshold; NaN before the first."""
     position_error_m: float
     """Distance of the mean relative position from one pitch; NaN without fresh pictures."""
     spread_m: float
@@ -69,9 +64,9 @@ class PairBank:
         for row, pair in zip(self.rows, pairs, strict=True):
             row["module"], row["face"] = (pair.module_a, pair.module_b), (pair.face_a, pair.face_b)
             row["offset_a"], row["turn_a"] = pair.offset_a, to_matrix(pair.q_ab).ravel()
-        for time in ("since_ns", "candidate_ns", "current_ns", "picture_ns"):
+        for time in ("candidate_ns", "current_ns", "picture_ns"):
             self.rows[time] = NEVER_NS
-        for figure in ("current_ma", "margin_ma", "error_m", "spread_m"):
+        for figure in ("current_ma", "error_m", "spread_m"):
             self.rows[figure] = np.nan
         self._watched = np.unique(self.rows["module"]).tolist()
         self._heard_ma = np.full((max(self._watched, default=-1) + 1, FACES), np.nan)
@@ -104,11 +99,8 @@ class PairBank:
     def status(self, i: int) -> PairStatus:
         """Of pair `i`."""
         row = self.rows[i]
-        (current, position), (current_since, position_since) = row["holds"].tolist(), row["since_ns"].tolist()
-        return PairStatus(
-            bool(current), bool(position), current_since, position_since, float(row["margin_ma"]), float(row["error_m"]),
-            float(row["spread_m"]), bool(current and position), bool(row["fresh"]),
-        )  # fmt: skip
+        current, position = map(bool, row["holds"].tolist())
+        return PairStatus(current, position, float(row["error_m"]), float(row["spread_m"]), current and position, bool(row["fresh"]))
 
 
 class PairDetector:

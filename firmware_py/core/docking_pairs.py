@@ -32,11 +32,9 @@ PAIR = np.dtype(
         ("offset_a", np.float64, 3),  # where the centre of b should be in the frame of a, m
         ("turn_a", np.float64, 9),  # attitude that b should have in the frame of a: rotation matrix, row by row
         ("holds", np.int64, 2),  # each condition, debounced
-        ("since_ns", np.int64, 2),  # since when each has been as it is
         ("candidate_ns", np.int64, 2),  # since when the opposite has been seen; NEVER_NS: it is not
         ("current_ma", np.float64, 2),
         ("current_ns", np.int64, 2),
-        ("margin_ma", np.float64),
         ("pictures", np.int64),  # relative positions since the last gap
         ("picture_ns", np.int64),
         ("error_m", np.float64),
@@ -77,15 +75,13 @@ def _see(row, which, seen, time_ns, after_ns):  # type: ignore[no-untyped-def]
     if row.candidate_ns[which] == NEVER_NS:
         row.candidate_ns[which] = time_ns
     if time_ns - row.candidate_ns[which] >= after_ns:
-        row.holds[which], row.since_ns[which], row.candidate_ns[which] = seen, time_ns, NEVER_NS
+        row.holds[which], row.candidate_ns[which] = seen, NEVER_NS
 
 
-@njit(numba.void(ROW, numba.int64, numba.int64), cache=True)
-def _lose(row, which, time_ns):  # type: ignore[no-untyped-def]
+@njit(numba.void(ROW, numba.int64), cache=True)
+def _lose(row, which):  # type: ignore[no-untyped-def]
     """No fresh measurement supports a condition any longer."""
-    if row.holds[which]:
-        row.holds[which], row.since_ns[which] = 0, time_ns
-    row.candidate_ns[which] = NEVER_NS
+    row.holds[which], row.candidate_ns[which] = 0, NEVER_NS
 
 
 @njit(cache=True)
@@ -99,13 +95,12 @@ def _take_currents(row, heard_ma, time_ns, limits):  # type: ignore[no-untyped-d
     if min(row.current_ns[0], row.current_ns[1]) == NEVER_NS:
         return False
     weaker = min(abs(row.current_ma[0]), abs(row.current_ma[1]))
-    row.margin_ma = weaker - limits.threshold_ma
     if heard:
         threshold = limits.threshold_ma - (limits.current_hysteresis_ma if row.holds[CURRENT] else 0.0)
         _see(row, CURRENT, weaker > threshold, time_ns, limits.debounce_ns)
     fresh = time_ns - min(row.current_ns[0], row.current_ns[1]) <= limits.current_fresh_ns
     if not fresh:
-        _lose(row, CURRENT, time_ns)
+        _lose(row, CURRENT)
     return fresh
 
 
@@ -169,7 +164,7 @@ def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[
             _see(row, POSITION, near, time_ns, limits.debounce_ns)
     fresh = time_ns - row.picture_ns <= limits.pose_fresh_ns
     if not fresh:
-        _lose(row, POSITION, time_ns)
+        _lose(row, POSITION)
         row.pictures, row.error_m, row.spread_m = 0, math.nan, math.nan
     return fresh
 

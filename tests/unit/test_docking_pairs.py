@@ -73,16 +73,15 @@ def test_pair_is_docked_once_both_conditions_were_seen_long_enough(row: Row) -> 
     bank = PairBank(ROW, P)
     assert not any(status.docked for status in row.watch(bank, 0.14)), "not before the debounce is over"
     for status in row.watch(bank, 0.8):
-        assert status.docked and status.fresh and status.current_margin_ma == pytest.approx(30.0)
+        assert status.docked and status.fresh
         assert status.position_error_m < 1e-9 and status.spread_m < 1e-9
-        assert 0.15e9 <= status.current_since_ns < 0.3e9 and 0.75e9 <= status.position_since_ns < 0.9e9
 
 
 def test_either_condition_alone_is_no_dock(row: Row) -> None:
     row.gaps_m[0], row.currents_ma[1] = 0.02, 50.0
     apart, loose, docked = row.watch(PairBank(ROW, P), 1.0)
     assert apart.current and not apart.position and not apart.docked and apart.position_error_m == pytest.approx(0.02)
-    assert loose.position and not loose.current and not loose.docked and loose.current_margin_ma == pytest.approx(-20.0)
+    assert loose.position and not loose.current and not loose.docked
     assert docked.docked
 
 
@@ -92,7 +91,7 @@ def test_current_of_one_face_alone_does_not_count(row: Row) -> None:
         time_ns, modules = row.hear()
         modules[1].docks.clear()
         bank.step(time_ns, modules, ModulePoses(modules, TAGS))
-    assert not bank.status(0).current and math.isnan(bank.status(0).current_margin_ma)
+    assert not bank.status(0).current
 
 
 def test_dock_that_holds_is_lost_later_than_it_was_won(row: Row) -> None:

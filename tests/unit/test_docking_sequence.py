@@ -18,7 +18,7 @@ from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.docking import plan_dock
 
 TICK_NS = 10_000_000
-NEITHER = PairStatus(False, False, 0, 0, math.nan, math.nan, math.nan, False, True)
+NEITHER = PairStatus(False, False, math.nan, math.nan, False, True)
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
