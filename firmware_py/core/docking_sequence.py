@@ -58,24 +58,28 @@ class Row(NamedTuple):
 
     relay: int
     """Magnets of both faces."""
-    on_timeout: Stage
-    limit_s: str
+    limit_s: str = ""
     """Field of `Docking` that holds the longest time; empty: none."""
+    on_timeout: Stage = Stage.ABORTED
+    on_done: Stage = Stage.DOCKED
+    """What follows when it has done its work."""
 
 
 TABLE = {
-    Stage.PRE_APPROACH: Row(RELAY_OFF, Stage.ABORTED, "timeout_s"),
-    Stage.ALIGN: Row(RELAY_OFF, Stage.ABORTED, "timeout_s"),
-    Stage.APPROACH: Row(RELAY_PULL, Stage.RELEASE, "timeout_s"),
-    Stage.PUSH: Row(RELAY_PULL, Stage.RELEASE, "push_s"),
-    Stage.VERIFY: Row(RELAY_PULL, Stage.RELEASE, "push_s"),
-    Stage.DOCKED: Row(RELAY_PULL, Stage.DOCKED, ""),
-    Stage.RELEASE: Row(RELAY_PUSH, Stage.BACK_OFF, "release_s"),
-    Stage.BACK_OFF: Row(RELAY_OFF, Stage.ABORTED, "timeout_s"),
-    Stage.ABORTED: Row(RELAY_OFF, Stage.ABORTED, ""),
-    Stage.FAILED: Row(RELAY_OFF, Stage.FAILED, ""),
+    Stage.PRE_APPROACH: Row(RELAY_OFF, "timeout_s", on_done=Stage.ALIGN),
+    Stage.ALIGN: Row(RELAY_OFF, "timeout_s", on_done=Stage.APPROACH),
+    Stage.APPROACH: Row(RELAY_PULL, "timeout_s", Stage.RELEASE, on_done=Stage.PUSH),
+    Stage.PUSH: Row(RELAY_PULL, "push_s", Stage.RELEASE, on_done=Stage.VERIFY),
+    Stage.VERIFY: Row(RELAY_PULL, "push_s", Stage.RELEASE),
+    Stage.DOCKED: Row(RELAY_PULL),
+    Stage.RELEASE: Row(RELAY_PUSH, "release_s", Stage.BACK_OFF),
+    Stage.BACK_OFF: Row(RELAY_OFF, "timeout_s", on_done=Stage.ALIGN),
+    Stage.ABORTED: Row(RELAY_OFF),
+    Stage.FAILED: Row(RELAY_OFF),
 }
 ENDED = frozenset({Stage.DOCKED, Stage.ABORTED, Stage.FAILED})
+TURNED = frozenset({Stage.APPROACH, Stage.PUSH, Stage.VERIFY, Stage.ALIGN})
+"""Stages that use the small turn."""
 
 
 class DockPlan(NamedTuple):
@@ -217,7 +221,7 @@ class DockingSequence:
         if row.limit_s and time_ns - self._entered_ns > getattr(self._p, row.limit_s) * 1e9:
             self._time_out(time_ns, status)
         elif self._is_done(time_ns, errors, status):
-            self._enter(NEXT[self.stage], time_ns)
+            self._enter(row.on_done, time_ns)
 
     def _is_done(self, time_ns: int, errors: Errors, status: PairStatus) -> bool:
         p = self._p
@@ -243,7 +247,7 @@ class DockingSequence:
         return time_ns - self._good_since_ns >= seconds * 1e9
 
     def _time_out(self, time_ns: int, status: PairStatus) -> None:
-        if self.stage in (Stage.PUSH, Stage.VERIFY, Stage.APPROACH):
+        if TABLE[self.stage].on_timeout == Stage.RELEASE:
             only = "current alone" if status.current else "position alone" if status.position else "neither condition"
             self.reason = f"jam: {only} after {self.stage.name}"
             if self.tries >= self._p.tries:
@@ -274,7 +278,7 @@ class DockingSequence:
             return -float(np.clip(SLOWING_PER_S * self._gap_m, p.contact_speed_m_s, p.speed_m_s))
         if self.stage in (Stage.PUSH, Stage.VERIFY):
             return -p.contact_speed_m_s if self._gap_m > -p.push_m else 0.0
-        if self.stage in (Stage.BACK_OFF, Stage.ABORTED, Stage.FAILED, Stage.PRE_APPROACH, Stage.ALIGN):
+        if TABLE[self.stage].relay == RELAY_OFF:
             return RETREAT_M_S if self._gap_m < p.standoff_m else 0.0
         return 0.0
 
@@ -296,18 +300,6 @@ class DockingSequence:
         if self._turn == 0.0 or self.stage not in TURNED:
             return self.plan.q_ta
         return np.asarray(multiply(exp(self.plan.axis_t * self._turn), self.plan.q_ta))
-
-
-NEXT = {
-    Stage.PRE_APPROACH: Stage.ALIGN,
-    Stage.ALIGN: Stage.APPROACH,
-    Stage.APPROACH: Stage.PUSH,
-    Stage.PUSH: Stage.VERIFY,
-    Stage.BACK_OFF: Stage.ALIGN,
-}
-"""What follows a stage that has done its work."""
-TURNED = frozenset({Stage.APPROACH, Stage.PUSH, Stage.VERIFY, Stage.ALIGN})
-"""Stages that use the small turn."""
 
 
 def nearest_pass(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, standoff_m: float) -> int | None:
