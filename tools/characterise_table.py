@@ -260,7 +260,7 @@ def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> None:
             writer.writerow([*row.key, row.better, *shown])
 
 
-def write_json(path: Path, found: Mapping[str, Capability], extra: Mapping[str, object] | None = None) -> None:
+def write_json(path: Path, found: Mapping[str, Capability]) -> None:
     """All figures, units in their names."""
-    content = {"vehicles": {name: to_plain(c) for name, c in found.items()}, **(extra or {})}
+    content = {"vehicles": {name: to_plain(c) for name, c in found.items()}}
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -70,9 +70,9 @@ class Firmware:
         return outputs
 
 
-def vehicles_of(fleet: Fleet, folder: Path | None = None) -> dict[str, Vehicle]:
+def vehicles_of(fleet: Fleet) -> dict[str, Vehicle]:
     """The vehicles that a fleet names; each file is read once."""
-    return {name: load_vehicle(name, folder) for name in dict.fromkeys(m.vehicle for m in fleet.module)}
+    return {name: load_vehicle(name) for name in dict.fromkeys(m.vehicle for m in fleet.module)}
 
 
 def read_fleet(path: Path) -> Fleet:

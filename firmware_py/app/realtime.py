@@ -106,10 +106,7 @@ def _name_of(observer: Observer) -> str:
 
 
 def open_loop(
-    stack: ExitStack,
-    firmware: Firmware,
-    requests: Callable[[int, Outputs | None], Sequence[Request]],
-    observers: Sequence[Observer] = (),
+    stack: ExitStack, firmware: Firmware, requests: Callable[[int, Outputs | None], Sequence[Request]]
 ) -> RealTimeLoop:
     """A loop on the fleet's buses, whose ports are closed with `stack`. Raises PortError."""
     clock = MonotonicClock.started_now()
@@ -119,4 +116,4 @@ def open_loop(
     ]
     sleep = absolute_sleeper(clock)
     keeper = RateKeeper(firmware.fleet.period_ns, clock, lambda deadline_ns: sleep(deadline_ns + clock.origin_ns))
-    return RealTimeLoop(firmware, ports, clock, keeper, requests, observers)
+    return RealTimeLoop(firmware, ports, clock, keeper, requests)

@@ -16,9 +16,6 @@ from typing import Any, NamedTuple
 from pymavlink.dialects.v20 import all as shipped
 from pymavlink.generator import mavparse
 
-Value = float | str | tuple[float, ...]
-"""A number (int or float by its field), text of a char array, or an array."""
-
 _LETTERS = {
     "char": "s", "int8_t": "b", "uint8_t": "B", "uint8_t_mavlink_version": "B", "int16_t": "h", "uint16_t": "H",
     "int32_t": "i", "uint32_t": "I", "int64_t": "q", "uint64_t": "Q", "float": "f", "double": "d",

@@ -62,15 +62,15 @@ def assemble(
     return _body(placements, modules, pitch_m, cache, name or _name(placements))
 
 
-def assemble_vehicle(vehicle: Vehicle, module_index: int = 0, cache: DragCache | None = None) -> Body:
+def assemble_vehicle(vehicle: Vehicle, cache: DragCache | None = None) -> Body:
     """The body that one module is on its own."""
-    return assemble([(0, 0, 0)], [0], [vehicle], [module_index], cache=cache, name=vehicle.name)
+    return assemble([(0, 0, 0)], [0], [vehicle], cache=cache, name=vehicle.name)
 
 
-def assemble_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle], cache: DragCache | None = None) -> list[Body]:
+def assemble_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> list[Body]:
     """The bodies that the fleet starts as, in the order of their leaders; `vehicles` by the name in the fleet file."""
     check_fleet(fleet, vehicles)
-    return [assemble(*_described(fleet, members, vehicles), members, fleet.pitch_m, cache) for members in _groups(fleet)]
+    return [assemble(*_described(fleet, members, vehicles), members, fleet.pitch_m) for members in _groups(fleet)]
 
 
 def check_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> None:

@@ -14,18 +14,10 @@ from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS, Vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
-from firmware_py.prepare.drag_cache import DragCache
 from firmware_py.prepare.lattice import MATRICES, QUATERNIONS, nearest
 
 
-def plan_dock(
-    request: DockRequest,
-    active: Body,
-    target: Body,
-    vehicles: Sequence[Vehicle],
-    pitch_m: float = PITCH_M,
-    cache: DragCache | None = None,
-) -> DockPlan:
+def plan_dock(request: DockRequest, active: Body, target: Body, vehicles: Sequence[Vehicle], pitch_m: float = PITCH_M) -> DockPlan:
     """The plan of a dock.
 
     Args:
@@ -51,7 +43,6 @@ def plan_dock(
         [vehicles[m] for m in modules],
         modules,
         pitch_m,
-        cache,
     )
     return DockPlan(
         request=request,
@@ -67,7 +58,6 @@ def plan_undock(
     whole: Body,
     vehicles: Sequence[Vehicle],
     pitch_m: float = PITCH_M,
-    cache: DragCache | None = None,
     lost: Sequence[DockRequest] = (),
 ) -> UndockPlan:
     """The plan of parting at the joint between two modules of one body.
@@ -102,7 +92,6 @@ def plan_undock(
             [vehicles[m] for m in half],
             half,
             pitch_m,
-            cache,
         )
         for half in (stays, [m for m in whole.modules if m in piece])
     )

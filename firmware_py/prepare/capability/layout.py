@@ -188,9 +188,7 @@ def of_thrusters(name: str, thrusters: ThrusterSet, passive: tuple[int, ...] = (
     )
 
 
-def of_rows(
-    name: str, rows: np.ndarray, f_min: float, f_max: float, curve_of: Vehicle | None = None, assumption: str = ""
-) -> Layout:
+def of_rows(name: str, rows: np.ndarray, f_min: float, f_max: float, curve_of: Vehicle | None = None) -> Layout:
     """The layout of raw rows (n, 6): position about the centre of mass (m), direction of positive force.
 
     Args:
@@ -207,7 +205,7 @@ def of_rows(
     n = len(table)
     forward = np.tile(curve_of.curve.power_forward, (n, 1)) if curve_of else np.zeros((n, 0))
     reverse = np.tile(curve_of.curve.power_reverse, (n, 1)) if curve_of else np.zeros((n, 0))
-    return Layout(name, matrix, np.full(n, f_min), np.full(n, f_max), forward, reverse, (), assumption)
+    return Layout(name, matrix, np.full(n, f_min), np.full(n, f_max), forward, reverse, ())
 
 
 def _first(bad: np.ndarray) -> int:

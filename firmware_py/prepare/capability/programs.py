@@ -6,8 +6,6 @@ leaves the reachable wrenches, so a section's facets can be found one by one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from firmware_py.prepare.capability.layout import Layout
@@ -27,31 +25,18 @@ _MOST_ROUNDS = 100
 """Rounds of the search; six to ten are usual."""
 
 
-def reach_by_programs(
-    layout: Layout, wrenches: np.ndarray, progress: Callable[[int], None] | None = None
-) -> np.ndarray:
-    """(k,) largest factor of each of (k, 6) wrenches.
-
-    Args:
-        progress: called with the number of programs solved so far.
-
-    Raises:
-        RuntimeError: the solver gave up.
-    """
-    return solve(layout, wrenches, progress)[0]
+def reach_by_programs(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
+    """(k,) largest factor of each of (k, 6) wrenches. Raises RuntimeError where the solver gives up."""
+    return solve(layout, wrenches)[0]
 
 
-def solve(
-    layout: Layout, wrenches: np.ndarray, progress: Callable[[int], None] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def solve(layout: Layout, wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Factors (k,) and duals (k, 6): y . w = 1, and y . v <= factor for every reachable v."""
     wrenches = np.atleast_2d(np.asarray(wrenches, dtype=float))
     factor, dual = np.zeros(len(wrenches)), np.zeros(wrenches.shape)
     for begin in range(0, len(wrenches), _BATCH):
         part = slice(begin, begin + _BATCH)
         factor[part], dual[part] = _batch(layout, wrenches[part])
-        if progress:
-            progress(min(begin + _BATCH, len(wrenches)))
     return factor, dual
 
 
