@@ -19,7 +19,7 @@ RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
 """States of a docking relay, as DOCK_CMD has them."""
 MCU_ESTOP = 4
 """State of MCU_STATUS: an e-stop holds the module."""
-CRITICAL, WARNING, INFORMATION = 2, 4, 6
+CRITICAL, WARNING, NOTICE, INFORMATION = 2, 4, 5, 6
 """Severities of an `Event`, as syslog and STATUSTEXT have them."""
 NEVER_NS = 1 << 60
 """Age of the last tag before the first one."""

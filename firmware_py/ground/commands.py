@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from firmware_py.core.types import Action, DockRequest, Event, Mode
+from firmware_py.core.types import WARNING, Action, DockRequest, Event, Mode
 from firmware_py.ground.command import ACCEPTED, DENIED, FAILED, TEMPORARILY_REJECTED, UNSUPPORTED, Answer, Command
 from firmware_py.ground.dialect import Message
 from firmware_py.ground.identity import SETTABLE
@@ -27,7 +27,6 @@ SET_MODE, TERMINATE, REPOSITION, ARM = 176, 185, 192, 400
 DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
 """User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
 
-_WARNING = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +163,7 @@ class CommandService:
         if mode == Mode.AUTO:
             return self._start_mission(command, None)
         if mode == Mode.GUIDED and not self._steering.has_setpoint(command.arrival.time_ns):
-            self._system.say(_WARNING, "SET_MODE refused: set-points must stream before guided mode")
+            self._system.say(WARNING, "SET_MODE refused: set-points must stream before guided mode")
             return TEMPORARILY_REJECTED
         subject = self._system.subject
         subject.mode_number = number
@@ -178,7 +177,7 @@ class CommandService:
     def _start_mission(self, command: Command, first: int | None) -> Answer:
         reason = self._missions.start(first)
         if reason:
-            self._system.say(_WARNING, f"mission refused: {reason}")
+            self._system.say(WARNING, f"mission refused: {reason}")
             return TEMPORARILY_REJECTED
         return ACCEPTED
 
@@ -190,7 +189,7 @@ class CommandService:
     def _set_current(self, command: Command) -> Answer:
         reason = self._missions.jump(int(command.get(1)))
         if reason:
-            self._system.say(_WARNING, f"mission refused: {reason}")
+            self._system.say(WARNING, f"mission refused: {reason}")
             return DENIED
         return ACCEPTED
 
@@ -203,7 +202,7 @@ class CommandService:
             return DENIED
         reason = self._missions.go_to(latitude, longitude, altitude, command.parameters[3])
         if reason:
-            self._system.say(_WARNING, f"reposition refused: {reason}")
+            self._system.say(WARNING, f"reposition refused: {reason}")
             return TEMPORARILY_REJECTED
         return ACCEPTED
 
@@ -226,7 +225,7 @@ class CommandService:
         picture = self._system.subject.picture  # of the fleet: it is one process for all of them
         reason = "a body is armed" if picture.any_armed else "the e-stop is not cleared" if picture.any_stopped else ""
         if reason:
-            self._system.say(_WARNING, f"reboot refused: {reason}")
+            self._system.say(WARNING, f"reboot refused: {reason}")
             return DENIED
         self.reboot_asked = True
         return ACCEPTED

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.setpoint import Trajectory
-from firmware_py.core.types import Action, Event, Mode
+from firmware_py.core.types import INFORMATION, WARNING, Action, Event, Mode
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.mission_items import LOITER_UNLIMITED, Item, MissionError, beyond_fence, flight_order
 from firmware_py.ground.system import NS_PER_S, System
@@ -26,7 +26,6 @@ _SETTLE_TICKS = 3
 _HOLD_TICKS = 100
 """Ticks from asking for a hold until it must be there: those that were queued while the loop took the request count too."""
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
-_INFORMATION, _WARNING = 6, 4
 _GO_TO = -1
 """Sequence number of a leg that belongs to no mission."""
 
@@ -187,7 +186,7 @@ class MissionFlight:
         if plan.serial != self._serial or self._flight is None:
             return
         if plan.trajectory is None:
-            self._system.say(_WARNING, f"mission refused: {plan.reason}")
+            self._system.say(WARNING, f"mission refused: {plan.reason}")
             self._end(PAUSED)
             return
         self._flight.arrivals_s = plan.arrivals_s
@@ -220,7 +219,7 @@ class MissionFlight:
             return
         reason = self._against_waiting(flight)
         if reason:
-            self._system.say(_WARNING, f"flight ended before it began: {reason}")
+            self._system.say(WARNING, f"flight ended before it began: {reason}")
             self._end(PAUSED)
 
     def _against_waiting(self, flight: _Flight) -> str:
@@ -265,7 +264,7 @@ class MissionFlight:
         last = flight.legs[-1]
         if flight.reached == len(flight.legs) and t >= flight.arrivals_s[-1] + last.hold_s:
             if last.sequence != _GO_TO:
-                self._system.say(_INFORMATION, "mission complete")
+                self._system.say(INFORMATION, "mission complete")
             self._end(DONE)
 
     def _tell_again(self, time_ns: int) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from firmware_py.core.types import WARNING
 from firmware_py.ground.mission_flight import MissionFlight
 from firmware_py.ground.mission_items import CHANGE_SPEED, DELAY, JUMP, Item, item_of
 from firmware_py.ground.system import Arrival, Handler, System
@@ -15,7 +16,6 @@ MOST_ITEMS = 500
 _MISSION = 0
 _ACCEPTED, _ERROR, _UNSUPPORTED, _NO_SPACE, _INVALID_SEQUENCE, _DENIED, _CANCELLED = 0, 1, 3, 4, 13, 14, 15
 _ASK_AGAIN_NS, _MOST_ASKED = 250_000_000, 20
-_WARNING = 4
 
 
 @dataclass(slots=True)
@@ -64,7 +64,7 @@ class MissionService:
             return
         if upload.asked >= _MOST_ASKED:
             self._upload = None
-            self._system.say(_WARNING, "mission transfer broke off: the old mission stays")
+            self._system.say(WARNING, "mission transfer broke off: the old mission stays")
             self._acknowledge(upload.arrival, _CANCELLED, upload.kind)
         else:
             self._ask(upload, time_ns)
@@ -120,7 +120,7 @@ class MissionService:
             fault, why = self._flight.against(item)
         if fault:
             self._upload = None
-            self._system.say(_WARNING, f"mission refused: item {sequence}, {why}")
+            self._system.say(WARNING, f"mission refused: item {sequence}, {why}")
             self._acknowledge(arrival, fault, upload.kind)
             return
         upload.items.append(item)
@@ -173,7 +173,7 @@ class MissionService:
     def _set_current(self, arrival: Arrival) -> None:
         reason = self._flight.jump(arrival.message["seq"])
         if reason:
-            self._system.say(_WARNING, f"mission refused: {reason}")
+            self._system.say(WARNING, f"mission refused: {reason}")
 
     def _acknowledge(self, arrival: Arrival, result: int, kind: int) -> None:
         values = {"type": result, "mission_type": kind, **arrival.sender}

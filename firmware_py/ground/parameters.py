@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.core.types import Action
+from firmware_py.core.types import WARNING, Action
 from firmware_py.description.parameters import Parameters, registry
 from firmware_py.description.schema import DescriptionError, Limits
 from firmware_py.ground.files import write_atomically
@@ -23,7 +23,6 @@ REAL32 = 9
 _INTEGERS = {1: "<B", 2: "<b", 3: "<H", 4: "<h", 5: "<I", 6: "<i"}
 """MAV_PARAM_TYPE of integers that fit, and how their bytes lie in the float."""
 _SMALLEST_NORMAL = 1.1754944e-38
-_WARNING = 4
 _AT_ONCE = 5
 """Values sent in one tick when all are asked for: a radio's buffer is small."""
 
@@ -100,7 +99,7 @@ class ParameterService:
     def _set(self, arrival: Arrival) -> None:
         name = arrival.message["param_id"]
         if name not in self._store.names:
-            self._system.say(_WARNING, f"parameter {name} is unknown")
+            self._system.say(WARNING, f"parameter {name} is unknown")
             return
         value = wire_value(arrival.message["param_value"], arrival.message["param_type"])
         try:
@@ -109,7 +108,7 @@ class ParameterService:
             dotted, kept = self._store.set(name, value)
         except (DescriptionError, OSError) as error:
             stays = f"parameter {name} stays, it cannot be stored"
-            self._system.say(_WARNING, f"{stays}: {error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error))
+            self._system.say(WARNING, f"{stays}: {error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error))
             self._system.send(arrival.channel, "PARAM_VALUE", self._value(name))
             return
         for system in self._everybody():

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from firmware_py.core.types import NOTICE
 from firmware_py.ground.system import NS_PER_S, Arrival, System
 
-_NOTICE = 5
 Sender = tuple[int, int]
 """System id, component id."""
 
@@ -48,7 +48,7 @@ class Turn:
     def _say_who_has_it(self) -> None:
         assert self._sender is not None
         system, component = self._sender
-        self._system.say(_NOTICE, f"ground station {system}/{component} has the {self._has}")
+        self._system.say(NOTICE, f"ground station {system}/{component} has the {self._has}")
 
 
 class Pilots:

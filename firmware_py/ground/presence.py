@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from firmware_py.core.types import Action
+from firmware_py.core.types import INFORMATION, WARNING, Action
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.identity import NAMES, SETTABLE
@@ -14,7 +14,6 @@ from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
 TYPE_GROUND_STATION = 6
 Station = tuple[int, int, int]
 """System id, component id, MAV_TYPE."""
-_INFORMATION, _WARNING = 6, 4
 _NAK, _OPEN_TO_READ, _UNKNOWN_COMMAND, _FILE_NOT_FOUND = 129, 4, 7, 10
 """Codes of the file transfer protocol."""
 CAPABILITIES = 0x2 | 0x4 | 0x8 | 0x40 | 0x80 | 0x800 | 0x2000
@@ -53,7 +52,7 @@ class Presence:
         patience_ns = self._parameters().ground.watch_s * NS_PER_S
         if self.watched is None or arrival.time_ns - self._heard_ns > patience_ns:
             if self.watched != station:
-                self._system.say(_INFORMATION, f"ground station {m.system}/{m.component} is watched")
+                self._system.say(INFORMATION, f"ground station {m.system}/{m.component} is watched")
             self.watched = station
         if self.watched == station:
             self._heard_ns = arrival.time_ns
@@ -74,15 +73,15 @@ class Presence:
         """Only disarmed, and on a link that is trusted. It is never forwarded and never answered."""
         m = arrival.message
         if self._system.subject.picture.any_armed or not arrival.trusted:
-            self._system.say(_WARNING, "signing refused: only disarmed, and on a trusted link")
+            self._system.say(WARNING, "signing refused: only disarmed, and on a trusted link")
             return
         if self._signing.is_ahead(m["initial_timestamp"]):
-            self._system.say(_WARNING, "signing refused: its time stamp is more than a minute ahead of the clock here")
+            self._system.say(WARNING, "signing refused: its time stamp is more than a minute ahead of the clock here")
             return
         key = bytes(m["secret_key"])
         if len(key) == KEY_BYTES:
             self._signing.adopt(key, m["initial_timestamp"])
-            self._system.say(_INFORMATION, "signing key set" if any(key) else "signing is off")
+            self._system.say(INFORMATION, "signing key set" if any(key) else "signing is off")
 
     def _no_files(self, arrival: Arrival) -> None:
         """There is no file service: said at once, so that clients fall back to parameters without a time-out."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence, Set
 from pathlib import Path
 
 from firmware_py.core.body import Body
-from firmware_py.core.types import DockRequest, Inputs, Outputs, Request
+from firmware_py.core.types import WARNING, DockRequest, Inputs, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
@@ -203,7 +203,7 @@ class GroundStation:
     def say(self, text: str) -> None:
         """A warning to everybody."""
         for system in self.present()[:1]:
-            system.say(4, text)
+            system.say(WARNING, text)
 
     # ------------------------------------------------------------ routes
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from firmware_py.core.rotations import from_euler, multiply, normalise, rotate, to_euler
 from firmware_py.core.setpoint import leashed
-from firmware_py.core.types import Action, DockRequest, Mode, Setpoint, Sticks
+from firmware_py.core.types import NOTICE, WARNING, Action, DockRequest, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.dialect import Message
 from firmware_py.ground.pilots import Pilots, Sender, Turn, sender_of
@@ -30,7 +30,6 @@ _POSITION_BIT, _VELOCITY_BIT, _ACCELERATION_BIT, _NO_YAW, _NO_YAW_RATE = 0, 3, 6
 """The first of three bits, one for each axis that is left out; and POSITION_TARGET_TYPEMASK's last two."""
 _RC_IGNORED = 0xFFFF
 """A channel of RC_CHANNELS_OVERRIDE that stays as it is; 0 lets it go."""
-_WARNING, _NOTICE = 4, 5
 BUTTONS: tuple[str, ...] = (
     "hold", "manual", "stabilize", "depth", "disarm", "", "arm", "estop", "clear_estop", "dock", "undock", "surface",
 )  # fmt: skip
@@ -134,7 +133,7 @@ class Steering:
         if guided and self._setpoint_ns is not None and not self.has_setpoint(time_ns):
             self._setpoint_ns = None
             self._system.ask(Action.SET_MODE, Mode.POSHOLD)
-            self._system.say(_WARNING, "set-points stay away: holding the place")
+            self._system.say(WARNING, "set-points stay away: holding the place")
 
     # ------------------------------------------------------------ pilot
 
@@ -194,7 +193,7 @@ class Steering:
             self._system.ask(Action.SET_MODE, _BUTTON_MODES[name])
         elif name in ("dock", "undock"):
             if self._dock is None:
-                self._system.say(_NOTICE, f"{name} refused: no faces are configured for the button")
+                self._system.say(NOTICE, f"{name} refused: no faces are configured for the button")
             else:
                 self._system.ask(_BUTTON_ACTIONS[name], self._dock)
         elif name in _BUTTON_ACTIONS:

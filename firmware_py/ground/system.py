@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from firmware_py.core.types import Action, Request
+from firmware_py.core.types import WARNING, Action, Request
 from firmware_py.ground.dialect import Message
 from firmware_py.ground.outbox import Outbox, Rates
 from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS, Subject
@@ -16,7 +16,6 @@ _TEXT = 50
 """Characters of one STATUSTEXT."""
 _SELDOM_NS = 5 * NS_PER_S
 """Between two texts about what streams in."""
-_WARNING = 4
 _NEVER_WAITS = ("HEARTBEAT",)
 """Without it clients lose the vehicle."""
 STOPPING = frozenset({Action.ESTOP, Action.DISARM})
@@ -98,7 +97,7 @@ class System:
         self._refused_ns = time_ns
         own, leader = self.outbox.system, self.outbox.system - self.body + self.subject.leader
         why = f"docked, system {leader} leads it now" if leader != own else "no tick has told of its body"
-        self.say(_WARNING, f"system {own} is not steered: {why}")
+        self.say(WARNING, f"system {own} is not steered: {why}")
 
     def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
         """To one channel."""
