@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.core.docking_pairs import NEVER_NS, PAIR, PICTURES, Limits, place_modules, watch
+from firmware_py.core.docking_pairs import PAIR, PICTURES, Limits, place_modules, watch
 from firmware_py.core.rotations import to_matrix
-from firmware_py.core.types import FACES, ModuleInputs
+from firmware_py.core.types import FACES, NEVER_NS, ModuleInputs
 from firmware_py.description.parameters import Docking
 
 

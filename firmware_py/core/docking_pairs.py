@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.rotations import multiply, to_matrix
+from firmware_py.core.types import NEVER_NS
 
-NEVER_NS = -(1 << 60)
 PICTURES = 32
 """Relative positions kept of each pair: their mean tells a locked pair from one that jammed 4 mm short of it."""
 TURNED_TRACE = 1.0 + 2.0 * math.cos(math.radians(15.0))

@@ -89,7 +89,7 @@ class Estimator:
         self.retune(parameters)
         self._refused_in_row = 0
         self._rejected = 0
-        self._last_tag_ns, self._taken_ns = -NEVER_NS, 0
+        self._last_tag_ns, self._taken_ns = NEVER_NS, 0
         self._first_sight, self._felt_ns, self._depth_ns = FirstSight(), 0, 0
         self._nis = math.nan
         self._nis_dof = 0
@@ -197,12 +197,12 @@ class Estimator:
         place = np.r_[self._now[:2], depths.mean() if len(depths) else self._now[2]]
         self._start(BodyPose(time_ns, place, np.zeros(3), multiply(heading(self._now[3:7]), tilt), 1.0))
         self._anchor.covariance[2, 2] = INITIAL_SIGMA[-1] ** 2 if len(depths) else UNKNOWN_SIGMA[2] ** 2
-        self._accepted, self._last_tag_ns = READY_AFTER, -NEVER_NS
+        self._accepted, self._last_tag_ns = READY_AFTER, NEVER_NS
 
     @property
     def _has_north(self) -> bool:
         """Whether a tag has told the heading."""
-        return self._last_tag_ns != -NEVER_NS
+        return self._last_tag_ns != NEVER_NS
 
     @property
     def _is_adrift(self) -> bool:

@@ -16,12 +16,10 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults, by_channel
 from firmware_py.core.topology import in_both
-from firmware_py.core.types import MCU_ESTOP, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
+from firmware_py.core.types import MCU_ESTOP, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 
-NEVER_NS = -(1 << 60)
-"""When what never came did come."""
 NEVER_S = 1e9
 """Age of what never came."""
 MEAN_S = 1.0

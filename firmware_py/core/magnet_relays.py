@@ -9,7 +9,7 @@ from firmware_py.core.types import FACES, NEVER_NS, DockRequest
 
 PERIOD_NS = 100_000_000
 """DOCK_CMD goes out at 10 Hz, and at once when a relay changes."""
-AT_ONCE_NS = -NEVER_NS
+AT_ONCE_NS = NEVER_NS
 """When a module is due whose relays have changed."""
 
 

@@ -50,7 +50,7 @@ class TagOnlyEstimator:
         self._rate_b = np.zeros(3)
         self._accepted = 0
         self._rejected = self._refused_in_row = 0
-        self._last_tag_ns = -NEVER_NS
+        self._last_tag_ns = NEVER_NS
 
     def retune(self, parameters: Estimation) -> None:
         """Takes other noise figures from the next tick on."""

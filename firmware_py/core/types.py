@@ -21,8 +21,10 @@ MCU_ESTOP = 4
 """State of MCU_STATUS: an e-stop holds the module."""
 CRITICAL, WARNING, NOTICE, INFORMATION = 2, 4, 5, 6
 """Severities of an `Event`, as syslog and STATUSTEXT have them."""
-NEVER_NS = 1 << 60
-"""Age of the last tag before the first one."""
+NEVER_NS = -(1 << 60)
+"""Time of what has not come yet."""
+NEVER_AGE_NS = -NEVER_NS
+"""What is so old, or older, has not come yet."""
 
 
 # ---------------------------------------------------------------- what comes in
@@ -256,7 +258,7 @@ class Estimate(NamedTuple):
     @property
     def placed(self) -> bool:
         """Whether tags have told heading and place."""
-        return self.ready and self.tag_age_ns < NEVER_NS
+        return self.ready and self.tag_age_ns < NEVER_AGE_NS
 
 
 class Setpoint(NamedTuple):

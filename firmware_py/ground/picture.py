@@ -12,13 +12,12 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.estimator import ADRIFT_NS
 from firmware_py.core.transitions import ARMED, State
-from firmware_py.core.types import BodyRecord, Estimate, Event, Inputs, Mode, ModuleInputs, Outputs
+from firmware_py.core.types import NEVER_NS, BodyRecord, Estimate, Event, Inputs, Mode, ModuleInputs, Outputs
 from firmware_py.description.parameters import Supervision
 from firmware_py.ground.times import Times
 
 _THRUSTERS = 8
 _MOST_EVENTS = 64
-NEVER_NS = -(2**62)
 
 
 @dataclass(slots=True)

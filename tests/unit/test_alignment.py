@@ -10,7 +10,7 @@ from firmware_py.core.alignment import FirstSight, upright
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.estimator import READY_AFTER, RESET_AFTER, Estimator
 from firmware_py.core.rotations import difference, exp, from_euler, heading, multiply
-from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
+from firmware_py.core.types import NEVER_AGE_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
@@ -161,7 +161,7 @@ def test_robot_without_a_tag_stands_upright_after_a_second() -> None:
     robot = Robot()
     assert not robot.rest(100).ready
     estimate = robot.rest(1)
-    assert estimate.ready and not estimate.placed and estimate.tag_age_ns >= NEVER_NS
+    assert estimate.ready and not estimate.placed and estimate.tag_age_ns >= NEVER_AGE_NS
     estimate = robot.rest(1000)
     level = multiply(heading(estimate.q_wb), from_euler(0.2, -0.4, 0.0))
     np.testing.assert_allclose(difference(estimate.q_wb, level), 0.0, atol=2e-3)

@@ -12,7 +12,7 @@ from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.estimator import READY_AFTER, RESET_AFTER, Estimator
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
-from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
+from firmware_py.core.types import NEVER_AGE_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
@@ -92,7 +92,7 @@ def test_robot_that_saw_no_tag_knows_nothing_for_a_second(body: Body) -> None:
         estimate = robot.step(sensors())
     assert not estimate.ready
     assert estimate.sigma_p.min() > 100.0
-    assert estimate.tag_age_ns >= NEVER_NS
+    assert estimate.tag_age_ns >= NEVER_AGE_NS
     assert math.isnan(estimate.nis)
 
 

@@ -12,7 +12,7 @@ from pymavlink.generator import mavgen
 from firmware_py.app.deadlines import times_of
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.rotations import rotate
-from firmware_py.core.types import NEVER_NS, Action
+from firmware_py.core.types import NEVER_AGE_NS, Action
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.ground.dialect import load_dialect
@@ -130,7 +130,7 @@ def test_system_status_tells_of_health_and_of_readiness_to_arm(world: World, cli
 
 
 def test_robot_that_no_camera_has_seen_knows_its_attitude_and_depth_and_no_heading(world: World, client: Client) -> None:
-    world.robot.tag_age_ns = NEVER_NS
+    world.robot.tag_age_ns = NEVER_AGE_NS
     world.run(200)
     health = client.last("SYS_STATUS").onboard_control_sensors_health
     assert health & mavlink.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION and health & mavlink.MAV_SYS_STATUS_SENSOR_Z_ALTITUDE_CONTROL

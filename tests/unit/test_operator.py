@@ -8,7 +8,7 @@ import pytest
 
 from firmware_py.app.vehicle import ARM_EVERY_S, FAREWELL_TICKS, REARM_S, Operator, with_ground
 from firmware_py.core.transitions import State
-from firmware_py.core.types import NEVER_NS, Action, BodyRecord, Mode, Outputs, Request
+from firmware_py.core.types import NEVER_AGE_NS, Action, BodyRecord, Mode, Outputs, Request
 from tests.unit.ground_world import Robot
 
 RATE_HZ = 100
@@ -204,7 +204,7 @@ def test_order_to_hold_stays_without_limit() -> None:
     flight = Flight()
     flight.robot.ready = False
     flight.run(2 * MINUTE)
-    flight.robot.ready, flight.robot.tag_age_ns = True, NEVER_NS
+    flight.robot.ready, flight.robot.tag_age_ns = True, NEVER_AGE_NS
     flight.run(MINUTE)
     assert flight.arms == [], "it stands upright, and does not know where"
     flight.robot.tag_age_ns = 0

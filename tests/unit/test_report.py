@@ -14,7 +14,7 @@ import pytest
 from matplotlib import pyplot
 from rich.console import Console
 
-from firmware_py.core.types import NEVER_NS
+from firmware_py.core.types import NEVER_AGE_NS
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED, Limit, Result, judge
 from hil.console import flight_progress, print_result
@@ -163,7 +163,7 @@ def test_report_of_a_dock_has_its_outcome_as_headline_and_no_rmse_that_nobody_as
 
 def test_what_the_firmware_believes_before_it_knows_its_pose_is_no_error(flight: Flight) -> None:
     ticks = np.arange(len(flight.firmware["tick"]))
-    unknown = {"ready": ticks >= 30, "tag_age_ns": np.where(ticks < 50, NEVER_NS, 0)}  # upright by gravity, then placed by tags
+    unknown = {"ready": ticks >= 30, "tag_age_ns": np.where(ticks < 50, NEVER_AGE_NS, 0)}  # upright by gravity, then placed by tags
     nowhere = {name: np.where(ticks[:, None] < 50, 0.0, flight.firmware[name]) for name in ("p_wb", "setpoint_p_wb")}
     lost = {"ready": unknown["ready"] & (ticks != 700)}
     late = dataclasses.replace(flight, firmware=flight.firmware | unknown | nowhere | lost)
