@@ -150,19 +150,11 @@ def run_vehicle(
         boot = boot_id()
         before = last_flight(out, fleet, firmware.codec, unix_ns(), boot) if out is not None else LastFlight()
         operator = Operator(fleet.rate_hz, to_arm(before, firmware, hold, teller.say), math.inf if hold else REARM_S, teller.say)
-        observers: list[Observer] = []
+        if hold and out is None:
+            teller.say(FORGETFUL)
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
         recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
-        if recorder is not None:
-            observers.append(recording(recorder, fleet.rate_hz))
-        if out is not None:
-            note = EstopNote(out)
-            stack.callback(note.close)
-            observers.append(noting_estop(note, before.stopped, recorder))
-        elif hold:
-            teller.say(FORGETFUL)
-        if live is not None:
-            observers.append(live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies))
+        observers = list(_keeping(stack, firmware, recorder, out, live, before.stopped))
         told: list[Observer] = [telling(teller.say)]  # after all others, which may have something to say
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
         side: GroundSide | None = None
@@ -190,6 +182,21 @@ def run_vehicle(
         if recorder is not None and loop.last is not None:
             recorder.record_times(loop.last.tick, loop.last.time_ns, loop.rate_keeper)
         return summary_of(loop)
+
+
+def _keeping(
+    stack: ExitStack, firmware: Firmware, recorder: Recorder | None, out: Path | None, live: LiveView | None, stopped: bool
+) -> Iterator[Observer]:
+    """Who keeps each tick: the log, the note of an e-stop (`stopped`: one stands from before), the viewers."""
+    fleet = firmware.fleet
+    if recorder is not None:
+        yield recording(recorder, fleet.rate_hz)
+    if out is not None:
+        note = EstopNote(out)
+        stack.callback(note.close)
+        yield noting_estop(note, stopped, recorder)
+    if live is not None:
+        yield live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies)
 
 
 def _open_recorder(
