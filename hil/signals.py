@@ -324,12 +324,9 @@ def _tell_of_same_body(firmware: Columns, truth: Columns, thrusters: int) -> Non
         if not len(known):
             continue
         then = known[np.maximum(np.searchsorted(known, unknown) - 1, 0)]
-        hull_then, hull = _rotation(truth["q_wm"][then]), _rotation(truth["q_wm"][unknown])
+        attitudes = (truth["q_wm"][then], truth["q_wm"][unknown], truth["q_wb"][then])
+        hull_then, hull, body_then = (Rotation.from_quat(q, scalar_first=True) for q in attitudes)
         lever_m = hull_then.inv().apply(truth["p_wb"][then] - truth["p_wm"][then])
-        body = hull * hull_then.inv() * _rotation(truth["q_wb"][then])
+        body = hull * hull_then.inv() * body_then
         truth["p_wb"][unknown] = truth["p_wm"][unknown] + hull.apply(lever_m)
-        truth["q_wb"][unknown] = np.roll(body.as_quat(), 1, axis=1)
-
-
-def _rotation(q: np.ndarray) -> Rotation:
-    return Rotation.from_quat(np.roll(q, -1, axis=1))  # scipy's scalar is the last
+        truth["q_wb"][unknown] = body.as_quat(scalar_first=True)
