@@ -61,7 +61,7 @@ class Row(NamedTuple):
     limit_s: str = ""
     """Field of `Docking` that holds the longest time; empty: none."""
     on_timeout: Stage = Stage.ABORTED
-    on_done: Stage = Stage.DOCKED
+    on_done: Stage = Stage.ABORTED
     """What follows when it has done its work."""
 
 

@@ -28,7 +28,6 @@ DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
 """User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
 
 
-
 @dataclass(frozen=True, slots=True)
 class Pending:
     """A command that the supervisor decides on."""
