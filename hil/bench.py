@@ -29,7 +29,7 @@ from hil.mode_script import ModeScript
 from hil.nodes import Nodes, make_nodes
 from hil.scenario import Scenario, make_world
 from hil.script import Script
-from hil.signals import TruthRecorder
+from hil.truth_log import TruthRecorder
 
 DEFAULT_BUS = "virtual:modcube"
 LOOK_S = 0.005

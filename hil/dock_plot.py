@@ -9,7 +9,8 @@ import numpy as np
 
 from firmware_py.description.signals import Columns, read_signals
 from hil.plots import STYLE
-from hil.signals import SIGNAL_LOG, TRUTH_LOG
+from hil.signals import SIGNAL_LOG
+from hil.truth_log import TRUTH_LOG
 
 THRESHOLD_MA = 70.0
 """The paper's; what a flight used may differ."""

@@ -14,7 +14,8 @@ from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS
 from hil.dock_plot import STAGES
 from hil.metrics import OUTCOMES
 from hil.scenario import Scenario, Step
-from hil.signals import SIGNAL_LOG, TRUTH_LOG
+from hil.signals import SIGNAL_LOG
+from hil.truth_log import TRUTH_LOG
 
 DOCKED, JAMMED, UNSTABLE, REFUSED, GAVE_UP = range(len(OUTCOMES))
 DECLARED = STAGES.index("docked")

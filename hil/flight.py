@@ -32,7 +32,8 @@ from hil.replaceable import check_replaceable, is_json_with, made
 from hil.report import REPORT_FILE, Scene, write_report
 from hil.scenario import Scenario
 from hil.script import Script
-from hil.signals import SIGNAL_LOG, TRUTH_LOG, Flight, is_truth_log, period_of, read_flight
+from hil.signals import SIGNAL_LOG, Flight, period_of, read_flight
+from hil.truth_log import TRUTH_LOG, is_truth_log
 
 LEFT_BEHIND = (RESULT_FILE, REPORT_FILE, DOCK_PLOT, *(f"{name}.png" for name in PLOTS))
 """What an earlier flight may have left in a folder, beside the logs, which are written anew."""

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from firmware_py.description.signals import Columns, read_signals
-from hil.signals import SIGNAL_LOG, TRUTH_LOG
+from hil.signals import SIGNAL_LOG
+from hil.truth_log import TRUTH_LOG
 
 if TYPE_CHECKING:
     from hil.scenario import Scenario

@@ -18,7 +18,7 @@ from hil.faults import Faults
 from hil.nodes import Nodes, make_nodes
 from hil.replaceable import check_replaceable, made
 from hil.scenario import Scenario, make_world
-from hil.signals import TRUTH_LOG, TruthRecorder, is_truth_log
+from hil.truth_log import TRUTH_LOG, TruthRecorder, is_truth_log
 
 CHUNK_NS = 2_500_000
 """The world moves in steps of this; what an MCU samples is at most so old."""

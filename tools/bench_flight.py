@@ -27,7 +27,7 @@ from firmware_py.runtime.recorder import Recorder
 from hil.bench import fleet_of, fly_scenario
 from hil.nodes import Nodes
 from hil.scenario import Scenario, load_scenario
-from hil.signals import TruthRecorder
+from hil.truth_log import TruthRecorder
 
 LINE = 8
 """Numbers of 8 bytes in a line of the cache."""

@@ -55,7 +55,8 @@ class LastFlight(NamedTuple):
     pulling: frozenset[Face] = frozenset()
     """Every magnet that pulled."""
     let_go: frozenset[Face] = frozenset()
-    """Every magnet that did not; and those of joints that were open before that process, which nobody flew as one."""
+    """Every magnet whose last command was not to pull; and the faces of joints that were open when that process started, of modules that it
+    did not fly."""
     stopped: bool = False
     """An e-stop stood at the end, of that process or of one before: since then nobody cleared it, and nobody armed. It grows not old."""
 

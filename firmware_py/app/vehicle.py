@@ -69,7 +69,8 @@ class Operator:
 
     rate_hz: int
     to_arm: set[int] = field(default_factory=set)
-    """Fleet indices of modules that are still to be armed. A body goes by its leader; who was armed once, by whomever, leaves."""
+    """Fleet indices of modules that are still to be armed. A body is armed where its leader is among them; a module leaves as soon as
+    anybody has armed it."""
     limit_s: float = math.inf
     """How long, by the loop's ticks, `to_arm` is meant."""
     say: Callable[[str], None] = write_line

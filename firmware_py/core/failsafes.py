@@ -107,7 +107,7 @@ class Watch:
         self._since_ns: int | None = None
         self._gone_ns: int | None = None
         self._told_ns: int | None = None
-        """`_since_ns` when it was last reported: a cause that comes back is another one."""
+        """`_since_ns` at the last report. A cause that went and came back has another one, and is reported again."""
         self.active, self.level = False, Level.NONE
         self.began = ""
         """Its words when it last began."""

@@ -33,8 +33,8 @@ GUST_M_S, GUST_LEVER_M = 0.0135, 0.03
 """Change of the water's speed within seconds that counts as noise: what it does to the drag of a body under way, and how far beside the
 centre that acts. Of a module that is the 0.15 N measured above, of a BlueROV2 Heavy 0.7 N."""
 DRIFT_M_S = 0.04
-"""Speed of the water, which a body under way meets from another side within seconds: its drag differs by as much as it rises over that.
-It does so at the middle, so that moments tell more of a body under way than forces."""
+"""Speed that the water is assumed to have. A body that turns or reverses meets it from another side within seconds, so its drag may be off
+by this times the slope of the drag. That acts at the body's middle and makes no moment, so moments are trusted more under way."""
 MODEL_SHARE = 0.12
 """What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too. Of the Coriolis wrench it is this
 share and that by which the water's drift changes the speed."""

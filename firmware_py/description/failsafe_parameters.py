@@ -6,12 +6,27 @@ Part of `parameters`. core.failsafes holds the table that goes with them: what i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from firmware_py.description.schema import quantity
 
-DELAY = "how long before it acts"
 ACTION = "0 none, 1 warn, 2 hold place, 3 hold depth and attitude, 4 surface, 5 disarm"
 LATCHED = "1: ends by disarming only, 0: also when its cause is gone for clear_s"
+
+
+def delay(default_s: float, mavlink: str) -> Any:
+    """A field: how long the cause must last."""
+    return quantity(default_s, unit="s", low=0, high=600, help="how long before it acts", mavlink=mavlink)
+
+
+def action(default: int, mavlink: str) -> Any:
+    """A field: what is then done."""
+    return quantity(default, low=0, high=5, help=ACTION, mavlink=mavlink)
+
+
+def latched(default: int, mavlink: str) -> Any:
+    """A field: whether it stays until the body is disarmed."""
+    return quantity(default, low=0, high=1, help=LATCHED, mavlink=mavlink)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,154 +34,154 @@ class Failsafes:
     """One block per fail-safe, gravest first, in the order of core.failsafes."""
 
     # water in a cabin
-    leak_delay_s: float = quantity(0.5, unit="s", low=0, high=600, help=DELAY, mavlink="FS_LEAK_S")
-    leak_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_LEAK_ACT")
-    leak_latched: int = quantity(1, low=0, high=1, help=LATCHED, mavlink="FS_LEAK_LAT")
+    leak_delay_s: float = delay(0.5, "FS_LEAK_S")
+    leak_action: int = action(4, "FS_LEAK_ACT")
+    leak_latched: int = latched(1, "FS_LEAK_LAT")
     # every module silent: the bus is off, thrusters stand still by themselves
     bus_silent_limit: float = quantity(
         2.0, unit="s", low=0.1, high=60, help="no module was heard for longer", mavlink="FS_BUS_LIM"
     )
-    bus_silent_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_BUS_S")
-    bus_silent_action: int = quantity(5, low=0, high=5, help=ACTION, mavlink="FS_BUS_ACT")
-    bus_silent_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_BUS_LAT")
+    bus_silent_delay_s: float = delay(0.0, "FS_BUS_S")
+    bus_silent_action: int = action(5, "FS_BUS_ACT")
+    bus_silent_latched: int = latched(0, "FS_BUS_LAT")
     # somebody else sends SYNC
-    foreign_sync_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_SYNC_S")
-    foreign_sync_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_SYNC_ACT")
-    foreign_sync_latched: int = quantity(1, low=0, high=1, help=LATCHED, mavlink="FS_SYNC_LAT")
+    foreign_sync_delay_s: float = delay(0.0, "FS_SYNC_S")
+    foreign_sync_action: int = action(4, "FS_SYNC_ACT")
+    foreign_sync_latched: int = latched(1, "FS_SYNC_LAT")
     # somebody else sends THRUSTER_CMD or DOCK_CMD
-    foreign_command_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_CMD_S")
-    foreign_command_action: int = quantity(1, low=0, high=5, help=ACTION, mavlink="FS_CMD_ACT")
-    foreign_command_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_CMD_LAT")
+    foreign_command_delay_s: float = delay(0.0, "FS_CMD_S")
+    foreign_command_action: int = action(1, "FS_CMD_ACT")
+    foreign_command_latched: int = latched(0, "FS_CMD_LAT")
     # battery nearly empty
     battery_critical_limit: float = quantity(
         0.8, low=0.3, high=1.2, help="voltage below this share of the nominal one", mavlink="FS_BATC_LIM"
     )
-    battery_critical_delay_s: float = quantity(5.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_BATC_S")
-    battery_critical_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_BATC_ACT")
-    battery_critical_latched: int = quantity(1, low=0, high=1, help=LATCHED, mavlink="FS_BATC_LAT")
+    battery_critical_delay_s: float = delay(5.0, "FS_BATC_S")
+    battery_critical_action: int = action(4, "FS_BATC_ACT")
+    battery_critical_latched: int = latched(1, "FS_BATC_LAT")
     # electronics too hot
     cabin_hot_limit: float = quantity(
         70.0, unit="degC", low=0, high=150, help="cabin temperature above this", mavlink="FS_HOT_LIM"
     )
-    cabin_hot_delay_s: float = quantity(5.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_HOT_S")
-    cabin_hot_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_HOT_ACT")
-    cabin_hot_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_HOT_LAT")
+    cabin_hot_delay_s: float = delay(5.0, "FS_HOT_S")
+    cabin_hot_action: int = action(4, "FS_HOT_ACT")
+    cabin_hot_latched: int = latched(0, "FS_HOT_LAT")
     # hull gives way
     cabin_pressure_limit: float = quantity(
         20000.0, unit="Pa", low=100, high=200000, help="cabin pressure off its first reading by more", mavlink="FS_CABP_LIM"
     )
-    cabin_pressure_delay_s: float = quantity(2.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_CABP_S")
-    cabin_pressure_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_CABP_ACT")
-    cabin_pressure_latched: int = quantity(1, low=0, high=1, help=LATCHED, mavlink="FS_CABP_LAT")
+    cabin_pressure_delay_s: float = delay(2.0, "FS_CABP_S")
+    cabin_pressure_action: int = action(4, "FS_CABP_ACT")
+    cabin_pressure_latched: int = latched(1, "FS_CABP_LAT")
     # the thrusters left cannot make every wrench
-    axis_lost_delay_s: float = quantity(3.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_AXIS_S")
-    axis_lost_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_AXIS_ACT")
-    axis_lost_latched: int = quantity(1, low=0, high=1, help=LATCHED, mavlink="FS_AXIS_LAT")
+    axis_lost_delay_s: float = delay(3.0, "FS_AXIS_S")
+    axis_lost_action: int = action(4, "FS_AXIS_ACT")
+    axis_lost_latched: int = latched(1, "FS_AXIS_LAT")
     # depth unknown
     depth_unknown_limit: float = quantity(
         5.0, unit="s", low=0.1, high=600, help="neither pressure nor tag for longer", mavlink="FS_DEPU_LIM"
     )
-    depth_unknown_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_DEPU_S")
-    depth_unknown_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_DEPU_ACT")
-    depth_unknown_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_DEPU_LAT")
+    depth_unknown_delay_s: float = delay(0.0, "FS_DEPU_S")
+    depth_unknown_action: int = action(4, "FS_DEPU_ACT")
+    depth_unknown_latched: int = latched(0, "FS_DEPU_LAT")
     # tags do not come back: what a fail-safe makes hold its depth comes up, 30 s after the last tag, or 22 s after a pilot is gone who flew
     # without any
     tag_gone_limit: float = quantity(
         8.0, unit="s", low=0.1, high=3600, help="no tag for longer", mavlink="FS_TAGG_LIM"
     )
-    tag_gone_delay_s: float = quantity(22.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_TAGG_S")
-    tag_gone_action: int = quantity(4, low=0, high=5, help=ACTION, mavlink="FS_TAGG_ACT")
-    tag_gone_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_TAGG_LAT")
+    tag_gone_delay_s: float = delay(22.0, "FS_TAGG_S")
+    tag_gone_action: int = action(4, "FS_TAGG_ACT")
+    tag_gone_latched: int = latched(0, "FS_TAGG_LAT")
     # a docked partner is lost
-    partner_lost_delay_s: float = quantity(0.4, unit="s", low=0, high=600, help=DELAY, mavlink="FS_PART_S")
+    partner_lost_delay_s: float = delay(0.4, "FS_PART_S")
     partner_lost_action: int = quantity(
         2, low=0, high=5, help=f"{ACTION}; with 0 a body that has come apart is flown on as one", mavlink="FS_PART_ACT"
     )
-    partner_lost_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_PART_LAT")
+    partner_lost_latched: int = latched(0, "FS_PART_LAT")
     # sensors and model disagree
     estimator_limit: float = quantity(
         5.0, low=1.5, high=100, help="innovations over their expectation, mean of a second", mavlink="FS_EST_LIM"
     )
-    estimator_delay_s: float = quantity(2.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_EST_S")
-    estimator_action: int = quantity(3, low=0, high=5, help=ACTION, mavlink="FS_EST_ACT")
-    estimator_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_EST_LAT")
+    estimator_delay_s: float = delay(2.0, "FS_EST_S")
+    estimator_action: int = action(3, "FS_EST_ACT")
+    estimator_latched: int = latched(0, "FS_EST_LAT")
     # tags are refused
     rejected_limit: float = quantity(
         0.8, low=0.05, high=1, help="share of tags refused by the gate, mean of a second", mavlink="FS_REJ_LIM"
     )
-    rejected_delay_s: float = quantity(2.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_REJ_S")
-    rejected_action: int = quantity(3, low=0, high=5, help=ACTION, mavlink="FS_REJ_ACT")
-    rejected_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_REJ_LAT")
+    rejected_delay_s: float = delay(2.0, "FS_REJ_S")
+    rejected_action: int = action(3, "FS_REJ_ACT")
+    rejected_latched: int = latched(0, "FS_REJ_LAT")
     # position unknown
     tag_lost_limit: float = quantity(8.0, unit="s", low=0.1, high=600, help="no tag for longer", mavlink="FS_TAGL_LIM")
-    tag_lost_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_TAGL_S")
-    tag_lost_action: int = quantity(3, low=0, high=5, help=ACTION, mavlink="FS_TAGL_ACT")
-    tag_lost_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_TAGL_LAT")
+    tag_lost_delay_s: float = delay(0.0, "FS_TAGL_S")
+    tag_lost_action: int = action(3, "FS_TAGL_ACT")
+    tag_lost_latched: int = latched(0, "FS_TAGL_LAT")
     # position uncertain
     tag_late_limit: float = quantity(
         1.0, unit="s", low=0.05, high=60, help="no tag for longer while on the move", mavlink="FS_TAGM_LIM"
     )
-    tag_late_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_TAGM_S")
-    tag_late_action: int = quantity(2, low=0, high=5, help=ACTION, mavlink="FS_TAGM_ACT")
-    tag_late_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_TAGM_LAT")
+    tag_late_delay_s: float = delay(0.0, "FS_TAGM_S")
+    tag_late_action: int = action(2, "FS_TAGM_ACT")
+    tag_late_latched: int = latched(0, "FS_TAGM_LAT")
     # pressure sensor lost
     depth_lost_limit: float = quantity(
         1.0, unit="s", low=0.1, high=60, help="no pressure for longer", mavlink="FS_DEPL_LIM"
     )
-    depth_lost_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_DEPL_S")
-    depth_lost_action: int = quantity(1, low=0, high=5, help=ACTION, mavlink="FS_DEPL_ACT")
-    depth_lost_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_DEPL_LAT")
+    depth_lost_delay_s: float = delay(0.0, "FS_DEPL_S")
+    depth_lost_action: int = action(1, "FS_DEPL_ACT")
+    depth_lost_latched: int = latched(0, "FS_DEPL_LAT")
     # the IMU is silent, at fault or frozen
     imu_lost_limit: float = quantity(
         0.5, unit="s", low=0.1, high=60, help="no IMU of the body gave a sample to believe for longer", mavlink="FS_IMU_LIM"
     )
-    imu_lost_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_IMU_S")
-    imu_lost_action: int = quantity(2, low=0, high=5, help=ACTION, mavlink="FS_IMU_ACT")
-    imu_lost_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_IMU_LAT")
+    imu_lost_delay_s: float = delay(0.0, "FS_IMU_S")
+    imu_lost_action: int = action(2, "FS_IMU_ACT")
+    imu_lost_latched: int = latched(0, "FS_IMU_LAT")
     # a CAN node is silent
     module_silent_limit: float = quantity(
         0.5, unit="s", low=0.1, high=60, help="a module was not heard for longer", mavlink="FS_MOD_LIM"
     )
-    module_silent_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_MOD_S")
-    module_silent_action: int = quantity(2, low=0, high=5, help=ACTION, mavlink="FS_MOD_ACT")
-    module_silent_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_MOD_LAT")
+    module_silent_delay_s: float = delay(0.0, "FS_MOD_S")
+    module_silent_action: int = action(2, "FS_MOD_ACT")
+    module_silent_latched: int = latched(0, "FS_MOD_LAT")
     # the controller is late
     ticks_missed_limit: float = quantity(
         5.0, unit="1/s", low=1, high=400, help="ticks missed in a second", mavlink="FS_TICK_LIM"
     )
-    ticks_missed_delay_s: float = quantity(0.5, unit="s", low=0, high=600, help=DELAY, mavlink="FS_TICK_S")
-    ticks_missed_action: int = quantity(2, low=0, high=5, help=ACTION, mavlink="FS_TICK_ACT")
-    ticks_missed_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_TICK_LAT")
+    ticks_missed_delay_s: float = delay(0.5, "FS_TICK_S")
+    ticks_missed_action: int = action(2, "FS_TICK_ACT")
+    ticks_missed_latched: int = latched(0, "FS_TICK_LAT")
     # outside the fence
     fence_limit: float = quantity(0.0, unit="m", low=0, high=10, help="beyond the fence by more", mavlink="FS_FENC_LIM")
-    fence_delay_s: float = quantity(0.2, unit="s", low=0, high=600, help=DELAY, mavlink="FS_FENC_S")
-    fence_action: int = quantity(2, low=0, high=5, help=ACTION, mavlink="FS_FENC_ACT")
-    fence_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_FENC_LAT")
+    fence_delay_s: float = delay(0.2, "FS_FENC_S")
+    fence_action: int = action(2, "FS_FENC_ACT")
+    fence_latched: int = latched(0, "FS_FENC_LAT")
     # ground station lost
     ground_lost_limit: float = quantity(
         5.0, unit="s", low=0.5, high=600, help="ground station silent for longer", mavlink="FS_GCS_LIM"
     )
-    ground_lost_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_GCS_S")
-    ground_lost_action: int = quantity(2, low=0, high=5, help=ACTION, mavlink="FS_GCS_ACT")
-    ground_lost_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_GCS_LAT")
+    ground_lost_delay_s: float = delay(0.0, "FS_GCS_S")
+    ground_lost_action: int = action(2, "FS_GCS_ACT")
+    ground_lost_latched: int = latched(0, "FS_GCS_LAT")
     # pilot input lost
     pilot_lost_limit: float = quantity(
         1.0, unit="s", low=0.1, high=60, help="no stick input for longer", mavlink="FS_RC_LIM"
     )
-    pilot_lost_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_RC_S")
-    pilot_lost_action: int = quantity(2, low=0, high=5, help=ACTION, mavlink="FS_RC_ACT")
-    pilot_lost_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_RC_LAT")
+    pilot_lost_delay_s: float = delay(0.0, "FS_RC_S")
+    pilot_lost_action: int = action(2, "FS_RC_ACT")
+    pilot_lost_latched: int = latched(0, "FS_RC_LAT")
     # a thruster is dead or lies
-    thruster_lost_delay_s: float = quantity(0.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_THR_S")
-    thruster_lost_action: int = quantity(1, low=0, high=5, help=ACTION, mavlink="FS_THR_ACT")
-    thruster_lost_latched: int = quantity(1, low=0, high=1, help=LATCHED, mavlink="FS_THR_LAT")
+    thruster_lost_delay_s: float = delay(0.0, "FS_THR_S")
+    thruster_lost_action: int = action(1, "FS_THR_ACT")
+    thruster_lost_latched: int = latched(1, "FS_THR_LAT")
     # battery low
     battery_low_limit: float = quantity(
         0.875, low=0.3, high=1.2, help="voltage below this share of the nominal one", mavlink="FS_BATL_LIM"
     )
-    battery_low_delay_s: float = quantity(5.0, unit="s", low=0, high=600, help=DELAY, mavlink="FS_BATL_S")
-    battery_low_action: int = quantity(1, low=0, high=5, help=ACTION, mavlink="FS_BATL_ACT")
-    battery_low_latched: int = quantity(0, low=0, high=1, help=LATCHED, mavlink="FS_BATL_LAT")
+    battery_low_delay_s: float = delay(5.0, "FS_BATL_S")
+    battery_low_action: int = action(1, "FS_BATL_ACT")
+    battery_low_latched: int = latched(0, "FS_BATL_LAT")
 
     clear_s: float = quantity(
         2.0, unit="s", low=0, high=60, help="so long a cause must be gone until the fail-safe ends", mavlink="FS_CLEAR_S"

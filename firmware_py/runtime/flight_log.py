@@ -100,8 +100,8 @@ class FlightLog:
 
         The last tick of a can.log that ends too early is left out: frames that it sent may be missing.
         """
-        groups, thoughts = self._frames(), self._thoughts()
-        for logged in thoughts:
+        groups, ticks = self._frames(), self._signal_ticks()
+        for logged in ticks:
             group = next(groups, None)
             if group is None:
                 self.torn = self.torn or f"{CAN_LOG} ends before tick {logged.tick}"
@@ -111,7 +111,7 @@ class FlightLog:
                 raise LogError(f"{here}: frames of {shown(group.stamp)} where {SIGNAL_LOG} has tick {logged.tick}")
             self._sort_lines(group, logged)
             wanted, came = _received_frames(logged), len(logged.received)
-            if group.is_last and (self.torn or came != wanted or next(thoughts, None) is not None):
+            if group.is_last and (self.torn or came != wanted or next(ticks, None) is not None):
                 self.torn = self.torn or f"{CAN_LOG} ends with tick {logged.tick}"
                 return
             if came != wanted:
@@ -122,7 +122,7 @@ class FlightLog:
         if next(groups, None) is not None:
             self.torn = self.torn or f"{SIGNAL_LOG} ends before {CAN_LOG}"
 
-    def _thoughts(self) -> Iterator[LoggedTick]:
+    def _signal_ticks(self) -> Iterator[LoggedTick]:
         """The ticks of the signal log, without their frames."""
         now: LoggedTick | None = None
         for message in read_messages(self.folder / SIGNAL_LOG):

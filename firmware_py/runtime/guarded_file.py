@@ -18,8 +18,8 @@ CLOSE_S = 5.0
 
 
 class GuardedFile:
-    """A file whose errors are kept instead of raised: after the first one it takes everything and writes nothing, and is dated back to the
-    beginning of time: it ends before what it tells of, and who goes by its end is not to take it for news.
+    """A file that never raises. After its first error it accepts and drops every write, and its modification time is set to 1970: such a
+    log lacks its end, and `app.last_flight`, which trusts recent logs alone, must not go by it.
     """
 
     def __init__(self, path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from firmware_py.runtime.flight_log import FlightLog
-from hil.signals import TRUTH_LOG
+from hil.truth_log import TRUTH_LOG
 from tests.closed_loop.processes import DEADLINE_S, DIE_WITH_TEST, free_group
 
 LONG = """

@@ -7,7 +7,7 @@ import numpy as np
 from firmware_py.core.rotations import exp, multiply, rotate
 from firmware_py.core.types import BodyRecord, Estimate, Event, Inputs, Outputs, Setpoint, Thrust
 from firmware_py.runtime.recorder import Recorder
-from hil.signals import TruthRecorder
+from hil.truth_log import TruthRecorder
 
 PERIOD_NS = 10_000_000
 START_NS = 4_000_000_000

@@ -20,8 +20,8 @@ from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import load_vehicle, vehicle_names
 from firmware_py.runtime.guarded_file import GuardedFile
 from hil.scenario import scenario_names
-from hil.signals import TruthRecorder
 from hil.trial_file import TrialFile
+from hil.truth_log import TruthRecorder
 
 SPIRAL = (Path(hil.bench.__file__).parent / "scenarios" / "spiral.toml").read_text(encoding="utf-8")
 

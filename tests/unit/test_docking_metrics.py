@@ -9,7 +9,8 @@ import pytest
 from firmware_py.description.signals import Columns
 from hil.docking_metrics import DECLARED, _docked_rmse_m, _false_declarations, docking_metrics, is_as_asked, is_obeyed
 from hil.scenario import Scenario, Step, load_scenario
-from hil.signals import SIGNAL_LOG, TRUTH_LOG
+from hil.signals import SIGNAL_LOG
+from hil.truth_log import TRUTH_LOG
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 TICKS = np.arange(1, 101)

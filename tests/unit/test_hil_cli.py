@@ -15,7 +15,7 @@ from firmware_py.description.schema import DescriptionError
 from hil.fault_campaign import Cell
 from hil.flight import LEFT_BEHIND, check_folder
 from hil.scenario import load_scenario
-from hil.signals import TruthRecorder
+from hil.truth_log import TruthRecorder
 
 OFF = [["--trials", "20"], ["--controller", "modcube"], ["--vehicle", "modcube_sim"], ["--sensors", "real"], ["--dask", "tcp://a:1"]]
 

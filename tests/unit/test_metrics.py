@@ -15,7 +15,8 @@ from hil.flight import ticks_of
 from hil.force_metrics import force_metrics
 from hil.metrics import Poses, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
 from hil.scenario import load_scenario
-from hil.signals import Flight, TruthRecorder, read_flight
+from hil.signals import Flight, read_flight
+from hil.truth_log import TruthRecorder
 from tests.unit.flights import MARGIN, POWER_W, START_NS, write_flight, write_pair
 
 LIMITS = (Limit("position_rmse_m", high=0.005), Limit("nis_mean", 0.7, 1.4))

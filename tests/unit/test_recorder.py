@@ -25,7 +25,8 @@ from firmware_py.core.types import (
 )
 from firmware_py.description.signals import Layout, Signal, read_signals
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, GuardedFile, Recorder
-from hil.signals import TruthRecorder, read_flight
+from hil.signals import read_flight
+from hil.truth_log import TruthRecorder
 
 PERIOD_NS = 10_000_000
 FRAMES = [(0x0C1, bytes.fromhex("0011223344556677")), (0x021, b"\x05\x00\x00\x00"), (0x000, b"")]

@@ -1,0 +1,195 @@
+"""The plant's own log, truth.mcap: where everything really is, tick by tick.
+
+The plant writes with another library than the firmware (mcap here, foxglove there): neither hides the other's faults.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from firmware_py.description.signals import Layout, Row, Signal
+
+if TYPE_CHECKING:
+    from hil.plant.world import World
+
+TRUTH_LOG = "truth.mcap"
+WRITER = "modcube"
+"""Who wrote it, in the header of the truth's log."""
+HEADER_BYTES = 64
+"""More than magic and header take."""
+CHUNK_BYTES = 65536
+"""About two seconds of one module at 100 Hz; a killed bench loses no more."""
+
+
+def module_signals(thrusters: int) -> tuple[Signal, ...]:
+    """Truth of one module in one tick, in the order of `TruthRecorder.record`."""
+    return (
+        Signal("tick", kind="int"),
+        Signal("time_ns", unit="ns", kind="int"),
+        Signal("p_wm", 3, "m"),
+        Signal("q_wm", 4),
+        Signal("v_w", 3, "m/s"),
+        Signal("w_b", 3, "rad/s"),
+        Signal("force_n", thrusters, "N"),
+        Signal("water_w", 3, "m/s"),
+        Signal("power_w", 1, "W"),
+    )
+
+
+def body_signals(modules: int) -> tuple[Signal, ...]:
+    """Truth of one body in one tick, in the order of `TruthRecorder.record_body`."""
+    return (
+        Signal("tick", kind="int"),
+        Signal("time_ns", unit="ns", kind="int"),
+        Signal("member", modules),
+        Signal("p_wb", 3, "m"),
+        Signal("q_wb", 4),
+        Signal("v_w", 3, "m/s"),
+        Signal("w_b", 3, "rad/s"),
+        Signal("load", 6, "N, N m"),
+    )
+
+
+def dock_signals(modules: int) -> tuple[Signal, ...]:
+    """Truth of all docking faces in one tick, in the order of `TruthRecorder.record_docks`."""
+    return (
+        Signal("tick", kind="int"),
+        Signal("time_ns", unit="ns", kind="int"),
+        Signal("joints", kind="int"),
+        Signal("contacts", kind="int"),
+        Signal("jams", kind="int"),
+        Signal("gap_m", unit="m"),
+        Signal("lateral_m", unit="m"),
+        Signal("current_ma", 6 * modules, "mA"),
+    )
+
+
+def is_truth_log(path: Path) -> bool:
+    """Whether a TruthRecorder wrote `path`: by its header, so a torn one too."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(HEADER_BYTES)
+    except OSError:
+        return False
+    return begin.startswith(MCAP0_MAGIC) and WRITER.encode() in begin
+
+
+class TruthRecorder:
+    """Writes /plant/moduleN and /plant/bodyN (N: its leader), a message per tick and module or body. A context
+    manager. Raises OSError when the disk is full.
+    """
+
+    def __init__(self, folder: Path, thrusters: tuple[int, ...]) -> None:
+        """`thrusters` has the number of thrusters of each module of the fleet, in its order."""
+        self._file = (folder / TRUTH_LOG).open("wb")
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        self._writer.start(profile="", library=WRITER)
+        self._file.flush()  # whatever comes, the folder is known as a flight's
+        self._sequence = 0
+        self._modules = []
+        for module, count in enumerate(thrusters):
+            self._modules.append(self._opened(f"/plant/module{module}", Layout("Module", module_signals(count))))
+        self._body_layout = Layout("Body", body_signals(len(thrusters)))
+        self._body_schema = self._writer.register_schema(
+            self._body_layout.schema_name, "protobuf", self._body_layout.schema
+        )
+        self._bodies: dict[int, Any] = {}
+        self._docks: Any = None
+        if len(thrusters) > 1:
+            self._docks = self._opened("/plant/docks", Layout("Docks", dock_signals(len(thrusters))))
+
+    def _opened(self, topic: str, layout: Layout) -> tuple[int, Row]:
+        """A channel, and what makes its messages."""
+        schema = self._writer.register_schema(layout.schema_name, "protobuf", layout.schema)
+        return self._writer.register_channel(topic, "protobuf", schema), layout.row()
+
+    def record_world(self, tick: int, world: World) -> None:
+        """Truth of everything at the moment of SYNC `tick`."""
+        for module in range(len(world.vehicles)):
+            t = world.truth(module)
+            power = t.voltage_v * t.current_a
+            self.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w, power)
+        for body in range(len(world.bodies)):
+            b = world.body_truth(body)
+            self.record_body(tick, b.time_ns, b.modules, b.p_wb, b.q_wb, b.v_w, b.w_b, world.load(body))
+        if self._docks is not None:
+            docks, (channel, row) = world.docks, self._docks
+            jams = sum(contact.jammed for contact in docks.contacts)
+            counts = (len(docks.joints), len(docks.contacts), jams)
+            values = (tick, world.time_ns, *counts, docks.gap_m, docks.lateral_m, docks.current_ma().ravel())
+            self._add(channel, world.time_ns, row.encode(values))
+
+    def record_body(
+        self,
+        tick: int,
+        time_ns: int,
+        modules: Sequence[int],
+        p_wb: np.ndarray,
+        q_wb: np.ndarray,
+        v_w: np.ndarray,
+        w_b: np.ndarray,
+        load: np.ndarray | None = None,
+    ) -> None:
+        """Truth of the body that `modules` make up, its leader first, at the moment of SYNC `tick`.
+
+        Args:
+            p_wb, q_wb: (3,) m nominal centre of mass and (4,) body frame in the world.
+            v_w: (3,) velocity of that point, world, m/s. w_b: (3,) angular rate, body frame, rad/s.
+            load: (6,) what an ideal load cell reads of a clamped body about its leader's hull centre, body frame.
+        """
+        leader = modules[0]
+        if leader not in self._bodies:
+            channel = self._writer.register_channel(f"/plant/body{leader}", "protobuf", self._body_schema)
+            self._bodies[leader] = (channel, self._body_layout.row())
+        channel, row = self._bodies[leader]
+        member = np.zeros(len(self._modules))
+        member[list(modules)] = 1.0
+        self._add(channel, time_ns, row.encode((tick, time_ns, member, p_wb, q_wb, v_w, w_b, np.zeros(6) if load is None else load)))
+
+    def record(
+        self,
+        tick: int,
+        time_ns: int,
+        module: int,
+        p_wm: np.ndarray,
+        q_wm: np.ndarray,
+        v_w: np.ndarray,
+        w_b: np.ndarray,
+        force_n: np.ndarray,
+        water_w: np.ndarray,
+        power_w: float = 0.0,
+    ) -> None:
+        """Truth of `module` at the moment of SYNC `tick`.
+
+        Args:
+            p_wm, q_wm: (3,) m and (4,) module frame (hull centre) in the world.
+            v_w: (3,) velocity of the module's origin, world, m/s. w_b: (3,) angular rate, module frame, rad/s.
+            force_n: (n,) force that each thruster gives, N. water_w: (3,) velocity of the undisturbed water there, m/s.
+            power_w: that its supply gives, electronics and magnets included, W.
+        """
+        channel, row = self._modules[module]
+        self._add(channel, time_ns, row.encode((tick, time_ns, p_wm, q_wm, v_w, w_b, force_n, water_w, power_w)))
+
+    def _add(self, channel: int, time_ns: int, data: bytes) -> None:
+        self._sequence += 1
+        self._writer.add_message(channel, log_time=time_ns, data=data, publish_time=time_ns, sequence=self._sequence)
+
+    def close(self) -> None:
+        """Finish the file; a second time does nothing."""
+        if not self._file.closed:
+            self._writer.finish()
+            self._file.close()
+
+    def __enter__(self) -> TruthRecorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
