@@ -37,6 +37,8 @@ MOMENT_S = 1.0
 """Time over which a moment that nobody foresaw comes and goes: that of the gusts which the thrusters work against (`gust_smoothing_s`)."""
 UNFORESEEN_N_M = 1e-3
 """Sigma of it: thrusters of 5 % more or less that work against gusts of 0.01 m/s^2 at 0.1 m. By ten times that nothing changes any more."""
+EXACT_N_M = 1e-5
+"""The same of a filter that knows each thruster's force to a ten-thousandth of a newton."""
 
 
 class Model(NamedTuple):
@@ -152,7 +154,7 @@ def main() -> None:
     """Prints the floors; takes no arguments."""
     Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for name, imu in (("the simulated IMU", None), ("an ICM-20602", ICM_20602)):
-        for unforeseen_n_m in (UNFORESEEN_N_M, 1e-4, 1e-5):
+        for unforeseen_n_m in (UNFORESEEN_N_M, 1e-4, EXACT_N_M):
             median, most = floor(imu, unforeseen_n_m)
             told = f"{name}, moments known to {1e3 * unforeseen_n_m:g} mN m"
             print(f"{told}: no filter keeps better than {1e3 * median:.1f} mm (median) and {1e3 * most:.1f} mm (95 %)")
