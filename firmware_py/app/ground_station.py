@@ -15,7 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from types import TracebackType
 
 import numpy as np
@@ -35,7 +35,7 @@ from firmware_py.ground.system import STOPPING
 from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import MonotonicClock, unix_ns
 from firmware_py.runtime.rate_keeper import RateKeeper
-from firmware_py.runtime.realtime import die_with, use_priority
+from firmware_py.runtime.realtime import die_with, use_ordinary_priority, use_priority
 from firmware_py.runtime.teller import Teller, write_line
 
 _AFTER = 0.1
@@ -69,6 +69,7 @@ def _planner() -> ProcessPoolExecutor:
 
 def _serve(parent: int) -> None:
     """The planning process ends when the vehicle's does, and not by the Ctrl-C that asks the vehicle to disarm first."""
+    use_ordinary_priority()  # one that takes the place of another is started by a thread of real-time priority
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     die_with(parent)
 
@@ -213,9 +214,7 @@ class GroundSide:
         """Hand out what is to be planned; take back what is."""
         bodies = {body.index: body for body in self._pipeline.bodies}
         for job in self.station.jobs():
-            if self._executor is None:
-                self._executor = _planner()
-            self._plans.append((job, self._executor.submit(_plan_mission, job, bodies.get(job.body))))
+            self._plans.append((job, self._begin(job, bodies.get(job.body))))
         for job, future in list(self._plans):
             if not future.done():
                 continue
@@ -223,6 +222,16 @@ class GroundSide:
             error = future.exception()
             plan = future.result() if error is None else Plan(job.serial, None, (), f"planning failed: {error}")
             self.station.planned(job.body, plan)
+
+    def _begin(self, job: PlanJob, body: Body | None) -> Future[Plan]:
+        """By the planning process; by a new one where that was killed, as the system does when memory is short."""
+        try:
+            if self._executor is not None:
+                return self._executor.submit(_plan_mission, job, body)
+        except BrokenExecutor:
+            pass
+        self._executor = _planner()
+        return self._executor.submit(_plan_mission, job, body)
 
     def _save(self, now_ns: int) -> None:
         signing, path = self.station.signing, self._config.key_file

@@ -1,5 +1,6 @@
 """Links over loopback: several at once, routed by system, bounded, and never in the way of a tick."""
 
+import multiprocessing
 import os
 import pty
 import re
@@ -8,7 +9,8 @@ import struct
 import threading
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from queue import Queue
@@ -18,12 +20,13 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from firmware_py.app.ground_station import GroundSide
+from firmware_py.app.ground_station import _NOTHING, GroundSide
 from firmware_py.core.types import Action, Event, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.link import Channel, Links
 from firmware_py.ground.logs import LogService
+from firmware_py.ground.mission_flight import Plan
 from firmware_py.ground.telemetry import DEFAULT_HZ
 from firmware_py.ground.transport import LinkError, open_link
 from tests.unit.ground_world import Robot, World, fleet_of
@@ -448,6 +451,23 @@ def test_ground_side_that_ends_says_so_and_the_vehicle_goes_on() -> None:
         assert "no ground station is heard any more: ZeroDivisionError" in line and "\n" not in line
         assert side.requests() == []
     assert isinstance(side.error, ZeroDivisionError)
+
+
+def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    killed = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+    assert isinstance(killed.submit(os._exit, 9).exception(), BrokenProcessPool)
+    monkeypatch.setattr("firmware_py.app.ground_station._planner", lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr("firmware_py.app.ground_station._plan_mission", lambda job, body: Plan(job.serial, None, ()))
+    plans: Queue[Plan] = Queue()
+    with closing(side_on(f"udpin:127.0.0.1:{free_port()}")) as side:
+        monkeypatch.setattr(side.station, "planned", lambda body, plan: plans.put(plan))
+        side._executor = killed
+        for _ in range(2):  # the second finds the new one
+            side.station.services[1].flight.jobs.append(_NOTHING)
+            side.pump()
+        wait([future for _, future in side._plans], PATIENCE_S)
+        side.pump()
+    assert plans.qsize() == 2
 
 
 def test_logs_are_listed_and_fetched(tmp_path: Path) -> None:
