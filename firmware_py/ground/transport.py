@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import termios
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -176,12 +177,15 @@ class SerialLink:
         self._left = b""
 
     def _open(self) -> Any:
-        return serial.Serial(self._device, self._baud, timeout=0, write_timeout=0)
+        try:
+            return serial.Serial(self._device, self._baud, timeout=0, write_timeout=0)
+        except termios.error as error:  # pulled out meanwhile: no OSError, and pyserial lets it through
+            raise OSError(*error.args) from None
 
     def _is_plugged(self) -> bool:
         """Whether the device is open; opens it when it is there again."""
         if self._serial is None and os.path.exists(self._device):
-            with contextlib.suppress(OSError):  # udev has yet to give it to us
+            with contextlib.suppress(OSError):  # udev has yet to give it to us, or it is pulled out again
                 self._serial = self._open()
         return self._serial is not None
 

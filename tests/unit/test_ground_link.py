@@ -6,6 +6,7 @@ import pty
 import re
 import socket
 import struct
+import termios
 import threading
 import time
 from collections import Counter
@@ -384,6 +385,27 @@ def test_radio_that_is_pulled_and_plugged_in_again_is_taken_up_again(tmp_path: P
         links.flush()
         assert os.read(radio.ours, 100) == b"answer"
     radio.pull()
+
+
+def test_radio_that_is_pulled_while_it_is_taken_up_again_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = tmp_path / "radio"
+    radio = Radio(name)
+    with closing(Links([f"{name},115200"])) as links:
+        radio.pull()
+        assert list(links.receive()) == []
+        radio = Radio(name)
+        with monkeypatch.context() as pulled:
+            pulled.setattr(termios, "tcflush", broken)
+            assert list(links.receive()) == []
+        assert list(links.receive()) == []  # opens it
+        os.write(radio.ours, heartbeat())
+        assert b"".join(r.data for r in received(links, 1)) == heartbeat()
+    radio.pull()
+
+
+def broken(descriptor: int, queue: int) -> None:
+    """As a device answers that is no more."""
+    raise termios.error(5, "Input/output error")
 
 
 @pytest.mark.parametrize(
