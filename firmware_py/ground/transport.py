@@ -51,22 +51,24 @@ class Link(Protocol):
 
 
 class UdpLink:
-    """udpin: answers whoever writes. udpout: writes to one address from the start."""
+    """udpin: answers whoever writes. udpout: writes to one address from the start, and hears nobody else.
+
+    It is not connected: that would tie it to the address that this machine has now, and mute it once it is given another.
+    """
 
     datagram = True
 
     def __init__(self, host: str, port: int, listen: bool) -> None:
+        address = socket.gethostbyname(host), port
+        self._to = None if listen else address
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._listen = listen
-        try:
-            if listen:
-                self._socket.bind((host, port))
-            else:
-                self._socket.connect((host, port))
-        except (OSError, OverflowError):
-            self._socket.close()
-            raise
+        if listen:
+            try:
+                self._socket.bind(address)
+            except (OSError, OverflowError):
+                self._socket.close()
+                raise
 
     @property
     def port(self) -> int:
@@ -80,20 +82,19 @@ class UdpLink:
                 data, peer = self._socket.recvfrom(_DATAGRAM)
             except BlockingIOError:
                 break
-            except ConnectionError:
-                continue  # nobody listens there yet
-            got.append((peer if self._listen else None, data))
+            if self._to is None or peer == self._to:
+                got.append((None if self._to else peer, data))
         return got
 
     def send(self, peer: Any, frame: bytes) -> bool:
         try:
-            self._socket.sendto(frame, peer) if self._listen else self._socket.send(frame)
+            self._socket.sendto(frame, self._to or peer)
         except BlockingIOError:
             return False
         return True
 
     def peers(self) -> Sequence[Any]:
-        return [] if self._listen else [None]
+        return [None] if self._to else []
 
     def leave(self, peer: Any) -> None:
         """Nothing is kept of it."""

@@ -95,6 +95,21 @@ def test_udpout_speaks_first_and_survives_that_nobody_listens() -> None:
             assert client.recv(100) == b"now"
 
 
+def test_robot_on_udpout_is_tied_to_no_address_of_its_own_and_hears_nobody_but_its_station() -> None:
+    """One that was given another address by its network was mute until it was started anew."""
+    station, stranger = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    station.bind(("127.0.0.1", 0))
+    station.settimeout(PATIENCE_S)
+    link: Any = open_link(f"udpout:127.0.0.1:{station.getsockname()[1]}")
+    with closing(link), closing(station), closing(stranger):
+        assert link.send(None, b"anybody?")
+        _, robot = station.recvfrom(100)
+        assert link._socket.getsockname()[0] == "0.0.0.0"
+        stranger.sendto(b"take me", robot)
+        station.sendto(b"here", robot)
+        assert link.receive() == [(None, b"here")]
+
+
 def test_tcp_clients_come_and_go() -> None:
     port = free_port()
     links = Links([f"tcpin:127.0.0.1:{port}"])
