@@ -544,12 +544,22 @@ def test_what_is_no_classic_frame_is_counted_by_kind(port, link):
         can.Message(arbitration_id=0x101, is_extended_id=False, is_fd=True, data=bytes(12)),
         can.Message(arbitration_id=0x800, is_extended_id=False, check=False),
         Frame(0x901, b"one wrong bit in the line of an adapter"),
+        can.Message(arbitration_id=-1, is_extended_id=False),
         can.Message(arbitration_id=0x004, is_extended_id=False, is_error_frame=True, data=bytes(8)),
         can.Message(arbitration_id=0x040, is_extended_id=False, is_error_frame=True, data=bytes(8)),
         can.Message(arbitration_id=0x102, is_extended_id=False, data=b"good"),
     ))
     assert port.receive() == [Frame(0x102, b"good")]
-    assert faults(port) == {"foreign": 5, "error_frame": 1, "bus_off": 1}
+    assert faults(port) == {"foreign": 6, "error_frame": 1, "bus_off": 1}
+
+
+@pytest.mark.parametrize("number", [1.5, -0.0, True])
+def test_datagram_whose_id_is_no_whole_number_ends_no_flight(number):
+    with open_port(UDP) as port, open_port(UDP) as other:
+        other._link.send(other._bus, Frame(number, b"odd"))
+        other.send(FRAMES[2])
+        assert receive(port, 1) == [FRAMES[2]]
+        assert faults(port) == {"foreign": 1}
 
 
 def test_reader_outlives_a_failing_bus_and_reopens_it(link):

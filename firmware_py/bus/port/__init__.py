@@ -37,7 +37,7 @@ REOPEN_EVERY = 16
 BUS_OFF = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the id of an error frame."""
 LARGEST_ID = 0x7FF
-"""Of a classic frame. The line of an slcan adapter has room for more, and one wrong bit makes it so."""
+"""Of a classic frame. The line of an slcan adapter has room for more, and one wrong bit makes it so; a datagram of udp: for any number."""
 
 _DOWN = {errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EADDRNOTAVAIL}
 _GONE = {errno.ENODEV, errno.ENXIO, errno.EBADF, errno.EIO}
@@ -170,7 +170,7 @@ class Port:
                 frame = item if type(item) is Frame else self._classic(item)
                 if frame is None:
                     continue
-                if frame[0] <= LARGEST_ID:
+                if type(frame[0]) is int and 0 <= frame[0] <= LARGEST_ID:
                     frames.append(frame)
                 else:
                     self.faults["foreign"] += 1
