@@ -28,6 +28,8 @@ _FRAMES_WORLD, _FRAMES_BODY = (1, 7), (8, 9, 12)
 _FRAME_OFFSETS = (7, 8, 9, 12)
 _POSITION_BIT, _VELOCITY_BIT, _ACCELERATION_BIT, _NO_YAW, _NO_YAW_RATE = 0, 3, 6, 0x400, 0x800
 """The first of three bits, one for each axis that is left out; and POSITION_TARGET_TYPEMASK's last two."""
+_FORCES, _NO_ACCELERATION = 0x200, 7 << _ACCELERATION_BIT
+"""What stands for accelerations is N; and all three are left out."""
 _RC_IGNORED = 0xFFFF
 """A channel of RC_CHANNELS_OVERRIDE that stays as it is; 0 lets it go."""
 BUTTONS: tuple[str, ...] = (
@@ -207,6 +209,8 @@ class Steering:
         if m["coordinate_frame"] not in (*_FRAMES_WORLD, *_FRAMES_BODY) or not self._system.body_is_known:
             return
         mask = m["type_mask"]
+        if mask & _FORCES and mask & _NO_ACCELERATION != _NO_ACCELERATION:
+            return  # a force is no acceleration, and there is no control of forces
         wanted = _Wanted(
             position=_vector(m, ("x", "y", "z"), mask >> _POSITION_BIT, math.nan),
             velocity=_vector(m, ("vx", "vy", "vz"), mask >> _VELOCITY_BIT, 0.0),

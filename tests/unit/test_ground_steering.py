@@ -165,6 +165,13 @@ def test_setpoints_that_are_no_numbers_are_ignored(world: World, client: Client)
     assert not world.robot.asked
 
 
+@pytest.mark.parametrize(("mask", "followed"), [(0xC38, True), (0xC38 | 0x200, False), (0xDF8 | 0x200, True)])
+def test_force_is_not_taken_for_an_acceleration(world: World, client: Client, mask: int, followed: bool) -> None:
+    send_target(client, mask, x=0.1)
+    world.run(1)
+    assert [request.action for request in world.robot.asked] == [Action.SET_POINT] * followed
+
+
 def test_body_frame_setpoints_turn_with_the_body(world: World, client: Client) -> None:
     send_target(client, 0xDF8, frame=9, x=0.1)
     world.run(1)
