@@ -10,7 +10,7 @@ from typing import Any
 from firmware_py.core.types import WARNING, Action, DockRequest, Event, Mode
 from firmware_py.ground.command import ACCEPTED, DENIED, FAILED, TEMPORARILY_REJECTED, UNSUPPORTED, Answer, Command
 from firmware_py.ground.dialect import Message
-from firmware_py.ground.identity import SETTABLE
+from firmware_py.ground.identity import CUSTOM_MODE_ENABLED, SETTABLE
 from firmware_py.ground.message_requests import MessageRequests
 from firmware_py.ground.mission_flight import MissionFlight
 from firmware_py.ground.mission_items import ABSOLUTE, RELATIVE
@@ -141,7 +141,7 @@ class CommandService:
 
     def _set_mode(self, command: Command) -> Answer:
         identity = self._system.subject.identity
-        mode = identity.mode_of_command(command.parameters[1], command.parameters[2])
+        mode = identity.mode_of_command(command.parameters[1], command.parameters[2]) if _names_mode(command) else None
         number = None
         if mode is not None and identity.pairs:
             number = int(command.parameters[1]) << 16 | int(command.get(3)) << 24
@@ -150,8 +150,8 @@ class CommandService:
     def _set_mode_message(self, arrival: Arrival) -> None:
         """The old message, which has no acknowledgement of its own."""
         custom = arrival.message["custom_mode"]
-        command = Command(SET_MODE, (1.0, *[math.nan] * 6), arrival)
-        mode = self._system.subject.identity.mode(custom)
+        command = Command(SET_MODE, (arrival.message["base_mode"], *[math.nan] * 6), arrival)
+        mode = self._system.subject.identity.mode(custom) if _names_mode(command) else None
         answer = self._enter(command, mode, custom) if self._system.body_is_known else self._refuse(command)
         if answer is not None:
             self._acknowledge(command, answer)
@@ -252,6 +252,11 @@ class CommandService:
         s = self._system.subject
         is_turning = lambda: s.picture.mode(s.body) == Mode.MOTOR_DETECT and s.armed  # noqa: E731
         return self._ask(command, Action.MOTOR_TEST, (thruster, share, seconds), is_turning)
+
+
+def _names_mode(command: Command) -> bool:
+    """Whether the number beside MAV_MODE_FLAG is one: without its flag it is to be ignored, and flags alone choose no mode here."""
+    return bool(int(command.get(1)) & CUSTOM_MODE_ENABLED)
 
 
 def _stops(command: Command) -> bool:

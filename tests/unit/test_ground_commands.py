@@ -92,6 +92,17 @@ def test_ardusub_identity_takes_ardusubs_numbers_by_command_and_by_message() -> 
     assert (heartbeat.autopilot, heartbeat.custom_mode) == (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 2)
 
 
+@pytest.mark.parametrize("flags", [mavlink.MAV_MODE_GUIDED_ARMED, mavlink.MAV_MODE_FLAG_SAFETY_ARMED])
+def test_flags_of_a_mode_do_not_put_an_ardusub_into_the_mode_of_number_zero(flags: int) -> None:
+    world = World(config=GroundConfig(identity="ardusub"))
+    client = world.client()
+    assert ask(world, client, 176, flags, 0) == mavlink.MAV_RESULT_UNSUPPORTED
+    client.clear()
+    client.send("SET_MODE", 1, flags, 0)
+    assert acknowledged(world, client, 176) == mavlink.MAV_RESULT_UNSUPPORTED
+    assert not world.robot.asked
+
+
 def test_a_number_of_the_other_encoding_is_no_mode() -> None:
     world = World()
     client = world.client()
