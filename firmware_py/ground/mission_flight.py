@@ -16,7 +16,7 @@ import numpy as np
 from firmware_py.core.setpoint import Trajectory
 from firmware_py.core.types import INFORMATION, WARNING, Action, Event, Mode
 from firmware_py.description.parameters import Parameters
-from firmware_py.ground.mission_items import LOITER_UNLIMITED, Item, MissionError, beyond_fence, flight_order
+from firmware_py.ground.mission_items import LOITER_UNLIMITED, SPEED_DEFAULT, SPEED_STAYS, Item, MissionError, beyond_fence, flight_order
 from firmware_py.ground.system import NS_PER_S, System
 
 NONE, READY, ACTIVE, PAUSED, DONE = 1, 2, 3, 4, 5
@@ -157,10 +157,11 @@ class MissionFlight:
         return ""
 
     def set_speed(self, speed_m_s: float) -> bool:
-        """Speed of what is planned from now on; -1: as the parameter says."""
-        if speed_m_s != -1 and not 0.01 <= speed_m_s <= 2.0:
+        """Speed of what is planned from now on; -1: as before, -2: as the parameter says."""
+        wanted = {SPEED_STAYS: self._speed, SPEED_DEFAULT: None}.get(speed_m_s, speed_m_s)
+        if wanted is not None and not 0.01 <= wanted <= 2.0:
             return False
-        self._speed = None if speed_m_s == -1 else speed_m_s
+        self._speed = wanted
         return True
 
     def go_to(self, latitude_deg: float, longitude_deg: float, altitude_m: float, yaw: float) -> str:

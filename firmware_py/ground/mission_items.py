@@ -24,6 +24,8 @@ ABSOLUTE, RELATIVE = (0, 5), (3, 6)
 """MAV_FRAME of absolute altitude, and of altitude relative to home."""
 UNSUPPORTED_FRAME, UNSUPPORTED, INVALID_1, INVALID_X, INVALID_Y, INVALID_Z = 2, 3, 6, 10, 11, 12
 """MAV_MISSION_RESULT; the invalid parameters count on from INVALID_1."""
+SPEED_STAYS, SPEED_DEFAULT = -1.0, -2.0
+"""What DO_CHANGE_SPEED has in place of a speed."""
 _MOST_STEPS = 1000
 _LONGEST_S = 86_400.0
 _BEYOND = {"north_m": INVALID_X, "east_m": INVALID_Y, "top_m": INVALID_Z, "bottom_m": INVALID_Z}
@@ -73,10 +75,9 @@ class Item(NamedTuple):
 
     @property
     def speed_m_s(self) -> float | None:
-        """What a change of speed asks for; 0 or less: the default."""
-        if self.command != CHANGE_SPEED or not math.isfinite(self.parameters[1]):
-            return None
-        return self.parameters[1]
+        """What a change of speed asks for; 0 or less: the default. None where it stays."""
+        speed = self.parameters[1]
+        return speed if self.command == CHANGE_SPEED and math.isfinite(speed) and speed != SPEED_STAYS else None
 
     def place(self, origin: Origin) -> np.ndarray | None:
         """(3,) NED, m; None for an item without a place."""

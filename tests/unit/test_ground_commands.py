@@ -38,7 +38,7 @@ def test_every_command_is_acknowledged_when_all_its_parameters_are_left_out() ->
         assert acknowledged(world, client, number) <= mavlink.MAV_RESULT_FAILED
 
 
-@pytest.mark.parametrize(("speed", "answer"), [(0.0, 2), (0.009, 2), (0.02, 0), (2.0, 0), (2.1, 2), (-1.0, 0), (-0.5, 2)])
+@pytest.mark.parametrize(("speed", "answer"), [(0.0, 2), (0.009, 2), (0.02, 0), (2.0, 0), (2.1, 2), (-1.0, 0), (-2.0, 0), (-0.5, 2)])
 def test_speed_that_would_never_arrive_is_denied(world: World, client: Client, speed: float, answer: int) -> None:
     assert ask(world, client, 178, 1, speed) == answer
 

@@ -262,6 +262,21 @@ def test_holds_delays_and_speeds_belong_to_their_items(world: World, client: Cli
     assert (second.hold_s, second.yaw) == (0.0, None)
 
 
+@pytest.mark.parametrize(("asked", "flown"), [(-1.0, 0.3), (-2.0, 0.15)])
+def test_speed_of_minus_one_is_as_before_and_minus_two_the_parameters(world: World, client: Client, asked: float, flown: float) -> None:
+    client.command(178, 1, 0.3)
+    client.command(178, 1, asked)
+    upload(world, client, [item(0, PLACES[0])])
+    assert fly(world, client).legs[0].speed_m_s == pytest.approx(flown)
+
+
+@pytest.mark.parametrize(("asked", "flown"), [(-1.0, 0.3), (-2.0, 0.15)])
+def test_item_with_such_a_speed_says_the_same(world: World, client: Client, asked: float, flown: float) -> None:
+    speeds = [item(i, (0, 0, 0), command=178, frame=2, p=(1, speed, -1, 0)) for i, speed in enumerate((0.3, asked))]
+    upload(world, client, [*speeds, item(2, PLACES[0])])
+    assert fly(world, client).legs[0].speed_m_s == pytest.approx(flown)
+
+
 def test_ardupilots_missions_begin_with_home_which_is_not_flown() -> None:
     world = World(config=GroundConfig(identity="ardusub"))
     client = world.client()
