@@ -167,10 +167,7 @@ class GroundSide:
         return self.station.reboot_asked
 
     def __enter__(self) -> GroundSide:
-        """Start the thread, and the process that plans: it takes seconds to be ready."""
-        if self._executor is None:
-            self._executor = _planner()
-            self._executor.submit(_plan_mission, _NOTHING, None)
+        """Start the thread, and by it the process that plans."""
         self._switch_s = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
         self._thread = threading.Thread(target=self._run, args=(Teller(self._say),), name="ground", daemon=True)
@@ -194,9 +191,10 @@ class GroundSide:
             self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _run(self, teller: Teller) -> None:
-        if self._priority:
-            use_priority(self._priority)  # where the system refuses it, the loop has said so
         try:
+            self._start_planner()
+            if self._priority:
+                use_priority(self._priority)  # where the system refuses it, the loop has said so
             while not self._stopping:
                 time.sleep(self._rest_s())
                 self.pump()
@@ -222,6 +220,12 @@ class GroundSide:
             error = future.exception()
             plan = future.result() if error is None else Plan(job.serial, None, (), f"planning failed: {error}")
             self.station.planned(job.body, plan)
+
+    def _start_planner(self) -> None:
+        """By the thread, with which it ends whatever it is busy with (`die_with`); it takes seconds to be ready."""
+        if self._executor is None:
+            self._executor = _planner()
+            self._executor.submit(_plan_mission, _NOTHING, None)
 
     def _begin(self, job: PlanJob, body: Body | None) -> Future[Plan]:
         """By the planning process; by a new one where that was killed, as the system does when memory is short."""

@@ -507,6 +507,18 @@ def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_
     assert plans.qsize() == 2
 
 
+def test_robot_that_is_stopped_waits_for_no_plan_that_is_being_made() -> None:
+    """The service manager gives it five seconds, and kills what is not through: its log is torn then."""
+    firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
+    with GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",)), firmware) as side:
+        while not isinstance(side._executor, ProcessPoolExecutor):
+            time.sleep(0.01)
+        side._executor.submit(os.getpid).result()  # it is there
+        side._executor.submit(time.sleep, 60.0)
+        start = time.monotonic()
+    assert time.monotonic() - start < PATIENCE_S
+
+
 def test_logs_are_listed_and_fetched(tmp_path: Path) -> None:
     (tmp_path / "flight1").mkdir()
     data = bytes(i % 251 for i in range(9_999))
