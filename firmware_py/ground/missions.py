@@ -6,6 +6,7 @@ Source: MAVLink developer guide, "Mission Protocol". The vehicle asks for each i
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from firmware_py.core.types import WARNING
 from firmware_py.ground.mission_flight import MissionFlight
@@ -34,12 +35,21 @@ class _Upload:
     asked: int = 0
 
 
+class _Ended(NamedTuple):
+    """How a mission came to its end."""
+
+    item: Arrival
+    """With which it did."""
+    result: int
+
+
 class MissionService:
     """The transfers of one system."""
 
     def __init__(self, system: System, flight: MissionFlight) -> None:
         self._system, self._flight = system, flight
         self._upload: _Upload | None = None
+        self._ended: _Ended | None = None
 
     def handlers(self) -> dict[str, Handler]:
         """By message name."""
@@ -83,7 +93,7 @@ class MissionService:
             self._acknowledge(arrival, _DENIED, kind)
             return
         if count == 0:
-            self._upload = None
+            self._upload = self._ended = None
             self._flight.replace(())
             self._acknowledge(arrival, _ACCEPTED, kind)
             return
@@ -108,7 +118,9 @@ class MissionService:
         self._system.send(upload.arrival.channel, "MISSION_REQUEST_INT", values)
 
     def _item(self, arrival: Arrival) -> None:
-        upload = self._upload
+        upload, ended = self._upload, self._ended
+        if upload is None and ended is not None and _is_again(arrival, ended.item):
+            self._acknowledge(arrival, ended.result, arrival.message["mission_type"])  # the answer to it was lost
         if upload is None or not _same(upload.arrival, arrival) or arrival.message["mission_type"] != upload.kind:
             return
         sequence = arrival.message["seq"]
@@ -119,23 +131,25 @@ class MissionService:
         if not fault:
             fault, why = self._flight.against(item)
         if fault:
-            self._upload = None
             self._system.say(WARNING, f"mission refused: item {sequence}, {why}")
-            self._acknowledge(arrival, fault, upload.kind)
+            self._end(arrival, fault, upload.kind)
             return
         upload.items.append(item)
         upload.asked = 0
         if len(upload.items) < upload.count:
             self._ask(upload, arrival.time_ns)
             return
-        self._upload = None
         (self._flight.amend if upload.in_part else self._flight.replace)((*upload.items, *upload.rest))
-        self._acknowledge(arrival, _ACCEPTED, upload.kind)
+        self._end(arrival, _ACCEPTED, upload.kind)
+
+    def _end(self, arrival: Arrival, result: int, kind: int) -> None:
+        self._upload, self._ended = None, _Ended(arrival, result)
+        self._acknowledge(arrival, result, kind)
 
     def _clear(self, arrival: Arrival) -> None:
         kind = arrival.message["mission_type"]
         if kind in (_MISSION, 255):
-            self._upload = None
+            self._upload = self._ended = None
             self._flight.replace(())
         self._acknowledge(arrival, _ACCEPTED, kind)
 
@@ -186,6 +200,10 @@ def _sent_frame(item: Item, whole: bool) -> int:
         return item.frame
     pairs = {0: 5, 3: 6} if whole else {5: 0, 6: 3}
     return pairs.get(item.frame, item.frame)
+
+
+def _is_again(item: Arrival, before: Arrival) -> bool:
+    return _same(item, before) and all(item.message[name] == before.message[name] for name in ("seq", "mission_type"))
 
 
 def _same(a: Arrival, b: Arrival) -> bool:

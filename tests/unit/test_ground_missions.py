@@ -103,6 +103,22 @@ def test_an_item_that_is_lost_is_asked_for_again(world: World, client: Client) -
     assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_ACCEPTED
 
 
+@pytest.mark.parametrize("last", [item(1, PLACES[1]), item(1, PLACES[1], command=22)])
+def test_last_item_that_comes_again_is_answered_again(world: World, client: Client, last: tuple[float, ...]) -> None:
+    """A client whose acknowledgement was lost sends it until it hears one."""
+    result = upload(world, client, [item(0, PLACES[0]), last])
+    for number, answers in ((1, [result]), (0, [])):
+        client.clear()
+        client.send("MISSION_ITEM_INT", *[item(0, PLACES[0]), last][number], 0)
+        world.run(2)
+        assert [ack.type for ack in client.all("MISSION_ACK")] == answers
+    client.send("MISSION_CLEAR_ALL", 1, 1, 0)
+    client.clear()
+    client.send("MISSION_ITEM_INT", *last, 0)
+    world.run(2)
+    assert [ack.type for ack in client.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED]  # of the clearing alone
+
+
 def test_a_transfer_that_breaks_off_leaves_the_old_mission(world: World, client: Client) -> None:
     upload(world, client, [item(0, PLACES[0])])
     client.clear()
