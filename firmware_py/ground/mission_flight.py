@@ -296,7 +296,8 @@ class MissionFlight:
     def _legs(self, first: int) -> tuple[Leg, ...]:
         origin, speed = self._system.subject.origin, self._cruise
         legs = []
-        for item in flight_order(self.items, first):
+        speeds = [item for item in self.items[:first] if item.speed_m_s is not None]  # one that was passed goes on to count
+        for item in (*speeds, *flight_order(self.items, first)):
             if item.speed_m_s is not None:
                 speed = item.speed_m_s if item.speed_m_s > 0 else self._cruise
             place = item.place(origin)

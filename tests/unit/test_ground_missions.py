@@ -236,6 +236,18 @@ def test_pause_and_resume_go_on_at_the_same_item(world: World, client: Client) -
     assert continued(world, client) == [1, 2]
 
 
+def test_mission_that_goes_on_is_as_fast_as_before_it_was_paused(world: World, client: Client) -> None:
+    upload(world, client, [item(0, (0, 0, 0), command=178, frame=2, p=(1, 0.3, -1, 0)), item(1, PLACES[0]), item(2, PLACES[1])])
+    fly(world, client)
+    world.run(1100)
+    client.command(193, 0)
+    world.run(20)
+    client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [(leg.sequence, leg.speed_m_s) for leg in job.legs] == [(2, pytest.approx(0.3))]
+
+
 def test_jump_replans_from_where_the_body_is(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)
