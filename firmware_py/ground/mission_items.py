@@ -58,8 +58,8 @@ class Item(NamedTuple):
 
     @property
     def yaw(self) -> float | None:
-        """rad, or None."""
-        return math.radians(self.parameters[3]) if math.isfinite(self.parameters[3]) else None
+        """rad, or None; a spline's fourth parameter is empty."""
+        return math.radians(self.parameters[3]) if self.command != LAST_SPLINE and math.isfinite(self.parameters[3]) else None
 
     @property
     def hold_s(self) -> float:

@@ -305,6 +305,11 @@ def test_item_with_such_a_speed_says_the_same(world: World, client: Client, aske
     assert fly(world, client).legs[0].speed_m_s == pytest.approx(flown)
 
 
+def test_spline_has_no_heading_and_turns_nobody_north(world: World, client: Client) -> None:
+    upload(world, client, [item(0, PLACES[0], command=82, p=(0, 0, 0, 0))])
+    assert fly(world, client).legs[0].yaw is None
+
+
 def test_ardupilots_missions_begin_with_home_which_is_not_flown() -> None:
     world = World(config=GroundConfig(identity="ardusub"))
     client = world.client()
