@@ -113,7 +113,7 @@ class ParameterService:
             return
         for system in self._everybody():
             system.ask(Action.SET_PARAMETER, (dotted, kept))
-        self._system.broadcast("PARAM_VALUE", self._value(name))
+            system.broadcast("PARAM_VALUE", self._value(name))
 
     def _value(self, name: str) -> dict[str, float | str]:
         return {

@@ -57,6 +57,13 @@ def test_a_set_parameter_reaches_the_next_tick_and_the_file(world: World, client
     assert again.station.store.get("POS_BW") == 2.75
 
 
+def test_parameter_that_is_set_on_one_body_is_told_by_all_for_it_is_theirs_too() -> None:
+    world = World(modules=2)
+    client = world.client()
+    put(world, client, "POS_BW", 2.75)
+    assert [(v.get_srcSystem(), v.param_value) for v in client.all("PARAM_VALUE")] == [(1, 2.75), (2, 2.75)]
+
+
 def test_out_of_range_is_refused_in_words_and_the_old_value_echoed(world: World, client: Client) -> None:
     assert put(world, client, "POS_BW", 1000.0) == SHIPPED
     assert "out of range; permitted: 0.1 to 10 rad/s" in client.texts
