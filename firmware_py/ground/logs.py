@@ -58,8 +58,11 @@ class LogService:
                 del self._listings[channel]
             elif channel not in self._system.busy:
                 self._tell(listing)
-        if self._transfer is not None and self._transfer.arrival.channel not in self._system.busy:
-            self._carry(self._transfer)
+        transfer = self._transfer
+        if transfer is not None and transfer.arrival.channel not in self._system.channels:
+            self._transfer = None
+        elif transfer is not None and transfer.arrival.channel not in self._system.busy:
+            self._carry(transfer)
 
     def _carry(self, t: _Transfer) -> None:
         try:

@@ -100,8 +100,9 @@ class System:
         self.say(WARNING, f"system {own} is not steered: {why}")
 
     def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
-        """To one channel."""
-        self.outbox.send(channel, name, values)
+        """To one channel; what is for one that is gone goes nowhere, and leaves nothing behind."""
+        if channel in self.channels:
+            self.outbox.send(channel, name, values)
 
     def broadcast(self, name: str, values: Mapping[str, Any]) -> None:
         """To everybody."""

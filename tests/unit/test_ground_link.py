@@ -289,6 +289,18 @@ def test_answers_find_their_way_while_a_log_is_fetched_over_a_radio(tmp_path: Pa
     assert len(client.all("LOG_DATA")) == 40
 
 
+def test_client_that_leaves_with_an_answer_to_come_leaves_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "can.log").write_bytes(bytes(1_000_000))
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    client = world.client()
+    client.send("LOG_REQUEST_DATA", 1, 1, 1, 0, 0xFFFFFFFF)
+    client.command(400, 1)
+    world.station.leave(client.channel)
+    world.run(3)
+    services = world.station.services[1]
+    assert not services.system.outbox._encoders and services.logs._transfer is None
+
+
 class SlowLink:
     """A radio that carries so many bytes a tick."""
 
