@@ -49,7 +49,7 @@ _MOST_TICKS = 200
 _MOST_REQUESTS = 256
 """That may wait for a tick."""
 _SAVE_EVERY_NS = 1_000_000_000
-"""How often the signing time stamp is stored; the store is that much ahead."""
+"""How often the signing time stamp is stored; the store is that much ahead. A new key is stored at once."""
 
 
 _NOTHING = PlanJob(0, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), 0.1, 1.0)
@@ -114,6 +114,7 @@ class GroundSide:
         self._say = say
         self._stopping = False
         self._saved_ns = 0
+        self._saved_key = self.station.signing.key
         self._switch_s = 0.0
         self.keeper: RateKeeper | None = None
         """Of a loop on a clock; telemetry tells how its ticks keep their deadlines."""
@@ -239,9 +240,10 @@ class GroundSide:
 
     def _save(self, now_ns: int) -> None:
         signing, path = self.station.signing, self._config.key_file
-        if path is None or not signing.changed or now_ns - self._saved_ns < _SAVE_EVERY_NS:
+        may_wait = signing.key == self._saved_key and now_ns - self._saved_ns < _SAVE_EVERY_NS
+        if path is None or not signing.changed or may_wait:
             return
-        self._saved_ns = now_ns
+        self._saved_ns, self._saved_key = now_ns, signing.key
         try:
             signing.save(path)
         except OSError as error:

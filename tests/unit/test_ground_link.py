@@ -28,6 +28,7 @@ from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.link import Channel, Links
 from firmware_py.ground.logs import LogService
 from firmware_py.ground.mission_flight import Plan
+from firmware_py.ground.signing import load_signing
 from firmware_py.ground.telemetry import DEFAULT_HZ
 from firmware_py.ground.transport import LinkError, open_link
 from tests.unit.ground_world import Robot, World, fleet_of
@@ -299,6 +300,18 @@ def test_client_that_leaves_with_an_answer_to_come_leaves_nothing_behind(tmp_pat
     world.run(3)
     services = world.station.services[1]
     assert not services.system.outbox._encoders and services.logs._transfer is None
+
+
+def test_new_key_is_stored_at_once_for_the_robot_may_be_restarted_next(tmp_path: Path) -> None:
+    firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=Robot().bodies), fleet=fleet_of(1), parameters=Parameters())
+    config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",), store=str(tmp_path))
+    with closing(GroundSide(config, firmware, ThreadPoolExecutor(1))) as side:
+        robot = Robot()
+        pump(side, robot, 200)
+        for key in (bytes(range(32)), bytes(range(1, 33)), bytes(32)):
+            side.station.signing.adopt(key, 0)
+            pump(side, robot)
+            assert load_signing(tmp_path / "signing.json").key == side.station.signing.key
 
 
 class SlowLink:
