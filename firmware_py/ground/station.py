@@ -15,6 +15,7 @@ from firmware_py.ground.commands import CommandService
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.geodesy import Origin
+from firmware_py.ground.identity import COMPONENT_AUTOPILOT
 from firmware_py.ground.logs import LogService
 from firmware_py.ground.message_requests import MessageRequests
 from firmware_py.ground.mission_flight import MissionFlight, Plan, PlanJob
@@ -209,19 +210,18 @@ class GroundStation:
 
     def _take_packet(self, packet: Packet, channel: int, time_ns: int, trusted: bool) -> None:
         message = packet.message
-        if message.system in self.services or message.system == 0:
-            return  # our own echo, or nobody
+        if message.system == 0 or (message.system in self.services and message.component == COMPONENT_AUTOPILOT):
+            return  # nobody, or our own echo; other components of our systems are companions
         if len(self._routes) < _SYSTEMS or message.system in self._routes:
             self._routes[message.system] = channel
         self.join(channel, time_ns)
         target = message.values.get("target_system", message.values.get("target", 0))
         arrival = Arrival(message, channel, time_ns, trusted)
-        if target not in self.services:
-            self._forward(packet, target, channel)
-        if target != 0 and target not in self.services:
-            return
         component = message.values.get("target_component", 0)
-        if target and component not in (0, 1):
+        is_ours = target in self.services and component in (0, COMPONENT_AUTOPILOT)
+        if not is_ours:
+            self._forward(packet, target, channel)
+        if target and not is_ours:
             return
         for number, services in self.services.items():
             if target in (0, number):

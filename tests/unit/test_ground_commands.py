@@ -49,6 +49,25 @@ def test_return_and_land_both_surface(world: World, client: Client, number: int)
     assert world.robot.mode[0] == Mode.SURFACE
 
 
+@pytest.mark.parametrize(("component", "is_heard"), [(191, True), (1, False)])
+def test_companion_computer_of_the_same_system_is_heard_and_an_echo_is_not(world: World, component: int, is_heard: bool) -> None:
+    """MAVLink gives the computers of a vehicle its system id, and each a component id of its own."""
+    companion = world.client(system=1, component=component)
+    companion.command(400, 1)
+    world.run(3)
+    assert [(ack.target_system, ack.target_component, ack.result) for ack in companion.all("COMMAND_ACK")] == [(1, 191, 0)] * is_heard
+    assert bool(world.robot.asked) == is_heard
+
+
+def test_what_is_for_a_companion_computer_goes_where_it_was_heard(world: World, client: Client) -> None:
+    companion = world.client(system=1, component=191)
+    companion.heartbeat(mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
+    client.command(400, 1, component=191)
+    world.run(3)
+    assert [m.target_component for m in companion.all("COMMAND_LONG")] == [191]
+    assert not world.robot.asked and not client.all("COMMAND_ACK")
+
+
 def test_component_zero_and_system_zero_are_accepted(world: World, client: Client) -> None:
     client.command(410, component=0)
     assert acknowledged(world, client, 410) == mavlink.MAV_RESULT_ACCEPTED
