@@ -18,6 +18,7 @@ from firmware_py.core.types import INFORMATION, WARNING, Action, Event, Mode
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.mission_items import LOITER_UNLIMITED, SPEED_DEFAULT, SPEED_STAYS, Item, MissionError, beyond_fence, flight_order
 from firmware_py.ground.system import NS_PER_S, System
+from firmware_py.ground.telemetry import mission_current
 
 NONE, READY, ACTIVE, PAUSED, DONE = 1, 2, 3, 4, 5
 """MISSION_STATE."""
@@ -28,6 +29,8 @@ _HOLD_TICKS = 100
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
 _GO_TO = -1
 """Sequence number of a leg that belongs to no mission."""
+_PRESENT = -1
+"""DO_SET_MISSION_CURRENT's number of the item that is current."""
 
 
 class Leg(NamedTuple):
@@ -146,7 +149,14 @@ class MissionFlight:
         return ""
 
     def jump(self, index: int) -> str:
-        """Go on at item `index`. Returns why not, or nothing."""
+        """Go on at item `index`, -1: at the present one, and tell which it is. Returns why not, or nothing."""
+        s = self._system.subject
+        reason = self._jump(s.progress.current if index == _PRESENT else index)
+        if not reason:
+            self._system.broadcast("MISSION_CURRENT", mission_current(s)[0])
+        return reason
+
+    def _jump(self, index: int) -> str:
         if index not in range(len(self.items)):
             return f"item {index} of {len(self.items)} does not exist"
         self._end_if_taken()

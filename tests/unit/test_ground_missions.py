@@ -248,6 +248,21 @@ def test_mission_that_goes_on_is_as_fast_as_before_it_was_paused(world: World, c
     assert [(leg.sequence, leg.speed_m_s) for leg in job.legs] == [(2, pytest.approx(0.3))]
 
 
+@pytest.mark.parametrize("index", [2, 0, -1])
+def test_client_that_sets_the_current_item_hears_at_once_which_it_is(world: World, client: Client, index: int) -> None:
+    """Also on a link where nothing streams: a client takes it for the answer."""
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    client.command(511, mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, -1)
+    world.run(2)
+    client.clear()
+    client.command(224, index)
+    if index >= 0:
+        client.send("MISSION_SET_CURRENT", 1, 1, index)
+    world.run(2)
+    assert [m.seq for m in client.all("MISSION_CURRENT")] == ([index] * 2 if index >= 0 else [0])
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+
+
 def test_jump_replans_from_where_the_body_is(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)
