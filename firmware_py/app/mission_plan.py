@@ -80,7 +80,9 @@ def _waypoints(p_wb: np.ndarray, q_wb: np.ndarray, section: Sequence[Leg]) -> tu
     """The waypoints from a pose through a section, and for each leg the number of its own; equal neighbours are one."""
     wanted = [Waypoint(p_wb, q_wb)]
     for leg in section:
-        wanted.append(Waypoint(leg.p_wb, wanted[-1].q_wb if leg.yaw is None else from_euler(0.0, 0.0, leg.yaw)))
+        before = wanted[-1]
+        place = before.p_wb if leg.p_wb is None else leg.p_wb
+        wanted.append(Waypoint(place, before.q_wb if leg.yaw is None else from_euler(0.0, 0.0, leg.yaw)))
     points, places = distinct(wanted, _SAME)
     return points, places[1:]
 

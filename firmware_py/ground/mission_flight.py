@@ -37,7 +37,8 @@ class Leg(NamedTuple):
     """A place to go to."""
 
     sequence: int
-    p_wb: np.ndarray
+    p_wb: np.ndarray | None
+    """(3,) m; None: where it is."""
     yaw: float | None
     """rad; None: as before."""
     hold_s: float
@@ -313,8 +314,9 @@ class MissionFlight:
             place = item.place(origin)
             if place is not None:
                 legs.append(Leg(item.sequence, place, item.yaw, item.hold_s, speed))
-            elif legs and item.delay_s > 0:
-                legs[-1] = legs[-1]._replace(hold_s=legs[-1].hold_s + item.delay_s)
+            elif item.delay_s > 0:
+                last = legs.pop() if legs else Leg(item.sequence, None, None, 0.0, speed)
+                legs.append(last._replace(hold_s=last.hold_s + item.delay_s))
             if item.command == LOITER_UNLIMITED:
                 break
         return tuple(legs)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from firmware_py.app.mission_plan import plan_mission
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode, Setpoint
 from firmware_py.ground.config import GroundConfig
@@ -303,6 +304,17 @@ def test_holds_delays_and_speeds_belong_to_their_items(world: World, client: Cli
     first, second = fly(world, client).legs
     assert (first.hold_s, first.speed_m_s, first.yaw) == (6.5, pytest.approx(0.3), pytest.approx(math.pi / 2))
     assert (second.hold_s, second.yaw) == (0.0, None)
+
+
+def test_mission_that_begins_with_a_delay_waits_where_the_robot_is_and_then_goes(world: World, client: Client) -> None:
+    delays = [item(i, (0, 0, 0), command=93, frame=2, p=(seconds, -1, -1, -1)) for i, seconds in enumerate((20, 5))]
+    upload(world, client, [*delays, item(2, PLACES[0])])
+    job = fly(world, client)
+    plan = plan_mission(job, None)
+    assert [leg.sequence for leg in job.legs] == [0, 2] and plan.trajectory is not None
+    assert plan.arrivals_s[0] == 0.0 and plan.arrivals_s[1] > 25.5
+    assert plan.trajectory.sample(24.9).p_wb == pytest.approx(job.p_wb)
+    assert plan.trajectory.sample(plan.arrivals_s[1]).p_wb == pytest.approx(job.legs[1].p_wb, abs=1e-6)
 
 
 @pytest.mark.parametrize(("asked", "flown"), [(-1.0, 0.3), (-2.0, 0.15)])
