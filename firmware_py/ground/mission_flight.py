@@ -44,6 +44,7 @@ class Leg(NamedTuple):
     hold_s: float
     """How long to stay; above 0 it stops there."""
     speed_m_s: float
+    """NaN, before it is planned: as missions are flown then."""
 
 
 class PlanJob(NamedTuple):
@@ -96,6 +97,8 @@ class MissionFlight:
         """To be planned; whoever plans takes them."""
         self._serial = 0
         self._flight: _Flight | None = None
+        self._left: tuple[Leg, ...] = ()
+        """Of the mission that is paused: jumps that were made are not made again."""
         self._plan_at_tick: int | None = None
         """None once it is asked for."""
         self._hold_by_tick = 0
@@ -106,7 +109,7 @@ class MissionFlight:
 
     def replace(self, items: tuple[Item, ...]) -> None:
         """A new mission, ready to be started. What flies goes on, of the old one."""
-        self.items = items
+        self.amend(items)
         p = self._system.subject.progress
         p.total, p.current = max(len(items) - self._first, 0), min(self._first, max(len(items) - 1, 0))
         p.state = READY if items else NONE
@@ -115,7 +118,7 @@ class MissionFlight:
 
     def amend(self, items: tuple[Item, ...]) -> None:
         """The same mission with other items in it, while it does not fly: it goes on where it is."""
-        self.items = items
+        self.items, self._left = items, ()
 
     def against(self, item: Item) -> tuple[int, str]:
         """A MAV_MISSION_RESULT and why `item` is flown nowhere, by the fence as it is now; 0: it is."""
@@ -137,10 +140,11 @@ class MissionFlight:
             return "the vehicle is disarmed"
         if first is None and s.progress.state == ACTIVE:
             return ""
+        left = self._left if first is None and s.progress.state == PAUSED else ()
         if first is None:
             first = s.progress.current if s.progress.state == PAUSED else self._first
         try:
-            legs = self._legs(max(first, self._first))
+            legs = left or self._legs(max(first, self._first))
         except MissionError as error:
             return str(error)
         if not legs:
@@ -164,7 +168,7 @@ class MissionFlight:
         p = self._system.subject.progress
         if self.flies or (self._flight is not None and self._flight.replaced):
             return self.start(index)
-        p.current, p.state = index, PAUSED
+        p.current, p.state, self._left = index, PAUSED, ()
         return ""
 
     def set_speed(self, speed_m_s: float) -> bool:
@@ -185,9 +189,9 @@ class MissionFlight:
         if result:
             return reason
         if s.progress.state == ACTIVE:
-            s.progress.state = PAUSED
+            self._end(PAUSED)
         turned = yaw if math.isfinite(yaw) else None
-        self._begin((Leg(_GO_TO, place, turned, 0.0, self._cruise),))
+        self._begin((Leg(_GO_TO, place, turned, 0.0, math.nan),))
         return ""
 
     # ------------------------------------------------------------ what happens
@@ -254,14 +258,12 @@ class MissionFlight:
         if self._plan_at_tick is None or s.picture.ticks < self._plan_at_tick or self._flight is None or not self._flight.holds:
             return
         self._plan_at_tick = None
-        at, ground = s.record.setpoint, self._parameters().ground
+        at, ground, cruise = s.record.setpoint, self._parameters().ground, self._cruise
         self._serial += 1
+        legs = tuple(leg._replace(speed_m_s=cruise) if math.isnan(leg.speed_m_s) else leg for leg in self._flight.legs)
         self.jobs.append(
-            PlanJob(
-                s.body, self._serial, at.p_wb, at.q_wb, self._flight.legs, ground.mission_acceleration,
-                ground.mission_corridor_m,
-            )
-        )  # fmt: skip
+            PlanJob(s.body, self._serial, at.p_wb, at.q_wb, legs, ground.mission_acceleration, ground.mission_corridor_m)
+        )
 
     def _advance(self, flight: _Flight, time_ns: int) -> None:
         assert flight.started_ns is not None
@@ -295,6 +297,7 @@ class MissionFlight:
         self.jobs.clear()
         if flight is not None and flight.legs[0].sequence != _GO_TO and not flight.replaced:
             self._system.subject.progress.state = state
+            self._left = flight.legs[flight.reached :]
 
     @property
     def _first(self) -> int:
@@ -305,12 +308,12 @@ class MissionFlight:
         return self._parameters().ground.mission_speed_m_s if self._speed is None else self._speed
 
     def _legs(self, first: int) -> tuple[Leg, ...]:
-        origin, speed = self._system.subject.origin, self._cruise
-        legs = []
+        origin, speed = self._system.subject.origin, math.nan
+        legs: list[Leg] = []
         speeds = [item for item in self.items[:first] if item.speed_m_s is not None]  # one that was passed goes on to count
         for item in (*speeds, *flight_order(self.items, first)):
             if item.speed_m_s is not None:
-                speed = item.speed_m_s if item.speed_m_s > 0 else self._cruise
+                speed = item.speed_m_s if item.speed_m_s > 0 else math.nan
             place = item.place(origin)
             if place is not None:
                 legs.append(Leg(item.sequence, place, item.yaw, item.hold_s, speed))

@@ -249,6 +249,24 @@ def test_mission_that_goes_on_is_as_fast_as_before_it_was_paused(world: World, c
     assert [(leg.sequence, leg.speed_m_s) for leg in job.legs] == [(2, pytest.approx(0.3))]
 
 
+@pytest.mark.parametrize(("asked", "left"), [
+    ((193, 0), [1, 3]), ((192, -1, 0, 0, NAN, 30.2084, 120.1614, -0.4), [1, 3]), ((224, 1), [1, 0, 1, 3]),
+])  # fmt: skip
+def test_rounds_that_were_flown_before_a_pause_are_not_flown_again(
+    world: World, client: Client, asked: tuple[float, ...], left: list[int]
+) -> None:
+    jump = item(2, (0, 0, 0), command=177, frame=2, p=(0, 1, 0, 0))
+    upload(world, client, [item(0, PLACES[0]), item(1, PLACES[1]), jump, item(3, PLACES[2])])
+    assert [leg.sequence for leg in fly(world, client).legs] == [0, 1, 0, 1, 3]
+    world.run(3100)
+    client.command(193, 0)
+    world.run(20)
+    client.command(*asked)  # type: ignore[arg-type]
+    world.run(20)
+    world.station.jobs()
+    assert continued(world, client) == left
+
+
 @pytest.mark.parametrize("index", [2, 0, -1])
 def test_client_that_sets_the_current_item_hears_at_once_which_it_is(world: World, client: Client, index: int) -> None:
     """Also on a link where nothing streams: a client takes it for the answer."""
@@ -262,6 +280,18 @@ def test_client_that_sets_the_current_item_hears_at_once_which_it_is(world: Worl
     world.run(2)
     assert [m.seq for m in client.all("MISSION_CURRENT")] == ([index] * 2 if index >= 0 else [0])
     assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+
+
+def test_speed_that_is_set_in_a_pause_counts_when_the_mission_goes_on(world: World, client: Client) -> None:
+    upload(world, client, [item(0, PLACES[0]), item(1, PLACES[1])])
+    fly(world, client)
+    client.command(193, 0)
+    world.run(20)
+    client.command(178, 1, 0.3)
+    client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.speed_m_s for leg in job.legs] == [pytest.approx(0.3)] * 2
 
 
 def test_jump_replans_from_where_the_body_is(world: World, client: Client) -> None:
