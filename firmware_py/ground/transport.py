@@ -63,12 +63,11 @@ class UdpLink:
         self._to = None if listen else address
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        if listen:
-            try:
-                self._socket.bind(address)
-            except (OSError, OverflowError):
-                self._socket.close()
-                raise
+        try:
+            self._socket.bind(address) if listen else _refuse_broadcast(address)
+        except (OSError, OverflowError):
+            self._socket.close()
+            raise
 
     @property
     def port(self) -> int:
@@ -101,6 +100,17 @@ class UdpLink:
 
     def close(self) -> None:
         self._socket.close()
+
+
+def _refuse_broadcast(address: tuple[str, int]) -> None:
+    """Raises PermissionError for an address from which nobody answers. A network that is not there yet is no mistake."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(address)
+        except PermissionError:
+            raise
+        except OSError:
+            return
 
 
 class TcpLink:

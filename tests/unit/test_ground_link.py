@@ -450,7 +450,7 @@ def broken(descriptor: int, queue: int) -> None:
 
 @pytest.mark.parametrize(
     "address",
-    ["nonsense", "udpin:127.0.0.1:no", "udpin:127.0.0.1:99999", "/dev/no-such-port,9600", "tcpin:256.0.0.1:5"],
+    ["nonsense", "udpin:127.0.0.1:no", "udpin:127.0.0.1:99999", "/dev/no-such-port,9600", "tcpin:256.0.0.1:5", "udpout:255.255.255.255:5"],
 )
 def test_an_address_that_cannot_be_opened_is_refused_in_one_line(address: str) -> None:
     with pytest.raises(LinkError, match="link ") as error:
