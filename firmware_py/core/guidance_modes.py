@@ -14,7 +14,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.health import Health
 from firmware_py.core.rotations import difference, heading, rotate, rotate_back
-from firmware_py.core.setpoint import Glider, Trajectory, Wish, ahead_of, at_estimate, leashed, rest_at
+from firmware_py.core.setpoint import Glider, Trajectory, Wish, ahead_of, at_estimate, on_leash, rest_at
 from firmware_py.core.supervisor import TAKES_OVER, Decision
 from firmware_py.core.transitions import Effect
 from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
@@ -181,9 +181,10 @@ class Guidance:
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):
             self._glider.put(self._docking)
             return self._docking, ahead_of(self._docking, self._lead_s)
-        if self.mode == Mode.GUIDED:  # its speeds are whatever somebody asks for
-            self._glider.put(self._glider.at._replace(p_wb=leashed(self._glider.at.p_wb, estimate.p_wb)))
-        now = self._glider.step(self._wish(time_ns, estimate, health), dt_s)
+        wish = self._wish(time_ns, estimate, health)
+        if self.mode == Mode.GUIDED or wish.v_w.any() or wish.w_b.any():  # it is led by what somebody asks for, and the body may be held
+            self._glider.put(on_leash(self._glider.at, estimate))
+        now = self._glider.step(wish, dt_s)
         lost, self._lost = self._lost, not self._placed(health)  # in the tick in which tags tell a place, the set-point still moves to it
         if STEERING[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (lost or self._lost)):
             now = self._let_go(now, estimate)

@@ -22,6 +22,8 @@ LEASH_M = 1.0
 """How far a set-point that moves by a given speed may be from the body. A speed that the body cannot make, or one that somebody holds it
 against, would lead it away without end, and the body after it long after it was told to stop. The shipped gains ask a module for all that
 it has in its worst direction (22.9 N) at 0.14 m, so a longer leash would not make it any faster."""
+LEASH_RAD = 2.0
+"""The same of an attitude that turns by a given rate: half a turn ahead of a body that is held, it would turn it back."""
 
 
 class Trajectory(Protocol):
@@ -132,6 +134,14 @@ class Glider:
         _glide(*self.at, wish.v_w, wish.w_b, place, attitude, self._w, self._speed, rate, dt_s, out)
         self.at = Setpoint(out[0:3], out[3:7], out[7:10], out[10:13], out[13:16], out[16:19])
         return self.at
+
+
+def on_leash(setpoint: Setpoint, estimate: Estimate) -> Setpoint:
+    """The set-point, or the nearest one that is not too far from the body to lead it."""
+    q_wb, turn = setpoint.q_wb, difference(setpoint.q_wb, estimate.q_wb)
+    if turn @ turn > LEASH_RAD**2:
+        q_wb = normalise(multiply(estimate.q_wb, exp(limited(turn, LEASH_RAD))))
+    return setpoint._replace(p_wb=leashed(setpoint.p_wb, estimate.p_wb), q_wb=q_wb)
 
 
 def leashed(place: np.ndarray, p_wb: np.ndarray) -> np.ndarray:

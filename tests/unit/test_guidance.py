@@ -261,6 +261,33 @@ def test_speed_that_the_body_cannot_make_leads_no_set_point_away_that_it_would_r
     assert flight.setpoints[-1].p_wb[0] < LEASH_M + 0.1 and np.abs(flight.setpoints[-1].v_w).max() < 1e-3
 
 
+@pytest.mark.parametrize("mode", [Mode.ALT_HOLD, Mode.POSHOLD])
+def test_sticks_lead_no_set_point_away_from_a_robot_that_lies_on_the_ground(mode: Mode) -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, mode)
+    flight.run(20.0, sticks(down=1.0), follows=False)
+    flight.run(2.0, sticks(), follows=False)
+    assert flight.setpoints[-1].p_wb[2] < flight.estimate.p_wb[2] + LEASH_M + 0.15
+    assert flight.run(4.5, sticks(down=-1.0), follows=False).p_wb[2] < flight.estimate.p_wb[2], "and it comes off as soon as it is asked to"
+
+
+@pytest.mark.parametrize("mode", [Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.GUIDED])
+def test_robot_that_is_held_is_turned_the_way_it_was_asked_to_and_never_back(mode: Mode) -> None:
+    flight, nan = Flight(), np.full(3, np.nan)
+    flight.do(Effect.ENTER_MODE, mode)
+    for _ in range(150):
+        flight.do(Effect.TAKE_POINT, mode, Setpoint(nan, np.full(4, np.nan), nan, np.array([0.0, 0.0, 0.6]), ZERO, ZERO))
+        flight.run(0.1, sticks(yaw=1.0), follows=False)
+        assert difference(flight.setpoints[-1].q_wb, flight.estimate.q_wb)[2] > 0.0
+
+
+def test_robot_that_is_pushed_off_its_place_comes_back_to_it() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.POSHOLD)
+    flight.estimate = estimate((3.0, 0.0, 1.0))
+    assert np.abs(flight.run(1.0, sticks(), follows=False).p_wb[0]) < 1e-9
+
+
 @pytest.mark.parametrize(("silence_s", "north_m"), [(60.0, 0.0), (0.1, 3.0)])
 def test_point_of_long_ago_is_no_place_to_go_to_when_the_mode_is_entered(silence_s: float, north_m: float) -> None:
     flight = Flight()
