@@ -106,11 +106,6 @@ class DockingStage:
         return rows.copy() if rows.size else rows
 
     @property
-    def busy(self) -> frozenset[int]:
-        """Bodies that a dock steers."""
-        return frozenset(dock.active for dock in self._docks)
-
-    @property
     def under_way(self) -> bool:
         """Whether any dock or undock is."""
         return bool(self._docks or self._undocks)
@@ -128,14 +123,8 @@ class DockingStage:
         """Plans of these have been asked for, in this order."""
         self._expected.update((body, request) for request in requests)
 
-    def abort(self, body: int, time_ns: int, reason: str) -> None:
-        """Ends every dock that a body takes part in."""
-        for dock in self._docks:
-            if body in (dock.active, dock.target):
-                dock.sequence.abort(time_ns, reason)
-
-    def leave(self, body: Body, armed: bool) -> list[Event]:
-        """The body is not in the mode DOCK: its undocks end at once, and where it is disarmed its docks. Says so.
+    def leave(self, body: Body) -> list[Event]:
+        """The body is not in the mode DOCK: its docks and undocks end at once, for nothing that they want moves it any more. Says so.
 
         An open joint is parted all the same: that its modules are apart is no wish.
         """
@@ -144,7 +133,7 @@ class DockingStage:
             self._undocks.remove(undock)
             self.relays.switch(RELAY_PULL, *undock.plan.opens)
             left.append(("undock", undock.plan.opens[0]))
-        for dock in [each for each in self._docks if each.active == body.index and not armed]:
+        for dock in [each for each in self._docks if each.active == body.index]:
             self._drop(dock)
             left.append(("dock", dock.prepared.request))
         return [Event(WARNING, f"{what} of module {request.module} ended: {NO_LONGER}") for what, request in left]

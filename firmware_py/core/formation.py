@@ -54,13 +54,9 @@ class Formation:
         outputs.events += self.docking.events
 
     def leave(self, chain: BodyPipeline, time_ns: int, outputs: Outputs) -> None:
-        """Docks and undocks go on in the mode DOCK alone: an armed body backs off from one, any other lets go at once."""
-        index, supervisor = chain.body.index, chain.supervisor
-        if supervisor.mode == Mode.DOCK:
-            return
-        if supervisor.armed and index in self.docking.busy:
-            self.docking.abort(index, time_ns, "the mode was changed")
-        outputs.events += [event._replace(body=index) for event in self.docking.leave(chain.body, supervisor.armed)]
+        """Docks and undocks go on in the mode DOCK alone: a body that leaves it lets go at once."""
+        if chain.supervisor.mode != Mode.DOCK:
+            outputs.events += [event._replace(body=chain.body.index) for event in self.docking.leave(chain.body)]
 
     def _miss_partners(self, outputs: Outputs) -> None:
         """Joints that are open though nobody asked: tells the bodies, and parts those that have come apart once their fail-safe is on."""

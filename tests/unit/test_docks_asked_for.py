@@ -8,7 +8,7 @@ from firmware_py.core.docking_decisions import Decisions, Join
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, DockRequest, Mode, Request
+from firmware_py.core.types import Action, DockRequest, Mode, Request, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.prepare.assembly import PITCH_M
 from tests.unit.test_partner_lost import RING, Docked
@@ -180,16 +180,39 @@ def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> 
     assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1, 1, 0]
 
 
-@pytest.mark.slow
-def test_dock_that_is_asked_for_again_while_it_ends_begins_anew() -> None:
-    tank, wanted = before_each_other(0.6), Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
-    tank.run(0.1, wanted)
+WANTED = Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
+
+
+def on_its_approach(delay: int = 0) -> Docked:
+    """Two modules, of which one has been told to dock to the other, and comes nearer. `delay`: ticks that each plan takes."""
+    tank = before_each_other(0.6)
+    tank._delay = delay
+    tank.run(0.02 + 0.01 * delay, WANTED)
     while tank.outputs[-1].docks[0].stage != Stage.APPROACH:
         tank.run(0.01)
     tank.run(1.5)
-    tank.run(0.05, Request(Action.SET_MODE, 1, Mode.POSHOLD))
-    assert tank.outputs[-1].docks[0].stage == Stage.ABORTED
-    outputs = tank.run(0.2, wanted)
+    return tank
+
+
+@pytest.mark.slow
+def test_dock_that_is_asked_for_again_while_it_ends_begins_anew() -> None:
+    tank = on_its_approach()
+    tank.pipeline.formation.docking._docks[0].sequence.abort(0, "on purpose")
+    outputs = tank.run(0.2, WANTED)
+    assert [dock.stage for dock in outputs.docks] == [Stage.PRE_APPROACH] and outputs.records[1].mode == Mode.DOCK
+
+
+@pytest.mark.slow
+def test_robot_that_was_flown_away_from_a_dock_is_not_flung_back_when_it_is_told_to_dock_again() -> None:
+    tank = on_its_approach(delay=50)
+    outputs = tank.run(0.05, Request(Action.SET_MODE, 1, Mode.POSHOLD))
+    assert outputs.docks == [] and tank.when("dock of module 1 ended")
+    for _ in range(18):
+        tank.run(0.1, Request(Action.STICKS, 1, Sticks((-1.0, 1.0, 0.0), (0.0, 0.0, 0.0))))
+    first = len(tank.outputs)
+    outputs = tank.run(1.5, WANTED)
+    places = np.array([outputs.records[1].setpoint.p_wb for outputs in tank.outputs[first - 1 :]])
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 0.006
     assert [dock.stage for dock in outputs.docks] == [Stage.PRE_APPROACH] and outputs.records[1].mode == Mode.DOCK
 
 
