@@ -187,8 +187,8 @@ class DockingStage:
         refusal = self._refusal(prepared, estimates)
         if plan is None or refusal:
             self._say(WARNING, f"dock refused: {refusal}")
-            if under_way is None and mine not in self._expected:
-                decisions.ended.append(mine)
+            if under_way is None:
+                self._end(mine, decisions)
         elif isinstance(plan, UndockPlan):
             self._begin_undock(plan, prepared.chains, time_ns)
         else:
@@ -272,12 +272,17 @@ class DockingStage:
         if stage == Stage.DOCKED:
             self._join(dock, decisions)
         elif stage in (Stage.ABORTED, Stage.FAILED) and steering.is_apart:
-            decisions.ended.append(dock.active)
             self._docks.remove(dock)
+            self._end(dock.active, decisions)
         else:
             decisions.setpoints[dock.active] = steering.active
         if steering.meets is not None:
             decisions.move(dock.target, steering.meets)
+
+    def _end(self, active: int, decisions: Decisions) -> None:
+        """The body is done with docking, but for a dock or undock whose plan it still waits for."""
+        if active not in self._expected:
+            decisions.ended.append(active)
 
     def _join(self, dock: _Dock, decisions: Decisions) -> None:
         """One join a tick and body: a dock that comes second finds its bodies gone, and `forget` ends it."""

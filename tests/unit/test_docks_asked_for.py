@@ -217,6 +217,18 @@ def test_robot_that_was_flown_away_from_a_dock_is_not_flung_back_when_it_is_told
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("delay", [0, 100])
+def test_dock_whose_plan_is_still_awaited_when_the_one_before_is_over_begins_all_the_same(delay: int) -> None:
+    tank = on_its_approach(delay)
+    (dock,) = tank.pipeline.formation.docking._docks
+    dock.sequence.abort(0, "on purpose")
+    while dock.sequence._gap_m < 0.1:
+        tank.run(0.01)
+    outputs = tank.run(2.0, WANTED)
+    assert len(outputs.docks) == 1 and outputs.records[1].mode == Mode.DOCK
+
+
+@pytest.mark.slow
 def test_dock_that_is_refused_leaves_the_one_under_way_alone() -> None:
     tank = before_each_other(0.6)
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
