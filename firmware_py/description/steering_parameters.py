@@ -37,13 +37,13 @@ class Steering:
     join_m: float = quantity(
         0.10,
         unit="m",
-        low=0,
+        low=1e-3,  # a set-point comes no nearer than rounding lets it, and a path whose start is never met does not begin
         high=10,
         help="start of a trajectory that is farther is approached first",
         mavlink="AUTO_JOIN",
     )
     join_rad: float = quantity(
-        0.20, unit="rad", low=0, high=3.2, help="the same for its attitude", mavlink="AUTO_JOIN_ANG"
+        0.20, unit="rad", low=1e-3, high=3.2, help="the same for its attitude", mavlink="AUTO_JOIN_ANG"
     )
     # Half of the 65 deg up to which the bench's cameras read a tag; at this rate a module on its head sees them within two seconds.
     hold_tilt_rad: float = quantity(

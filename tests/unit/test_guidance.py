@@ -13,7 +13,7 @@ from firmware_py.core.setpoint import LEASH_M, rest_at
 from firmware_py.core.supervisor import Decision
 from firmware_py.core.transitions import Effect, Trigger
 from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
-from firmware_py.description.parameters import Parameters
+from firmware_py.description.parameters import Parameters, registry
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.healths import BLIND, GOOD, UPRIGHT
@@ -226,6 +226,16 @@ def test_trajectory_that_begins_elsewhere_is_approached_first() -> None:
     assert not flight.guidance.finished(flight.time_ns)
     flight.run(20.0)
     np.testing.assert_allclose(flight.setpoints[-1].p_wb, [1.0, 1.0, 1.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["steering.join_m", "steering.join_rad"])
+def test_trajectory_begins_however_exactly_its_start_is_to_be_met(name: str) -> None:
+    flight = Flight(Parameters().replace(name, dict(registry())[name].low))
+    flight.estimate = estimate((0.0, 0.1, 1.0), from_euler(0.0, 0.0, 0.3))
+    flight.guidance.rest(flight.estimate)
+    flight.do(Effect.FOLLOW, Mode.AUTO, Ramp())
+    flight.run(20.0)
+    assert flight.guidance.finished(flight.time_ns)
 
 
 def test_stopped_mission_comes_to_rest_smoothly() -> None:
