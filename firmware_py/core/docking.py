@@ -142,14 +142,16 @@ class DockingStage:
         self,
         inputs: Inputs,
         estimates: Mapping[int, tuple[Body, Estimate]],
-        holding: Collection[int] = (),
-        resting: Collection[tuple[int, int]] = (),
+        waiting: Collection[int],
+        holding: Collection[int],
+        resting: Collection[tuple[int, int]],
     ) -> Decisions:
         """One tick.
 
         Args:
             estimates: body and its estimate, by the body's number.
-            holding: bodies that hold a place which may be moved: only these come to meet another. Looked at when a dock begins.
+            waiting: bodies in the mode DOCK: only these begin a dock. Looked at when a plan is there, as `holding` is.
+            holding: bodies that hold a place which may be moved: only these come to meet another.
             resting: modules and faces whose magnets are off whatever is wanted.
         """
         self.events, self.records = [], []
@@ -158,7 +160,7 @@ class DockingStage:
             return decisions
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:
-            self._begin(prepared, inputs.time_ns, estimates, holding, decisions)
+            self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)
         if self._joints.rows.size:
             self._joints.step(inputs.time_ns, inputs.modules, poses, resting)
         for dock in list(self._docks):
@@ -174,6 +176,7 @@ class DockingStage:
         prepared: Prepared,
         time_ns: int,
         estimates: Mapping[int, tuple[Body, Estimate]],
+        waiting: Collection[int],
         holding: Collection[int],
         decisions: Decisions,
     ) -> None:
@@ -184,7 +187,7 @@ class DockingStage:
         under_way = next((dock for dock in self._docks if dock.active == mine), None)
         if under_way is not None and under_way.prepared.request == request and under_way.sequence.stage not in ENDED:
             return
-        refusal = self._refusal(prepared, estimates)
+        refusal = self._refusal(prepared, estimates, waiting)
         if plan is None or refusal:
             self._say(WARNING, f"dock refused: {refusal}")
             if under_way is None:
@@ -196,17 +199,19 @@ class DockingStage:
                 self._give_up(under_way, holding, decisions)
             self._begin_dock(prepared, plan, time_ns, estimates, holding)
 
-    def _refusal(self, prepared: Prepared, estimates: Mapping[int, tuple[Body, Estimate]]) -> str:
+    def _refusal(self, prepared: Prepared, estimates: Mapping[int, tuple[Body, Estimate]], waiting: Collection[int]) -> str:
         """Why a plan is not begun; empty: it is."""
         plan = prepared.plan
         if plan is None:
             return prepared.refusal
         if not _fits(plan, estimates):
             return CHANGED
-        if isinstance(plan, UndockPlan) or self._p.approach == "straight":
+        if isinstance(plan, UndockPlan):
             return ""
-        active, target = (estimates[_body_of(module, estimates)] for module in (plan.request.module, plan.request.target_module))
-        return _in_the_way(plan, *active, *target, self._p.standoff_m)
+        mine, others = (_body_of(module, estimates) for module in (plan.request.module, plan.request.target_module))
+        if mine not in waiting:
+            return NO_LONGER
+        return "" if self._p.approach == "straight" else _in_the_way(plan, *estimates[mine], *estimates[others], self._p.standoff_m)
 
     def _drop(self, dock: _Dock) -> None:
         """It is no longer under way, and its magnets let go."""

@@ -40,9 +40,9 @@ class Formation:
 
     def step(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
         """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
-        held = [c for c in self.chains if c.supervisor.armed and c.supervisor.mode == Mode.POSHOLD] if inputs.prepared else []
         bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.chains}
-        decisions = self.docking.step(inputs, bodies, [c.body.index for c in held], self._resting())
+        waiting, holding = (self._armed_in(mode) if inputs.prepared else [] for mode in (Mode.DOCK, Mode.POSHOLD))
+        decisions = self.docking.step(inputs, bodies, waiting, holding, self._resting())
         self._miss_partners(outputs)
         outputs.docks += self.docking.records
         outputs.joints = self.docking.joints
@@ -71,6 +71,10 @@ class Formation:
             if gone and gone != chain.parting and chain.supervisor.armed and chain.supervisor.is_on("partner_lost"):
                 chain.parting = gone
                 outputs.preparations.append(PartRequest(tuple(gone)))
+
+    def _armed_in(self, mode: Mode) -> list[int]:
+        """Numbers of the bodies that are armed in a mode."""
+        return [chain.body.index for chain in self.chains if chain.supervisor.armed and chain.supervisor.mode == mode]
 
     def _resting(self) -> list[tuple[int, int]]:
         """Modules and faces whose magnets have used up their time."""

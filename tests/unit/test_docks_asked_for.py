@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.docking import CHANGED
+from firmware_py.core.docking import CHANGED, NO_LONGER
 from firmware_py.core.docking_decisions import Decisions, Join
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.rotations import from_euler
@@ -245,6 +245,17 @@ def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
     goal = tank.pipeline.formation.chains[0].guidance._goal
     assert goal is not None and goal.p_wb is not None
     assert 0.6 < goal.p_wb[1] < 0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m) + 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [Request(Action.DISARM, 1), Request(Action.SET_MODE, 1, Mode.MANUAL)], ids=["DISARM", "mode"])
+def test_target_does_not_come_to_meet_a_robot_that_has_left_the_dock_before_it_was_planned(stop: Request) -> None:
+    tank = before_each_other(2.0)
+    tank._delay = 30
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    tank.run(1.0, stop)
+    assert tank.when(f"dock refused: {NO_LONGER}")
+    assert tank.pipeline.formation.chains[0].guidance._goal is None
 
 
 @pytest.mark.slow
