@@ -285,8 +285,9 @@ class DockingStage:
             decisions.move(dock.target, steering.meets)
 
     def _end(self, active: int, decisions: Decisions) -> None:
-        """The body is done with docking, but for a dock or undock whose plan it still waits for."""
-        if active not in self._expected:
+        """The body is done with docking, but for what it still waits for the plan of, and an undock under way."""
+        parting = {module for undock in self._undocks for module in (*undock.plan.stays.modules, *undock.plan.leaves.modules)}
+        if active not in self._expected and active not in parting:
             decisions.ended.append(active)
 
     def _join(self, dock: _Dock, decisions: Decisions) -> None:

@@ -167,6 +167,16 @@ def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_ho
     assert tank.pipeline.formation.docking.relays.states == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
 
 
+@pytest.mark.parametrize(("body", "refused"), [(0, DockRequest(2, 1, 0, 0)), (0, DockRequest(0, 2, 3, 2))], ids=["undock", "dock"])
+def test_undock_under_way_goes_on_when_what_is_asked_for_meanwhile_is_refused(body: int, refused: DockRequest) -> None:
+    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0), (4, 0, 0)], each=3)
+    tank.fly()
+    tank.run(0.3, Request(Action.UNDOCK, body, DockRequest(2, 1, 1, 0)))
+    tank.run(2.0, Request(Action.UNDOCK if refused.target_module < 3 else Action.DOCK, body, refused))
+    assert tank.when("dock refused")
+    assert tank.shape == [(0, 1), (2,), (3,)]
+
+
 @pytest.mark.slow
 def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> None:
     tank = Docked(RING)
