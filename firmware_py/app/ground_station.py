@@ -119,7 +119,7 @@ class GroundSide:
         self.keeper: RateKeeper | None = None
         """Of a loop on a clock; telemetry tells how its ticks keep their deadlines."""
         self.error: Exception | None = None
-        """What ended the thread; the vehicle goes on without it."""
+        """The first that nobody foresaw. The thread goes on, and so does the vehicle."""
 
     def observe(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
         """Observer of the loop: hands the tick over, once its commands are out."""
@@ -148,8 +148,8 @@ class GroundSide:
             station.join(number, now_ns)
         for number in self.links.take_gone():
             station.leave(number)
+        self._hand_over(station.requests())  # first: whatever fails after it, a stop is on its way
         self._plan()
-        self._hand_over(station.requests())
         for channel, frame in station.frames(now_ns):
             self.links.send(channel, frame)
         self.links.flush()
@@ -192,17 +192,22 @@ class GroundSide:
             self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _run(self, teller: Teller) -> None:
-        try:
-            self._start_planner()
-            if self._priority:
-                use_priority(self._priority)  # where the system refuses it, the loop has said so
-            while not self._stopping:
-                time.sleep(self._rest_s())
-                self.pump()
-        except Exception as error:  # the flight is worth more than its telemetry
-            self.error = error
-            teller.say(f"warning: no ground station is heard any more: {type(error).__name__}: {error}")
+        self._try(self._start_planner, teller)
+        if self._priority:
+            use_priority(self._priority)  # where the system refuses it, the loop has said so
+        while not self._stopping:
+            time.sleep(self._rest_s())
+            self._try(self.pump, teller)
         teller.close()
+
+    def _try(self, act: Callable[[], None], teller: Teller) -> None:
+        """Does it, and lives on whatever comes of it: a stop that is asked for next must be heard. Only the first error is told."""
+        try:
+            act()
+        except Exception as error:
+            if self.error is None:
+                teller.say(f"warning: the ground side goes on after an error that nobody foresaw: {type(error).__name__}: {error}")
+            self.error = self.error or error
 
     def _rest_s(self) -> float:
         """Until shortly after the next tick; when it is overdue, half as long again as it is already waited for."""

@@ -53,7 +53,7 @@ class Formation:
             self._part(parted, inputs.time_ns, estimates)
         outputs.events += self.docking.events
 
-    def leave(self, chain: BodyPipeline, time_ns: int, outputs: Outputs) -> None:
+    def leave(self, chain: BodyPipeline, outputs: Outputs) -> None:
         """Docks and undocks go on in the mode DOCK alone: a body that leaves it lets go at once."""
         if chain.supervisor.mode != Mode.DOCK:
             outputs.events += [event._replace(body=chain.body.index) for event in self.docking.leave(chain.body)]

@@ -224,7 +224,7 @@ class Pipeline:
             outputs.events += [event._replace(body=chain.body.index) for event in chain.supervisor.events]
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
             if docking.under_way:
-                formation.leave(chain, inputs.time_ns, outputs)
+                formation.leave(chain, outputs)
         wanted, due = docking.relays.states, docking.relays.due(inputs.time_ns)
         for chain in formation.chains:
             relays = chain.magnets(wanted, due)

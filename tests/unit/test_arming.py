@@ -10,6 +10,7 @@ from firmware_py.core.arming import CHECKS, Question, against_arming, missing
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.types import Mode
+from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Limiter, Parameters
 from tests.unit.healths import BLIND, GOOD, UPRIGHT
 
@@ -90,6 +91,13 @@ def test_parameters_out_of_range_are_never_passed_over() -> None:
             "parameter limiter.force_share: 1.5 is out of range; permitted: 0.05 to 1",
             "parameter limiter.slew_n_per_s: 0.0 is out of range; permitted: 1 to 10000 N/s",
         ]
+
+
+def test_robot_whose_fence_is_upside_down_is_never_armed() -> None:
+    for forced in (False, True):
+        words = "fence.top_m is 50, fence.bottom_m 50: the top must be at less depth"
+        assert reasons(parameters=replace(P, fence=Fence(top_m=50.0)), forced=forced) == [words]
+        assert reasons(parameters=replace(P, fence=Fence(top_m=49.9)), forced=forced) == []
 
 
 def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:

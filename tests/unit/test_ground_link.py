@@ -504,15 +504,19 @@ def test_a_tick_only_hands_over_its_results() -> None:
         assert len(side._ticks) == 200
 
 
-def test_ground_side_that_ends_says_so_and_the_vehicle_goes_on() -> None:
+def test_ground_side_in_which_something_fails_says_so_once_and_goes_on_to_hear_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
     said: Queue[str] = Queue()
     config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",))
-    with GroundSide(config, firmware, ThreadPoolExecutor(1), unix_now_ns=lambda: 1 // 0, say=said.put) as side:
-        line = said.get(timeout=PATIENCE_S)
-        assert "no ground station is heard any more: ZeroDivisionError" in line and "\n" not in line
-        assert side.requests() == []
+    side = GroundSide(config, firmware, ThreadPoolExecutor(1), say=said.put)
+    asked, handed = [Request(Action.ESTOP)], threading.Event()
+    monkeypatch.setattr(side.station, "jobs", lambda: 1 // 0)  # in every round
+    monkeypatch.setattr(side, "_hand_over", lambda requests: handed.set() if said.qsize() and Request(Action.ESTOP) in requests else None)
+    monkeypatch.setattr(side.station, "requests", lambda: asked)
+    with side:
+        assert handed.wait(PATIENCE_S)
     assert isinstance(side.error, ZeroDivisionError)
+    assert "ZeroDivisionError" in said.get_nowait() and said.empty()
 
 
 def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
