@@ -132,15 +132,27 @@ class GroundSide:
 
     def pump(self) -> None:
         """One round: take ticks and bytes, answer, stream."""
+        for part in self._parts():
+            part()
+
+    def _parts(self) -> Sequence[Callable[[], None]]:
+        """Of a round, in order. None needs another to succeed: a stop passes through hearing and handing over alone."""
+        return self._look, self._hear, self._hand_over, self._plan, self._speak, self._save
+
+    def _look(self) -> None:
+        """Take ticks."""
         station = self.station
+        station.signing.advance(self._unix_now_ns())
         if self.keeper is not None:
             station.picture.times = times_of(self.keeper)
         station.spare(self.links.busy())
         while self._ticks:
             inputs, outputs = self._ticks.popleft()
             station.observe(inputs, outputs, self._pipeline.bodies)
-        now_ns = station.picture.time_ns
-        station.signing.advance(self._unix_now_ns())
+
+    def _hear(self) -> None:
+        """Take bytes."""
+        station, now_ns = self.station, self.station.picture.time_ns
         for got in self.links.receive():
             if station.take(got.channel, got.data, now_ns, got.datagram, got.trusted):
                 self.links.believe(got.channel)
@@ -148,19 +160,19 @@ class GroundSide:
             station.join(number, now_ns)
         for number in self.links.take_gone():
             station.leave(number)
-        self._hand_over(station.requests())  # first: whatever fails after it, a stop is on its way
-        self._plan()
-        for channel, frame in station.frames(now_ns):
-            self.links.send(channel, frame)
-        self.links.flush()
-        self._save(now_ns)
 
-    def _hand_over(self, requests: Sequence[Request]) -> None:
-        """To the next tick, in order. Of too many nothing but a stop is taken."""
-        for request in requests:
+    def _hand_over(self) -> None:
+        """What was asked, to the next tick, in order. Of too many nothing but a stop is taken."""
+        for request in self.station.requests():
             room = _MOST_REQUESTS * (2 if request.action in STOPPING else 1)
             if len(self._requests) < room:
                 self._requests.append(request)
+
+    def _speak(self) -> None:
+        """Answer and stream."""
+        for channel, frame in self.station.frames(self.station.picture.time_ns):
+            self.links.send(channel, frame)
+        self.links.flush()
 
     @property
     def reboot_asked(self) -> bool:
@@ -197,7 +209,8 @@ class GroundSide:
             use_priority(self._priority)  # where the system refuses it, the loop has said so
         while not self._stopping:
             time.sleep(self._rest_s())
-            self._try(self.pump, teller)
+            for part in self._parts():
+                self._try(part, teller)
         teller.close()
 
     def _try(self, act: Callable[[], None], teller: Teller) -> None:
@@ -243,8 +256,8 @@ class GroundSide:
         self._executor = _planner()
         return self._executor.submit(_plan_mission, job, body)
 
-    def _save(self, now_ns: int) -> None:
-        signing, path = self.station.signing, self._config.key_file
+    def _save(self) -> None:
+        signing, path, now_ns = self.station.signing, self._config.key_file, self.station.picture.time_ns
         may_wait = signing.key == self._saved_key and now_ns - self._saved_ns < _SAVE_EVERY_NS
         if path is None or not signing.changed or may_wait:
             return

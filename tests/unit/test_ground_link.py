@@ -504,19 +504,23 @@ def test_a_tick_only_hands_over_its_results() -> None:
         assert len(side._ticks) == 200
 
 
-def test_ground_side_in_which_something_fails_says_so_once_and_goes_on_to_hear_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("what", ["observe", "jobs", "frames"])
+def test_ground_side_in_which_something_fails_says_so_once_and_goes_on_to_hear_a_stop(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
     said: Queue[str] = Queue()
-    config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",))
-    side = GroundSide(config, firmware, ThreadPoolExecutor(1), say=said.put)
-    asked, handed = [Request(Action.ESTOP)], threading.Event()
-    monkeypatch.setattr(side.station, "jobs", lambda: 1 // 0)  # in every round
-    monkeypatch.setattr(side, "_hand_over", lambda requests: handed.set() if said.qsize() and Request(Action.ESTOP) in requests else None)
-    monkeypatch.setattr(side.station, "requests", lambda: asked)
-    with side:
-        assert handed.wait(PATIENCE_S)
-    assert isinstance(side.error, ZeroDivisionError)
-    assert "ZeroDivisionError" in said.get_nowait() and said.empty()
+    port = free_port()
+    side = GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{port}",)), firmware, ThreadPoolExecutor(1), say=said.put)
+    monkeypatch.setattr(side.station, what, None)  # whatever is done with it fails, in every round
+    estop = mavlink.MAVLink_command_long_message(1, 1, 31012, 0, 1, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None, srcSystem=255))
+    end, asked = time.monotonic() + PATIENCE_S, []
+    with side, closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as client:
+        while Action.ESTOP not in asked and time.monotonic() < end:
+            side.observe([], [], *Robot().step([]))
+            client.sendto(estop, ("127.0.0.1", port))
+            time.sleep(0.01)
+            asked = [request.action for request in side.requests()]
+    assert Action.ESTOP in asked and side.error is not None
+    assert type(side.error).__name__ in said.get_nowait() and said.empty()
 
 
 def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
