@@ -297,7 +297,7 @@ class MissionFlight:
         self.jobs.clear()
         if flight is not None and flight.legs[0].sequence != _GO_TO and not flight.replaced:
             self._system.subject.progress.state = state
-            self._left = flight.legs[flight.reached :]
+            self._left = flight.legs[flight.reached :] or flight.legs[-1:]
 
     @property
     def _first(self) -> int:

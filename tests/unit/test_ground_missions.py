@@ -267,6 +267,16 @@ def test_rounds_that_were_flown_before_a_pause_are_not_flown_again(
     assert continued(world, client) == left
 
 
+def test_mission_that_is_paused_in_its_last_hold_goes_on_with_that_alone(world: World, client: Client) -> None:
+    jump = item(2, (0, 0, 0), command=177, frame=2, p=(0, 1, 0, 0))
+    upload(world, client, [item(0, PLACES[0]), item(1, PLACES[1], p=(20, 0, 0, NAN)), jump])
+    assert [leg.sequence for leg in fly(world, client).legs] == [0, 1, 0, 1]
+    world.run(4100)
+    client.command(193, 0)
+    world.run(20)
+    assert continued(world, client) == [1]
+
+
 @pytest.mark.parametrize("index", [2, 0, -1])
 def test_client_that_sets_the_current_item_hears_at_once_which_it_is(world: World, client: Client, index: int) -> None:
     """Also on a link where nothing streams: a client takes it for the answer."""
