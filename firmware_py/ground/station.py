@@ -23,6 +23,7 @@ from firmware_py.ground.missions import MissionService
 from firmware_py.ground.outbox import Outbox, Outgoing
 from firmware_py.ground.parameters import ParameterService, ParameterStore
 from firmware_py.ground.picture import Picture
+from firmware_py.ground.pilots import Sender
 from firmware_py.ground.presence import Presence
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.steering import Steering
@@ -30,7 +31,7 @@ from firmware_py.ground.system import Arrival, System
 from firmware_py.ground.telemetry import Subject
 from firmware_py.ground.wire import Framer, Packet
 
-_SYSTEMS = 256
+_SENDERS = 256
 _LAST_SYSTEM = 254
 """255 is what ground stations take."""
 _MAY_STOP = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE", "MANUAL_CONTROL")
@@ -103,7 +104,7 @@ class GroundStation:
         self._busy: set[int] = set()
         self._frames: list[Outgoing] = []
         self._framers: dict[int, Framer] = {}
-        self._routes: dict[int, int] = {}
+        self._routes: dict[Sender, int] = {}
         origin = Origin(fleet.latitude_deg, fleet.longitude_deg, fleet.altitude_m)
         self.services: dict[int, Services] = {}
         for body in range(len(fleet.module)):
@@ -146,7 +147,7 @@ class GroundStation:
     def leave(self, channel: int) -> None:
         """A channel is gone."""
         self._framers.pop(channel, None)
-        self._routes = {system: at for system, at in self._routes.items() if at != channel}
+        self._routes = {sender: at for sender, at in self._routes.items() if at != channel}
         for services in self.services.values():
             services.system.remove_channel(channel)
 
@@ -212,32 +213,36 @@ class GroundStation:
         message = packet.message
         if message.system == 0 or (message.system in self.services and message.component == COMPONENT_AUTOPILOT):
             return  # nobody, or our own echo; other components of our systems are companions
-        if len(self._routes) < _SYSTEMS or message.system in self._routes:
-            self._routes[message.system] = channel
+        self._route(sender=(message.system, message.component), channel=channel)
         self.join(channel, time_ns)
         target = message.values.get("target_system", message.values.get("target", 0))
         arrival = Arrival(message, channel, time_ns, trusted)
         component = message.values.get("target_component", 0)
         is_ours = target in self.services and component in (0, COMPONENT_AUTOPILOT)
         if not is_ours:
-            self._forward(packet, target, channel)
+            self._forward(packet, target, component, channel)
         if target and not is_ours:
             return
         for number, services in self.services.items():
             if target in (0, number):
                 services.take(arrival, target == number)
 
-    def _forward(self, packet: Packet, target: int, channel: int) -> None:
-        """To whom it is for, where that system was heard; to everybody else what is for all."""
+    def _route(self, sender: Sender, channel: int) -> None:
+        """It was heard there. Of too many the one that was silent longest is forgotten."""
+        self._routes.pop(sender, None)
+        self._routes[sender] = channel
+        if len(self._routes) > _SENDERS:
+            del self._routes[next(iter(self._routes))]
+
+    def _forward(self, packet: Packet, target: int, component: int, channel: int) -> None:
+        """To wherever the system that it is for was heard, of one of ours the component; what is for all, to everybody else."""
         if packet.message.name in _NEVER_FORWARDED:
             return
-        if target:
-            to = self._routes.get(target)
-            if to is not None and to != channel:
-                self._frames.append(Outgoing(to, packet.raw))
-            return
-        for other in set(self._routes.values()) - {channel}:
-            self._frames.append(Outgoing(other, packet.raw))
+        heard = {
+            at for (system, part), at in self._routes.items()
+            if target in (0, system) and (target not in self.services or component == part)
+        }  # fmt: skip
+        self._frames += [Outgoing(other, packet.raw) for other in heard - {channel}]
 
 
 def _dock_of(config: GroundConfig) -> DockRequest | None:

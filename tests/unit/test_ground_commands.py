@@ -68,6 +68,22 @@ def test_what_is_for_a_companion_computer_goes_where_it_was_heard(world: World, 
     assert not world.robot.asked and not client.all("COMMAND_ACK")
 
 
+def test_each_companion_computer_and_each_station_of_one_system_hears_what_is_for_it(world: World, client: Client) -> None:
+    stations = [client, world.client(component=230)]
+    companions = [world.client(system=1, component=component) for component in (191, 100)]
+    stranger = world.client(system=7)
+    for stranger.mav.srcComponent in range(1, 256):  # however many names one gives itself
+        stranger.heartbeat()
+    for each in (*stations, *companions):
+        each.heartbeat(mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
+    for companion in companions:
+        client.command(512, 259, component=companion.mav.srcComponent)
+        companion.send("COMMAND_ACK", 512, 0, target_system=255, target_component=190)
+    world.run(2)
+    assert [[m.target_component for m in companion.all("COMMAND_LONG")] for companion in companions] == [[191], [100]]
+    assert [m.get_srcComponent() for m in client.all("COMMAND_ACK")] == [191, 100]
+
+
 def test_component_zero_and_system_zero_are_accepted(world: World, client: Client) -> None:
     client.command(410, component=0)
     assert acknowledged(world, client, 410) == mavlink.MAV_RESULT_ACCEPTED
