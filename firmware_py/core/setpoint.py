@@ -138,15 +138,18 @@ class Glider:
 
 def on_leash(setpoint: Setpoint, estimate: Estimate) -> Setpoint:
     """The set-point, or the nearest one that is not too far from the body to lead it."""
-    q_wb, turn = setpoint.q_wb, difference(setpoint.q_wb, estimate.q_wb)
-    if turn @ turn > LEASH_RAD**2:
-        q_wb = normalise(multiply(estimate.q_wb, exp(limited(turn, LEASH_RAD))))
-    return setpoint._replace(p_wb=leashed(setpoint.p_wb, estimate.p_wb), q_wb=q_wb)
+    return setpoint._replace(p_wb=leashed(setpoint.p_wb, estimate.p_wb), q_wb=leashed_turn(setpoint.q_wb, estimate.q_wb))
 
 
 def leashed(place: np.ndarray, p_wb: np.ndarray) -> np.ndarray:
     """The place (3,), or the nearest one that is along no axis farther than LEASH_M from the body at `p_wb` (3,)."""
     return np.asarray(np.clip(place, p_wb - LEASH_M, p_wb + LEASH_M))
+
+
+def leashed_turn(attitude: np.ndarray, q_wb: np.ndarray) -> np.ndarray:
+    """The attitude (4,), or the nearest one that is turned no farther than LEASH_RAD from the body at `q_wb` (4,)."""
+    turn = difference(attitude, q_wb)
+    return attitude if turn @ turn <= LEASH_RAD**2 else np.asarray(normalise(multiply(q_wb, exp(limited(turn, LEASH_RAD)))))
 
 
 def ahead_of(setpoint: Setpoint, lead_s: float) -> Setpoint:

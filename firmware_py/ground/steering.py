@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.rotations import from_euler, multiply, normalise, rotate, to_euler
-from firmware_py.core.setpoint import leashed
+from firmware_py.core.setpoint import leashed, leashed_turn
 from firmware_py.core.types import NOTICE, WARNING, Action, DockRequest, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.dialect import Message
@@ -248,6 +248,7 @@ class Steering:
             return from_euler(0.0, 0.0, yaw)
         start, elapsed_s = self._before(time_ns)
         q = now if start is None else start.q_wb
+        q = leashed_turn(q, self._system.subject.record.estimate.q_wb) if rate else q
         return np.asarray(normalise(multiply(from_euler(0.0, 0.0, rate * elapsed_s), q)))
 
     def _before(self, time_ns: int) -> tuple[Setpoint | None, float]:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from firmware_py.core.rotations import difference
+from firmware_py.core.setpoint import LEASH_RAD
 from firmware_py.core.types import Action, DockRequest, Mode
 from firmware_py.ground.config import GroundConfig
 from tests.unit.ground_requests import NAN, ask
@@ -155,6 +157,15 @@ def test_velocity_of_zero_stops_a_body_that_could_not_follow(world: World, clien
     stop = [r.argument for r in world.robot.asked if r.action == Action.SET_POINT][-1]
     assert stop.v_w == pytest.approx([0, 0, 0])
     assert 0.5 < stop.p_wb[0] - world.robot.p_wb[0][0] <= 1.0 + 1e-6
+
+
+def test_robot_that_is_held_while_a_rate_streams_is_turned_that_way_and_never_back(world: World, client: Client) -> None:
+    fly_by_velocity(world, client)
+    for _ in range(100):
+        send_target(client, 0x5C7, yaw_rate=0.6)
+        world.run(10)
+        turn = difference(world.robot.asked[-1].argument.q_wb, world.robot.q_wb[0])
+        assert turn[2] > -1e-9 and np.linalg.norm(turn) < LEASH_RAD + 0.1
 
 
 def test_setpoints_that_are_no_numbers_are_ignored(world: World, client: Client) -> None:
