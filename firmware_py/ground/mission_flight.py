@@ -222,10 +222,10 @@ class MissionFlight:
             tracking = s.armed and s.picture.mode(s.body) == Mode.AUTO
             if tracking and flight.started_ns is None:
                 flight.started_ns = time_ns
-            if flight.started_ns is not None:
+            if tracking:
                 self._advance(flight, time_ns)
-                if not tracking and self._flight is flight:
-                    self._end(PAUSED)
+            elif flight.started_ns is not None:
+                self._end(PAUSED)
         self._tell_again(time_ns)
 
     def _end_if_taken(self) -> None:

@@ -1,6 +1,7 @@
 """Missions: the protocol with pymavlink's messages, what is refused, and how the body is followed along the plan."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -661,6 +662,23 @@ def test_flight_that_is_being_planned_ends_when_the_body_becomes_another(parts: 
     world.run(3)
     assert Action.TRACK not in [r.action for r in world.robot.asked]
     assert client.texts.count("flight ended before it began: the body is another one") == 1
+
+
+def test_mission_of_a_robot_that_was_part_of_another_meanwhile_is_not_complete_but_paused() -> None:
+    world = World(2)
+    client, apart = world.client(), list(world.robot.bodies)
+    world.robot.state[1] = State.ARMED
+    come_back(world, planning(world, client))
+    world.run(1100)
+    world.robot.bodies = [SimpleNamespace(index=1, modules=(0, 1))]
+    world.run(3000)
+    client.clear()
+    world.robot.bodies, world.robot.mode[0] = apart, Mode.POSHOLD
+    world.run(120)
+    assert not client.all("MISSION_ITEM_REACHED") and "mission complete" not in client.texts
+    told = [m for m in client.all("MISSION_CURRENT") if m.get_srcSystem() == 1][-1]
+    assert (told.mission_state, told.seq) == (mavlink.MISSION_STATE_PAUSED, 1)
+    assert continued(world, client) == [1, 2]
 
 
 def test_way_to_a_place_ends_by_pause_while_it_is_planned(world: World, client: Client) -> None:
