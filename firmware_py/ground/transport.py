@@ -60,11 +60,12 @@ class UdpLink:
 
     def __init__(self, host: str, port: int, listen: bool) -> None:
         address = socket.gethostbyname(host), port
-        self._to = None if listen else address
+        self._to = None if listen else _who_answers(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
-            self._socket.bind(address) if listen else _refuse_broadcast(address)
+            if listen:
+                self._socket.bind(address)
         except (OSError, OverflowError):
             self._socket.close()
             raise
@@ -102,15 +103,20 @@ class UdpLink:
         self._socket.close()
 
 
-def _refuse_broadcast(address: tuple[str, int]) -> None:
-    """Raises PermissionError for an address from which nobody answers. A network that is not there yet is no mistake."""
+def _who_answers(address: tuple[str, int]) -> tuple[str, int]:
+    """From where the answers of an address come: those of 0.0.0.0 from 127.0.0.1. A network that is not there yet is no mistake.
+
+    Raises PermissionError for a broadcast address, from which nobody answers.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(address)
+            host, port = probe.getpeername()
         except PermissionError:
             raise
         except OSError:
-            return
+            return address
+    return host, port
 
 
 class TcpLink:

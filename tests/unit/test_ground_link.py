@@ -448,6 +448,20 @@ def broken(descriptor: int, queue: int) -> None:
     raise termios.error(5, "Input/output error")
 
 
+def test_station_on_the_robots_own_machine_is_heard_by_whatever_name_of_it() -> None:
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as station:
+        station.bind(("127.0.0.1", 0))
+        station.settimeout(PATIENCE_S)
+        for host in ("127.0.0.1", "localhost", "0.0.0.0"):
+            links = Links([f"udpout:{host}:{station.getsockname()[1]}"])
+            with closing(links):
+                links.send(None, b"telemetry")
+                links.flush()
+                robot = station.recvfrom(100)[1]
+                station.sendto(b"stop", robot)
+                assert [got.data for got in received(links, 1)] == [b"stop"], host
+
+
 @pytest.mark.parametrize(
     "address",
     ["nonsense", "udpin:127.0.0.1:no", "udpin:127.0.0.1:99999", "/dev/no-such-port,9600", "tcpin:256.0.0.1:5", "udpout:255.255.255.255:5"],
