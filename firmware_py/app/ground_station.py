@@ -82,7 +82,7 @@ class GroundSide:
         unix_now_ns: the time of day, for signing.
         priority: SCHED_FIFO priority of the thread, beside a loop that has one; 0: an ordinary thread.
         started: parameters before the stored ones were laid over them; None: the firmware's.
-        say: told in one line what ended the thread, by a thread of its own.
+        say: told in one line what failed first, by a thread of its own.
     """
 
     def __init__(
