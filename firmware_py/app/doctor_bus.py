@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from firmware_py.app.doctor import FAILED, OK, WARNING, Finding
-from firmware_py.bus.codec import Codec, Frame, Receiver
+from firmware_py.bus.codec import Codec, Frame, Received, Receiver
 from firmware_py.bus.load import BIT_RATE, MEAN_LIMIT, bus_load, frame_bits
 from firmware_py.bus.port import Port
 
@@ -16,11 +16,21 @@ TICK_S = 0.01
 TICKS = 60
 """SYNCs sent: every slow message of a module comes at least once in 200 ms but HEARTBEAT."""
 STATES = ("boot", "disarmed", "armed", "time-out of commands", "e-stop", "fault")
+FIT_STATES = (1, 2, 3)
+"""Of those; a module in another one turns no thruster when it is armed."""
 ERRORS = ("bad CRC", "bad counter", "bad length", "command time-out", "sensor fault", "relay fault")
 TOO_MANY = 1.5
 """Commands of a module for each SYNC, which are more than one controller sends, however many of either were missed."""
 TIME_OUT = 1 << 3
 """Of MCU_STATUS: nobody commands while the doctor looks, so it is no fault."""
+WRONG: Mapping[str, Mapping[int, str]] = {
+    "Leak": {1: "water in its cabin"},
+    "PowerStatus": {1: "a low supply", 2: "a critical supply", 15: "a dead supply sensor"},
+    **{f"{name}Status": {2: f"a stale {name.lower()} sensor", 15: f"a dead {name.lower()} sensor"} for name in ("Gyro", "Accel", "Depth")},
+    **{f"EscStatus{number}": {1: f"a fault of ESC {number}", 2: f"an ESC {number} that is too hot"} for number in range(1, 9)},
+    **{f"RelayEcho{face}": {3: f"a fault of relay {face}"} for face in "ABCDEF"},
+}
+"""By field and value, what a module's frames say of it. A silent ESC is not there: an MCU says so of one that the vehicle lacks."""
 
 
 @dataclass(slots=True)
@@ -36,6 +46,8 @@ class Seen:
     estop: set[int] = field(default_factory=set)
     status: dict[int, tuple[int, int, int]] = field(default_factory=dict)
     """By module: version, errors, state."""
+    wrong: dict[int, dict[str, None]] = field(default_factory=dict)
+    """By module: what its frames said to be wrong, each once, in order."""
     messages: dict[int, set[str]] = field(default_factory=dict)
     """By number: names of what came."""
     dropped: dict[str, int] = field(default_factory=dict)
@@ -85,6 +97,14 @@ def take(port: Port, receiver: Receiver, seen: Seen) -> None:
             _, version, errors, state = received.values
             seen.status[received.number] = (version, seen.status.get(received.number, (0, 0, 0))[1] | errors, state)
         seen.messages.setdefault(received.number, set()).add(name)
+        seen.wrong.setdefault(received.number, {}).update(dict.fromkeys(complaints(received)))
+
+
+def complaints(received: Received) -> Iterator[str]:
+    """What a frame says to be wrong."""
+    for name, value in zip(received.message.fields, received.values, strict=True):
+        if word := WRONG.get(name, {}).get(int(value)):
+            yield word
 
 
 def judge(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec) -> list[Finding]:
@@ -126,10 +146,12 @@ def judge_module(title: str, number: int, seen: Seen, codec: Codec) -> Finding:
         return Finding(title, FAILED, f"module {number} is silent", "is it powered, its number set? candump shows ids")
     version, errors, state = seen.status[number]
     text = f"module {number}: version {version}, {STATES[state] if state < len(STATES) else state}"
-    words = [word for bit, word in enumerate(ERRORS) if errors & ~TIME_OUT & 1 << bit]
+    words = [word for bit, word in enumerate(ERRORS) if errors & ~TIME_OUT & 1 << bit] + [*seen.wrong.get(number, ())]
     missing = sorted(expected_of(codec) - seen.messages[number])
     if words:
         return Finding(title, WARNING, f"{text}; reports {', '.join(words)}", "see can_dbc/README.md")
+    if state not in FIT_STATES:
+        return Finding(title, WARNING, text, "CLEAR_ESTOP ends an e-stop; boot and fault are the module's own: switch it off and on")
     if missing:
         return Finding(title, WARNING, f"{text}; never sent {', '.join(missing)}", "a sensor or ESC of it may be dead")
     return Finding(title, OK, text)

@@ -27,7 +27,7 @@ from firmware_py.app.doctor import (
     check_throttle,
     lines_of,
 )
-from firmware_py.app.doctor_bus import Seen, judge, look_at
+from firmware_py.app.doctor_bus import Seen, expected_of, judge, look_at
 from firmware_py.app.doctor_report import check_bus
 from firmware_py.app.service import reporting
 from firmware_py.bus.codec import Codec, Frame
@@ -179,6 +179,25 @@ def test_raised_estop_and_bad_frames_are_told(nodes: Nodes, far_end: Port) -> No
     findings = list(check_bus(far_end.address, [1], 100, CODEC, lambda seconds: answer(nodes, far_end, bad)))
     text = "\n".join(finding.text for finding in findings)
     assert "e-stop raised by number 30" in text and "bad frames" in text
+
+
+@pytest.mark.parametrize(("state", "fit"), [(0, False), (1, True), (2, True), (3, True), (4, False), (5, False)])
+def test_module_that_an_e_stop_or_a_fault_of_its_own_holds_is_not_called_ok(state: int, fit: bool) -> None:
+    seen = Seen(1.0, status={1: (1, 0, state)}, messages={1: expected_of(CODEC)})
+    assert (judge("bus", seen, [1], 100, CODEC)[0].state == OK) == fit
+
+
+@pytest.mark.parametrize(("message", "values", "says"), [
+    ("ENVIRONMENT", (30.0, 101325.0, 1), "water in its cabin"), ("POWER", (12.0, 1.0, 15), "a dead supply sensor"),
+    ("DEPTH", (101325.0, 20.0, 2), "stale depth sensor"), ("ESC_FEEDBACK_2", (0, 0.0, 1, 0, 0.0, 3), "a fault of ESC 3"),
+    ("DOCK_CURRENT_DEF", (0, 0, 0, 0, 0, 3), "a fault of relay F"),
+])  # fmt: skip
+def test_what_a_module_says_to_be_wrong_with_it_is_told(
+    message: str, values: tuple[float, ...], says: str, nodes: Nodes, far_end: Port
+) -> None:
+    bad = [CODEC.message(message).encode(1, values, counter) for counter in (5, 11)]
+    finding = next(iter(check_bus(far_end.address, [1], 100, CODEC, lambda seconds: answer(nodes, far_end, bad))))
+    assert finding.state == WARNING and finding.text.count(says) == 1 and "ESC 4" not in finding.text
 
 
 @pytest.mark.parametrize(("syncs", "controllers", "says"), [
