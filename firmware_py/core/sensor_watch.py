@@ -60,12 +60,12 @@ class SensorWatch:
             module = modules[index]
             if module.gyro is not None and module.accel is not None:
                 self.frozen[i] = self._repeats_itself(i, module.gyro, module.accel)
-                self.imu_heard = self.imu_heard or not self.frozen[i]
             gone: dict[str, Any] = {name: None for name in LEAPS if self._leaps(i, name, getattr(module, name))}
             if self.frozen[i]:
                 gone |= FROZEN
             if gone:
                 believed[index] = dataclasses.replace(module, **gone)
+            self.imu_heard = self.imu_heard or (believed[index].gyro is not None and believed[index].accel is not None)
         return believed
 
     def _repeats_itself(self, i: int, gyro: np.ndarray, accel: np.ndarray) -> bool:

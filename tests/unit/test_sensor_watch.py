@@ -44,6 +44,17 @@ def test_one_number_that_changes_is_a_sensor_that_lives(change: str) -> None:
         assert hears(watch, module)
 
 
+@pytest.mark.parametrize("broken", ["gyro", "accel"])
+def test_imu_that_leaps_with_every_sample_is_not_heard(broken: str) -> None:
+    """Or the fail-safe `imu_lost` would never know that nothing of it is believed."""
+    watch, rng = SensorWatch([0]), np.random.default_rng(0)
+    for n in range(100):
+        module = sample(0.1 + 1e-3 * (n % 2))
+        setattr(module, broken, rng.uniform(-16.0, 16.0, 3))
+        is_heard = hears(watch, module)
+        assert n < REPEATS or not is_heard
+
+
 def test_lost_frames_neither_freeze_nor_thaw() -> None:
     watch = SensorWatch([0])
     for _ in range(5 * REPEATS):
