@@ -141,15 +141,14 @@ class FaultDetector:
             modules: inputs of the whole fleet, by fleet index.
             measured, estimate: of this tick.
             force_n, mean_n: (n,) forces that the thrusters are believed to give now, and on the mean since the last tick, N.
-            armed: nothing is looked for while disarmed.
+            armed: while disarmed nothing is looked for but propellers that turn all the same.
         """
         self.words, self.changed = [], False
         found = self._motion.step(measured, estimate, mean_n * self._share, self.now.alive, armed)
         if found is not None:
             self._lose(found, "does not push as it says")
         own = [modules[m] for m in self._modules]
-        if armed:
-            self._hear(own, force_n)
+        (self._hear if armed else self._hear_at_rest)(own, force_n)
         self._miss(own, armed)
         return self.now
 
@@ -196,6 +195,21 @@ class FaultDetector:
             for i, kind in np.argwhere(self._counts >= self._needed).tolist():
                 if self.now.alive[i]:
                     self._lose(i, WHY[kind])
+
+    def _hear_at_rest(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
+        """Tells of a propeller that turns though nobody may turn it: somebody may be about to reach for it."""
+        for module, thruster_at in zip(modules, self._thruster_at, strict=True):
+            for esc in module.esc:
+                for channel, rpm in enumerate(esc.rpm, esc.first):
+                    if channel in thruster_at:
+                        self._watch_at_rest(thruster_at[channel], rpm, force_n)
+
+    def _watch_at_rest(self, i: int, rpm: float, force_n: np.ndarray) -> None:
+        """One feedback. After a flight a propeller runs down, as is believed of its force."""
+        most = FAST_SHARE * abs(self.believed_rpm(i, force_n[i])) + FAST_MARGIN * self._believed[1][i]
+        self._counts[i, DISOBEYS] = self._counts[i, DISOBEYS] + 1 if abs(rpm) > most else 0
+        if self._counts[i, DISOBEYS] == self._needed[DISOBEYS]:
+            self.words.append(f"thruster {i + 1} turns though it was told to stand still")
 
     def believed_rpm(self, i: int, force_n: float) -> float:
         """Speed of thruster `i` at a force, 1/min."""

@@ -39,7 +39,7 @@ class Water:
         self.believed, self.acts = ThrusterLag(body.thrusters, DT), ThrusterLag(body.thrusters, DT)
         self.gain = self.rng.uniform(0.95, 1.05, n)
         self.deadband = self.rng.uniform(0.10, 0.25, n)
-        self.speed_factor = np.ones(n)
+        self.speed_factor, self.stray_rpm = np.ones(n), np.zeros(n)
         self.status = np.zeros(n, dtype=int)
         self.heard = 1.0
         self.tag_age_ns = 0
@@ -93,7 +93,8 @@ class Water:
         for first in range(0, 8, 2):
             if self.tick % 10 == first and self.rng.uniform() < self.heard:
                 rpm = [
-                    self.speed_factor[i] * self.detector.believed_rpm(i, float(self.acts.force_n[i])) + 5.0 * self.rng.normal()
+                    self.speed_factor[i] * self.detector.believed_rpm(i, float(self.acts.force_n[i]))
+                    + self.stray_rpm[i] + 5.0 * self.rng.normal()
                     for i in (first, first + 1)
                 ]
                 status = (int(self.status[first]), int(self.status[first + 1]))
@@ -191,6 +192,18 @@ def test_slow_thruster_below_its_deadband_is_healthy(water: Water) -> None:
 def test_disarmed_robot_is_not_judged(water: Water) -> None:
     water.speed_factor[:], water.status[:] = 0.0, 1
     assert water.run(2.0, armed=False) == []
+
+
+def test_propeller_that_turns_on_a_disarmed_robot_is_told_of_once_and_anew_when_it_does_so_again(water: Water) -> None:
+    water.fly(1.0)
+    assert water.run(1.0, armed=False) == [], "they only run down"
+    water.stray_rpm[2] = -0.4 * BODY.thrusters.rpm_at_full[2]
+    assert [words for _, words in water.run(1.0, armed=False)] == ["thruster 3 turns though it was told to stand still"]
+    assert water.detector.now.alive.all(), "it is trusted again when it is armed, and judged then"
+    water.stray_rpm[2] = 0.0
+    assert water.run(1.0, armed=False) == []
+    water.stray_rpm[2] = 0.4 * BODY.thrusters.rpm_at_full[2]
+    assert len(water.run(1.0, armed=False)) == 1
 
 
 def test_dead_thruster_is_found_although_frames_are_lost(water: Water) -> None:
