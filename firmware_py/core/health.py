@@ -59,7 +59,7 @@ class Health(NamedTuple):
     cabin_change_pa: float
     """Largest change of a cabin's pressure since its first reading."""
     stopped: tuple[int, ...]
-    """Fleet indices of modules that say that an e-stop holds them."""
+    """Fleet indices of modules that say that an e-stop holds them: those of every body, for an e-stop is meant for all."""
     silent: tuple[int, ...]
     """Fleet indices of modules that did not answer of late."""
     silent_s: float
@@ -111,7 +111,8 @@ class HealthMonitor:
         self._esc_ns = [NEVER_NS] * t.module.size
         self._heard_ns = [0] * count
         self._answered_ns = [NEVER_NS] * count
-        self._stopped = [False] * count
+        self._stopped_ns: dict[int, int] = {}
+        """By fleet index, when a module said last that an e-stop holds it; without those that have said since that none does."""
         self._leak, self._wet, self._wet_ns = [False] * count, [False] * count, [NEVER_NS] * count
         self._voltage_share: dict[int, float] = {}
         self._cabin_c: dict[int, float] = {}
@@ -148,9 +149,9 @@ class HealthMonitor:
     def take_over(self, before: Sequence[HealthMonitor]) -> None:
         """Goes on from the bodies that this one is made of, or was part of: what each module said last, and when people were heard."""
         for other in before:
+            self._stopped_ns |= other._stopped_ns
             for i, j in in_both(self._modules, other._modules):
                 self._heard_ns[i], self._answered_ns[i] = other._heard_ns[j], other._answered_ns[j]
-                self._stopped[i] = other._stopped[j]
                 self._leak[i], self._wet[i], self._wet_ns[i] = other._leak[j], other._wet[j], other._wet_ns[j]
                 for mine, theirs in zip(self._readings, other._readings, strict=True):
                     if j in theirs:
@@ -175,6 +176,7 @@ class HealthMonitor:
             self._heard_ns, self._depth_ns, self._imu_ns, self._time_ns = [now] * len(self._modules), now, now, now
         dt_s = (now - self._time_ns) * 1e-9
         self._listen([inputs.modules[m] for m in self._modules], now)
+        self._hear_stops(inputs.modules, now)
         if self.imu_heard:
             self._imu_ns = now
         self._foreign_sync_ns = now if inputs.foreign_sync else self._foreign_sync_ns
@@ -196,7 +198,7 @@ class HealthMonitor:
             leak=any(self._leak),
             cabin_c=max(self._cabin_c.values(), default=math.nan),
             cabin_change_pa=max(self._cabin_change_pa.values(), default=math.nan),
-            stopped=tuple(m for m, stopped in zip(self._modules, self._stopped, strict=True) if stopped),
+            stopped=tuple(m for m, at in self._stopped_ns.items() if m in self._modules or now - at <= self._answer_ns),
             silent=tuple(self._modules[i] for i in _older(self._answered_ns, now - self._answer_ns)),
             silent_s=_age_s(min(self._heard_ns), now),
             bus_silent_s=_age_s(max(self._heard_ns), now),
@@ -226,8 +228,6 @@ class HealthMonitor:
             for tag in module.tags:
                 if tag.capture_ns > self._pictures_ns[1]:
                     self._pictures_ns = self._pictures_ns[1], tag.capture_ns
-            if module.mcu_state is not None:
-                self._stopped[index] = module.mcu_state == MCU_ESTOP
             if module.pressure_pa is not None:
                 self._depth_ns, self._depth_heard = now, True
             if module.leak is not None:
@@ -245,6 +245,14 @@ class HealthMonitor:
                 self._cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
             if module.esc:
                 self._hear_escs(self._thruster_at[index], module.esc, now)
+
+    def _hear_stops(self, modules: Sequence[ModuleInputs], now: int) -> None:
+        """Of the whole fleet: an ESTOP on one bus stops the bodies on the others too, also where only a module has heard it."""
+        for index, module in enumerate(modules):
+            if module.mcu_state == MCU_ESTOP:
+                self._stopped_ns[index] = now
+            elif module.mcu_state is not None:
+                self._stopped_ns.pop(index, None)
 
     def _tag_gap_s(self, now: int) -> float:
         """Told as long as another picture is not overdue."""

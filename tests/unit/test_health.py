@@ -35,7 +35,8 @@ class Ear:
     def hear(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: object) -> Health:
         self.tick += 1
         self.time_ns += TICK_NS
-        modules = [ModuleInputs(), one or ModuleInputs(), ModuleInputs(), three or ModuleInputs()]
+        other = more.get("others", ModuleInputs())
+        modules = [other, one or ModuleInputs(), other, three or ModuleInputs()]
         estimate = Estimate(
             np.array([1.0, -2.0, 3.0]), np.array([1.0, 0, 0, 0]), np.zeros(6), ZERO, ZERO, np.array([0.01, 0.03, 0.02]),
             np.full(3, 0.002), 30_000_000, 6.0, 6, 0, True,
@@ -64,6 +65,20 @@ def test_silence_is_counted_per_module() -> None:
     health = ear.wait(0.3)
     assert health.silent == (1, 3) and health.bus_silent_s == pytest.approx(0.3) and health.silent_s == pytest.approx(0.8)
     assert ear.hear(here(), here()).silent == ()
+
+
+def test_e_stop_that_holds_a_module_of_another_body_is_heard_until_that_falls_silent_or_lets_go() -> None:
+    """Modules 0 and 2 are of other bodies, on another bus maybe: whoever pressed it there wants all to stop."""
+    ear = Ear()
+    stopped, free = here(mcu_state=4), here(mcu_state=1)
+    assert ear.hear(here(), here(), others=stopped).stopped == (0, 2)
+    assert ear.hear(here(), here(), others=free).stopped == ()
+    ear.hear(here(), stopped, others=stopped)
+    assert ear.wait(0.1).stopped == (0, 2, 3)
+    assert ear.wait(1.0).stopped == (3,), "its own modules are waited for; one that was switched off elsewhere holds nobody back"
+    whole = HealthMonitor(BODY, Parameters(), TICK_NS)
+    whole.take_over([ear.monitor])
+    assert set(whole._stopped_ns) == {0, 2, 3}
 
 
 def test_module_that_only_talks_has_not_answered() -> None:

@@ -377,6 +377,23 @@ def test_each_body_obeys_its_own_requests() -> None:
     np.testing.assert_allclose(tank.states[1][:3], tank.past[50][1][:3], atol=5e-3)
 
 
+def test_e_stop_that_only_the_module_of_one_body_has_heard_stops_every_body() -> None:
+    """It was pressed on one of two buses, while the firmware did not hear that one."""
+    tank = Tank([single(0), single(1)])
+    hear, says = tank._hear, [2]
+
+    def heard(tick: int) -> list[ModuleInputs]:
+        modules = hear(tick)
+        modules[0].mcu_state = says[0]
+        return modules
+
+    tank._hear = heard  # type: ignore[method-assign]
+    tank.run(0.5)
+    assert all(command.armed for command in tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1)).modules)
+    says[0] = 4
+    assert [record.state for record in tank.run(DT).records] == [State.ESTOP] * 2
+
+
 def test_what_is_said_names_the_body_that_it_is_about() -> None:
     tank = Tank([single(0), single(1)])
     refused = tank.run(DT, Request(Action.ARM, 1), Request(Action.SET_MODE, 0, 19.5))
