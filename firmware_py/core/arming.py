@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -93,8 +92,7 @@ def _failsafes(q: Question) -> list[str]:
 
 
 def _readings(q: Question) -> list[str]:
-    figures = {"battery": q.health.voltage_share, "cabin": q.health.cabin_c}
-    return [f"{name} was not heard of" for name, value in figures.items() if math.isnan(value)]
+    return [f"{name} was not heard of lately" for name in q.health.unheard]
 
 
 def _frames(q: Question) -> str:

@@ -26,6 +26,8 @@ MEAN_S = 1.0
 """Time over which rates and shares are averaged."""
 DRY_NS = 3_000_000_000
 """A cabin that was wet in two readings running is dry when its sensor has been for so long: water in it moves. ArduSub waits as long."""
+READ_NS = 2_000_000_000
+"""So long what a module says of its battery and its cabin is known: ten readings of its cabin, twenty of its battery."""
 FOREIGN_NS = 1_000_000_000
 """So long a frame of somebody else is remembered: one that sends as slowly as once a second is one stranger."""
 VOLTAGE_SHARE = 0.2
@@ -91,6 +93,8 @@ class Health(NamedTuple):
     """Which docked partner is lost, in words; empty: none."""
     tag_gap_s: float = math.nan
     """Between the last two pictures of tags, believed or not; NaN while none come."""
+    unheard: tuple[str, ...] = ()
+    """What some module has said nothing of lately: battery, cabin. The figures above stay what they were."""
 
     @property
     def placed(self) -> bool:
@@ -119,6 +123,7 @@ class HealthMonitor:
         self._cabin_start_pa: dict[int, float] = {}
         self._cabin_change_pa: dict[int, float] = {}
         self._readings = (self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa)
+        self._read_ns = {name: [NEVER_NS] * count for name in ("battery", "cabin")}
         self._foreign_sync_ns = self._foreign_command_ns = NEVER_NS
         self._depth_ns = self._imu_ns = 0
         self._depth_heard = False
@@ -153,6 +158,8 @@ class HealthMonitor:
             for i, j in in_both(self._modules, other._modules):
                 self._heard_ns[i], self._answered_ns[i] = other._heard_ns[j], other._answered_ns[j]
                 self._leak[i], self._wet[i], self._wet_ns[i] = other._leak[j], other._wet[j], other._wet_ns[j]
+                for name, times_ns in self._read_ns.items():
+                    times_ns[i] = other._read_ns[name][j]
                 for mine, theirs in zip(self._readings, other._readings, strict=True):
                     if j in theirs:
                         mine[i] = theirs[j]
@@ -216,6 +223,7 @@ class HealthMonitor:
             warm=self.warm,
             topology=self.topology,
             tag_gap_s=self._tag_gap_s(now),
+            unheard=tuple(name for name, times_ns in self._read_ns.items() if min(times_ns) < now - READ_NS),
         )
         return self.now
 
@@ -235,10 +243,12 @@ class HealthMonitor:
                 self._leak[index] = module.leak or now - self._wet_ns[index] < DRY_NS
                 self._wet[index] = module.leak
             if module.voltage_v is not None and isfinite(module.voltage_v):
+                self._read_ns["battery"][index] = now
                 share = module.voltage_v / self._nominal_v[index]
                 before = self._voltage_share.get(index, share)
                 self._voltage_share[index] = before + VOLTAGE_SHARE * (share - before)
             if module.cabin_temperature_c is not None and isfinite(module.cabin_temperature_c):
+                self._read_ns["cabin"][index] = now
                 self._cabin_c[index] = module.cabin_temperature_c
             if module.cabin_pressure_pa is not None and isfinite(module.cabin_pressure_pa):
                 start = self._cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
