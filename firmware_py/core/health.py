@@ -139,6 +139,8 @@ class HealthMonitor:
         self.now: Health
         self.imu_heard = True
         """Whether an IMU that is to be believed was heard in this tick; set by whoever watches them."""
+        self.pressure_heard = False
+        """The same of a pressure sensor."""
         self.topology = ""
         """Set by whoever watches the docked faces."""
         self.warm = True
@@ -186,6 +188,8 @@ class HealthMonitor:
         self._hear_stops(inputs.modules, now)
         if self.imu_heard:
             self._imu_ns = now
+        if self.pressure_heard:
+            self._depth_ns, self._depth_heard = now, True
         self._foreign_sync_ns = now if inputs.foreign_sync else self._foreign_sync_ns
         self._foreign_command_ns = now if inputs.foreign_command else self._foreign_command_ns
         self._people(requests, now)
@@ -236,8 +240,6 @@ class HealthMonitor:
             for tag in module.tags:
                 if tag.capture_ns > self._pictures_ns[1]:
                     self._pictures_ns = self._pictures_ns[1], tag.capture_ns
-            if module.pressure_pa is not None:
-                self._depth_ns, self._depth_heard = now, True
             if module.leak is not None:
                 self._wet_ns[index] = now if module.leak and self._wet[index] else self._wet_ns[index]
                 self._leak[index] = module.leak or now - self._wet_ns[index] < DRY_NS

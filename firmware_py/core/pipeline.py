@@ -97,7 +97,7 @@ class BodyPipeline:
         self.supply.step(inputs.modules)
         mean_n = self.lag.step()
         believed = self.sensors.step(inputs.modules)
-        self.health.imu_heard = self.sensors.imu_heard
+        self.health.imu_heard, self.health.pressure_heard = self.sensors.imu_heard, self.sensors.pressure_heard
         measured = self.measurements.fuse(believed, self.estimator.q_wb)
         estimate = self.estimator.step(inputs.time_ns, measured, self.body.thrusters.matrix @ mean_n)
         self._find_faults(inputs, measured, estimate, mean_n)

@@ -7,6 +7,7 @@ bit on its way unless the next one says the same: no thruster moves a body so su
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +20,8 @@ from firmware_py.core.types import ModuleInputs
 
 REPEATS = 10
 """Samples in a row that are the same in all six numbers. A quiet sensor of one count of noise does that once in a day of 100 Hz."""
+DEPTH_REPEATS = 100
+"""The same of a pressure, two seconds of DEPTH: the noise of a sensor that lives is tens of pascals, and its frames count single ones."""
 LEAPS = {"gyro": 1.0, "accel": 2.0, "pressure_pa": 2000.0}
 """From sample to sample, rad/s, m/s^2, Pa. A module's full moment, 3.2 N m of 0.088 kg m^2, turns it by 0.7 rad/s more in a tick at 50 Hz;
 its force, 40 N of 15.5 kg, comes with a lag of 80 ms: reversed, 1.2 m/s^2 in that tick. Twenty centimetres of water are 2000 Pa."""
@@ -34,28 +37,31 @@ class SensorWatch:
 
     Attributes:
         frozen: of each module, whether its IMU is not to be believed now.
-        imu_heard: whether any IMU that is to be believed gave a sample in this tick.
+        imu_heard, pressure_heard: whether any IMU, any pressure sensor that is to be believed gave a sample in this tick.
     """
 
     def __init__(self, modules: Sequence[int]) -> None:
         self._modules = tuple(modules)
         self._last: list[tuple[bytes, np.ndarray]] = [(b"", np.zeros(0))] * len(self._modules)
         self._repeats = [0] * len(self._modules)
+        self._pressures = [(math.nan, 0)] * len(self._modules)
+        """The last one, and how often it has been repeated."""
         self._traces: list[dict[str, Trace]] = [{} for _ in self._modules]
         self.frozen = [False] * len(self._modules)
-        self.imu_heard = False
+        self.imu_heard = self.pressure_heard = False
 
     def take_over(self, before: Sequence[SensorWatch]) -> None:
         """Goes on from the bodies that this one is made of, or was part of."""
         for other in before:
             for i, j in in_both(self._modules, other._modules):
                 self._last[i], self._repeats[i], self.frozen[i] = other._last[j], other._repeats[j], other.frozen[j]
+                self._pressures[i] = other._pressures[j]
                 self._traces[i] = dict(other._traces[j])
 
     def step(self, modules: Sequence[ModuleInputs]) -> Sequence[ModuleInputs]:
         """The inputs of the fleet, by fleet index, less what is not to be believed."""
         believed = list(modules)
-        self.imu_heard = False
+        self.imu_heard = self.pressure_heard = False
         for i, index in enumerate(self._modules):
             module = modules[index]
             if module.gyro is not None and module.accel is not None:
@@ -63,9 +69,12 @@ class SensorWatch:
             gone: dict[str, Any] = {name: None for name in LEAPS if self._leaps(i, name, getattr(module, name))}
             if self.frozen[i]:
                 gone |= FROZEN
+            if module.pressure_pa is not None and self._pressure_repeats_itself(i, module.pressure_pa):
+                gone["pressure_pa"] = None
             if gone:
                 believed[index] = dataclasses.replace(module, **gone)
             self.imu_heard = self.imu_heard or (believed[index].gyro is not None and believed[index].accel is not None)
+            self.pressure_heard = self.pressure_heard or believed[index].pressure_pa is not None
         return believed
 
     def _repeats_itself(self, i: int, gyro: np.ndarray, accel: np.ndarray) -> bool:
@@ -74,6 +83,11 @@ class SensorWatch:
         self._repeats[i] = self._repeats[i] + 1 if repeats else 0
         self._last[i] = rate, accel
         return self._repeats[i] >= REPEATS
+
+    def _pressure_repeats_itself(self, i: int, pressure_pa: float) -> bool:
+        last_pa, repeats = self._pressures[i]
+        self._pressures[i] = pressure_pa, repeats + 1 if pressure_pa == last_pa else 0
+        return self._pressures[i][1] >= DEPTH_REPEATS
 
     def _leaps(self, i: int, name: str, reading: np.ndarray | float | None) -> bool:
         """Whether a reading is far from the one that was believed last, and from the one after that as well."""

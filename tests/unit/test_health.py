@@ -42,6 +42,7 @@ class Ear:
             np.full(3, 0.002), 30_000_000, 6.0, 6, 0, True,
         )  # fmt: skip
         estimate = estimate._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
+        self.monitor.pressure_heard = any(module.pressure_pa is not None for module in (modules[1], modules[3]))
         inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, foreign_command=self.foreign_command)
         return self.monitor.step(inputs, estimate, list(requests), ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6)))
 

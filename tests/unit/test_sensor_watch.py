@@ -7,8 +7,8 @@ import pytest
 
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.rotations import difference
-from firmware_py.core.sensor_watch import LEAPS, REPEATS, SensorWatch
-from firmware_py.core.types import Action, ModuleInputs, Request
+from firmware_py.core.sensor_watch import DEPTH_REPEATS, LEAPS, REPEATS, SensorWatch
+from firmware_py.core.types import Action, Mode, ModuleInputs, Request
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from tests.unit.test_pipeline import Tank, single
@@ -53,6 +53,37 @@ def test_imu_that_leaps_with_every_sample_is_not_heard(broken: str) -> None:
         setattr(module, broken, rng.uniform(-16.0, 16.0, 3))
         is_heard = hears(watch, module)
         assert n < REPEATS or not is_heard
+
+
+def test_pressure_that_is_repeated_for_two_seconds_is_not_believed_until_it_changes() -> None:
+    watch = SensorWatch([0])
+
+    def is_heard(pressure_pa: float) -> bool:
+        watch.step([ModuleInputs(pressure_pa=pressure_pa)])
+        return watch.pressure_heard
+
+    assert [is_heard(1.1e5) for _ in range(DEPTH_REPEATS + 3)] == [True] * DEPTH_REPEATS + [False] * 3
+    assert is_heard(1.1e5 + 1.0)
+
+
+def test_blind_robot_whose_depth_sensor_freezes_comes_up_instead_of_drifting_at_a_depth_it_believes_in() -> None:
+    tank, rng, frozen_pa = Tank([single()]), np.random.default_rng(0), [0.0]
+    hear = tank._hear
+
+    def heard(tick: int) -> list[ModuleInputs]:
+        (module,) = hear(tick)
+        assert module.gyro is not None and module.accel is not None and module.pressure_pa is not None
+        module.gyro, module.accel = module.gyro + 0.002 * rng.normal(size=3), module.accel + 0.03 * rng.normal(size=3)
+        module.pressure_pa = frozen_pa[0] or module.pressure_pa + 20.0 * rng.normal()
+        module.tags = [] if frozen_pa[0] else module.tags
+        return [module]
+
+    tank._hear = heard  # type: ignore[method-assign]
+    tank.run(1.0)
+    tank.run(1.0, Request(Action.ARM))
+    tank.run(1.0, Request(Action.SET_MODE, 0, Mode.ALT_HOLD))
+    frozen_pa[0] = 1.1e5
+    assert tank.run(10.0).records[0].mode == Mode.SURFACE
 
 
 def test_lost_frames_neither_freeze_nor_thaw() -> None:
