@@ -215,9 +215,9 @@ def measure(modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicl
     return [Response(base * n, -u[n, axis] / p[n, axis], float(beside[axis]), bool(pushed[axis])) for axis, n in enumerate(chosen)]
 
 
-def step_responses(parameters: Parameters, axes: Sequence[int]) -> np.ndarray:
-    """(k, STEP_TICKS) share of a step of the set-point that a lone module has made, tick by tick, one of `axes` after the other."""
-    loop, found, still = Loop(1, parameters), [], np.zeros(6)
+def step_responses(parameters: Parameters, axes: Sequence[int], vehicle: str) -> np.ndarray:
+    """(k, STEP_TICKS) share of a step of the set-point that a lone vehicle has made, tick by tick, one of `axes` after the other."""
+    loop, found, still = Loop(1, parameters, vehicle=vehicle), [], np.zeros(6)
     for _ in range(STEP_SETTLE_TICKS):
         loop.step(still)
     for axis in axes:

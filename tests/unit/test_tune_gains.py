@@ -277,6 +277,39 @@ def test_steps_fill_their_plot_and_the_start_is_seen_where_the_others_agree_with
     assert lines["start"].get_linestyle() == "--" and lines["start"].get_zorder() > lines["tuned"].get_zorder()
 
 
+def test_plots_of_a_search_are_of_the_vehicle_that_it_flies(
+    drawn: list[Any], tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import loop_response
+    import optuna
+    import tune_plots
+
+    shaken: list[str] = []
+
+    class Still:
+        """A vehicle that stays where it is."""
+
+        def __init__(self, modules: int, parameters: Parameters, vehicle: str = "modcube") -> None:
+            shaken.append(vehicle)
+            self.pose = np.zeros(6)
+
+        def step(self, shake: np.ndarray) -> None:
+            pass
+
+    def measured(modules: int, parameters: Parameters, vehicle: str) -> list[Any]:
+        shaken.append(vehicle)
+        return [loop_response.Response(np.array([1.0, 2.0, 3.0]), np.array([2.0, 1.0, 0.5]) * -1j)] * 6
+
+    monkeypatch.setattr(loop_response, "Loop", Still)
+    monkeypatch.setattr(tune_plots, "measure", measured)
+    monkeypatch.setattr(tune_plots, "worker_pool", lambda jobs: Inline())
+    study = optuna.create_study()
+    study.add_trial(optuna.trial.create_trial(value=2.0))
+    sets = dict.fromkeys(("start", "shipped", "tuned"), Parameters())
+    tune_plots.draw(tmp_path, objective_of(tools, tmp_path), study, sets, "bluerov2_heavy")
+    assert len(drawn) == 3 and shaken == ["bluerov2_heavy"] * 5
+
+
 @pytest.mark.parametrize("before", [0.5, 1.5, 1.6, 2.5, 4.4, 4.5, 9.0])
 def test_refused_live_step_does_not_come_twice(tools: tuple[Any, Any], before: float) -> None:
     import tune_live
