@@ -62,7 +62,7 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
         "jams": float(docks["jams"][-1]),
         "outcome": float(outcome),
         "false_declarations": float(_false_declarations(truths, signals)),
-        "join_jump_n": _join_jump_n(scenario, signals),
+        "join_jump_n": _join_jump_n(truths, signals),
         "docked_rmse_m": _docked_rmse_m(truths, signals),
     }
 
@@ -156,29 +156,28 @@ def _off_attitude(signals: Mapping[str, Columns]) -> float:
     return worst
 
 
-def _join_jump_n(scenario: Scenario, signals: Mapping[str, Columns]) -> float:
-    """A joined body has the target's thrusters first, then the active one's; NaN when nothing was joined."""
+def _join_jump_n(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> float:
+    """Over all joins that docks declared; a joined body has the target's thrusters first, then the active one's. NaN without any."""
     bodies = {int(name.removeprefix("/firmware/body")): c for name, c in signals.items() if name.startswith("/firmware/body")}
-    groups = {group[0]: set(group) for group in scenario.groups}
-    docks = [(scenario.index_of(step.target_module), scenario.index_of(step.module)) for step in scenario.step if step.do == "dock"]
-    worst = math.nan
-    for tick, gone in sorted((int(tick), number) for number, columns in bodies.items() for tick in _ends(columns["tick"])):
-        after = {n: force for n, c in bodies.items() if (force := _forces(c, tick + 1)) is not None}
-        for target, active in docks:
-            pair = [next((n for n, members in groups.items() if module in members), -1) for module in (target, active)]
-            if gone not in pair or pair[0] == pair[1]:
-                continue
-            kept = pair[0] if gone == pair[1] else pair[1]
-            before = [force for n in pair if (force := _forces(bodies[n], tick)) is not None]
-            if kept in after and len(before) == len(pair):
-                worst = float(np.fmax(worst, np.abs(after[kept] - np.concatenate(before)).max()))
-                groups[kept] |= groups.pop(gone)
+    docks, worst = signals.get("/firmware/docks"), math.nan
+    if docks is None:
+        return worst
+    declared = docks["stage"] == DECLARED
+    for tick, target, active in zip(*(docks[name][declared].tolist() for name in ("tick", "module_a", "module_b")), strict=True):
+        before, after = ({n: force for n, c in bodies.items() if (force := _forces(c, at)) is not None} for at in (tick - 1, tick))
+        members = {n: _members(truths, n, tick, len(force)) for n, force in before.items()}
+        pair = [n for module in (target, active) for n in members if module in members[n]]
+        both = np.concatenate([before[n] for n in pair] or [np.zeros(0)])
+        for joined in (after[n] for n in pair if n in after and len(after[n]) == len(both)):
+            worst = float(np.fmax(worst, np.abs(joined - both).max()))
     return worst
 
 
-def _ends(ticks: np.ndarray) -> np.ndarray:
-    """Last tick of each run of ticks without a gap."""
-    return ticks[np.append(np.flatnonzero(np.diff(ticks) > 1), len(ticks) - 1)]
+def _members(truths: Mapping[str, Columns], leader: int, tick: int, thrusters: int) -> np.ndarray:
+    """Modules of a body that has so many thrusters for the firmware: those of the true one when it last had as many, for it joins first."""
+    true, each = truths[f"/plant/body{leader}"], truths["/plant/module0"]["force_n"].shape[1]
+    alike = (true["tick"] < tick) & (each * np.count_nonzero(true["member"], axis=1) == thrusters)
+    return np.flatnonzero(true["member"][alike][-1:].any(axis=0))
 
 
 def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> float:

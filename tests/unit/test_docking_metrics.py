@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from firmware_py.description.signals import Columns
-from hil.docking_metrics import DECLARED, _docked_rmse_m, _false_declarations, docking_metrics, is_as_asked, is_obeyed
+from hil.docking_metrics import DECLARED, _docked_rmse_m, _false_declarations, _join_jump_n, docking_metrics, is_as_asked, is_obeyed
 from hil.scenario import Scenario, Step, load_scenario
 from hil.signals import SIGNAL_LOG
 from hil.truth_log import TRUTH_LOG
@@ -102,6 +102,23 @@ def test_join_that_no_dock_declared_is_found_by_the_number_of_bodies() -> None:
     signals = {"/firmware/body0": {"tick": TICKS}, "/firmware/body1": {"tick": TICKS[:30]}, "/firmware/body2": {"tick": TICKS}}
     assert _false_declarations(truth_of([APART], PLACES), signals) == 1
     assert _false_declarations(truth_of([APART, PAIR], PLACES), signals) == 1  # thirty ticks in, and true from fifty
+
+
+def test_step_of_the_thrusters_counts_in_every_join_of_modules_that_part_and_dock_again() -> None:
+    """By 0.2 N in the first, and by 0.7 N in the second, a tick after the faces have locked."""
+    truths = truth_of([APART, PAIR, APART, PAIR], PLACES)
+    truths["/plant/module0"]["force_n"] = np.zeros((100, 8))
+    joined = ((TICKS > 26) & (TICKS <= 50)) | (TICKS > 76)
+    force_n = np.where(np.arange(16) < 8, 1.0, 2.0) + np.select([(TICKS > 26) & (TICKS <= 50), TICKS > 76], [0.2, -0.7])[:, None]
+    both = np.where(joined[:, None] | (np.arange(16) < 8), force_n, np.nan)
+    docks = {"tick": np.array([26, 27, 77]), "stage": np.array([4, DECLARED, DECLARED]),
+             "module_a": np.zeros(3, int), "module_b": np.ones(3, int)}  # fmt: skip
+    signals = {"/firmware/body0": {"tick": TICKS, "commanded_n": both}, "/firmware/docks": docks,
+               "/firmware/body1": {"tick": TICKS[~joined], "commanded_n": force_n[~joined, 8:]}}  # fmt: skip
+    assert _join_jump_n(truths, signals) == pytest.approx(0.7)
+    one = {name: column[:2] for name, column in docks.items()}
+    assert _join_jump_n(truths, signals | {"/firmware/docks": one}) == pytest.approx(0.2)
+    assert np.isnan(_join_jump_n(truths, {}))
 
 
 def test_place_of_a_joined_body_counts_from_when_the_firmware_knows_it() -> None:
