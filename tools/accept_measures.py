@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -70,9 +71,10 @@ def saved_by_least_power(folder: Path) -> Values:
 
 def loop_margins(folder: Path) -> Values:
     """Least margins of all axes of bodies of 1, 2 and 4 modules, nominal and in the worst corner; keys `nominal.gain_db`."""
-    command = [sys.executable, Path(__file__).with_name("margins.py"), "--jobs", str(JOBS), "--out", folder]
+    command, out = [sys.executable, Path(__file__).with_name("margins.py"), "--jobs", str(JOBS), "--out", folder], folder / "margins.json"
+    out.unlink(missing_ok=True)  # an earlier run's: were this one to fail, its figures would be taken for new
     subprocess.run(command, stdout=subprocess.DEVNULL)
-    found = json.loads((folder / "margins.json").read_text(encoding="utf-8"))
+    found = json.loads(out.read_text(encoding="utf-8"))
     kinds, keys = ("nominal", "worst"), ("gain_db", "phase_deg")
     return {f"{kind}.{key}": min(row[key] for row in found if row["kind"] == kind) for kind in kinds for key in keys}
 
@@ -142,6 +144,7 @@ def repeated(folder: Path) -> Values:
     """Flies one seed twice and another once: logs of the twin that differ, logs of the other that are the same."""
     for name, seed in (("first", 0), ("second", 0), ("other", 1)):
         command = [Path(sys.executable).with_name("modcube"), "hil", "run", "spiral", "--no-plots"]
+        shutil.rmtree(folder / name, ignore_errors=True)  # an earlier run's logs, which a flight that cannot run would leave
         subprocess.run([*command, "--seed", str(seed), "--out", folder / name], capture_output=True)
     logs = {run: [(folder / run / log).read_bytes() for log in LOGS] for run in ("first", "second", "other")}
     pairs = [zip(logs["first"], logs[run], strict=True) for run in ("second", "other")]
