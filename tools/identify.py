@@ -34,7 +34,7 @@ from rich.table import Table
 
 from firmware_py.description.schema import DescriptionError, build, read_toml
 from firmware_py.description.toml_text import to_toml
-from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
+from firmware_py.description.vehicle import ThrusterCurve, Vehicle, load_vehicle
 
 FARTHEST_M = 10.0
 """From the hull's middle, as the vehicle file permits of its parts."""
@@ -86,6 +86,14 @@ def reference_of(recording: Recording, thruster: int | None, accuracy_percent: f
     return Reference(thruster - 1, 0.01 * accuracy_percent)
 
 
+def check_fitted(vehicle: Vehicle) -> None:
+    """Raises DescriptionError where no flight of this vehicle can be fitted, so that none is asked for either."""
+    if vehicle.drag.quadratic.size:
+        raise DescriptionError(f"vehicle {vehicle.name}: its drag is published damping; only cd_face and cd_edge can be fitted")
+    if not vehicle.tag:
+        raise DescriptionError(f"vehicle {vehicle.name}: it carries no tag; without poses nothing can be identified")
+
+
 def check_excitation(path: Path) -> None:
     """Raises DescriptionError where no scenario can go to `path`, or something of somebody's is there."""
     if path.suffix != ".toml":
@@ -126,7 +134,7 @@ def identify(given: argparse.Namespace) -> int:
     if not given.logs:
         if given.excitation is None:
             raise DescriptionError("no LOG was given; give the folder of a flight, or --excitation FILE for the flight to begin with")
-        load_vehicle(given.vehicle)
+        check_fitted(load_vehicle(given.vehicle))
         given.excitation.write_text(excitation(list(MOTIONS), given.vehicle, given.space), encoding="utf-8")
         print(fly_it(given.excitation))
         return 0
@@ -141,8 +149,7 @@ def identify(given: argparse.Namespace) -> int:
     if len({to_toml(r.vehicle) for r in recordings}) > 1:
         raise DescriptionError(f"{given.logs[0]} and the others were flown by different vehicles; give logs of one")
     vehicle = recordings[0].vehicle
-    if vehicle.drag.quadratic.size:
-        raise DescriptionError(f"vehicle {vehicle.name}: its drag is published damping; only cd_face and cd_edge can be fitted")
+    check_fitted(vehicle)
     curve = read_curve(given.curve) if given.curve else vehicle.curve
     reference = reference_of(recordings[0], given.thruster, given.accuracy) if given.curve else None
     make_folder(given.out)
