@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -97,7 +98,7 @@ def _write(out: Path, task: Task, found: Sequence[Choice]) -> None:
             "vehicle": task.vehicle,
             "rank_by": task.rank_by,
             "dead": task.dead,
-            "shapes": rows,
+            "shapes": [{k: v if not isinstance(v, float) or math.isfinite(v) else None for k, v in row.items()} for row in rows],
         }
         (out / "choice.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     except OSError as error:

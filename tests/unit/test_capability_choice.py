@@ -9,9 +9,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import characterise_choose
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from firmware_py.description.schema import DescriptionError
@@ -124,6 +126,17 @@ def test_trajectory_task_ranks_by_the_wrench_along_it(tmp_path: Path) -> None:
     found = rank(load_task(path), 2, load_vehicle("modcube"))
     assert len(found) == 1 and found[0].poses == 3
     assert found[0].best.margin > found[0].guaranteed_margin > 1.0
+
+
+def test_margin_that_nothing_limits_is_none_in_the_json_of_a_choice(tmp_path: Path) -> None:
+    """A robot in balance that stays where it is asks its thrusters for nothing."""
+    path = tmp_path / "task.toml"
+    path.write_text('name = "rest"\n[trajectory]\nkind = "circle"\nradius_m = 0.0\nsamples = 3\n')
+    with (tmp_path / "said").open("w") as file:
+        characterise_choose.choose(1, path, tmp_path, Console(file=file), Console(file=file))
+    text = (tmp_path / "choice.json").read_text()
+    (shape,) = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))["shapes"]
+    assert shape["margin"] is None and shape["guaranteed_n"] > 0.0
 
 
 @pytest.mark.parametrize(
