@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
+import numpy as np
+
 from firmware_py.bus.codec import Codec, Frame, pack_quaternion
 from hil.plant.camera import Camera, Sighting, in_the_world
 from hil.plant.spec import SensorSpec
@@ -29,18 +31,20 @@ class TagCamera:
         self._waiting: deque[tuple[Sighting, int, int]] = deque()
         self._sync: tuple[int, int] | None = None
         self._counters = dict.fromkeys(self._number_of, 0)
+        self._farthest_m = min(axis.factor * axis.raw_high for axis in self._position.field_details[:3])
         self.change: Callable[[Sighting, int], Sighting | None] = lambda sighting, carrier: sighting
         """What a fault makes of every sighting by a camera that is carried by that module (-1: by none); None: lost."""
         self.watch()
 
     def watch(self) -> None:
-        """Takes the pictures that have become due; each is stamped by the last SYNC heard before it."""
+        """Takes the pictures that have become due; each is stamped by the last SYNC heard before it. What no frame can say is dropped."""
         for sighting in self._see():
             if self._sync is None or sighting.module not in self._number_of:
                 continue
             tick, sync_ns = self._sync
             offset_ns = sighting.capture_ns - sync_ns
-            if 0 <= offset_ns <= 25_500_000:  # what 8 bits of 0.1 ms can say
+            is_near = bool(np.abs(sighting.p_wt).max() <= self._farthest_m)  # else the frame would say that it is at the limit
+            if is_near and 0 <= offset_ns <= 25_500_000:  # what 8 bits of 0.1 ms can say
                 self._waiting.append((sighting, tick, offset_ns))
 
     def _see(self) -> list[Sighting]:

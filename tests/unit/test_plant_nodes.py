@@ -197,6 +197,22 @@ def test_picture_that_was_taken_too_long_after_sync_to_say_so_is_not_sent() -> N
     assert sum(told_ms > 10.0 for told_ms in told) == 6
 
 
+@pytest.mark.parametrize(("x_m", "told"), [(16.3, True), (16.4, False), (-16.4, False)])
+def test_tag_that_is_farther_than_its_frame_can_say_is_not_told_to_be_nearer(x_m: float, told: bool) -> None:
+    scenario = calm()
+    place = np.array([x_m, 0.0, 1.5])
+    nodes = nodes_of(
+        dataclasses.replace(
+            scenario,
+            tank=dataclasses.replace(scenario.tank, size_m=np.array([60.0, 4.0, 3.0])),
+            module=(dataclasses.replace(scenario.module[0], position_m=place),),
+            camera=(dataclasses.replace(scenario.camera[0], position_m=place - [0.0, 0.0, 2.5]),),
+        )
+    )
+    places = [f for tick in range(1, 30) for f in nodes.step([sync(tick)]) if f.id == 0x0C1]
+    assert bool(places) == told
+
+
 def test_disarmed_command_gives_no_thrust_even_in_one_half() -> None:
     nodes = nodes_of(calm())
     nodes.step([*thrust(0.5, ARMED, 0, "A"), *thrust(0.5, DISARMED, 0, "B"), sync(0)])
