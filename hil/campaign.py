@@ -61,8 +61,9 @@ def code_digest() -> str:
 
 def identity(scenario: Scenario, parameters: Parameters) -> str:
     """Same identity and same seed, same trial."""
-    vehicles = [dataclasses.asdict(load_vehicle(m.vehicle)) for m in scenario.module]
-    parts = (code_digest(), dataclasses.asdict(scenario), vehicles, dataclasses.asdict(parameters))
+    vehicles = [load_vehicle(m.vehicle) for m in scenario.module]
+    meshes = [hashlib.sha256(Path(v.hull.mesh).read_bytes()).hexdigest() if v.hull.mesh else "" for v in vehicles]
+    parts = (code_digest(), dataclasses.asdict(scenario), list(map(dataclasses.asdict, vehicles)), meshes, dataclasses.asdict(parameters))
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 

@@ -1,6 +1,7 @@
 """Many seeds of one scenario: each is flown once, and what was flown is kept."""
 
 import json
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
-from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, fly_trial, outcome_of, run_campaign
+from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, fly_trial, identity, outcome_of, run_campaign
 from hil.checks import Check, Result
 from hil.plant.world_parameters import world_parameters
 from hil.scenario import load_scenario
@@ -87,6 +88,17 @@ def test_trials_of_other_gains_are_thrown_away_only_when_told_to(tmp_path: Path,
     assert [seed for seed, _ in flown] == [0, 1, 0, 1]
     run_campaign(spiral, other, range(2), Inline, tmp_path, anew=True)
     assert [seed for seed, _ in flown] == [0, 1, 0, 1]
+
+
+def test_robot_whose_hull_has_another_mesh_is_another_robot(tmp_path: Path) -> None:
+    vehicle, mesh = tmp_path / "robot.toml", tmp_path / "hull.stl"
+    text = (Path(str(resources.files("firmware_py"))) / "vehicles" / "modcube.toml").read_text()
+    vehicle.write_text(text.replace("[hull]", f'[hull]\nmesh = "{mesh}"'))
+    scenario, known = load_scenario("hover").with_vehicle(str(vehicle)), set()
+    for triangles in ("first", "second", "first"):
+        mesh.write_text(triangles)
+        known.add(identity(scenario, Parameters()))
+    assert len(known) == 2
 
 
 @pytest.mark.parametrize("begun", [b"", b'{"campaign": "other"}\n', b'{"campa'])
