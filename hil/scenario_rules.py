@@ -110,6 +110,12 @@ def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:
     if kind == "force" and not {1, 2} <= set(counts):
         found = ", ".join(map(str, counts))
         yield ("task", "kind"), f"force compares a module alone with two docked ones; the bodies here have {found} modules"
+    for members in scenario.groups if kind == "force" else []:
+        leader = scenario.module[members[0]].number
+        if counts.count(len(members)) > 1:
+            yield ("module", members[0]), f"the body of module {leader} has as many modules as another, and force tells them apart by that"
+        if not any(scenario.module[m].clamped for m in members):
+            yield ("module", members[0]), f"no load cell holds the body of module {leader}, whose force is measured; clamped = true"
 
 
 def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
