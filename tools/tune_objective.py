@@ -14,9 +14,10 @@ from loop_response import BODIES, Scale, body_of, margins, measure
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError, build, meant, quantity, read_toml, repeated
+from hil.campaign import WALL_CLOCK
 from hil.metrics import SHOWN
 from hil.scenario import Scenario, load_scenario
-from hil.scenario_rules import mistakes
+from hil.scenario_rules import metric_names, mistakes
 
 FAILED_COST = 1e6
 """Cost of a flight that could not be judged."""
@@ -171,11 +172,18 @@ def detuned(objective: Objective, parameters: Parameters, factor: float, seed: i
     return with_values(parameters, {s.parameter: min(max(value, s.low), s.high) for s, value in off})
 
 
+def check_terms(spec: FlightSpec, terms: Sequence[Term]) -> None:
+    """Raises DescriptionError for a flight that cannot be flown, or whose trials lack the metric of a term: all would cost the most."""
+    had = set(metric_names(spec.flown())) - set(WALL_CLOCK)
+    if lacking := next((term.metric for term in terms if term.metric not in had), ""):
+        raise DescriptionError(f"a trial of {spec.scenario} has no {lacking}, which a term asks of every flight")
+
+
 def load_objective(path: Path) -> Objective:
     """The objective in a file, its scenarios checked. Raises DescriptionError, one line."""
     table, source = read_toml(path)
     objective: Objective = build(Objective, table, source)
-    checks = [("flight", i, spec.flown) for i, spec in enumerate(objective.flight)]
+    checks = [("flight", i, partial(check_terms, spec, objective.term)) for i, spec in enumerate(objective.flight)]
     checks += [("stability", i, partial(body_of, each.modules, objective.vehicle)) for i, each in enumerate(objective.stability)]
     for table_name, i, check in checks:
         try:

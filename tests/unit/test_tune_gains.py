@@ -209,6 +209,8 @@ def test_search_that_is_terminated_from_elsewhere_says_that_it_goes_on(
         ("help = \"a valley\"", "help = \"\"\"a\nvalley\"\"\"", "help has more than one line"),
         ("control.position_damping", "control.position_bandwidth", "position_bandwidth is searched twice"),
         ("position_rmse_m", "position_rmse", r"objective\.toml:11: metric 'position_rmse' is unknown; did you mean position_rmse_m\?$"),
+        ("thrust_rms_n", "docked_rmse_m", r"flight\[0\]: a trial of hover has no docked_rmse_m, which a term asks of every flight"),
+        ("thrust_rms_n", "real_time_factor", r"flight\[0\]: a trial of hover has no real_time_factor"),
         ("term = [", f"stability = [{{ modules = 3, {MARGINS} }}]\nterm = [", "stability of 3 modules; there are bodies of 1, 2, 4"),
     ],
 )
