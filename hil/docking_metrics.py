@@ -175,16 +175,22 @@ def _join_jump_n(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) 
 
 def _members(truths: Mapping[str, Columns], leader: int, tick: int, thrusters: int) -> np.ndarray:
     """Modules of a body that has so many thrusters for the firmware: those of the true one when it last had as many, for it joins first."""
-    true, each = truths[f"/plant/body{leader}"], truths["/plant/module0"]["force_n"].shape[1]
-    alike = (true["tick"] < tick) & (each * np.count_nonzero(true["member"], axis=1) == thrusters)
+    true = truths[f"/plant/body{leader}"]
+    alike = (true["tick"] < tick) & (_thrusters(truths, true) == thrusters)
     return np.flatnonzero(true["member"][alike][-1:].any(axis=0))
+
+
+def _thrusters(truths: Mapping[str, Columns], true: Columns) -> np.ndarray:
+    """(k,) of all modules of a true body, tick by tick; those of one fleet may be of several kinds."""
+    each = [truths[f"/plant/module{m}"]["force_n"].shape[1] for m in range(true["member"].shape[1])]
+    return np.asarray((true["member"] > 0.0) @ each)
 
 
 def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> float:
     """Position of the truth against the set-point over the ticks in which both logs know of a joined body, and the firmware of its pose;
     NaN without any.
     """
-    squares, thrusters = [np.zeros(0)], truths["/plant/module0"]["force_n"].shape[1]
+    squares = [np.zeros(0)]
     for name, true in truths.items():
         believed = signals.get(name.replace("/plant/body", "/firmware/body"))
         if not name.startswith("/plant/body") or believed is None:
@@ -192,7 +198,7 @@ def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]
         _, mine, theirs = np.intersect1d(true["tick"], believed["tick"], return_indices=True)
         forces = np.isfinite(believed["commanded_n"][theirs]).sum(axis=1)
         members = (true["member"][mine] > 0.0).sum(axis=1)
-        joined = (members > 1) & (forces == members * thrusters) & (believed["ready"][theirs] > 0)
+        joined = (members > 1) & (forces == _thrusters(truths, true)[mine]) & (believed["ready"][theirs] > 0)
         gap = true["p_wb"][mine][joined] - believed["setpoint_p_wb"][theirs][joined]
         squares.append(np.sum(gap**2, axis=1))
     everything = np.concatenate(squares)

@@ -107,7 +107,8 @@ def test_join_that_no_dock_declared_is_found_by_the_number_of_bodies() -> None:
 def test_step_of_the_thrusters_counts_in_every_join_of_modules_that_part_and_dock_again() -> None:
     """By 0.2 N in the first, and by 0.7 N in the second, a tick after the faces have locked."""
     truths = truth_of([APART, PAIR, APART, PAIR], PLACES)
-    truths["/plant/module0"]["force_n"] = np.zeros((100, 8))
+    for module, thrusters in enumerate((8, 8, 6)):  # the third is of another kind, and stays away
+        truths[f"/plant/module{module}"]["force_n"] = np.zeros((100, thrusters))
     joined = ((TICKS > 26) & (TICKS <= 50)) | (TICKS > 76)
     force_n = np.where(np.arange(16) < 8, 1.0, 2.0) + np.select([(TICKS > 26) & (TICKS <= 50), TICKS > 76], [0.2, -0.7])[:, None]
     both = np.where(joined[:, None] | (np.arange(16) < 8), force_n, np.nan)
@@ -127,5 +128,14 @@ def test_place_of_a_joined_body_counts_from_when_the_firmware_knows_it() -> None
     true = {"tick": TICKS, "member": np.ones((100, 2)), "p_wb": np.tile([0.3, 0.0, 0.4], (100, 1))}
     setpoint = np.where(ready[:, None], [0.3, 0.002, 0.4], 0.0)
     believed = {"tick": TICKS, "commanded_n": np.zeros((100, 16)), "setpoint_p_wb": setpoint, "ready": ready.astype(np.uint8)}
-    truths = {"/plant/body0": true, "/plant/module0": {"force_n": np.zeros((100, 8))}}
+    truths = {"/plant/body0": true, **{f"/plant/module{m}": {"force_n": np.zeros((100, 8))} for m in range(2)}}
     assert _docked_rmse_m(truths, {"/firmware/body0": believed}) == pytest.approx(0.002)
+
+
+def test_place_of_a_joined_body_counts_beside_a_robot_with_fewer_thrusters() -> None:
+    truths = truth_of([((0,), (1, 2))], PLACES)
+    for module, thrusters in enumerate((6, 8, 8)):
+        truths[f"/plant/module{module}"]["force_n"] = np.zeros((100, thrusters))
+    setpoint = truths["/plant/body1"]["p_wb"] + [0.0, 0.003, 0.0]
+    believed = {"tick": TICKS, "commanded_n": np.zeros((100, 16)), "setpoint_p_wb": setpoint, "ready": np.ones(100, np.uint8)}
+    assert _docked_rmse_m(truths, {"/firmware/body1": believed}) == pytest.approx(0.003)
