@@ -131,7 +131,7 @@ def fly_in_real_time(
                     raise DescriptionError("the plant's process has ended, and the flight with it")
                 if progress is not None:
                     progress(tick / rate_hz)
-            return tick >= script.ticks
+            return tick >= script.ticks or script.is_over(outputs.time_ns - start_ns)
 
         refused = stack.enter_context(real_time())
         loop = open_loop(stack, firmware, requests)
@@ -145,8 +145,9 @@ def fly_in_real_time(
         loop.rate_keeper.start(start_ns + fleet.period_ns)
         loop.run(stop_at_end)
     keeper, late = loop.rate_keeper, loop.rate_keeper.lateness
+    flown = loop.last.tick if loop.last is not None else 0
     lateness_ns = {"p50": late.quantile_ns(0.5), "p99": late.quantile_ns(0.99), "worst": late.worst_ns}
-    return RealTimeFlight(script.ticks / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness_ns, refused)
+    return RealTimeFlight(flown / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness_ns, refused)
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """The same flight on every bus: in lockstep neither the bus nor strangers on it change it. tests/vcan: on SocketCAN."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -16,7 +17,8 @@ from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
 from hil.bench import open_bench
-from hil.scenario import Scenario
+from hil.realtime import fly_in_real_time
+from hil.scenario import Scenario, Step, load_scenario
 from tests.closed_loop.flights import shortened
 
 UDP = f"udp:239.74.163.4:{40_000 + os.getpid() % 20_000}"
@@ -63,3 +65,12 @@ def test_strangers_on_the_bus_do_not_change_what_the_robot_is_told(tmp_path: Pat
         beside = fly(scenario, bus, tmp_path / "beside", stranger)
     assert sent(beside) == sent(alone)
     assert len(beside[CAN_LOG].splitlines()) >= len(alone[CAN_LOG].splitlines()) + 100 * len(STRANGERS)
+
+
+@pytest.mark.slow
+def test_task_whose_steps_are_over_ends_against_the_clock_as_it_does_in_lockstep(tmp_path: Path) -> None:
+    dock = load_scenario("dock")
+    task = dataclasses.replace(dock.task, settle_s=2.0, duration_s=30.0)
+    scenario = dataclasses.replace(dock, task=task, step=(Step(do="wait", duration_s=1.0),))
+    flown = fly_in_real_time(scenario, 0, Parameters(), tmp_path, UDP)
+    assert flown.wall_s == pytest.approx(6.0, abs=0.1)  # settled, waited, and three seconds more
