@@ -15,6 +15,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
+from importlib import resources
 from pathlib import Path
 from statistics import median
 
@@ -35,7 +36,6 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import lsq_linear
 
-from can_dbc import __path__ as dbc_path
 from firmware_py.bus.codec import Codec, crc8
 from firmware_py.bus.port import open_port
 from firmware_py.core.allocator import Allocator
@@ -78,7 +78,7 @@ def codec_entries() -> list[Entry]:
     """GYRO: three int16, counter and CRC; cantools and struct get the CRC from the same function."""
     codec = Codec.load()
     gyro = codec.message("GYRO")
-    database = cantools.database.load_file(str(Path(next(iter(dbc_path))) / "modcube.dbc"), frame_id_mask=0x7E0)
+    database = cantools.database.load_file(str(resources.files("can_dbc") / "modcube.dbc"), frame_id_mask=0x7E0)
     theirs = database.get_message_by_name("GYRO")
     values = [0.11, -0.22, 0.33, 0]
     factors = [field.factor for field in gyro.field_details[:3]]

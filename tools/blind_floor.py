@@ -113,7 +113,7 @@ def with_tags(axis: Model, sensors: SensorSpec, seconds: float) -> np.ndarray:
 
 def without_tags(axis: Model, covariance: np.ndarray, seconds: float) -> tuple[list[list[np.ndarray]], np.ndarray]:
     """Kalman's gains, (11,) each, of every tick's accelerometer and gyro, and the covariance (11, 11) after so long with these alone."""
-    gains = []
+    gains: list[list[np.ndarray]] = []
     for _ in range(round(seconds / PERIOD_S)):
         covariance = axis.step @ covariance @ axis.step.T + np.diag(axis.noise)
         gains.append([])

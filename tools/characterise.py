@@ -12,7 +12,7 @@ import argparse
 import io
 import sys
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
 from functools import partial
 from pathlib import Path
@@ -170,7 +170,7 @@ def _cells(shape: str) -> list[tuple[int, int, int]]:
 
 def _all(layouts: dict[str, Layout], settings: dict[str, Any], jobs: int) -> dict[str, Capability]:
     """Every layout characterised, with progress; in `jobs` processes where there are several."""
-    work = partial(characterise, **settings)
+    work: Callable[..., Capability] = partial(characterise, **settings)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     console = _console(error=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

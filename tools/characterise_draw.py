@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from characterise_surfaces import FLAT, SPACES, Picture, pictures
 from matplotlib.colors import to_rgba
+from matplotlib.patches import Rectangle
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from firmware_py.prepare.capability.layout import UNITS
@@ -133,6 +134,6 @@ def _legend(figure: Any, height: float, drawn: Sequence[Picture]) -> None:
         (_DECLARED, "reachable wrench, the passive degree of freedom declared", any(picture.declared for picture in drawn)),
         (_ELLIPSOID, "largest inscribed ellipsoid", any(picture.ellipsoid for picture in drawn)),
     )
-    handles = [plt.Rectangle((0, 0), 1, 1, color=colour, alpha=0.7, label=text) for colour, text, is_there in entries if is_there]
+    handles = [Rectangle((0, 0), 1, 1, color=colour, alpha=0.7, label=text) for colour, text, is_there in entries if is_there]
     figure.legend(handles=handles, loc="upper center", ncols=2, fontsize=8, frameon=False,
                   bbox_to_anchor=(0.5, 1.0 - 0.05 / height))  # fmt: skip

@@ -78,15 +78,15 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
     """Fits all flights of one vehicle at once; without `reference` and weight the mean gain is 1 by decree."""
     vehicle = flights[0].vehicle
     mine = unknowns(len(vehicle.thruster))
-    shared, count = places(mine), sum(u.count for u in mine)
+    shared, count = places(mine), sum(u.size for u in mine)
     parts, own, gusts = list(mine), [], []
     for flight in flights:
         nuisances = [*NUISANCES, Unknown("gust", 3 * flight.knots.shape[1], math.inf)]
-        own.append(places(nuisances, sum(u.count for u in parts)))
+        own.append(places(nuisances, sum(u.size for u in parts)))
         gusts.append(np.kron(gust_precision(flight.knots.shape[1]), np.eye(3)))
         parts += nuisances
-    width = np.concatenate([np.full(u.count, u.width) for u in parts])
-    step = np.concatenate([np.full(u.count, u.step) for u in parts])
+    width = np.concatenate([np.full(u.size, u.width) for u in parts])
+    step = np.concatenate([np.full(u.size, u.step) for u in parts])
     first = np.zeros(len(width))
     first[:count] = np.concatenate(list(beginning(vehicle).values()))
     scale, pull = _scale_row(shared["gain"], len(first), reference, has_weight)

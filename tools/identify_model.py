@@ -48,7 +48,7 @@ class Unknown(NamedTuple):
     """So many numbers that are searched, with the width of what is thinkable around where the vehicle file has them."""
 
     name: str
-    count: int
+    size: int
     width: float
     step: float = 1e-4
     """For slopes."""
@@ -83,8 +83,8 @@ NUISANCES = (Unknown("current", 3, 0.3), Unknown("bias", 3, 0.3))
 
 def places(parts: Sequence[Unknown], first: int = 0) -> dict[str, slice]:
     """Where each stands in the vector of all."""
-    ends = first + np.cumsum([p.count for p in parts])
-    return {p.name: slice(int(end) - p.count, int(end)) for p, end in zip(parts, ends, strict=True)}
+    ends = first + np.cumsum([p.size for p in parts])
+    return {p.name: slice(int(end) - p.size, int(end)) for p, end in zip(parts, ends, strict=True)}
 
 
 class Weight(NamedTuple):

@@ -17,7 +17,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import NamedTuple
@@ -106,9 +106,9 @@ def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
 Change = tuple[str, "object"]
 
 
-def _changes(node: ast.AST) -> list[tuple[str, object]]:
+def _changes(node: ast.AST) -> list[tuple[str, Callable[[], object]]]:
     """What can be changed at a node: a name, and the function that changes it in place."""
-    found: list[tuple[str, object]] = []
+    found: list[tuple[str, Callable[[], object]]] = []
     if isinstance(node, ast.Compare):
         for i, op in enumerate(node.ops):
             for new in COMPARISONS[type(op)]:
@@ -137,9 +137,9 @@ def _changes(node: ast.AST) -> list[tuple[str, object]]:
     return found
 
 
-def _cells(call: ast.Call) -> list[tuple[str, object]]:
+def _cells(call: ast.Call) -> list[tuple[str, Callable[[], object]]]:
     """Cells of a table's row."""
-    found: list[tuple[str, object]] = []
+    found: list[tuple[str, Callable[[], object]]] = []
     for i, cell in enumerate(call.args):
         if isinstance(cell, ast.Attribute) and isinstance(cell.value, ast.Name) and CELLS.get(cell.value.id, cell.attr) != cell.attr:
             found.append((f"{ast.unparse(cell)} -> {CELLS[cell.value.id]}", lambda c=cell: setattr(c, "attr", CELLS[c.value.id])))
@@ -149,9 +149,9 @@ def _cells(call: ast.Call) -> list[tuple[str, object]]:
     return found
 
 
-def _statements(function: ast.FunctionDef) -> list[tuple[str, object]]:
+def _statements(function: ast.FunctionDef) -> list[tuple[str, Callable[[], object]]]:
     """Statements that do something and can be left out."""
-    found: list[tuple[str, object]] = []
+    found: list[tuple[str, Callable[[], object]]] = []
     for holder in ast.walk(function):
         for name in ("body", "orelse"):
             block = getattr(holder, name, None)
