@@ -62,12 +62,12 @@ lint: setup ## ruff, mypy and the import contracts
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/mypy --no-error-summary
 	@$(BIN)/mypy --no-error-summary $(MYPY_TOOLS) tools/*.py
-	@$(BIN)/lint-imports
+	@found=$$($(BIN)/lint-imports --no-logo) || { echo "$$found"; exit 1; }
 
 quick: lint ## lint and the fast tests, about a minute on two idle cores: for every commit
 	@$(PY) -m pytest -x -q -n 2 -m 'not slow and not vcan and not clients and not jetson'
 
-test: setup ## all tests that this machine can run; names what is left out in its last lines
+test: setup ## lint and all tests that this machine can run; names what is left out in its last lines
 	@MAKE='$(MAKE)' $(PY) tools/run_tests.py $(SYSTEM_PACKAGES)
 
 test-vcan: setup ## the tests on real SocketCAN: here, or in the virtual machine where there is none

@@ -1,8 +1,8 @@
 """Run every test that this machine can run; name what was left out, and why, in the last lines.
 
 Arguments: the Debian packages that the tests marked `vcan` need. Those run in a virtual machine, beside all others and beside the setup
-of the clients; beside that, too, numba compiles what is not compiled yet, so that not both of pytest's processes do. The exit status is
-pytest's, the worse of both.
+of the clients; beside that, too, `make lint` reads the code, and numba compiles what is not compiled yet, so that not both of pytest's
+processes do. The exit status is the worst of pytest's two and lint's.
 """
 
 import os
@@ -39,19 +39,22 @@ def main() -> int:
     left_out = {"jetson": "they take half an hour (make test-flash)"}
     if missing := [package for package in sys.argv[1:] if not is_installed(package)]:
         left_out["vcan"] = f"missing Debian packages: {' '.join(missing)} (make setup-system)"
+    make = [os.environ.get("MAKE", "make"), "--no-print-directory"]
     with tempfile.TemporaryFile("w+") as report:
         beside = None if missing else subprocess.Popen(VCAN, stdout=report, stderr=subprocess.STDOUT)
-        with subprocess.Popen(COMPILE, stdout=subprocess.DEVNULL):
-            subprocess.run([os.environ.get("MAKE", "make"), "--no-print-directory", "setup-clients"])
+        with subprocess.Popen(COMPILE, stdout=subprocess.DEVNULL), subprocess.Popen([*make, "lint"]) as lint:
+            subprocess.run([*make, "setup-clients"])
         if not CLIENTS.exists():
             left_out["clients"] = f"{CLIENTS.parent} is not complete (make setup-clients)"
         markers = " and ".join(f"not {marker}" for marker in sorted({"vcan", *left_out}))
-        status = subprocess.run([*ALL, "-m", markers]).returncode
+        status = max(lint.returncode, subprocess.run([*ALL, "-m", markers]).returncode)
         if beside is not None:
             print("tests marked vcan, in the virtual machine:", flush=True)
             status = max(status, beside.wait())
             report.seek(0)
             print(report.read())
+    if lint.returncode:
+        print("the code is not clean: make lint")
     for marker, reason in left_out.items():
         print(f"left out: tests marked {marker}; {reason}")
     return status
