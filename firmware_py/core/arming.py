@@ -45,6 +45,10 @@ def _answers(q: Question) -> str:
     return f"module {', '.join(str(m) for m in q.health.silent)} does not answer" if q.health.silent else ""
 
 
+def _fit(q: Question) -> str:
+    return f"module {', '.join(str(m) for m in q.health.unfit)} starts, or has a fault" if q.health.unfit else ""
+
+
 def _needs(q: Question) -> list[str]:
     return missing(q.mode, q.health, q.parameters)
 
@@ -125,6 +129,7 @@ CHECKS = (
     Check("pose sure", _pose_sure, True),
     Check("pose consistent", _pose_consistent, True),
     Check("battery and cabin known", _readings, True),
+    Check("modules fit", _fit, True),
     Check("every ESC answers", _escs, True),
     Check("every axis has thrust", _thrusters, True),
     Check("no fail-safe on", _failsafes, True),

@@ -16,7 +16,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults, by_channel
 from firmware_py.core.topology import in_both
-from firmware_py.core.types import MCU_ESTOP, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
+from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 
@@ -95,6 +95,8 @@ class Health(NamedTuple):
     """Between the last two pictures of tags, believed or not; NaN while none come."""
     unheard: tuple[str, ...] = ()
     """What some module has said nothing of lately: battery, cabin. The figures above stay what they were."""
+    unfit: tuple[int, ...] = ()
+    """Fleet indices of modules that say that they start, or have a fault."""
 
     @property
     def placed(self) -> bool:
@@ -117,6 +119,7 @@ class HealthMonitor:
         self._answered_ns = [NEVER_NS] * count
         self._stopped_ns: dict[int, int] = {}
         """By fleet index, when a module said last that an e-stop holds it; without those that have said since that none does."""
+        self._unfit = [False] * count
         self._leak, self._wet, self._wet_ns = [False] * count, [False] * count, [NEVER_NS] * count
         self._voltage_share: dict[int, float] = {}
         self._cabin_c: dict[int, float] = {}
@@ -159,6 +162,7 @@ class HealthMonitor:
             self._stopped_ns |= other._stopped_ns
             for i, j in in_both(self._modules, other._modules):
                 self._heard_ns[i], self._answered_ns[i] = other._heard_ns[j], other._answered_ns[j]
+                self._unfit[i] = other._unfit[j]
                 self._leak[i], self._wet[i], self._wet_ns[i] = other._leak[j], other._wet[j], other._wet_ns[j]
                 for name, times_ns in self._read_ns.items():
                     times_ns[i] = other._read_ns[name][j]
@@ -227,6 +231,7 @@ class HealthMonitor:
             warm=self.warm,
             topology=self.topology,
             tag_gap_s=self._tag_gap_s(now),
+            unfit=tuple(m for m, unfit in zip(self._modules, self._unfit, strict=True) if unfit),
             unheard=tuple(name for name, times_ns in self._read_ns.items() if min(times_ns) < now - READ_NS),
         )
         return self.now
@@ -240,6 +245,8 @@ class HealthMonitor:
             for tag in module.tags:
                 if tag.capture_ns > self._pictures_ns[1]:
                     self._pictures_ns = self._pictures_ns[1], tag.capture_ns
+            if module.mcu_state is not None:
+                self._unfit[index] = module.mcu_state in MCU_UNFIT
             if module.leak is not None:
                 self._wet_ns[index] = now if module.leak and self._wet[index] else self._wet_ns[index]
                 self._leak[index] = module.leak or now - self._wet_ns[index] < DRY_NS

@@ -19,6 +19,8 @@ RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
 """States of a docking relay, as DOCK_CMD has them."""
 MCU_ESTOP = 4
 """State of MCU_STATUS: an e-stop holds the module."""
+MCU_UNFIT = (0, 5)
+"""States of MCU_STATUS: the module starts, or has a fault of its own."""
 CRITICAL, WARNING, NOTICE, INFORMATION = 2, 4, 5, 6
 """Severities of an `Event`, as syslog and STATUSTEXT have them."""
 NEVER_NS = -(1 << 60)

@@ -50,6 +50,7 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(unheard=("battery",)), "battery was not heard of lately"),
     (GOOD._replace(unheard=("cabin",)), "cabin was not heard of lately"),
     (GOOD._replace(nis_ratio=6.0), "sensors and model disagree: 6.0 of the expected, 5.0 permitted"),
+    (GOOD._replace(unfit=(0, 2)), "module 0, 2 starts, or has a fault"),
     (GOOD._replace(esc_missing=(0, 7)), "ESC 1, 8 does not answer"),
     (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
     (GOOD._replace(frame_errors_per_s=21.0), "21 bad frames a second, 20 permitted"),
@@ -106,7 +107,7 @@ def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
     ]  # fmt: skip
     assert [check.name for check in CHECKS if check.may_be_skipped] == [
         "pose fresh", "pose sure", "pose consistent", "battery and cabin known",
-        "every ESC answers", "every axis has thrust", "no fail-safe on",
+        "modules fit", "every ESC answers", "every axis has thrust", "no fail-safe on",
         "few bad frames", "topology as configured",
     ]  # fmt: skip
     both = GOOD._replace(silent=(2,), tag_age_s=0.7)

@@ -82,6 +82,18 @@ def test_e_stop_that_holds_a_module_of_another_body_is_heard_until_that_falls_si
     assert set(whole._stopped_ns) == {0, 2, 3}
 
 
+def test_module_that_starts_or_has_a_fault_is_unfit_until_it_says_otherwise() -> None:
+    ear = Ear()
+    assert ear.hear(here(mcu_state=1), here(mcu_state=5)).unfit == (3,)
+    assert ear.hear(here(mcu_state=0), here()).unfit == (1, 3), "one that says nothing is as it was"
+    whole = HealthMonitor(BODY, Parameters(), TICK_NS)
+    whole.take_over([ear.monitor])
+    assert whole._unfit == [True, True]
+    for state in (1, 2, 3, 4):
+        assert ear.hear(here(mcu_state=state), here(mcu_state=state)).unfit == ()
+
+
+
 def test_module_that_only_talks_has_not_answered() -> None:
     ear = Ear()
     ear.hear(here(), here())
