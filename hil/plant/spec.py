@@ -122,9 +122,9 @@ IDEAL: dict[str, float] = dict.fromkeys(
     0,
 )  # fmt: skip
 """Overrides for perfect sensors: no noise, no bias, no delay."""
-HALF_A_COUNT = {"gyro_sigma": 0.00025, "accel_sigma": 0.001, "tag_sigma_deg": 0.09}
-"""Noise that stays, half a step of the frames: an IMU that repeats itself to the last bit counts as frozen, and within one step of the
-tags' attitude a tilt of a tenth of a degree comes and goes unseen."""
+HALF_A_COUNT = {"gyro_sigma": 0.00025, "accel_sigma": 0.001, "depth_sigma_m": 0.00005, "tag_sigma_deg": 0.09}
+"""Noise that stays, half a step of the frames: an IMU or a pressure that repeats itself to the last bit counts as frozen, and within one
+step of the tags' attitude a tilt of a tenth of a degree comes and goes unseen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
