@@ -105,9 +105,10 @@ def _frames(q: Question) -> str:
 
 
 def _parameters(q: Question) -> list[str]:
-    fence = q.parameters.fence
-    upside_down = f"fence.top_m is {fence.top_m:g}, fence.bottom_m {fence.bottom_m:g}: the top must be at less depth"
-    return [*invalid(q.parameters), *([upside_down] if fence.top_m >= fence.bottom_m else [])]
+    fence, wrong = q.parameters.fence, invalid(q.parameters)
+    if fence.top_m >= fence.bottom_m:
+        wrong.append(f"fence.top_m is {fence.top_m:g}, fence.bottom_m {fence.bottom_m:g}: the top must be at less depth")
+    return wrong
 
 
 def _warm(q: Question) -> str:
