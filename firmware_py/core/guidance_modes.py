@@ -67,7 +67,7 @@ class Guidance:
         self._trajectory: Trajectory | None = None
         self._start_ns: int | None = None
         self._goal: Wish | None = None
-        self._upright = self._lost = False
+        self._upright = self._lost = self._led = False
         self._point: tuple[int, Setpoint] | None = None
         self._docking: Setpoint | Wish | None = None
         self._sticks, self._sticks_ns = NEUTRAL, 0
@@ -154,14 +154,20 @@ class Guidance:
         return self._start_ns is not None and (time_ns - self._start_ns) * 1e-9 >= self._trajectory.duration_s
 
     def _enter(self, mode: Mode, time_ns: int, estimate: Estimate) -> None:
-        at = self._glider.at
-        gap, turn = np.linalg.norm(at.p_wb - estimate.p_wb), np.linalg.norm(difference(at.q_wb, estimate.q_wb))
-        if STEERING[self.mode] != STEERING[Mode.POSHOLD] or not (gap <= NEAR_M and turn <= NEAR_RAD):
+        if STEERING[self.mode] != STEERING[Mode.POSHOLD]:
             self._glider.put(at_estimate(estimate))
+        self._go_on(estimate)
         self._trajectory = self._goal = self._docking = None
         if self._point is not None and time_ns - self._point[0] > self._p.guided_timeout_s * 1e9:
             self._point = None
         self.mode, self._blend = mode, True
+
+    def _go_on(self, estimate: Estimate) -> None:
+        """From the set-point where it is near the body, or from the body itself."""
+        at = self._glider.at
+        gap, turn = np.linalg.norm(at.p_wb - estimate.p_wb), np.linalg.norm(difference(at.q_wb, estimate.q_wb))
+        if not (gap <= NEAR_M and turn <= NEAR_RAD):
+            self._glider.put(at_estimate(estimate))
 
     # ------------------------------------------------------------ the set-point
 
@@ -182,8 +188,11 @@ class Guidance:
             self._glider.put(self._docking)
             return self._docking, ahead_of(self._docking, self._lead_s)
         wish = self._wish(time_ns, estimate, health)
-        if self.mode == Mode.GUIDED or wish.v_w.any() or wish.w_b.any():  # it is led by what somebody asks for, and the body may be held
+        led, self._led = self._led, self.mode == Mode.GUIDED or bool(wish.v_w.any() or wish.w_b.any())
+        if self._led:  # by what somebody asks for, and the body may be held
             self._glider.put(on_leash(self._glider.at, estimate))
+        elif led:
+            self._go_on(estimate)
         now = self._glider.step(wish, dt_s)
         lost, self._lost = self._lost, not self._placed(health)  # in the tick in which tags tell a place, the set-point still moves to it
         if STEERING[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (lost or self._lost)):
