@@ -6,6 +6,7 @@ What was torn stays beside it, as `NAME.torn`.
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -43,6 +44,7 @@ def recover(folder: Path) -> Recovery:
     _cut_frames(folder / CAN_LOG, mended[CAN_LOG], candump_stamp(last_ns))
     rewrite(folder / SIGNAL_LOG, mended[SIGNAL_LOG], lambda topic, message: message.log_time <= last_ns)
     for name, path in mended.items():
+        shutil.copystat(folder / name, path)  # by its time `app.last_flight` knows how long ago the flight was
         os.replace(folder / name, folder / f"{name}{TORN}")
         os.replace(path, folder / name)
     return Recovery(count, log.torn)

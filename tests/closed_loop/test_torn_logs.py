@@ -1,6 +1,7 @@
 """Whatever happens to the process or its disk: the log is there up to a second before, is read up to its tear, and can be mended."""
 
 import errno
+import os
 import resource
 import signal
 import subprocess
@@ -94,6 +95,14 @@ def test_torn_log_is_read_up_to_the_tear_and_mended(log: Path, seed: int) -> Non
     mended = replay(log)
     assert (mended.first, mended.ticks, mended.torn) == (None, len(ticks), "")
     assert recover(log) == (len(ticks), "")
+
+
+def test_mended_log_is_as_old_as_its_flight_so_that_nobody_is_armed_for_it(log: Path) -> None:
+    tear(log / SIGNAL_LOG, 0.9)
+    for name in (CAN_LOG, SIGNAL_LOG):
+        os.utime(log / name, ns=(0, 0))
+    recover(log)
+    assert [(log / name).stat().st_mtime_ns for name in (CAN_LOG, SIGNAL_LOG)] == [0, 0]
 
 
 def test_half_a_line_of_can_log_is_left_out(log: Path) -> None:
