@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import threading
 from collections.abc import Callable
@@ -31,6 +32,9 @@ class GuardedFile:
             self._file = path.open("wb", buffering=0)  # bytes given are with the system: kill -9 loses none
         except OSError as error:
             self.error = error
+            return
+        with suppress(OSError):
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed: it is being written
 
     def write(self, data: bytes | bytearray) -> int:
         """Append; always says that all was taken."""

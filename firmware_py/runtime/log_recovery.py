@@ -5,6 +5,7 @@ What was torn stays beside it, as `NAME.torn`.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 from collections.abc import Callable
@@ -31,8 +32,9 @@ class Recovery(NamedTuple):
 
 
 def recover(folder: Path) -> Recovery:
-    """Mends the log in `folder`. Raises LogError where no tick of it is whole, and OSError."""
+    """Mends the log in `folder`. Raises LogError where no tick of it is whole or its flight goes on, and OSError."""
     log = FlightLog(folder)
+    _refuse_in_flight(folder)
     count, last_ns = 0, 0
     for logged in log.ticks():
         count, last_ns = count + 1, logged.time_ns
@@ -48,6 +50,17 @@ def recover(folder: Path) -> Recovery:
         os.replace(folder / name, folder / f"{name}{TORN}")
         os.replace(path, folder / name)
     return Recovery(count, log.torn)
+
+
+def _refuse_in_flight(folder: Path) -> None:
+    """What still writes the log would go on in what is set aside."""
+    with (folder / CAN_LOG).open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise LogError(f"{folder}: is still being written; mend it when its run has ended") from None
+        except OSError:
+            return  # a disk without locks
 
 
 def rewrite(source: Path, target: Path, keep: Callable[[str, Message], bool], attach: Callable[[bytes], bytes] = bytes) -> None:

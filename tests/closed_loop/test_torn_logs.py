@@ -105,6 +105,15 @@ def test_mended_log_is_as_old_as_its_flight_so_that_nobody_is_armed_for_it(log: 
     assert [(log / name).stat().st_mtime_ns for name in (CAN_LOG, SIGNAL_LOG)] == [0, 0]
 
 
+def test_log_of_a_flight_that_goes_on_is_not_mended(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path)
+    recorder.flush()
+    with pytest.raises(LogError, match="is still being written; mend it when its run has ended"):
+        recover(tmp_path)
+    recorder.close()
+    assert recover(tmp_path) == (0, "")
+
+
 def test_half_a_line_of_can_log_is_left_out(log: Path) -> None:
     tear(log / SIGNAL_LOG, 0.9)
     (log / CAN_LOG).write_bytes((log / CAN_LOG).read_bytes()[:-20])
