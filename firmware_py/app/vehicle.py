@@ -153,6 +153,7 @@ def run_vehicle(
         operator = Operator(fleet.rate_hz, to_arm(before, firmware, hold, teller.say), math.inf if hold else REARM_S, teller.say)
         if hold and out is None:
             teller.say(FORGETFUL)
+        logged = stack.enter_context(ExitStack())  # ends when the log and the note of an e-stop are closed
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
         recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
         observers = list(_keeping(stack, firmware, recorder, out, live, before.stopped))
@@ -176,7 +177,7 @@ def run_vehicle(
         loop.listen()
         if out is not None and estop_stands(out) and not before.stopped:
             raise DescriptionError(f"{out}: an e-stop was raised while this process started, by one that ran until then; start it again")
-        stack.enter_context(handled(operator.stop))  # SIGINT and SIGTERM
+        logged.enter_context(handled(operator.stop))  # SIGINT and SIGTERM
         stack.enter_context(quiet_garbage())
         teller.say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
         loop.run(operator.is_done)

@@ -30,6 +30,7 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime import teller
 from firmware_py.runtime.clock import boot_id
 from firmware_py.runtime.flight_log import FlightLog
+from firmware_py.runtime.interrupts import handled
 from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
 from tests.unit.ground_world import Robot
@@ -60,6 +61,20 @@ def fly(
 
     run_vehicle(fleet or single(bus=bus_of(tmp_path)), parameters or Parameters(), hold=hold, out=out, say=say)
     return said
+
+
+def test_second_signal_does_not_end_the_process_before_its_log_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fatal: list[int] = []
+    close = Recorder.close
+
+    def close_disturbed(recorder: Recorder) -> list[Event]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return close(recorder)
+
+    monkeypatch.setattr(Recorder, "close", close_disturbed)
+    with handled(lambda number, frame: fatal.append(number)):
+        fly(tmp_path, tmp_path / "log")
+    assert not fatal
 
 
 def content(folder: Path) -> dict[str, bytes]:
