@@ -27,9 +27,9 @@ def main() -> None:
 
 
 @contextmanager
-def compiling_told(out: TextIO) -> Iterator[None]:
+def compiling_told(out: TextIO | None) -> Iterator[None]:
     """Meanwhile who waits at a terminal is told when numba compiles the first function that it does not find compiled."""
-    if not out.isatty():
+    if out is None or not out.isatty():  # None: it is closed
         yield
         return
     from numba.core.event import Listener, install_listener

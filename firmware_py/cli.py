@@ -31,6 +31,7 @@ REASONS = {errno.EEXIST: "is a file; a folder is needed"}
 """In place of the system's words, where these do not say what would be right."""
 BUS, VEHICLE, RATE_HZ = "socketcan:can0", "modcube", 100
 """Of one module, where the command line does not say."""
+_STDERR = 2
 LIVE_HOST, LIVE_PORT = "127.0.0.1", 8765
 """Where the live view listens, where the command line does not say."""
 
@@ -219,8 +220,16 @@ def logs() -> None:
     """Logs that runs left."""
 
 
+def fill_standard_streams() -> None:
+    """Whoever starts this process may have closed one: the next file would take its number, and a log all lines that are said."""
+    while (handle := os.open(os.devnull, os.O_RDWR)) <= _STDERR:
+        pass
+    os.close(handle)
+
+
 def main() -> None:
     """Runs the command line; wrong input ends in one line on stderr and status 2."""
+    fill_standard_streams()
     own = {command.name or command.callback.__name__ for command in app.registered_commands if command.callback is not None}
     if own.isdisjoint(sys.argv[1:2]):  # the vehicle's process has no room for the bench
         for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):

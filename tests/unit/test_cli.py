@@ -2,6 +2,7 @@
 
 import errno
 import os
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -214,6 +215,21 @@ def test_interrupt_during_the_imports_is_silent(monkeypatch: pytest.MonkeyPatch,
         main_from_the_start()
     assert ended.value.code == INTERRUPTED
     assert capsys.readouterr() == ("", "")
+
+
+OPENED_AFTER_A_COMMAND = """
+import os
+from firmware_py.__main__ import main
+try:
+    main()
+except SystemExit as ended:
+    os._exit(ended.code or os.open(os.devnull, os.O_RDWR) <= 2)
+"""
+
+
+def test_no_file_takes_the_place_of_a_standard_stream_that_is_closed() -> None:
+    command = [sys.executable, "-c", OPENED_AFTER_A_COMMAND, "vehicle"]
+    assert subprocess.run(["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *command]).returncode == 0
 
 
 def test_installed_command_is_the_one_that_bears_an_interrupt() -> None:
