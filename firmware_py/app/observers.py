@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.core.types import Event, Inputs, Outputs
+from firmware_py.bus.port import Port
+from firmware_py.core.types import WARNING, Event, Inputs, Outputs
 from firmware_py.runtime.recorder import Recorder
 
 Observer = Callable[[Sequence[BusFrame], Sequence[BusFrame], Inputs, Outputs], None]
@@ -48,5 +49,24 @@ def recording(recorder: Recorder, rate_hz: int) -> Observer:
         if armed != was_armed or outputs.tick % flush_every == 0:
             was_armed[:] = armed
             outputs.events += recorder.flush()
+
+    return observe
+
+
+def watching_buses(ports: Sequence[Port], rate_hz: int) -> Observer:
+    """An observer that looks once a second at what ports count, and warns of every kind that grows and did not in the second before."""
+    counted = [dict(port.faults) for port in ports]
+    growing: list[set[str]] = [set() for _ in ports]
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        if outputs.tick % rate_hz:
+            return
+        for place, port in enumerate(ports):
+            now, before = dict(port.faults), counted[place]
+            grown = {kind for kind, count in now.items() if count > before[kind]}
+            if fresh := sorted(grown - growing[place]):
+                words = ", ".join(f"{now[kind] - before[kind]} {kind}" for kind in fresh)
+                outputs.events.append(Event(WARNING, f"bus {port.address}: in the last second {words}"))
+            counted[place], growing[place] = now, grown
 
     return observe

@@ -15,7 +15,7 @@ from firmware_py.app.estop_note import EstopNote, estop_stands, noting_estop
 from firmware_py.app.firmware import Firmware, compose, vehicles_of
 from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight, outdate, to_arm
 from firmware_py.app.live_view import LiveView
-from firmware_py.app.observers import Observer, recording, telling
+from firmware_py.app.observers import Observer, recording, telling, watching_buses
 from firmware_py.app.realtime import open_loop
 from firmware_py.app.service import reporting
 from firmware_py.core.body import Body
@@ -171,7 +171,8 @@ def run_vehicle(
         for line in stack.enter_context(real_time()):
             teller.say(f"warning: {line}")
         loop = open_loop(stack, firmware, requests)
-        loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier), *told]
+        buses = watching_buses(loop.ports, fleet.rate_hz)
+        loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier), buses, *told]
         use_priority(TICK_PRIORITY)
         move_to_own_processor()
         loop.listen()

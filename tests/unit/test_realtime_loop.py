@@ -8,7 +8,7 @@ import pytest
 
 from firmware_py.app.firmware import BusFrame, Firmware, compose
 from firmware_py.app.lockstep import Lockstep
-from firmware_py.app.observers import Observer, telling
+from firmware_py.app.observers import Observer, telling, watching_buses
 from firmware_py.app.realtime import RealTimeLoop, open_loop
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Inputs, Outputs
@@ -53,3 +53,17 @@ def test_observer_that_fails_on_the_bench_ends_the_flight(firmware: Firmware) ->
         lockstep.start_tick(1, 0)
         with pytest.raises(IndexError, match="no such id"):
             lockstep.finish_tick(1, 0, [], [])
+
+
+def test_what_a_bus_loses_is_told_once_while_it_goes_on(tmp_path: Path) -> None:
+    with open_port(f"virtual:{tmp_path.name}") as port:
+        observe = watching_buses([port], 100)
+        told = {}
+        for tick, lost in ((99, 3), (100, 0), (200, 7), (300, 0), (350, 2), (400, 0)):
+            port.faults["full"] += lost
+            observe([], [], Inputs(tick, 0, []), outputs := Outputs(tick, 0, [], False, [], []))
+            told[tick] = [event.text for event in outputs.events]
+    assert told == {
+        99: [], 100: [f"bus {port.address}: in the last second 3 full"], 200: [], 300: [], 350: [],
+        400: [f"bus {port.address}: in the last second 2 full"],
+    }  # fmt: skip

@@ -3,6 +3,7 @@
 import dataclasses
 import errno
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Sequence
@@ -21,6 +22,7 @@ from firmware_py.app.realtime import RealTimeLoop
 from firmware_py.app.vehicle import FORGETFUL, Operator, run_vehicle
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import PortError
+from firmware_py.bus.port.links import VirtualLink
 from firmware_py.cli import main
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Inputs, ModuleCommand, Outputs, Request
@@ -75,6 +77,21 @@ def test_second_signal_does_not_end_the_process_before_its_log_is_closed(tmp_pat
     with handled(lambda number, frame: fatal.append(number)):
         fly(tmp_path, tmp_path / "log")
     assert not fatal
+
+
+def test_vehicle_says_that_a_bus_takes_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(link: VirtualLink, bus: Any, frame: Frame) -> None:
+        raise OSError(errno.ENOBUFS, "No buffer space available")
+
+    def say(line: str) -> None:
+        said.append(line)
+        if "full" in line or "bus silent" in line:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    said: list[str] = []
+    monkeypatch.setattr(VirtualLink, "send", refuse)
+    run_vehicle(single(bus=bus_of(tmp_path)), Parameters(), say=say)
+    assert any(re.search(f"bus {bus_of(tmp_path)}: in the last second [0-9]+ full$", line) for line in said)
 
 
 def content(folder: Path) -> dict[str, bytes]:
