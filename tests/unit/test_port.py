@@ -275,6 +275,17 @@ class TestSlcan(PortSuite):
         bus.serialPortOrig.close()
         link.close(link.open())
 
+    def test_settings_of_this_machine_for_python_can_change_nothing(self, cable, monkeypatch):
+        """In ~/.canrc a listener of somebody else may be told to send nothing, or to hear its own frames."""
+        monkeypatch.setenv("CAN_CONFIG", '{"listen_only": true, "rtscts": true}')
+        link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))
+        bus = link.open()
+        try:
+            assert not bus._listen_only
+            assert not bus.serialPortOrig.rtscts
+        finally:
+            link.close(bus)
+
     def test_silent_adapter_is_waited_for_asleep(self, cable, monkeypatch):
         """python-can's own wait reads in a loop: at real-time priority nothing else would run on that processor."""
         link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))

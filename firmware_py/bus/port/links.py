@@ -191,7 +191,7 @@ class SocketcanLink(Link):
             # python-can leaks the socket of an interface that it cannot bind, so this one goes first.
             with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
                 probe.bind((self.address,))
-            bus = can.Bus(interface="socketcan", channel=self.address)
+            bus = can.Bus(interface="socketcan", channel=self.address, ignore_config=True)
         except (OSError, can.CanError) as error:
             hint = "not a CAN interface" if error_number(error) == errno.ENODEV else _reason(error)
             raise PortError(f"socketcan:{self.address}: {hint}; it takes can0, vcan0 or the like") from None
@@ -243,7 +243,9 @@ class SlcanLink(Link):
         self._rest = b""
         try:
             self._take()
-            return can.Bus(interface="slcan", channel=self.address, bitrate=BIT_RATE, sleep_after_open=0.0, timeout=0.0)
+            return can.Bus(
+                interface="slcan", channel=self.address, bitrate=BIT_RATE, sleep_after_open=0.0, timeout=0.0, ignore_config=True
+            )
         except Exception as error:
             if isinstance(error, BlockingIOError) and self._lock is None:
                 raise PortError(f"slcan:{self.address}: another process uses it; one adapter serves one process") from None
