@@ -88,6 +88,10 @@ def rewrite(source: Path, target: Path, keep: Callable[[str, Message], bool], at
 
 def _cut_frames(source: Path, target: Path, last: str) -> None:
     """Copies whole lines up to the last one with the stamp `last`."""
-    lines = source.read_bytes().splitlines(True)
-    end = max(i for i, line in enumerate(lines) if line.startswith(last.encode() + b" "))
-    target.write_bytes(b"".join(lines[: end + 1]))
+    stamp, end, here = f"{last} ".encode(), 0, 0
+    with source.open("rb") as file:
+        for line in file:
+            here += len(line)
+            end = here if line.startswith(stamp) else end
+    shutil.copyfile(source, target)
+    os.truncate(target, end)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import tracemalloc
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -22,8 +23,8 @@ from firmware_py.description.signals import is_closed
 from firmware_py.runtime import guarded_file
 from firmware_py.runtime.flight_log import FlightLog, LogError
 from firmware_py.runtime.guarded_file import GuardedFile, QueuedFile
-from firmware_py.runtime.log_recovery import recover
-from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
+from firmware_py.runtime.log_recovery import _cut_frames, recover
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder, candump_stamp
 from hil.bench import open_bench
 from tests.closed_loop.flights import shortened
 
@@ -112,6 +113,20 @@ def test_log_of_a_flight_that_goes_on_is_not_mended(tmp_path: Path) -> None:
         recover(tmp_path)
     recorder.close()
     assert recover(tmp_path) == (0, "")
+
+
+def test_long_can_log_is_cut_without_being_held_in_memory(log: Path) -> None:
+    path, last = log / CAN_LOG, max(ticks_of(log))
+    with (log / "long.log").open("wb") as long:
+        for _ in range(20):
+            long.write(path.read_bytes())
+    stamp = candump_stamp(last * 1_000_000_000 // TICKS_A_SECOND)
+    tracemalloc.start()
+    _cut_frames(log / "long.log", log / "cut.log", stamp)
+    held = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (log / "cut.log").read_bytes() == (log / "long.log").read_bytes()
+    assert held < (log / "long.log").stat().st_size / 2
 
 
 def test_half_a_line_of_can_log_is_left_out(log: Path) -> None:
