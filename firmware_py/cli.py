@@ -78,7 +78,7 @@ def run(
     live_host: Annotated[str | None, typer.Option(help="address that the live view listens on", show_default=LIVE_HOST)] = None,
     live_port: Annotated[int | None, typer.Option(min=1, max=65535, help="and its port", show_default=f"{LIVE_PORT}")] = None,
 ) -> None:
-    """Run the vehicle until SIGINT or SIGTERM."""
+    """Run the vehicle until SIGINT, SIGTERM or SIGHUP."""
     from firmware_py.app.deadlines import stats_lines
     from firmware_py.app.live_view import LiveView
     from firmware_py.app.vehicle import run_vehicle

@@ -27,7 +27,7 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.stored_parameters import laid_over, stored_line
 from firmware_py.runtime.clock import boot_id, unix_ns
-from firmware_py.runtime.interrupts import handled
+from firmware_py.runtime.interrupts import endings_of_a_run, handled
 from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.rate_keeper import RateKeeper
@@ -126,7 +126,7 @@ def run_vehicle(
     ground: GroundConfig | None = None,
     live: LiveView | None = None,
 ) -> Summary:
-    """Runs the firmware against the clock until SIGINT or SIGTERM. Raises DescriptionError and PortError before the first tick.
+    """Runs the firmware against the clock until SIGINT, SIGTERM or SIGHUP. Raises DescriptionError and PortError before the first tick.
 
     Args:
         hold: arm as soon as the vehicle may, and hold the place.
@@ -178,7 +178,7 @@ def run_vehicle(
         loop.listen()
         if out is not None and estop_stands(out) and not before.stopped:
             raise DescriptionError(f"{out}: an e-stop was raised while this process started, by one that ran until then; start it again")
-        logged.enter_context(handled(operator.stop))  # SIGINT and SIGTERM
+        logged.enter_context(handled(operator.stop, endings_of_a_run()))
         stack.enter_context(quiet_garbage())
         teller.say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
         loop.run(operator.is_done)

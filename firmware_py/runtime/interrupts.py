@@ -15,6 +15,11 @@ ENDINGS = (signal.SIGINT, signal.SIGTERM)
 """What somebody ends a command with: at its terminal, and from elsewhere."""
 
 
+def endings_of_a_run() -> list[signal.Signals]:
+    """Besides ENDINGS its terminal's end, as of an ssh connection that is lost, unless whoever started the process has it ignore that."""
+    return [*ENDINGS] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [*ENDINGS, signal.SIGHUP]
+
+
 @contextmanager
 def handled(handler: Callable[[int, FrameType | None], object], numbers: Iterable[signal.Signals] = ENDINGS) -> Iterator[None]:
     """These signals go to `handler` inside, and afterwards to whoever had them."""

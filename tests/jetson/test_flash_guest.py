@@ -96,7 +96,7 @@ def test_release_is_flashed_and_the_service_flies_the_hover_on_vcan0(guest: Gues
 
 def test_broken_release_is_rolled_back_by_the_machine_itself(guest: Guest, tmp_path: Path) -> None:
     before = current(guest)
-    body = '"""Run the vehicle until SIGINT or SIGTERM."""'
+    body = '"""Run the vehicle until SIGINT, SIGTERM or SIGHUP."""'
     done = flash(guest, checkout(tmp_path, "broken", body, f'{body}\n    raise RuntimeError("broken on purpose")'))
     assert done.returncode == 1, done.stdout + done.stderr
     assert f"rolled back to {before}, which runs" in done.stderr

@@ -32,7 +32,7 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime import teller
 from firmware_py.runtime.clock import boot_id
 from firmware_py.runtime.flight_log import FlightLog
-from firmware_py.runtime.interrupts import handled
+from firmware_py.runtime.interrupts import endings_of_a_run, handled
 from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
 from tests.unit.ground_world import Robot
@@ -50,7 +50,7 @@ def bus_of(path: Path) -> str:
 
 def fly(
     tmp_path: Path, out: Path | None = None, then: Callable[[], None] = lambda: None, parameters: Parameters | None = None,
-    fleet: Fleet | None = None, hold: bool = False,
+    fleet: Fleet | None = None, hold: bool = False, ending: signal.Signals = signal.SIGTERM,
 ) -> list[str]:  # fmt: skip
     """Starts, and asks for the end in the first tick. `then` is done by whoever says so. Returns what was said."""
     said: list[str] = []
@@ -58,7 +58,7 @@ def fly(
     def say(line: str) -> None:
         said.append(line)
         if line.startswith("running at"):
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), ending)
             then()
 
     run_vehicle(fleet or single(bus=bus_of(tmp_path)), parameters or Parameters(), hold=hold, out=out, say=say)
@@ -77,6 +77,26 @@ def test_second_signal_does_not_end_the_process_before_its_log_is_closed(tmp_pat
     with handled(lambda number, frame: fatal.append(number)):
         fly(tmp_path, tmp_path / "log")
     assert not fatal
+
+
+def test_vehicle_whose_terminal_is_gone_ends_as_it_does_by_a_signal(tmp_path: Path) -> None:
+    fatal: list[int] = []
+
+    def die(number: int, frame: object) -> None:
+        fatal.append(number)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with handled(die, [signal.SIGHUP]):
+        fly(tmp_path, ending=signal.SIGHUP)
+    assert not fatal
+
+
+def test_vehicle_that_is_told_to_ignore_the_end_of_its_terminal_does() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert signal.SIGHUP not in endings_of_a_run()
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_vehicle_says_that_a_bus_takes_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
