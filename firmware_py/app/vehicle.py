@@ -154,9 +154,10 @@ def run_vehicle(
         if hold and out is None:
             teller.say(FORGETFUL)
         logged = stack.enter_context(ExitStack())  # ends when the log and the note of an e-stop are closed
+        note = _open_note(stack, out) if out is not None else None  # before the log: of two that start at once one has the folder
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
         recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
-        observers = list(_keeping(stack, firmware, recorder, out, live, before.stopped))
+        observers = list(_keeping(firmware, recorder, note, live, before.stopped))
         told: list[Observer] = [telling(teller.say)]  # after all others, which may have something to say
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
         side: GroundSide | None = None
@@ -187,16 +188,23 @@ def run_vehicle(
         return summary_of(loop)
 
 
+def _open_note(stack: ExitStack, out: Path) -> EstopNote:
+    """The note of an e-stop in the folder for logs, which nobody else has from now on. Raises DescriptionError where somebody has it."""
+    with suppress(OSError):  # said when a log is to go there
+        out.mkdir(parents=True, exist_ok=True)
+    note = EstopNote(out)
+    stack.callback(note.close)
+    return note
+
+
 def _keeping(
-    stack: ExitStack, firmware: Firmware, recorder: Recorder | None, out: Path | None, live: LiveView | None, stopped: bool
+    firmware: Firmware, recorder: Recorder | None, note: EstopNote | None, live: LiveView | None, stopped: bool
 ) -> Iterator[Observer]:
     """Who keeps each tick: the log, the note of an e-stop (`stopped`: one stands from before), the viewers."""
     fleet = firmware.fleet
     if recorder is not None:
         yield recording(recorder, fleet.rate_hz)
-    if out is not None:
-        note = EstopNote(out)
-        stack.callback(note.close)
+    if note is not None:
         yield noting_estop(note, stopped, recorder)
     if live is not None:
         yield live.drawing(fleet, vehicles_of(fleet), lambda: firmware.pipeline.bodies)

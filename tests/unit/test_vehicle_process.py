@@ -79,6 +79,20 @@ def test_second_signal_does_not_end_the_process_before_its_log_is_closed(tmp_pat
     assert not fatal
 
 
+def test_process_that_is_refused_a_folder_leaves_the_log_of_who_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two that start at once, both before either has a log there."""
+    monkeypatch.setattr(vehicle, "make_log_folder", lambda out: out)
+    note = EstopNote(tmp_path)
+    log = Recorder(tmp_path, {})
+    log.flush()
+    before = content(tmp_path)
+    with pytest.raises(DescriptionError, match="another vehicle that runs logs into"):
+        fly(tmp_path, tmp_path)
+    assert content(tmp_path) == before
+    log.close()
+    note.close()
+
+
 def test_vehicle_whose_terminal_is_gone_ends_as_it_does_by_a_signal(tmp_path: Path) -> None:
     fatal: list[int] = []
 
