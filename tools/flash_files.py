@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import zipfile
@@ -44,11 +45,11 @@ def unpack(wheel: Path, packages: Path) -> None:
 
 
 def carry_compiled(old: Path, new: Path) -> bool:
-    """Copies numba's caches from one site-packages folder to another, if the same files there use numba.
+    """Copies numba's caches from one site-packages folder to another, if all that they were compiled from is the same there.
 
-    One compiled function contains others, so that all of them have to be the same, or none is taken.
+    One compiled function contains others, and constants, so that all of them have to be the same, or none is taken.
     """
-    if numba_users(old) != numba_users(new):
+    if compiled_from(old) != compiled_from(new):
         return False
     for package in OWN_PACKAGES:
         for path in (old / package).rglob("__pycache__/*.nb[ic]"):
@@ -58,11 +59,26 @@ def carry_compiled(old: Path, new: Path) -> bool:
     return True
 
 
-def numba_users(packages: Path) -> dict[str, bytes]:
-    """Our own files that use numba, by place."""
+def compiled_from(packages: Path) -> dict[str, bytes]:
+    """Our own files that use numba, and those that they import modules or constants (in capitals) from, by place."""
     files = [path for package in OWN_PACKAGES for path in (packages / package).rglob("*.py")]
     texts = {str(path.relative_to(packages)): path.read_bytes() for path in files}
-    return {name: text for name, text in texts.items() if b"numba" in text}
+    found, left = set[str](), {name for name, text in texts.items() if b"numba" in text}
+    while left:
+        found |= left
+        left = {source for name in left for source in _sources(texts[name].decode())} & texts.keys() - found
+    return {name: texts[name] for name in found}
+
+
+def _sources(text: str) -> set[str]:
+    """Where the modules and constants may be that a file imports."""
+    found = set[str]()
+    for module, names in re.findall(r"^from ([\w.]+) import (\([^)]*\)|[^\n]*)", text, re.MULTILINE):
+        folder = module.replace(".", "/")
+        found |= {f"{folder}/{name}.py" for name in re.findall(r"\w+", names)}
+        if re.search(r"\b[A-Z][A-Z0-9_]+\b", names):
+            found |= {f"{folder}.py", f"{folder}/__init__.py"}
+    return found
 
 
 def file_digest(path: Path) -> str:

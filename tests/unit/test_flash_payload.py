@@ -33,18 +33,32 @@ def test_offline_names_the_first_wheel_that_is_missing(tmp_path: Path) -> None:
         flash_payload.make_payload("aarch64", "3.11", tmp_path, offline=True)
 
 
+FAST = "import numba\n\nfrom firmware_py.core.sizes import (\n    LENGTH,\n)\n"
+
+
 def test_compiled_code_is_carried_over_only_if_all_its_sources_are_the_same(tmp_path: Path) -> None:
     old, new = tmp_path / "old", tmp_path / "new"
     for folder in (old, new):
         (folder / "firmware_py" / "core").mkdir(parents=True)
-        (folder / "firmware_py" / "core" / "fast.py").write_text("import numba\n")
+        (folder / "firmware_py" / "core" / "fast.py").write_text(FAST)
+        (folder / "firmware_py" / "core" / "sizes.py").write_text("LENGTH = 8\n")
+        (folder / "firmware_py" / "core" / "slow.py").write_text(f"# {folder}\n")
     cache = old / "firmware_py" / "core" / "__pycache__"
     cache.mkdir()
     (cache / "fast.run-1.py311.nbi").write_text("index")
     assert flash_files.carry_compiled(old, new)
     assert (new / "firmware_py/core/__pycache__/fast.run-1.py311.nbi").read_text() == "index"
-    (new / "firmware_py" / "core" / "fast.py").write_text("import numba  # another\n")
-    assert not flash_files.carry_compiled(old, new)
+    for name, text in (("fast", f"{FAST}  # another"), ("sizes", "LENGTH = 9\n")):
+        before = (new / f"firmware_py/core/{name}.py").read_text()
+        (new / f"firmware_py/core/{name}.py").write_text(text)
+        assert not flash_files.carry_compiled(old, new), name
+        (new / f"firmware_py/core/{name}.py").write_text(before)
+
+
+def test_compiled_code_is_made_of_the_files_that_it_takes_constants_from_too() -> None:
+    used = flash_files.compiled_from(flash_payload.ROOT)
+    assert {"firmware_py/bus/codec/crc.py", "firmware_py/bus/codec/message.py", "firmware_py/core/types.py"} < used.keys()
+    assert "firmware_py/description/parameters.py" not in used, "every release changes it"
 
 
 @pytest.mark.slow
