@@ -27,7 +27,7 @@ Before=ssh.service
 Type=oneshot
 RemainAfterExit=yes
 ExecStart=/bin/sh -c 'ip link set lo up; cd /sys/class/net; for i in e*; do ip link set $i up; ip addr add 10.0.2.15/24 dev $i; done'
-ExecStart=/bin/sh -c 'ip route add 224.0.0.0/4 dev lo; ip link add vcan0 type vcan; ip link set vcan0 txqueuelen 1000 up'
+ExecStart=/bin/sh -c 'ip route add 224.0.0.0/4 dev lo; ip link add vcan0 type vcan; ip link set vcan0 txqueuelen 200 up'
 EOF
 # An idle machine's counted clock jumps while files are waited for.
 unit guest-spinner.service <<'EOF'
