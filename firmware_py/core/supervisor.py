@@ -52,6 +52,8 @@ class Supervisor:
         self.raises_estop = False
         self.events: list[Event] = []
         self._estop_ns: int | None = None
+        self._let_go = True
+        """Disarmed in the tick before, with no e-stop that a module could still say of that it holds it."""
         self._testing = False
 
     @property
@@ -77,25 +79,21 @@ class Supervisor:
 
         Args:
             estop: an ESTOP frame came since the previous tick. A module that says it is stopped while the body is armed is as good as one;
-                and one that holds an e-stop of which this process never knew: it was raised before the start, and nobody cleared it.
+                and one that says so of a disarmed body when none did in the tick before: nobody has cleared that e-stop.
             health: of this tick.
             requests: for this body, and e-stops for all.
             endings: TEST_OVER while no motor test runs, DOCK_OVER when a dock has ended; nothing is said where they do not apply.
         """
         self.events = []
         decisions: list[Decision | None] = []
-        if estop or (health.stopped and (self.armed or self._knows_of_no_estop)):  # a module has heard what the firmware has not
+        if estop or (health.stopped and (self.armed or self._let_go)):  # a module has heard what the firmware has not
             self._estop_ns = health.time_ns
             decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
         decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger)]
         decisions += [self._request(request, health) for request in requests]
         decisions += self._run_failsafes(health)
+        self._let_go = self.state == State.DISARMED and not health.stopped and not self._estop_is_fresh(health)
         return [decision for decision in decisions if decision is not None]
-
-    @property
-    def _knows_of_no_estop(self) -> bool:
-        """Whether a disarmed body has had no e-stop since the start: then no module is still to let go of one that was cleared here."""
-        return self.state == State.DISARMED and self._estop_ns is None
 
     def _request(self, request: Request, health: Health) -> Decision | None:
         trigger = TRIGGERS.get(request.action)
@@ -179,7 +177,7 @@ class Supervisor:
             if self._testing:  # and nobody has asked yet whether it may fly
                 reasons = reasons or self._reasons(Guard.ARMING_CHECKS, mode, health)
             return reasons
-        if guard == Guard.ESTOP_QUIET and self._estop_age_ms(health) < self._p.supervision.estop_quiet_ms:
+        if guard == Guard.ESTOP_QUIET and self._estop_is_fresh(health):
             return ["the e-stop is still raised"]
         if guard == Guard.IN_MOTOR_DETECT and self.mode != Mode.MOTOR_DETECT:
             return ["the mode is not MOTOR_DETECT"]
@@ -210,10 +208,14 @@ class Supervisor:
         self.mode, self.level = next(iter(kept), Mode.POSHOLD), worst.level
         self.raises_estop = any(other.raises_estop for other in before)
         self._estop_ns = max((other._estop_ns for other in before if other._estop_ns is not None), default=None)
+        self._let_go = all(other._let_go for other in before)
         self._failsafes.take_over([other._failsafes for other in before])
 
     def _estop_age_ms(self, health: Health) -> float:
         return math.inf if self._estop_ns is None else (health.time_ns - self._estop_ns) * 1e-6
+
+    def _estop_is_fresh(self, health: Health) -> bool:
+        return self._estop_age_ms(health) < self._p.supervision.estop_quiet_ms
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))

@@ -170,8 +170,29 @@ def test_e_stop_that_was_raised_before_the_process_started_is_latched_until_a_pe
     let_go = at(GOOD, 1.0)
     assert ask(supervisor, Action.ARM, None, let_go) == [] and ask(supervisor, Action.ARM, True, let_go) == []
     assert ask(supervisor, Action.CLEAR_ESTOP, None, let_go) and supervisor.state == State.DISARMED
-    assert supervisor.step(False, at(stopped, 1.01), []) == [], "once one was cleared here, modules may take their time"
     assert ask(supervisor, Action.ARM, None, at(GOOD, 1.3)) and supervisor.armed
+
+
+def test_e_stop_that_only_a_module_has_heard_is_latched_after_another_was_cleared_once_that_is_let_go() -> None:
+    supervisor = supervisor_in(State.DISARMED)
+    stopped = GOOD._replace(stopped=(0,))
+    supervisor.step(False, stopped, [])
+    assert ask(supervisor, Action.CLEAR_ESTOP, None, at(stopped, 0.2)) and supervisor.state == State.DISARMED
+    for health in (at(stopped, 0.21), at(stopped, 9.0), at(GOOD, 9.01)):
+        assert supervisor.step(False, health, []) == [], "its modules may take their time"
+    whole = Supervisor(P)
+    whole.take_over([supervisor])
+    for robot in (supervisor, whole):
+        robot.step(False, at(stopped, 9.02), [])
+        assert robot.state == State.ESTOP and ask(robot, Action.ARM, True, at(GOOD, 10.0)) == []
+
+
+def test_modules_that_hear_an_e_stop_of_the_robots_own_when_it_is_cleared_do_not_raise_it_again() -> None:
+    supervisor = supervisor_in()
+    supervisor.step(False, GOOD, [Request(Action.ESTOP)])
+    supervisor.step(False, at(GOOD, 0.01), [Request(Action.CLEAR_ESTOP)])
+    for health in (at(GOOD, 0.02), at(GOOD._replace(stopped=(0,)), 0.03), at(GOOD._replace(stopped=(0,)), 0.22), at(GOOD, 0.23)):
+        assert supervisor.step(False, health, []) == [] and supervisor.state == State.DISARMED
 
 
 def test_e_stop_is_cleared_when_the_bus_has_been_quiet() -> None:
