@@ -115,6 +115,9 @@ ROWS = (
         "battery critical", "surfaces after 5 s", _fault("battery_sag", 3.0), ends=_to("SURFACE", *MODES), within_s=6.5, error_m=0.100,
         says="battery critical",
     ),
+    Row(
+        "battery and cabin not told of", "warns; 20 mm", _fault("readings_absent"), error_m=0.020, says="no reading of a cabin for",
+    ),
     Row("leak", "surfaces after 0.5 s", _fault("leak"), ends=_to("SURFACE", *MODES), within_s=0.8, error_m=0.100, says="water in a cabin"),
     Row(
         "firmware killed for 0.5 s", "comes back disarmed", _fault("process_killed", until_s=AT_S + 0.5), ends=_to("DISARMED", *MODES),

@@ -104,6 +104,7 @@ class Faults:
             **dict.fromkeys(THRUSTER_KINDS, self._break_thrusters),
             "imu_frozen": lambda fault, mcu: setattr(mcu, "frozen", True),
             "leak": lambda fault, mcu: setattr(mcu, "leaks", True),
+            "readings_absent": lambda fault, mcu: setattr(mcu, "unread", True),
             "battery_sag": lambda fault, mcu: self._world.sag(mcu.module, fault.value),
             "magnet": self._hang_magnets,
             "jets": lambda fault, mcu: setattr(self._world, "jet_strength", fault.value),
@@ -181,7 +182,7 @@ class Faults:
         """
         self._world.jet_strength = self._world.spec.jet_strength
         for number, mcu in self._nodes.mcus.items():
-            mcu.frozen = mcu.leaks = False
+            mcu.frozen = mcu.leaks = mcu.unread = False
             self._world.mend(mcu.module)
             for fault in self._on:
                 if fault.kind in self._breaks and fault.module in (0, number):

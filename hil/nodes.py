@@ -65,8 +65,8 @@ class Mcu:
         self._dock = Noise(stream(world.seed, "dock", module), 6)
         self._fast = [codec.message(name) for name in ("GYRO", "ACCEL", "MCU_STATUS")]
         self._slow = _schedule(codec, number, tick_ns)
-        self.frozen = self.leaks = False
-        """Faults: the IMU repeats its last sample; water in the cabin."""
+        self.frozen = self.leaks = self.unread = False
+        """Faults: the IMU repeats its last sample; water in the cabin; nothing is said of battery and cabin."""
         self._motion: tuple[list[float], list[float]] | None = None
         self._counters = dict.fromkeys(SLOW, 0)
 
@@ -130,7 +130,7 @@ class Mcu:
             accel.encode(self.number, [*self._motion[1], 0], tick),
         ]
         for message, every, phase in self._slow:
-            if tick % every == phase:
+            if tick % every == phase and not (self.unread and message.name in ("POWER", "ENVIRONMENT")):
                 counter = self._counters[message.name]
                 self._counters[message.name] = (counter + 1) & 15
                 frames.append(message.encode(self.number, self._reading(message.name, truth), counter))

@@ -96,7 +96,9 @@ def _failsafes(q: Question) -> list[str]:
 
 
 def _readings(q: Question) -> list[str]:
-    return [f"{name} was not heard of lately" for name in q.health.unheard]
+    limits, health = q.parameters.failsafes, q.health
+    ages = {"battery": (health.battery_age_s, limits.battery_unknown_limit), "cabin": (health.cabin_age_s, limits.cabin_unknown_limit)}
+    return [f"{name} was not heard of lately" for name, (age_s, permitted_s) in ages.items() if age_s > permitted_s]
 
 
 def _frames(q: Question) -> str:

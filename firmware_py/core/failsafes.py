@@ -84,6 +84,8 @@ TABLE = (
     Row("ground_lost", "ground station silent for {:.1f} s", attrgetter("ground_age_s"), modes=ANY - {Mode.AUTO, Mode.SURFACE}),
     Row("pilot_lost", "pilot silent for {:.1f} s", attrgetter("pilot_age_s"), modes=PILOTED),
     Row("thruster_lost", "a thruster is out", lambda h: len(h.dead) > 0),
+    Row("cabin_unknown", "no reading of a cabin for {:.1f} s", attrgetter("cabin_age_s")),
+    Row("battery_unknown", "no reading of a battery for {:.1f} s", attrgetter("battery_age_s")),
     Row("battery_low", "battery low: {:.0%} of its voltage", attrgetter("voltage_share"), below=True),
 )
 

@@ -26,8 +26,6 @@ MEAN_S = 1.0
 """Time over which rates and shares are averaged."""
 DRY_NS = 3_000_000_000
 """A cabin that was wet in two readings running is dry when its sensor has been for so long: water in it moves. ArduSub waits as long."""
-READ_NS = 2_000_000_000
-"""So long what a module says of its battery and its cabin is known: ten readings of its cabin, twenty of its battery."""
 FOREIGN_NS = 1_000_000_000
 """So long a frame of somebody else is remembered: one that sends as slowly as once a second is one stranger."""
 VOLTAGE_SHARE = 0.2
@@ -93,8 +91,10 @@ class Health(NamedTuple):
     """Which docked partner is lost, in words; empty: none."""
     tag_gap_s: float = math.nan
     """Between the last two pictures of tags, believed or not; NaN while none come."""
-    unheard: tuple[str, ...] = ()
-    """What some module has said nothing of lately: battery, cabin. The figures above stay what they were."""
+    battery_age_s: float = 0.0
+    """Oldest last reading of a module's supply; the figures above stay what they were."""
+    cabin_age_s: float = 0.0
+    """The same of a module's cabin, which tells of water in it too."""
     unfit: tuple[int, ...] = ()
     """Fleet indices of modules that say that they start, or have a fault."""
 
@@ -232,7 +232,8 @@ class HealthMonitor:
             topology=self.topology,
             tag_gap_s=self._tag_gap_s(now),
             unfit=tuple(m for m, unfit in zip(self._modules, self._unfit, strict=True) if unfit),
-            unheard=tuple(name for name, times_ns in self._read_ns.items() if min(times_ns) < now - READ_NS),
+            battery_age_s=_age_s(min(self._read_ns["battery"]), now),
+            cabin_age_s=_age_s(min(self._read_ns["cabin"]), now),
         )
         return self.now
 

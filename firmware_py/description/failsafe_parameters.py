@@ -175,6 +175,20 @@ class Failsafes:
     thruster_lost_delay_s: float = delay(0.0, "FS_THR_S")
     thruster_lost_action: int = action(1, "FS_THR_ACT")
     thruster_lost_latched: int = latched(1, "FS_THR_LAT")
+    # a module does not say whether it leaks: its readings come at 5 Hz, the delay is for the first of all
+    cabin_unknown_limit: float = quantity(
+        2.0, unit="s", low=0.5, high=60, help="no leak, temperature or pressure of a cabin for longer, to arm too", mavlink="FS_CABU_LIM"
+    )
+    cabin_unknown_delay_s: float = delay(1.0, "FS_CABU_S")
+    cabin_unknown_action: int = action(1, "FS_CABU_ACT")
+    cabin_unknown_latched: int = latched(0, "FS_CABU_LAT")
+    # a module does not say how full its battery is
+    battery_unknown_limit: float = quantity(
+        2.0, unit="s", low=0.5, high=60, help="no voltage of a module for longer, to arm too", mavlink="FS_BATU_LIM"
+    )
+    battery_unknown_delay_s: float = delay(1.0, "FS_BATU_S")
+    battery_unknown_action: int = action(1, "FS_BATU_ACT")
+    battery_unknown_latched: int = latched(0, "FS_BATU_LAT")
     # battery low
     battery_low_limit: float = quantity(
         0.875, low=0.3, high=1.2, help="voltage below this share of the nominal one", mavlink="FS_BATL_LIM"

@@ -60,6 +60,7 @@ TAKES: Mapping[str, Takes] = {
     "camera_bias": ANY_SIZE,
     "battery_sag": ANY_SIZE,
     "leak": Takes(),
+    "readings_absent": Takes(),
     "magnet": Takes(-1.0, 1.0, whole=True, part=FACE),
     "jets": Takes(0.0, 1.0, one_module=False),
     "process_killed": OF_ALL,

@@ -47,8 +47,8 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(sigma_m=0.06), "pose sigma 60 mm, 50 permitted"),
     (GOOD._replace(sigma_m=math.nan), "pose sigma nan mm, 50 permitted"),
     (GOOD._replace(nis_ratio=math.nan), "sensors and model disagree: nan of the expected, 5.0 permitted"),
-    (GOOD._replace(unheard=("battery",)), "battery was not heard of lately"),
-    (GOOD._replace(unheard=("cabin",)), "cabin was not heard of lately"),
+    (GOOD._replace(battery_age_s=NEVER_S), "battery was not heard of lately"),
+    (GOOD._replace(cabin_age_s=NEVER_S), "cabin was not heard of lately"),
     (GOOD._replace(nis_ratio=6.0), "sensors and model disagree: 6.0 of the expected, 5.0 permitted"),
     (GOOD._replace(unfit=(0, 2)), "module 0, 2 starts, or has a fault"),
     (GOOD._replace(esc_missing=(0, 7)), "ESC 1, 8 does not answer"),
@@ -114,7 +114,7 @@ def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
     assert reasons(both) == ["module 2 does not answer", "pose is 700 ms old, 500 permitted"]
 
 
-BOUNDARIES = [("tag_age_s", 0.5), ("sigma_m", 0.05), ("nis_ratio", 5.0), ("frame_errors_per_s", 20.0)]
+BOUNDARIES = [("tag_age_s", 0.5), ("sigma_m", 0.05), ("nis_ratio", 5.0), ("frame_errors_per_s", 20.0), ("cabin_age_s", 2.0)]
 
 
 @pytest.mark.parametrize(("field", "limit"), BOUNDARIES)

@@ -23,7 +23,7 @@ FIELDS: dict[str, str] = {
     "tag_gone": "tag_age_s", "partner_lost": "topology", "estimator": "nis_ratio", "rejected": "rejected_share",
     "tag_lost": "tag_age_s", "tag_late": "tag_age_s", "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
     "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
-    "thruster_lost": "dead", "battery_low": "voltage_share",
+    "thruster_lost": "dead", "cabin_unknown": "cabin_age_s", "battery_unknown": "battery_age_s", "battery_low": "voltage_share",
 }  # fmt: skip
 """Which figure of Health each fail-safe judges; depth_unknown needs two."""
 YES: dict[str, Any] = {
@@ -245,6 +245,8 @@ WORDS = {
     "ground_lost": "ground station silent for 5.0 s",
     "pilot_lost": "pilot silent for 1.0 s",
     "thruster_lost": "a thruster is out",
+    "cabin_unknown": "no reading of a cabin for 2.0 s",
+    "battery_unknown": "no reading of a battery for 2.0 s",
     "battery_low": "battery low: 87% of its voltage",
 }
 

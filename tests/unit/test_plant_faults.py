@@ -83,9 +83,9 @@ SINGLE = (
     Fault(kind="thruster_dead", index=3), Fault(kind="thruster_weak", index=3, value=0.4), Fault(kind="thruster_fake_rpm", value=0.3),
     Fault(kind="thruster_reversed", module=1), Fault(kind="thruster_stuck", module=2, index=3, value=-0.6),
     Fault(kind="imu_frozen"), Fault(kind="imu_frozen", module=1), Fault(kind="leak", module=2), Fault(kind="leak"),
-    Fault(kind="battery_sag", value=1.8), Fault(kind="battery_sag", module=2, value=0.7), Fault(kind="magnet", index=1, value=1.0),
-    Fault(kind="magnet", value=0.0), Fault(kind="magnet", module=2, index=1, value=-1.0), Fault(kind="jets", value=0.9),
-    Fault(kind="jets", value=0.0), Fault(kind="push", value=2.0), Fault(kind="push", module=1, value=-0.7),
+    Fault(kind="battery_sag", value=1.8), Fault(kind="battery_sag", module=2, value=0.7), Fault(kind="readings_absent", module=1),
+    Fault(kind="magnet", index=1, value=1.0), Fault(kind="magnet", value=0.0), Fault(kind="magnet", module=2, index=1, value=-1.0),
+    Fault(kind="jets", value=0.9), Fault(kind="jets", value=0.0), Fault(kind="push", value=2.0), Fault(kind="push", module=1, value=-0.7),
 )  # fmt: skip
 
 
@@ -98,7 +98,8 @@ def broken(nodes: Nodes) -> list[object]:
         world.set_command(mcu.module, [0.5] * 8, True)
     levels = world._thrusters.level[:, 0].tolist(), world._thrusters.constants[:, 0].tolist()
     supply = world._thrusters.supply[:, 1].tolist()
-    return [*levels, supply, world.docks.relays.tolist(), world.push.tolist(), world.jet_strength, [(m.frozen, m.leaks) for m in mcus]]
+    told = [(m.frozen, m.leaks, m.unread) for m in mcus]
+    return [*levels, supply, world.docks.relays.tolist(), world.push.tolist(), world.jet_strength, told]
 
 
 def lasting(fault: Fault, at_s: float, until_s: float) -> Fault:
@@ -192,6 +193,12 @@ def test_leak_and_sag_are_reported() -> None:
     wet, power = values(frames, "ENVIRONMENT"), values(frames, "POWER")
     assert wet[0][2] == 0 and wet[-1][2] == 1
     assert power[0][0] - power[-1][0] == pytest.approx(2.0, abs=0.1)
+
+
+def test_readings_of_battery_and_cabin_stay_away() -> None:
+    frames, others = fly(nodes_with(Fault(kind="readings_absent")), 100, u=0.0), fly(nodes_with(), 100, u=0.0)
+    for name, is_there in (("POWER", False), ("ENVIRONMENT", False), ("DEPTH", True), ("MCU_STATUS", True)):
+        assert values(others, name) and bool(values(frames, name)) == is_there
 
 
 def tags(*faults: Fault, ticks: int = 60) -> np.ndarray:
