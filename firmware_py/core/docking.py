@@ -41,6 +41,7 @@ from firmware_py.description.parameters import Docking
 
 CHANGED = "the bodies are others than those that it was planned for"
 NO_LONGER = "its body is no longer in DOCK"
+ANOTHER = "another was asked for"
 
 
 class _Dock(NamedTuple):
@@ -211,6 +212,8 @@ class DockingStage:
         mine, others = (_body_of(module, estimates) for module in (plan.request.module, plan.request.target_module))
         if mine not in waiting:
             return NO_LONGER
+        if mine in self._expected:
+            return ANOTHER
         return "" if self._p.approach == "straight" else _in_the_way(plan, *estimates[mine], *estimates[others], self._p.standoff_m)
 
     def _drop(self, dock: _Dock) -> None:
@@ -221,7 +224,7 @@ class DockingStage:
     def _give_up(self, dock: _Dock, holding: Collection[int], decisions: Decisions) -> None:
         """Ends a dock in whose place another begins; a target that was coming goes back to where it held."""
         self._drop(dock)
-        self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: another was asked for")
+        self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: {ANOTHER}")
         if dock.target in holding:
             decisions.move(dock.target, -dock.sequence.met_w)
 

@@ -269,6 +269,24 @@ def test_target_does_not_come_to_meet_a_robot_that_has_left_the_dock_before_it_w
 
 
 @pytest.mark.slow
+def test_dock_in_whose_place_another_was_asked_for_before_it_was_planned_never_begins() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], apart=True)
+    tank.weak = {0, 1, 2}
+    for state, y in zip(tank.states, (0.0, 0.6, 1.2), strict=True):
+        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
+    tank._delay = 50
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    tank.run(0.1, Request(Action.SET_MODE, 1, Mode.POSHOLD))
+    first = len(tank.outputs)
+    outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 2, 2, 3)))
+    assert {(dock.module_a, dock.module_b) for each in tank.outputs[first:] for dock in each.docks} == {(2, 1)}
+    assert tank.pipeline.formation.chains[0].guidance._goal is None, "nor does its target come"
+    assert outputs.records[1].mode == Mode.DOCK and tank.when("dock refused: another was asked for")
+
+
+@pytest.mark.slow
 def test_target_comes_to_meet_the_first_of_two_alone() -> None:
     tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], apart=True)
     for state, y in zip(tank.states, (0.0, 2.0, -1.5), strict=True):
