@@ -153,13 +153,19 @@ class GroundSide:
     def _hear(self) -> None:
         """Take bytes."""
         station, now_ns = self.station, self.station.picture.time_ns
+        failed: list[Exception] = []
         for got in self.links.receive():
-            if station.take(got.channel, got.data, now_ns, got.datagram, got.trusted):
-                self.links.believe(got.channel)
+            try:
+                if station.take(got.channel, got.data, now_ns, got.datagram, got.trusted):
+                    self.links.believe(got.channel)
+            except Exception as error:  # what comes behind it may be a stop
+                failed.append(error)
         for number in self.links.channels:
             station.join(number, now_ns)
         for number in self.links.take_gone():
             station.leave(number)
+        if failed:
+            raise failed[0]
 
     def _hand_over(self) -> None:
         """What was asked, to the next tick, in order. Of too many nothing but a stop is taken."""

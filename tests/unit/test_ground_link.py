@@ -518,6 +518,24 @@ def test_a_tick_only_hands_over_its_results() -> None:
         assert len(side._ticks) == 200
 
 
+def test_stop_that_comes_behind_something_that_fails_is_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one round, on one link."""
+    firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
+    port = free_port()
+    side = GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{port}",)), firmware, ThreadPoolExecutor(1))
+    take = side.station.take
+    monkeypatch.setattr(side.station, "take", lambda channel, data, *more: 1 // 0 if data == b"bad" else take(channel, data, *more))
+    estop = mavlink.MAVLink_command_long_message(1, 1, 31012, 0, 1, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None, srcSystem=255))
+    side.observe([], [], *Robot().step([]))
+    with closing(side.links), closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as client:
+        for data in (b"bad", estop):
+            client.sendto(data, ("127.0.0.1", port))
+        with pytest.raises(ZeroDivisionError):
+            side.pump()
+        side.pump()
+    assert [request.action for request in side.requests()] == [Action.ESTOP]
+
+
 @pytest.mark.parametrize("what", ["observe", "jobs", "frames"])
 def test_ground_side_in_which_something_fails_says_so_once_and_goes_on_to_hear_a_stop(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
