@@ -27,7 +27,8 @@ who was heard and then fell silent; where none was ever heard, the sticks are ne
 WHILE_TESTED = """\
 In MOTOR_DETECT a body is disarmed instead, whatever the action, if a motor test armed it or it never saw a tag: it may lie on a bench. A
 cause that returns before its fail-safe has ended acts again after its delay. A disarmed or stopped body keeps the mode that a person chose;
-after a motor test, a dock or a fail-safe's mode it goes to POSHOLD."""
+after a motor test, a dock or a fail-safe's mode it goes to POSHOLD. A mode that a person chose and fail-safes left as it was is that
+person's again when they are over."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

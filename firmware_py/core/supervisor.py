@@ -49,6 +49,8 @@ class Supervisor:
         self.state = State.DISARMED
         self.mode = Mode.POSHOLD
         self.level = Level.NONE
+        self._chosen = self.mode
+        """By a person, before a fail-safe acted."""
         self.raises_estop = False
         self.events: list[Event] = []
         self._estop_ns: int | None = None
@@ -115,6 +117,10 @@ class Supervisor:
         begun = [alarm.level for alarm in alarms if alarm.begins and alarm.level > Level.WARN]
         level = self._failsafes.level
         acts = self.armed and bool(begun) and level > self.safety
+        if level <= Level.WARN and self.mode == self._chosen:  # all that acted are over, and have left the mode as it was
+            self.level = Level.NONE
+        if self.level == Level.NONE:
+            self._chosen = self.mode
         for alarm in alarms:
             severity = INFORMATION if not alarm.begins else CRITICAL if alarm.level > Level.HOLD else WARNING
             if acts or not alarm.again:  # one that comes and goes is said when it takes the robot from somebody
@@ -205,7 +211,7 @@ class Supervisor:
         worst = max(before, key=lambda other: other.safety)
         unplaced = [other.mode for other in flown if Need.POSITION not in MODES[other.mode].needs]
         kept = [worst.mode] if worst.safety > Level.NONE else unplaced
-        self.mode, self.level = next(iter(kept), Mode.POSHOLD), worst.level
+        self.mode, self.level, self._chosen = next(iter(kept), Mode.POSHOLD), worst.level, worst._chosen
         self.raises_estop = any(other.raises_estop for other in before)
         self._estop_ns = max((other._estop_ns for other in before if other._estop_ns is not None), default=None)
         self._let_go = all(other._let_go for other in before)

@@ -239,6 +239,24 @@ def test_pilots_depth_hold_needs_no_tags() -> None:
     assert supervisor.step(False, GOOD._replace(tag_age_s=100.0, pilot_age_s=0.1), []) == []
 
 
+@pytest.mark.parametrize(("figure", "value"), [("imu_age_s", 0.6), ("pilot_age_s", 1.1)])
+def test_pilots_depth_hold_without_tags_is_his_again_when_the_fail_safe_that_kept_it_is_over(figure: str, value: float) -> None:
+    """A moment without IMU or sticks brought the robot up 22 s later, with its pilot at the sticks."""
+    supervisor = supervisor_in(mode=Mode.ALT_HOLD)
+    for tenth in range(300):
+        health = UPRIGHT._replace(**{figure: value}) if tenth < 3 else UPRIGHT
+        supervisor.step(False, at(health, tenth / 10), [])
+        assert supervisor.level == (Level.HOLD if tenth < 23 else Level.NONE)
+    whole = supervisor_in()
+    whole.take_over([supervisor])
+    for robot in (supervisor, whole):
+        modes = []
+        for tenth in range(300, 530):
+            robot.step(False, at(UPRIGHT._replace(**{figure: value}), tenth / 10), [])
+            modes.append(robot.mode)
+        assert modes == [Mode.ALT_HOLD] * 221 + [Mode.SURFACE] * 9, "what does not end brings it up"
+
+
 def test_depth_hold_of_a_fail_safe_that_a_pilot_takes_is_his() -> None:
     supervisor = supervisor_in(mode=Mode.POSHOLD)
     supervisor.step(False, GOOD._replace(tag_age_s=9.0), [])
