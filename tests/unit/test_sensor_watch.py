@@ -63,6 +63,10 @@ def test_pressure_that_is_repeated_for_two_seconds_is_not_believed_until_it_chan
         return watch.pressure_heard
 
     assert [is_heard(1.1e5) for _ in range(DEPTH_REPEATS + 3)] == [True] * DEPTH_REPEATS + [False] * 3
+    joined = SensorWatch([0])
+    joined.take_over([watch])
+    joined.step([ModuleInputs(pressure_pa=1.1e5)])
+    assert not joined.pressure_heard
     assert is_heard(1.1e5 + 1.0)
 
 
