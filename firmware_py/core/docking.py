@@ -42,6 +42,7 @@ from firmware_py.description.parameters import Docking
 CHANGED = "the bodies are others than those that it was planned for"
 NO_LONGER = "its body is no longer in DOCK"
 ANOTHER = "another was asked for"
+LED = "the body that it is to go to is on its way to it: end that dock first"
 
 
 class _Dock(NamedTuple):
@@ -214,7 +215,17 @@ class DockingStage:
             return NO_LONGER
         if mine in self._expected:
             return ANOTHER
+        if mine in self._leaders(others):
+            return LED
         return "" if self._p.approach == "straight" else _in_the_way(plan, *estimates[mine], *estimates[others], self._p.standoff_m)
+
+    def _leaders(self, body: int) -> list[int]:
+        """The bodies that this one is steered by: the target of its dock, the target of that one's, and so on. None is led by itself."""
+        targets, found = {dock.active: dock.target for dock in self._docks}, list[int]()
+        while body in targets:
+            body = targets[body]
+            found.append(body)
+        return found
 
     def _drop(self, dock: _Dock) -> None:
         """It is no longer under way, and its magnets let go."""

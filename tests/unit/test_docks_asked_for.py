@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.docking import CHANGED, NO_LONGER
+from firmware_py.core.docking import CHANGED, LED, NO_LONGER
 from firmware_py.core.docking_decisions import Decisions, Join
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.rotations import from_euler
@@ -135,6 +135,25 @@ def test_body_whose_dock_is_over_may_dock_again() -> None:
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
     outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     assert len(outputs.docks) == 1 and outputs.records[1].mode == Mode.DOCK
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ring", [False, True])
+def test_bodies_that_are_to_dock_to_each_other_do_not_chase_each_other(ring: bool) -> None:
+    places = [(1.0, 0.0), (1.5, 0.5), (0.4, 0.8)][: 3 if ring else 2]
+    tank = Docked([(0, m, 0) for m in range(len(places))], apart=True)
+    tank.weak = set(range(len(places)))
+    for state, (north, east) in zip(tank.states, places, strict=True):
+        state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in range(len(places))))
+    wanted = [DockRequest(1, 3, 0, 2), DockRequest(2, 0, 1, 1), DockRequest(0, 2, 2, 3)] if ring else [
+        DockRequest(1, 3, 0, 2), DockRequest(0, 0, 1, 1)
+    ]
+    outputs = tank.run(4.0, *(Request(Action.DOCK, request.module, request) for request in wanted))
+    assert tank.when(f"dock refused: {LED}") and len(outputs.docks) == len(wanted) - 1
+    assert sum(record.mode == Mode.POSHOLD for record in outputs.records) == 1
+    assert max(np.linalg.norm(outputs.records[m].estimate.nu[:3]) for m in range(len(places))) < 0.35
 
 
 @pytest.mark.slow
