@@ -230,7 +230,7 @@ class DockingStage:
     def _drop(self, dock: _Dock) -> None:
         """It is no longer under way, and its magnets let go."""
         self._docks.remove(dock)
-        self.relays.switch(RELAY_OFF, dock.prepared.request)
+        self.relays.switch(RELAY_OFF, *dock.sequence.plan.closes)
 
     def _give_up(self, dock: _Dock, holding: Collection[int], decisions: Decisions) -> None:
         """Ends a dock in whose place another begins; a target that was coming goes back to where it held."""
@@ -277,7 +277,7 @@ class DockingStage:
         before = dock.sequence.stage
         steering = dock.sequence.step(inputs.time_ns, active, target, status)
         stage = dock.sequence.stage
-        self.relays.switch(steering.relay, dock.prepared.request)
+        self.relays.switch(steering.relay, *dock.sequence.plan.closes)
         errors, pair = dock.sequence.errors(active, target), dock.detector.pair
         self.records.append(
             DockRecord(

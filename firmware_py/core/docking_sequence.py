@@ -86,6 +86,8 @@ class DockPlan(NamedTuple):
     """A dock, prepared: the geometry of the two faces and the body that they will make."""
 
     request: DockRequest
+    closes: tuple[DockRequest, ...]
+    """Every joint that there will be between the two bodies: more than one where the dock closes a ring."""
     merged: Body
     axis_t: np.ndarray
     """(3,) outward normal of the target's face, target module frame."""

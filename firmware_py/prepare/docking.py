@@ -27,7 +27,7 @@ def plan_dock(request: DockRequest, active: Body, target: Body, vehicles: Sequen
         vehicles: by fleet index.
 
     Raises:
-        DescriptionError: the two would overlap, or a probe would meet no drogue; the modules are named.
+        DescriptionError: the two would overlap, a probe would meet no drogue, or both faces are drogues; the modules are named.
     """
     turn_t = _turn_of(target, request.target_module)
     normal = _rounded(turn_t @ FACE_NORMALS[request.target_face])
@@ -44,8 +44,13 @@ def plan_dock(request: DockRequest, active: Body, target: Body, vehicles: Sequen
         modules,
         pitch_m,
     )
+    closes = [joint.request for joint in joints_of(merged) if len(modules_of(joint.request).intersection(active.modules)) == 1]
+    if modules_of(request) not in map(modules_of, closes):
+        names = FACE_NAMES[request.face], FACE_NAMES[request.target_face]
+        raise DescriptionError(f"face {names[0]} of module {request.module} does not dock to {names[1]} of {request.target_module}")
     return DockPlan(
         request=request,
+        closes=tuple(closes),
         merged=merged,
         axis_t=FACE_NORMALS[request.target_face].copy(),
         place_t=FACE_NORMALS[request.target_face] * pitch_m,

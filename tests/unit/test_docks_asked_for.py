@@ -209,6 +209,22 @@ def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> 
     assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1, 1, 0]
 
 
+@pytest.mark.slow
+def test_magnets_of_every_face_that_will_meet_pull_in_a_dock_and_let_go_with_it() -> None:
+    tank = Docked(RING, each=2)
+    for state, east in zip(tank.states, (0.0, 0.6), strict=True):
+        state[:7] = [1.0, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 2))
+    tank.run(0.03, Request(Action.DOCK, 2, DockRequest(2, 3, 0, 2)))
+    while tank.outputs[-1].docks[0].stage != Stage.APPROACH:
+        tank.run(0.01)
+    states = tank.pipeline.formation.docking.relays.states
+    assert [(state[2], state[3]) for state in states] == [(1, 0), (1, 0), (0, 1), (0, 1)]
+    tank.run(0.1, Request(Action.SET_MODE, 2, Mode.POSHOLD))
+    assert [sum(state) for state in tank.pipeline.formation.docking.relays.states] == [1] * 4, "the pairs hold"
+
+
 WANTED = Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
 
 

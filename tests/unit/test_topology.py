@@ -136,6 +136,20 @@ def test_third_module_docks_to_a_pair_in_an_l() -> None:
     assert plan.merged.cells.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
 
 
+def test_dock_that_closes_a_ring_closes_every_joint_of_it() -> None:
+    pairs = [assemble([(0, 0, 0), (1, 0, 0)], [0, 0], VEHICLES[:1] * 2, modules) for modules in ([0, 1], [2, 3])]
+    plan = plan_dock(DockRequest(2, 3, 0, 2), pairs[1], pairs[0], VEHICLES[:1] * 4)
+    assert [{(joint.module, joint.face), (joint.target_module, joint.target_face)} for joint in plan.closes] == [
+        {(2, 3), (0, 2)}, {(3, 3), (1, 2)}
+    ]
+
+
+def test_two_drogues_are_not_docked_though_others_beside_them_would_be() -> None:
+    target, active = (assemble([(0, 0, 0), (0, 1, 0)], [0, turn], VEHICLES[:2], modules) for turn, modules in ((0, [0, 1]), (2, [2, 3])))
+    with pytest.raises(DescriptionError, match=r"^face -x of module 2 does not dock to -x of 0"):
+        plan_dock(DockRequest(2, 1, 0, 1), active, target, VEHICLES[:1] * 4)
+
+
 def lattice(cells: list[tuple[int, ...]]) -> Body:
     return assemble(cells, [0] * len(cells), [VEHICLES[0]] * len(cells))
 
