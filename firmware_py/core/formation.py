@@ -150,7 +150,8 @@ def take_over(chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int)
     chain.health.take_over([other.health for other in before])
     chain.supervisor.take_over([other.supervisor for other in before])
     estimate = chain.estimator.restart(time_ns, motion)
-    chain.guidance.take_over(chain.supervisor.mode, estimate, chain.body.thrusters.matrix @ chain.limiter.force_n)
+    namesake = next((other.guidance for other in before if other.body.index == chain.body.index), None)
+    chain.guidance.take_over(chain.supervisor.mode, estimate, chain.body.thrusters.matrix @ chain.limiter.force_n, namesake)
     return estimate
 
 

@@ -128,10 +128,14 @@ class Guidance:
         self._trajectory = self._goal = self._docking = None
         self._wrench, self._blend = np.zeros(6), True
 
-    def take_over(self, mode: Mode, estimate: Estimate, wrench: np.ndarray) -> None:
-        """Starts in `mode` where a new body is, from the wrench (6,) that its thrusters give."""
+    def take_over(self, mode: Mode, estimate: Estimate, wrench: np.ndarray, before: Guidance | None = None) -> None:
+        """Starts in `mode` where a new body is, from the wrench (6,) that its thrusters give. The body that had its number `before` leaves
+        it the sticks: whoever moves those steers on.
+        """
         self._glider.put(at_estimate(estimate))
         self.mode, self._wrench, self._blend = mode, wrench, True
+        if before is not None:
+            self._sticks, self._sticks_ns = before._sticks, before._sticks_ns
 
     def follow(self, trajectory: Trajectory) -> None:
         """AUTO's next trajectory."""
