@@ -35,10 +35,11 @@ class DockScript:
                 refuse_outside(_strip(step, scenario), scenario)
         self._scenario = scenario
         self._fleet = fleet
-        self._groups = [list(g) for g in scenario.groups]
+        self._bodies: dict[int, set[int]] = {}
         self._steps = list(scenario.step)
         self._running: list[_Running] = []
         self._armed: set[int] = set()
+        """Modules that have been."""
         self._over_ns: int | None = None
         self.begin_ns = round(scenario.task.settle_s * 1e9)
         self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
@@ -48,12 +49,13 @@ class DockScript:
         """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
         if last is None:
             return []
+        self._bodies = _bodies_of(last, len(self._fleet.module))
         asked = self._arm(time_ns, last)
         if time_ns < self.begin_ns:
             return asked
         if any([self._is_given_up(r, last) for r in self._running]):  # the steps after it have lost their sense
             self._running, self._steps = [], []
-        self._running = [r for r in self._running if not self._is_over(r, time_ns, last)]
+        self._running = [r for r in self._running if not self._is_over(r, time_ns)]
         if not self._running and self._steps:
             while True:
                 asked += self._begin(self._steps.pop(0), time_ns, last)
@@ -75,7 +77,7 @@ class DockScript:
         for record in last.records:
             if record.body not in self._armed:
                 if record.state in ARMED:
-                    self._armed.add(record.body)
+                    self._armed |= self._bodies[record.body]
                     here = rest_at(record.estimate.p_wb, heading(record.estimate.q_wb))
                     asked.append(Request(Action.HOLD, record.body, here))
                 elif due:
@@ -88,7 +90,7 @@ class DockScript:
         self._running.append(running)
         if step.do == "wait":
             return []
-        body = self._leader(module)
+        body = self._number(module)
         if step.do in ("dock", "undock"):
             wanted = DockRequest(
                 module, FACE_NAMES.index(step.face), target, FACE_NAMES.index(step.target_face),
@@ -102,36 +104,30 @@ class DockScript:
         """Whether a dock that was under way has ended, and its bodies are still two. One that is refused never was."""
         if running.step.do != "dock":
             return False
-        docking = [r.mode == Mode.DOCK for r in last.records if r.body == self._leader(running.module)]
+        docking = [r.mode == Mode.DOCK for r in last.records if r.body == self._number(running.module)]
         was_docking, running.docking = running.docking, any(docking)
         return was_docking and docking == [False]
 
-    def _is_over(self, running: _Running, time_ns: int, last: Outputs) -> bool:
-        step, bodies = running.step, {r.body for r in last.records}
-        if step.do == "dock":
-            if self._leader(running.module) in bodies:
-                return False
-            mine, other = self._group(running.module), self._group(running.target)
-            self._groups.remove(mine)
-            other += mine
-            return True
-        if step.do == "undock":
-            if len(bodies) <= len(self._groups):
-                return False
-            whole = self._group(running.module)
-            fresh = sorted(bodies - {g[0] for g in self._groups})
-            piece = [m for m in whole if m == running.module] if fresh == [running.module] else fresh
-            whole[:] = [m for m in whole if m not in piece]
-            self._groups.append(piece)
-            self._armed |= set(fresh)
-            return True
+    def _is_over(self, running: _Running, time_ns: int) -> bool:
+        if running.step.do in ("dock", "undock"):
+            return self._are_one(running) == (running.step.do == "dock")
         return time_ns >= running.end_ns
 
-    def _group(self, module: int) -> list[int]:
-        return next(g for g in self._groups if module in g)
+    def _are_one(self, running: _Running) -> bool:
+        """Whether the two modules of a step are of one body."""
+        return self._number(running.module) == self._number(running.target)
 
-    def _leader(self, module: int) -> int:
-        return self._group(module)[0]
+    def _number(self, module: int) -> int:
+        """Of the body that a module is of."""
+        return next((number for number, modules in self._bodies.items() if module in modules), NOBODY)
+
+
+def _bodies_of(last: Outputs, modules: int) -> dict[int, set[int]]:
+    """Modules of each body, by its number. In the tick in which bodies join or part its joints are still those before."""
+    body_of = list(range(modules))
+    for a, b in [] if last.joints is None else last.joints["module"].tolist():
+        body_of = [body_of[a] if body == body_of[b] else body for body in body_of]
+    return {record.body: {m for m in range(modules) if body_of[m] == body_of[record.body]} for record in last.records}
 
 
 class _Running:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from firmware_py.app.firmware import vehicles_of
-from firmware_py.core.types import Outputs, Setpoint
+from firmware_py.core.types import Action, Outputs, Request, Setpoint
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from hil.bench import fleet_of, script_of
@@ -20,9 +20,10 @@ from hil.campaign import identity
 from hil.dock_script import AFTERWARDS_NS, DockScript
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN
-from hil.scenario import Scenario, load_scenario, make_world, scenario_names
+from hil.scenario import Scenario, Step, load_scenario, make_world, scenario_names
 from hil.scenario_rules import metric_names
 from hil.script import Script
+from tests.unit.test_partner_lost import Docked
 
 FOLDER = Path(load_scenario.__code__.co_filename).parent / "scenarios"
 Load = Callable[..., Scenario]
@@ -206,6 +207,22 @@ def test_wait_is_about_no_module(load: Load) -> None:
     for time_ns in (begin_ns, ends_ns, ends_ns + AFTERWARDS_NS):
         assert script.requests(time_ns, nothing) == []
     assert script.is_over(ends_ns + AFTERWARDS_NS)
+
+
+@pytest.mark.parametrize(("leaves", "goes", "number"), [(3, 4, 2), (1, 3, 1)], ids=["middle", "leader"])
+def test_steps_after_an_undock_are_for_the_body_that_their_module_is_of_now(leaves: int, goes: int, number: int) -> None:
+    third = load_scenario("dock-third")
+    modules = tuple(dataclasses.replace(third.module[0], number=n, cell=np.array([n - 1, 0, 0])) for n in (1, 2, 3, 4))
+    steps = Step(do="undock", module=leaves, target_module=2), Step(do="move", module=goes, duration_s=9.0)
+    scenario = dataclasses.replace(third, module=modules, step=steps, task=dataclasses.replace(third.task, settle_s=2.0))
+    script, tank = DockScript(scenario, fleet_of(scenario, "virtual:chain", 100)), Docked([(n, 0, 0) for n in range(4)])
+    tank.run(0.5)
+    asked: list[Request] = []
+    while not any(request.action == Action.TRACK for request in asked):
+        asked = list(script.requests(len(tank.outputs) * 10_000_000, tank.outputs[-1]))
+        assert len(tank.shape) == 1 or all(request.action != Action.HOLD for request in asked), "the piece that leaves is not held back"
+        tank.run(0.01, *asked)
+    assert len(tank.shape) == 2 and [request.body for request in asked] == [number]
 
 
 def test_every_kind_of_run_has_metrics_of_its_own() -> None:
