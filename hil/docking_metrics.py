@@ -100,13 +100,27 @@ def _meet(scenario: Scenario, step: Step, truths: Mapping[str, Columns]) -> bool
     )
 
 
+def _later_dock(scenario: Scenario, last: Step, together: np.ndarray) -> list[Step]:
+    """The dock after `last`, an undock, that brought its two modules together again with others of their bodies; empty: none."""
+    low, high = map(scenario.index_of, last.modules)
+    apart = np.flatnonzero(~together[:, low, high])
+    if last.do == "dock" or not apart.size:
+        return []
+    hold = np.logical_and.reduce(together[apart[-1] :])
+    begun = next(i for i, step in enumerate(scenario.step) if step is last)
+    docks = [step for step in scenario.step[begun:] if step.do == "dock"]
+    ends = [tuple(map(scenario.index_of, step.modules)) for step in docks]
+    joins = [(hold[low, i] and hold[high, j]) or (hold[low, j] and hold[high, i]) for i, j in ends]
+    return [step for step, joined in zip(docks, joins, strict=True) if joined][-1:]
+
+
 def is_as_asked(scenario: Scenario, truths: Mapping[str, Columns]) -> bool:
     """Whether docks and undocks were obeyed, each in its turn, with the faces that they name; without any, nothing joined or parted."""
     together, pairs = _together(truths, truths["/plant/docks"]["tick"]), wishes_of(scenario)
     if not pairs:
         return bool((together == together[0]).all())
     return all(
-        is_obeyed([step.do == "dock" for step in steps], together[:, i, j])
+        is_obeyed([step.do == "dock" for step in (*steps, *_later_dock(scenario, steps[-1], together))], together[:, i, j])
         and (steps[-1].do == "undock" or _meet(scenario, steps[-1], truths))
         for (i, j), steps in pairs.items()
     )

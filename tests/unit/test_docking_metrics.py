@@ -70,6 +70,19 @@ def test_dock_counts_with_the_faces_that_were_named() -> None:
     assert not is_as_asked(asked(DOCK, Step(do="undock", module=2, target_module=1)), joined)
 
 
+def test_module_that_is_undocked_and_docked_to_another_of_the_same_body_is_as_asked() -> None:
+    """From one end of a pair to the other."""
+    moved = [((0, 1, 2),), PAIR, PAIR, ((0, 1, 2),)]
+    places = [[0.0, 0.0, 0.4], [0.21, 0.0, 0.4], [-0.21, 0.0, 0.4]]
+    undock, dock = Step(do="undock", module=3, target_module=2), Step(do="dock", module=3, face="+x", target_module=1, target_face="-x")
+    assert is_as_asked(asked(undock, dock), truth_of(moved, places))
+    assert not is_as_asked(asked(undock, dock), truth_of([((0, 1, 2),)], places))
+    assert not is_as_asked(asked(undock), truth_of(moved, places))
+    assert not is_as_asked(asked(dock, undock), truth_of(moved, places))
+    others = asked(Step(do="undock", module=2, target_module=1), dock)
+    assert not is_as_asked(others, truth_of([PAIR, APART, APART, ((0, 1, 2),)], places)), "module 2 came along unasked"
+
+
 def test_faces_that_came_nearest_are_told_of_and_none_where_none_came_near(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     truths = truth_of([APART], PLACES)
     for module in range(3):
