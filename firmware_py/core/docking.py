@@ -13,7 +13,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Decisions, Join, Part, Prepared
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, TagTable
-from firmware_py.core.docking_pairs import APART
+from firmware_py.core.docking_pairs import APART, POSITION
 from firmware_py.core.docking_sequence import (
     ENDED,
     DockingSequence,
@@ -40,6 +40,7 @@ from firmware_py.core.types import (
 from firmware_py.description.parameters import Docking
 
 CHANGED = "the bodies are others than those that it was planned for"
+IN_PLACE = "pictures show that it is still in its place"
 NO_LONGER = "its body is no longer in DOCK"
 ANOTHER = "another was asked for"
 LED = "the body that it is to go to is on its way to it: end that dock first"
@@ -322,6 +323,12 @@ class DockingStage:
         changes = whole in decisions.joining or whole in [part.whole for part in decisions.parts]
         if time_ns < undock.until_ns or changes:  # the next tick has no such body, and ends this
             return
+        if self._in_place(plan):
+            self._undocks.remove(undock)
+            self.relays.switch(RELAY_PULL, *plan.opens)
+            self._say(WARNING, f"undock of module {request.module} ended: {IN_PLACE}")
+            self._end(whole, decisions)
+            return
         self.relays.switch(RELAY_OFF, *plan.opens)
         estimate = estimates[whole][1]
         away_w = rotate(estimate.q_wb, plan.axis_b) * self._p.standoff_m
@@ -334,6 +341,14 @@ class DockingStage:
         """Whether there still is a joint to be undone."""
         watched = [modules_of(joint.request) for joint in self._watched]
         return any(modules_of(joint) in watched for joint in plan.opens)
+
+    def _in_place(self, plan: UndockPlan) -> bool:
+        """Whether the joint is still seen as docked, as where a relay hangs: two bodies would fly against each other. Of several that part
+        at once the funnels hold back what leaves across, until thrusters draw it out.
+        """
+        watched = zip(self._watched, self._joints.rows, strict=True)
+        held = [modules_of(joint.request) for joint, row in watched if row["holds"][POSITION]]
+        return len(plan.opens) == 1 and modules_of(plan.opens[0]) in held
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))

@@ -7,11 +7,11 @@ import pytest
 
 from firmware_py.app.preparation import prepare
 from firmware_py.core.body import Body
-from firmware_py.core.docking import CHANGED
+from firmware_py.core.docking import CHANGED, IN_PLACE
 from firmware_py.core.docking_decisions import Prepared
 from firmware_py.core.joints import joints_of
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, DockFeedback, DockRequest, Inputs, Mode, ModuleInputs, Outputs, Request
+from firmware_py.core.types import RELAY_PUSH, Action, DockFeedback, DockRequest, Inputs, Mode, ModuleInputs, Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
@@ -27,7 +27,9 @@ def _body_of(cells: list[tuple[int, int, int]], first: int) -> Body:
 
 
 class Docked(Tank):
-    """A tank in which the magnets of some modules carry no current, and some modules' tags are out of sight."""
+    """A tank in which the magnets of some modules carry no current, and some modules' tags are out of sight. Joints that push apart stay
+    in their places in pictures where they are `stuck`.
+    """
 
     def __init__(
         self, cells: list[tuple[int, int, int]], parameters: Parameters | None = None, delay: int = 0, apart: bool = False, each: int = 0
@@ -39,15 +41,18 @@ class Docked(Tank):
         self.cabin_pa = [101_325.0] * count
         self.weak: set[int] = set()
         self.hidden: set[int] = set()
+        self.stuck = False
         self.said: list[tuple[float, str]] = []
         self._delay, self._plans = delay, list[tuple[int, Prepared]]()
         self._step, self.pipeline.step = self.pipeline.step, self._step_with_plans  # type: ignore[method-assign]
 
     def _hear(self, tick: int) -> list[ModuleInputs]:
         modules = super()._hear(tick)
+        relays = self.pipeline.formation.docking.relays.states
+        pushing = [m for m, states in enumerate(relays) if RELAY_PUSH in states and not self.stuck]
         for m, module in enumerate(modules):
             module.cabin_pressure_pa = self.cabin_pa[m]
-            if m in self.hidden:
+            if m in self.hidden or m in pushing[1:]:  # no picture shows two in their places that push each other apart
                 module.tags.clear()
             if tick % 4 == 0:
                 current = 0.0 if m in self.weak else 110.0
@@ -225,6 +230,20 @@ def test_undock_that_is_asked_for_twice_parts_once() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_joint_that_a_hanging_relay_holds_is_not_taken_for_undocked() -> None:
+    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
+    tank.fly()
+    tank.stuck = True
+    outputs = tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(2, 1, 1, 0)))
+    assert tank.shape == [(0, 1, 2)] and outputs.records[0].mode == Mode.POSHOLD
+    assert tank.when(f"undock of module 2 ended: {IN_PLACE}")
+    assert tank.pipeline.formation.docking.relays.states[2] == [0, 1, 0, 0, 0, 0], "and pulls again"
+    tank.stuck = False
+    tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(2, 1, 1, 0)))
+    assert tank.shape == [(0, 1), (2,)]
+
+
 def test_partner_that_is_being_undocked_is_not_lost() -> None:
     """While the magnets push, currents and pictures say that the joint is open: it is wanted so."""
     tank = Docked(RING[:2], Parameters().replace("docking.release_s", 2.0))
