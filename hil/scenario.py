@@ -292,6 +292,8 @@ def load_scenario(name: str) -> Scenario:
 
 def _with_file_text(scenario: Scenario, folder: Path, source: Source) -> Scenario:
     """The same with the text of the file that its task names. Raises DescriptionError."""
+    if scenario.task.file_text:
+        raise source.error(("task", "file_text"), "is read from `file`; give that alone")
     if not scenario.task.file:
         return scenario
     path = folder / scenario.task.file

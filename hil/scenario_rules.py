@@ -99,8 +99,6 @@ def _in_file(scenario: Scenario) -> Iterator[Mistake]:
         yield ("task", "kind"), "waypoints flies a file, and there is none; give file"
     if task.kind != "waypoints" and task.file:
         yield ("task", "file"), f"a task of the kind {task.kind} flies no file; only waypoints does"
-    if task.file_text:
-        yield ("task", "file_text"), "is read from `file`; give that alone"
 
 
 def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:

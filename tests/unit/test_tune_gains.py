@@ -196,6 +196,12 @@ def test_search_that_is_terminated_from_elsewhere_says_that_it_goes_on(
     assert capsys.readouterr().err == f"tune_gains: interrupted; the same command with --out {tmp_path} goes on where it was\n"
 
 
+def test_flight_through_the_points_of_a_file_is_flown_with_them(tools: tuple[Any, Any], tmp_path: Path) -> None:
+    flown = objective_of(tools, tmp_path, OBJECTIVE.replace('"spiral"', '"waypoints", settle_s = 8.0')).flight[1].flown()
+    assert flown.task.settle_s == 8.0 and flown.task.file_text.startswith("x_m")
+
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
