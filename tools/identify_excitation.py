@@ -61,6 +61,10 @@ roll_turns = {roll}
 [[check]]               # it knew where it was
 metric = "estimate_position_rmse_m"
 high = 0.01
+
+[[check]]               # it flew all of it: a fail-safe ends the motion
+metric = "warnings"
+high = 0.0
 """
 
 

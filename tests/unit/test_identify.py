@@ -54,6 +54,7 @@ def test_whole_excitation_is_a_scenario_that_stays_in_its_tank(tmp_path: Path) -
     assert np.linalg.norm(task.amplitude_m[:2]) < scenario.tank.radius_m - 0.2
     assert task.centre_m[2] + task.amplitude_m[2] < scenario.tank.depth_m - 0.2
     assert task.yaw_turns and task.roll_turns
+    assert {check.metric for check in scenario.check} == {"estimate_position_rmse_m", "warnings"}  # a flight that a fail-safe ended fails
 
 
 @pytest.mark.parametrize(
