@@ -22,6 +22,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import NamedTuple
 
+from argument_types import whole
 from command_line import Parser, run_tool
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -242,7 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs all mutants of the modules asked for."""
     parser = Parser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("module", nargs="*", help="last part of a module's name; all when none is given")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--jobs", type=whole(1), default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--list", action="store_true", help="only say what would be tried")
     options = parser.parse_args(arguments)
     short = [name.rpartition(".")[2] for name in TARGETS]
@@ -272,7 +273,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         survivors = run(name, todo, options.jobs)
         total, alive = total + len(todo), alive + len(survivors)
         print(f"{name}: {len(todo) - len(survivors)} killed, {len(survivors)} survived, {time.monotonic() - began:.0f} s", flush=True)
-    print(f"mutants: {total - alive} killed, {alive} survived")
+    if not options.list:
+        print(f"mutants: {total - alive} killed, {alive} survived")
     return 1 if alive else 0
 
 

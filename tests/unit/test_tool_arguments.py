@@ -71,6 +71,7 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
             "margins: 2 of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --modules 1",
         ),
         ("mutants", ["nosuch"], "mutants: nosuch: unknown; there are transitions, "),
+        ("mutants", ["--jobs", "0"], "mutants: argument --jobs: '0' is not a whole number above zero"),
     ],
 )  # fmt: skip
 def test_wrong_arguments_are_refused(
