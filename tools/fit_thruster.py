@@ -19,10 +19,11 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+from argument_types import make_room
 from command_line import Parser, in_words, run_tool
 from scipy.optimize import nnls
 
-from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of
+from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of, meant, read_toml
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
@@ -32,6 +33,7 @@ LEAST_SLOPE = 1e-3
 LEAST_POINTS = 6
 """On either side, beyond the deadband."""
 COLUMNS = ("command", "force_n")
+OPTIONAL = ("voltage_v", "power_w")
 MOST = 1e6
 """Of any number that is read; W and N beyond it no thruster has."""
 VOLTAGE = limits_of(ThrusterCurve, "voltage_v")
@@ -57,7 +59,7 @@ def read_points(path: Path) -> dict[str, np.ndarray]:
     """The columns of the CSV. Raises DescriptionError and OSError."""
     rows = _rows(path)
     points = {}
-    for name in (*COLUMNS, "voltage_v", "power_w"):
+    for name in (*COLUMNS, *OPTIONAL):
         if name in rows[0]:
             points[name] = np.array([_number(row[name], path, line) for line, row in enumerate(rows, 2)])
     for name, low, high, permitted in (("command", -1.0, 1.0, "-1 to 1"), ("voltage_v", VOLTAGE.low, VOLTAGE.high, describe(VOLTAGE))):
@@ -72,11 +74,15 @@ def _rows(path: Path) -> list[dict[str, str | None]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
-            lacking = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
+            header = list(reader.fieldnames or [])
+            lacking = [name for name in COLUMNS if name not in header]
             if lacking:
                 raise DescriptionError(
                     f"{path}:1: no column {', '.join(lacking)}; the header needs command,force_n (and voltage_v, power_w)"
                 )
+            for name in header:
+                if name not in (*COLUMNS, *OPTIONAL) and (hint := meant(name, [n for n in OPTIONAL if n not in header])):
+                    raise DescriptionError(f"{path}:1: column '{name}' is unknown; {hint}else give it another name or leave it out")
             rows = list(reader)
     except (UnicodeDecodeError, csv.Error) as error:
         raise DescriptionError(f"{path}: is no CSV in UTF-8: {error}") from None
@@ -161,6 +167,17 @@ def checked_toml(curve: ThrusterCurve, out: Path) -> str:
     return text
 
 
+def check_out(path: Path) -> None:
+    """Raises DescriptionError where no curve can go to `path`, or something else than one is there."""
+    make_room(path)
+    if path.exists() and path.stat().st_size:
+        try:
+            table, source = read_toml(path)
+            build(ThrusterCurve, table, source)
+        except DescriptionError:
+            raise DescriptionError(f"--out {path}: there already, and no curve; give another name or delete it") from None
+
+
 def main() -> int:
     """The command line."""
     parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -175,7 +192,9 @@ def main() -> int:
         voltage_v = like.voltage_v if given.voltage is None else given.voltage
         points = read_points(given.csv)
         curve, left_n = fit_curve(points, like, voltage_v, given.zero)
-        given.out.write_text(checked_toml(curve, given.out), encoding="utf-8")
+        text = checked_toml(curve, given.out)
+        check_out(given.out)
+        given.out.write_text(text, encoding="utf-8")
     except (DescriptionError, OSError) as error:
         print(f"fit_thruster: {in_words(error)}", file=sys.stderr)
         return 2

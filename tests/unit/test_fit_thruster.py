@@ -87,6 +87,7 @@ def test_file_that_is_written_is_a_vehicle_files_curve(
         ("command,force_n\n0,0\n1.5,3\n", "3: command 1.5 is out of range"),
         ("command,force_n\n1,5\n", "forward: 1 points"),
         ("", "no column command, force_n"),
+        ("command,force_n,voltage\n0,0,16\n", "1: column 'voltage' is unknown; did you mean voltage_v?"),
         ("command,force_n\n", "no measurement follows the header"),
         ("command,force_n\n0,\xff\n", "is no CSV in UTF-8"),
         ("command,force_n\n0,1e7\n", "2: '1e7' is not a number of at most 1e+06"),
@@ -131,6 +132,25 @@ def test_thruster_that_no_vehicle_file_takes_is_refused_in_one_line(
     points = measured()
     write_csv(tmp_path / "bench.csv", points | {name: factor * points[name]})
     refused(tmp_path, monkeypatch, capsys, complaint)
+
+
+@pytest.mark.parametrize("name", ["bench.csv", "mine.toml"])
+def test_file_that_is_no_curve_is_not_written_over(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.toml").write_text('name = "mine"\n')
+    write_csv(tmp_path / "bench.csv", measured())
+    before = (tmp_path / name).read_bytes()
+    refused(tmp_path, monkeypatch, capsys, f"{name}: there already, and no curve; give another name", "--out", str(tmp_path / name))
+    assert (tmp_path / name).read_bytes() == before
+
+
+def test_curve_of_an_earlier_fit_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, out = write_csv(tmp_path / "bench.csv", measured()), tmp_path / "runs" / "curve.toml"
+    for voltage in ("12", "14"):
+        monkeypatch.setattr(sys, "argv", ["fit_thruster", str(source), "--voltage", voltage, "--out", str(out)])
+        assert tool.main() == 0
+    assert out.read_text().startswith("voltage_v = 14.0")
 
 
 def refused(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], complaint: str, *options: str) -> None:
