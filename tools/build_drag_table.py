@@ -187,26 +187,20 @@ def main(
     console = Console(highlight=False)
     console = console if console.is_terminal else Console(highlight=False, width=WIDTH)
     store = DragCache(cache or default_folder(os.environ, Path.home()))
-    try:
-        if mode not in METHODS:
-            raise DescriptionError(f"mode {mode!r} is unknown; there are {', '.join(METHODS)}")
-        description = load_vehicle(vehicle)
-        shapes = shapes_of(cells)
-        check_docks(description, shapes)
-        make_room(out)
-        modes = list(METHODS) if compare else [mode]
-        tables = {
-            shape: {m: table_of(description, placed, m, store) for m in modes} for shape, placed in shapes.items()
-        }
-        if description.assumption:
-            console.print(f"assumed: {description.assumption}")
-        print_forces(console, tables)
-        if compare:
-            print_comparison(console, description, shapes, directions)
-        draw(out, {shape: by_mode[modes[0]] for shape, by_mode in tables.items()})
-    except DescriptionError as error:
-        Console(stderr=True, highlight=False).print(str(error), soft_wrap=True)
-        raise typer.Exit(2) from None
+    if mode not in METHODS:
+        raise DescriptionError(f"mode {mode!r} is unknown; there are {', '.join(METHODS)}")
+    description = load_vehicle(vehicle)
+    shapes = shapes_of(cells)
+    check_docks(description, shapes)
+    make_room(out)
+    modes = list(METHODS) if compare else [mode]
+    tables = {shape: {m: table_of(description, placed, m, store) for m in modes} for shape, placed in shapes.items()}
+    if description.assumption:
+        console.print(f"assumed: {description.assumption}")
+    print_forces(console, tables)
+    if compare:
+        print_comparison(console, description, shapes, directions)
+    draw(out, {shape: by_mode[modes[0]] for shape, by_mode in tables.items()})
     console.print(f"drag spaces: {out}; outlines kept in {store.folder}", soft_wrap=True)
 
 

@@ -54,7 +54,7 @@ def main() -> None:
     try:
         run(arguments())
     except DescriptionError as error:
-        print(error, file=sys.stderr)
+        print(f"characterise: {error}", file=sys.stderr)
         raise SystemExit(2) from None
 
 

@@ -71,6 +71,7 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
             "margins: 2 of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --modules 1",
         ),
         ("mutants", ["nosuch"], "mutants: nosuch: unknown; there are transitions, "),
+        ("characterise", ["nosuch"], "characterise: vehicle 'nosuch' is unknown; there are "),
         ("mutants", ["--jobs", "0"], "mutants: argument --jobs: '0' is not a whole number above zero"),
     ],
 )  # fmt: skip
@@ -126,7 +127,7 @@ def test_every_tool_that_reads_arguments_ends_alike(tool: str) -> None:
         ("build_drag_table", ["--directions", "one"], "build_drag_table: Invalid value for '--directions': Input should be"),
         (
             "build_drag_table", ["--vehicle", "bluerov2", "--cache", "/proc/self/none"],
-            "line of two of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --cells 0,0,0",
+            "build_drag_table: line of two of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --",
         ),
         ("accept", ["--out", "/proc/self/accept.json"], "accept: --out /proc/self/accept.json: cannot be written: "),
         ("accept", ["--only", "nosuch"], "accept: Invalid value: nosuch: unknown; there are hover, spiral, "),
