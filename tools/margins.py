@@ -128,7 +128,7 @@ def draw(path: Path, found: Found) -> None:
                 panel.legend(frameon=False, loc="lower left", fontsize=8, title=title, title_fontsize=8, alignment="left")
         phase.set_xlabel("frequency, rad/s")
     panels[0, 0].set(xscale="log", ylabel="loop gain, dB", ylim=(-40, 45))
-    panels[1, 0].set(ylabel="phase, deg", ylim=(-400, -80), yticks=range(-360, -80, 45))
+    panels[1, 0].set(ylabel="phase, deg", ylim=(-400, 100), yticks=range(-360, 91, 90))
     for panel in panels.flat:
         panel.grid(color="#d8dee4", linewidth=0.6)
     what = f"Loops broken at the plant's input; bands: mass, inertia and thruster lag +-{SPREAD:.0%}"

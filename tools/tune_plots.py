@@ -19,6 +19,8 @@ from firmware_py.description.parameters import Parameters
 SHOWN = (0, 2, 3, 5)
 """Axes of the plots: surge (sway is its like), heave, roll (pitch is its like), yaw."""
 COLOURS = {"start": "#8c959f", "shipped": "#0072b2", "tuned": "#d55e00"}
+LINES = {"start": {"linestyle": "--", "zorder": 3}, "shipped": {"linewidth": 3.5}, "tuned": {}}
+"""So that each is seen where the others agree with it."""
 GREY = "#30363d"
 JOBS = 2
 
@@ -61,8 +63,7 @@ def draw_steps(path: Path, steps: Mapping[str, np.ndarray]) -> None:
     time_s = 1e-9 * PERIOD_NS * np.arange(1, STEP_TICKS + 1)
     for k, (axis, panel) in enumerate(zip(SHOWN, panels.flat, strict=True)):
         for name, moved in steps.items():
-            above = {"linestyle": "--", "zorder": 3} if name == "start" else {}  # seen where the others agree with it
-            panel.plot(time_s, np.clip(moved[k], -1.0, 3.0), color=COLOURS[name], label=name, **above)
+            panel.plot(time_s, np.clip(moved[k], -1.0, 3.0), color=COLOURS[name], label=name, **LINES[name])
         panel.axhline(1.0, color=GREY, linewidth=0.8)
         panel.set(title=AXES[axis], xlabel="time, s", ylim=steps_range(steps))
     panels[0, 0].set_ylabel("share of the step")
@@ -85,7 +86,7 @@ def draw_bode(path: Path, loops: Mapping[str, list[Response]]) -> None:
             found = margins(response)
             label = f"{name}: {found.gain_db:.1f} dB, {found.phase_deg:.0f} deg" if math.isfinite(found.gain_db) else name
             for panel, values in zip((gain, phase), bode(response), strict=True):
-                panel.plot(response.frequency, values, color=COLOURS[name], label=label)
+                panel.plot(response.frequency, values, color=COLOURS[name], label=label, **LINES[name])
             for panel in (gain, phase):
                 panel.axvline(found.crossover_rad_s, color=COLOURS[name], linewidth=0.8, linestyle=":")
         gain.axhline(0.0, color=GREY, linewidth=0.8)
@@ -94,7 +95,7 @@ def draw_bode(path: Path, loops: Mapping[str, list[Response]]) -> None:
         gain.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), borderaxespad=0.2, fontsize=8, **title)
         phase.set_xlabel("frequency, rad/s")
     panels[0, 0].set(xscale="log", ylabel="loop gain, dB", ylim=(-40, 50))
-    panels[1, 0].set(ylabel="phase, deg", ylim=(-400, -80), yticks=range(-360, -80, 45))
+    panels[1, 0].set(ylabel="phase, deg", ylim=(-300, 100), yticks=range(-270, 91, 90))
     _save(figure, path, "One module: loops broken at the plant's input, gain and phase margin; dotted: crossover")
 
 
@@ -118,4 +119,4 @@ def draw_search(path: Path, objective: Objective, study: optuna.Study) -> None:
         importance.barh([name.partition(".")[2] for name in shares], list(shares.values()), color=COLOURS["shipped"])
         importance.invert_yaxis()
     importance.set(title="importance (PED-ANOVA, share of the variance)", xlabel="share")
-    _save(figure, path, objective.help.capitalize())
+    _save(figure, path, objective.help[:1].upper() + objective.help[1:])

@@ -273,8 +273,18 @@ def test_legends_of_the_bode_plot_stand_where_no_line_runs(drawn: list[Any]) -> 
     assert all(legend.get_window_extent().y0 >= panel.get_window_extent().y1 - 0.5 for panel, legend in legends)
 
 
+def test_bode_plot_shows_the_whole_phase_of_a_loop_that_rights_itself(drawn: list[Any]) -> None:
+    from loop_response import Response
+    from tune_plots import draw_bode
+
+    w = np.geomspace(0.3, 30.0, 50)
+    draw_bode(Path(), {"shipped": [Response(w, 20.0 * np.exp(1j * np.linspace(0.7, -4.0, 50)) / (1.0 + w**2))] * 6})
+    phase = drawn[0].axes[-1]
+    assert phase.get_ylim()[0] < phase.dataLim.ymin and phase.dataLim.ymax < phase.get_ylim()[1]
+
+
 @pytest.mark.parametrize(("most", "top"), [(1.0, 1.1), (1.3, 1.35), (9.0, 1.8)])
-def test_steps_fill_their_plot_and_the_start_is_seen_where_the_others_agree_with_it(drawn: list[Any], most: float, top: float) -> None:
+def test_steps_fill_their_plot_and_each_is_seen_where_the_others_agree_with_it(drawn: list[Any], most: float, top: float) -> None:
     from loop_response import STEP_TICKS
     from tune_plots import SHOWN, draw_steps
 
@@ -283,6 +293,7 @@ def test_steps_fill_their_plot_and_the_start_is_seen_where_the_others_agree_with
     assert panel.get_ylim() == pytest.approx((-0.05, top))
     lines = {line.get_label(): line for line in panel.get_lines()}
     assert lines["start"].get_linestyle() == "--" and lines["start"].get_zorder() > lines["tuned"].get_zorder()
+    assert lines["shipped"].get_linewidth() > 2.0 * lines["tuned"].get_linewidth()
 
 
 def test_plots_of_a_search_are_of_the_vehicle_that_it_flies(
