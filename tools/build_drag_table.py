@@ -163,7 +163,7 @@ def draw(path: Path, tables: dict[str, DragTable]) -> None:
         axes.plot_surface(*surface, facecolors=colours, rstride=1, cstride=1, shade=False)
         limit = float(force.max())
         axes.set(xlim=(-limit, limit), ylim=(limit, -limit), zlim=(limit, -limit))  # FRD: z down, y then the other way
-        axes.set(xlabel="x N", ylabel="y N", zlabel="z N")
+        axes.set(xlabel="x, N", ylabel="y, N", zlabel="z, N")
         axes.set_box_aspect((1, 1, 1), zoom=0.92)  # room for the label of z
         axes.set_title(f"{name}: {force.min():.1f} to {force.max():.1f} N at {SPEED_M_S:g} m/s", y=1.0)  # left to itself it is cut
     try:

@@ -66,7 +66,7 @@ def _power(result: Capability, frame: str) -> Picture:
     forces = wrenches @ np.linalg.pinv(result.layout.matrix, rcond=1e-9).T
     power = electrical_power(result.layout, forces).reshape(_POLAR, _AZIMUTH, 1)
     known = bool(np.all(np.isfinite(power)))
-    caption = f"mean {space.power_w.mean():.3g} W, E_D {result.power_shape[frame].dirichlet:.3g} W$^2$"
+    caption = f"mean {space.power_w.mean():.3g} W, Dirichlet energy {result.power_shape[frame].dirichlet:.4g} W$^2$"
     if space.residual > 1e-6:
         caption += f"\ndegenerate: |J f - w| up to {space.residual:.2g}"
     title = f"power for {space.size:g} {UNITS[frame]}, W ({frame} frame)"

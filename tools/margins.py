@@ -81,7 +81,7 @@ def rows(found: Found) -> list[dict[str, Any]]:
 def print_table(table_rows: Sequence[dict[str, Any]]) -> None:
     """One line for each body and axis."""
     table = Table(box=box.SIMPLE_HEAD, title=f"margins at the plant's input; worst over mass, inertia and lag +-{SPREAD:.0%}")
-    for column in ("modules", "axis", "crossover", "gain", "phase", "gain, worst", "phase, worst", "worst at mass, inertia, lag", ""):
+    for column in ("modules", "axis", "crossover", "gain", "phase", "gain, worst", "phase, worst", "phase worst at mass, inertia, lag", ""):
         table.add_column(column, justify="left" if column in ("axis", "") else "right")
     for nominal, worst in zip(table_rows[::2], table_rows[1::2], strict=True):
         if not nominal["controlled"]:
