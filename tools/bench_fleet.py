@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import gc
 import json
-import sys
 from collections import deque
 from pathlib import Path
 from time import perf_counter_ns
 
 import numpy as np
-from command_line import run_tool
+from command_line import Parser, run_tool
 
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
@@ -159,8 +158,10 @@ def peak_memory_mb() -> float:
 
 
 def main() -> None:
-    """Holds a cube of `sys.argv[1]`^3 modules in a process of its own; prints what came of it."""
-    flight = Hold(cube_of(int(sys.argv[1])))
+    """Holds a cube of modules in a process of its own; prints what came of it."""
+    parser = Parser(description=__doc__)
+    parser.add_argument("side", type=int, help="of the cube, modules")
+    flight = Hold(cube_of(parser.parse_args().side))
     tick_us = flight.run(TIMED_TICKS)
     print(json.dumps({"tick_us": tick_us, "strayed_m": flight.strayed_m, "memory_mb": peak_memory_mb()}))
 

@@ -16,6 +16,7 @@ from dataclasses import asdict
 
 import numpy as np
 from bench_entry import Entry
+from command_line import Parser, run_tool
 
 from firmware_py.app.firmware import Firmware
 from firmware_py.app.ground_station import GroundSide
@@ -131,5 +132,11 @@ def compared(name: str, beside_us: float, without_us: float) -> Entry:
     return Entry(name, beside_us, "us", "without", without_us, without_us / beside_us)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Prints the entries; takes no arguments."""
+    Parser(description=__doc__).parse_args()
     print(json.dumps([asdict(entry) for entry in ground_entries()], indent=2))
+
+
+if __name__ == "__main__":
+    run_tool(main)

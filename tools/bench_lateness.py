@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from bench_entry import Entry
+from command_line import Parser, run_tool
 
 from firmware_py.app.firmware import BusFrame
 from firmware_py.core.types import Inputs, Outputs
@@ -113,7 +114,16 @@ def lateness_entries() -> list[Entry]:
     return entries
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Flies; prints what came of it."""
+    parser = Parser(description=__doc__)
+    parser.add_argument("rate", type=int, help="ticks a second")
+    parser.add_argument("seconds", type=float, help="of the flight")
+    given = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # the bench keeps to one processor, a vehicle does not
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
-    print(json.dumps(fly(int(sys.argv[1]), float(sys.argv[2]))))
+    print(json.dumps(fly(given.rate, given.seconds)))
+
+
+if __name__ == "__main__":
+    run_tool(main)

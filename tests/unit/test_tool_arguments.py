@@ -42,7 +42,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
             del sys.modules[name]
 
 
-@pytest.mark.parametrize("tool", ["bench", "identify_plants", "readme_tables"])
+@pytest.mark.parametrize("tool", ["bench", "bench_fleet", "bench_ground", "bench_lateness", "identify_plants", "readme_tables"])
 def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tool, "--help") == 0
     assert "usage: " in capsys.readouterr().out
