@@ -223,7 +223,7 @@ def test_two_vehicles_of_one_name_are_not_one_column(
     with pytest.raises(SystemExit) as stopped:
         importlib.import_module("characterise").main()
     assert stopped.value.code == 2
-    assert capsys.readouterr().err == "2 vehicles have the name 'modcube'; give each file another `name`\n"
+    assert capsys.readouterr().err == "characterise: 2 vehicles have the name 'modcube'; give each file another `name`\n"
 
 
 def test_space_that_rounding_left_of_none_is_called_degenerate_and_has_no_ticks(
