@@ -43,6 +43,7 @@ CHANGED = "the bodies are others than those that it was planned for"
 IN_PLACE = "pictures show that it is still in its place"
 NO_LONGER = "its body is no longer in DOCK"
 ANOTHER = "another was asked for"
+SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
 
 
@@ -126,20 +127,23 @@ class DockingStage:
         """Plans of these have been asked for, in this order."""
         self._expected.update((body, request) for request in requests)
 
-    def leave(self, body: Body) -> list[Event]:
-        """The body is not in the mode DOCK: its docks and undocks end at once, for nothing that they want moves it any more. Says so.
+    def leave(self, body: Body, surfaces: bool, holding: Collection[int]) -> Decisions:
+        """The body is not in the mode DOCK: its docks and undocks end at once, for nothing that they want moves it any more. One that
+        `surfaces` nobody docks to either: he would follow it up. A target that was coming goes back to where it held.
 
         An open joint is parted all the same: that its modules are apart is no wish.
         """
-        left: list[tuple[str, DockRequest]] = []
+        self.events, decisions = [], Decisions({}, [], [], [], {})
         for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._holds(each.plan)]:
             self._undocks.remove(undock)
             self.relays.switch(RELAY_PULL, *undock.plan.opens)
-            left.append(("undock", undock.plan.opens[0]))
+            self._say(WARNING, f"undock of module {undock.plan.opens[0].module} ended: {NO_LONGER}")
         for dock in [each for each in self._docks if each.active == body.index]:
-            self._drop(dock)
-            left.append(("dock", dock.prepared.request))
-        return [Event(WARNING, f"{what} of module {request.module} ended: {NO_LONGER}") for what, request in left]
+            self._give_up(dock, NO_LONGER, holding, decisions)
+        for dock in [each for each in self._docks if surfaces and each.target == body.index]:
+            self._give_up(dock, SURFACES, holding, decisions)
+            self._end(dock.active, decisions)
+        return decisions
 
     def step(
         self,
@@ -199,7 +203,7 @@ class DockingStage:
             self._begin_undock(plan, prepared.chains, time_ns)
         else:
             if under_way is not None:
-                self._give_up(under_way, holding, decisions)
+                self._give_up(under_way, ANOTHER, holding, decisions)
             self._begin_dock(prepared, plan, time_ns, estimates, holding)
 
     def _refusal(self, prepared: Prepared, estimates: Mapping[int, tuple[Body, Estimate]], waiting: Collection[int]) -> str:
@@ -233,10 +237,10 @@ class DockingStage:
         self._docks.remove(dock)
         self.relays.switch(RELAY_OFF, *dock.sequence.plan.closes)
 
-    def _give_up(self, dock: _Dock, holding: Collection[int], decisions: Decisions) -> None:
-        """Ends a dock in whose place another begins; a target that was coming goes back to where it held."""
+    def _give_up(self, dock: _Dock, reason: str, holding: Collection[int], decisions: Decisions) -> None:
+        """Ends a dock before its end; a target that was coming goes back to where it held."""
         self._drop(dock)
-        self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: {ANOTHER}")
+        self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: {reason}")
         if dock.target in holding:
             decisions.move(dock.target, -dock.sequence.met_w)
 

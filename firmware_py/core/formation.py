@@ -10,7 +10,7 @@ from firmware_py.core.docking import DockingStage
 from firmware_py.core.docking_decisions import Decisions, Join, Part
 from firmware_py.core.docking_pairs import APART, LOOSE
 from firmware_py.core.topology import in_both, join, part_of
-from firmware_py.core.types import DockRequest, Estimate, Inputs, Mode, Outputs, PartRequest
+from firmware_py.core.types import WARNING, DockRequest, Estimate, Event, Inputs, Mode, Outputs, PartRequest
 from firmware_py.description.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -55,8 +55,11 @@ class Formation:
 
     def leave(self, chain: BodyPipeline, outputs: Outputs) -> None:
         """Docks and undocks go on in the mode DOCK alone: a body that leaves it lets go at once."""
-        if chain.supervisor.mode != Mode.DOCK:
-            outputs.events += [event._replace(body=chain.body.index) for event in self.docking.leave(chain.body)]
+        supervisor = chain.supervisor
+        if supervisor.mode != Mode.DOCK:
+            surfaces = supervisor.armed and supervisor.mode == Mode.SURFACE
+            self._steer(self.docking.leave(chain.body, surfaces, self._armed_in(Mode.POSHOLD)))
+            outputs.events += [event._replace(body=chain.body.index) for event in self.docking.events]
 
     def _miss_partners(self, outputs: Outputs) -> None:
         """Joints that are open though nobody asked: tells the bodies, and parts those that have come apart once their fail-safe is on."""
@@ -99,6 +102,8 @@ class Formation:
     def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
         before = self._chains_of(joined.target, joined.active)
         estimate = self._begin(joined.chain, before, time_ns)
+        if any(chain.supervisor.armed for chain in before) and not joined.chain.supervisor.armed:
+            self.docking.events.append(Event(WARNING, "docked to a body that is not armed: all of it is disarmed"))
         self._swap(before, [joined.chain], estimates, [estimate])
 
     def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:

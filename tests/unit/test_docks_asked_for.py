@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.docking import CHANGED, LED, NO_LONGER
+from firmware_py.core.docking import CHANGED, LED, NO_LONGER, SURFACES
 from firmware_py.core.docking_decisions import Decisions, Join
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.rotations import from_euler
@@ -325,6 +325,44 @@ def test_target_does_not_come_to_meet_a_robot_that_has_left_the_dock_before_it_w
     tank.run(1.0, stop)
     assert tank.when(f"dock refused: {NO_LONGER}")
     assert tank.pipeline.formation.chains[0].guidance._goal is None
+
+
+@pytest.mark.slow
+def test_target_that_comes_goes_back_when_the_dock_is_called_off() -> None:
+    tank = before_each_other(2.0)
+    held = tank.pipeline.formation.chains[0].guidance._glider.at.p_wb.copy()
+    tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    tank.run(0.1, Request(Action.SET_MODE, 1, Mode.POSHOLD))
+    goal = tank.pipeline.formation.chains[0].guidance._goal
+    assert goal is not None and goal.p_wb is not None
+    np.testing.assert_allclose(goal.p_wb, held, atol=0.02)
+
+
+@pytest.mark.slow
+def test_nobody_docks_to_a_body_that_surfaces() -> None:
+    tank = before_each_other(2.0)
+    outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    assert outputs.docks and outputs.records[1].mode == Mode.DOCK
+    outputs = tank.run(0.1, Request(Action.SET_MODE, 0, Mode.SURFACE))
+    assert outputs.docks == [] and tank.when(f"dock of module 1 ended: {SURFACES}")
+    assert [record.mode for record in outputs.records] == [Mode.SURFACE, Mode.POSHOLD]
+    assert not any(any(states) for states in tank.pipeline.formation.docking.relays.states)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("armed", [0, 1])
+def test_robot_that_docks_to_one_that_is_disarmed_is_disarmed_and_says_so(armed: int) -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0)], Parameters().replace("docking.push_m", 0.0), apart=True)
+    for state, side in zip(tank.states, (0.0, PITCH_M), strict=True):
+        state[:7] = [1.0, side, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in range(1 - armed, 2)))
+    tank.run(0.03, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    (dock,) = tank.pipeline.formation.docking._docks
+    dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just come
+    outputs = tank.run(2.0)
+    assert tank.shape == [(0, 1)] and outputs.records[0].state == (State.ARMED if armed else State.DISARMED)
+    assert any("docked to a body that is not armed" in words for _, words in tank.said) is not bool(armed)
 
 
 @pytest.mark.slow

@@ -230,7 +230,6 @@ def test_undock_that_is_asked_for_twice_parts_once() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_joint_that_a_hanging_relay_holds_is_not_taken_for_undocked() -> None:
     tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
     tank.fly()
@@ -244,6 +243,7 @@ def test_joint_that_a_hanging_relay_holds_is_not_taken_for_undocked() -> None:
     assert tank.shape == [(0, 1), (2,)]
 
 
+@pytest.mark.slow
 def test_partner_that_is_being_undocked_is_not_lost() -> None:
     """While the magnets push, currents and pictures say that the joint is open: it is wanted so."""
     tank = Docked(RING[:2], Parameters().replace("docking.release_s", 2.0))
