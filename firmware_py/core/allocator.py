@@ -52,6 +52,12 @@ def are_within(force, f_min, f_max):  # type: ignore[no-untyped-def]
     return bool(np.all((force >= f_min) & (force <= f_max)))
 
 
+@njit("boolean(float64[::1],float64[:,::1],float64[:,::1],int64[::1],float64[::1])", cache=True)
+def are_fed(force, power_forward, power_reverse, module, supply):  # type: ignore[no-untyped-def]
+    """Whether the (m,) supplies, W, are enough for the forces; a power that is not a number is no reason against."""
+    return not np.any(module_power(force, power_forward, power_reverse, module, supply.size) > supply)
+
+
 def _sizes(wrench: np.ndarray) -> np.ndarray:
     """(2,) of force and moment."""
     return np.asarray(np.linalg.norm(wrench.reshape(2, 3), axis=1))
@@ -136,9 +142,8 @@ class Allocator:
 
     def _is_fed(self, thrust: Thrust) -> bool:
         """Whether every module's supply is enough; for forces that are no numbers the limiter has the last word."""
-        t, supply_w = self._thrusters, self._room.supply_w
-        power_w = module_power(thrust.force_n, t.power_forward, t.power_reverse, t.module, supply_w.size)
-        return not bool(np.any(power_w > supply_w))
+        t = self._thrusters
+        return bool(are_fed(thrust.force_n, t.power_forward, t.power_reverse, t.module, self._room.supply_w))
 
     def _largest_share(self, wrench: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, Thrust]:
         """The largest share of a wrench that is fed beside another, both together, and the forces; where none is, of the other alone."""
@@ -152,7 +157,7 @@ class Allocator:
 
     def _within(self, wrench: np.ndarray) -> Thrust:
         """The forces within the thrusters' limits."""
-        force = self._preload + self._pinv @ wrench
+        force = self._preload + self._pinv.dot(wrench)
         if are_within(force, self._f_min, self._f_max):
             return self._thrust(force, (1.0, 1.0))
         if self._clip_only:
@@ -160,7 +165,7 @@ class Allocator:
         return self._saturated(wrench)
 
     def _thrust(self, force: np.ndarray, kept: tuple[float, float]) -> Thrust:
-        return Thrust(force, self._matrix @ force, kept, 1.0 - busiest(force, self._room.low_n, self._room.high_n))
+        return Thrust(force, self._matrix.dot(force), kept, 1.0 - busiest(force, self._room.low_n, self._room.high_n))
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
         """min |f - f_preload|^2 + sum_i w_i (1 - s_i)^2 so that J f = sum_i s_i W_i, f within limits, 0 <= s_i <= 1; W the parts."""

@@ -95,7 +95,7 @@ class Measurements:
             return np.asarray(self._rotations[:, which].reshape(3, -1) @ stacked / len(heard) - offsets.of(which))
         if self._is_still:
             offsets.learn((self._apart @ stacked).reshape(-1, 3))
-        return np.asarray(self._mean_of_all @ stacked)
+        return np.asarray(self._mean_of_all.dot(stacked))
 
     def _accel(self, readings: list[np.ndarray | None], gyro: np.ndarray | None) -> np.ndarray | None:
         """Mean specific force (3,) less what turning adds at the mean place of those heard, as far as a gyro tells it."""
@@ -124,7 +124,7 @@ class Measurements:
         if not heard:
             return None
         which, down = [m.pressure_pa is not None for m in mine], to_matrix(q_wb)[2]
-        pressure, below = sum(heard) / len(heard), float(self._lever(which) @ down)
+        pressure, below = sum(heard) / len(heard), float(self._lever(which).dot(down))
         depth_m = (pressure - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - below
         if len(mine) > 1:
             each_m = (np.array(heard) - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - self._r_bi[which] @ down

@@ -99,7 +99,7 @@ class BodyPipeline:
         believed = self.sensors.step(inputs.modules)
         self.health.imu_heard, self.health.pressure_heard = self.sensors.imu_heard, self.sensors.pressure_heard
         measured = self.measurements.fuse(believed, self.estimator.q_wb)
-        estimate = self.estimator.step(inputs.time_ns, measured, self.body.thrusters.matrix @ mean_n)
+        estimate = self.estimator.step(inputs.time_ns, measured, self.body.thrusters.matrix.dot(mean_n))
         self._find_faults(inputs, measured, estimate, mean_n)
         return estimate
 
@@ -180,7 +180,7 @@ class BodyPipeline:
         if self.supervisor.mode == Mode.MOTOR_DETECT:
             force = self.motor_test.step(time_ns)
             return Thrust(force, self.body.thrusters.matrix @ force, (1.0, 1.0))
-        return self.allocator.step(self.faults.now.keep @ wrench)
+        return self.allocator.step(self.faults.now.keep.dot(wrench))
 
 
 class Pipeline:
