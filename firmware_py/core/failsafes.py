@@ -5,7 +5,7 @@ The first row is the gravest. `Failsafes` keeps the time of each row; the superv
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import IntEnum
 from operator import attrgetter
 from typing import NamedTuple
@@ -47,12 +47,13 @@ PERMITTED = {
 
 
 class Row(NamedTuple):
-    """One fail-safe. Its parameters are `name`_limit (unless `value` is yes or no), _delay_s, _action and _latched."""
+    """One fail-safe. Its parameters are `name`_limit (unless its figure is yes or no), _delay_s, _action and _latched."""
 
     name: str
     words: str
     """For people; `{}` takes the value."""
-    value: Callable[[Health], float | bool]
+    figure: str
+    """Of Health; of yes or no and of numbers without a limit, what is above zero is bad."""
     below: bool = False
     """Low values are bad."""
     modes: frozenset[Mode] = ANY
@@ -61,33 +62,35 @@ class Row(NamedTuple):
 
 
 TABLE = (
-    Row("leak", "water in a cabin", attrgetter("leak")),
-    Row("bus_silent", "bus silent for {:.1f} s", attrgetter("bus_silent_s")),
-    Row("foreign_sync", "somebody else sends SYNC", attrgetter("foreign_sync")),
-    Row("foreign_command", "somebody else commands modules", attrgetter("foreign_command")),
-    Row("battery_critical", "battery critical: {:.0%} of its voltage", attrgetter("voltage_share"), below=True),
-    Row("cabin_hot", "cabin at {:.0f} degC", attrgetter("cabin_c")),
-    Row("cabin_pressure", "cabin pressure off by {:.0f} Pa", attrgetter("cabin_change_pa")),
-    Row("axis_lost", "the thrusters left cannot make every wrench", lambda h: h.lost_axes > 0),
-    Row("depth_unknown", "depth unknown for {:.1f} s", lambda h: min(h.depth_age_s, h.tag_age_s), modes=PLACED | {Mode.ALT_HOLD}),
-    Row("tag_gone", "no tag for {:.1f} s", attrgetter("tag_age_s"), modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
-    Row("partner_lost", "a docked partner is lost", lambda h: h.topology != ""),
-    Row("estimator", "sensors and model disagree: {:.1f} of the expected", attrgetter("nis_ratio"), modes=PLACED),
-    Row("rejected", "{:.0%} of the tags refused", attrgetter("rejected_share"), modes=PLACED),
-    Row("tag_lost", "no tag for {:.1f} s", attrgetter("tag_age_s"), modes=PLACED),
-    Row("tag_late", "no tag for {:.1f} s", attrgetter("tag_age_s"), modes=MOVING),
-    Row("depth_lost", "no pressure for {:.1f} s", attrgetter("depth_age_s")),
-    Row("imu_lost", "no IMU for {:.1f} s", attrgetter("imu_age_s")),
-    Row("module_silent", "a module is silent for {:.1f} s", attrgetter("silent_s")),
-    Row("ticks_missed", "{:.0f} ticks missed in a second", attrgetter("missed_ticks_per_s")),
-    Row("fence", "{:.2f} m outside the fence", attrgetter("outside_m"), modes=MOVING),
-    Row("ground_lost", "ground station silent for {:.1f} s", attrgetter("ground_age_s"), modes=ANY - {Mode.AUTO, Mode.SURFACE}),
-    Row("pilot_lost", "pilot silent for {:.1f} s", attrgetter("pilot_age_s"), modes=PILOTED),
-    Row("thruster_lost", "a thruster is out", lambda h: len(h.dead) > 0),
-    Row("cabin_unknown", "no reading of a cabin for {:.1f} s", attrgetter("cabin_age_s")),
-    Row("battery_unknown", "no reading of a battery for {:.1f} s", attrgetter("battery_age_s")),
-    Row("battery_low", "battery low: {:.0%} of its voltage", attrgetter("voltage_share"), below=True),
+    Row("leak", "water in a cabin", "leak"),
+    Row("bus_silent", "bus silent for {:.1f} s", "bus_silent_s"),
+    Row("foreign_sync", "somebody else sends SYNC", "foreign_sync"),
+    Row("foreign_command", "somebody else commands modules", "foreign_command"),
+    Row("battery_critical", "battery critical: {:.0%} of its voltage", "voltage_share", below=True),
+    Row("cabin_hot", "cabin at {:.0f} degC", "cabin_c"),
+    Row("cabin_pressure", "cabin pressure off by {:.0f} Pa", "cabin_change_pa"),
+    Row("axis_lost", "the thrusters left cannot make every wrench", "lost_axes"),
+    Row("depth_unknown", "depth unknown for {:.1f} s", "depth_unknown_s", modes=PLACED | {Mode.ALT_HOLD}),
+    Row("tag_gone", "no tag for {:.1f} s", "tag_age_s", modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
+    Row("partner_lost", "a docked partner is lost", "partner_lost"),
+    Row("estimator", "sensors and model disagree: {:.1f} of the expected", "nis_ratio", modes=PLACED),
+    Row("rejected", "{:.0%} of the tags refused", "rejected_share", modes=PLACED),
+    Row("tag_lost", "no tag for {:.1f} s", "tag_age_s", modes=PLACED),
+    Row("tag_late", "no tag for {:.1f} s", "tag_age_s", modes=MOVING),
+    Row("depth_lost", "no pressure for {:.1f} s", "depth_age_s"),
+    Row("imu_lost", "no IMU for {:.1f} s", "imu_age_s"),
+    Row("module_silent", "a module is silent for {:.1f} s", "silent_s"),
+    Row("ticks_missed", "{:.0f} ticks missed in a second", "missed_ticks_per_s"),
+    Row("fence", "{:.2f} m outside the fence", "outside_m", modes=MOVING),
+    Row("ground_lost", "ground station silent for {:.1f} s", "ground_age_s", modes=ANY - {Mode.AUTO, Mode.SURFACE}),
+    Row("pilot_lost", "pilot silent for {:.1f} s", "pilot_age_s", modes=PILOTED),
+    Row("thruster_lost", "a thruster is out", "thruster_lost"),
+    Row("cabin_unknown", "no reading of a cabin for {:.1f} s", "cabin_age_s"),
+    Row("battery_unknown", "no reading of a battery for {:.1f} s", "battery_age_s"),
+    Row("battery_low", "battery low: {:.0%} of its voltage", "voltage_share", below=True),
 )
+FIGURES = attrgetter(*(row.figure for row in TABLE))
+"""What each row looks at, of the health of a tick."""
 
 
 class Alarm(NamedTuple):
@@ -105,7 +108,7 @@ class Watch:
     """One row and its time."""
 
     def __init__(self, row: Row, parameters: FailsafeParameters) -> None:
-        self.row, self._value, self._below = row, row.value, row.below
+        self.row, self.below = row, row.below
         self._since_ns: int | None = None
         self._gone_ns: int | None = None
         self._told_ns: int | None = None
@@ -137,28 +140,25 @@ class Watch:
 
     def beyond(self, health: Health) -> bool:
         """Whether its cause holds now, whatever the mode. A NaN is no cause."""
-        value = self._value(health)
-        return value < self.limit if self._below else value > self.limit
+        value = getattr(health, self.row.figure)
+        return bool(value < self.limit if self.below else value > self.limit)
 
     def counts(self, mode: Mode, forced: bool, armed: bool) -> bool:
         """Whether it counts now."""
+        if self.level == Level.NONE:
+            return False
         if not armed:
             return self.row.modes == ANY
         return mode in self.row.modes or (forced and mode in self.row.forced_modes)
 
     def words(self, health: Health) -> str:
         """How it is, for people."""
-        value, words = self._value(health), self.row.words
+        value, words = getattr(health, self.row.figure), self.row.words
         return words.replace(" for {:.1f} s", "") if value >= NEVER_S else words.format(value)
 
     def reason(self, health: Health) -> str:
         """What is wrong, for people; what was wrong when it began, where its cause is gone."""
         return self.words(health) if self.beyond(health) else self.began
-
-    @property
-    def rests(self) -> bool:
-        """Whether a tick without cause changes nothing."""
-        return not self.active and self._since_ns is None
 
     def step(self, now: int, cause: bool, armed: bool) -> bool:
         """Moves its time on; whether it has begun or ended in this tick, or its cause has come back to stay."""
@@ -190,7 +190,6 @@ class Failsafes:
         """Takes other limits and actions; what is on stays on."""
         for watch in self._all:
             watch.retune(parameters)
-        self._watches = [watch for watch in self._all if watch.level != Level.NONE]
 
     def take_over(self, before: Sequence[Failsafes]) -> None:
         """Goes on from those of the bodies that this one is made of, or was part of."""
@@ -204,9 +203,9 @@ class Failsafes:
             forced: a fail-safe and no person chose `mode`.
         """
         alarms = []
-        for watch in self._watches:
-            cause = watch.beyond(health) and watch.counts(mode, forced, armed)
-            if not cause and watch.rests:
+        for watch, value in zip(self._all, FIGURES(health), strict=True):
+            cause = (value < watch.limit if watch.below else value > watch.limit) and watch.counts(mode, forced, armed)
+            if not cause and not watch.active and watch._since_ns is None:
                 continue
             was_active = watch.active
             if watch.step(health.time_ns, cause, armed):
@@ -218,21 +217,21 @@ class Failsafes:
     @property
     def level(self) -> Level:
         """What the gravest of those that are on asks for."""
-        return max((watch.level for watch in self._watches if watch.active), default=Level.NONE)
+        return max((watch.level for watch in self._all if watch.active), default=Level.NONE)
 
     def is_on(self, name: str) -> bool:
         """Whether the row of that name is on."""
-        return any(watch.active for watch in self._watches if watch.row.name == name)
+        return any(watch.active for watch in self._all if watch.row.name == name)
 
     def active(self, health: Health) -> list[str]:
         """Those that are on and more than a warning, in words."""
-        return [watch.reason(health) for watch in self._watches if watch.active and watch.level > Level.WARN]
+        return [watch.reason(health) for watch in self._all if watch.active and watch.level > Level.WARN]
 
     def against(self, mode: Mode, health: Health) -> list[str]:
         """Why `mode` must not be entered now, in words; empty when it may."""
         return [
             watch.reason(health)
-            for watch in self._watches
+            for watch in self._all
             if mode not in PERMITTED[watch.level]
             and (watch.beyond(health) or (watch.active and watch.latched))
             and mode in watch.row.modes

@@ -330,7 +330,7 @@ class Guidance:
         force_w = np.asarray(rotate(estimate.q_wb, wrench[:3].copy()))
         if not self._placed(health):
             force_w[:2] = 0.0
-        if min(health.depth_age_s, health.tag_age_s) > self._no_depth_s:
+        if health.depth_unknown_s > self._no_depth_s:
             force_w[2] = -self._lift_n
         out[:3] = rotate_back(estimate.q_wb, force_w)
         return np.asarray(out)

@@ -103,6 +103,21 @@ class Health(NamedTuple):
         """Whether tags have told heading and place."""
         return self.ready and self.tag_age_s < NEVER_S
 
+    @property
+    def depth_unknown_s(self) -> float:
+        """Age of what told the depth last, pressure or tag."""
+        return min(self.depth_age_s, self.tag_age_s)
+
+    @property
+    def partner_lost(self) -> bool:
+        """Whether a docked partner is."""
+        return self.topology != ""
+
+    @property
+    def thruster_lost(self) -> bool:
+        """Whether any is."""
+        return len(self.dead) > 0
+
 
 class HealthMonitor:
     """Keeps the ages and means of one body."""

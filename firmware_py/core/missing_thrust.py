@@ -16,7 +16,7 @@ from firmware_py.core.body import BUOYANCY_SIGMA_N, CRUISE_M_S, Body
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
-from firmware_py.core.rotations import M, V, cross, rotate_back
+from firmware_py.core.rotations import M, V, cross, rotate_back, turned_back
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 
@@ -62,6 +62,7 @@ class MissingThrust:
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
         self._body, self.parameters = body, parameters
+        self._plant = (body.mass, body.righting, body.drag.nodes, body.drag.rotational, body.drag.linear)
         self._columns = t.matrix.T.copy()
         self._ticks = max(1, round(BLOCK_NS / period_ns))
         count = len(body.modules)
@@ -113,7 +114,6 @@ class MissingThrust:
 
     def _add(self, measured: Measured, estimate: Estimate, force_n: np.ndarray) -> None:
         """Adds one tick to the block."""
-        b, nu = self._body, estimate.nu
         self._n += 1
         if measured.gyro is not None:
             if self._first is None:
@@ -121,12 +121,9 @@ class MissingThrust:
             self._last, self._last_n = measured.gyro, self._n
         if measured.accel is not None:
             self._accels += 1
-            self._sum_a += measured.accel + rotate_back(estimate.q_wb, DOWN)
-        self._sum_f += force_n
-        self._sum_speed += math.sqrt(nu[0] ** 2 + nu[1] ** 2 + nu[2] ** 2)
-        add_model(b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear, nu, estimate.q_wb, self._sum_model)
-        add_coriolis(b.mass, nu, self._sum_coriolis)
-        add_flow(nu, self._sum_flow)
+            add_motion(measured.accel, estimate.q_wb, self._sum_a)
+        sums = (self._sum_model, self._sum_coriolis, self._sum_flow, self._sum_f)
+        self._sum_speed += add_tick(estimate.nu, estimate.q_wb, force_n, *self._plant, *sums)
 
     def _close(self, estimate: Estimate) -> bool:
         """Ends the block; whether it is whole."""
@@ -185,6 +182,24 @@ def add_flow(nu, out):  # type: ignore[no-untyped-def]
     for i in range(3):
         out[i] += (across - abs(nu[i])) * nu[3 + i]
         out[3 + i] += nu[(i + 1) % 3] * nu[(i + 2) % 3]
+
+
+@njit(f"void({V},{V},{V})", cache=True)
+def add_motion(accel, q_wb, out):  # type: ignore[no-untyped-def]
+    """Adds to `out` (3,) the acceleration of a body that feels `accel` (3,), m/s^2."""
+    down = turned_back(q_wb, 0.0, 0.0, GRAVITY)
+    for i in range(3):
+        out[i] += accel[i] + down[i]
+
+
+@njit(f"float64({V},{V},{V},{M},{V},float64[:,:,:,::1],{V},{V},{V},{V},{V},{V})", cache=True)
+def add_tick(nu, q_wb, force_n, mass, righting, nodes, rotational, linear, model, coriolis, flow, forces):  # type: ignore[no-untyped-def]
+    """Adds one tick to the sums of a block, the last four, and returns the speed, m/s."""
+    add_model(righting, nodes, rotational, linear, nu, q_wb, model)
+    add_coriolis(mass, nu, coriolis)
+    add_flow(nu, flow)
+    forces += force_n
+    return math.sqrt(nu[0] ** 2 + nu[1] ** 2 + nu[2] ** 2)
 
 
 @njit(cache=True)
