@@ -96,7 +96,7 @@ def _fly_alone(bodies, modules, thrusters, water, gusts, external, steps, step_s
     for i in range(6):
         external[0, i] = 0.0
     for k in range(commands.shape[0]):
-        command(thrusters, 0, commands[k])
+        command(thrusters.force_curve, thrusters.constants, thrusters.level, 0, commands[k])
         for i in range(3):
             water.flow[2, i] = gusts[k, i]
         advance(bodies, modules, None, thrusters, water, external, steps, step_s, stage, thrust, seen)

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
-from firmware_py.bus.codec import Codec, Frame, Received, Receiver
+from firmware_py.bus.codec import Codec, Frame, Receiver
+from firmware_py.bus.codec.receiver import KINDS, MESSAGE, NUMBER, VALUES
 from firmware_py.description.schema import DescriptionError
 from hil.plant.camera import Camera
 from hil.plant.draw import Noise, stream
@@ -80,9 +81,8 @@ class Mcu:
         """When each half of THRUSTER_CMD was last accepted, on the plant's clock."""
         return tuple(self._accepted_ns)
 
-    def heard(self, received: Received, time_ns: int) -> None:
-        """A checked frame for this module."""
-        name, values = received.message.name, received.values
+    def heard(self, name: str, values: Sequence[float], time_ns: int) -> None:
+        """A checked message for this module."""
         if name in ("THRUSTER_CMD_A", "THRUSTER_CMD_B"):
             half = 0 if name == "THRUSTER_CMD_A" else 1
             self._command[4 * half : 4 * half + 4] = values[:4]
@@ -262,8 +262,8 @@ class Nodes:
         """Takes frames off the wire at `time_ns` and puts the answers on it, through whatever is wrong with the wire."""
         answers: list[Frame] = []
         arrived = self.faults.incoming(frames, time_ns)
-        for frame, received in zip(arrived, self.receiver.judge(arrived), strict=True):
-            answers += self._hear(frame, received, time_ns)
+        for frame, row in zip(arrived, self.receiver.rows(arrived).tolist(), strict=True):
+            answers += self._hear(frame, row, time_ns)
         return self.faults.outgoing(answers, time_ns)
 
     def watch(self) -> None:
@@ -276,25 +276,27 @@ class Nodes:
 
     def take(self, frame: Frame, time_ns: int) -> list[Frame]:
         """One frame from the bus at `time_ns` on the plant's clock; returns the answers. Bad frames count and drop."""
-        return self._hear(frame, self.receiver.judge((frame,))[0], time_ns)
+        return self._hear(frame, self.receiver.rows((frame,)).tolist()[0], time_ns)
 
-    def _hear(self, frame: Frame, received: Received | str, time_ns: int) -> list[Frame]:
-        if isinstance(received, str):
-            self._blame(frame, received)
+    def _hear(self, frame: Frame, row: list[float], time_ns: int) -> list[Frame]:
+        """`row`: what the receiver makes of the frame."""
+        which, number, values = int(row[MESSAGE]), row[NUMBER], row[VALUES:]
+        if which < 0:
+            self._blame(frame, KINDS[~which])
             return []
-        name = received.message.name
+        name = self.codec.messages[which].name
         if name == "ESTOP":
             for mcu in self.mcus.values():
                 mcu.estop(time_ns)
             return []
         if name == "SYNC":
-            tick = int(received.values[0])
+            tick = int(values[0])
             answers = [f for camera in self.cameras for f in camera.sync(tick, time_ns)]
             for mcu in self.mcus.values():
                 answers += mcu.sync(tick, time_ns)
             return answers
-        if received.number in self.mcus:
-            self.mcus[received.number].heard(received, time_ns)
+        if number in self.mcus:
+            self.mcus[int(number)].heard(name, values, time_ns)
         return []
 
     def _blame(self, frame: Frame, kind: str) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
-import numpy as np
-
 from firmware_py.bus.codec import Codec, Frame, pack_quaternion
 from hil.plant.camera import Camera, Sighting, in_the_world
 from hil.plant.spec import SensorSpec
@@ -43,7 +41,7 @@ class TagCamera:
                 continue
             tick, sync_ns = self._sync
             offset_ns = sighting.capture_ns - sync_ns
-            is_near = bool(np.abs(sighting.p_wt).max() <= self._farthest_m)  # else the frame would say that it is at the limit
+            is_near = all(abs(m) <= self._farthest_m for m in sighting.p_wt.tolist())  # else the frame would say that it is at the limit
             if is_near and 0 <= offset_ns <= 25_500_000:  # what 8 bits of 0.1 ms can say
                 self._waiting.append((sighting, tick, offset_ns))
 

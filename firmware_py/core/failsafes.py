@@ -108,7 +108,7 @@ class Watch:
     """One row and its time."""
 
     def __init__(self, row: Row, parameters: FailsafeParameters) -> None:
-        self.row, self.below = row, row.below
+        self.row = row
         self._since_ns: int | None = None
         self._gone_ns: int | None = None
         self._told_ns: int | None = None
@@ -141,7 +141,7 @@ class Watch:
     def beyond(self, health: Health) -> bool:
         """Whether its cause holds now, whatever the mode. A NaN is no cause."""
         value = getattr(health, self.row.figure)
-        return bool(value < self.limit if self.below else value > self.limit)
+        return bool(value < self.limit if self.row.below else value > self.limit)
 
     def counts(self, mode: Mode, forced: bool, armed: bool) -> bool:
         """Whether it counts now."""
@@ -190,6 +190,7 @@ class Failsafes:
         """Takes other limits and actions; what is on stays on."""
         for watch in self._all:
             watch.retune(parameters)
+        self._limits = [(watch, watch.row.below, watch.limit) for watch in self._all]
 
     def take_over(self, before: Sequence[Failsafes]) -> None:
         """Goes on from those of the bodies that this one is made of, or was part of."""
@@ -203,8 +204,8 @@ class Failsafes:
             forced: a fail-safe and no person chose `mode`.
         """
         alarms = []
-        for watch, value in zip(self._all, FIGURES(health), strict=True):
-            cause = (value < watch.limit if watch.below else value > watch.limit) and watch.counts(mode, forced, armed)
+        for (watch, below, limit), value in zip(self._limits, FIGURES(health), strict=True):
+            cause = (value < limit if below else value > limit) and watch.counts(mode, forced, armed)
             if not cause and not watch.active and watch._since_ns is None:
                 continue
             was_active = watch.active

@@ -82,6 +82,7 @@ class Camera:
         self._least = math.cos(math.radians(spec.tag_incidence_deg))
         self._tags = [(m, t) for m, v in enumerate(vehicles) for t in v.tag if t.id in tags]
         self._rows = _tag_rows(self._tags)
+        self._places = [(np.array(t.position_m), np.array(t.quaternion)) for _, t in self._tags]
         self._boxes = solid_boxes(vehicles)
         self._period_ns = round(1e9 / spec.tag_rate_hz)
         # A carried camera is triggered together with the first one: its node needs both pictures of one moment.
@@ -118,7 +119,7 @@ class Camera:
             drawn = errors.draw()
             if k >= 0 and cosines[k] > self._least and not drawn.lost and self._tags[k][0] != self.carrier:
                 m, tag = self._tags[k]
-                p, q = tag_pose(poses[m, :3], poses[m, 3:], tag)
+                p, q = placed(poses[m, :3], poses[m, 3:], *self._places[k])
                 p, q = self._blur(p, q, drawn, eye, axis)
                 if self.carrier >= 0:
                     p, q = _seen_from(poses[self.carrier], p, q)
@@ -188,7 +189,13 @@ def _tag_rows(tags: Sequence[tuple[int, Tag]]) -> np.ndarray:
 
 def tag_pose(p_wm: np.ndarray, q_wm: np.ndarray, tag: Tag) -> tuple[np.ndarray, np.ndarray]:
     """World pose of a tag on a module; its z axis points into the face."""
-    return p_wm + rotations.rotate(q_wm, np.array(tag.position_m)), rotations.multiply(q_wm, np.array(tag.quaternion))
+    return placed(p_wm, q_wm, np.array(tag.position_m), np.array(tag.quaternion))
+
+
+@njit("Tuple((float64[::1],float64[::1]))(float64[::1],float64[::1],float64[::1],float64[::1])", cache=True)
+def placed(p_wm, q_wm, position, quaternion):
+    """World pose of what is at `position` (3,) and has the attitude `quaternion` (4,) on a module."""
+    return p_wm + rotations.rotate(q_wm, position), rotations.multiply(q_wm, quaternion)
 
 
 @njit("float64[:,::1](float64[:,::1],float64[:,::1],float64,float64)", cache=True)

@@ -10,7 +10,7 @@ import numpy as np
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import FACE_NORMALS, Vehicle
 from hil.plant.bodies import Bodies, Modules
-from hil.plant.build import fill_body, make_bodies, make_modules, seat_thrusters
+from hil.plant.build import fill_body, make_bodies, make_modules, nominal_centre, seat_thrusters
 from hil.plant.contact import touch
 from hil.plant.docking import DISK_M, Docks, Joint, joints_between
 from hil.plant.draw import ModuleDraw
@@ -31,6 +31,8 @@ class DockedBodies(ABC):
     """Modules of each body, its leader first; in the order of the leaders."""
     places: list[Place]
     """Where each module sits in its body."""
+    _centres: list[tuple[float, ...]]
+    """(3,) what the vehicle files say of each body's centre of mass."""
     _draws: list[ModuleDraw]
     _thrusters: Thrusters
     _water: Water
@@ -52,6 +54,8 @@ class DockedBodies(ABC):
         """Puts the modules into bodies; their states are the caller's business."""
         self.bodies = [tuple(members) for members in groups]
         self.places = list(places)
+        centres = (nominal_centre([self.vehicles[m] for m in members], [places[m] for m in members]) for members in self.bodies)
+        self._centres = [tuple(centre.tolist()) for centre in centres]
         self._modules = make_modules(self.vehicles, self._draws, self.bodies, places)
         seat_thrusters(self._thrusters, self.vehicles, self._modules)
         self._body_arrays = make_bodies(len(self.bodies))

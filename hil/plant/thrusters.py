@@ -56,15 +56,15 @@ def polynomial(curves, t, side, x):
     return total
 
 
-@compiled(types.void(THRUSTERS, types.int64, F1))
-def command(thrusters, first, u):
-    """Gives thrusters `first` and on the commands u, -1 to 1; a force within the deadband is none."""
+@compiled(types.void(F3, F2, F2, types.int64, F1))
+def command(force_curve, constants, level, first, u):
+    """Gives thrusters `first` and on the commands u, -1 to 1; a force within the deadband is none. The arrays are those of Thrusters."""
     for i in range(u.shape[0]):
         t, side = first + i, 0 if u[i] > 0.0 else 1
-        force = polynomial(thrusters.force_curve, t, side, min(1.0, abs(u[i])))
-        if force < thrusters.constants[t, 1]:
+        force = polynomial(force_curve, t, side, min(1.0, abs(u[i])))
+        if force < constants[t, 1]:
             force = 0.0
-        thrusters.level[t, 0] = force if u[i] > 0.0 else -force
+        level[t, 0] = force if u[i] > 0.0 else -force
 
 
 @inlined

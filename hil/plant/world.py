@@ -15,7 +15,7 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from hil.plant import thrusters as thrusters_module
 from hil.plant.bodies import Bodies, Modules, steered
-from hil.plant.build import make_thrusters, nominal_centre
+from hil.plant.build import make_thrusters
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.docked import DockedBodies
 from hil.plant.docking import Docks, joints_between
@@ -124,7 +124,6 @@ class World(DockedBodies):
         """
         if period_ns % step_ns:
             raise DescriptionError(f"plant: the sub-step of {step_ns} ns does not divide the tick of {period_ns} ns")
-        self._centres: dict[tuple[int, ...], tuple[tuple[Place, ...], tuple[float, ...]]] = {}
         self._truths: dict[int, Truth] = {}
         self._escs: dict[int, np.ndarray] = {}
         self.time_ns = 0
@@ -160,10 +159,11 @@ class World(DockedBodies):
 
     def set_command(self, module: int, u: Sequence[float] | np.ndarray, armed: bool) -> None:
         """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call; disarmed is zero."""
-        wanted = np.array(u, dtype=np.float64) * float(armed)
+        wanted = np.array(u, dtype=np.float64) if armed else np.zeros(len(u))
         if self._broken:
             wanted = self._as_broken(module, wanted)
-        thrusters_module.command(self._thrusters, self._first[module], wanted)
+        arrays = self._thrusters
+        thrusters_module.command(arrays.force_curve, arrays.constants, arrays.level, self._first[module], wanted)
         for (m, t), (how, value) in self._broken.items():
             if m == module and how == "weak":
                 self._thrusters.level[self._first[m] + t, 0] *= value
@@ -233,7 +233,7 @@ class World(DockedBodies):
         if len(self.vehicles) > 1 and self.jet_strength > 0.0:
             jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
             add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._hands)
-        pushed = sorted(set(self.push.nonzero()[0].tolist())) if np.count_nonzero(self.push) else []
+        pushed = sorted(set(self.push.nonzero()[0].tolist()))
         for m in pushed:
             force, moment = (self._modules.turn[m] @ part for part in np.split(self.push[m], 2))
             moment += np.cross(self._modules.position[m], force)
@@ -296,17 +296,8 @@ class World(DockedBodies):
         modules = self.bodies[body]
         x = self._body_arrays.state[body]
         seen = np.empty(9)
-        steered(x, self._nominal_centre(modules), self._body_arrays.rigid[body], seen)
+        steered(x, self._centres[body], self._body_arrays.rigid[body], seen)
         return BodyTruth(self.time_ns, modules, seen[:3], x[3:7].copy(), seen[3:6], x[10:13].copy(), seen[6:])
-
-    def _nominal_centre(self, modules: tuple[int, ...]) -> tuple[float, ...]:
-        """(3,) what the vehicle files say of a body's centre of mass; worked out again when a dock has moved its modules."""
-        places = tuple(self.places[m] for m in modules)
-        kept = self._centres.get(modules)
-        if kept is None or any(a is not b for a, b in zip(kept[0], places, strict=True)):
-            centre = nominal_centre([self.vehicles[m] for m in modules], places)
-            kept = self._centres[modules] = places, tuple(centre.tolist())
-        return kept[1]
 
     def esc(self, module: int) -> np.ndarray:
         """(t, 2) speed (1/min) and current (A) of each thruster of a module; the same array until the world moves on."""

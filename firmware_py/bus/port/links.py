@@ -88,31 +88,11 @@ class FrameBus(VirtualBus):
 
     def __init__(self, channel: str) -> None:
         super().__init__(channel=channel)
-        self._listeners = cast(list[Any], self.channel)
+        self.listeners = cast(list[Any], self.channel)
         with channels_lock:
-            place = self._listeners.index(self.queue)
+            place = self.listeners.index(self.queue)
             self.queue: Any = _FrameQueue()
-            self._listeners[place] = self.queue
-
-    def send_frame(self, frame: Frame) -> None:
-        """Gives `frame` to everyone else on the channel."""
-        for queue in tuple(self._listeners):
-            if queue is self.queue:
-                continue
-            if type(queue) is not _FrameQueue:
-                queue.put(can.Message(arbitration_id=frame[0], is_extended_id=False, data=frame[1]))
-            elif queue.qsize() < WAITING_FRAMES:
-                queue.put(frame)
-            else:
-                queue.lost += 1
-
-    def read_frame(self, timeout_s: float) -> Frame | can.Message | None:
-        """The next frame, or None."""
-        try:
-            item: Frame | can.Message = self.queue.get(timeout_s > 0.0, timeout_s)
-        except Empty:
-            return None
-        return item
+            self.listeners[place] = self.queue
 
 
 class VirtualLink(Link):
@@ -124,10 +104,21 @@ class VirtualLink(Link):
         return FrameBus(self.address)
 
     def send(self, bus: Any, frame: Frame) -> None:
-        bus.send_frame(frame)
+        for queue in tuple(bus.listeners):
+            if queue is bus.queue:
+                continue
+            if type(queue) is not _FrameQueue:
+                queue.put(can.Message(arbitration_id=frame[0], is_extended_id=False, data=frame[1]))
+            elif queue.qsize() < WAITING_FRAMES:
+                queue.put(frame)
+            else:
+                queue.lost += 1
 
     def read(self, bus: Any, timeout_s: float) -> Frame | can.Message | None:
-        item: Frame | can.Message | None = bus.read_frame(timeout_s)
+        try:
+            item: Frame | can.Message = bus.queue.get(timeout_s > 0.0, timeout_s)
+        except Empty:
+            return None
         return item
 
 
