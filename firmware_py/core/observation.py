@@ -91,23 +91,27 @@ def update(x, covariance, residual, h, variance, shared, gate):  # type: ignore[
     ph = np.empty(ERRORS)
     nis = 0.0
     for row in range(residual.size):
-        ph[:] = shared[row]
-        innovation = residual[row]
+        innovation, s = residual[row], variance[row]
+        for i in range(ERRORS):
+            ph[i] = shared[row, i]
         for j in range(ERRORS):
-            if h[row, j] != 0.0:
-                innovation -= h[row, j] * error[j]
+            share = h[row, j]
+            if share != 0.0:
+                innovation -= share * error[j]
                 for i in range(ERRORS):
-                    ph[i] += h[row, j] * p[j, i]
-        s = variance[row]
+                    ph[i] += share * p[j, i]
         for j in range(ERRORS):
             s += h[row, j] * ph[j]
         root = 1.0 / math.sqrt(s)
-        ph *= root  # so that what is taken off is symmetric to the last bit
-        nis += (innovation * root) ** 2
-        error += ph * (innovation * root)
+        innovation *= root
+        nis += innovation**2
         for i in range(ERRORS):
+            ph[i] *= root  # so that what is taken off is symmetric to the last bit
+        for i in range(ERRORS):
+            gain = ph[i]
+            error[i] += gain * innovation
             for j in range(ERRORS):
-                p[i, j] -= ph[i] * ph[j]
+                p[i, j] -= gain * ph[j]
     if not nis <= gate:
         return nis, x.copy(), covariance.copy()
     return nis, inject(x, error), p
