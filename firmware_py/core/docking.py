@@ -110,6 +110,11 @@ class DockingStage:
         return rows.copy() if rows.size else rows
 
     @property
+    def has_work(self) -> bool:
+        """Whether there is anything to watch or to steer."""
+        return self.under_way or self._joints.rows.size > 0
+
+    @property
     def under_way(self) -> bool:
         """Whether any dock or undock is."""
         return bool(self._docks or self._undocks)
@@ -163,8 +168,6 @@ class DockingStage:
         """
         self.events, self.records = [], []
         decisions = Decisions({}, [], [], [], {})
-        if not (inputs.prepared or self._docks or self._undocks or self._joints.rows.size):
-            return decisions
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)

@@ -40,6 +40,9 @@ class Formation:
 
     def step(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
         """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
+        if not (inputs.prepared or self.docking.has_work):
+            outputs.joints = self.docking.joints
+            return
         bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.chains}
         waiting, holding = (self._armed_in(mode) if inputs.prepared else [] for mode in (Mode.DOCK, Mode.POSHOLD))
         decisions = self.docking.step(inputs, bodies, waiting, holding, self._resting())
