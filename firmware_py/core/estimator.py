@@ -109,7 +109,7 @@ class Estimator:
     @property
     def q_wb(self) -> np.ndarray:
         """(4,) latest attitude."""
-        return np.ascontiguousarray(self._now[3:7])
+        return np.asarray(self._now[3:7])
 
     def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:
         """The estimate at `time_ns`.
@@ -313,13 +313,13 @@ class Estimator:
         if not sound:  # sensors have lied
             self._forget()
             sigma = UNKNOWN_SIGMA
-        x = self._now
+        x = self._now.copy()
         return Estimate(
-            p_wb=x[:3].copy(),
-            q_wb=x[3:7].copy(),
-            nu=x[7:13].copy(),
-            force_w=x[19:22].copy(),
-            moment_b=x[22:25] + restoring_moment(x[26:29].copy(), x[3:7].copy()),
+            p_wb=x[:3],
+            q_wb=x[3:7],
+            nu=x[7:13],
+            force_w=x[19:22],
+            moment_b=x[22:25] + restoring_moment(x[26:29], x[3:7]),
             sigma_p=sigma[:3],
             sigma_q=sigma[3:],
             tag_age_ns=time_ns - self._last_tag_ns,

@@ -208,7 +208,8 @@ class Guidance:
         assert self._start_ns is not None
         t = (time_ns - self._start_ns) * 1e-9
         now, ahead = trajectory.sample(t), trajectory.sample(t + self._lead_s)
-        if not math.isfinite(np.concatenate((*now, *ahead)).sum()):
+        motion = np.concatenate((*now, *ahead))
+        if not math.isfinite(motion.dot(motion)):
             return None
         self._glider.put(now)
         return now, ahead

@@ -228,8 +228,8 @@ class HealthMonitor:
             leak=any(self._leak),
             cabin_c=max(self._cabin_c.values(), default=math.nan),
             cabin_change_pa=max(self._cabin_change_pa.values(), default=math.nan),
-            stopped=tuple(m for m, at in self._stopped_ns.items() if m in self._modules or now - at <= self._answer_ns),
-            silent=tuple(self._modules[i] for i in _older(self._answered_ns, now - self._answer_ns)),
+            stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._modules or now - at <= self._answer_ns]),
+            silent=tuple([self._modules[i] for i in _older(self._answered_ns, now - self._answer_ns)]),
             silent_s=_age_s(min(self._heard_ns), now),
             bus_silent_s=_age_s(max(self._heard_ns), now),
             esc_missing=_older(self._esc_ns, now - self._esc_fresh_ns),
@@ -246,7 +246,7 @@ class HealthMonitor:
             warm=self.warm,
             topology=self.topology,
             tag_gap_s=self._tag_gap_s(now),
-            unfit=tuple(m for m, unfit in zip(self._modules, self._unfit, strict=True) if unfit),
+            unfit=tuple([m for m, unfit in zip(self._modules, self._unfit, strict=True) if unfit]),
             battery_age_s=_age_s(min(self._read_ns["battery"]), now),
             cabin_age_s=_age_s(min(self._read_ns["cabin"]), now),
         )
@@ -353,13 +353,14 @@ def is_sticks(argument: object) -> bool:
 
 def beyond(p_w: np.ndarray, fence: Fence) -> dict[str, float]:
     """How far a place (3,) is beyond each side of the fence, by the side's name, m; negative: how far inside."""
+    return dict(zip(("north_m", "east_m", "top_m", "bottom_m"), _beyond(p_w, fence), strict=True))
+
+
+def _beyond(p_w: np.ndarray, fence: Fence) -> tuple[float, float, float, float]:
     north, east, down = p_w.tolist()
-    return {
-        "north_m": abs(north) - fence.north_m, "east_m": abs(east) - fence.east_m,
-        "top_m": fence.top_m - down, "bottom_m": down - fence.bottom_m,
-    }  # fmt: skip
+    return abs(north) - fence.north_m, abs(east) - fence.east_m, fence.top_m - down, down - fence.bottom_m
 
 
 def outside(p_w: np.ndarray, fence: Fence) -> float:
     """How far a place (3,) is beyond the fence, m; negative: how far inside."""
-    return max(beyond(p_w, fence).values())
+    return max(_beyond(p_w, fence))

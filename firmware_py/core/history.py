@@ -40,11 +40,11 @@ class History:
     ) -> None:
         self.newest += 1
         self.newest_ns = time_ns
-        for row in (self.newest % self.length, self.newest % self.length + self.length):
-            self._tau[row] = tau
-            self._gyro[row] = np.nan if gyro is None else gyro
-            self._rows[row, :3] = np.nan if accel is None else accel
-            self._rows[row, 3] = np.nan if depth_m is None else depth_m
+        both = slice(self.newest % self.length, None, self.length)
+        self._tau[both] = tau
+        self._gyro[both] = np.nan if gyro is None else gyro
+        self._rows[both, :3] = np.nan if accel is None else accel
+        self._rows[both, 3] = np.nan if depth_m is None else depth_m
 
     def time_of(self, index: int) -> int:
         """Time of sample `index`, ns."""

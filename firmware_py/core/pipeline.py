@@ -216,7 +216,8 @@ class Pipeline:
         bodies = {body.index: body for body in formation.bodies}
         requests, refusals = sift(follow(inputs.requests, before, bodies), bodies)
         outputs.events += refusals
-        self._retune(requests, outputs)
+        if requests:
+            self._retune(requests, outputs)
         for chain in formation.chains:
             granted = chain.decide(inputs, estimates[chain.body.index], requests)
             outputs.preparations += granted

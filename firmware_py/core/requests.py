@@ -117,6 +117,8 @@ SOUND: Mapping[Action, Callable[[Any], bool]] = {
 
 def sift(requests: Sequence[Request], bodies: Mapping[int, Body]) -> tuple[list[Request], list[Event]]:
     """The requests that make sense and reach a body, and for each of the others why not."""
+    if not requests:
+        return [], []
     reasons = [against_request(request, bodies) for request in requests]
     sound = [request for request, why in zip(requests, reasons, strict=True) if not why]
     refused = [(request, why) for request, why in zip(requests, reasons, strict=True) if why]

@@ -93,7 +93,7 @@ class SensorWatch:
         """Whether a reading is far from the one that was believed last, and from the one after that as well."""
         if reading is None:
             return False
-        sample = np.atleast_1d(reading)
+        sample = reading if isinstance(reading, np.ndarray) else np.array([reading])
         sound, odd = self._traces[i].get(name, (sample, NOTHING))
         is_odd = not (is_near(sample, sound, LEAPS[name]) or is_near(sample, odd, LEAPS[name]))
         self._traces[i][name] = (sound, sample) if is_odd else (sample, NOTHING)

@@ -192,7 +192,7 @@ class Supervisor:
     def _applies(self, trigger: Trigger) -> bool:
         """Whether the end of something concerns the present state."""
         row = ROWS.get((self.state, trigger))
-        return row is not None and {Guard.TESTING: self._testing, Guard.IN_DOCK: self.mode == Mode.DOCK}[row.guard]
+        return row is not None and (self._testing if row.guard == Guard.TESTING else self.mode == Mode.DOCK)
 
     def retune(self, parameters: Parameters) -> None:
         """Takes other limits from this tick on; state and mode stay."""
