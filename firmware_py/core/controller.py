@@ -71,7 +71,7 @@ def _wrench(  # type: ignore[no-untyped-def]
     ahead = _body_velocity(q1, v1, w1, q)
     rate = kp * error + kd * (_body_velocity(q0, v0, w0, q) - nu)
     # w x v is taken off because the Coriolis term holds it
-    rate[:3] += rotate_back(q, a1) - cross(ahead[3:].copy(), ahead[:3].copy())
+    rate[:3] += rotate_back(q, a1) - cross(ahead[3:], ahead[:3])
     rate[3:] += rotate_back(q, rotate(q1, alpha1))
     modelled = ahead if law[0] > 0.5 else nu
     tau = mass @ rate + coriolis_wrench(mass, modelled) - law[1] * drag_wrench(nodes, rotational, linear, modelled)

@@ -37,8 +37,8 @@ def inertial(x, gyro, accel, depth, sigma, moved, mobility):  # type: ignore[no-
             variance[i] = sigma[0] ** 2
         rows = 3
     if not math.isnan(accel[0]):
-        r = to_matrix(x[3:7].copy())
-        down, pushed = r[2].copy(), rotate_back(x[3:7].copy(), x[19:22].copy())
+        r = to_matrix(x[3:7])
+        down, pushed = r[2], rotate_back(x[3:7], x[19:22])
         h[rows : rows + 3, 3:6] = mobility @ skew(pushed) - GRAVITY * skew(down)
         h[rows : rows + 3, 18:21] = mobility @ np.ascontiguousarray(r.T)
         for i in range(3):
@@ -51,7 +51,7 @@ def inertial(x, gyro, accel, depth, sigma, moved, mobility):  # type: ignore[no-
         h[rows, 2] = h[rows, 24] = 1.0
         variance[rows] = sigma[2] ** 2
         rows += 1
-    return residual[:rows].copy(), h[:rows].copy(), variance[:rows].copy()
+    return residual[:rows], h[:rows], variance[:rows]
 
 
 @njit(cache=True)
@@ -59,7 +59,7 @@ def tag(x, p_wt, lever_b, q_wb, variance):  # type: ignore[no-untyped-def]
     """Tag centre p_wt (3,) at lever_b (3,) and attitude q_wb (4,); variance (6,) of position (world) and attitude
     (body).
     """
-    q = x[3:7].copy()
+    q = x[3:7]
     r = to_matrix(q)
     h = np.zeros((6, ERRORS))
     h[:3, :3] = np.eye(3)
@@ -156,17 +156,17 @@ def advance(  # type: ignore[no-untyped-def]
         density, under_way: as `predict`. sigma: (3,) as `inertial`.
     """
     for i in range(count):
-        tau, elapsed = taus[i].copy(), first if i == 0 else dt
+        tau, elapsed = taus[i], first if i == 0 else dt
         x, covariance = predict(x, covariance, tau, elapsed, density, under_way, mass, mass_inv, righting, nodes, rotational, linear)
         x, covariance = fuse_inertial(
-            x, covariance, tau, gyros[i].copy(), others[i, :3].copy(), others[i, 3], elapsed, dt, density, under_way, sigma,
+            x, covariance, tau, gyros[i], others[i, :3], others[i, 3], elapsed, dt, density, under_way, sigma,
             mass, mass_inv, righting, nodes, rotational, linear,
         )  # fmt: skip
     if rest > 0.0:
-        tau = taus[count].copy()
+        tau = taus[count]
         x, covariance = predict(x, covariance, tau, rest, density, under_way, mass, mass_inv, righting, nodes, rotational, linear)
         x, covariance = fuse_inertial(
-            x, covariance, tau, np.full(3, math.nan), others[count, :3].copy(), math.nan, rest, dt, density, under_way, sigma,
+            x, covariance, tau, np.full(3, math.nan), others[count, :3], math.nan, rest, dt, density, under_way, sigma,
             mass, mass_inv, righting, nodes, rotational, linear,
         )  # fmt: skip
     return x, covariance
@@ -187,7 +187,7 @@ def fuse_stillness(x, covariance, variance, axes, heading_variance):  # type: ig
         variance: of the speed, (m/s)^2; axes: 2: of the horizontal speed alone, 3: downwards too.
         heading_variance: rad^2; infinite: nothing is said of the heading.
     """
-    r, rows = to_matrix(x[3:7].copy()), axes + 1
+    r, rows = to_matrix(x[3:7]), axes + 1
     h, residual, noise = np.zeros((rows, ERRORS)), np.zeros(rows), np.full(rows, variance)
     for i in range(axes):
         h[i, 6:9] = r[i]
@@ -206,7 +206,7 @@ def carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance):
     Args:
         density: (28,) process noise, per second. rate_variance: of the carried attitude, rad^2/s.
     """
-    r = to_matrix(x[3:7].copy())
+    r = to_matrix(x[3:7])
     f = np.zeros((6, ERRORS))
     f[:, :6] = np.eye(6)
     f[:3, 6:9] = r * lag

@@ -64,13 +64,12 @@ def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, l
     """(3,) acceleration of the centre of mass against the world, body frame, in state x under the thruster wrench tau
     (6,).
     """
-    q = x[3:7].copy()
-    nu = x[7:13].copy()
+    q, nu = x[3:7], x[7:13]
     external = tau.copy()
-    external[:3] += rotate_back(q, x[19:22].copy())
+    external[:3] += rotate_back(q, x[19:22])
     external[3:] += x[22:25]
     rate = acceleration(nu, q, external, mass, mass_inv, righting + x[26:29], nodes, rotational, linear)
-    return rate[:3] + cross(nu[3:].copy(), nu[:3].copy())
+    return rate[:3] + cross(nu[3:], nu[:3])
 
 
 @njit(cache=True)
@@ -128,14 +127,14 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
 
     Biases, disturbance and righting stand still: their rows of F are those of the identity.
     """
-    q = x[3:7].copy()
+    q = x[3:7]
     nu = x[7:13].copy()
     r = to_matrix(q)
-    force_b = rotate_back(q, x[19:22].copy())
+    force_b = rotate_back(q, x[19:22])
     a = np.zeros((MOVING, ERRORS))
-    a[0:3, 3:6] = -r @ skew(nu[:3].copy())
+    a[0:3, 3:6] = -r @ skew(nu[:3])
     a[0:3, 6:9] = r
-    a[3:6, 3:6] = -skew(nu[3:].copy())
+    a[3:6, 3:6] = -skew(nu[3:])
     external = tau.copy()
     external[:3] += force_b
     external[3:] += x[22:25]
@@ -152,11 +151,11 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
             a[6 + j, 6 + i] = (there[j] - base[j]) / step_size
     linear_part = np.ascontiguousarray(mass_inv[:, :3])
     angular_part = np.ascontiguousarray(mass_inv[:, 3:])
-    down = r[2].copy()
+    down = r[2]
     a[6:12, 3:6] = linear_part @ skew(force_b) - angular_part @ (skew(believed) @ skew(down))
     a[6:12, 18:21] = linear_part @ np.ascontiguousarray(r.T)
     a[6:12, 21:24] = angular_part
-    a[6:12, 25:28] = angular_part @ skew(x[29:32].copy())
+    a[6:12, 25:28] = angular_part @ skew(x[29:32])
     for i in range(3):
         a[3 + i, 9 + i] = 1.0
     f = dt * a + (0.5 * dt * dt) * (np.ascontiguousarray(a[:, :MOVING]) @ a)
@@ -234,6 +233,6 @@ def inject(x, e):  # type: ignore[no-untyped-def]
     """(32,) state with the (28,) error added."""
     out = x.copy()
     out[:3] += e[:3]
-    out[3:7] = normalise(multiply(x[3:7].copy(), exp(e[3:6].copy())))
+    out[3:7] = normalise(multiply(x[3:7], exp(e[3:6])))
     out[7:29] += e[6:]
     return out

@@ -17,10 +17,10 @@ def coriolis(mass, nu):  # type: ignore[no-untyped-def]
     """
     momentum = mass @ nu
     c = np.zeros((6, 6))
-    linear = skew(momentum[:3].copy())
+    linear = skew(momentum[:3])
     c[:3, 3:] = -linear
     c[3:, :3] = -linear
-    c[3:, 3:] = -skew(momentum[3:].copy())
+    c[3:, 3:] = -skew(momentum[3:])
     return c
 
 

@@ -96,8 +96,7 @@ def _harmonic(terms, head, duration, end_phase, ramp, t):  # type: ignore[no-unt
     half_yaw, roll = 0.5 * yaw_rate * phase, roll_rate * phase
     qz = np.array([math.cos(half_yaw), 0.0, 0.0, math.sin(half_yaw)])
     qx = np.array([math.cos(0.5 * roll), math.sin(0.5 * roll), 0.0, 0.0])
-    fixed = head[12:16].copy()
-    first = head[6:10].copy()
+    first, fixed = head[6:10], head[12:16]
     out[3:7] = rotations.multiply(rotations.multiply(rotations.multiply(first, qz), qx), fixed)
     c, d = math.cos(roll), math.sin(roll)
     w = np.array([roll_rate, yaw_rate * d, yaw_rate * c])
