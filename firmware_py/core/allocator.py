@@ -111,7 +111,7 @@ class Allocator:
 
     def _set_limits(self) -> None:
         self._f_min, self._f_max = self._room.low_n * self._alive, self._room.high_n * self._alive
-        self._low, self._high = np.r_[self._f_min, np.zeros(3)], np.r_[self._f_max, np.ones(3)]
+        self._low, self._high = np.concatenate((self._f_min, np.zeros(3))), np.concatenate((self._f_max, np.ones(3)))
         if self._cheaper:
             self._cheaper.confine(self._f_min, self._f_max)
 

@@ -134,7 +134,7 @@ class MissingThrust:
         whole = felt and alone and estimate.tag_age_ns < FRESH_NS
         rest, acted = np.full(6, np.nan), self._columns.T @ (self._sum_f / n)
         if whole and self._last is not None and self._first is not None:
-            motion = np.r_[self._sum_a / self._accels, (self._last - self._first) / span]
+            motion = np.concatenate((self._sum_a / self._accels, (self._last - self._first) / span))
             rest = self._body.mass @ motion - acted - (self._sum_model + self._sum_coriolis) / n
         down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
         self._blocks[:-1] = self._blocks[1:]
