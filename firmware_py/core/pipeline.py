@@ -255,6 +255,6 @@ IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)
 def _command(chain: BodyPipeline, command: np.ndarray, relays: Mapping[int, tuple[int, ...]], outputs: Outputs) -> None:
     """Hands each module its own thrusters and, where there are any to be sent, its relays."""
     armed, channels = chain.supervisor.armed, np.zeros((len(chain.body.modules), CHANNELS))
-    channels.reshape(-1)[chain.slots] = command
+    channels.put(chain.slots, command)
     for module, thrusters in zip(chain.body.modules, channels, strict=True):
         outputs.modules[module] = ModuleCommand(armed, thrusters, relays.get(module))
