@@ -140,7 +140,7 @@ class Recorder:
     def record(self, inputs: Inputs, outputs: Outputs) -> None:
         """One tick: what it took and everything that it thought."""
         for topic, layout, data in self._messages.of(self._received, inputs, outputs):
-            self._channel(topic, layout).log(data, log_time=outputs.time_ns)
+            self._channel(topic, layout).base.log(data, outputs.time_ns)  # bytes, which `log` would first ask after
         self._received = 0
         self.ticks += 1
 
