@@ -22,22 +22,22 @@ class Channel:
         self.bias: np.ndarray = bias * rng.standard_normal(width)
         self._then_ns = 0
 
-    def sample(self, time_ns: int) -> np.ndarray:
-        """(width,) the error now; the walk goes on by the time since the last sample."""
+    def sample(self, truth: np.ndarray, time_ns: int) -> np.ndarray:
+        """(width,) the truth with the error of now; the walk goes on by the time since the last sample."""
         walked = self._walk * math.sqrt(1e-9 * (time_ns - self._then_ns))
         self._then_ns = time_ns
-        error = np.empty(self.bias.size)
-        _sample(self._noise.take(), walked, self._sigma, self.bias, error)
-        return error
+        out = np.empty(self.bias.size)
+        _sample(self._noise.take(), walked, self._sigma, self.bias, truth, out)
+        return out
 
 
-@compiled(types.void(F1, F8, F8, F1, F1))
-def _sample(draw, walked, sigma, bias, error):
-    """Moves `bias` (w,) on by `walked` standard deviations of its walk and writes `error` (w,), by 2 w standard normal numbers."""
+@compiled(types.void(F1, F8, F8, F1, F1, F1))
+def _sample(draw, walked, sigma, bias, truth, out):
+    """Moves `bias` (w,) on by `walked` standard deviations of its walk; writes `truth` (w,) with the error. draw: (2 w,) of variance 1."""
     width = bias.shape[0]
     for i in range(width):
         bias[i] += walked * draw[i]
-        error[i] = bias[i] + sigma * draw[width + i]
+        out[i] = truth[i] + (bias[i] + sigma * draw[width + i])
 
 
 class Sensors:
@@ -52,13 +52,13 @@ class Sensors:
 
     def gyro(self, truth: Truth) -> np.ndarray:
         """(3,) angular rate, module frame, rad/s."""
-        return truth.w_b + self._gyro.sample(truth.time_ns)
+        return self._gyro.sample(truth.w_b, truth.time_ns)
 
     def accel(self, truth: Truth) -> np.ndarray:
         """(3,) specific force at the hull centre, module frame, m/s^2: (0, 0, -g) at rest and level."""
-        return truth.specific_force + self._accel.sample(truth.time_ns)
+        return self._accel.sample(truth.specific_force, truth.time_ns)
 
     def pressure_pa(self, truth: Truth) -> float:
         """Absolute pressure at the hull centre, Pa."""
-        depth = truth.p_wm[2] + float(self._depth.sample(truth.time_ns)[0])
+        depth = float(self._depth.sample(truth.p_wm[2:], truth.time_ns)[0])
         return self._world.atmosphere_pa + self._world.density * self._world.gravity * depth
