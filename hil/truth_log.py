@@ -24,7 +24,9 @@ WRITER = "modcube"
 HEADER_BYTES = 64
 """More than magic and header take."""
 CHUNK_BYTES = 65536
-"""About two seconds of one module at 100 Hz; a killed bench loses no more."""
+"""About two seconds of one module at 100 Hz; a killed bench loses no more than that and what waits."""
+AT_ONCE = 20
+"""Messages that are made and written together, ten ticks of one module: by code that is then at hand and not out of the cache."""
 
 
 def module_signals(thrusters: int) -> tuple[Signal, ...]:
@@ -92,6 +94,8 @@ class TruthRecorder:
         self._writer.start(profile="", library=WRITER)
         self._file.flush()  # whatever comes, the folder is known as a flight's
         self._sequence = 0
+        self._waiting: list[tuple[int, int, Row, tuple[Any, ...]]] = []
+        """Messages that are not made yet: channel, time, and the row and the values for it."""
         self._modules = []
         for module, count in enumerate(thrusters):
             self._modules.append(self._opened(f"/plant/module{module}", Layout("Module", module_signals(count))))
@@ -123,7 +127,7 @@ class TruthRecorder:
             jams = sum(contact.jammed for contact in docks.contacts)
             counts = (len(docks.joints), len(docks.contacts), jams)
             values = (tick, world.time_ns, *counts, docks.gap_m, docks.lateral_m, docks.current_ma().ravel())
-            self._add(channel, world.time_ns, row.encode(values))
+            self._add(channel, world.time_ns, row, values)
 
     def record_body(
         self,
@@ -150,7 +154,7 @@ class TruthRecorder:
         channel, row = self._bodies[leader]
         member = np.zeros(len(self._modules))
         member[list(modules)] = 1.0
-        self._add(channel, time_ns, row.encode((tick, time_ns, member, p_wb, q_wb, v_w, w_b, np.zeros(6) if load is None else load)))
+        self._add(channel, time_ns, row, (tick, time_ns, member, p_wb, q_wb, v_w, w_b, np.zeros(6) if load is None else load))
 
     def record(
         self,
@@ -174,15 +178,24 @@ class TruthRecorder:
             power_w: that its supply gives, electronics and magnets included, W.
         """
         channel, row = self._modules[module]
-        self._add(channel, time_ns, row.encode((tick, time_ns, p_wm, q_wm, v_w, w_b, force_n, water_w, power_w)))
+        self._add(channel, time_ns, row, (tick, time_ns, p_wm, q_wm, v_w, w_b, force_n, water_w, power_w))
 
-    def _add(self, channel: int, time_ns: int, data: bytes) -> None:
-        self._sequence += 1
-        self._writer.add_message(channel, log_time=time_ns, data=data, publish_time=time_ns, sequence=self._sequence)
+    def _add(self, channel: int, time_ns: int, row: Row, values: tuple[Any, ...]) -> None:
+        self._waiting.append((channel, time_ns, row, values))
+        if len(self._waiting) >= AT_ONCE:
+            self._write()
+
+    def _write(self) -> None:
+        for channel, time_ns, row, values in self._waiting:
+            self._sequence += 1
+            data = row.encode(values)
+            self._writer.add_message(channel, log_time=time_ns, data=data, publish_time=time_ns, sequence=self._sequence)
+        self._waiting.clear()
 
     def close(self) -> None:
         """Finish the file; a second time does nothing."""
         if not self._file.closed:
+            self._write()
             self._writer.finish()
             self._file.close()
 
