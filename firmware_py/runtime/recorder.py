@@ -88,7 +88,8 @@ class Recorder:
         kind = QueuedFile if queued else GuardedFile
         self._can = kind(folder / CAN_LOG if folder is not None else Path(os.devnull))
         self._mcap = kind(folder / SIGNAL_LOG if folder is not None else Path(os.devnull))
-        self._lines: list[str] = []
+        self._frames: list[tuple[int, int, str, Collection[tuple[int, bytes]]]] = []
+        """What `candump_lines` will make lines of when they are written: code that runs again and again is at hand by then."""
         self._received = 0
         self.ticks = 0
         self._reported = False
@@ -128,14 +129,14 @@ class Recorder:
         """Opens the channel of `record_times`."""
         self._channel(TIMES, self._times)
 
-    def sent(self, time_ns: int, bus: int, frames: Iterable[tuple[int, bytes]]) -> None:
+    def sent(self, time_ns: int, bus: int, frames: Collection[tuple[int, bytes]]) -> None:
         """Frames (id, data) that the tick at `time_ns` put on bus number `bus`."""
-        self._lines.append(candump_lines(time_ns, bus, "T", frames))
+        self._frames.append((time_ns, bus, "T", frames))
 
     def received(self, time_ns: int, bus: int, frames: Collection[tuple[int, bytes]]) -> None:
         """Frames (id, data) that the tick at `time_ns` took from bus number `bus`."""
         self._received += len(frames)
-        self._lines.append(candump_lines(time_ns, bus, "R", frames))
+        self._frames.append((time_ns, bus, "R", frames))
 
     def record(self, inputs: Inputs, outputs: Outputs) -> None:
         """One tick: what it took and everything that it thought."""
@@ -155,8 +156,8 @@ class Recorder:
         Args:
             to_disk: and have it write that, for a power cut: 10 ms and more, which in flight only a `queued` recorder may take.
         """
-        self._can.write("".join(self._lines).encode())
-        self._lines.clear()
+        self._can.write("".join([candump_lines(*each) for each in self._frames]).encode())
+        self._frames.clear()
         self._writer.flush()
         for file in (self._can, self._mcap) if to_disk else ():
             file.sync()
