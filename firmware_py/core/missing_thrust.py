@@ -90,11 +90,10 @@ class MissingThrust:
         self._start_block(None)
 
     def _start_block(self, gyro: np.ndarray | None) -> None:
-        self._n, self._accels = 0, 0
+        self._seen: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]] = []
+        """Of each tick of the block speed, attitude, forces and what was felt."""
         self._first = self._last = gyro
         self._first_n = self._last_n = 0
-        self._sum_a, self._sum_f = np.zeros(3), np.zeros(self._columns.shape[0])
-        self._sum_model, self._sum_coriolis, self._sum_flow, self._sum_speed = np.zeros(6), np.zeros(6), np.zeros(6), 0.0
 
     def step(
         self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool
@@ -103,10 +102,10 @@ class MissingThrust:
         if not estimate.ready:
             return None
         self._add(measured, estimate, force_n)
-        if self._n < self._ticks:
+        if len(self._seen) < self._ticks:
             return None
         full = self._close(estimate)
-        self._start_block(self._last if self._last_n == self._n else None)
+        self._start_block(self._last if self._last_n == len(self._seen) else None)
         if not (full and armed):
             self._count = 0
             return None
@@ -114,33 +113,33 @@ class MissingThrust:
 
     def _add(self, measured: Measured, estimate: Estimate, force_n: np.ndarray) -> None:
         """Adds one tick to the block."""
-        self._n += 1
+        self._seen.append((estimate.nu, estimate.q_wb, force_n, measured.accel))
         if measured.gyro is not None:
             if self._first is None:
-                self._first, self._first_n = measured.gyro, self._n
-            self._last, self._last_n = measured.gyro, self._n
-        if measured.accel is not None:
-            self._accels += 1
-            add_motion(measured.accel, estimate.q_wb, self._sum_a)
-        sums = (self._sum_model, self._sum_coriolis, self._sum_flow, self._sum_f)
-        self._sum_speed += add_tick(estimate.nu, estimate.q_wb, force_n, *self._plant, *sums)
+                self._first, self._first_n = measured.gyro, len(self._seen)
+            self._last, self._last_n = measured.gyro, len(self._seen)
 
     def _close(self, estimate: Estimate) -> bool:
         """Ends the block; whether it is whole."""
-        n = self._n
+        n, accels, speed = len(self._seen), 0, 0.0
+        felt, model, coriolis, flow, forces = np.zeros(3), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(self._columns.shape[0])
+        for nu, q_wb, force_n, accel in self._seen:  # together, by code that the processor then has at hand
+            speed += add_tick(nu, q_wb, force_n, *self._plant, model, coriolis, flow, forces)
+            if accel is not None:
+                accels += 1
+                add_motion(accel, q_wb, felt)
         span = (self._last_n - self._first_n) * self._period_s
-        felt = self._accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
+        known = accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
         alone = estimate.p_wb[2] > self._body.reach_m  # at the surface pushes what no model here knows
-        whole = felt and alone and estimate.tag_age_ns < FRESH_NS
-        rest, acted = np.full(6, np.nan), self._columns.T @ (self._sum_f / n)
+        whole = known and alone and estimate.tag_age_ns < FRESH_NS
+        rest, acted = np.full(6, np.nan), self._columns.T @ (forces / n)
         if whole and self._last is not None and self._first is not None:
-            motion = np.concatenate((self._sum_a / self._accels, (self._last - self._first) / span))
-            rest = self._body.mass @ motion - acted - (self._sum_model + self._sum_coriolis) / n
+            motion = np.concatenate((felt / accels, (self._last - self._first) / span))
+            rest = self._body.mass @ motion - acted - (model + coriolis) / n
         down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
         self._blocks[:-1] = self._blocks[1:]
-        known = [max(estimate.sigma_q.tolist()), self._sum_speed / n]
-        means = [self._sum_coriolis / n, self._sum_flow / n, self._sum_f / n]
-        self._blocks[-1] = np.concatenate([rest, acted, down_b, *means, known])
+        doubts = [max(estimate.sigma_q.tolist()), speed / n]
+        self._blocks[-1] = np.concatenate([rest, acted, down_b, coriolis / n, flow / n, forces / n, doubts])
         return whole
 
     def _decide(self, alive: np.ndarray) -> int | None:
