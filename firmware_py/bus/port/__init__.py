@@ -156,17 +156,13 @@ class Port:
     def _drain(self, timeout_s: float) -> list[Frame]:
         """What is there now, after waiting up to `timeout_s` for the first."""
         frames: list[Frame] = []
-        bus, read = self._bus, self._link.read
+        bus = self._bus
         if bus is None:
             self._refuse_if_closed()
             self._reopen()
             return frames
         try:
-            for _ in range(WAITING_FRAMES):
-                item = read(bus, timeout_s)
-                if item is None:
-                    break
-                timeout_s = 0.0
+            for item in self._link.waiting(bus, timeout_s):
                 frame = item if type(item) is Frame else self._classic(item)
                 if frame is None:
                     continue

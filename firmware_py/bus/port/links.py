@@ -11,6 +11,7 @@ import socket
 import struct
 import uuid
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from queue import Empty, SimpleQueue
 from typing import Any, cast
 
@@ -72,6 +73,15 @@ class Link(ABC):
         message: can.Message | None = bus.recv(timeout_s)
         return message
 
+    def waiting(self, bus: Any, timeout_s: float) -> Iterable[Frame | can.Message]:
+        """Everything that is there, after waiting up to `timeout_s` for the first; of a bus without end, so much as would wait."""
+        for _ in range(WAITING_FRAMES):
+            item = self.read(bus, timeout_s)
+            if item is None:
+                return
+            yield item
+            timeout_s = 0.0
+
 
 class _FrameQueue(SimpleQueue[Any]):
     """What waits for one virtual port; `lost` counts what found it full."""
@@ -120,6 +130,11 @@ class VirtualLink(Link):
         except Empty:
             return None
         return item
+
+    def waiting(self, bus: Any, timeout_s: float) -> Iterable[Frame | can.Message]:
+        first = self.read(bus, timeout_s) if timeout_s > 0.0 else None
+        rest = [bus.queue.get(False) for _ in range(bus.queue.qsize())]  # nobody else takes from it
+        return rest if first is None else [first, *rest]
 
 
 class UdpLink(Link):
