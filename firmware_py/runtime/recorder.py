@@ -41,6 +41,9 @@ from firmware_py.runtime.tick_messages import (
 CAN_LOG = "can.log"
 SIGNAL_LOG = "signals.mcap"
 CONFIGURATION = "configuration.json"
+TOGETHER = 10
+"""Ticks whose lines and messages are made at once where time does not matter: by code that is then at hand and not out of the cache. In
+real time each tick makes its own."""
 LIVE_ONLY = ("/scene", "/tf")
 """What is drawn from other channels has no place in a log."""
 
@@ -88,8 +91,12 @@ class Recorder:
         kind = QueuedFile if queued else GuardedFile
         self._can = kind(folder / CAN_LOG if folder is not None else Path(os.devnull))
         self._mcap = kind(folder / SIGNAL_LOG if folder is not None else Path(os.devnull))
+        self._together = 1 if queued or context is not None else TOGETHER
         self._frames: list[tuple[int, int, str, Collection[tuple[int, bytes]]]] = []
-        """What `candump_lines` will make lines of when they are written: code that runs again and again is at hand by then."""
+        """What `candump_lines` is still to make lines of."""
+        self._ticks: list[tuple[int, Inputs, Outputs]] = []
+        """Of which messages are still to be made, each with the count of frames that it took."""
+        self._lines: list[str] = []
         self._received = 0
         self.ticks = 0
         self._reported = False
@@ -140,10 +147,20 @@ class Recorder:
 
     def record(self, inputs: Inputs, outputs: Outputs) -> None:
         """One tick: what it took and everything that it thought."""
-        for topic, layout, data in self._messages.of(self._received, inputs, outputs):
-            self._channel(topic, layout).base.log(data, outputs.time_ns)  # bytes, which `log` would first ask after
+        self._ticks.append((self._received, inputs, outputs))
         self._received = 0
         self.ticks += 1
+        if self.ticks % self._together == 0:
+            self._make()
+
+    def _make(self) -> None:
+        """Lines and messages of all that waits."""
+        self._lines += [candump_lines(*each) for each in self._frames]
+        self._frames.clear()
+        for received, inputs, outputs in self._ticks:
+            for topic, layout, data in self._messages.of(received, inputs, outputs):
+                self._channel(topic, layout).base.log(data, outputs.time_ns)  # bytes, which `log` would first ask after
+        self._ticks.clear()
 
     def record_times(self, tick: int, time_ns: int, keeper: RateKeeper) -> None:
         """How the ticks that are done kept their deadlines. Real time only: another run is never the same."""
@@ -156,8 +173,9 @@ class Recorder:
         Args:
             to_disk: and have it write that, for a power cut: 10 ms and more, which in flight only a `queued` recorder may take.
         """
-        self._can.write("".join([candump_lines(*each) for each in self._frames]).encode())
-        self._frames.clear()
+        self._make()
+        self._can.write("".join(self._lines).encode())
+        self._lines.clear()
         self._writer.flush()
         for file in (self._can, self._mcap) if to_disk else ():
             file.sync()
