@@ -114,9 +114,11 @@ class Supervisor:
         """Says what begins and ends, and does what the gravest one asks for."""
         decisions: list[Decision | None] = []
         alarms = self._failsafes.step(health, self.mode, self.level > Level.NONE, self.armed)
-        begun = [alarm.level for alarm in alarms if alarm.begins and alarm.level > Level.WARN]
+        if not alarms:
+            return decisions
+        begun = any(alarm.begins and alarm.level > Level.WARN for alarm in alarms)
         level = self._failsafes.level
-        acts = self.armed and bool(begun) and level > self.safety
+        acts = self.armed and begun and level > self.safety
         if level <= Level.WARN and self.mode == self._chosen:  # all that acted are over, and have left the mode as it was
             self.level = Level.NONE
         if self.level == Level.NONE:
