@@ -253,8 +253,9 @@ class Estimator:
         return Belief(x, covariance, to_ns)
 
     def _fuse_tag(self, pose: BodyPose) -> None:
-        variance, gate, at = self._tag_variance / pose.tags, self._p.tag_gate**2, self._anchor
-        nis, x, covariance = observation.fuse_tag(at.x, at.covariance, pose.p_wt, pose.lever_b, pose.q_wb, variance, gate)
+        gate, at = self._p.tag_gate**2, self._anchor
+        seen = (pose.p_wt, pose.lever_b, pose.q_wb, self._tag_variance, pose.tags)
+        nis, x, covariance = observation.fuse_tag(at.x, at.covariance, *seen, gate)
         self._anchor = Belief(x, covariance, at.time_ns)
         if not nis <= gate:  # also when it is NaN
             self._refuse(pose)

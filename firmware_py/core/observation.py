@@ -172,10 +172,10 @@ def advance(  # type: ignore[no-untyped-def]
     return x, covariance
 
 
-@njit(f"Tuple((float64,{V},{M}))({V},{M},{V},{V},{V},{V},float64)", cache=True)
-def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, gate):  # type: ignore[no-untyped-def]
-    """`update` by a tag, of which `tag` tells."""
-    residual, h, noise = tag(x, p_wt, lever_b, q_wb, variance)
+@njit(f"Tuple((float64,{V},{M}))({V},{M},{V},{V},{V},{V},float64,float64)", cache=True)
+def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, tags, gate):  # type: ignore[no-untyped-def]
+    """`update` by so many tags of one picture, of which `tag` tells."""
+    residual, h, noise = tag(x, p_wt, lever_b, q_wb, variance / tags)
     return update(x, covariance, residual, h, noise, np.zeros((6, ERRORS)), gate)
 
 
