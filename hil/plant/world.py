@@ -229,20 +229,24 @@ class World(DockedBodies):
         h = 1e-9 * self._step_ns
         self._truths.clear()
         self._escs.clear()
-        self._hands[:] = self._external[:] = 0.0
-        if len(self.vehicles) > 1 and self.jet_strength > 0.0:
-            jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
-            add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._hands)
-        pushed = sorted(set(self.push.nonzero()[0].tolist()))
-        for m in pushed:
-            force, moment = (self._modules.turn[m] @ part for part in np.split(self.push[m], 2))
-            moment += np.cross(self._modules.position[m], force)
-            self._hands[m] += np.concatenate([force, moment])
-        if pushed or len(self.vehicles) > 1:
-            np.add.at(self._external, self._modules.body, self._hands)
+        self._external[:] = 0.0
+        if len(self.vehicles) > 1 or any(self.push.ravel().tolist()):
+            self._touch()
         faces = self.docks.faces if len(self.bodies) > 1 else None
         arrays = (self._body_arrays, self._modules, faces, self._thrusters, self._water)
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
+
+    def _touch(self) -> None:
+        """What jets and hands do to the bodies."""
+        self._hands[:] = 0.0
+        if len(self.vehicles) > 1 and self.jet_strength > 0.0:
+            jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
+            add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._hands)
+        for m in sorted(set(self.push.nonzero()[0].tolist())):
+            force, moment = (self._modules.turn[m] @ part for part in np.split(self.push[m], 2))
+            moment += np.cross(self._modules.position[m], force)
+            self._hands[m] += np.concatenate([force, moment])
+        np.add.at(self._external, self._modules.body, self._hands)
 
     def terms(self) -> tuple[object, ...]:
         """What the worlds of one batch must agree in: water, tank, tick and sub-step.
