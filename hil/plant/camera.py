@@ -15,7 +15,7 @@ from numba import njit
 
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import Tag, Vehicle
-from hil.plant.draw import Noise, stream
+from hil.plant.draw import Noise, stream, uniforms
 from hil.plant.sight import look, solid_boxes
 from hil.plant.spec import CameraPose, SensorSpec
 from hil.plant.world import World
@@ -54,12 +54,12 @@ class _Errors:
     def __init__(self, spec: SensorSpec, seed: int, key: int) -> None:
         self._spec = spec
         self._noise = Noise(stream(seed, "tag_noise", key), 6)
-        self._loss, self._flip = stream(seed, "tag_loss", key), stream(seed, "tag_flip", key)
+        self._loss, self._flip = uniforms(stream(seed, "tag_loss", key)), uniforms(stream(seed, "tag_flip", key))
 
     def draw(self) -> _Drawn:
         """Fresh numbers; always the same count of them."""
-        lost = self._loss.random() < self._spec.tag_dropped
-        return _Drawn(self._noise.take(), lost, self._flip.random() < self._spec.tag_flipped)
+        lost = next(self._loss) < self._spec.tag_dropped
+        return _Drawn(self._noise.take(), lost, next(self._flip) < self._spec.tag_flipped)
 
 
 class Camera:

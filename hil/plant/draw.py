@@ -5,6 +5,7 @@ The magnitude scales numbers that are always drawn, so switching one error off c
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,6 +126,12 @@ def carried(matrix: np.ndarray, position: np.ndarray, turn: np.ndarray) -> np.nd
 
 BLOCK = 1024
 """Random numbers drawn at a time: one call for each sample would cost more than the rest of the sensor."""
+
+
+def uniforms(rng: np.random.Generator) -> Iterator[float]:
+    """Numbers from 0 to 1 for ever, from blocks drawn ahead."""
+    while True:
+        yield from rng.random(BLOCK).tolist()
 
 
 class Noise:
