@@ -221,24 +221,24 @@ class HealthMonitor:
             sigma_m=max(estimate.sigma_p.tolist()),
             nis_ratio=self._nis_ratio,
             rejected_share=self._rejected_share,
-            depth_age_s=_age_s(self._depth_ns, now),
+            depth_age_s=(now - self._depth_ns) * 1e-9,
             depth_heard=self._depth_heard,
-            imu_age_s=_age_s(self._imu_ns, now),
+            imu_age_s=(now - self._imu_ns) * 1e-9,
             voltage_share=min(self._voltage_share.values(), default=math.nan),
             leak=any(self._leak),
             cabin_c=max(self._cabin_c.values(), default=math.nan),
             cabin_change_pa=max(self._cabin_change_pa.values(), default=math.nan),
             stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._modules or now - at <= self._answer_ns]),
             silent=tuple([self._modules[i] for i in _older(self._answered_ns, now - self._answer_ns)]),
-            silent_s=_age_s(min(self._heard_ns), now),
-            bus_silent_s=_age_s(max(self._heard_ns), now),
+            silent_s=(now - min(self._heard_ns)) * 1e-9,
+            bus_silent_s=(now - max(self._heard_ns)) * 1e-9,
             esc_missing=_older(self._esc_ns, now - self._esc_fresh_ns),
             frame_errors_per_s=self._error_rate,
             missed_ticks_per_s=self._missed_rate,
             foreign_sync=now - self._foreign_sync_ns <= FOREIGN_NS,
             foreign_command=now - self._foreign_command_ns <= FOREIGN_NS,
-            ground_age_s=_age_s(self._ground_ns, now, math.nan),
-            pilot_age_s=_age_s(self._pilot_ns, now, math.nan),
+            ground_age_s=_age_s(self._ground_ns, now),
+            pilot_age_s=_age_s(self._pilot_ns, now),
             stick=self._stick,
             outside_m=outside(estimate.p_wb, self._fence) if estimate.placed else math.nan,
             dead=faults.dead,
@@ -333,8 +333,8 @@ TAG_SHARE = 1.0 / 60.0
 """Weight of one tag observation in a mean of a second: tags come at 60 Hz."""
 
 
-def _age_s(at_ns: int | None, now_ns: int, never: float = NEVER_S) -> float:
-    return never if at_ns is None else (now_ns - at_ns) * 1e-9
+def _age_s(at_ns: int | None, now_ns: int) -> float:
+    return math.nan if at_ns is None else (now_ns - at_ns) * 1e-9
 
 
 def _older(times_ns: list[int], oldest_ns: int) -> tuple[int, ...]:
