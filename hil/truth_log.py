@@ -152,8 +152,7 @@ class TruthRecorder:
             channel = self._writer.register_channel(f"/plant/body{leader}", "protobuf", self._body_schema)
             self._bodies[leader] = (channel, self._body_layout.row())
         channel, row = self._bodies[leader]
-        member = np.zeros(len(self._modules))
-        member[list(modules)] = 1.0
+        member = [float(module in modules) for module in range(len(self._modules))]
         self._add(channel, time_ns, row, (tick, time_ns, member, p_wb, q_wb, v_w, w_b, np.zeros(6) if load is None else load))
 
     def record(
