@@ -178,8 +178,12 @@ def test_e_stop_that_only_a_module_has_heard_is_latched_after_another_was_cleare
     stopped = GOOD._replace(stopped=(0,))
     supervisor.step(False, stopped, [])
     assert ask(supervisor, Action.CLEAR_ESTOP, None, at(stopped, 0.2)) and supervisor.state == State.DISARMED
-    for health in (at(stopped, 0.21), at(stopped, 9.0), at(GOOD, 9.01)):
+    for health in (at(stopped, 0.21), at(stopped, 9.0)):
         assert supervisor.step(False, health, []) == [], "its modules may take their time"
+    whole = Supervisor(P)
+    whole.take_over([supervisor, supervisor_in(State.DISARMED)])
+    assert whole.step(False, at(stopped, 9.01), []) == [], "also in the body that they became part of"
+    assert supervisor.step(False, at(GOOD, 9.01), []) == []
     whole = Supervisor(P)
     whole.take_over([supervisor])
     for robot in (supervisor, whole):
