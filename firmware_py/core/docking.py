@@ -132,21 +132,21 @@ class DockingStage:
         """Plans of these have been asked for, in this order."""
         self._expected.update((body, request) for request in requests)
 
-    def leave(self, body: Body, surfaces: bool, holding: Collection[int]) -> Decisions:
+    def leave(self, body: Body, surfaces: bool) -> Decisions:
         """The body is not in the mode DOCK: its docks and undocks end at once, for nothing that they want moves it any more. One that
         `surfaces` nobody docks to either: he would follow it up. A target that was coming goes back to where it held.
 
         An open joint is parted all the same: that its modules are apart is no wish.
         """
-        self.events, decisions = [], Decisions({}, [], [], [], {})
+        self.events, decisions = [], Decisions({}, [], [], [], {}, [])
         for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._holds(each.plan)]:
             self._undocks.remove(undock)
             self.relays.switch(RELAY_PULL, *undock.plan.opens)
             self._say(WARNING, f"undock of module {undock.plan.opens[0].module} ended: {NO_LONGER}")
         for dock in [each for each in self._docks if each.active == body.index]:
-            self._give_up(dock, NO_LONGER, holding, decisions)
+            self._give_up(dock, NO_LONGER, decisions)
         for dock in [each for each in self._docks if surfaces and each.target == body.index]:
-            self._give_up(dock, SURFACES, holding, decisions)
+            self._give_up(dock, SURFACES, decisions)
             self._end(dock.active, decisions)
         return decisions
 
@@ -167,7 +167,7 @@ class DockingStage:
             resting: modules and faces whose magnets are off whatever is wanted.
         """
         self.events, self.records = [], []
-        decisions = Decisions({}, [], [], [], {})
+        decisions = Decisions({}, [], [], [], {}, [])
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)
@@ -206,7 +206,7 @@ class DockingStage:
             self._begin_undock(plan, prepared.chains, time_ns)
         else:
             if under_way is not None:
-                self._give_up(under_way, ANOTHER, holding, decisions)
+                self._give_up(under_way, ANOTHER, decisions)
             self._begin_dock(prepared, plan, time_ns, estimates, holding)
 
     def _refusal(self, prepared: Prepared, estimates: Mapping[int, tuple[Body, Estimate]], waiting: Collection[int]) -> str:
@@ -240,12 +240,12 @@ class DockingStage:
         self._docks.remove(dock)
         self.relays.switch(RELAY_OFF, *dock.sequence.plan.closes)
 
-    def _give_up(self, dock: _Dock, reason: str, holding: Collection[int], decisions: Decisions) -> None:
+    def _give_up(self, dock: _Dock, reason: str, decisions: Decisions) -> None:
         """Ends a dock before its end; a target that was coming goes back to where it held."""
         self._drop(dock)
         self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: {reason}")
-        if dock.target in holding:
-            decisions.move(dock.target, -dock.sequence.met_w)
+        if dock.sequence.met_w.any():
+            decisions.returning.append(dock.target)
 
     def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
         apart = [modules_of(joint) for joint in self.open_joints(APART)]
@@ -304,7 +304,7 @@ class DockingStage:
         else:
             decisions.setpoints[dock.active] = steering.active
         if steering.meets is not None:
-            decisions.move(dock.target, steering.meets)
+            decisions.meets[dock.target] = steering.meets
 
     def _end(self, active: int, decisions: Decisions) -> None:
         """The body is done with docking, but for what it still waits for the plan of, and an undock under way."""

@@ -51,12 +51,10 @@ class Decisions(NamedTuple):
     """Bodies whose dock is over without a join: they hold where they are."""
     meets: dict[int, np.ndarray]
     """By body: (3,) how far it comes to meet the other, world, m, from where it holds."""
+    returning: list[int]
+    """Bodies that came to meet one whose dock is called off."""
 
     @property
     def joining(self) -> set[int]:
         """Bodies that take part in a join of this tick."""
         return {body for join in self.joins for body in (join.active, join.target)}
-
-    def move(self, body: int, by_w: np.ndarray) -> None:
-        """Adds to what a body comes."""
-        self.meets[body] = self.meets.get(body, 0.0) + by_w

@@ -61,7 +61,7 @@ class Formation:
         supervisor = chain.supervisor
         if supervisor.mode != Mode.DOCK:
             surfaces = supervisor.armed and supervisor.mode == Mode.SURFACE
-            self._steer(self.docking.leave(chain.body, surfaces, self._armed_in(Mode.POSHOLD)))
+            self._steer(self.docking.leave(chain.body, surfaces))
             outputs.events += [event._replace(body=chain.body.index) for event in self.docking.events]
 
     def _miss_partners(self, outputs: Outputs) -> None:
@@ -95,8 +95,10 @@ class Formation:
     def _steer(self, decisions: Decisions) -> None:
         for chain in self.chains:
             number = chain.body.index
+            if number in decisions.returning:
+                chain.guidance.go_back()
             if number in decisions.meets:
-                chain.guidance.move_by(decisions.meets[number])
+                chain.guidance.meet(decisions.meets[number])
             if number in decisions.setpoints:
                 chain.guidance.dock(decisions.setpoints[number])
             elif number in decisions.ended:

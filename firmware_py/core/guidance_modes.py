@@ -67,6 +67,8 @@ class Guidance:
         self._trajectory: Trajectory | None = None
         self._start_ns: int | None = None
         self._goal: Wish | None = None
+        self._met: tuple[Wish, Wish | None] | None = None
+        """Where it held before it came to meet another body, and where it was to come."""
         self._upright = self._lost = self._led = False
         self._point: tuple[int, Setpoint] | None = None
         self._docking: Setpoint | Wish | None = None
@@ -147,9 +149,24 @@ class Guidance:
 
     def move_by(self, by_w: np.ndarray) -> None:
         """POSHOLD's place, or the one that it is on its way to, moves by so much (3,), world, m."""
-        at = self._glider.at
-        goal = self._goal or Wish(ZERO, ZERO, at.p_wb, at.q_wb)
+        goal = self._held()
         self._goal = goal._replace(p_wb=self._inside(goal.p_wb + by_w))
+
+    def meet(self, by_w: np.ndarray) -> None:
+        """POSHOLD's place comes so much (3,), world, m, to meet another body."""
+        before = self._held()
+        self.move_by(by_w)
+        self._met = before, self._goal
+
+    def go_back(self) -> None:
+        """To where it held before it came to meet another body; one that has been sent or steered elsewhere since stays there."""
+        if self._met is not None and self._goal is self._met[1]:
+            self._goal = self._met[0]
+
+    def _held(self) -> Wish:
+        """POSHOLD's place, or the one that it is on its way to."""
+        at = self._glider.at
+        return self._goal or Wish(ZERO, ZERO, at.p_wb, at.q_wb)
 
     def finished(self, time_ns: int) -> bool:
         """Whether no trajectory is under way."""

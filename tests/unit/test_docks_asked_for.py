@@ -7,6 +7,7 @@ from firmware_py.core.docking import CHANGED, LED, NO_LONGER, SURFACES
 from firmware_py.core.docking_decisions import Decisions, Join
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.rotations import from_euler
+from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Mode, Request, Sticks
 from firmware_py.description.parameters import Parameters
@@ -338,6 +339,24 @@ def test_target_that_comes_goes_back_when_the_dock_is_called_off() -> None:
     np.testing.assert_allclose(goal.p_wb, held, atol=0.02)
 
 
+ELSEWHERE = Request(Action.HOLD, 0, rest_at(np.array([1.0, -0.5, 0.8]), np.array([1.0, 0.0, 0.0, 0.0])))
+LEFTWARDS = Request(Action.STICKS, 0, Sticks((0.0, -1.0, 0.0), (0.0, 0.0, 0.0)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("move", [ELSEWHERE, LEFTWARDS], ids=["sent", "steered"])
+def test_target_that_came_and_was_moved_by_a_person_since_stays_there_when_the_dock_is_called_off(move: Request) -> None:
+    tank = before_each_other(3.0)
+    tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    guidance = tank.pipeline.formation.chains[0].guidance
+    assert guidance._goal is not None
+    tank.run(1.0, move)
+    goal = guidance._goal
+    outputs = tank.run(1.0, Request(Action.SET_MODE, 1, Mode.POSHOLD))
+    assert outputs.docks == [] and tank.when(f"dock of module 1 ended: {NO_LONGER}")
+    assert guidance._goal is goal and (goal is None) == (move is LEFTWARDS)
+
+
 @pytest.mark.slow
 def test_nobody_docks_to_a_body_that_surfaces() -> None:
     tank = before_each_other(2.0)
@@ -404,7 +423,7 @@ def test_undock_that_ends_in_the_tick_of_a_join_is_not_said_to_be_done() -> None
     stage = tank.pipeline.formation.docking
     tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 3, 0, 2)))
     (undock,) = stage._undocks
-    decisions = Decisions({}, [Join(0, 7, None)], [], [], {})
+    decisions = Decisions({}, [Join(0, 7, None)], [], [], {}, [])
     estimates = {0: (tank.pipeline.bodies[0], tank.outputs[-1].records[0].estimate)}
     stage._release(undock, undock.until_ns, estimates, decisions)
     assert decisions.parts == [] and stage._undocks == [undock]
