@@ -189,9 +189,17 @@ def _join_jump_n(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) 
 
 def _members(truths: Mapping[str, Columns], leader: int, tick: int, thrusters: int) -> np.ndarray:
     """Modules of a body that has so many thrusters for the firmware: those of the true one when it last had as many, for it joins first."""
-    true = truths[f"/plant/body{leader}"]
+    true = _body_with(truths, leader)
     alike = (true["tick"] < tick) & (_thrusters(truths, true) == thrusters)
     return np.flatnonzero(true["member"][alike][-1:].any(axis=0))
+
+
+def _body_with(truths: Mapping[str, Columns], module: int) -> Columns:
+    """The true body that has a module, tick by tick: it bears the number of its lowest one, and the firmware's that of its leader."""
+    rows = [(columns, columns["member"][:, module] > 0.0) for name, columns in truths.items() if name.startswith("/plant/body")]
+    found = {name: np.concatenate([columns[name][inside] for columns, inside in rows]) for name in ("tick", "member", "p_wb")}
+    order = np.argsort(found["tick"])
+    return {name: column[order] for name, column in found.items()}
 
 
 def _thrusters(truths: Mapping[str, Columns], true: Columns) -> np.ndarray:
@@ -205,10 +213,10 @@ def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]
     NaN without any.
     """
     squares = [np.zeros(0)]
-    for name, true in truths.items():
-        believed = signals.get(name.replace("/plant/body", "/firmware/body"))
-        if not name.startswith("/plant/body") or believed is None:
+    for name, believed in signals.items():
+        if not name.startswith("/firmware/body"):
             continue
+        true = _body_with(truths, int(name.removeprefix("/firmware/body")))
         _, mine, theirs = np.intersect1d(true["tick"], believed["tick"], return_indices=True)
         forces = np.isfinite(believed["commanded_n"][theirs]).sum(axis=1)
         members = (true["member"][mine] > 0.0).sum(axis=1)

@@ -152,3 +152,20 @@ def test_place_of_a_joined_body_counts_beside_a_robot_with_fewer_thrusters() -> 
     setpoint = truths["/plant/body1"]["p_wb"] + [0.0, 0.003, 0.0]
     believed = {"tick": TICKS, "commanded_n": np.zeros((100, 16)), "setpoint_p_wb": setpoint, "ready": np.ones(100, np.uint8)}
     assert _docked_rmse_m(truths, {"/firmware/body1": believed}) == pytest.approx(0.003)
+
+
+def test_body_of_which_the_target_has_the_higher_number_is_judged_as_any_other() -> None:
+    """The plant names it by its lowest module, 0; the firmware by its first, which is the target's, 1."""
+    truths = truth_of([APART, PAIR, APART, PAIR], PLACES)
+    for module in range(3):
+        truths[f"/plant/module{module}"]["force_n"] = np.zeros((100, 8))
+    joined = ((TICKS > 26) & (TICKS <= 50)) | (TICKS > 76)
+    force_n = np.select([(TICKS > 26) & (TICKS <= 50), TICKS > 76], [0.2, -0.7])[:, None] + np.ones(16)
+    both = np.where(joined[:, None] | (np.arange(16) < 8), force_n, np.nan)
+    docks = {"tick": np.array([27, 77]), "stage": np.array([DECLARED] * 2), "module_a": np.ones(2, int), "module_b": np.zeros(2, int)}
+    setpoint = np.mean(PLACES[:2], axis=0) + np.array([0.0, 0.004, 0.0])
+    target = {"tick": TICKS, "commanded_n": both, "setpoint_p_wb": np.tile(setpoint, (100, 1)), "ready": np.ones(100, np.uint8)}
+    active = {name: column[~joined] for name, column in target.items()} | {"commanded_n": force_n[~joined, 8:]}
+    signals = {"/firmware/body1": target, "/firmware/docks": docks, "/firmware/body0": active}
+    assert _join_jump_n(truths, signals) == pytest.approx(0.7)
+    assert _docked_rmse_m(truths, signals) == pytest.approx(0.004)
