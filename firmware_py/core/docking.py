@@ -27,6 +27,7 @@ from firmware_py.core.magnet_relays import MagnetRelays
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
 from firmware_py.core.types import (
     INFORMATION,
+    NEVER_NS,
     RELAY_OFF,
     RELAY_PULL,
     RELAY_PUSH,
@@ -354,7 +355,7 @@ class DockingStage:
         at once the funnels hold back what leaves across, until thrusters draw it out.
         """
         watched = zip(self._watched, self._joints.rows, strict=True)
-        held = [modules_of(joint.request) for joint, row in watched if row["holds"][POSITION]]
+        held = [modules_of(j.request) for j, row in watched if row["holds"][POSITION] and row["candidate_ns"][POSITION] == NEVER_NS]
         return len(plan.opens) == 1 and modules_of(plan.opens[0]) in held
 
     def _say(self, severity: int, text: str) -> None:

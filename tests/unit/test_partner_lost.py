@@ -243,6 +243,23 @@ def test_joint_that_a_hanging_relay_holds_is_not_taken_for_undocked() -> None:
     assert tank.shape == [(0, 1), (2,)]
 
 
+def test_undock_whose_pictures_show_it_leaving_is_done_though_that_is_not_yet_believed() -> None:
+    tank = Docked(RING[:2], Parameters().replace("docking.release_s", 0.5).replace("docking.debounce_ms", 1000.0))
+    tank.run(2.0)
+    tank.fly()
+    tank.stuck, hear = True, tank._hear
+
+    def see_it_leave(tick: int) -> list[ModuleInputs]:
+        modules, away = hear(tick), 0.001 * (tick - first)
+        for tag in modules[1].tags:
+            tag.p_wt[0] += away
+        return modules
+
+    first, tank._hear = len(tank.outputs), see_it_leave  # type: ignore[method-assign]
+    tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.shape == [(0,), (1,)] and not any(IN_PLACE in said for _, said in tank.said)
+
+
 @pytest.mark.slow
 def test_partner_that_is_being_undocked_is_not_lost() -> None:
     """While the magnets push, currents and pictures say that the joint is open: it is wanted so."""
