@@ -241,10 +241,10 @@ def test_pilots_depth_hold_needs_no_tags() -> None:
 
 @pytest.mark.parametrize(("figure", "value"), [("imu_age_s", 0.6), ("pilot_age_s", 1.1)])
 def test_pilots_depth_hold_without_tags_is_his_again_when_the_fail_safe_that_kept_it_is_over(figure: str, value: float) -> None:
-    """A moment without IMU or sticks brought the robot up 22 s later, with its pilot at the sticks."""
+    """A moment without IMU or sticks brought the robot up 22 s later, with its pilot at the sticks. Others may warn meanwhile."""
     supervisor = supervisor_in(mode=Mode.ALT_HOLD)
     for tenth in range(300):
-        health = UPRIGHT._replace(**{figure: value}) if tenth < 3 else UPRIGHT
+        health = (UPRIGHT._replace(**{figure: value}) if tenth < 3 else UPRIGHT)._replace(dead=(3,))
         supervisor.step(False, at(health, tenth / 10), [])
         assert supervisor.level == (Level.HOLD if tenth < 23 else Level.NONE)
     whole = supervisor_in()
