@@ -218,13 +218,11 @@ class GroundStation:
         target = message.values.get("target_system", message.values.get("target", 0))
         arrival = Arrival(message, channel, time_ns, trusted)
         component = message.values.get("target_component", 0)
-        is_ours = target in self.services and component in (0, COMPONENT_AUTOPILOT)
-        if not is_ours:
+        is_for_autopilots = component in (0, COMPONENT_AUTOPILOT)
+        if not (is_for_autopilots and target in self.services):
             self._forward(packet, target, component, channel)
-        if target and not is_ours:
-            return
         for number, services in self.services.items():
-            if target in (0, number):
+            if is_for_autopilots and target in (0, number):
                 services.take(arrival, target == number)
 
     def _route(self, sender: Sender, channel: int) -> None:

@@ -91,9 +91,20 @@ def test_component_zero_and_system_zero_are_accepted(world: World, client: Clien
     client.command(410, target=0, component=0)
     assert acknowledged(world, client, 410) == mavlink.MAV_RESULT_ACCEPTED
     client.clear()
-    client.command(410, component=154)
+    for target in (1, 0):
+        client.command(410, target=target, component=154)
     world.run(3)
     assert not client.all("COMMAND_ACK"), "another component's command is not ours"
+
+
+def test_what_is_for_a_camera_of_every_system_neither_arms_nor_reboots_a_robot(client: Client, world: World) -> None:
+    other = world.client(system=7)
+    other.heartbeat(mavlink.MAV_TYPE_CAMERA)
+    for number in (246, 400):
+        client.command(number, 1, target=0, component=mavlink.MAV_COMP_ID_CAMERA)
+    world.run(3)
+    assert not world.robot.asked and not world.station.reboot_asked
+    assert [m.command for m in other.all("COMMAND_LONG")] == [246, 400], "they are passed on"
 
 
 @pytest.mark.parametrize(
