@@ -312,6 +312,8 @@ class MissionFlight:
         legs: list[Leg] = []
         speeds = [item for item in self.items[:first] if item.speed_m_s is not None]  # one that was passed goes on to count
         for item in (*speeds, *flight_order(self.items, first)):
+            if item.sequence < self._first:
+                continue  # home, to which a jump leads
             if item.speed_m_s is not None:
                 speed = item.speed_m_s if item.speed_m_s > 0 else math.nan
             place = item.place(origin)

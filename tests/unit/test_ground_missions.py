@@ -390,6 +390,20 @@ def test_ardupilots_missions_begin_with_home_which_is_not_flown() -> None:
     assert [leg.sequence for leg in job.legs] == [1, 2]
 
 
+def test_jump_to_home_flies_to_no_home_that_may_lie_outside_the_fence() -> None:
+    world = World(config=GroundConfig(identity="ardusub"))
+    client = world.client()
+    home = item(0, (302184000, 1201614000, 100.0), frame=0)  # a kilometre away
+    jump = item(2, (0, 0, 0), command=177, frame=2, p=(0, 1, 0, 0))
+    assert upload(world, client, [home, item(1, PLACES[0]), jump, item(3, PLACES[1])]) == mavlink.MAV_MISSION_ACCEPTED
+    client.command(400, 1)
+    world.run(3)
+    client.command(300, 0, 0)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [1, 1, 3]
+
+
 def test_a_mission_is_refused_disarmed_or_when_there_is_none(world: World, client: Client) -> None:
     client.command(300, 0, 0)
     world.run(2)
