@@ -139,6 +139,9 @@ class MissionService:
         if len(upload.items) < upload.count:
             self._ask(upload, arrival.time_ns)
             return
+        if upload.in_part and self._flight.flies:  # it was started meanwhile
+            self._end(arrival, _DENIED, upload.kind)
+            return
         (self._flight.amend if upload.in_part else self._flight.replace)((*upload.items, *upload.rest))
         self._end(arrival, _ACCEPTED, upload.kind)
 

@@ -600,6 +600,18 @@ def test_part_of_a_mission_is_written_over(world: World, client: Client) -> None
     assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_UNSUPPORTED
 
 
+def test_part_of_a_mission_that_was_started_meanwhile_is_not_written_over(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    before = world.station.services[1].flight.items
+    client.clear()
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 2, 0)
+    fly(world, client)
+    client.send("MISSION_ITEM_INT", *item(2, PLACES[0]), 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_DENIED
+    assert world.station.services[1].flight.items == before
+
+
 def planning(world: World, client: Client) -> PlanJob:
     """Armed, the mission started, its plan under way."""
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
