@@ -234,9 +234,10 @@ class GroundSide:
         return max(1.0 + _AFTER - since, min(since / 2, _LONGEST)) * self._period_ns * 1e-9
 
     def _plan(self) -> None:
-        """Hand out what is to be planned; take back what is."""
+        """Hand out what is to be planned, in place of what was to be for the same body; take back what is."""
         bodies = {body.index: body for body in self._pipeline.bodies}
         for job in self.station.jobs():
+            self._plans = [(other, future) for other, future in self._plans if other.body != job.body or not future.cancel()]
             self._plans.append((job, self._begin(job, bodies.get(job.body))))
         for job, future in list(self._plans):
             if not future.done():

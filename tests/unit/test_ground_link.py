@@ -27,7 +27,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.link import Channel, Links
 from firmware_py.ground.logs import LogService
-from firmware_py.ground.mission_flight import Plan
+from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.signing import load_signing
 from firmware_py.ground.telemetry import DEFAULT_HZ
 from firmware_py.ground.transport import LinkError, open_link
@@ -570,6 +570,30 @@ def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_
         wait([future for _, future in side._plans], PATIENCE_S)
         side.pump()
     assert plans.qsize() == 2
+
+
+def test_plans_that_nobody_waits_for_any_more_are_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that moves the robot's goal on five times a second waited minutes for the last one."""
+    may_end, planned = threading.Event(), list[tuple[int, int]]()
+
+    def plan(job: PlanJob, body: object) -> Plan:
+        may_end.wait(PATIENCE_S)
+        planned.append((job.body, job.serial))
+        return Plan(job.serial, None, ())
+
+    monkeypatch.setattr("firmware_py.app.ground_station._plan_mission", plan)
+    firmware: Any = SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(2), parameters=Parameters())
+    config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",))
+    with ThreadPoolExecutor(1) as executor, closing(GroundSide(config, firmware, executor)) as side:
+        side.station.services[2].flight.jobs.append(_NOTHING._replace(body=1))
+        side.pump()
+        for serial in range(100):
+            side.station.services[1].flight.jobs.append(_NOTHING._replace(serial=serial))
+            side.pump()
+        may_end.set()
+        wait([future for _, future in side._plans], PATIENCE_S)
+        side.pump()
+        assert side._plans == [] and planned == [(1, 0), (0, 99)]
 
 
 def test_robot_that_is_stopped_waits_for_no_plan_that_is_being_made() -> None:
