@@ -71,7 +71,8 @@ class CommandService:
 
     def hear(self, event: Event) -> None:
         """An event of the tick: it may refuse what is pending, of several the first whose wish is not there, else the newest."""
-        asked = [pending for pending in self._pending if event.text.startswith(f"{pending.action.name} refused")]
+        text = event.text.removeprefix("FORCED_")
+        asked = [pending for pending in self._pending if text.startswith(f"{pending.action.name} refused")]
         if asked:
             self._finish(next((pending for pending in asked if not pending.is_done()), asked[-1]), DENIED)
 

@@ -5,11 +5,13 @@ import math
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Event, Mode
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.identity import px4
 from tests.unit.ground_requests import NAN, acknowledged, actions, ask
 from tests.unit.ground_world import Client, World
+from tests.unit.supervisors import GOOD, supervisor_in
 
 
 def test_arm_is_acknowledged_when_the_supervisor_has_granted_it(world: World, client: Client) -> None:
@@ -191,6 +193,16 @@ def test_reboot_is_denied_while_an_emergency_stop_stands(world: World, client: C
     assert "reboot refused: the e-stop is not cleared" in client.texts
     ask(world, client, 31013)
     assert ask(world, client, 246, 1) == mavlink.MAV_RESULT_ACCEPTED
+
+
+def test_forced_arming_that_the_supervisor_refuses_is_denied_at_once(world: World, client: Client) -> None:
+    client.command(400, 1, 21196)
+    (forced,) = world.station.requests()
+    supervisor = supervisor_in(State.DISARMED)
+    supervisor.step(False, GOOD._replace(silent=(0,)), [forced])
+    world.robot.events = supervisor.events
+    world.run(2)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_DENIED
 
 
 def test_one_refusal_answers_one_command(world: World, client: Client) -> None:
