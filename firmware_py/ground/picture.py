@@ -17,6 +17,8 @@ from firmware_py.description.parameters import Supervision
 from firmware_py.ground.times import Times
 
 _THRUSTERS = 8
+ESC_SILENT = 3
+"""EscStatus of one that is not heard."""
 _MOST_EVENTS = 64
 
 
@@ -33,7 +35,7 @@ class ModulePicture:
     dock_current_ma: list[float] = field(default_factory=lambda: [math.nan] * 6)
     rpm: list[float] = field(default_factory=lambda: [0.0] * _THRUSTERS)
     esc_current_a: list[float] = field(default_factory=lambda: [0.0] * _THRUSTERS)
-    esc_status: list[int] = field(default_factory=lambda: [0] * _THRUSTERS)
+    esc_status: list[int] = field(default_factory=lambda: [ESC_SILENT] * _THRUSTERS)
     esc_frames: int = 0
     command: np.ndarray = field(default_factory=lambda: np.zeros(_THRUSTERS))
     """(8,) share of full command, as sent."""

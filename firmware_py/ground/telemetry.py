@@ -14,7 +14,7 @@ from firmware_py.core.types import BodyRecord
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.ground.geodesy import Origin
 from firmware_py.ground.identity import TYPE_SUBMARINE, Identity, base_mode
-from firmware_py.ground.picture import ModulePicture, Picture
+from firmware_py.ground.picture import ESC_SILENT, ModulePicture, Picture
 from firmware_py.ground.times import histograms, load_permille
 
 Values = Mapping[str, Any]
@@ -230,15 +230,26 @@ def esc_status(s: Subject) -> list[Values]:
     } for i, m in enumerate(s.modules) for first in (0, 4)]  # fmt: skip
 
 
+_ESC_FAILURES = (0, 64, 4, 0)
+"""ESC_FAILURE_FLAGS of each EscStatus: none, generic, over temperature; one that is silent is offline."""
+_BY_CAN = 4
+"""ESC_CONNECTION_TYPE."""
+
+
 def esc_info(s: Subject) -> list[Values]:
     count = 8 * len(s.modules)
-    now = s.picture.time_ns
     return [{
         "index": 8 * i + first, "time_usec": s.time_us, "counter": m.esc_frames & 0xFFFF, "count": count,
-        "connection_type": 5,  # CAN
-        "info": 0x0F if now - m.answered_ns < _SENSOR_FRESH_NS else 0, "failure_flags": m.esc_status[first : first + 4],
+        "connection_type": _BY_CAN, "info": _online(s, m, first),
+        "failure_flags": [_ESC_FAILURES[status] for status in m.esc_status[first : first + 4]],
         "error_count": (0, 0, 0, 0), "temperature": (0x7FFF,) * 4,
     } for i, m in enumerate(s.modules) for first in (0, 4)]  # fmt: skip
+
+
+def _online(s: Subject, m: ModulePicture, first: int) -> int:
+    """A bit for each of four ESCs that is heard, by a module that answers."""
+    answers = s.picture.time_ns - m.answered_ns < _SENSOR_FRESH_NS
+    return sum(1 << n for n, status in enumerate(m.esc_status[first : first + 4]) if answers and status != ESC_SILENT)
 
 
 def scaled_pressure(s: Subject) -> list[Values]:

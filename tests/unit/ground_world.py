@@ -79,7 +79,7 @@ class Robot:
         return ModuleInputs(
             gyro=ZERO, accel=ZERO, pressure_pa=106_000.0, docks=[DockFeedback(0, (100.0, 0.0, 0.0), (1, 0, 0))], voltage_v=12.1,
             current_a=2.5, cabin_temperature_c=25.5, cabin_pressure_pa=101_300.0, leak=False, answered=True, heard=True,
-            esc=[EscFeedback(2, (900.0, -450.0), (1.5, 0.5), (0, 4))],
+            esc=[EscFeedback(2, (900.0, -450.0), (1.5, 0.5), (0, 2)), EscFeedback(4, (0.0, 0.0), (0.0, 0.0), (1, 3))],
         )  # fmt: skip
 
     def _take(self, request: Request) -> list[Event]:

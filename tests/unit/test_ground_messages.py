@@ -168,7 +168,9 @@ def test_esc_messages_decode_with_a_dialect_that_mavgen_made(world: World, clien
     assert [m.index for m in statuses] == [m.index for m in info] == [0, 4], "eight ESCs, four in a message"
     assert (statuses[0].rpm, statuses[0].current) == ([0, 0, 900, -450], [0.0, 0.0, 1.5, 0.5])
     assert statuses[0].voltage == pytest.approx([12.1] * 4)
-    assert (info[0].count, info[0].info, info[0].connection_type, info[0].failure_flags) == (8, 15, 5, [0, 0, 0, 4])
+    over_temperature, generic, can = 4, 64, 4  # ESC_FAILURE_FLAGS and ESC_CONNECTION_TYPE of MAVLink's own common.xml
+    assert [(m.count, m.info, m.connection_type) for m in info] == [(8, 0b1100, can), (8, 0b0001, can)], "the others are silent"
+    assert [m.failure_flags for m in info] == [[0, 0, 0, over_temperature], [generic, 0, 0, 0]]
 
 
 def test_frames_carry_the_checksum_that_pymavlink_computes(client: Client) -> None:
