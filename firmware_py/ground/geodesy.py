@@ -36,7 +36,8 @@ class Origin:
         """Latitude and longitude, deg, and altitude, m, of a point (3,) NED, m."""
         north, east = self._radii()
         latitude = self.latitude_deg + math.degrees(p_w[0] / north)
-        return latitude, self.longitude_deg + math.degrees(p_w[1] / east), self.altitude_m - float(p_w[2])
+        longitude = math.remainder(self.longitude_deg + math.degrees(p_w[1] / east), 360.0)
+        return latitude, longitude, self.altitude_m - float(p_w[2])
 
     def local(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> np.ndarray:
         """(3,) NED, m, of a place."""

@@ -207,7 +207,9 @@ def test_places_are_about_the_tanks_origin() -> None:
     assert origin.local(30.2084, 120.1624, 4.0) == pytest.approx([0.0, east * 1e-3, 0.0], abs=1e-3)
     for p in ([0.1, -0.2, 0.5], [50.0, 80.0, -3.0]):
         assert origin.local(*origin.geodetic(np.array(p))) == pytest.approx(p, abs=1e-6)
-    assert Origin(0.0, 179.9999, 0.0).local(0.0, -179.9999, 0.0)[1] == pytest.approx(22.26, abs=0.01)
+    date_line = Origin(0.0, 179.9999, 0.0)
+    assert date_line.local(0.0, -179.9999, 0.0)[1] == pytest.approx(22.26, abs=0.01)
+    assert date_line.geodetic(np.array([0.0, 22.264, 0.0]))[1] == pytest.approx(-179.9999, abs=1e-7), "no client takes more than 180"
 
 
 def test_mission_starts_by_mode_holds_first_and_tracks_the_plan(world: World, client: Client) -> None:
