@@ -35,6 +35,7 @@ class Identity:
         numbers: custom mode of each mode; the first is what is reported.
         pairs: the second and third parameter of DO_SET_MODE are a main and a sub mode, as PX4 has it.
         mission_has_home: item 0 of a mission is the home position and is not flown, as ArduPilot has it.
+        first_log: number of the oldest log. QGroundControl counts from 1 for ArduPilot alone.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Identity:
     numbers: Mapping[Mode, tuple[int, ...]]
     pairs: bool
     mission_has_home: bool
+    first_log: int
 
     def custom_mode(self, mode: Mode) -> int:
         """The number that HEARTBEAT carries."""
@@ -85,6 +87,7 @@ GENERIC = Identity(
     },
     pairs=True,
     mission_has_home=False,
+    first_log=0,
 )
 
 ARDUSUB = Identity(
@@ -93,6 +96,7 @@ ARDUSUB = Identity(
     numbers={mode: (int(mode),) for mode in Mode},
     pairs=False,
     mission_has_home=True,
+    first_log=1,
 )
 
 IDENTITIES = {identity.name: identity for identity in (GENERIC, ARDUSUB)}

@@ -28,15 +28,17 @@ class _Transfer:
 @dataclass(slots=True)
 class _Listing:
     arrival: Arrival
-    next: int
     last: int
+    next: int | None = None
+    """None before the folder was looked at."""
 
 
 class LogService:
-    """The logs of one process, oldest first, numbered from 1. They go out where nothing else waits to be sent."""
+    """The logs of one process, oldest first. They go out where nothing else waits to be sent."""
 
     def __init__(self, system: System, folder: Path | None) -> None:
         self._system, self._folder = system, folder
+        self._first = system.subject.identity.first_log
         self._transfer: _Transfer | None = None
         self._listings: dict[int, _Listing] = {}
         """By channel."""
@@ -85,26 +87,27 @@ class LogService:
         t.left -= len(data)
 
     def _list(self, arrival: Arrival) -> None:
-        self._listings[arrival.channel] = _Listing(arrival, 0, arrival.message["end"])
+        self._listings[arrival.channel] = _Listing(arrival, arrival.message["end"])
 
     def _tell(self, listing: _Listing) -> None:
         """The folder is looked at once for a list, not for each request of a flood."""
         arrival = listing.arrival
-        if listing.next == 0:
+        if listing.next is None:
             self._files = self._find()
-            listing.next, listing.last = max(arrival.message["start"], 1), min(listing.last, len(self._files))
+            listing.next = max(arrival.message["start"], self._first)
             if not self._files:
                 self._system.send(arrival.channel, "LOG_ENTRY", {})
-        first, listing.next = listing.next, listing.next + _ENTRIES_AT_ONCE
-        if listing.next > listing.last:
+        newest = self._first + len(self._files) - 1
+        last, first, listing.next = min(listing.last, newest), listing.next, listing.next + _ENTRIES_AT_ONCE
+        if listing.next > last:
             del self._listings[arrival.channel]
-        for number in range(first, min(listing.next - 1, listing.last) + 1):
+        for number in range(first, min(listing.next - 1, last) + 1):
             try:
-                status = self._files[number - 1].stat()
+                status = self._files[number - self._first].stat()
             except OSError:
                 continue
             values = {
-                "id": number, "num_logs": len(self._files), "last_log_num": len(self._files),
+                "id": number, "num_logs": len(self._files), "last_log_num": newest,
                 "time_utc": int(status.st_mtime), "size": status.st_size,
             }  # fmt: skip
             self._system.send(arrival.channel, "LOG_ENTRY", values)
@@ -113,8 +116,8 @@ class LogService:
         number = arrival.message["id"]
         if not self._files:
             self._files = self._find()
-        if number in range(1, len(self._files) + 1):
-            path = self._files[number - 1]
+        if number - self._first in range(len(self._files)):
+            path = self._files[number - self._first]
             self._transfer = _Transfer(arrival, number, path, arrival.message["ofs"], arrival.message["count"])
 
     def _end(self, arrival: Arrival) -> None:

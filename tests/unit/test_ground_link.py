@@ -281,7 +281,7 @@ def test_answers_find_their_way_while_a_log_is_fetched_over_a_radio(tmp_path: Pa
     (tmp_path / "can.log").write_bytes(bytes(1_000_000))
     world = World(config=GroundConfig(logs=str(tmp_path)))
     client = world.client()
-    client.send("LOG_REQUEST_DATA", 1, 1, 1, 0, 0xFFFFFFFF)
+    client.send("LOG_REQUEST_DATA", 1, 1, 0, 0, 0xFFFFFFFF)
     world.station.spare({client.channel})
     world.run(50)
     assert not client.all("LOG_DATA") and client.all("HEARTBEAT")
@@ -294,7 +294,7 @@ def test_client_that_leaves_with_an_answer_to_come_leaves_nothing_behind(tmp_pat
     (tmp_path / "can.log").write_bytes(bytes(1_000_000))
     world = World(config=GroundConfig(logs=str(tmp_path)))
     client = world.client()
-    client.send("LOG_REQUEST_DATA", 1, 1, 1, 0, 0xFFFFFFFF)
+    client.send("LOG_REQUEST_DATA", 1, 1, 0, 0, 0xFFFFFFFF)
     client.command(400, 1)
     world.station.leave(client.channel)
     world.run(3)
@@ -608,24 +608,27 @@ def test_robot_that_is_stopped_waits_for_no_plan_that_is_being_made() -> None:
     assert time.monotonic() - start < PATIENCE_S
 
 
-def test_logs_are_listed_and_fetched(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("identity", "first"), [("generic", 0), ("ardusub", 1)])
+def test_logs_are_listed_and_fetched(identity: str, first: int, tmp_path: Path) -> None:
+    """QGroundControl finds no log whose number is that of their count, unless the autopilot is ArduPilot: it missed the newest."""
     (tmp_path / "flight1").mkdir()
     data = bytes(i % 251 for i in range(9_999))
     (tmp_path / "flight1" / "signals.mcap").write_bytes(data)
     os.utime(tmp_path / "flight1" / "signals.mcap", (1_000_000, 1_000_000))
     (tmp_path / "can.log").write_bytes(b"frames")
-    world = World(config=GroundConfig(logs=str(tmp_path)))
+    world = World(config=GroundConfig(logs=str(tmp_path), identity=identity))
     client = world.client()
     client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
     world.run(1)
-    assert [(e.id, e.size, e.num_logs) for e in client.all("LOG_ENTRY")] == [(1, 9_999, 2), (2, 6, 2)]
-    client.send("LOG_REQUEST_DATA", 1, 1, 1, 0, 0xFFFFFFFF)
+    entries = [(e.id - first, e.size, e.num_logs, e.last_log_num - first) for e in client.all("LOG_ENTRY")]
+    assert entries == [(0, 9_999, 2, 1), (1, 6, 2, 1)]
+    client.send("LOG_REQUEST_DATA", 1, 1, first, 0, 0xFFFFFFFF)
     world.run(20)
     pieces = {m.ofs: bytes(m.data[: m.count]) for m in client.all("LOG_DATA")}
     assert b"".join(pieces[at] for at in sorted(pieces)) == data
     assert client.last("LOG_DATA").count == 0 or sum(map(len, pieces.values())) == len(data)
     client.clear()
-    client.send("LOG_REQUEST_DATA", 1, 1, 1, 90, 180)
+    client.send("LOG_REQUEST_DATA", 1, 1, first, 90, 180)
     world.run(5)
     assert b"".join(bytes(m.data[: m.count]) for m in client.all("LOG_DATA")) == data[90:270]
     client.send("LOG_ERASE", 1, 1)
@@ -642,4 +645,4 @@ def test_logs_of_all_runs_are_listed_oldest_first(tmp_path: Path) -> None:
     client = (world := World(config=GroundConfig(logs=str(tmp_path)))).client()
     client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
     world.run(1)
-    assert [(e.id, e.size) for e in client.all("LOG_ENTRY")] == [(1, 1), (2, 2), (3, 3), (4, 4)]
+    assert [(e.id, e.size) for e in client.all("LOG_ENTRY")] == [(0, 1), (1, 2), (2, 3), (3, 4)]
