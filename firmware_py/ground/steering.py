@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.core.rotations import from_euler, multiply, normalise, rotate, to_euler
+from firmware_py.core.rotations import from_euler, heading, multiply, normalise, rotate, to_euler
 from firmware_py.core.setpoint import leashed, leashed_turn
 from firmware_py.core.types import NOTICE, WARNING, Action, DockRequest, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
@@ -222,7 +222,7 @@ class Steering:
             return
         record = self._system.subject.record
         if m["coordinate_frame"] in _FRAMES_BODY:
-            wanted = wanted.turned(to_euler(record.setpoint.q_wb)[2])
+            wanted = wanted.turned(to_euler(heading(record.setpoint.q_wb))[2])
         if wanted.position is not None and m["coordinate_frame"] in _FRAME_OFFSETS:
             wanted = wanted._replace(position=wanted.position + record.estimate.p_wb)
         q_wb = self._attitude(record.setpoint.q_wb, wanted.yaw, wanted.rate, arrival.time_ns)

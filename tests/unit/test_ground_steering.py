@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from firmware_py.core.rotations import difference
+from firmware_py.core.rotations import difference, from_euler, multiply
 from firmware_py.core.setpoint import LEASH_RAD
 from firmware_py.core.types import Action, DockRequest, Mode
 from firmware_py.ground.config import GroundConfig
@@ -188,6 +188,17 @@ def test_body_frame_setpoints_turn_with_the_body(world: World, client: Client) -
     world.run(1)
     p = world.robot.asked[-1].argument.p_wb - world.robot.p_wb[0]
     assert p == pytest.approx([0.1 * math.cos(0.3), 0.1 * math.sin(0.3), 0], abs=1e-6)
+
+
+@pytest.mark.parametrize("roll", [-1e-3, 1e-3])
+@pytest.mark.parametrize("pitch", [-1.570, -1.572])
+def test_robot_that_looks_straight_down_goes_ahead_where_its_top_looks(world: World, client: Client, roll: float, pitch: float) -> None:
+    """Whatever the last milliradian of its attitude: its Euler angles turn round by that."""
+    world.robot.q_wb[0] = np.asarray(multiply(from_euler(0.0, pitch, 0.3), from_euler(0.0, 0.0, roll)))
+    world.run(1)
+    send_target(client, 0xDC7, frame=8, vx=0.2)
+    world.run(1)
+    assert world.robot.asked[-1].argument.v_w == pytest.approx([0.2 * math.cos(0.3), 0.2 * math.sin(0.3), 0.0], abs=2e-3)
 
 
 @pytest.mark.parametrize("frame", [8, 9, 12])
