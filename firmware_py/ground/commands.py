@@ -200,7 +200,7 @@ class CommandService:
         latitude, longitude, altitude = command.parameters[4:7]
         if not all(map(math.isfinite, (latitude, longitude, altitude))):
             return DENIED
-        reason = self._missions.go_to(latitude, longitude, altitude, command.parameters[3])
+        reason = self._missions.go_to(latitude, longitude, altitude, command.parameters[3], command.get(1))
         if reason:
             self._system.say(WARNING, f"reposition refused: {reason}")
             return TEMPORARILY_REJECTED

@@ -29,6 +29,8 @@ _HOLD_TICKS = 100
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
 _GO_TO = -1
 """Sequence number of a leg that belongs to no mission."""
+_SLOWEST, _FASTEST = 0.01, 2.0
+"""m/s that a command may ask for."""
 _PRESENT = -1
 """DO_SET_MISSION_CURRENT's number of the item that is current."""
 
@@ -174,13 +176,13 @@ class MissionFlight:
     def set_speed(self, speed_m_s: float) -> bool:
         """Speed of what is planned from now on; -1: as before, -2: as the parameter says."""
         wanted = {SPEED_STAYS: self._speed, SPEED_DEFAULT: None}.get(speed_m_s, speed_m_s)
-        if wanted is not None and not 0.01 <= wanted <= 2.0:
+        if wanted is not None and not _SLOWEST <= wanted <= _FASTEST:
             return False
         self._speed = wanted
         return True
 
-    def go_to(self, latitude_deg: float, longitude_deg: float, altitude_m: float, yaw: float) -> str:
-        """Fly to one place inside the fence. Returns why not, or nothing."""
+    def go_to(self, latitude_deg: float, longitude_deg: float, altitude_m: float, yaw: float, speed_m_s: float) -> str:
+        """Fly to one place inside the fence; a speed of 0 or less is that of missions. Returns why not, or nothing."""
         s = self._system.subject
         if not s.armed:
             return "the vehicle is disarmed"
@@ -188,10 +190,12 @@ class MissionFlight:
         result, reason = beyond_fence(place, self._parameters().fence)
         if result:
             return reason
+        if speed_m_s > 0 and not _SLOWEST <= speed_m_s <= _FASTEST:
+            return f"a speed of {speed_m_s:g} m/s; it needs {_SLOWEST:g} to {_FASTEST:g}"
         if s.progress.state == ACTIVE:
             self._end(PAUSED)
         turned = yaw if math.isfinite(yaw) else None
-        self._begin((Leg(_GO_TO, place, turned, 0.0, math.nan),))
+        self._begin((Leg(_GO_TO, place, turned, 0.0, speed_m_s if speed_m_s > 0 else math.nan),))
         return ""
 
     # ------------------------------------------------------------ what happens

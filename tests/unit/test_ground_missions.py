@@ -503,6 +503,27 @@ def test_reposition_plans_one_leg(world: World, client: Client) -> None:
     assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
 
 
+@pytest.mark.parametrize(("asked", "flown"), [(0.05, 0.05), (-1.0, 0.15), (0.0, 0.15), (NAN, 0.15)])
+def test_reposition_is_as_fast_as_it_asks_for(world: World, client: Client, asked: float, flown: float) -> None:
+    client.command(400, 1)
+    world.run(3)
+    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, asked, 1, 0, NAN, 302084010, 1201614000, -0.4)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert job.legs[0].speed_m_s == pytest.approx(flown)
+
+
+@pytest.mark.parametrize("speed", [1e-6, 50.0])
+def test_reposition_at_a_speed_that_no_mission_may_have_is_refused(world: World, client: Client, speed: float) -> None:
+    client.command(400, 1)
+    world.run(3)
+    client.clear()
+    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, speed, 1, 0, NAN, 302084010, 1201614000, -0.4)
+    world.run(10)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED and not world.station.jobs()
+    assert "reposition refused: a speed of" in client.texts
+
+
 @pytest.mark.parametrize(("frame", "above", "z"), [(0, 0.0, 0.4), (5, 0.0, 0.4), (3, 400.0, 0.4), (6, 400.0, 0.4)])
 def test_reposition_reads_the_altitude_by_its_frame(frame: int, above: float, z: float) -> None:
     world = World(altitude_m=400.0)
