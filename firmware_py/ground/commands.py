@@ -13,7 +13,7 @@ from firmware_py.ground.dialect import Message
 from firmware_py.ground.identity import CUSTOM_MODE_ENABLED, SETTABLE
 from firmware_py.ground.message_requests import MessageRequests
 from firmware_py.ground.mission_flight import MissionFlight
-from firmware_py.ground.mission_items import ABSOLUTE, RELATIVE
+from firmware_py.ground.mission_items import ABSOLUTE, ONE_WAY_SPEEDS, RELATIVE
 from firmware_py.ground.steering import Steering
 from firmware_py.ground.system import Arrival, Handler, System
 
@@ -194,7 +194,7 @@ class CommandService:
         return ACCEPTED
 
     def _change_speed(self, command: Command) -> Answer:
-        return ACCEPTED if self._missions.set_speed(command.get(2)) else DENIED
+        return ACCEPTED if command.get(1) not in ONE_WAY_SPEEDS and self._missions.set_speed(command.get(2)) else DENIED
 
     def _reposition(self, command: Command) -> Answer:
         latitude, longitude, altitude = command.parameters[4:7]

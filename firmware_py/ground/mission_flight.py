@@ -16,7 +16,17 @@ import numpy as np
 from firmware_py.core.setpoint import Trajectory
 from firmware_py.core.types import INFORMATION, WARNING, Action, Event, Mode
 from firmware_py.description.parameters import Parameters
-from firmware_py.ground.mission_items import LOITER_UNLIMITED, SPEED_DEFAULT, SPEED_STAYS, Item, MissionError, beyond_fence, flight_order
+from firmware_py.ground.mission_items import (
+    FASTEST,
+    LOITER_UNLIMITED,
+    SLOWEST,
+    SPEED_DEFAULT,
+    SPEED_STAYS,
+    Item,
+    MissionError,
+    beyond_fence,
+    flight_order,
+)
 from firmware_py.ground.system import NS_PER_S, System
 from firmware_py.ground.telemetry import mission_current
 
@@ -29,8 +39,6 @@ _HOLD_TICKS = 100
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
 _GO_TO = -1
 """Sequence number of a leg that belongs to no mission."""
-_SLOWEST, _FASTEST = 0.01, 2.0
-"""m/s that a command may ask for."""
 _PRESENT = -1
 """DO_SET_MISSION_CURRENT's number of the item that is current."""
 
@@ -176,7 +184,7 @@ class MissionFlight:
     def set_speed(self, speed_m_s: float) -> bool:
         """Speed of what is planned from now on; -1: as before, -2: as the parameter says."""
         wanted = {SPEED_STAYS: self._speed, SPEED_DEFAULT: None}.get(speed_m_s, speed_m_s)
-        if wanted is not None and not _SLOWEST <= wanted <= _FASTEST:
+        if wanted is not None and not SLOWEST <= wanted <= FASTEST:
             return False
         self._speed = wanted
         return True
@@ -190,8 +198,8 @@ class MissionFlight:
         result, reason = beyond_fence(place, self._parameters().fence)
         if result:
             return reason
-        if speed_m_s > 0 and not _SLOWEST <= speed_m_s <= _FASTEST:
-            return f"a speed of {speed_m_s:g} m/s; it needs {_SLOWEST:g} to {_FASTEST:g}"
+        if speed_m_s > 0 and not SLOWEST <= speed_m_s <= FASTEST:
+            return f"a speed of {speed_m_s:g} m/s; it needs {SLOWEST:g} to {FASTEST:g}"
         if s.progress.state == ACTIVE:
             self._end(PAUSED)
         turned = yaw if math.isfinite(yaw) else None

@@ -26,6 +26,10 @@ UNSUPPORTED_FRAME, UNSUPPORTED, INVALID_1, INVALID_X, INVALID_Y, INVALID_Z = 2, 
 """MAV_MISSION_RESULT; the invalid parameters count on from INVALID_1."""
 SPEED_STAYS, SPEED_DEFAULT = -1.0, -2.0
 """What DO_CHANGE_SPEED has in place of a speed."""
+SLOWEST, FASTEST = 0.01, 2.0
+"""m/s that may be asked for."""
+ONE_WAY_SPEEDS = (2, 3)
+"""SPEED_TYPE of climbing and of descending alone: there are no such speeds."""
 _MOST_STEPS = 1000
 _LONGEST_S = 86_400.0
 _BEYOND = {"north_m": INVALID_X, "east_m": INVALID_Y, "top_m": INVALID_Z, "bottom_m": INVALID_Z}
@@ -117,6 +121,9 @@ def _fault(item: Item) -> int:
         value = item.parameters[index]
         if not math.isfinite(value) or abs(value) > _LONGEST_S:
             return INVALID_1 + index
+    if item.command == CHANGE_SPEED:
+        kind, speed = item.parameters[:2]
+        return INVALID_1 if kind in ONE_WAY_SPEEDS else INVALID_1 + 1 if speed > 0 and not SLOWEST <= speed <= FASTEST else 0
     return INVALID_1 if item.command == DELAY and item.parameters[0] < 0 else 0
 
 

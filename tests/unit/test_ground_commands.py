@@ -45,6 +45,11 @@ def test_speed_that_would_never_arrive_is_denied(world: World, client: Client, s
     assert ask(world, client, 178, 1, speed) == answer
 
 
+@pytest.mark.parametrize("kind", [mavlink.SPEED_TYPE_CLIMB_SPEED, mavlink.SPEED_TYPE_DESCENT_SPEED])
+def test_speed_of_climbing_or_descending_alone_is_denied(world: World, client: Client, kind: int) -> None:
+    assert ask(world, client, 178, kind, 1.5) == mavlink.MAV_RESULT_DENIED
+
+
 @pytest.mark.parametrize("number", [20, 21])
 def test_return_and_land_both_surface(world: World, client: Client, number: int) -> None:
     assert ask(world, client, number) == mavlink.MAV_RESULT_ACCEPTED

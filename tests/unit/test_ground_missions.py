@@ -138,6 +138,9 @@ def test_a_transfer_that_breaks_off_leaves_the_old_mission(world: World, client:
         (item(0, (2**31 - 1, 0, -0.4)), mavlink.MAV_MISSION_INVALID_PARAM5_X),
         (item(0, (0, 0, NAN)), mavlink.MAV_MISSION_INVALID_PARAM7),
         (item(0, PLACES[0], p=(-1, 0, 0, 0)), mavlink.MAV_MISSION_INVALID_PARAM1),
+        (item(0, (0, 0, 0), command=178, frame=2, p=(2, 0.5, -1, 0)), mavlink.MAV_MISSION_INVALID_PARAM1),
+        (item(0, (0, 0, 0), command=178, frame=2, p=(1, 15.0, -1, 0)), mavlink.MAV_MISSION_INVALID_PARAM2),
+        (item(0, (0, 0, 0), command=178, frame=2, p=(1, 1e-6, -1, 0)), mavlink.MAV_MISSION_INVALID_PARAM2),
     ],
 )
 def test_items_that_cannot_be_flown_are_refused_when_they_come(
