@@ -48,7 +48,7 @@ class Signing:
     timestamp: int = 0
     """Of the next frame that goes out; at least that of every believed frame."""
     clock: int = 0
-    """The time of day when it was told last; 0: never."""
+    """The latest time of day that was told; 0: none."""
     floor: int = 0
     """New streams start above this: nothing from before the last start is believed again."""
     streams: dict[Stream, int] = field(default_factory=dict)
@@ -58,8 +58,8 @@ class Signing:
     """There is something to store."""
 
     def advance(self, unix_ns: int) -> None:
-        """Follow the clock; the time stamp never goes back."""
-        self.clock = units_of(unix_ns)
+        """Follow the clock; neither goes back, for stations went on from the time stamps that they heard."""
+        self.clock = max(self.clock, units_of(unix_ns))
         self.timestamp = max(self.timestamp, self.clock)
 
     def is_ahead(self, stamp: int) -> bool:

@@ -220,3 +220,17 @@ def test_a_clock_that_is_behind_what_is_stored_locks_nobody_out() -> None:
     signing.advance(NOW_NS - 3_600 * 1_000_000_000)
     world = World(signing=signing)
     assert armed(world, with_key(world.client(), at=NOW + 10 * MINUTE))
+
+
+def test_station_that_followed_a_clock_which_was_ahead_may_stop_the_robot_when_that_is_set_right() -> None:
+    """A time server sets the robot's clock in flight; the station goes on from the newest time stamp that it heard."""
+    signing = Signing(key=KEY)
+    signing.advance(NOW_NS + 3_600 * 1_000_000_000)
+    world = World(signing=signing)
+    client = with_key(world.client())
+    world.run(100)
+    assert client.mav.signing.timestamp > NOW + 59 * MINUTE and armed(world, client)
+    signing.advance(NOW_NS)
+    client.command(31012)
+    world.run(2)
+    assert Action.ESTOP in [request.action for request in world.robot.asked]
