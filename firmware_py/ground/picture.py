@@ -42,6 +42,7 @@ class ModulePicture:
     gyro_ns: int = NEVER_NS
     accel_ns: int = NEVER_NS
     pressure_ns: int = NEVER_NS
+    voltage_ns: int = NEVER_NS
     answered_ns: int = NEVER_NS
 
     def take(self, inputs: ModuleInputs, time_ns: int) -> None:
@@ -55,7 +56,7 @@ class ModulePicture:
         if inputs.answered:
             self.answered_ns = time_ns
         if inputs.voltage_v is not None:
-            self.voltage_v = inputs.voltage_v
+            self.voltage_ns, self.voltage_v = time_ns, inputs.voltage_v
         if inputs.current_a is not None:
             self.current_a = inputs.current_a
         if inputs.cabin_pressure_pa is not None:

@@ -129,7 +129,7 @@ def sys_status(s: Subject) -> list[Values]:
         "depth": ready and (pressure or fresh),
         "position": fresh,
         "motors": all(now - m.answered_ns < _SENSOR_FRESH_NS for m in modules),
-        "battery": not math.isnan(modules[0].voltage_v),
+        "battery": all(now - m.voltage_ns < _SENSOR_FRESH_NS for m in modules),
         "prearm": s.armed or (s.neutral and s.picture.may_arm(s.body)),
     }
     known = sum(SENSORS.values())

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,15 @@ def test_system_status_tells_of_health_and_of_readiness_to_arm(world: World, cli
     world.robot.tag_age_ns = 2_000_000_000
     world.run(100)
     assert not client.last("SYS_STATUS").onboard_control_sensors_health & (vision | prearm)
+
+
+def test_battery_of_which_nothing_is_heard_any_more_is_not_well(world: World, client: Client) -> None:
+    hears = world.robot._inputs
+    world.run(100)
+    assert client.last("SYS_STATUS").onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+    world.robot._inputs = lambda: replace(hears(), voltage_v=None, current_a=None)  # type: ignore[method-assign]
+    world.run(200)
+    assert not client.last("SYS_STATUS").onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
 
 
 def test_robot_that_no_camera_has_seen_knows_its_attitude_and_depth_and_no_heading(world: World, client: Client) -> None:
