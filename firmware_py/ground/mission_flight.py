@@ -284,7 +284,8 @@ class MissionFlight:
             sequence = flight.legs[flight.reached].sequence
             flight.reached += 1
             if sequence != _GO_TO and not flight.replaced:
-                self._repeat = [(sequence, time_ns + n * _REACHED_EVERY_NS) for n in range(_REACHED_REPEATS)]
+                self._system.broadcast("MISSION_ITEM_REACHED", {"seq": sequence})
+                self._repeat = [(sequence, time_ns + n * _REACHED_EVERY_NS) for n in range(1, _REACHED_REPEATS)]
                 if flight.reached < len(flight.legs):
                     p.current = flight.legs[flight.reached].sequence
         last = flight.legs[-1]

@@ -468,6 +468,13 @@ def test_mission_that_flies_is_not_begun_anew_when_it_is_asked_for_again(world: 
     assert world.station.jobs() == [] and len(world.robot.asked) == before and world.robot.mode[0] == Mode.AUTO
 
 
+def test_items_at_one_place_are_all_told_to_be_reached(world: World, client: Client) -> None:
+    upload(world, client, [item(i, PLACES[0]) for i in range(3)])
+    fly(world, client, first_arrival_s=0.0)
+    world.run(100)
+    assert [m.seq for m in client.all("MISSION_ITEM_REACHED")] == [0, 1, 2, 2, 2], "the last is told again"
+
+
 def test_mission_is_complete_once_its_last_hold_is_over(world: World, client: Client) -> None:
     upload(world, client, [item(0, PLACES[0]), item(1, PLACES[1], p=(5, 0, 0, NAN))])
     fly(world, client)
