@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from firmware_py.ground.system import Arrival
 
-ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED, COMMAND_INT_ONLY = 0, 1, 2, 3, 4, 8
 """MAV_RESULT."""
 
 Answer = int | None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from firmware_py.core.types import WARNING, Action, DockRequest, Event, Mode
-from firmware_py.ground.command import ACCEPTED, DENIED, FAILED, TEMPORARILY_REJECTED, UNSUPPORTED, Answer, Command
+from firmware_py.ground.command import ACCEPTED, COMMAND_INT_ONLY, DENIED, FAILED, TEMPORARILY_REJECTED, UNSUPPORTED, Answer, Command
 from firmware_py.ground.dialect import Message
 from firmware_py.ground.identity import CUSTOM_MODE_ENABLED, SETTABLE
 from firmware_py.ground.message_requests import MessageRequests
@@ -89,8 +89,13 @@ class CommandService:
         self._acknowledge(pending.command, result)
 
     def _long(self, arrival: Arrival) -> None:
+        """A place is not taken: in float32 it is told to a metre or two, and has no frame."""
         m = arrival.message
-        self._run(Command(m["command"], tuple(m[f"param{i}"] for i in range(1, 8)), arrival))
+        command = Command(m["command"], tuple(m[f"param{i}"] for i in range(1, 8)), arrival)
+        if command.number == REPOSITION:
+            self._acknowledge(command, COMMAND_INT_ONLY)
+        else:
+            self._run(command)
 
     def _int(self, arrival: Arrival) -> None:
         """Only a place is in 1e-7 deg and has a frame; in other commands x and y are the parameters 5 and 6."""

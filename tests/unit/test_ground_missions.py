@@ -255,11 +255,13 @@ def test_mission_that_goes_on_is_as_fast_as_before_it_was_paused(world: World, c
     assert [(leg.sequence, leg.speed_m_s) for leg in job.legs] == [(2, pytest.approx(0.3))]
 
 
-@pytest.mark.parametrize(("asked", "left"), [
-    ((193, 0), [1, 3]), ((192, -1, 0, 0, NAN, 30.2084, 120.1614, -0.4), [1, 3]), ((224, 1), [1, 0, 1, 3]),
+@pytest.mark.parametrize(("kind", "asked", "left"), [
+    ("COMMAND_LONG", (193, 0, 0, 0, 0, 0, 0, 0, 0), [1, 3]),
+    ("COMMAND_INT", (6, 192, 0, 0, -1, 0, 0, NAN, 302084000, 1201614000, -0.4), [1, 3]),
+    ("COMMAND_LONG", (224, 0, 1, 0, 0, 0, 0, 0, 0), [1, 0, 1, 3]),
 ])  # fmt: skip
 def test_rounds_that_were_flown_before_a_pause_are_not_flown_again(
-    world: World, client: Client, asked: tuple[float, ...], left: list[int]
+    world: World, client: Client, kind: str, asked: tuple[float, ...], left: list[int]
 ) -> None:
     jump = item(2, (0, 0, 0), command=177, frame=2, p=(0, 1, 0, 0))
     upload(world, client, [item(0, PLACES[0]), item(1, PLACES[1]), jump, item(3, PLACES[2])])
@@ -267,7 +269,7 @@ def test_rounds_that_were_flown_before_a_pause_are_not_flown_again(
     world.run(3100)
     client.command(193, 0)
     world.run(20)
-    client.command(*asked)  # type: ignore[arg-type]
+    client.send(kind, 1, 1, *asked)
     world.run(20)
     world.station.jobs()
     assert continued(world, client) == left
@@ -554,6 +556,16 @@ def test_reposition_to_no_place_is_denied(world: World, client: Client, frame: i
     client.send("COMMAND_INT", 1, 1, frame, 192, 0, 0, -1, 1, 0, NAN, x, y, -0.4)
     world.run(3)
     assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_DENIED
+    assert not world.station.jobs()
+
+
+def test_reposition_in_floats_is_answered_with_command_int_only(world: World, client: Client) -> None:
+    client.command(400, 1)
+    world.run(3)
+    client.clear()
+    client.command(192, -1, 0, 0, NAN, 30.2084, 120.1614, -0.4)
+    world.run(3)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_COMMAND_INT_ONLY
     assert not world.station.jobs()
 
 
