@@ -133,7 +133,14 @@ class FaultDetector:
         self.now = self._judge(self._obeys)
 
     def step(
-        self, modules: list[ModuleInputs], measured: Measured, estimate: Estimate, force_n: np.ndarray, mean_n: np.ndarray, armed: bool
+        self,
+        modules: list[ModuleInputs],
+        measured: Measured,
+        estimate: Estimate,
+        force_n: np.ndarray,
+        mean_n: np.ndarray,
+        armed: bool,
+        free: bool = True,
     ) -> ThrusterFaults:
         """What is known after this tick.
 
@@ -142,9 +149,10 @@ class FaultDetector:
             measured, estimate: of this tick.
             force_n, mean_n: (n,) forces that the thrusters are believed to give now, and on the mean since the last tick, N.
             armed: while disarmed nothing is looked for but propellers that turn all the same.
+            free: no magnet pushes anything away; while one does, the motion says nothing of thrusters.
         """
         self.words, self.changed = [], False
-        found = self._motion.step(measured, estimate, mean_n * self._share, self.now.alive, armed)
+        found = self._motion.step(measured, estimate, mean_n * self._share, self.now.alive, armed, free)
         if found is not None:
             self._lose(found, "does not push as it says")
         own = [modules[m] for m in self._modules]

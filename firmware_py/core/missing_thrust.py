@@ -94,14 +94,21 @@ class MissingThrust:
         """Of each tick of the block speed, attitude, forces and what was felt."""
         self._first = self._last = gyro
         self._first_n = self._last_n = 0
+        self._free = True
 
     def step(
-        self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool
+        self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool, free: bool = True
     ) -> int | None:
-        """The thruster that lies, once it is sure. `force_n`: (n,) believed mean forces since the last tick, N."""
+        """The thruster that lies, once it is sure.
+
+        Args:
+            force_n: (n,) believed mean forces since the last tick, N.
+            free: no magnet pushes another body, or a module of this one, away.
+        """
         if not estimate.ready:
             return None
         self._add(measured, estimate, force_n)
+        self._free = self._free and free
         if len(self._seen) < self._ticks:
             return None
         full = self._close(estimate)
@@ -131,7 +138,7 @@ class MissingThrust:
         span = (self._last_n - self._first_n) * self._period_s
         known = accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
         alone = estimate.p_wb[2] > self._body.reach_m  # at the surface pushes what no model here knows
-        whole = known and alone and estimate.tag_age_ns < FRESH_NS
+        whole = known and alone and self._free and estimate.tag_age_ns < FRESH_NS
         rest, acted = np.full(6, np.nan), self._columns.T @ (forces / n)
         if whole and self._last is not None and self._first is not None:
             motion = np.concatenate((felt / accels, (self._last - self._first) / span))

@@ -31,6 +31,7 @@ from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.transitions import DOCKING, Effect, State, Trigger
 from firmware_py.core.types import (
     CHANNELS,
+    RELAY_PUSH,
     WARNING,
     Action,
     BodyRecord,
@@ -105,7 +106,8 @@ class BodyPipeline:
 
     def _find_faults(self, inputs: Inputs, measured: Measured, estimate: Estimate, mean_n: np.ndarray) -> None:
         """Thrusters that are dead or lie leave the allocation at once."""
-        self.faults.step(inputs.modules, measured, estimate, self.lag.force_n, mean_n, self.supervisor.armed)
+        free = not any(RELAY_PUSH in magnets.states for magnets in self.limiter.magnets)
+        self.faults.step(inputs.modules, measured, estimate, self.lag.force_n, mean_n, self.supervisor.armed, free)
         if self.faults.changed:
             self.allocator.set_alive(self.faults.now.alive)
 
