@@ -30,6 +30,8 @@ NEITHER = (-1, -1)
 """Thrusters of a feedback that the vehicle does not have."""
 RANK_TOLERANCE = 1e-6
 """Singular values below this share of the largest count as zero."""
+LEAST_LEVER = 0.1
+"""Moment in a lost axis (a unit vector) with which force is kept: with less, a newton costs 10 N m and more; 1e16 where it is rounding."""
 FAST_SHARE = 2.0
 """A propeller that turns at more than this share of the believed speed does not obey."""
 FAST_MARGIN = 0.25
@@ -65,8 +67,10 @@ def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:
     """
     if not lost.size:
         return np.eye(6)  # without rounding
+    turned, levers, axes = np.linalg.svd(lost[3:], full_matrices=False)
+    long = levers > LEAST_LEVER
     give_up = np.eye(6)
-    give_up[3:] -= np.linalg.pinv(lost[3:].T) @ lost.T
+    give_up[3:] -= turned[:, long] / levers[long] @ axes[long] @ lost.T
     return np.asarray(made @ made.T @ give_up)
 
 

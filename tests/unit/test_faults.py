@@ -1,5 +1,6 @@
 """Dead and lying thrusters: found in time from ESCs or from the motion alone, and never where all is well."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -369,6 +370,24 @@ def test_axes_that_are_lost_with_a_pair_are_those_of_the_errata(pair: tuple[int,
     np.testing.assert_allclose(matrix @ np.linalg.pinv(matrix) @ kept, kept, atol=1e-9)
     np.testing.assert_allclose(kept[:3], wrench[:3], atol=1e-9, err_msg="the force, and so the place, is kept")
     assert np.linalg.matrix_rank(now.keep, tol=1e-6) == 6 - now.lost_axes
+
+
+@pytest.mark.parametrize(("name", "offset_m"), [("bluerov2_heavy", 0.0), ("bluerov2_heavy", 0.001), ("modcube_sim", 0), ("chasing_m2", 0)])
+def test_force_that_is_lost_whole_costs_no_moment(name: str, offset_m: float) -> None:
+    """The diagonal pair of horizontal thrusters: the pseudo-inverse of a rounding error asked for 1e16 N m, and the robot spun."""
+    vehicle = load_vehicle(name)
+    inertial = dataclasses.replace(vehicle.inertial, com_m=vehicle.inertial.com_m + np.array([0.0, offset_m, 0.0]))
+    body = assemble_vehicle(dataclasses.replace(vehicle, inertial=inertial))
+    detector = FaultDetector(body, Faults(), TICK_NS)
+    failed = [EscFeedback(0, (0.0, 0.0), (0.0, 0.0), (1, 0)), EscFeedback(2, (0.0, 0.0), (0.0, 0.0), (0, 1))]
+    nowhere = Estimate(ZERO, from_euler(0.0, 0.0, 0.0), np.zeros(6), ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, False)
+    for _ in range(Faults().dead_count):
+        now = detector.step([ModuleInputs(esc=failed)], Measured(None, None, None, []), nowhere, np.zeros(8), np.zeros(8), True)
+    assert now.dead == (0, 3) and now.lost_axes == 1
+    wanted = np.array([2.0, 1.0, 0.5, 0.1, 0.05, -0.1])
+    kept = now.keep @ wanted
+    np.testing.assert_allclose(kept[2:], wanted[2:], atol=0.01)
+    assert 0.0 < np.linalg.norm(kept[:2]) <= np.linalg.norm(wanted[:2])
 
 
 @pytest.mark.parametrize(("wanted", "made"), [([200.0, 200.0, 0, 0, 0, 0], [64.84, 64.84]), ([60.0, 60.0, 0, 0, 0.5, 0], [60.0, 60.0])])
