@@ -236,7 +236,7 @@ class FaultDetector:
 
     def _judge(self, usable: np.ndarray) -> ThrusterFaults:
         alive = usable.copy()
-        u, values, _ = np.linalg.svd(self._t.matrix * alive, full_matrices=False)
+        u, values, _ = np.linalg.svd(self._t.matrix * alive, full_matrices=alive.size < 6)  # all six axes, however few thrusters
         rank = int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1e-12)))
         dead = tuple(int(i) for i in np.flatnonzero(~alive))
         return ThrusterFaults(alive, dead, self._rank - rank, _keep(u[:, :rank], u[:, rank:]))

@@ -401,6 +401,14 @@ def test_healthy_robot_that_lacks_an_axis_makes_the_force_that_it_can(wanted: li
     assert np.abs(thrust.achieved[3:]).max() < 0.02 * made[0]
 
 
+def test_robot_of_five_thrusters_makes_the_force_that_it_can() -> None:
+    """Girona 500 cannot roll, and its sway rolls it a little: saturated, nothing was left of it."""
+    chain = BodyPipeline(assemble_vehicle(load_vehicle("girona500")), Parameters(), TICK_NS)
+    thrust = chain._allocate(np.array([600.0, 100.0, 0.0, 0.0, 0.0, 0.0]), 0)
+    np.testing.assert_allclose(thrust.achieved[:3], [269.1, 44.85, 0.0], atol=0.5)
+    assert np.abs(thrust.achieved[3:]).max() < 1.0
+
+
 def test_robot_that_is_armed_anew_trusts_its_thrusters_again(water: Water) -> None:
     water.speed_factor[1] = 0.0
     water.run(0.6)
