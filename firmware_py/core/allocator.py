@@ -89,7 +89,7 @@ class Allocator:
 
     def set_alive(self, alive: np.ndarray) -> None:
         """(n,) bool: thrusters that may be used from now on."""
-        self._set(alive, np.linalg.pinv(self._thrusters.matrix * alive))
+        self._set(alive, np.linalg.pinv(self._thrusters.matrix * alive) * alive[:, None])  # no rounding for those that may not be used
 
     def confine(self, room: Room) -> None:
         """Keeps within `room` from now on."""

@@ -106,10 +106,15 @@ def test_dead_thruster_stays_out(dead: int) -> None:
     single = assemble_vehicle(load_vehicle("modcube"))
     allocator = Allocator(single, LEAST)
     allocator.set_alive(np.arange(8) != dead)
+    usual = Allocator(single, Allocation())
+    usual.set_alive(np.arange(8) != dead)
+    less = 0
     for wrench in 0.3 * wrenches(single, 10, seed=4):
         thrust = allocator.step(wrench)
         assert thrust.force_n[dead] == 0.0
         np.testing.assert_allclose(thrust.achieved, [*thrust.scale[:1] * wrench[:3], *thrust.scale[1:] * wrench[3:]], atol=1e-6)
+        less += power(single, thrust.force_n) < 0.999 * power(single, usual.step(wrench).force_n)
+    assert less >= 5, "and the others still draw the least"
 
 
 def test_same_wrench_gets_the_same_forces_whatever_came_before(body: Body) -> None:
