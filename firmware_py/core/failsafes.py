@@ -125,9 +125,7 @@ class Watch:
         self.level = Level(getattr(parameters, f"{name}_action"))
         self.latched = bool(getattr(parameters, f"{name}_latched"))
         self._told_ns = self._told_ns if self.level == before else None
-        if self.level == Level.NONE:  # it is not looked at any more, and begins anew when it is again
-            self._since_ns = self._gone_ns = self._told_ns = None
-            self.active = False
+        self.active = self.active and self.level != Level.NONE  # else it is not looked at any more, and begins anew when it is again
         self._delay_ns = round(getattr(parameters, f"{name}_delay_s") * 1e9)
         self._clear_ns = round(parameters.clear_s * 1e9)
 
@@ -203,8 +201,9 @@ class Failsafes:
         Args:
             forced: a fail-safe and no person chose `mode`.
         """
-        alarms = []
-        for (watch, below, limit), value in zip(self._limits, FIGURES(health), strict=True):
+        alarms, values = [], FIGURES(health)
+        for i, (watch, below, limit) in enumerate(self._limits):
+            value = values[i]
             cause = (value < limit if below else value > limit) and watch.counts(mode, forced, armed)
             if not cause and not watch.active and watch._since_ns is None:
                 continue

@@ -283,6 +283,8 @@ def test_mode_is_refused_while_a_fail_safe_would_leave_it_at_once(name: str, mod
     words = [Watch(ROWS[name], P).words(bad(name))]
     assert failsafes.against(mode, bad(name)) == (words if refused else [])
     assert failsafes.against(mode, GOOD) == []
+    if name not in YES:
+        assert failsafes.against(mode, spoilt(name, getattr(P, f"{name}_limit"))) == []
 
 
 def test_mode_is_permitted_as_soon_as_the_cause_is_gone_unless_it_is_latched() -> None:
