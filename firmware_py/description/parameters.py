@@ -235,7 +235,7 @@ class Docking:
         250.0, unit="ms", low=10, high=5000, help="age at which a current no longer counts", mavlink="DOCK_MA_AGE"
     )
     pose_fresh_ms: float = quantity(
-        300.0, unit="ms", low=10, high=5000, help="age at which a picture no longer counts", mavlink="DOCK_POSE_AGE"
+        300.0, unit="ms", low=10, high=5000, help="older pictures do not count; a slow camera needs 5 periods", mavlink="DOCK_POSE_AGE"
     )
     approach: str = quantity(
         "staged",
