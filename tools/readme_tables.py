@@ -12,12 +12,14 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from command_line import Parser, in_words, run_tool
 
+RowName = tuple[str, str, str]
+"""Command, what `the same` means, and name: `rows_by_name`."""
 PAGES = (Path("README.md"), Path("docs/figures.md"))
 SOURCES = {"accept": Path("accept.json"), "bench": Path("bench.json")}
 MARKER = re.compile(r"(<!-- table: (?P<kind>\w+)(?P<words>[^>]*?) -->\n)(?P<old>.*?)(<!-- end -->)", re.DOTALL)
@@ -83,7 +85,7 @@ def accept_table(entries: Entries, groups: Sequence[str], old: str) -> str:
     new = rows(("figure", "measured", "limit", "result", "command"), body)
     wanted = {group for group, _ in HEADLINES["accept"]} if HEADLINE in groups else set(groups)
     whole = wanted <= {e["group"] for e in entries}
-    return new if whole else "".join((rows_by_name(old) | rows_by_name(new)).values())
+    return new if whole else merged(rows_by_name(old), rows_by_name(new))
 
 
 def chosen(kind: str, entries: Entries, words: Sequence[str], named: Callable[[dict[str, Any]], bool]) -> Entries:
@@ -93,7 +95,7 @@ def chosen(kind: str, entries: Entries, words: Sequence[str], named: Callable[[d
     return [e for e in entries if not words or named(e)]
 
 
-def rows_by_name(table: str) -> dict[tuple[str, str, str], str]:
+def rows_by_name(table: str) -> dict[RowName, str]:
     """The lines of a table by their command, by what `the same` means among the figures of that command, and by name."""
     found, meant, before = {}, "", ""
     for line in table.splitlines(keepends=True):
@@ -105,6 +107,16 @@ def rows_by_name(table: str) -> dict[tuple[str, str, str], str]:
         found[command, meant, name] = line
         before = command
     return found
+
+
+def merged(old: Mapping[RowName, str], new: Mapping[RowName, str]) -> str:
+    """The old lines with the new ones in their places; one that is new altogether stands behind the new one before it."""
+    names, place, lines = list(old), 0, {**old, **new}
+    for name in new:
+        if name not in old:
+            names.insert(place, name)
+        place = names.index(name) + 1
+    return "".join(lines[name] for name in names)
 
 
 def bench_table(entries: Entries, words: Sequence[str], old: str) -> str:

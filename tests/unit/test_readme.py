@@ -99,6 +99,9 @@ def test_figure_that_was_not_measured_stays_as_it_is_while_others_of_its_table_a
     assert re.findall(r"(\d) mm", again) == ["1", "2", "8", "8", "8"]
     alone = readme_tables.filled(first, {"accept": [entry(*blind, 9.0)]})
     assert re.findall(r"(\d) mm", alone) == ["1", "2", "3", "4", "9"], "whatever row it follows"
+    more = [entry(*hover[0], 6.0), entry("hover", "the same: median", 7.0), entry(*hover[1], 8.0)]
+    twice = readme_tables.filled(readme_tables.filled(first, {"accept": more}), {"accept": more})
+    assert re.findall(r"(\d) mm", twice) == ["6", "7", "8", "3", "4", "5"], "a new figure stands beside its own, and once"
     assert [line for line in again.splitlines() if "hover: RMSE" in line] == [line for line in first.splitlines() if "hover: RMSE" in line]
 
 
