@@ -144,7 +144,7 @@ class FaultDetector:
         force_n: np.ndarray,
         mean_n: np.ndarray,
         armed: bool,
-        free: bool = True,
+        free: bool,
     ) -> ThrusterFaults:
         """What is known after this tick.
 

@@ -247,8 +247,8 @@ class HealthMonitor:
             topology=self.topology,
             tag_gap_s=self._tag_gap_s(now),
             unfit=tuple([m for m, unfit in zip(self._modules, self._unfit, strict=True) if unfit]),
-            battery_age_s=_age_s(min(self._read_ns["battery"]), now),
-            cabin_age_s=_age_s(min(self._read_ns["cabin"]), now),
+            battery_age_s=(now - min(self._read_ns["battery"])) * 1e-9,
+            cabin_age_s=(now - min(self._read_ns["cabin"])) * 1e-9,
         )
         return self.now
 

@@ -97,7 +97,7 @@ class MissingThrust:
         self._free = True
 
     def step(
-        self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool, free: bool = True
+        self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool, free: bool
     ) -> int | None:
         """The thruster that lies, once it is sure.
 

@@ -187,14 +187,9 @@ def _tag_rows(tags: Sequence[tuple[int, Tag]]) -> np.ndarray:
     return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
-def tag_pose(p_wm: np.ndarray, q_wm: np.ndarray, tag: Tag) -> tuple[np.ndarray, np.ndarray]:
-    """World pose of a tag on a module; its z axis points into the face."""
-    return placed(p_wm, q_wm, np.array(tag.position_m), np.array(tag.quaternion))
-
-
 @njit("Tuple((float64[::1],float64[::1]))(float64[::1],float64[::1],float64[::1],float64[::1])", cache=True)
 def placed(p_wm, q_wm, position, quaternion):
-    """World pose of what is at `position` (3,) and has the attitude `quaternion` (4,) on a module."""
+    """World pose of what is at `position` (3,), m, with the attitude `quaternion` (4,) on a module; a tag's z axis points into its face."""
     return p_wm + rotations.rotate(q_wm, position), rotations.multiply(q_wm, quaternion)
 
 

@@ -104,14 +104,15 @@ def test_pilot_of_the_target_feels_no_blow_when_another_docks_to_it() -> None:
 # ---------------------------------------------------------------- what was asked for
 
 
-def before_each_other(y_m: float, parameters: Parameters | None = None, armed: tuple[int, ...] = (0, 1)) -> Docked:
-    """Two armed modules in one line; no magnet draws current."""
-    tank = Docked([(0, 0, 0), (0, 1, 0)], parameters, apart=True)
-    tank.weak = {0, 1}
-    for state, y in zip(tank.states, (0.0, y_m), strict=True):
+def before_each_other(*y_m: float, parameters: Parameters | None = None, armed: tuple[int, ...] = (0, 1, 2)) -> Docked:
+    """Armed modules in one line, the first at 0, the others so far from it; no magnet draws current."""
+    modules = range(len(y_m) + 1)
+    tank = Docked([(0, m, 0) for m in modules], parameters, apart=True)
+    tank.weak = set(modules)
+    for state, y in zip(tank.states, (0.0, *y_m), strict=True):
         state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
-    tank.run(0.5, *(Request(Action.ARM, m) for m in armed))
+    tank.run(0.5, *(Request(Action.ARM, m) for m in modules if m in armed))
     return tank
 
 
@@ -141,14 +142,14 @@ def test_dock_whose_way_leads_through_the_target_is_refused() -> None:
 
 
 def test_straight_dock_is_begun_from_anywhere_as_the_papers() -> None:
-    tank = before_each_other(2.0, Parameters().replace("docking.approach", "straight"))
+    tank = before_each_other(2.0, parameters=Parameters().replace("docking.approach", "straight"))
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
     assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] and outputs.records[1].mode == Mode.DOCK
 
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_target_that_is_disarmed_is_not_expected_to_come(approach: str) -> None:
-    tank = before_each_other(2.0, Parameters().replace("docking.approach", approach), armed=(1,))
+    tank = before_each_other(2.0, parameters=Parameters().replace("docking.approach", approach), armed=(1,))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     (dock,) = tank.pipeline.formation.docking._docks
     assert not dock.sequence.met_w.any() and tank.pipeline.formation.chains[0].guidance._goal is None
@@ -183,12 +184,7 @@ def test_bodies_that_are_to_dock_to_each_other_do_not_chase_each_other(ring: boo
 
 @pytest.mark.slow
 def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], apart=True)
-    tank.weak = {0, 1, 2}
-    for state, y in zip(tank.states, (0.0, 0.6, 1.2), strict=True):
-        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
-    tank.run(2.0)
-    tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
+    tank = before_each_other(0.6, 1.2)
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     while tank.outputs[-1].docks[0].stage != Stage.APPROACH:
         tank.run(0.01)
@@ -386,12 +382,7 @@ def test_robot_that_docks_to_one_that_is_disarmed_is_disarmed_and_says_so(armed:
 
 @pytest.mark.slow
 def test_dock_in_whose_place_another_was_asked_for_before_it_was_planned_never_begins() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], apart=True)
-    tank.weak = {0, 1, 2}
-    for state, y in zip(tank.states, (0.0, 0.6, 1.2), strict=True):
-        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
-    tank.run(2.0)
-    tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
+    tank = before_each_other(0.6, 1.2)
     tank._delay = 50
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     tank.run(0.1, Request(Action.SET_MODE, 1, Mode.POSHOLD))

@@ -11,7 +11,7 @@ from firmware_py.bus.codec import Codec
 from firmware_py.core import rotations
 from firmware_py.description.vehicle import Payload, load_vehicle
 from hil.nodes import make_nodes
-from hil.plant.camera import Camera, Sighting, tag_pose
+from hil.plant.camera import Camera, Sighting, placed
 from hil.plant.sight import crosses
 from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
@@ -20,6 +20,8 @@ from hil.scenario import load_scenario, make_world
 PERIOD_NS = 10_000_000
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 VEHICLE = load_vehicle("modcube")
+TOP = (np.array(VEHICLE.tag[5].position_m), np.array(VEHICLE.tag[5].quaternion))
+"""Place (3,), m, and attitude (4,) of the tag on the upper face, module frame."""
 ABOVE = CameraPose()
 
 
@@ -53,7 +55,7 @@ def pictures(eye: Camera, seconds: float, start: Start | None = None) -> list[Si
 
 def test_camera_sees_the_top_tag_where_it_is() -> None:
     (seen,) = look(world_of(at(0.1, -0.2, 0.4, rotations.from_euler(0.1, -0.2, 2.0))), camera())
-    p, q = tag_pose(np.array([0.1, -0.2, 0.4]), rotations.from_euler(0.1, -0.2, 2.0), VEHICLE.tag[5])
+    p, q = placed(np.array([0.1, -0.2, 0.4]), rotations.from_euler(0.1, -0.2, 2.0), *TOP)
     assert seen.tag_id == 5 and seen.capture_ns == 0
     np.testing.assert_allclose(seen.p_wt, p, atol=1e-12)
     np.testing.assert_allclose(np.abs(seen.q_wt @ q), 1.0)
@@ -178,7 +180,7 @@ def test_moving_module_is_seen_where_it_was_at_the_picture() -> None:
         truth = fine.truth(0)
         late_s = 1e-9 * (sighting.capture_ns - truth.time_ns)
         q = rotations.multiply(truth.q_wm, rotations.exp(truth.w_b * late_s))
-        p, _ = tag_pose(truth.p_wm + truth.v_w * late_s, q, VEHICLE.tag[5])
+        p, _ = placed(truth.p_wm + truth.v_w * late_s, q, *TOP)
         np.testing.assert_allclose(sighting.p_wt, p, atol=2e-6)
         assert np.linalg.norm(rotations.difference(sighting.q_wt, q)) < 1e-5
 
