@@ -13,9 +13,9 @@ FLASH_PACKAGES := debootstrap e2fsprogs openssh-client
 PYTHON_PACKAGES := python3-venv
 # What `make bench` measures beside; nothing else needs it.
 PEERS := mujoco==4.0.0
-# Of tools/: names, arguments and calls. Arrays and lambdas there are as loose as what they are handed to.
-MYPY_TOOLS := --allow-untyped-defs --allow-incomplete-defs --allow-untyped-calls --allow-any-generics --no-warn-return-any \
-	--no-warn-unused-ignores $(addprefix --disable-error-code=,arg-type list-item misc union-attr)
+# Of tools/ and tests/: names, attributes and the arguments of calls. Arrays and lambdas there are as loose as what they are handed to.
+MYPY_LOOSE := --allow-untyped-defs --allow-incomplete-defs --allow-untyped-calls --allow-any-generics --no-warn-return-any \
+	--no-warn-unused-ignores --implicit-reexport $(addprefix --disable-error-code=,arg-type list-item misc union-attr)
 PIP_INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-deps
 
 # $(call make_venv,DIR): keep DIR if its Python runs, else make it with the first Python that is new enough.
@@ -61,7 +61,7 @@ setup-system: ## install the Debian packages of the virtual machine with real So
 lint: setup ## ruff, mypy and the import contracts
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/mypy --no-error-summary
-	@$(BIN)/mypy --no-error-summary $(MYPY_TOOLS) tools/*.py
+	@$(BIN)/mypy --no-error-summary $(MYPY_LOOSE) tools tests
 	@found=$$($(BIN)/lint-imports --no-logo) || { echo "$$found"; exit 1; }
 
 quick: lint ## lint and the fast tests, about a minute on two idle cores: for every commit

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import near_miss
 import numpy as np
 import pytest
 
@@ -15,7 +16,6 @@ from firmware_py.prepare.assembly import PITCH_M
 from hil.plant.fault_spec import Fault
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly
-from tools import near_miss
 
 LARGEST_JUMP_N = 1.0
 """Of a thruster's command in the tick in which two bodies become one."""

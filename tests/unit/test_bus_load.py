@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
+import bus_load as tool
 import cantools.database
 import pytest
 
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.load import MEAN_LIMIT, TICK_LIMIT, bus_load, frame_bits, slow_schedule
 from hil.nodes import _schedule
-from tools import bus_load as tool
 
 CODEC = Codec.load()
 FLEET = """

@@ -1,6 +1,7 @@
 """Health: ages, means and worst cases of what the modules of a body say."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ class Ear:
         self.dropped = 0
         self.foreign_command = False
 
-    def hear(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: object) -> Health:
+    def hear(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: Any) -> Health:
         self.tick += 1
         self.time_ns += TICK_NS
         other = more.get("others", ModuleInputs())

@@ -1,11 +1,16 @@
 """Parts of tools/identify.py on made-up data: no flight."""
 
 import dataclasses
-import importlib
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import identify as tool
+import identify_excitation as excitation
+import identify_fit as fit
+import identify_model as model
+import identify_motion as motion
+import identify_quantities as quantities
 import numpy as np
 import pytest
 
@@ -15,10 +20,6 @@ from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle, vehicle_names
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.scenario import load_scenario
-
-excitation, fit, model, motion, quantities, tool = (
-    importlib.import_module(f"identify{name}") for name in ("_excitation", "_fit", "_model", "_motion", "_quantities", "")
-)
 
 
 def test_noise_of_a_sensor_is_found_beside_its_motion() -> None:

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loop_response import AXES, LINES, Loop, Response, Scale, body_of, controlled, corners, lines, margins, measure
 from matplotlib import pyplot
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from tools.loop_response import AXES, LINES, Loop, Response, Scale, body_of, controlled, corners, lines, margins, measure
 
 ROOT = Path(__file__).resolve().parents[2]
 SURGE = 0

@@ -8,13 +8,13 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import generate_mcu_code
 import numpy as np
 import pytest
+from generate_mcu_code import raw_type, snake
 
 from firmware_py.bus.codec import Codec, Frame, MessageCodec, Receiver, crc8
 from firmware_py.bus.load import slow_schedule
-from tools import generate_mcu_code
-from tools.generate_mcu_code import raw_type, snake
 
 CODEC = Codec.load()
 WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror"]

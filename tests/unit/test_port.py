@@ -10,6 +10,7 @@ import threading
 import time
 import tty
 from collections import deque
+from typing import Any
 
 import can
 import pytest
@@ -267,7 +268,7 @@ class TestSlcan(PortSuite):
 
     def test_adapter_whose_device_fails_to_close_can_be_opened_again(self, cable, monkeypatch):
         link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))
-        bus = link.open()
+        bus: Any = link.open()
         with monkeypatch.context() as broken:
             broken.setattr(bus.serialPortOrig, "close", lambda: 1 // 0)
             with pytest.raises(ZeroDivisionError):
@@ -279,7 +280,7 @@ class TestSlcan(PortSuite):
         """In ~/.canrc a listener of somebody else may be told to send nothing, or to hear its own frames."""
         monkeypatch.setenv("CAN_CONFIG", '{"listen_only": true, "rtscts": true}')
         link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))
-        bus = link.open()
+        bus: Any = link.open()
         try:
             assert not bus._listen_only
             assert not bus.serialPortOrig.rtscts

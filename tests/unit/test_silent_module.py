@@ -26,7 +26,7 @@ class Pair:
         modules = [ModuleInputs(heard=m in heard) for m in range(len(self.body.modules))]
         estimate = Estimate(ZERO, np.eye(1, 4)[0], np.zeros(6), ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, True)
         for _ in range(round(seconds / DT)):
-            self.detector.step(modules, Measured(None, None, None, []), estimate, np.zeros(n), np.zeros(n), armed)
+            self.detector.step(modules, Measured(None, None, None, []), estimate, np.zeros(n), np.zeros(n), armed, True)
             assert self.detector.changed == bool(self.detector.words)
             said += self.detector.words
         return said
