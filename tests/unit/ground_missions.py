@@ -1,0 +1,73 @@
+"""Missions as a client sends them, flown along a plan that stands still."""
+
+import numpy as np
+
+from firmware_py.core.types import Setpoint
+from firmware_py.ground.mission_flight import Plan, PlanJob
+from tests.unit.ground_requests import NAN
+from tests.unit.ground_world import Client, World
+
+PLACES = [(302084010, 1201614010, -0.4), (302084020, 1201614000, -0.3), (302084000, 1201614000, -0.5)]
+
+
+class Path:
+    """A trajectory of ten seconds a leg that stands still."""
+
+    duration_s = 30.0
+
+    def sample(self, t_s: float) -> Setpoint:
+        zero = np.zeros(3)
+        return Setpoint(zero, np.array([1.0, 0, 0, 0]), zero, zero, zero, zero)
+
+
+def item(
+    sequence: int,
+    place: tuple[int, int, float],
+    command: int = 16,
+    frame: int = 6,
+    p: tuple[float, ...] = (0, 0, 0, NAN),
+) -> tuple[float, ...]:
+    return (1, 1, sequence, frame, command, 0, 1, *p, *place)
+
+
+def upload(world: World, client: Client, items: list[tuple[float, ...]], kind: int = 0) -> int:
+    """Send items as they are asked for; the result."""
+    client.clear()
+    client.send("MISSION_COUNT", 1, 1, len(items), kind)
+    answered = 0
+    for _ in range(400):
+        world.run(1)
+        if client.all("MISSION_ACK"):
+            return int(client.last("MISSION_ACK").type)
+        asked = client.all("MISSION_REQUEST_INT")
+        if len(asked) > answered:
+            client.send("MISSION_ITEM_INT", *items[asked[-1].seq], kind)
+            answered = len(asked)
+    raise AssertionError("no acknowledgement")
+
+
+def begin(world: World, client: Client) -> PlanJob:
+    """Arm, start by mode: what is to be planned."""
+    client.command(400, 1)
+    world.run(3)
+    client.command(176, 1, 4, 4)
+    world.run(10)
+    (job,) = world.station.jobs()
+    return job
+
+
+def fly(world: World, client: Client, first_arrival_s: float = 10.0) -> PlanJob:
+    """Arm, start by mode, plan: the body tracks."""
+    job = begin(world, client)
+    arrivals = tuple(first_arrival_s * (i + 1) for i in range(len(job.legs)))
+    world.station.planned(0, Plan(job.serial, Path(), arrivals))
+    world.run(3)
+    return job
+
+
+def continued(world: World, client: Client) -> list[int]:
+    """Items that are planned when the mission is continued."""
+    client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    return [leg.sequence for leg in job.legs]

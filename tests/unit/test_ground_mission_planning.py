@@ -1,0 +1,175 @@
+"""A flight while its plan is being made: what ends it before it begins, and what comes too late."""
+
+from types import SimpleNamespace
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Action, Mode
+from firmware_py.ground.mission_flight import Plan, PlanJob
+from tests.unit.ground_missions import PLACES, Path, begin, continued, item, upload
+from tests.unit.ground_world import Client, World
+
+
+def test_a_plan_that_cannot_be_made_is_told_and_the_body_holds(world: World, client: Client) -> None:
+    upload(world, client, [item(0, PLACES[0])])
+    job = begin(world, client)
+    world.station.planned(0, Plan(job.serial, None, (), "the thrusters would be used to 120 %"))
+    world.run(2)
+    assert "the thrusters would be used to 120 %" in client.texts
+    assert world.robot.mode[0] == Mode.POSHOLD
+
+
+@pytest.mark.parametrize("ticks", [1, 10])
+def test_plan_that_comes_after_something_else_was_asked_for_is_not_flown(world: World, client: Client, ticks: int) -> None:
+    """Until the hold is settled nothing new is planned: a plan that comes meanwhile is the one before's, as is one that comes later."""
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    old = begin(world, client)
+    client.command(224, 2)
+    world.run(ticks)
+    world.station.planned(0, Plan(old.serial, Path(), (10.0, 20.0, 30.0)))
+    world.run(3)
+    assert Action.TRACK not in [r.action for r in world.robot.asked]
+
+
+def planning(world: World, client: Client) -> PlanJob:
+    """Armed, the mission started, its plan under way."""
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    job = begin(world, client)
+    client.clear()
+    return job
+
+
+def come_back(world: World, job: PlanJob) -> None:
+    world.station.planned(0, Plan(job.serial, Path(), tuple(10.0 * (i + 1) for i in range(len(job.legs)))))
+
+
+TAKEN = {
+    "pause": (193, (0.0,)), "manual": (176, (1.0, 1.0)), "hold": (176, (1.0, 4.0, 3.0)), "land": (21, ()), "disarm": (400, (0.0,)),
+    "e-stop": (31012, ()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 20])
+@pytest.mark.parametrize("what", TAKEN)
+def test_flight_that_is_being_planned_ends_when_the_pilot_takes_the_vehicle(world: World, client: Client, what: str, ticks: int) -> None:
+    job = planning(world, client)
+    number, parameters = TAKEN[what]
+    client.command(number, *parameters)
+    world.run(ticks)
+    come_back(world, job)
+    world.run(120)
+    assert Action.TRACK not in [r.action for r in world.robot.asked]
+    assert world.robot.mode[0] != Mode.AUTO
+    assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_PAUSED
+    assert client.texts.count("flight ended before it began") == 1
+
+
+@pytest.mark.parametrize("button", [0, 1, 11])
+def test_flight_that_is_being_planned_ends_by_a_button(world: World, client: Client, button: int) -> None:
+    job = planning(world, client)
+    client.send("MANUAL_CONTROL", 1, 0, 0, 500, 0, 1 << button)
+    come_back(world, job)
+    world.run(3)
+    assert Action.TRACK not in [r.action for r in world.robot.asked]
+
+
+def test_flight_that_is_being_planned_ends_when_a_fail_safe_changes_the_mode(world: World, client: Client) -> None:
+    job = planning(world, client)
+    world.robot.mode[0] = Mode.SURFACE
+    world.run(1)
+    world.robot.mode[0] = Mode.POSHOLD
+    world.run(1)
+    come_back(world, job)
+    world.run(3)
+    assert "flight ended before it began: the mode is SURFACE" in client.texts
+    assert world.robot.mode[0] == Mode.POSHOLD
+
+
+@pytest.mark.parametrize("parts", [False, True])
+def test_flight_that_is_being_planned_ends_when_the_body_becomes_another(parts: bool) -> None:
+    world = World(2)
+    client, apart = world.client(), list(world.robot.bodies)
+    world.robot.state[1] = State.ARMED
+    if parts:
+        world.robot.dock()
+        world.run(1)
+    job = planning(world, client)
+    if parts:
+        world.robot.bodies = apart
+    else:
+        world.robot.dock()
+    world.run(1)
+    come_back(world, job)
+    world.run(3)
+    assert Action.TRACK not in [r.action for r in world.robot.asked]
+    assert client.texts.count("flight ended before it began: the body is another one") == 1
+
+
+def test_mission_of_a_robot_that_was_part_of_another_meanwhile_is_not_complete_but_paused() -> None:
+    world = World(2)
+    client, apart = world.client(), list(world.robot.bodies)
+    world.robot.state[1] = State.ARMED
+    come_back(world, planning(world, client))
+    world.run(1100)
+    world.robot.bodies = [SimpleNamespace(index=1, modules=(0, 1))]
+    world.run(3000)
+    client.clear()
+    world.robot.bodies, world.robot.mode[0] = apart, Mode.POSHOLD
+    world.run(120)
+    assert not client.all("MISSION_ITEM_REACHED") and "mission complete" not in client.texts
+    told = [m for m in client.all("MISSION_CURRENT") if m.get_srcSystem() == 1][-1]
+    assert (told.mission_state, told.seq) == (mavlink.MISSION_STATE_PAUSED, 1)
+    assert continued(world, client) == [1, 2]
+
+
+def test_way_to_a_place_ends_by_pause_while_it_is_planned(world: World, client: Client) -> None:
+    client.command(400, 1)
+    world.run(3)
+    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 1.0, 302084010, 1201614000, -0.4)
+    world.run(10)
+    (job,) = world.station.jobs()
+    client.command(193, 0)
+    come_back(world, job)
+    world.run(3)
+    assert world.robot.mode[0] == Mode.POSHOLD and "flight ended before it began" in client.texts
+
+
+def test_mission_that_was_paused_while_it_was_planned_goes_on_when_it_is_continued(world: World, client: Client) -> None:
+    old = planning(world, client)
+    client.command(193, 0)
+    client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    come_back(world, old)
+    world.run(3)
+    assert world.robot.mode[0] == Mode.POSHOLD
+    come_back(world, job)
+    world.run(3)
+    assert world.robot.mode[0] == Mode.AUTO
+
+
+def test_mission_that_starts_from_another_mode_waits_for_its_hold(world: World, client: Client) -> None:
+    upload(world, client, [item(0, PLACES[0])])
+    client.command(400, 1)
+    client.command(176, 1, 1)
+    world.run(3)
+    client.command(176, 1, 4, 4)
+    for _ in range(20):  # ticks that were queued while the loop took the request
+        inputs, outputs = world.robot.step([])
+        world.station.observe(inputs, outputs, world.robot.bodies)
+    assert world.robot.mode[0] == Mode.MANUAL and not world.station.jobs()
+    world.run(3)
+    assert world.robot.mode[0] == Mode.POSHOLD and len(world.station.jobs()) == 1
+
+
+def test_mission_whose_hold_never_comes_ends(world: World, client: Client) -> None:
+    upload(world, client, [item(0, PLACES[0])])
+    client.command(400, 1)
+    client.command(176, 1, 1)
+    world.run(3)
+    world.robot.refuse[Action.SET_MODE] = "no"
+    client.command(176, 1, 4, 4)
+    world.run(105)
+    assert not world.station.jobs() and "flight ended before it began: the mode is MANUAL" in client.texts

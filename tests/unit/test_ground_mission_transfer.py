@@ -1,0 +1,127 @@
+"""The mission protocol: items go up and come down, get lost, come late, and are written over in part."""
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from tests.unit.ground_missions import PLACES, continued, fly, item, upload
+from tests.unit.ground_world import Client, World
+
+
+def test_mission_goes_up_and_comes_down_the_same(world: World, client: Client) -> None:
+    items = [item(i, place) for i, place in enumerate(PLACES)]
+    assert upload(world, client, items) == mavlink.MAV_MISSION_ACCEPTED
+    client.clear()
+    client.send("MISSION_REQUEST_LIST", 1, 1, 0)
+    for i in range(3):
+        client.send("MISSION_REQUEST_INT", 1, 1, i, 0)
+    client.send("MISSION_REQUEST", 1, 1, 0, 0)
+    world.run(1)
+    assert client.last("MISSION_COUNT").count == 3
+    down = client.all("MISSION_ITEM_INT")
+    assert [(m.x, m.y, pytest.approx(m.z)) for m in down] == PLACES and {m.frame for m in down} == {6}
+    old = client.last("MISSION_ITEM")
+    assert (old.frame, old.x) == (3, pytest.approx(30.208401, abs=1e-5))
+    world.run(120)
+    assert client.last("MISSION_CURRENT").total == 3
+
+
+def test_an_item_that_is_lost_is_asked_for_again(world: World, client: Client) -> None:
+    client.send("MISSION_COUNT", 1, 1, 2, 0)
+    world.run(100)
+    assert [m.seq for m in client.all("MISSION_REQUEST_INT")] == [0] * 5
+    client.send("MISSION_ITEM_INT", *item(0, PLACES[0]), 0)
+    client.send("MISSION_ITEM_INT", *item(0, PLACES[0]), 0)
+    client.send("MISSION_ITEM_INT", *item(1, PLACES[1]), 0)
+    world.run(1)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_ACCEPTED
+
+
+@pytest.mark.parametrize("last", [item(1, PLACES[1]), item(1, PLACES[1], command=22)])
+def test_last_item_that_comes_again_is_answered_again(world: World, client: Client, last: tuple[float, ...]) -> None:
+    """A client whose acknowledgement was lost sends it until it hears one."""
+    result = upload(world, client, [item(0, PLACES[0]), last])
+    for number, answers in ((1, [result]), (0, [])):
+        client.clear()
+        client.send("MISSION_ITEM_INT", *[item(0, PLACES[0]), last][number], 0)
+        world.run(2)
+        assert [ack.type for ack in client.all("MISSION_ACK")] == answers
+    client.send("MISSION_CLEAR_ALL", 1, 1, 0)
+    client.clear()
+    client.send("MISSION_ITEM_INT", *last, 0)
+    world.run(2)
+    assert [ack.type for ack in client.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED]  # of the clearing alone
+
+
+def test_a_transfer_that_breaks_off_leaves_the_old_mission(world: World, client: Client) -> None:
+    upload(world, client, [item(0, PLACES[0])])
+    client.clear()
+    client.send("MISSION_COUNT", 1, 1, 3, 0)
+    world.run(600)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_OPERATION_CANCELLED
+    assert len(world.station.services[1].flight.items) == 1
+
+
+def test_local_frame_is_refused_and_fences_are_told_to_be_unsupported(world: World, client: Client) -> None:
+    assert upload(world, client, [item(0, PLACES[0])], kind=1) == mavlink.MAV_MISSION_UNSUPPORTED
+    client.send("MISSION_REQUEST_LIST", 1, 1, 1)
+    world.run(1)
+    assert (client.last("MISSION_COUNT").count, client.last("MISSION_COUNT").mission_type) == (0, 1)
+
+
+def test_too_many_items_find_no_space_and_clear_removes_all(world: World, client: Client) -> None:
+    client.send("MISSION_COUNT", 1, 1, 501, 0)
+    world.run(1)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_NO_SPACE
+    upload(world, client, [item(0, PLACES[0])])
+    client.send("MISSION_CLEAR_ALL", 1, 1, 0)
+    world.run(1)
+    assert not world.station.services[1].flight.items
+
+
+def test_mission_that_flies_is_not_written_over_in_part_and_a_paused_one_goes_on_where_it_was(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    world.run(1100)
+    client.clear()
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 2, 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_DENIED
+    client.command(193, 0)
+    world.run(120)
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 2, 0)
+    world.run(2)
+    client.send("MISSION_ITEM_INT", *item(2, PLACES[0]), 0)
+    world.run(2)
+    assert continued(world, client) == [1, 2]
+
+
+def test_part_of_a_mission_is_written_over(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    before = world.station.services[1].flight.items
+    client.clear()
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 1, 1, 0)
+    world.run(2)
+    assert client.last("MISSION_REQUEST_INT").seq == 1
+    client.send("MISSION_ITEM_INT", *item(1, (PLACES[1][0], PLACES[1][1], -0.123)), 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_ACCEPTED
+    after = world.station.services[1].flight.items
+    assert (after[0], after[2]) == (before[0], before[2]) and after[1].z == pytest.approx(-0.123)
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 3, 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_INVALID_SEQUENCE
+    client.send("MISSION_REQUEST_PARTIAL_LIST", 1, 1, 0, 1, 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_UNSUPPORTED
+
+
+def test_part_of_a_mission_that_was_started_meanwhile_is_not_written_over(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    before = world.station.services[1].flight.items
+    client.clear()
+    client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 2, 0)
+    fly(world, client)
+    client.send("MISSION_ITEM_INT", *item(2, PLACES[0]), 0)
+    world.run(2)
+    assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_DENIED
+    assert world.station.services[1].flight.items == before
