@@ -1,9 +1,7 @@
 """The thin walk: HEARTBEAT and ATTITUDE reach a real MAVLink client over loopback."""
 
 import os
-import socket
 from contextlib import closing
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,21 +10,11 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 
 from firmware_py.app.ground_station import GroundSide
-from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
-from tests.unit.ground_world import Robot, fleet_of
+from tests.unit.ground_sides import firmware_of, free_port
+from tests.unit.ground_world import Robot
 
 DEADLINE_ROUNDS = 2000
-
-
-def free_port() -> int:
-    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def firmware() -> Any:
-    return SimpleNamespace(pipeline=SimpleNamespace(bodies=[]), fleet=fleet_of(1), parameters=Parameters())
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [("udpout", "udpin"), ("udpin", "udpout"), ("tcpin", "tcp")])
@@ -34,9 +22,9 @@ def test_client_sees_heartbeat_and_attitude(ours: str, theirs: str) -> None:
     port = free_port()
     if theirs == "udpin":
         client = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", dialect="all")
-        side = GroundSide(GroundConfig(links=(f"{ours}:127.0.0.1:{port}",)), firmware())
+        side = GroundSide(GroundConfig(links=(f"{ours}:127.0.0.1:{port}",)), firmware_of())
     else:
-        side = GroundSide(GroundConfig(links=(f"{ours}:127.0.0.1:{port}",)), firmware())
+        side = GroundSide(GroundConfig(links=(f"{ours}:127.0.0.1:{port}",)), firmware_of())
         client = mavutil.mavlink_connection(f"{theirs}:127.0.0.1:{port}", dialect="all")
     robot = Robot()
     seen: dict[str, Any] = {}

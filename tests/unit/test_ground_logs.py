@@ -1,0 +1,96 @@
+"""Logs: listed, fetched piece by piece, and never in the way of anything else."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.logs import LogService
+from tests.unit.ground_world import World
+
+
+def test_each_of_two_clients_has_its_list_of_logs(tmp_path: Path) -> None:
+    for number in range(25):
+        (tmp_path / f"{number}.log").touch()
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    clients = [world.client(), world.client(200)]
+    for client in clients:
+        client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(5)
+    assert [len(client.all("LOG_ENTRY")) for client in clients] == [25, 25]
+
+
+def test_answers_find_their_way_while_a_log_is_fetched_over_a_radio(tmp_path: Path) -> None:
+    (tmp_path / "can.log").write_bytes(bytes(1_000_000))
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    client = world.client()
+    client.send("LOG_REQUEST_DATA", 1, 1, 0, 0, 0xFFFFFFFF)
+    world.station.spare({client.channel})
+    world.run(50)
+    assert not client.all("LOG_DATA") and client.all("HEARTBEAT")
+    world.station.spare(set())
+    world.run(2)
+    assert len(client.all("LOG_DATA")) == 40
+
+
+def test_client_that_leaves_with_an_answer_to_come_leaves_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "can.log").write_bytes(bytes(1_000_000))
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    client = world.client()
+    client.send("LOG_REQUEST_DATA", 1, 1, 0, 0, 0xFFFFFFFF)
+    client.command(400, 1)
+    world.station.leave(client.channel)
+    world.run(3)
+    services = world.station.services[1]
+    assert not services.system.outbox._encoders and services.logs._transfer is None
+
+
+def test_flood_of_requests_for_the_list_of_logs_looks_at_the_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    client, looks = world.client(), []
+    monkeypatch.setattr(LogService, "_find", lambda service: looks.append(1) or [])
+    for _ in range(100):
+        client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(2)
+    assert len(looks) == 1
+
+
+@pytest.mark.parametrize(("identity", "first"), [("generic", 0), ("ardusub", 1)])
+def test_logs_are_listed_and_fetched(identity: str, first: int, tmp_path: Path) -> None:
+    """QGroundControl finds no log whose number is that of their count, unless the autopilot is ArduPilot: it missed the newest."""
+    (tmp_path / "flight1").mkdir()
+    data = bytes(i % 251 for i in range(9_999))
+    (tmp_path / "flight1" / "signals.mcap").write_bytes(data)
+    os.utime(tmp_path / "flight1" / "signals.mcap", (1_000_000, 1_000_000))
+    (tmp_path / "can.log").write_bytes(b"frames")
+    world = World(config=GroundConfig(logs=str(tmp_path), identity=identity))
+    client = world.client()
+    client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(1)
+    entries = [(e.id - first, e.size, e.num_logs, e.last_log_num - first) for e in client.all("LOG_ENTRY")]
+    assert entries == [(0, 9_999, 2, 1), (1, 6, 2, 1)]
+    client.send("LOG_REQUEST_DATA", 1, 1, first, 0, 0xFFFFFFFF)
+    world.run(20)
+    pieces = {m.ofs: bytes(m.data[: m.count]) for m in client.all("LOG_DATA")}
+    assert b"".join(pieces[at] for at in sorted(pieces)) == data
+    assert client.last("LOG_DATA").count == 0 or sum(map(len, pieces.values())) == len(data)
+    client.clear()
+    client.send("LOG_REQUEST_DATA", 1, 1, first, 90, 180)
+    world.run(5)
+    assert b"".join(bytes(m.data[: m.count]) for m in client.all("LOG_DATA")) == data[90:270]
+    client.send("LOG_ERASE", 1, 1)
+    world.run(1)
+    assert "logs are not erased" in client.texts and (tmp_path / "can.log").exists()
+
+
+def test_logs_of_all_runs_are_listed_oldest_first(tmp_path: Path) -> None:
+    """The first run logs into the folder itself, later ones into numbered folders in it."""
+    for size, name in enumerate((".", "0002", "0003", "0010"), 1):
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / "can.log").write_bytes(bytes(size))
+        os.utime(tmp_path / name / "can.log", (1_000_000 + size, 1_000_000 + size))
+    client = (world := World(config=GroundConfig(logs=str(tmp_path)))).client()
+    client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(1)
+    assert [(e.id, e.size) for e in client.all("LOG_ENTRY")] == [(0, 1), (1, 2), (2, 3), (3, 4)]

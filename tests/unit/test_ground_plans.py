@@ -1,0 +1,70 @@
+"""Plans made beside the ground side: in a process that may die, and none that nobody waits for."""
+
+import multiprocessing
+import os
+import threading
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
+from queue import Queue
+
+import pytest
+
+from firmware_py.app.ground_station import _NOTHING, GroundSide
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.mission_flight import Plan, PlanJob
+from tests.unit.ground_sides import PATIENCE_S, firmware_of, free_port, side_on
+
+
+def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    killed = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+    assert isinstance(killed.submit(os._exit, 9).exception(), BrokenProcessPool)
+    monkeypatch.setattr("firmware_py.app.ground_station._planner", lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr("firmware_py.app.ground_station._plan_mission", lambda job, body: Plan(job.serial, None, ()))
+    plans: Queue[Plan] = Queue()
+    with closing(side_on(f"udpin:127.0.0.1:{free_port()}")) as side:
+        monkeypatch.setattr(side.station, "planned", lambda body, plan: plans.put(plan))
+        side._executor = killed
+        for _ in range(2):  # the second finds the new one
+            side.station.services[1].flight.jobs.append(_NOTHING)
+            side.pump()
+        wait([future for _, future in side._plans], PATIENCE_S)
+        side.pump()
+    assert plans.qsize() == 2
+
+
+def test_plans_that_nobody_waits_for_any_more_are_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that moves the robot's goal on five times a second waited minutes for the last one."""
+    may_end, planned = threading.Event(), list[tuple[int, int]]()
+
+    def plan(job: PlanJob, body: object) -> Plan:
+        may_end.wait(PATIENCE_S)
+        planned.append((job.body, job.serial))
+        return Plan(job.serial, None, ())
+
+    monkeypatch.setattr("firmware_py.app.ground_station._plan_mission", plan)
+    firmware = firmware_of(2)
+    config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",))
+    with ThreadPoolExecutor(1) as executor, closing(GroundSide(config, firmware, executor)) as side:
+        side.station.services[2].flight.jobs.append(_NOTHING._replace(body=1))
+        side.pump()
+        for serial in range(100):
+            side.station.services[1].flight.jobs.append(_NOTHING._replace(serial=serial))
+            side.pump()
+        may_end.set()
+        wait([future for _, future in side._plans], PATIENCE_S)
+        side.pump()
+        assert side._plans == [] and planned == [(1, 0), (0, 99)]
+
+
+def test_robot_that_is_stopped_waits_for_no_plan_that_is_being_made() -> None:
+    """The service manager gives it five seconds, and kills what is not through: its log is torn then."""
+    firmware = firmware_of()
+    with GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",)), firmware) as side:
+        while not isinstance(side._executor, ProcessPoolExecutor):
+            time.sleep(0.01)
+        side._executor.submit(os.getpid).result()  # it is there
+        side._executor.submit(time.sleep, 60.0)
+        start = time.monotonic()
+    assert time.monotonic() - start < PATIENCE_S

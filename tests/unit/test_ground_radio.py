@@ -1,0 +1,166 @@
+"""A radio on a serial line: it is slow, takes nothing for a while, and is pulled out and plugged in again."""
+
+import os
+import pty
+import socket
+import termios
+import threading
+from collections import Counter
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from firmware_py.core.types import Action, Event
+from firmware_py.ground.link import Links
+from firmware_py.ground.telemetry import DEFAULT_HZ
+from tests.unit.ground_sides import PATIENCE_S, free_port, heartbeat, pump, received, side_on
+from tests.unit.ground_world import Robot, World
+
+
+def test_radio_that_takes_nothing_holds_up_nobody() -> None:
+    """pyserial's own write would turn in a loop."""
+    ours, theirs = pty.openpty()
+    port = free_port()
+    with (
+        closing(side_on(f"{os.ttyname(theirs)},57600", f"udpin:127.0.0.1:{port}")) as side,
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as station,
+    ):
+        robot = Robot()
+        done = threading.Thread(target=pump, args=(side, robot, 600), daemon=True)
+        done.start()
+        done.join(4 * PATIENCE_S)
+        assert not done.is_alive(), "it hangs in the write"
+        mav = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        stop = mavlink.MAVLink_command_long_message(1, 1, 31012, 0, 0, 0, 0, 0, 0, 0, 0).pack(mav)
+        station.sendto(bytes(stop), ("127.0.0.1", port))
+        assert Action.ESTOP in [request.action for request in pump(side, robot, 3)]
+    os.close(ours)
+
+
+def test_radio_status_makes_nobody_believed() -> None:
+    """It is taken unsigned from everybody."""
+    station = World().station
+    mav = mavlink.MAVLink(None, srcSystem=51, srcComponent=68)
+    assert not station.take(3, bytes(mavlink.MAVLink_radio_status_message(0, 0, 0, 0, 0, 0, 0).pack(mav)), 0)
+    assert station.take(3, heartbeat(), 0)
+
+
+class SlowLink:
+    """A radio that carries so many bytes a tick."""
+
+    datagram = False
+
+    def __init__(self, bytes_per_tick: float) -> None:
+        self.bytes_per_tick, self.room, self.frames = bytes_per_tick, 0.0, list[bytes]()
+
+    def receive(self) -> list[tuple[Any, bytes]]:
+        """Once in a tick."""
+        self.room = min(self.room + self.bytes_per_tick, 300.0)
+        return []
+
+    def send(self, peer: Any, frame: bytes) -> bool:
+        if self.room < len(frame):
+            return False
+        self.room -= len(frame)
+        self.frames.append(frame)
+        return True
+
+    def peers(self) -> list[None]:
+        return [None]
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+def test_radio_slower_than_what_streams_gets_less_of_everything_and_every_heartbeat_and_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    radio, robot = SlowLink(57.6), Robot(modules=4)  # 57,600 Bd at 100 Hz
+    monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address: radio)
+    with closing(side_on("radio", modules=4)) as side:
+        for second in range(20):
+            pump(side, robot, 99)
+            robot.events.append(Event(6, f"second {second}", 0))
+            pump(side, robot, 1)
+            side.station.services[1].parameters._list(SimpleNamespace(channel=0))  # type: ignore[arg-type]
+        pump(side, robot, 300)
+        assert not side.links.dropped
+    parser = mavlink.MAVLink(None)
+    got = Counter((m.get_srcSystem(), m.get_type()) for frame in radio.frames for m in parser.parse_buffer(frame))
+    names = {name for name, hz in DEFAULT_HZ.items() if hz >= 1} - {"ESC_STATUS"}  # pymavlink here knows none
+    for system in (1, 2, 3, 4):
+        assert 21 <= got[system, "HEARTBEAT"] <= 24
+        assert all(got[system, name] >= 3 for name in names)
+        assert got[system, "ATTITUDE"] < 100  # of 230
+    assert got[1, "STATUSTEXT"] == 20
+    assert got[1, "PARAM_VALUE"] >= 20
+
+
+def test_serial_link_carries_frames_both_ways() -> None:
+    ours, theirs = pty.openpty()
+    links = Links([f"{os.ttyname(theirs)},115200"])
+    with closing(links):
+        os.write(ours, heartbeat())
+        assert b"".join(r.data for r in received(links, 1))[:1] == b"\xfd"
+        links.send(None, b"answer")
+        links.flush()
+        assert os.read(ours, 100) == b"answer"
+    os.close(ours)
+    os.close(theirs)
+
+
+class Radio:
+    """A serial device behind a link, as udev names one: plugged in until it is pulled."""
+
+    def __init__(self, name: Path) -> None:
+        self.ours, self._theirs = pty.openpty()
+        self._name = name
+        name.symlink_to(os.ttyname(self._theirs))
+
+    def pull(self) -> None:
+        self._name.unlink()
+        os.close(self.ours)
+        os.close(self._theirs)
+
+
+def test_radio_that_is_pulled_and_plugged_in_again_is_taken_up_again(tmp_path: Path) -> None:
+    name = tmp_path / "radio"
+    radio = Radio(name)
+    with closing(Links([f"{name},115200"])) as links:
+        radio.pull()
+        for _ in range(3):  # the first finds out
+            links.send(None, b"to nobody")
+            links.flush()
+            assert list(links.receive()) == []
+        assert links.counts["send"] + links.counts["receive"] == 1
+        radio = Radio(name)
+        assert list(links.receive()) == []  # opens it
+        os.write(radio.ours, heartbeat())
+        assert b"".join(r.data for r in received(links, 1)) == heartbeat()
+        links.send(None, b"answer")
+        links.flush()
+        assert os.read(radio.ours, 100) == b"answer"
+    radio.pull()
+
+
+def test_radio_that_is_pulled_while_it_is_taken_up_again_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = tmp_path / "radio"
+    radio = Radio(name)
+    with closing(Links([f"{name},115200"])) as links:
+        radio.pull()
+        assert list(links.receive()) == []
+        radio = Radio(name)
+        with monkeypatch.context() as pulled:
+            pulled.setattr(termios, "tcflush", broken)
+            assert list(links.receive()) == []
+        assert list(links.receive()) == []  # opens it
+        os.write(radio.ours, heartbeat())
+        assert b"".join(r.data for r in received(links, 1)) == heartbeat()
+    radio.pull()
+
+
+def broken(descriptor: int, queue: int) -> None:
+    """As a device answers that is no more."""
+    raise termios.error(5, "Input/output error")
