@@ -1,0 +1,96 @@
+"""Guidance of a robot that surfaces, and of one whose world moves when tags come, go and come back."""
+
+import numpy as np
+import pytest
+
+from firmware_py.core.rotations import difference, from_euler, heading
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.transitions import Effect
+from firmware_py.core.types import Mode
+from firmware_py.description.parameters import Parameters
+from tests.unit.guidance_flight import LEVEL, WRENCH, ZERO, Flight, estimate
+from tests.unit.healths import BLIND, GOOD, UPRIGHT
+
+
+def test_surfacing_robot_rises_levels_and_stays_up() -> None:
+    flight = Flight()
+    flight.estimate = estimate(q=from_euler(0.4, -0.6, 1.0))
+    flight.guidance.rest(flight.estimate)
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    now = flight.run(15.0)
+    assert 0.05 < now.p_wb[2] < 0.13 and np.abs(now.v_w).max() < 1e-3
+    np.testing.assert_allclose(now.p_wb[:2], 0.0, atol=1e-9)
+    assert np.linalg.norm(difference(now.q_wb, heading(now.q_wb))) < 1e-3
+
+
+def test_surfacing_robot_lifts_blindly_when_it_must() -> None:
+    lift = -Parameters().steering.surface_force_n
+    for health, expected in (
+        (BLIND, [0.0, 0.0, lift, 0.0, 0.0, 0.0]),
+        (GOOD._replace(tag_age_s=9.0, depth_age_s=9.0), [0.0, 0.0, lift, *WRENCH[3:]]),
+        (GOOD._replace(tag_age_s=9.0), [0.0, 0.0, *WRENCH[2:]]),
+        (GOOD, WRENCH),
+    ):
+        flight = Flight()
+        flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+        flight.run(0.5, health=health)
+        np.testing.assert_allclose(flight.wrenches[-1], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", [Mode.STABILIZE, Mode.ALT_HOLD, Mode.SURFACE])
+def test_first_tags_move_the_set_point_with_the_world(mode: Mode) -> None:
+    """They tell another place and heading: the robot, which is where it was, is not to go back to what it believed before."""
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, mode)
+    flight.run(2.0, health=UPRIGHT)
+    there = flight.estimate = estimate((5.0, -3.0, 1.4), from_euler(0.0, 0.0, 2.5), (0.1, 0.0, 0.0, 0.0, 0.0, 0.2))
+    now = flight.run(0.01, follows=False)
+    np.testing.assert_allclose(now.p_wb, there.p_wb, atol=0.01)
+    assert np.linalg.norm(difference(now.q_wb, there.q_wb)) < 0.01
+    assert flight.run(1.0).p_wb[0] < 5.2
+
+
+def test_what_was_asked_for_in_the_world_before_is_forgotten_and_what_comes_with_the_first_tags_is_not() -> None:
+    flight, there = Flight(), estimate((5.0, -3.0, 1.4))
+    flight.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    flight.run(1.0, health=UPRIGHT)
+    flight.do(Effect.TAKE_POINT, Mode.ALT_HOLD, rest_at(ZERO, LEVEL))
+    flight.estimate = there
+    flight.guidance.look(there, GOOD)
+    flight.do(Effect.HOLD_AT, Mode.POSHOLD, rest_at(np.array([4.0, -3.0, 1.4]), LEVEL))
+    assert flight.run(20.0).p_wb[0] == pytest.approx(4.0, abs=0.01)
+    other = Flight()
+    other.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    other.run(1.0, health=UPRIGHT)
+    other.do(Effect.TAKE_POINT, Mode.ALT_HOLD, rest_at(ZERO, LEVEL))
+    other.estimate = there
+    other.guidance.look(there, GOOD)
+    other.do(Effect.ENTER_MODE, Mode.GUIDED)
+    assert other.run(5.0).p_wb[0] == pytest.approx(5.0, abs=0.01)
+
+
+def test_place_that_tags_tell_a_surfacing_robot_anew_is_not_swum_back_from() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    flight.run(2.0, health=GOOD._replace(tag_age_s=20.0), follows=False)
+    flight.estimate = estimate((1.5, -1.0, 1.0))
+    now = flight.run(0.01, follows=False)
+    np.testing.assert_allclose(now.p_wb[:2], [1.5, -1.0], atol=1e-3)
+
+
+def test_robot_that_falls_back_on_gravity_goes_on_from_where_it_is_believed_to_be() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    flight.run(1.0)
+    flight.estimate = estimate((0.0, 0.0, 1.3), from_euler(0.0, 0.0, 2.5))
+    now = flight.run(0.01, health=UPRIGHT, follows=False)
+    assert np.linalg.norm(difference(now.q_wb, flight.estimate.q_wb)) < 0.01
+
+
+def test_tags_that_come_back_move_no_set_point() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.ALT_HOLD)
+    flight.run(1.0, health=GOOD._replace(tag_age_s=100.0), follows=False)
+    flight.estimate = estimate((0.0, 0.0, 1.3), from_euler(0.0, 0.0, 0.3))
+    now = flight.run(0.01, follows=False)
+    assert now.p_wb[2] == pytest.approx(1.0) and np.linalg.norm(difference(now.q_wb, flight.estimate.q_wb)) > 0.29
