@@ -6,6 +6,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
+pytest.register_assert_rewrite("tests.unit.ports")  # tests stand in it, which subclasses take over
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """`--update-golden` flies the golden logs anew."""

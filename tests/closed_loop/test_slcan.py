@@ -15,7 +15,7 @@ from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from hil.bench import Bench, open_bench
 from tests.closed_loop.flights import shortened
-from tests.unit.test_port import Cable
+from tests.unit.ports import Cable
 
 HOVER_S = 1.0
 PULLED_TICKS = 5

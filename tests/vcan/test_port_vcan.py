@@ -14,7 +14,7 @@ import pytest
 
 from firmware_py.bus.codec import Frame
 from firmware_py.bus.port import PortError, open_port
-from tests.unit.test_port import FRAMES, PortSuite, faults, no_channel_left_open, poll, receive
+from tests.unit.ports import FRAMES, PortSuite, faults, no_channel_left_open, poll, receive
 
 pytestmark = pytest.mark.vcan
 ROOT = Path(__file__).resolve().parents[2]
