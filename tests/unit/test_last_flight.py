@@ -2,40 +2,23 @@
 
 import errno
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from firmware_py.app.last_flight import RECENT_NS, TAIL_BYTES, LastFlight, last_flight, outdate
-from firmware_py.bus.codec import Codec
-from firmware_py.description.fleet import Fleet, Module
 from firmware_py.runtime.clock import unix_ns
 from firmware_py.runtime.guarded_file import GuardedFile, QueuedFile
-from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder, candump_lines
+from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
+from tests.unit.can_logs import CODEC, FLEET, dock_line, lines_of
 
-CODEC = Codec.load()
-FLEET = Fleet(module=(Module(number=1), Module(number=2), Module(number=1, bus=1)), buses=("virtual:a", "virtual:b"))
 BOOT = "a-start-of-the-machine"
-PERIOD_NS = 10_000_000
+
+
 WRITTEN_NS = 1_700_000_000_000_000_000
 NOW_NS = WRITTEN_NS + 2_000_000_000
 TAIL = TAIL_BYTES * len(FLEET.module)
-
-
-def lines_of(armed: Sequence[bool], tick: int = 1) -> str:
-    """What one tick writes: SYNC, an answer of each module, its commands."""
-    text = ""
-    for on, module in zip(armed, FLEET.module, strict=True):
-        names = ("THRUSTER_CMD_A", "THRUSTER_CMD_B")
-        commands = [CODEC.message(name).encode(module.number, (0.1, 0.2, 0.3, 0.4, int(on)), tick) for name in names]
-        answer = CODEC.message("GYRO").encode(module.number, (0.0, 0.0, 0.0, 0), tick)
-        sync = CODEC.message("SYNC").encode(0, (tick,))
-        text += candump_lines(tick * PERIOD_NS, module.bus, "T", [sync])
-        text += candump_lines(tick * PERIOD_NS, module.bus, "R", [answer])
-        text += candump_lines(tick * PERIOD_NS, module.bus, "T", commands)
-    return text
 
 
 def write(folder: Path, text: str, written_ns: int = WRITTEN_NS, **notes: Any) -> None:
@@ -43,12 +26,6 @@ def write(folder: Path, text: str, written_ns: int = WRITTEN_NS, **notes: Any) -
     Recorder(folder, {"boot": BOOT, **notes}).close()
     (folder / CAN_LOG).write_text(text)
     os.utime(folder / CAN_LOG, ns=(written_ns, written_ns))
-
-
-def dock_line(index: int, relays: Sequence[int], tick: int = 1, direction: str = "T") -> str:
-    """What a tick writes in which the relays of a module are due."""
-    module = FLEET.module[index]
-    return candump_lines(tick * PERIOD_NS, module.bus, direction, [CODEC.message("DOCK_CMD").encode(module.number, relays, tick)])
 
 
 def found(out: Path, now_ns: int = NOW_NS) -> LastFlight:

@@ -1,0 +1,31 @@
+"""What the process of a vehicle of three modules writes into its can.log, by the codec's own frames."""
+
+from collections.abc import Sequence
+
+from firmware_py.bus.codec import Codec
+from firmware_py.description.fleet import Fleet, Module
+from firmware_py.runtime.recorder import candump_lines
+
+CODEC = Codec.load()
+FLEET = Fleet(module=(Module(number=1), Module(number=2), Module(number=1, bus=1)), buses=("virtual:a", "virtual:b"))
+PERIOD_NS = 10_000_000
+
+
+def lines_of(armed: Sequence[bool], tick: int = 1) -> str:
+    """What one tick writes: SYNC, an answer of each module, its commands."""
+    text = ""
+    for on, module in zip(armed, FLEET.module, strict=True):
+        names = ("THRUSTER_CMD_A", "THRUSTER_CMD_B")
+        commands = [CODEC.message(name).encode(module.number, (0.1, 0.2, 0.3, 0.4, int(on)), tick) for name in names]
+        answer = CODEC.message("GYRO").encode(module.number, (0.0, 0.0, 0.0, 0), tick)
+        sync = CODEC.message("SYNC").encode(0, (tick,))
+        text += candump_lines(tick * PERIOD_NS, module.bus, "T", [sync])
+        text += candump_lines(tick * PERIOD_NS, module.bus, "R", [answer])
+        text += candump_lines(tick * PERIOD_NS, module.bus, "T", commands)
+    return text
+
+
+def dock_line(index: int, relays: Sequence[int], tick: int = 1, direction: str = "T") -> str:
+    """What a tick writes in which the relays of a module are due."""
+    module = FLEET.module[index]
+    return candump_lines(tick * PERIOD_NS, module.bus, direction, [CODEC.message("DOCK_CMD").encode(module.number, relays, tick)])
