@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+import shapely
+import shapely.affinity
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
@@ -11,21 +13,11 @@ from firmware_py.core import rotations
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.plant.contact import touch
 from hil.plant.dock_spec import DockSpec
-from hil.plant.spec import CALM, Tank, WorldSpec
+from hil.plant.spec import CALM, WorldSpec
 from hil.plant.world import STEP_NS, Start, World
+from tests.unit.plant_docks import LEVEL, OCEAN, PERIOD_NS, SLIPPERY, SMOOTH, hulls, run, two
 
-PERIOD_NS = 10_000_000
 DEPTH_M = 400.0
-LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
-OCEAN = Tank(kind="box", size_m=np.array([900.0, 900.0, 900.0]))
-MODCUBE = load_vehicle("modcube")
-SLIPPERY = dataclasses.replace(
-    MODCUBE,
-    drag=dataclasses.replace(MODCUBE.drag, cd_face=0.0, cd_edge=0.0, rotational_cd=0.0),
-    inertial=dataclasses.replace(MODCUBE.inertial, righting_arm_m=0.0),
-)
-"""In still water nothing but contact acts on it."""
-HULL = dataclasses.replace(SLIPPERY, faces=("-",) * 6)
 COLLISIONS = 120
 TICKS = 250
 DAMPED, ELASTIC = 1e-9, 1e-4
@@ -33,7 +25,7 @@ DAMPED, ELASTIC = 1e-9, 1e-4
 
 
 def pair(
-    away_m: np.ndarray, q: np.ndarray, other_q: np.ndarray, vehicle: Vehicle = HULL, step_ns: int = STEP_NS, **springs: float
+    away_m: np.ndarray, q: np.ndarray, other_q: np.ndarray, vehicle: Vehicle = SMOOTH, step_ns: int = STEP_NS, **springs: float
 ) -> World:
     """Two modules without drag in calm deep water; `springs`: of `contact.Faces`, in place of the scenario's."""
     first = np.array([0.0, 0.0, DEPTH_M])
@@ -161,3 +153,54 @@ def test_magnets_and_funnel_of_tilted_faces_only_turn_energy_into_motion_and_bac
     for _ in range(30):
         world.advance(PERIOD_NS)
         assert energy() == pytest.approx(start, rel=1e-7)
+
+
+def test_colliding_cubes_bounce_off_and_gain_no_energy() -> None:
+    world = two(0.05, 0.12)  # beside the funnel: hulls alone
+    world.set_motion(1, [-0.15, 0.0, 0.0], np.zeros(3))
+    energy = world.kinetic_energy().sum()
+    for _ in range(150):
+        world.advance(PERIOD_NS)
+        away = world.truth(1).p_wm - world.truth(0).p_wm
+        assert np.abs(away).max() > 0.205
+    assert world.kinetic_energy().sum() < energy
+    assert world.truth(0).v_w[0] < -0.01, "the other one was hit"
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 0.6, 5.0, 20.0, 45.0])
+@pytest.mark.parametrize("y_m", [0.0, 0.003])
+def test_rolled_cubes_do_not_pass_through_each_other(roll_deg: float, y_m: float) -> None:
+    world = hulls(0.23, y_m, roll_deg)
+    world.set_motion(1, [-0.1, 0.0, 0.0], np.zeros(3))
+    energy, momentum = world.kinetic_energy().sum(), world.momentum().sum(axis=0)
+    for _ in range(60):
+        world.advance(PERIOD_NS)
+        assert world.truth(1).p_wm[0] - world.truth(0).p_wm[0] > 0.209
+        assert world.kinetic_energy().sum() <= energy * (1.0 + 1e-9)
+    assert world.truth(1).v_w[0] - world.truth(0).v_w[0] > 0.0
+    np.testing.assert_allclose(world.momentum().sum(axis=0), momentum, rtol=0, atol=1e-6 * np.abs(momentum).max())
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 1e-9, 0.3, 30.0, 45.0])
+@pytest.mark.parametrize("y_m", [0.0, 0.05])
+def test_overlap_of_faces_bears_by_its_area(roll_deg: float, y_m: float) -> None:
+    """To be exact, at every depth by what overlaps of the two squares so far inside their edges; Simpson's rule is exact for that."""
+    deep = 2e-4
+    world = hulls(0.21 - deep, y_m, roll_deg)
+
+    def area(inset_m: float) -> float:
+        square = shapely.box(*(-0.105 + inset_m,) * 2, *(0.105 - inset_m,) * 2)
+        return square.intersection(shapely.affinity.translate(shapely.affinity.rotate(square, roll_deg), y_m)).area
+
+    bears = (area(0.0) + 4.0 * area(0.25 * deep) + area(0.5 * deep)) / 6.0
+    np.testing.assert_allclose(world._body_arrays.wrench[1, 0], bears * deep * DockSpec().contact_n_m3, rtol=1e-9)
+
+
+def test_hulls_of_any_size_stop_each_other() -> None:
+    girona = load_vehicle("girona500")
+    length = girona.hull.size_m[0]
+    world = hulls(length + 0.02, vehicle=dataclasses.replace(girona, inertial=dataclasses.replace(girona.inertial, righting_arm_m=0.0)))
+    world.set_motion(1, [-0.2, 0.0, 0.0], np.zeros(3))
+    run(world, 1.0)
+    assert world.truth(1).p_wm[0] - world.truth(0).p_wm[0] > length - 0.01
+    assert world.truth(0).v_w[0] < -0.01, "the other one was hit"
