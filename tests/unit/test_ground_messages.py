@@ -27,7 +27,7 @@ from firmware_py.runtime.clock import ManualClock
 from firmware_py.runtime.rate_keeper import RateKeeper
 from tests.unit.ground_requests import ask
 from tests.unit.ground_world import PERIOD_NS, Client, World
-from tests.unit.test_live_parameters import resting
+from tests.unit.module_at_rest import resting
 
 # ---------------------------------------------------------------- telemetry
 

@@ -4,27 +4,13 @@ import numpy as np
 import pytest
 
 from firmware_py.core.pipeline import Pipeline
-from firmware_py.core.rotations import to_matrix
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.core.types import Action, Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
-from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare.assembly import assemble_vehicle
-
-PERIOD_NS = 10_000_000
-PLACE = np.array([0.1, -0.2, 0.5])
-LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
-
-
-def resting(tick: int, requests: list[Request]) -> Inputs:
-    """What a module at rest says, every sensor answering."""
-    module = ModuleInputs(answered=True, heard=True, gyro=np.zeros(3), accel=-9.80665 * to_matrix(LEVEL)[2].copy())
-    module.pressure_pa = 101325.0 + WATER_DENSITY * 9.80665 * PLACE[2]
-    module.tags = [TagObservation(5, 7, tick * PERIOD_NS, np.add(PLACE, [0.0, 0.0, -0.105]), LEVEL)]
-    module.voltage_v, module.current_a = 12.0, 1.0
-    module.leak, module.cabin_temperature_c, module.cabin_pressure_pa = False, 30.0, 101325.0
-    return Inputs(tick, tick * PERIOD_NS, [module], requests)
+from tests.unit.module_at_rest import PERIOD_NS, resting
+from tests.unit.tanks import RING, Docked
 
 
 @pytest.fixture
@@ -90,3 +76,10 @@ def test_whole_numbers_set_in_flight_are_flown_with(flying: Pipeline) -> None:
     outputs = step(flying, 121, [])
     assert flying.parameters.control.attitude_bandwidth == 2.0
     assert np.isfinite(outputs.records[0].commanded_n).all()
+
+
+def test_of_several_values_of_a_parameter_in_a_tick_the_last_counts() -> None:
+    tank = Docked(RING[:2])
+    tank.run(0.1)
+    tank.run(0.01, *(Request(Action.SET_PARAMETER, 0, ("failsafes.leak_action", value)) for value in (4, 1, 4)))
+    assert tank.pipeline.parameters.failsafes.leak_action == 4

@@ -2,90 +2,14 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from firmware_py.app.preparation import prepare
-from firmware_py.core.body import Body
 from firmware_py.core.docking import CHANGED, IN_PLACE
-from firmware_py.core.docking_decisions import Prepared
 from firmware_py.core.joints import joints_of
 from firmware_py.core.transitions import State
-from firmware_py.core.types import RELAY_PUSH, Action, DockFeedback, DockRequest, Inputs, Mode, ModuleInputs, Outputs, Request
+from firmware_py.core.types import Action, DockFeedback, DockRequest, Mode, ModuleInputs, Request
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.assembly import PITCH_M, assemble
-from tests.unit.test_pipeline import Tank
-
-MODCUBE = load_vehicle("modcube")
-RING = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
-LOST = "fail-safe on: a docked partner is lost"
-
-
-def _body_of(cells: list[tuple[int, int, int]], first: int) -> Body:
-    return assemble(cells, [0] * len(cells), [MODCUBE] * len(cells), list(range(first, first + len(cells))))
-
-
-class Docked(Tank):
-    """A tank in which the magnets of some modules carry no current, and some modules' tags are out of sight. Joints that push apart stay
-    in their places in pictures where they are `stuck`.
-    """
-
-    def __init__(
-        self, cells: list[tuple[int, int, int]], parameters: Parameters | None = None, delay: int = 0, apart: bool = False, each: int = 0
-    ) -> None:
-        """`delay`: ticks until a plan that was asked for is there. `apart`: each module is a body of its own; `each`: so many are one."""
-        count = len(cells)
-        size = 1 if apart else each or count
-        super().__init__([_body_of(cells[m : m + size], m) for m in range(0, count, size)], parameters)
-        self.cabin_pa = [101_325.0] * count
-        self.weak: set[int] = set()
-        self.hidden: set[int] = set()
-        self.stuck = False
-        self.said: list[tuple[float, str]] = []
-        self._delay, self._plans = delay, list[tuple[int, Prepared]]()
-        self._step, self.pipeline.step = self.pipeline.step, self._step_with_plans  # type: ignore[method-assign]
-
-    def _hear(self, tick: int) -> list[ModuleInputs]:
-        modules = super()._hear(tick)
-        relays = self.pipeline.formation.docking.relays.states
-        pushing = [m for m, states in enumerate(relays) if RELAY_PUSH in states and not self.stuck]
-        for m, module in enumerate(modules):
-            module.cabin_pressure_pa = self.cabin_pa[m]
-            if m in self.hidden or m in pushing[1:]:  # no picture shows two in their places that push each other apart
-                module.tags.clear()
-            if tick % 4 == 0:
-                current = 0.0 if m in self.weak else 110.0
-                module.docks = [DockFeedback(first, (current,) * 3, (1, 1, 1)) for first in (0, 3)]
-        return modules
-
-    def _step_with_plans(self, inputs: Inputs) -> Outputs:
-        inputs.prepared = [plan for due, plan in self._plans if due <= inputs.tick]
-        self._plans = [each for each in self._plans if each[0] > inputs.tick]
-        outputs = self._step(inputs)
-        for request in outputs.preparations:
-            plan = prepare(request, self.pipeline, [MODCUBE] * len(inputs.modules), PITCH_M)
-            self._plans.append((inputs.tick + 1 + self._delay, plan))
-        self.said += [(1e-9 * inputs.time_ns, event.text) for event in outputs.events]
-        return outputs
-
-    def fly(self) -> None:
-        """Armed, and holding its place."""
-        self.run(0.5)
-        assert self.run(1.0, Request(Action.ARM)).records[0].state == State.ARMED
-
-    def lose(self, *modules: int) -> float:
-        """These are out of sight, and their magnets carry no current; returns the time."""
-        self.weak |= set(modules)
-        self.hidden |= set(modules)
-        return len(self.outputs) * 0.01
-
-    @property
-    def shape(self) -> list[tuple[int, ...]]:
-        return sorted(body.modules for body in self.pipeline.bodies)
-
-    def when(self, text: str) -> float:
-        return next(at for at, said in self.said if text in said)
+from tests.unit.tanks import LOST, RING, Docked
 
 
 def test_module_that_is_lost_is_parted_half_a_second_later_and_both_hold() -> None:
@@ -305,98 +229,6 @@ def test_three_that_have_all_come_apart_are_three_however_they_are_numbered(cell
     assert tank.shape == [(0,), (1,), (2,)]
 
 
-# ---------------------------------------------------------------- what is known is not forgotten
-
-
-@pytest.mark.slow
-def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
-    """A thruster is out, a cabin loses its pressure, the ground station has fallen silent; then the joint opens."""
-    tank = Docked(RING[:2])
-    tank.run(0.5)
-    tank.run(1.0, Request(Action.GROUND_ALIVE), Request(Action.ARM))
-    whole = tank.pipeline.formation.chains[0]
-    whole.faults._lose(3, "stands still")
-    whole.allocator.set_alive(whole.faults.now.alive)
-    tank.cabin_pa[0] = 130e3
-    tank.run(2.5)
-    tank.lose(1)
-    tank.run(1.0)
-    assert tank.shape == [(0,), (1,)]
-    hurt, sound = tank.pipeline.formation.chains
-    assert hurt.faults.now.dead == (3,) and sound.faults.now.dead == ()
-    assert hurt.health.now.cabin_change_pa == 130e3 - 101_325.0 and sound.health.now.cabin_change_pa == 0.0
-    assert all(chain.supervisor.is_on("cabin_pressure") and chain.supervisor.mode == Mode.SURFACE for chain in (hurt, sound))
-    assert tank.outputs[-1].modules[0].thrusters[3] == 0.0 and hurt.supervisor.is_on("thruster_lost")
-    assert hurt.health.now.ground_age_s == sound.health.now.ground_age_s == pytest.approx(4.49, abs=0.02)
-    tank.run(0.1, Request(Action.DISARM, 0))
-    assert tank.run(0.1, Request(Action.ARM, 0)).records[0].state == State.DISARMED, "a hull that fails flies no more"
-
-
-def test_body_that_was_prepared_with_other_gains_flies_with_those_of_now() -> None:
-    tank = Docked(RING[:2], delay=30)
-    tank.fly()
-    tank.lose(1)
-    while not tank._plans:
-        tank.run(0.01)
-    tank.run(0.05, Request(Action.SET_PARAMETER, 0, ("control.position_bandwidth", 1.5)))
-    tank.run(0.6)
-    assert tank.shape == [(0,), (1,)]
-    assert all(chain.parameters.control.position_bandwidth == 1.5 for chain in tank.pipeline.formation.chains)
-
-
-@pytest.mark.slow
-def test_magnets_of_a_joint_rest_when_their_account_is_empty_and_take_power_while_they_pull() -> None:
-    parameters = Parameters().replace("limiter.relay_on_s", 2.0).replace("limiter.relay_duty", 0.25)
-    tank = Docked(RING[:2], parameters)
-    tank.run(1.0)
-    assert [magnets.power_w for magnets in tank.pipeline.formation.chains[0].limiter.magnets] == [6.0, 6.0]
-    tank.run(3.0)
-    sent = [(tick, outputs.modules[0].relays) for tick, outputs in enumerate(tank.outputs) if outputs.modules[0].relays is not None]
-    pulling = {tick for tick, states in sent if any(states)}
-    resting = sorted({tick for tick, states in sent if not any(states)})
-    assert resting and resting[0] == pytest.approx(2.0 / 0.75 / 0.01, abs=2), "sent at once, not with the next tenth of a second"
-    assert not pulling & set(resting) and tank.pipeline.formation.chains[0].limiter.magnets[0].power_w == 0.0
-
-
-def test_parted_modules_magnets_keep_their_accounts() -> None:
-    tank = Docked(RING[:2], Parameters().replace("limiter.relay_on_s", 60.0).replace("limiter.relay_duty", 0.01))
-    tank.fly()
-    before = [list(magnets._left_s) for magnets in tank.pipeline.formation.chains[0].limiter.magnets]
-    tank.lose(1)
-    tank.run(1.0)
-    after = [list(chain.limiter.magnets[0]._left_s) for chain in tank.pipeline.formation.chains]
-    assert min(before[0]) < 59.0 and min(after[0]) < min(before[0]) and min(after[1]) < min(before[1])
-
-
-def test_joint_that_holds_for_a_moment_and_is_lost_again_is_parted_by_another_plan() -> None:
-    """The first plan comes while nothing is open, and is dropped."""
-    tank = Docked(RING[:2], delay=60)
-    tank.fly()
-    tank.lose(1)
-    while not tank._plans:
-        tank.run(0.01)
-    tank.weak.clear()
-    tank.hidden.clear()
-    tank.run(3.0)
-    assert tank.shape == [(0, 1)]
-    tank.lose(1)
-    tank.run(2.0)
-    assert tank.shape == [(0,), (1,)]
-
-
-def test_disarming_a_body_in_the_tick_in_which_it_parts_reaches_both_pieces() -> None:
-    tank = Docked(RING[:2])
-    tank.fly()
-    tank.run(0.01, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
-    while tank.shape == [(0, 1)]:
-        (undock,) = tank.pipeline.formation.docking._undocks or [None]
-        parts = undock is not None and len(tank.outputs) * 10_000_000 >= undock.until_ns
-        outputs = tank.run(0.01, *([Request(Action.DISARM, 0)] if parts else []))
-    assert tank.shape == [(0,), (1,)]
-    assert [record.state for record in outputs.records] == [State.DISARMED] * 2
-    assert not np.any([module.thrusters for module in outputs.modules])
-
-
 @pytest.mark.parametrize("hidden", [set(), {1}], ids=["seen", "out of sight"])
 def test_magnets_that_the_limiter_rests_are_no_lost_partner(hidden: set[int]) -> None:
     """Their currents are gone, and with a partner out of sight nothing else would speak for the joint."""
@@ -423,23 +255,3 @@ def test_magnets_that_the_limiter_rests_are_no_lost_partner(hidden: set[int]) ->
     rested = [outputs.modules[0].relays for outputs in tank.outputs if outputs.modules[0].relays == (0,) * 6]
     assert rested and tank.shape == [(0, 1)]
     assert LOST not in [text for _, text in tank.said]
-
-
-def test_refused_dock_does_not_end_the_one_that_was_asked_for_after_it() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0)], apart=True, delay=20)
-    tank.weak = {0, 1}
-    tank.states[1][1] = 0.6
-    tank.run(2.0)
-    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
-    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 2)))  # a probe against a probe
-    tank.run(0.15, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
-    outputs = tank.run(1.0)
-    assert tank.when("dock refused") < tank.when("docking module 1 to 0")
-    assert outputs.records[1].mode == Mode.DOCK
-
-
-def test_of_several_values_of_a_parameter_in_a_tick_the_last_counts() -> None:
-    tank = Docked(RING[:2])
-    tank.run(0.1)
-    tank.run(0.01, *(Request(Action.SET_PARAMETER, 0, ("failsafes.leak_action", value)) for value in (4, 1, 4)))
-    assert tank.pipeline.parameters.failsafes.leak_action == 4

@@ -14,7 +14,7 @@ from firmware_py.core.types import Action, DockRequest, Event, Mode, Request, Se
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.paths import hold
-from tests.unit.test_pipeline import DT, Tank, single
+from tests.unit.tanks import DT, Tank, single
 
 NAN, LEVEL, ZERO = math.nan, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
 HERE = rest_at(np.array([1.0, 0.0, 0.8]), from_euler(0.1, -0.15, 0.4))

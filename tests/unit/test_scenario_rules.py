@@ -23,7 +23,7 @@ from hil.metrics import DOCKING, SHOWN
 from hil.scenario import Scenario, Step, load_scenario, make_world, scenario_names
 from hil.scenario_rules import metric_names
 from hil.script import Script
-from tests.unit.test_partner_lost import Docked
+from tests.unit.tanks import Docked
 
 FOLDER = Path(load_scenario.__code__.co_filename).parent / "scenarios"
 Load = Callable[..., Scenario]

@@ -11,7 +11,7 @@ from firmware_py.core.sensor_watch import DEPTH_REPEATS, LEAPS, REPEATS, SensorW
 from firmware_py.core.types import Action, Mode, ModuleInputs, Request
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
-from tests.unit.test_pipeline import Tank, single
+from tests.unit.tanks import Tank, single
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 PAIR = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)

@@ -1,0 +1,204 @@
+"""Tanks in which whole ticks are run: a world of the controller's own model, without the bus."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from firmware_py.app.preparation import prepare
+from firmware_py.core import propagation
+from firmware_py.core.body import Body
+from firmware_py.core.docking_decisions import Prepared
+from firmware_py.core.pipeline import Pipeline
+from firmware_py.core.propagation import STATES
+from firmware_py.core.rotations import from_euler, multiply
+from firmware_py.core.transitions import State
+from firmware_py.core.types import RELAY_PUSH, Action, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.water import WATER_DENSITY
+from firmware_py.prepare.assembly import PITCH_M, assemble
+
+PERIOD = 10_000_000
+DT = 0.01
+START = from_euler(0.1, -0.15, 0.4)
+TAG_DELAY_TICKS = 4
+TOP_FACE = 5
+MODCUBE = load_vehicle("modcube")
+RING = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
+LOST = "fail-safe on: a docked partner is lost"
+
+
+class Tank:
+    """A world of the controller's own model: bodies with lagging thrusters, exact sensors, late tags on the top faces.
+
+    What tick k commands acts from SYNC k + 1 on.
+    """
+
+    def __init__(self, bodies: list[Body], parameters: Parameters | None = None, believed: list[Body] | None = None):
+        self.bodies = bodies
+        self.pipeline = Pipeline(believed or bodies, parameters or Parameters(), PERIOD)
+        self.states = [self._start(n) for n in range(len(bodies))]
+        self.forces = [np.zeros(b.thrusters.f_max.size) for b in bodies]
+        self.acting = [np.zeros((len(b.modules), 8)) for b in bodies]
+        self.waiting = [a.copy() for a in self.acting]
+        self.wrenches = [np.zeros(6) for _ in bodies]
+        self.past: list[list[np.ndarray]] = []
+        self.outputs: list[Outputs] = []
+
+    @staticmethod
+    def _start(number: int) -> np.ndarray:
+        x = np.zeros(STATES)
+        x[:3], x[3:7] = [1.0, 2.0 * number, 0.8], START
+        return x
+
+    def run(self, seconds: float, *requests: Request, estop: bool = False) -> Outputs:
+        """Ticks for `seconds`; requests and e-stop enter the first of them."""
+        for n in range(round(seconds / DT)):
+            self._tick(list(requests) if n == 0 else [], estop and n == 0)
+        return self.outputs[-1]
+
+    def _tick(self, requests: list[Request], estop: bool) -> None:
+        tick = len(self.outputs)
+        if tick:
+            for n in range(len(self.bodies)):
+                self._move(n)
+        self.past.append([x.copy() for x in self.states])
+        inputs = Inputs(tick, tick * PERIOD, self._hear(tick), requests, estop=estop)
+        self.outputs.append(self.pipeline.step(inputs))
+        for n, body in enumerate(self.bodies):
+            self.acting[n] = self.waiting[n]
+            self.waiting[n] = np.array([self.outputs[-1].modules[m].thrusters for m in body.modules])
+
+    def _move(self, n: int) -> None:
+        t = self.bodies[n].thrusters
+        u = self.acting[n][t.module, t.channel]
+        curves = np.where(u[:, None] >= 0.0, t.forward, t.reverse)
+        wanted = np.copysign([np.polyval(np.r_[c[::-1], 0.0], abs(v)) for c, v in zip(curves, u, strict=True)], u)
+        end = wanted + (self.forces[n] - wanted) * np.exp(-DT / t.lag_s)
+        self.wrenches[n] = t.matrix @ (wanted + (self.forces[n] - end) * t.lag_s / DT)
+        self.forces[n] = end
+        self.states[n] = propagation.step(self.states[n], self.wrenches[n], DT, *plant(self.bodies[n]))
+
+    def _hear(self, tick: int) -> list[ModuleInputs]:
+        modules = [ModuleInputs(answered=True, heard=True) for body in self.bodies for _ in body.modules]
+        for n, body in enumerate(self.bodies):
+            x = self.states[n]
+            felt = propagation.inertial_acceleration(x, self.wrenches[n], *plant(body))
+            felt = felt + world(x).inv().apply([0.0, 0.0, -9.80665])
+            for k, m in enumerate(body.modules):
+                r_mb = Rotation.from_quat(body.q_bm[k][[1, 2, 3, 0]]).inv()
+                heard = modules[m]
+                heard.gyro, heard.accel = r_mb.apply(x[10:13]), r_mb.apply(felt)
+                heard.pressure_pa = 101_325.0 + WATER_DENSITY * 9.80665 * float((x[:3] + world(x).apply(body.r_bi[k]))[2])
+                heard.voltage_v, heard.current_a, heard.leak, heard.cabin_temperature_c = 12.0, 3.0, False, 30.0
+                if tick % 10 == 0:
+                    heard.esc = self._escs(n, k)
+                if tick % 2 == 0 and tick >= TAG_DELAY_TICKS:
+                    heard.tags.append(self._tag(n, k, tick - TAG_DELAY_TICKS))
+        return modules
+
+    def _escs(self, n: int, k: int) -> list[EscFeedback]:
+        t = self.bodies[n].thrusters
+        speed = np.sign(self.forces[n]) * t.rpm_at_full * np.sqrt(np.abs(self.forces[n]) / np.where(self.forces[n] > 0, 10.0, 8.0))
+        rpm = [float(v) for v in speed[t.module == k]]
+        return [EscFeedback(i, (rpm[i], rpm[i + 1]), (1.0, 1.0), (0, 0)) for i in range(0, 8, 2)]
+
+    def _tag(self, n: int, k: int, tick: int) -> TagObservation:
+        body, x = self.bodies[n], self.past[tick][n]
+        row = int(np.flatnonzero((body.tag_module == k) & (body.tag_ids == TOP_FACE))[0])
+        q_wt = multiply(x[3:7].copy(), np.ascontiguousarray(body.q_bt[row]))
+        return TagObservation(TOP_FACE, 7, tick * PERIOD, x[:3] + world(x).apply(body.r_bt[row]), q_wt)
+
+
+def plant(body: Body) -> tuple[np.ndarray, ...]:
+    drag = body.drag
+    return body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear
+
+
+def world(x: np.ndarray) -> Rotation:
+    return Rotation.from_quat(x[[4, 5, 6, 3]])
+
+
+def single(module: int = 0) -> Body:
+    return assemble([(0, 0, 0)], [0], [MODCUBE], [module])
+
+
+def has_power(outputs: Outputs, module: int = 0) -> bool:
+    return bool(outputs.modules[module].thrusters.any())
+
+
+def _body_of(cells: list[tuple[int, int, int]], first: int) -> Body:
+    return assemble(cells, [0] * len(cells), [MODCUBE] * len(cells), list(range(first, first + len(cells))))
+
+
+class Docked(Tank):
+    """A tank in which the magnets of some modules carry no current, and some modules' tags are out of sight. Joints that push apart stay
+    in their places in pictures where they are `stuck`.
+    """
+
+    def __init__(
+        self, cells: list[tuple[int, int, int]], parameters: Parameters | None = None, delay: int = 0, apart: bool = False, each: int = 0
+    ) -> None:
+        """`delay`: ticks until a plan that was asked for is there. `apart`: each module is a body of its own; `each`: so many are one."""
+        count = len(cells)
+        size = 1 if apart else each or count
+        super().__init__([_body_of(cells[m : m + size], m) for m in range(0, count, size)], parameters)
+        self.cabin_pa = [101_325.0] * count
+        self.weak: set[int] = set()
+        self.hidden: set[int] = set()
+        self.stuck = False
+        self.said: list[tuple[float, str]] = []
+        self._delay, self._plans = delay, list[tuple[int, Prepared]]()
+        self._step, self.pipeline.step = self.pipeline.step, self._step_with_plans  # type: ignore[method-assign]
+
+    def _hear(self, tick: int) -> list[ModuleInputs]:
+        modules = super()._hear(tick)
+        relays = self.pipeline.formation.docking.relays.states
+        pushing = [m for m, states in enumerate(relays) if RELAY_PUSH in states and not self.stuck]
+        for m, module in enumerate(modules):
+            module.cabin_pressure_pa = self.cabin_pa[m]
+            if m in self.hidden or m in pushing[1:]:  # no picture shows two in their places that push each other apart
+                module.tags.clear()
+            if tick % 4 == 0:
+                current = 0.0 if m in self.weak else 110.0
+                module.docks = [DockFeedback(first, (current,) * 3, (1, 1, 1)) for first in (0, 3)]
+        return modules
+
+    def _step_with_plans(self, inputs: Inputs) -> Outputs:
+        inputs.prepared = [plan for due, plan in self._plans if due <= inputs.tick]
+        self._plans = [each for each in self._plans if each[0] > inputs.tick]
+        outputs = self._step(inputs)
+        for request in outputs.preparations:
+            plan = prepare(request, self.pipeline, [MODCUBE] * len(inputs.modules), PITCH_M)
+            self._plans.append((inputs.tick + 1 + self._delay, plan))
+        self.said += [(1e-9 * inputs.time_ns, event.text) for event in outputs.events]
+        return outputs
+
+    def fly(self) -> None:
+        """Armed, and holding its place."""
+        self.run(0.5)
+        assert self.run(1.0, Request(Action.ARM)).records[0].state == State.ARMED
+
+    def lose(self, *modules: int) -> float:
+        """These are out of sight, and their magnets carry no current; returns the time."""
+        self.weak |= set(modules)
+        self.hidden |= set(modules)
+        return len(self.outputs) * 0.01
+
+    @property
+    def shape(self) -> list[tuple[int, ...]]:
+        return sorted(body.modules for body in self.pipeline.bodies)
+
+    def when(self, text: str) -> float:
+        return next(at for at, said in self.said if text in said)
+
+
+def before_each_other(*y_m: float, parameters: Parameters | None = None, armed: tuple[int, ...] = (0, 1, 2)) -> Docked:
+    """Armed modules in one line, the first at 0, the others so far from it; no magnet draws current."""
+    modules = range(len(y_m) + 1)
+    tank = Docked([(0, m, 0) for m in modules], parameters, apart=True)
+    tank.weak = set(modules)
+    for state, y in zip(tank.states, (0.0, *y_m), strict=True):
+        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in modules if m in armed))
+    return tank

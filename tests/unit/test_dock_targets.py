@@ -1,0 +1,140 @@
+"""The body that others dock to: it feels no blow, comes to meet one of them, and goes back where it was."""
+
+import numpy as np
+import pytest
+
+from firmware_py.core.docking import LED, NO_LONGER, SURFACES
+from firmware_py.core.docking_sequence import Stage
+from firmware_py.core.rotations import from_euler
+from firmware_py.core.setpoint import rest_at
+from firmware_py.core.types import Action, DockRequest, Mode, Request, Sticks
+from firmware_py.description.parameters import Parameters
+from firmware_py.prepare.assembly import PITCH_M
+from tests.unit.tanks import Docked, before_each_other
+
+
+@pytest.mark.slow
+def test_pilot_of_the_target_feels_no_blow_when_another_docks_to_it() -> None:
+    wide = Parameters().replace("docking.push_m", 0.0).replace("docking.position_tolerance_m", 0.1).replace("docking.settled_m", 0.1)
+    tank = Docked([(0, 0, 0), (0, 1, 0)], wide, apart=True)
+    for state, east in zip(tank.states, (0.0, PITCH_M), strict=True):
+        state[:7] = [1.0, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
+    sticks = Request(Action.STICKS, 0, Sticks((0.2, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    tank.run(0.03, sticks, Request(Action.SET_MODE, 0, Mode.ALT_HOLD), Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    (dock,) = tank.pipeline.formation.docking._docks
+    dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just come
+    for _ in range(300):
+        if len(tank.shape) == 2:
+            tank.run(0.01, *([sticks] if len(tank.outputs) % 10 == 5 else []))
+    assert len(tank.shape) == 1
+    forward = [tank.outputs[-1].records[0].wrench[0]]
+    for _ in range(6):
+        tank.run(0.1, sticks)
+        forward += [outputs.records[0].wrench[0] for outputs in tank.outputs[-10:]]
+    assert tank.outputs[-1].records[0].mode == Mode.ALT_HOLD
+    assert max(forward) < 1.2 * forward[-1]
+
+
+@pytest.mark.parametrize("approach", ["staged", "straight"])
+def test_target_that_is_disarmed_is_not_expected_to_come(approach: str) -> None:
+    tank = before_each_other(2.0, parameters=Parameters().replace("docking.approach", approach), armed=(1,))
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    (dock,) = tank.pipeline.formation.docking._docks
+    assert not dock.sequence.met_w.any() and tank.pipeline.formation.chains[0].guidance._goal is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ring", [False, True])
+def test_bodies_that_are_to_dock_to_each_other_do_not_chase_each_other(ring: bool) -> None:
+    places = [(1.0, 0.0), (1.5, 0.5), (0.4, 0.8)][: 3 if ring else 2]
+    tank = Docked([(0, m, 0) for m in range(len(places))], apart=True)
+    tank.weak = set(range(len(places)))
+    for state, (north, east) in zip(tank.states, places, strict=True):
+        state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in range(len(places))))
+    wanted = [DockRequest(1, 3, 0, 2), DockRequest(2, 0, 1, 1), DockRequest(0, 2, 2, 3)] if ring else [
+        DockRequest(1, 3, 0, 2), DockRequest(0, 0, 1, 1)
+    ]
+    outputs = tank.run(4.0, *(Request(Action.DOCK, request.module, request) for request in wanted))
+    assert tank.when(f"dock refused: {LED}") and len(outputs.docks) == len(wanted) - 1
+    assert sum(record.mode == Mode.POSHOLD for record in outputs.records) == 1
+    assert max(np.linalg.norm(outputs.records[m].estimate.nu[:3]) for m in range(len(places))) < 0.35
+
+
+@pytest.mark.slow
+def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
+    tank = before_each_other(2.0)
+    for turns in (0, 1, 0, 1):
+        tank.run(0.2, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, turns, True)))
+    goal = tank.pipeline.formation.chains[0].guidance._goal
+    assert goal is not None and goal.p_wb is not None
+    assert 0.6 < goal.p_wb[1] < 0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m) + 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [Request(Action.DISARM, 1), Request(Action.SET_MODE, 1, Mode.MANUAL)], ids=["DISARM", "mode"])
+def test_target_does_not_come_to_meet_a_robot_that_has_left_the_dock_before_it_was_planned(stop: Request) -> None:
+    tank = before_each_other(2.0)
+    tank._delay = 30
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    tank.run(1.0, stop)
+    assert tank.when(f"dock refused: {NO_LONGER}")
+    assert tank.pipeline.formation.chains[0].guidance._goal is None
+
+
+@pytest.mark.slow
+def test_target_that_comes_goes_back_when_the_dock_is_called_off() -> None:
+    tank = before_each_other(2.0)
+    held = tank.pipeline.formation.chains[0].guidance._glider.at.p_wb.copy()
+    tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    tank.run(0.1, Request(Action.SET_MODE, 1, Mode.POSHOLD))
+    goal = tank.pipeline.formation.chains[0].guidance._goal
+    assert goal is not None and goal.p_wb is not None
+    np.testing.assert_allclose(goal.p_wb, held, atol=0.02)
+
+
+ELSEWHERE = Request(Action.HOLD, 0, rest_at(np.array([1.0, -0.5, 0.8]), np.array([1.0, 0.0, 0.0, 0.0])))
+LEFTWARDS = Request(Action.STICKS, 0, Sticks((0.0, -1.0, 0.0), (0.0, 0.0, 0.0)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("move", [ELSEWHERE, LEFTWARDS], ids=["sent", "steered"])
+def test_target_that_came_and_was_moved_by_a_person_since_stays_there_when_the_dock_is_called_off(move: Request) -> None:
+    tank = before_each_other(3.0)
+    tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    guidance = tank.pipeline.formation.chains[0].guidance
+    assert guidance._goal is not None
+    tank.run(1.0, move)
+    goal = guidance._goal
+    outputs = tank.run(1.0, Request(Action.SET_MODE, 1, Mode.POSHOLD))
+    assert outputs.docks == [] and tank.when(f"dock of module 1 ended: {NO_LONGER}")
+    assert guidance._goal is goal and (goal is None) == (move is LEFTWARDS)
+
+
+@pytest.mark.slow
+def test_nobody_docks_to_a_body_that_surfaces() -> None:
+    tank = before_each_other(2.0)
+    outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    assert outputs.docks and outputs.records[1].mode == Mode.DOCK
+    outputs = tank.run(0.1, Request(Action.SET_MODE, 0, Mode.SURFACE))
+    assert outputs.docks == [] and tank.when(f"dock of module 1 ended: {SURFACES}")
+    assert [record.mode for record in outputs.records] == [Mode.SURFACE, Mode.POSHOLD]
+    assert not any(any(states) for states in tank.pipeline.formation.docking.relays.states)
+
+
+@pytest.mark.slow
+def test_target_comes_to_meet_the_first_of_two_alone() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], apart=True)
+    for state, y in zip(tank.states, (0.0, 2.0, -1.5), strict=True):
+        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in range(3)))
+    wanted = DockRequest(1, 3, 0, 2, 0, True), DockRequest(2, 2, 0, 3, 0, True)
+    tank.run(0.2, *(Request(Action.DOCK, request.module, request) for request in wanted))
+    assert len(tank.outputs[-1].docks) == 2
+    goal = tank.pipeline.formation.chains[0].guidance._goal
+    assert goal is not None and goal.p_wb is not None
+    assert goal.p_wb[1] == pytest.approx(0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m), abs=0.01)

@@ -1,0 +1,69 @@
+"""Undocks as people ask for them: twice, under way, ended, and across a ring."""
+
+import numpy as np
+import pytest
+
+from firmware_py.core.docking_decisions import Decisions, Join
+from firmware_py.core.types import Action, DockRequest, Mode, Request
+from firmware_py.description.parameters import Parameters
+from tests.unit.tanks import RING, Docked
+
+
+@pytest.mark.parametrize("stop", ["e-stop", "DISARM", "mode"])
+def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
+    tank = Docked(RING[:2])
+    tank.fly()
+    tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert any(2 in states for states in tank.pipeline.formation.docking.relays.states), "magnets push"
+    request = Request(Action.SET_MODE, 0, Mode.POSHOLD) if stop == "mode" else Request(Action.DISARM, 0)
+    tank.run(0.02, *([] if stop == "e-stop" else [request]), estop=stop == "e-stop")
+    outputs = tank.run(3.0)
+    assert tank.shape == [(0, 1)] and tank.when("undock of module 1 ended")
+    assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1], "and pull again"
+    assert outputs.records[0].mode == Mode.POSHOLD
+
+
+def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_holds() -> None:
+    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
+    tank.fly()
+    tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)), Request(Action.UNDOCK, 0, DockRequest(2, 1, 1, 0)))
+    assert tank.shape == [(0,), (1, 2)]
+    assert not any("is undocked from 1" in text for _, text in tank.said)
+    assert tank.when("undock of module 2 ended")
+    assert tank.pipeline.formation.docking.relays.states == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
+
+
+@pytest.mark.parametrize(("body", "refused"), [(0, DockRequest(2, 1, 0, 0)), (0, DockRequest(0, 2, 3, 2))], ids=["undock", "dock"])
+def test_undock_under_way_goes_on_when_what_is_asked_for_meanwhile_is_refused(body: int, refused: DockRequest) -> None:
+    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0), (4, 0, 0)], each=3)
+    tank.fly()
+    tank.run(0.3, Request(Action.UNDOCK, body, DockRequest(2, 1, 1, 0)))
+    tank.run(2.0, Request(Action.UNDOCK if refused.target_module < 3 else Action.DOCK, body, refused))
+    assert tank.when("dock refused")
+    assert tank.shape == [(0, 1), (2,), (3,)]
+
+
+@pytest.mark.slow
+def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> None:
+    tank = Docked(RING)
+    tank.fly()
+    tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
+    assert [sum(state == 2 for state in states) for states in tank.pipeline.formation.docking.relays.states] == [0, 1, 1, 2]
+    outputs = tank.run(5.0)
+    assert tank.shape == [(0, 1, 2), (3,)]
+    rest, corner = (chain.guidance._glider.at.p_wb for chain in tank.pipeline.formation.chains)
+    assert outputs.records[1].mode == Mode.POSHOLD and np.linalg.norm(corner - rest) > 0.3
+    assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1, 1, 0]
+
+
+def test_undock_that_ends_in_the_tick_of_a_join_is_not_said_to_be_done() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], Parameters().replace("docking.push_m", 0.0))
+    tank.fly()
+    stage = tank.pipeline.formation.docking
+    tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 3, 0, 2)))
+    (undock,) = stage._undocks
+    decisions = Decisions({}, [Join(0, 7, None)], [], [], {}, [])
+    estimates = {0: (tank.pipeline.bodies[0], tank.outputs[-1].records[0].estimate)}
+    stage._release(undock, undock.until_ns, estimates, decisions)
+    assert decisions.parts == [] and stage._undocks == [undock]
+    assert not any("is undocked" in event.text for event in stage.events)
