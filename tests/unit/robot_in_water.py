@@ -1,0 +1,100 @@
+"""A robot in water that is the model's but for what every real one is off by, and its detector of faults."""
+
+import numpy as np
+
+from firmware_py.core import propagation
+from firmware_py.core.body import Body
+from firmware_py.core.faults import FaultDetector
+from firmware_py.core.preload import preload
+from firmware_py.core.propagation import STATES
+from firmware_py.core.rotations import difference, from_euler, to_matrix
+from firmware_py.core.thruster import ThrusterLag
+from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
+from firmware_py.description.failsafe_parameters import Faults
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+
+BODY = assemble_vehicle(load_vehicle("modcube"))
+PUSH = preload(BODY.thrusters, np.ones(8, dtype=bool), 0.6)
+"""Thrusters pushed against each other: the least that an armed robot commands, and nothing moves."""
+TICK_NS, DT = 10_000_000, 0.01
+ZERO = np.zeros(3)
+
+
+class Water:
+    """A robot that holds its place by PD, in water that is the model's but for what every real one is off by; feedback at 10 Hz."""
+
+    def __init__(self, seed: int = 0, body: Body = BODY) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.body, n = body, body.thrusters.f_max.size
+        self.detector = FaultDetector(body, Faults(), TICK_NS)
+        self.believed, self.acts = ThrusterLag(body.thrusters, DT), ThrusterLag(body.thrusters, DT)
+        self.gain = self.rng.uniform(0.95, 1.05, n)
+        self.deadband = self.rng.uniform(0.10, 0.25, n)
+        self.speed_factor, self.stray_rpm = np.ones(n), np.zeros(n)
+        self.status = np.zeros(n, dtype=int)
+        self.heard = 1.0
+        self.free = True
+        self.tag_age_ns = 0
+        self.x = np.zeros(STATES)
+        self.x[2] = 2.0
+        self.x[3:7] = from_euler(0.05, -0.02, 0.3)
+        self.x[19:22], self.x[22:25] = [0.1, -0.05, 0.1], [0.003, -0.004, 0.002]
+        self.start = self.x.copy()
+        self.tick = 0
+
+    def run(self, seconds: float, wanted: np.ndarray = PUSH, armed: bool = True) -> list[tuple[float, str]]:
+        """What is found, with the time since the start of this run."""
+        found = []
+        for n in range(round(seconds / DT)):
+            found += [((n + 1) * DT, words) for words in self._step(wanted if armed else np.zeros(8), armed)]
+        return found
+
+    def _step(self, wanted: np.ndarray, armed: bool) -> list[str]:
+        self.tick += 1
+        if armed:
+            wanted = wanted + BODY.thrusters.pinv @ self._steer()
+        wanted = np.where(self.detector.now.alive, wanted, 0.0)
+        believed, acting = self.believed.step(), self.acts.step()
+        self.believed.command(wanted)
+        self.acts.command(np.where(np.abs(wanted) < self.deadband, 0.0, wanted))
+        b, tau = self.body, self.body.thrusters.matrix @ (self.gain * acting)
+        plant = (b.mass, b.mass_inv, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear)
+        felt = propagation.inertial_acceleration(self.x, tau, *plant)
+        self.x = propagation.step(self.x, tau, DT, *plant)
+        estimate = Estimate(
+            self.x[:3].copy(), self.x[3:7].copy(), self.x[7:13].copy(), ZERO, ZERO, np.full(3, 0.002), np.full(3, 0.0009),
+            self.tag_age_ns, 1.0, 6, 0, True,
+        )  # fmt: skip
+        gyro = self.x[10:13] + 0.005 + 0.002 * self.rng.normal(size=3)
+        weight = to_matrix(self.x[3:7].copy()).T @ np.array([0.0, 0.0, 9.80665])
+        accel = felt - weight + 0.05 + 0.03 * self.rng.normal(size=3)
+        measured = Measured(gyro, accel, None, [])
+        if self.rng.uniform() >= self.heard:
+            measured = Measured(None, None, None, [])
+        module = ModuleInputs(esc=self._feedback())
+        self.detector.step([module], measured, estimate, self.believed.force_n, believed, armed, self.free)
+        return self.detector.words
+
+    def _steer(self) -> np.ndarray:
+        q = self.x[3:7].copy()
+        off = np.r_[to_matrix(q).T @ (self.start[:3] - self.x[:3]), difference(self.start[3:7].copy(), q)]
+        return BODY.mass @ (np.repeat([6.0, 9.0], 3) * off - np.repeat([5.0, 6.0], 3) * self.x[7:13])
+
+    def _feedback(self) -> list[EscFeedback]:
+        frames = []
+        for first in range(0, 8, 2):
+            if self.tick % 10 == first and self.rng.uniform() < self.heard:
+                rpm = [
+                    self.speed_factor[i] * self.detector.believed_rpm(i, float(self.acts.force_n[i]))
+                    + self.stray_rpm[i] + 5.0 * self.rng.normal()
+                    for i in (first, first + 1)
+                ]
+                status = (int(self.status[first]), int(self.status[first + 1]))
+                frames.append(EscFeedback(first, (rpm[0], rpm[1]), (0.5, 0.5), status))
+        return frames
+
+    def fly(self, seconds: float = 3.0) -> None:
+        """Disarmed, then armed and healthy; nothing may be found."""
+        assert self.run(1.0, armed=False) == []
+        assert self.run(seconds) == []

@@ -1,0 +1,146 @@
+"""Tags that are wrong, late or few: refused or weighed by the estimator, which finds the robot again by good ones."""
+
+import math
+
+import numpy as np
+import pytest
+
+from firmware_py.core.body import Body
+from firmware_py.core.estimator import READY_AFTER, RESET_AFTER
+from firmware_py.core.rotations import exp, multiply
+from firmware_py.core.types import Estimate
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+from tests.unit.estimated_robot import DELAY_TICKS, P_WB, PERIOD, Q_WB, Robot, assert_rests, sensors, tag
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return assemble_vehicle(load_vehicle("modcube"))
+
+
+def test_tag_that_jumps_is_refused_and_moves_nothing(body: Body) -> None:
+    robot = Robot(body)
+    robot.rest(101)
+    before = robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD, P_WB + np.array([0.3, 0.0, 0.0]))))
+    assert before.rejected == 1
+    assert_rests(before)
+    assert before.tag_age_ns > PERIOD, "a refused tag is no fresh pose"
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_flipped_tag_is_refused(body: Body, axis: int) -> None:
+    """The second solution of a planar tag: right place, tilted by tens of degrees."""
+    robot = Robot(body)
+    robot.rest(101)
+    flipped = tag(robot.time_ns - PERIOD)._replace(q_wb=multiply(Q_WB, exp(0.6 * np.eye(3)[axis])))
+    estimate = robot.step(sensors(P_WB, Q_WB, flipped))
+    assert estimate.rejected == 1
+    assert_rests(estimate)
+
+
+def test_robot_that_was_carried_away_is_found_again_after_half_a_second(body: Body) -> None:
+    robot = Robot(body)
+    robot.rest(100)
+    there = P_WB + np.array([0.8, -0.6, 0.3])
+    for n in range(1, RESET_AFTER + 1):
+        estimate = robot.step(sensors(there, Q_WB, tag(robot.time_ns - PERIOD, there)))
+        assert estimate.rejected == n
+        assert (np.linalg.norm(estimate.p_wb - there) < 0.01) == (n == RESET_AFTER)
+    assert not estimate.ready, "the new pose has to prove itself as the first one did"
+    for _ in range(READY_AFTER):
+        estimate = robot.step(sensors(there, Q_WB, tag(robot.time_ns - PERIOD, there)))
+    assert estimate.ready
+    assert_rests(estimate, there)
+
+
+def rest_pushed(body: Body, ticks: int, q_wb: np.ndarray = Q_WB) -> tuple[Robot, Estimate]:
+    """A robot that stands as Q_WB, held against a moment that its description has not, and seen as `q_wb`; and what it believes then."""
+    robot = Robot(body)
+    robot.tau = robot.tau - np.r_[np.zeros(3), PUSH]
+    for _ in range(ticks):
+        seen = [tag(robot.time_ns - DELAY_TICKS * PERIOD, P_WB, q_wb)] if robot.tick % 2 else []
+        estimate = robot.step(sensors(P_WB, Q_WB, *seen))
+    return robot, estimate
+
+
+PUSH = np.array([0.09, -0.045, 0.02])
+"""N m, such as of an arm and a trim that nobody has measured."""
+
+
+def test_robot_that_was_carried_away_still_knows_what_pushes_it(body: Body) -> None:
+    """The place is lost, and no more: its controller would let the arm turn it until all was learnt anew."""
+    robot, estimate = rest_pushed(body, 1000)
+    np.testing.assert_allclose(estimate.moment_b, PUSH, atol=2e-3)
+    there = P_WB + np.array([0.8, -0.6, 0.3])
+    for n in range(200):
+        estimate = robot.step(sensors(there, Q_WB, tag(robot.time_ns - PERIOD, there)))
+        np.testing.assert_allclose(estimate.moment_b, PUSH, atol=2e-3, err_msg=f"after {n} tags")
+    assert_rests(estimate, there)
+
+
+@pytest.mark.parametrize("spoilt", [5.0, -5.0, np.nan])
+def test_moment_that_nobody_could_believe_is_forgotten_with_the_place(body: Body, spoilt: float) -> None:
+    """It may be why the tags were refused."""
+    robot = Robot(body)
+    robot.rest(100)
+    there = P_WB + np.array([0.8, -0.6, 0.3])
+    for _ in range(RESET_AFTER):
+        robot.estimator._anchor.x[22:25] = spoilt
+        robot.step(sensors(there, Q_WB, tag(robot.time_ns - PERIOD, there)))
+    for _ in range(100):
+        estimate = robot.step(sensors(there, Q_WB, tag(robot.time_ns - PERIOD, there)))
+    assert_rests(estimate, there)
+
+
+@pytest.mark.parametrize("ticks", [20, 60, 200])
+def test_robot_that_was_seen_askew_is_upright_at_once_when_it_is_seen_well(body: Body, ticks: int) -> None:
+    """Tags that had another tilt than gravity: biases took up what did not fit, and would tilt what comes."""
+    robot, _ = rest_pushed(body, ticks, multiply(Q_WB, exp(np.array([0.3, 0.0, 0.0]))))
+    for _ in range(RESET_AFTER):
+        estimate = robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD)))
+    assert estimate.rejected >= RESET_AFTER
+    for _ in range(100):
+        assert_rests(robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD))))
+
+
+def test_good_tags_between_bad_ones_keep_the_pose(body: Body) -> None:
+    robot = Robot(body)
+    robot.rest(100)
+    for n in range(3 * RESET_AFTER):
+        seen = tag(robot.time_ns - PERIOD, P_WB if n % 10 == 9 else P_WB + np.array([0.5, 0.0, 0.0]))
+        estimate = robot.step(sensors(P_WB, Q_WB, seen))
+    assert_rests(estimate)
+    assert estimate.rejected == 27 * 3
+
+
+def test_tag_older_than_one_that_counted_is_refused(body: Body) -> None:
+    """In order is the only order: the picture that was overtaken is of no use any more."""
+    robot = Robot(body)
+    robot.rest(60)
+    robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - 3 * PERIOD)))
+    estimate = robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - 6 * PERIOD)))
+    assert estimate.rejected == 1
+    assert math.isnan(estimate.nis) and estimate.nis_dof == 0
+
+
+def test_tag_older_than_the_window_is_refused(body: Body) -> None:
+    """Half a second, and the tick that the filter is behind."""
+    robot = Robot(body)
+    robot.rest(60)
+    for _ in range(70):
+        robot.step(sensors())
+    assert robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - 511_000_000))).rejected == 1
+    accepted = robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - 499_000_000)))
+    assert (accepted.rejected, accepted.nis_dof) == (1, 6)
+
+
+def test_picture_with_more_tags_weighs_more(body: Body) -> None:
+    """The noise of a mean falls with the root of the number of tags in it."""
+    moved = []
+    for count in (1, 4, 16):
+        robot = Robot(body)
+        robot.rest(101)
+        aside = tag(robot.time_ns - PERIOD, P_WB + np.array([0.004, 0.0, 0.0]))._replace(tags=count)
+        moved.append(robot.step(sensors(P_WB, Q_WB, aside)).p_wb[0] - P_WB[0])
+    assert 0.0 < 1.3 * moved[0] < moved[1] and 1.3 * moved[1] < moved[2] < 0.004

@@ -1,0 +1,73 @@
+"""Axes that a body lacks or has lost with its thrusters: what is kept of a wrench, and what it can still make."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from firmware_py.core.faults import FaultDetector
+from firmware_py.core.pipeline import BodyPipeline
+from firmware_py.core.rotations import from_euler
+from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
+from firmware_py.description.failsafe_parameters import Faults
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+from tests.unit.robot_in_water import BODY, TICK_NS, ZERO, Water
+
+LOST_AXES = {(4, 7): 1, (5, 6): 1, (2, 3): 1}
+"""The paper's errata: pairs without which an axis cannot be made."""
+
+
+@pytest.mark.parametrize("pair", list(itertools.combinations(range(8), 2)), ids=str)
+def test_axes_that_are_lost_with_a_pair_are_those_of_the_errata(pair: tuple[int, int]) -> None:
+    water = Water()
+    for thruster in pair:
+        water.gain[thruster] = water.speed_factor[thruster] = 0.0
+    water.run(0.6)
+    now = water.detector.now
+    assert now.dead == pair and now.lost_axes == LOST_AXES.get(pair, 0)
+    matrix = BODY.thrusters.matrix * now.alive
+    wrench = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    kept = now.keep @ wrench
+    np.testing.assert_allclose(matrix @ np.linalg.pinv(matrix) @ kept, kept, atol=1e-9)
+    np.testing.assert_allclose(kept[:3], wrench[:3], atol=1e-9, err_msg="the force, and so the place, is kept")
+    assert np.linalg.matrix_rank(now.keep, tol=1e-6) == 6 - now.lost_axes
+
+
+@pytest.mark.parametrize(("name", "offset_m"), [("bluerov2_heavy", 0.0), ("bluerov2_heavy", 0.001), ("modcube_sim", 0), ("chasing_m2", 0)])
+def test_force_that_is_lost_whole_costs_no_moment(name: str, offset_m: float) -> None:
+    """The diagonal pair of horizontal thrusters: the pseudo-inverse of a rounding error asked for 1e16 N m, and the robot spun."""
+    vehicle = load_vehicle(name)
+    inertial = dataclasses.replace(vehicle.inertial, com_m=vehicle.inertial.com_m + np.array([0.0, offset_m, 0.0]))
+    body = assemble_vehicle(dataclasses.replace(vehicle, inertial=inertial))
+    detector = FaultDetector(body, Faults(), TICK_NS)
+    failed = [EscFeedback(0, (0.0, 0.0), (0.0, 0.0), (1, 0)), EscFeedback(2, (0.0, 0.0), (0.0, 0.0), (0, 1))]
+    nowhere = Estimate(ZERO, from_euler(0.0, 0.0, 0.0), np.zeros(6), ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, False)
+    for _ in range(Faults().dead_count):
+        now = detector.step([ModuleInputs(esc=failed)], Measured(None, None, None, []), nowhere, np.zeros(8), np.zeros(8), True, True)
+    assert now.dead == (0, 3) and now.lost_axes == 1
+    wanted = np.array([2.0, 1.0, 0.5, 0.1, 0.05, -0.1])
+    kept = now.keep @ wanted
+    np.testing.assert_allclose(kept[2:], wanted[2:], atol=0.01)
+    assert 0.0 < np.linalg.norm(kept[:2]) <= np.linalg.norm(wanted[:2])
+
+
+@pytest.mark.parametrize(("wanted", "made"), [([200.0, 200.0, 0, 0, 0, 0], [64.84, 64.84]), ([60.0, 60.0, 0, 0, 0.5, 0], [60.0, 60.0])])
+def test_healthy_robot_that_lacks_an_axis_makes_the_force_that_it_can(wanted: list[float], made: list[float]) -> None:
+    """BlueROV2 cannot pitch, and its surge pitches it a little: saturated, nothing was left of it."""
+    body = assemble_vehicle(load_vehicle("bluerov2"))
+    chain = BodyPipeline(body, Parameters(), TICK_NS)
+    assert chain.faults.now.lost_axes == 0 and np.linalg.matrix_rank(body.thrusters.matrix) == 5
+    thrust = chain._allocate(np.array(wanted, dtype=np.float64), 0)
+    np.testing.assert_allclose(thrust.achieved[:2], np.array(made), rtol=0.02)
+    assert np.abs(thrust.achieved[3:]).max() < 0.02 * made[0]
+
+
+def test_robot_of_five_thrusters_makes_the_force_that_it_can() -> None:
+    """Girona 500 cannot roll, and its sway rolls it a little: saturated, nothing was left of it."""
+    chain = BodyPipeline(assemble_vehicle(load_vehicle("girona500")), Parameters(), TICK_NS)
+    thrust = chain._allocate(np.array([600.0, 100.0, 0.0, 0.0, 0.0, 0.0]), 0)
+    np.testing.assert_allclose(thrust.achieved[:3], [269.1, 44.85, 0.0], atol=0.5)
+    assert np.abs(thrust.achieved[3:]).max() < 1.0

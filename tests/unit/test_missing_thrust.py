@@ -1,0 +1,153 @@
+"""Lying thrusters: found by the thrust that the motion misses, and none blamed for what the water does."""
+
+import numpy as np
+import pytest
+
+from firmware_py.core import propagation
+from firmware_py.core.missing_thrust import CORIOLIS, CROSSED, FORCES, MUNK, RECENT, MissingThrust, add_coriolis, add_flow, add_model
+from firmware_py.core.propagation import STATES
+from firmware_py.core.rotations import from_euler
+from firmware_py.description.failsafe_parameters import Faults
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+from tests.unit.robot_in_water import BODY, PUSH, TICK_NS, Water
+
+
+@pytest.fixture
+def water() -> Water:
+    return Water()
+
+
+@pytest.mark.parametrize("thruster", range(8))
+@pytest.mark.parametrize("gain", [0.0, -1.0], ids=["fakes its speed", "reversed"])
+def test_lying_thruster_is_found_within_two_seconds(thruster: int, gain: float) -> None:
+    water = Water(seed=thruster)
+    water.fly()
+    water.gain[thruster] *= gain
+    found = water.run(2.0)
+    assert [words for _, words in found] == [f"thruster {thruster + 1} does not push as it says: left out"]
+
+
+def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_sees_no_tag_and_is_when_it_sees_one_again() -> None:
+    """Blind it knows its tilt and speed too badly."""
+    water = Water(seed=2)
+    water.fly()
+    water.tag_age_ns = 600_000_000
+    water.gain[2] = 0.0
+    assert water.run(2.0) == []
+    water.gain[2], water.tag_age_ns = 1.0, 0
+    assert water.run(6.0) == []
+    water.gain[2] = 0.0
+    assert [words for _, words in water.run(2.0)] == ["thruster 3 does not push as it says: left out"]
+
+
+def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_touches_the_surface() -> None:
+    """There water pushes that no model here knows. Half the diagonal of the module's box is 0.17 m."""
+    found = {}
+    for depth_m in (0.1, 0.3):
+        water = Water(seed=2)
+        water.x[2] = water.start[2] = depth_m
+        water.fly()
+        water.gain[2] = 0.0
+        found[depth_m] = [words for _, words in water.run(2.0)]
+    assert found == {0.1: [], 0.3: ["thruster 3 does not push as it says: left out"]}
+
+
+@pytest.mark.parametrize("every", [1, 10])
+def test_thruster_is_not_judged_by_the_motion_of_a_robot_from_which_magnets_push_another(every: int) -> None:
+    """A second of that looked like a thruster that does not push, in one undock of seven. One tick of it spoils a block."""
+    water = Water(seed=2)
+    water.fly()
+    water.gain[2] = 0.0
+    said: list[tuple[float, str]] = []
+    for tick in range(200):
+        water.free = tick % every != 0
+        said += water.run(0.01)
+    assert said == []
+    water.free = True
+    assert [words for _, words in water.run(2.0)] == ["thruster 3 does not push as it says: left out"]
+
+
+def test_lying_thruster_is_found_from_the_moment_of_arming() -> None:
+    water = Water(seed=3)
+    water.gain[5] = 0.0
+    assert water.run(2.0, armed=False) == []
+    water.detector.reset()
+    found = water.run(2.0)
+    assert [words for _, words in found] == ["thruster 6 does not push as it says: left out"]
+
+
+def test_lying_thruster_is_found_although_frames_are_lost() -> None:
+    water = Water(seed=1)
+    water.heard = 0.7
+    water.fly()
+    water.gain[0] = 0.0
+    assert [words for _, words in water.run(2.0)] == ["thruster 1 does not push as it says: left out"]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_healthy_robot_that_is_pushed_about_has_no_liar(seed: int) -> None:
+    """Forces that change twice a second, gains and deadbands off as real ones, a disturbance that turns with the body."""
+    water = Water(seed)
+    assert water.run(1.0, armed=False) == []
+    rng = np.random.default_rng(100 + seed)
+    for _ in range(20):
+        wrench = rng.normal(size=6) * np.repeat([1.5, 0.05], 3)
+        assert water.run(0.5, PUSH + BODY.thrusters.pinv @ wrench) == []
+
+
+@pytest.mark.parametrize("thruster", range(8))
+def test_weak_thruster_whose_speed_says_so_does_not_lie_and_one_that_says_too_little_does(thruster: int) -> None:
+    """Half the force comes with 71 % of the speed."""
+    found = {}
+    for gain, speed in ((0.5, 0.5**0.5), (0.0, 0.9)):
+        water = Water(seed=thruster)
+        water.fly()
+        water.gain[thruster] *= gain
+        water.speed_factor[thruster] = speed
+        found[gain] = [words for _, words in water.run(5.0, PUSH * np.where(np.arange(8) == thruster, 1.4, 1.0))]
+    assert found == {0.5: [], 0.0: [f"thruster {thruster + 1} does not push as it says: left out"]}
+
+
+@pytest.mark.parametrize("name", ["modcube", "bluerov2_heavy", "girona500"])
+def test_motion_of_a_body_whose_water_is_heavier_along_one_axis_than_along_another_misses_no_thrust(name: str) -> None:
+    """What the model leaves out of a healthy body's motion, a Munk moment say, would be blamed on a thruster."""
+    b = assemble_vehicle(load_vehicle(name))
+    plant = (b.mass, b.mass_inv, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear)
+    rng = np.random.default_rng(5)
+    x, tau, modelled = np.zeros(STATES), rng.normal(size=6), np.zeros(6)
+    x[3:7], x[7:13] = from_euler(0.3, -0.2, 0.9), [0.5, 0.2, -0.3, 0.2, -0.1, 0.3]
+    felt = propagation.inertial_acceleration(x, tau, *plant)
+    turning = propagation.acceleration(x[7:13].copy(), x[3:7].copy(), tau, *plant)[3:]
+    add_model(*plant[2:], x[7:13].copy(), x[3:7].copy(), modelled)
+    add_coriolis(b.mass, x[7:13].copy(), modelled)
+    np.testing.assert_allclose(b.mass @ np.r_[felt, turning], tau + modelled, atol=1e-9)
+
+
+@pytest.mark.parametrize("coriolis", [0.0, 1.0, 10.0])
+def test_a_thruster_is_not_blamed_for_a_change_that_is_small_beside_the_coriolis_wrench(coriolis: float) -> None:
+    """Masses are known to a tenth, the speed through water that drifts to less: so is what both do on a fast curve."""
+    watch = MissingThrust(BODY, Faults(), TICK_NS)
+    watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.3
+    lost = -3.0 * BODY.thrusters.matrix[:, 2]
+    watch._blocks[-RECENT:, :6], watch._blocks[-RECENT:, FORCES + 2] = lost, 3.0
+    watch._blocks[-RECENT:, CORIOLIS:CROSSED] = coriolis * lost
+    assert watch._explain(np.ones(8, bool)) == (-1 if coriolis == 10.0 else 2)
+
+
+@pytest.mark.parametrize(("column", "most"), [(CROSSED, 0.5), (MUNK, 0.2)])
+@pytest.mark.parametrize("sign", [-1.0, 0.0, 1.0])
+def test_a_thruster_is_not_blamed_for_what_the_water_does_to_a_body_that_turns_under_way(column: int, most: float, sign: float) -> None:
+    """Flow across the turn brakes it, and masses that differ from axis to axis turn it: neither is in the model of a cube."""
+    watch = MissingThrust(BODY, Faults(), TICK_NS)
+    watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.3
+    watch._blocks[-RECENT:, :6] = -2.0 * BODY.thrusters.matrix[:, 2]
+    watch._blocks[-RECENT:, FORCES + 2] = 2.0
+    watch._blocks[-RECENT:, column : column + 3] = sign * most
+    assert watch._explain(np.ones(8, bool)) == (2 if sign == 0.0 else -1)
+
+
+def test_flow_is_what_a_turn_under_way_meets() -> None:
+    out = np.zeros(6)
+    add_flow(np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2]), out)
+    np.testing.assert_allclose(out, [0.3 * 0.5, -0.4 * 0.4, 0.5 * 0.2, -0.02, 0.03, -0.06])
