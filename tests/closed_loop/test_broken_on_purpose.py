@@ -2,47 +2,27 @@
 
 import dataclasses
 import fcntl
-import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from firmware_py.app.firmware import Firmware
 from firmware_py.bus.codec import Frame
-from firmware_py.core import rotations
 from firmware_py.core.types import Action, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import Vehicle
-from hil.checks import Result
 from hil.flight import judge_logs
 from hil.plant.fault_spec import Fault
 from hil.scenario import load_scenario
+from tests.closed_loop.broken_vehicles import failed, reversed_thruster, turned_tags
 from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
 
 HOVER_S = 20.0
 PROTECTED_FROM = 0x040
 """Ids below carry no CRC (ESTOP, SYNC); HEARTBEAT is not sent here."""
-
-
-def failed(result: Result) -> set[str]:
-    return {check.name for check in result.checks if not check.passed}
-
-
-def reversed_thruster(vehicle: Vehicle, index: int) -> Vehicle:
-    thrusters = list(vehicle.thruster)
-    thrusters[index] = dataclasses.replace(thrusters[index], direction=-thrusters[index].direction)
-    return dataclasses.replace(vehicle, thruster=tuple(thrusters))
-
-
-def turned_tags(vehicle: Vehicle, axis: int) -> Vehicle:
-    turn = rotations.exp(math.radians(10.0) * np.eye(3)[axis])
-    tags = (dataclasses.replace(t, quaternion=rotations.multiply(np.array(t.quaternion), turn)) for t in vehicle.tag)
-    return dataclasses.replace(vehicle, tag=tuple(tags))
 
 
 def crc_off_by_one_bit(frame: Frame) -> Frame:

@@ -20,17 +20,9 @@ from firmware_py.description.schema import DescriptionError
 from hil.campaign import TRIALS_FILE, run_campaign
 from hil.scenario import load_scenario
 from hil.workers import processes
+from tests.closed_loop.short_hover import SCENARIO
 
 TRIALS = 8
-SCENARIO = """
-name = "short"
-help = "a hover that is over soon"
-module = [{ number = 1, position_m = [0.0, 0.0, 0.4] }]
-camera = [{}]
-tank = {}
-check = [{ metric = "position_rmse_m", high = 0.1 }]
-task = { kind = "hover", settle_s = 3.0, duration_s = 4.0, centre_m = [0.0, 0.0, 0.4] }
-"""
 TABLES = ("campaign.json", "trials.csv")
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.clients.bench_process import ROOT
-from tests.closed_loop.test_campaign_workers import SCENARIO
+from tests.closed_loop.short_hover import SCENARIO
 
 TRIALS = 4
 FILES = ("search.jsonl", "parameters.toml", "tuning.json")

@@ -27,7 +27,7 @@ from firmware_py.ground.config import GroundConfig
 from hil.bench import open_bench
 from hil.scenario import load_scenario
 from tests.clients.bench_process import ROOT, free_port
-from tests.unit.test_campaign import Inline
+from tests.unit.campaigns import Inline
 
 os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil

@@ -10,8 +10,8 @@ from firmware_py.prepare.waypoints import read_mission
 from hil.flight import start_of
 from hil.scenario import load_scenario
 from hil.signals import read_flight
+from tests.closed_loop.broken_vehicles import failed, turned_tags
 from tests.closed_loop.flights import Fly, Rebuild
-from tests.closed_loop.test_broken_on_purpose import failed, turned_tags
 
 POSITION_LIMIT_M, ATTITUDE_LIMIT_RAD = 0.010, 0.0349066
 """At a waypoint: twice the worst tick of three seeds, 4.3 mm; 2 deg."""

@@ -23,27 +23,9 @@ from firmware_py.runtime.guarded_file import GuardedFile
 from hil.scenario import scenario_names
 from hil.trial_file import TrialFile
 from hil.truth_log import TruthRecorder
+from tests.unit.command_line import refusal
 
 SPIRAL = (Path(hil.bench.__file__).parent / "scenarios" / "spiral.toml").read_text(encoding="utf-8")
-
-
-def outcome(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> tuple[int, str]:
-    """Exit status and what came on stderr."""
-    monkeypatch.setattr("sys.argv", ["modcube", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0), capsys.readouterr().err
-
-
-def refusal(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that refuses."""
-    status, error = outcome(arguments, monkeypatch, capsys)
-    assert status == 2
-    assert error.endswith("\n")
-    assert len(error.splitlines()) == 1, error
-    return error.strip()
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -10,46 +9,10 @@ from firmware_py.core.failsafes import ANY, MOVING, PERMITTED, PILOTED, PLACED, 
 from firmware_py.core.health import Health
 from firmware_py.core.types import Mode
 from firmware_py.description.failsafe_parameters import Failsafes as Parameters
+from tests.unit.failsafe_causes import FIELDS, ROWS, YES, P, bad, quick, spoilt
 from tests.unit.healths import GOOD, UPRIGHT, at
 
-P = Parameters()
-ROWS = {row.name: row for row in TABLE}
 POSE_MODES = {Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK}
-
-FIELDS: dict[str, str] = {
-    "leak": "leak", "bus_silent": "bus_silent_s", "foreign_sync": "foreign_sync",
-    "foreign_command": "foreign_command", "battery_critical": "voltage_share",
-    "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
-    "tag_gone": "tag_age_s", "partner_lost": "topology", "estimator": "nis_ratio", "rejected": "rejected_share",
-    "tag_lost": "tag_age_s", "tag_late": "tag_age_s", "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
-    "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
-    "thruster_lost": "dead", "cabin_unknown": "cabin_age_s", "battery_unknown": "battery_age_s", "battery_low": "voltage_share",
-}  # fmt: skip
-"""Which figure of Health each fail-safe judges; depth_unknown needs two."""
-YES: dict[str, Any] = {
-    "leak": True, "foreign_sync": True, "foreign_command": True, "axis_lost": 1, "partner_lost": "0 and 1", "thruster_lost": (3,),
-}  # fmt: skip
-
-
-def spoilt(name: str, value: float) -> Health:
-    """`GOOD` with the figure of fail-safe `name` at `value`."""
-    if name == "depth_unknown":
-        return GOOD._replace(tag_age_s=value, depth_age_s=value)
-    return GOOD._replace(**{FIELDS[name]: value})
-
-
-def bad(name: str) -> Health:
-    """`GOOD` with fail-safe `name`'s cause just there."""
-    if name in YES:
-        return GOOD._replace(**{FIELDS[name]: YES[name]})
-    limit = getattr(P, f"{name}_limit")
-    return spoilt(name, math.nextafter(limit, -math.inf if ROWS[name].below else math.inf))
-
-
-def quick(name: str) -> Parameters:
-    """Parameters with which only `name` acts, and at once."""
-    none = {f"{row.name}_action": 0 for row in TABLE if row.name != name}
-    return replace(P, **none, **{f"{name}_delay_s": 0.0})
 
 
 def alarms_of(parameters: Parameters, health: Health, mode: Mode = Mode.AUTO, forced: bool = False, armed: bool = True) -> list[Alarm]:

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import pytest
 
+from firmware_py.core.failsafes import PILOTED
 from firmware_py.core.supervisor import Supervisor
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Mode
 from firmware_py.description.parameters import Parameters
+from tests.unit.failsafe_causes import FIELDS, ROWS, bad, quick
 from tests.unit.ground_world import Client, World
-from tests.unit.test_failsafes import FIELDS, PILOTED, ROWS, bad, quick
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from firmware_py.cli import fleet_of
-from tests.unit.test_cli import refusal
+from tests.unit.command_line import refusal
 
 FLEET = 'buses = ["virtual:options"]\n[[module]]\nnumber = 7\n'
 

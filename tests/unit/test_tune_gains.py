@@ -16,7 +16,7 @@ import pytest
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from hil.scenario import Scenario
-from tests.unit.test_campaign import Inline
+from tests.unit.campaigns import Inline
 
 ROOT = Path(__file__).resolve().parents[2]
 BANDWIDTH, DAMPING = "control.position_bandwidth", "control.position_damping"
