@@ -8,6 +8,7 @@ service to it, waits for its health report, and goes back to the release before 
     .venv/bin/python tools/flash.py USER@HOST --offline    from the cache of wheels alone, without any registry
     .venv/bin/python tools/flash.py USER@HOST --status     what is installed and how it runs
     .venv/bin/python tools/flash.py USER@HOST --rollback   back to the release before
+    .venv/bin/python tools/flash.py USER@HOST --armed      also while it is armed: the service is stopped in flight
 
 Exit status: 0 done, 1 switched in vain (the old release runs again) or out of sight, 2 cannot run (nothing was changed).
 """
@@ -20,9 +21,10 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from command_line import Parser, run_tool
+from flash_device import in_flight
 from flash_payload import Payload, PayloadError, make_payload
 from flash_ssh import DEVICE_FILES, LostError, Vehicle, VehicleError
 
@@ -92,11 +94,11 @@ def check_room(vehicle: Vehicle, target: Target, payload: Payload) -> None:
         )
 
 
-def ship(vehicle: Vehicle, target: Target, payload: Payload, say: Callable[[str], None]) -> None:
-    """Sends what is missing there and installs the release beside the one that runs. Raises VehicleError."""
+def ship(vehicle: Vehicle, target: Target, payload: Payload, armed: bool, say: Callable[[str], None]) -> None:
+    """Sends what is missing there and installs the release beside the one that runs; `armed`: even if it is. Raises VehicleError."""
     vehicle.install_tools([TOOLS / name for name in DEVICE_FILES])
     digests = payload.digests()
-    missing = set(vehicle.device("missing", {"wheels": digests}))
+    missing = set(vehicle.device("missing", {"wheels": digests, "armed": armed}))
     wheels = [wheel for wheel in payload.wheels if wheel.name in missing]
     total = sum(wheel.stat().st_size for wheel in wheels)
     say(f"2/4 ship {len(wheels)} of {len(payload.wheels)} wheels, {total / 1e6:.1f} MB")
@@ -130,12 +132,12 @@ def flash(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[str], None
         size = payload.size_bytes / 1e6
         say(f"dry run: would install {payload.release} ({len(payload.wheels)} wheels, {size:.0f} MB) in {vehicle.root}")
         return 0
-    ship(vehicle, target, payload, say)
+    ship(vehicle, target, payload, given.armed, say)
     say("4/4 switch, restart, wait for the health report")
-    return switch(vehicle, say, "activate", {"release": payload.release})
+    return switch(vehicle, say, "activate", {"release": payload.release, "armed": given.armed})
 
 
-def switch(vehicle: Vehicle, say: Callable[[str], None], command: str, given: Mapping[str, str] | None = None) -> int:
+def switch(vehicle: Vehicle, say: Callable[[str], None], command: str, given: Mapping[str, Any]) -> int:
     """Has the vehicle activate or roll back; returns the exit status: nobody can say any more that nothing was changed."""
     try:
         release = vehicle.device(command, given)
@@ -171,7 +173,9 @@ def look_or_go_back(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[
     found = vehicle.device("status")
     if not found["previous"] and not found["trial"]:
         raise FlashError(f"{vehicle.host}: there is no earlier release to go back to")
-    return switch(vehicle, say, "rollback")
+    if not given.armed and (line := in_flight(found["service"])):
+        raise FlashError(f"{vehicle.host}: {line}")
+    return switch(vehicle, say, "rollback", {"armed": given.armed})
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -182,6 +186,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     what.add_argument("--status", action="store_true", help="what is installed and how it runs")
     what.add_argument("--rollback", action="store_true", help="back to the release before")
     what.add_argument("--dry-run", action="store_true", help="check everything, change nothing")
+    parser.add_argument("--armed", action="store_true", help="also while it is armed: its service is stopped in flight")
     parser.add_argument("--offline", action="store_true", help="wheels from the cache alone")
     parser.add_argument("--root", default="/opt/modcube", help="folder on the vehicle")
     parser.add_argument("--python", default="python3.12 python3.11 python3", help="interpreters to try there")

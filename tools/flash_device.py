@@ -14,6 +14,7 @@ service, or by the next flash. Standard library alone.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import fcntl
 import json
@@ -40,6 +41,11 @@ KEPT_RELEASES = 3
 COMPILERS = ("numba", "llvmlite", "numpy")
 """What compiled code depends on besides its sources."""
 STATUS_FIELDS = ("ActiveState", "SubState", "MainPID", "NRestarts", "StatusText")
+COMMANDS = ("missing", "install", "activate", "rollback", "boot", "status")
+LOOKING = ("boot", "status")
+"""Commands that take nothing, and never wait for another flash."""
+DISTURBING = ("missing", "activate", "rollback")
+"""Commands that stop the service, and the first of those that end in that."""
 
 
 class Device:
@@ -257,6 +263,11 @@ class Device:
             return {}
         return dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
 
+    def check_disarmed(self) -> None:
+        """Raises RefusedError where the service controls an armed vehicle, or does not say that it controls none."""
+        if line := in_flight(self.service()):
+            raise RefusedError(line)
+
     def prune(self) -> None:
         """Removes releases beyond KEPT_RELEASES, and wheels that none of the rest needs."""
         self._step("prune")
@@ -346,8 +357,24 @@ class Device:
 
 def ticks(status: dict[str, str]) -> int | None:
     """The tick that the service reported last; None before its first report."""
-    words = dict(word.split("=", 1) for word in status.get("StatusText", "").split() if "=" in word)
-    return int(words["tick"]) if words.get("tick", "").isdigit() else None
+    tick = report(status).get("tick", "")
+    return int(tick) if tick.isdigit() else None
+
+
+def report(status: dict[str, str]) -> dict[str, str]:
+    """The words KEY=VALUE of the service's own report."""
+    return dict(word.split("=", 1) for word in status.get("StatusText", "").split() if "=" in word)
+
+
+def in_flight(status: dict[str, str]) -> str:
+    """Why the service may not be stopped now, in a line; empty where it may: it does not run, does not tick yet, or has nobody armed."""
+    if status.get("ActiveState") in ("inactive", "failed") or ticks(status) is None:
+        return ""
+    armed = report(status).get("armed", "")
+    if armed.startswith("0/"):
+        return ""
+    what = f"{armed} modules are armed" if armed else "its release does not say whether it is armed"
+    return f"{what}, and its service would be stopped: disarm it, or say --armed"
 
 
 def made_by(wheels: dict[str, str], name: str) -> str:
@@ -355,15 +382,25 @@ def made_by(wheels: dict[str, str], name: str) -> str:
     return next((wheel for wheel in wheels if wheel.startswith(f"{name}-")), "")
 
 
+def parse(words: Sequence[str]) -> argparse.Namespace:
+    """The command line."""
+    what = "flash_device.py ROOT COMMAND: installs and switches releases; flash.py runs it on the vehicle"
+    parser = argparse.ArgumentParser(prog="flash_device.py", description=what, usage=argparse.SUPPRESS)  # what is wrong, in one line
+    parser.add_argument("root", type=Path, help="folder of the releases")
+    parser.add_argument("command", choices=COMMANDS, help="all but boot and status take JSON on standard input")
+    return parser.parse_args(words)
+
+
 def main(words: Sequence[str]) -> int:
     """flash_device.py ROOT COMMAND, with the command's JSON on standard input where it takes any.
 
-    Prints one line of JSON: {"error": line} or the command's result. Exit status 0 or 1.
+    Prints one line of JSON: {"error": line} or the command's result. Exit status 0 or 1; 2 where the words are wrong.
     """
     # A lost connection must not end what it began.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    device, command = Device(Path(words[0]), run), words[1]
-    given = json.loads(sys.stdin.read() or "{}") if command in ("missing", "install", "activate") else {}
+    asked = parse(words)
+    device, command = Device(asked.root, run), asked.command
+    given = {} if command in LOOKING else json.loads(sys.stdin.read() or "{}")
     device.root.mkdir(parents=True, exist_ok=True)
     try:
         with alone(device.root, command):
@@ -379,6 +416,8 @@ def main(words: Sequence[str]) -> int:
 
 def perform(device: Device, command: str, given: dict[str, Any]) -> object:
     """One command. Raises RefusedError."""
+    if command in DISTURBING and not given.get("armed"):
+        device.check_disarmed()
     if command == "missing":
         return device.missing_wheels(given["wheels"])
     if command == "install":
@@ -395,7 +434,7 @@ def perform(device: Device, command: str, given: dict[str, Any]) -> object:
 @contextlib.contextmanager
 def alone(root: Path, command: str) -> Iterator[None]:
     """Two flashes at once are refused; the service's start and a look at the status never wait."""
-    if command in ("boot", "status"):
+    if command in LOOKING:
         yield
         return
     with (root / "lock").open("w") as lock:

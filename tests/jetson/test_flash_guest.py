@@ -89,6 +89,8 @@ def test_release_is_flashed_and_the_service_flies_the_hover_on_vcan0(guest: Gues
     assert done.returncode == 0, done.stdout + done.stderr
     assert "answered=1/1" in wait_for(guest, "answered=1/1")
     figure("flashed Debian machine: modules that answer its service", 1)
+    refused = flash(guest, ROOT)  # it hovers
+    assert refused.returncode == 2 and "1/1 modules are armed" in refused.stderr, refused.stdout + refused.stderr
     journal = guest.run("sudo journalctl -u modcube --no-pager").stdout
     assert "-> ARMED" in journal, journal[-2000:]
     assert guest.run("ps -o user= -C python | sort -u").stdout.split() == ["robot"]
@@ -97,7 +99,7 @@ def test_release_is_flashed_and_the_service_flies_the_hover_on_vcan0(guest: Gues
 def test_broken_release_is_rolled_back_by_the_machine_itself(guest: Guest, tmp_path: Path) -> None:
     before = current(guest)
     body = '"""Run the vehicle until SIGINT, SIGTERM or SIGHUP."""'
-    done = flash(guest, checkout(tmp_path, "broken", body, f'{body}\n    raise RuntimeError("broken on purpose")'))
+    done = flash(guest, checkout(tmp_path, "broken", body, f'{body}\n    raise RuntimeError("broken on purpose")'), "--armed")
     assert done.returncode == 1, done.stdout + done.stderr
     assert f"rolled back to {before}, which runs" in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -111,7 +113,7 @@ def test_power_cut_half_way_through_a_flash_brings_the_old_release_up(guest: Gue
     source = checkout(tmp_path, "interrupted")
     unit = source / "firmware_py" / "deploy" / "modcube.service"
     unit.write_text(unit.read_text().replace("Description=modcube", "Description=interrupted modcube", 1))
-    words = guest.flash_words(sys.executable, source)
+    words = guest.flash_words(sys.executable, source, "--armed")
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as flashing:
         assert flashing.stdout is not None
         for line in flashing.stdout:

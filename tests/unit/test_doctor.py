@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -262,8 +263,18 @@ def test_service_is_ready_once_after_a_second_at_every_rate() -> None:
         assert len([text for text in said if "STATUS=" in text]) == 2, rate_hz
 
 
-def outputs(tick: int) -> Outputs:
-    return Outputs(tick=tick, time_ns=tick * PERIOD_NS, modules=[], events=[], records=[], estop=False)
+def test_service_says_at_once_that_a_module_is_armed_and_that_it_is_not() -> None:
+    """flash.py asks before it stops the service; a second is long."""
+    said: list[str] = []
+    notifier: Any = SimpleNamespace(is_heard=True, send=said.append)
+    observe = reporting(notifier, RateKeeper(PERIOD_NS, ManualClock(), lambda deadline_ns: None), 100)
+    for tick, armed in enumerate((False, True, True, False, False), 1):
+        observe([], [], Inputs(tick, 0, [ModuleInputs()], [], False, 0, False), outputs(tick, [SimpleNamespace(armed=armed)]))
+    assert [re.findall(r"tick=\d|armed=\S+", text) for text in said] == [["tick=2", "armed=1/1"], ["tick=4", "armed=0/1"]]
+
+
+def outputs(tick: int, modules: Sequence[Any] = ()) -> Outputs:
+    return Outputs(tick=tick, time_ns=tick * PERIOD_NS, modules=list(modules), events=[], records=[], estop=False)
 
 
 def test_without_a_service_manager_nothing_is_sent(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ case $* in
         ls -d "${FAKE}/root/current"/lib/python*/site-packages/broken && exit 1;;
     *show*) tick=$(($(cat "$FAKE/tick" 2>/dev/null || echo 0) + 1)); echo $tick > "$FAKE/tick"
         echo ActiveState=active; echo SubState=running; echo MainPID=7; echo NRestarts=0
-        echo "StatusText=tick=$tick rate_hz=100";;
+        echo "StatusText=tick=$tick rate_hz=100 $(cat "$FAKE/armed" 2>/dev/null || echo armed=0/1)";;
 esac
 exit 0
 """
@@ -172,6 +172,25 @@ def test_release_without_health_is_taken_back_and_the_old_one_runs(
 def test_first_release_without_health_leaves_none(put: Callable[..., int], fake: Path) -> None:
     assert put(BROKEN) == 1
     assert current(fake) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("report", "says"), [("armed=1/2", "1/2 modules are armed"), ("", "does not say whether it is armed")])
+def test_vehicle_that_is_or_may_be_armed_is_left_alone_unless_told_otherwise(
+    put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str], report: str, says: str
+) -> None:
+    """Its service would be stopped, in flight. A release of before it said so says nothing."""
+    assert put(GOOD) == put(BETTER) == 0
+    (fake / "armed").write_text(report)
+    restarts = (fake / "restarts").read_text()
+    for words in ((), ("--rollback",)):
+        capsys.readouterr()
+        assert put("2.0-new", *words) == 2
+        error = capsys.readouterr().err
+        assert len(error.splitlines()) == 1 and says in error and "--armed" in error
+    assert current(fake) == BETTER and (fake / "restarts").read_text() == restarts
+    assert put("2.0-new", "--armed") == 0 and current(fake) == "2.0-new"
+    assert put("2.0-new", "--rollback", "--armed") == 0 and current(fake) == BETTER
 
 
 def test_dry_run_changes_nothing(put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,6 +32,7 @@ class Machine:
         self.left: int | None = None
         self.steps: list[str] = []
         self.tick = 0
+        self.says, self.active = "armed=0/1", "active"
         self.dies_in = ""
         self.fills_in = ""
         self.sick: set[str] = set()
@@ -59,8 +60,8 @@ class Machine:
             self.obey(words)
             return ""
         self.tick += 1
-        state = "failed" if self.device().linked(self.root / "current") in self.sick else "active"
-        return f"ActiveState={state}\nMainPID=1\nNRestarts=0\nStatusText=tick={self.tick}\n"
+        state = "failed" if self.device().linked(self.root / "current") in self.sick else self.active
+        return f"ActiveState={state}\nMainPID=1\nNRestarts=0\nStatusText=tick={self.tick} {self.says}\n"
 
     def obey(self, words: list[str]) -> None:
         """What a command does here."""
@@ -289,3 +290,34 @@ def test_torn_wheel_is_never_installed(tmp_path: Path) -> None:
     with pytest.raises(RefusedError, match="did not arrive whole"):
         device.install(GOOD, digests, {})
     assert device.missing_wheels(digests) == [path.name]
+
+
+@pytest.mark.parametrize("command", ["missing", "activate", "rollback"])
+def test_vehicle_that_was_armed_since_flash_looked_is_left_alone(tmp_path: Path, command: str) -> None:
+    Machine(tmp_path).install_and_activate(GOOD)
+    machine = Machine(tmp_path)
+    machine.says = "armed=1/1"
+    with pytest.raises(RefusedError, match="1/1 modules are armed, and its service would be stopped: disarm it, or say --armed"):
+        flash_device.perform(machine.device(), command, {"release": GOOD, "wheels": {}})
+    assert machine.steps == []
+
+
+@pytest.mark.parametrize("state", ["inactive", "failed"])
+def test_service_that_has_ended_is_not_armed_whatever_it_said_last(tmp_path: Path, state: str) -> None:
+    machine = Machine(tmp_path)
+    machine.says, machine.active = "armed=1/1", state
+    machine.device().check_disarmed()
+
+
+def test_service_that_ticks_not_yet_can_be_replaced(tmp_path: Path) -> None:
+    """systemd forgets the report at every start: a release that never comes to a tick has none."""
+    assert flash_device.in_flight({"ActiveState": "activating", "StatusText": ""}) == ""
+
+
+@pytest.mark.parametrize(("words", "status"), [(["--help"], 0), ([], 2), (["root"], 2), (["root", "fly"], 2)])
+def test_wrong_words_and_a_call_for_help_are_answered(words: list[str], status: int, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        flash_device.main(words)
+    assert ended.value.code == status
+    said = capsys.readouterr()
+    assert "ROOT COMMAND" in said.out if status == 0 else len(said.err.splitlines()) == 1
