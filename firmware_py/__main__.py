@@ -8,19 +8,32 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
+from firmware_py import PASSING_PLACE
 from firmware_py.runtime.interrupts import INTERRUPTED, ended_at_once
 
 COMPILING = "modcube: compiles its numeric code, once, in a minute or so"
+COMPILED_IN_PASSING = (
+    "modcube: nobody may write beside the code nor in the home: "
+    "every start compiles the numeric code, in a minute or so (set NUMBA_CACHE_DIR to a folder that stays)"
+)
+NO_PLACE = "modcube: no folder takes compiled code: set NUMBA_CACHE_DIR to one that can be written"
 
 
 def main() -> None:
     """Runs the command line; what takes a second or more to import is imported here."""
+    if PASSING_PLACE:
+        print(COMPILED_IN_PASSING, file=sys.stderr, flush=True)
     try:
         with compiling_told(sys.stderr):
             with ended_at_once():
                 from firmware_py.cli import main as run
 
             run()
+    except RuntimeError as error:
+        if "no locator available" not in str(error):
+            raise
+        print(NO_PLACE, file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         sys.exit(INTERRUPTED)

@@ -2,6 +2,6 @@
 
 from pathlib import Path
 
-import firmware_py
+from firmware_py.compiled_code import forget_stale_code
 
-firmware_py.forget_stale_code(Path(__file__).parent, Path(firmware_py.__file__).parent)
+forget_stale_code(Path(__file__).parents[1], "hil", "firmware_py")

@@ -26,9 +26,8 @@ from typing import Any, NamedTuple
 from command_line import Parser, run_tool
 from flash_device import in_flight
 from flash_payload import Payload, PayloadError, make_payload
-from flash_ssh import DEVICE_FILES, LostError, Vehicle, VehicleError
+from flash_ssh import LostError, Vehicle, VehicleError
 
-TOOLS = Path(__file__).resolve().parent
 UNPACKED = 4.0
 """Bytes on the vehicle's disk per byte of wheel, compiled code included (3.3 measured)."""
 MACHINES = ("aarch64", "x86_64")
@@ -96,14 +95,14 @@ def check_room(vehicle: Vehicle, target: Target, payload: Payload) -> None:
 
 def ship(vehicle: Vehicle, target: Target, payload: Payload, armed: bool, say: Callable[[str], None]) -> None:
     """Sends what is missing there and installs the release beside the one that runs; `armed`: even if it is. Raises VehicleError."""
-    vehicle.install_tools([TOOLS / name for name in DEVICE_FILES])
+    vehicle.install_tools()
     digests = payload.digests()
     missing = set(vehicle.device("missing", {"wheels": digests, "armed": armed}))
     wheels = [wheel for wheel in payload.wheels if wheel.name in missing]
     total = sum(wheel.stat().st_size for wheel in wheels)
     say(f"2/4 ship {len(wheels)} of {len(payload.wheels)} wheels, {total / 1e6:.1f} MB")
     if wheels:
-        vehicle.send(wheels, f"{vehicle.root}/wheels", progress_of(total, say))
+        vehicle.send({wheel.name: wheel for wheel in wheels}, f"{vehicle.root}/wheels", progress_of(total, say))
     say(f"3/4 install {payload.release}")
     facts = {"machine": target.machine, "python": target.version}
     vehicle.device("install", {"release": payload.release, "wheels": digests, "facts": facts})

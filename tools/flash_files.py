@@ -1,18 +1,19 @@
 """Files that survive a power cut, processes that cannot be mistaken, wheels without pip. Runs on the vehicle too.
 
-Standard library of Python 3.11 alone; flash.py ships it beside flash_device.py.
+Standard library of Python 3.11 alone, and a module of ours that is so too; flash.py ships both beside flash_device.py.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import re
 import shutil
 import subprocess
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+
+from firmware_py.compiled_code import cached_sources, taken_in
 
 FILE_TIME_S = 315532800
 """1980-01-01, of every file of a release: caches of compiled code know their source by time and size."""
@@ -49,7 +50,8 @@ def carry_compiled(old: Path, new: Path) -> bool:
 
     One compiled function contains others, and constants, so that all of them have to be the same, or none is taken.
     """
-    if compiled_from(old) != compiled_from(new):
+    cached = cached_sources(old, OWN_PACKAGES)
+    if compiled_from(old, cached) != compiled_from(new, cached):
         return False
     for package in OWN_PACKAGES:
         for path in (old / package).rglob("__pycache__/*.nb[ic]"):
@@ -59,26 +61,10 @@ def carry_compiled(old: Path, new: Path) -> bool:
     return True
 
 
-def compiled_from(packages: Path) -> dict[str, bytes]:
-    """Our own files that use numba, and those that they import modules or constants (in capitals) from, by place."""
-    files = [path for package in OWN_PACKAGES for path in (packages / package).rglob("*.py")]
-    texts = {str(path.relative_to(packages)): path.read_bytes() for path in files}
-    found, left = set[str](), {name for name, text in texts.items() if b"numba" in text}
-    while left:
-        found |= left
-        left = {source for name in left for source in _sources(texts[name].decode())} & texts.keys() - found
-    return {name: texts[name] for name in found}
-
-
-def _sources(text: str) -> set[str]:
-    """Where the modules and constants may be that a file imports."""
-    found = set[str]()
-    for module, names in re.findall(r"^from ([\w.]+) import (\([^)]*\)|[^\n]*)", text, re.MULTILINE):
-        folder = module.replace(".", "/")
-        found |= {f"{folder}/{name}.py" for name in re.findall(r"\w+", names)}
-        if re.search(r"\b[A-Z][A-Z0-9_]+\b", names):
-            found |= {f"{folder}.py", f"{folder}/__init__.py"}
-    return found
+def compiled_from(packages: Path, cached: set[str]) -> dict[str, bytes]:
+    """The files of `cached`, our others that use numba, and those that either imports modules or constants from, by place."""
+    files = [path for package in OWN_PACKAGES for path in (packages / package).rglob("*.py") if b"numba" in path.read_bytes()]
+    return taken_in(packages, cached | {str(path.relative_to(packages)) for path in files})
 
 
 def file_digest(path: Path) -> str:

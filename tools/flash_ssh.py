@@ -16,7 +16,15 @@ CONNECT_TIMEOUT_S = 10
 OPTIONS = (
     "BatchMode=yes", f"ConnectTimeout={CONNECT_TIMEOUT_S}", "ServerAliveInterval=5", "ServerAliveCountMax=4",
 )  # fmt: skip
-DEVICE_FILES = ("flash_device.py", "flash_files.py", "flash_units.py")
+TOOLS = Path(__file__).resolve().parent
+PACKAGE = TOOLS.parent / "firmware_py"
+DEVICE_FILES = {
+    **{name: TOOLS / name for name in ("flash_device.py", "flash_files.py", "flash_units.py")},
+    "firmware_py/compiled_code.py": PACKAGE / "compiled_code.py",
+    "firmware_py/__init__.py": PACKAGE / "runtime" / "__init__.py",
+}
+"""What flash_device.py is made of, by place in its folder. An empty __init__.py, for a package without any is found last:
+behind one that the vehicle's Python may have."""
 LOST = 255
 """ssh's own exit status."""
 REASONS = (
@@ -66,15 +74,15 @@ class Vehicle:
             raise self._error(done.returncode, done.stderr.decode(errors="replace"), output)
         return output
 
-    def send(self, paths: Sequence[Path], folder: str, progress: Callable[[int], None]) -> None:
-        """Streams files into a folder there, as one tar; `progress` is told bytes. Raises VehicleError."""
+    def send(self, files: Mapping[str, Path], folder: str, progress: Callable[[int], None]) -> None:
+        """Streams files (by place there) into a folder there, as one tar; `progress` is told bytes. Raises VehicleError."""
         command = [*self._ssh, f"mkdir -p {quote(folder)} && tar -x -C {quote(folder)}"]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as ssh:
             assert ssh.stdin is not None and ssh.stderr is not None
             pipe = cast(IO[bytes], _Counted(ssh.stdin, progress))
             with suppress(BrokenPipeError), tarfile.open(fileobj=pipe, mode="w|") as archive:
-                for path in paths:
-                    archive.add(path, path.name, filter=_anonymous)
+                for place, path in files.items():
+                    archive.add(path, place, filter=_anonymous)
             with suppress(BrokenPipeError):  # of what was not yet written: closed it is in any case
                 ssh.stdin.close()
             text = ssh.stderr.read().decode(errors="replace")
@@ -82,11 +90,11 @@ class Vehicle:
         if ssh.returncode:
             raise self._error(ssh.returncode, text, "")
 
-    def install_tools(self, paths: Sequence[Path]) -> None:
+    def install_tools(self) -> None:
         """The device's own scripts, switched to as one: the service needs them to start. Raises VehicleError."""
-        digest = hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()[:8]
+        digest = hashlib.sha256(b"".join(path.read_bytes() for path in DEVICE_FILES.values())).hexdigest()[:8]
         folder, link = f"tools/{digest}", quote(f"{self.root}/flash")
-        self.send(paths, f"{self.root}/{folder}", lambda size: None)
+        self.send(DEVICE_FILES, f"{self.root}/{folder}", lambda size: None)
         self.shell(f"sync; rm -f {link}.new; ln -s {folder} {link}.new && mv -T {link}.new {link}")
 
     def device(self, command: str, given: Mapping[str, Any] | None = None) -> Any:

@@ -5,7 +5,6 @@ import-linter checks the contracts of pyproject.toml; here stands what it cannot
 
 import ast
 import importlib.util
-import os
 import re
 import subprocess
 import sys
@@ -14,8 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from firmware_py import forget_stale_code
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE_LIBRARIES = {"numpy", "numba", "filterpy", "daqp"}
@@ -151,31 +148,3 @@ def test_no_file_names_a_path_of_one_machine() -> None:
     listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     files = [ROOT / name.decode() for name in listing.split(b"\0") if name]
     assert not [path for path in files if path.is_file() and MACHINE_PATH.search(path.read_bytes())]
-
-
-def test_compiled_code_older_than_any_source_that_it_may_have_taken_in_is_forgotten(tmp_path: Path) -> None:
-    paths = {}
-    for package, at in (("used", 300), ("mine", 200)):
-        (tmp_path / package / "__pycache__").mkdir(parents=True)
-        for name, changed in ((f"{package}/sums.py", at), (f"{package}/__pycache__/sums.run-3.py311.nbi", 250)):
-            paths[name] = tmp_path / name
-            paths[name].write_text("")
-            os.utime(paths[name], (changed, changed))
-    forget_stale_code(tmp_path / "mine")
-    assert all(path.exists() for path in paths.values())
-    forget_stale_code(tmp_path / "mine", tmp_path / "used")
-    assert not paths.pop("mine/__pycache__/sums.run-3.py311.nbi").exists()
-    assert all(path.exists() for path in paths.values())
-
-
-def test_folder_that_cannot_be_read_does_not_stop_the_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "gone" / "__pycache__").mkdir(parents=True)
-    scandir = os.scandir
-
-    def listed_but_gone(path: Path) -> object:
-        if Path(path).name == "__pycache__":
-            raise FileNotFoundError(path)
-        return scandir(path)
-
-    monkeypatch.setattr(os, "scandir", listed_but_gone)
-    forget_stale_code(tmp_path)

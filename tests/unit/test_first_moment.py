@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import runpy
+import sys
+from types import SimpleNamespace
 
 import pytest
 from numba import njit
 
-from firmware_py.__main__ import COMPILING, compiling_told
+from firmware_py.__main__ import COMPILING, NO_PLACE, compiling_told, main
 
 
 class Terminal(io.StringIO):
@@ -34,3 +36,13 @@ def test_a_function_that_an_earlier_process_has_compiled_is_not(tmp_path):
         with compiling_told(out := Terminal()):
             assert runpy.run_path(str(file))["add"](1) == 2
         assert out.getvalue() == said
+
+
+def test_compiled_code_without_any_place_is_one_line(monkeypatch, capsys):
+    def no_place():
+        raise RuntimeError("cannot cache function 'turn': no locator available for file 'rotations.py'")
+
+    monkeypatch.setitem(sys.modules, "firmware_py.cli", SimpleNamespace(main=no_place))
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2 and capsys.readouterr().err == f"{NO_PLACE}\n"

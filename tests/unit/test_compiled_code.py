@@ -1,0 +1,75 @@
+"""Compiled code is never older than what it was made of, and always finds a place."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from firmware_py.compiled_code import CACHE_FOLDER, caches, forget_stale_code, passing_place, taken_in
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def written(path: Path, changed: float, text: str = "") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    os.utime(path, (changed, changed))
+    return path
+
+
+def cache_of(package: Path, changed: float) -> Path:
+    return written(package / "__pycache__" / "sums.run-3.py311.nbi", changed)
+
+
+def test_compiled_code_older_than_any_source_that_it_may_have_taken_in_is_forgotten(tmp_path: Path) -> None:
+    for package, changed in (("used", 300), ("mine", 200)):
+        written(tmp_path / package / "sums.py", changed)
+    mine, used = (cache_of(tmp_path / package, 250) for package in ("mine", "used"))
+    forget_stale_code(tmp_path, "mine")
+    assert mine.exists() and used.exists()
+    forget_stale_code(tmp_path, "mine", "used")
+    assert not mine.exists() and used.exists()
+
+
+@pytest.mark.parametrize(("changed", "stays"), [(200, True), (300, False)])
+def test_compiled_code_older_than_a_constant_that_it_holds_is_forgotten(tmp_path: Path, changed: float, stays: bool) -> None:
+    """The file of the constant has no compiled code of its own."""
+    written(tmp_path / "mine" / "sums.py", 200, "from mine.sizes import LENGTH\nfrom mine.words import hello\n")
+    written(tmp_path / "mine" / "sizes.py", changed, "LENGTH = 8\n")
+    written(tmp_path / "mine" / "words.py", 300)
+    cache = cache_of(tmp_path / "mine", 250)
+    forget_stale_code(tmp_path, "mine")
+    assert cache.exists() == stays
+
+
+def test_the_constants_of_the_wire_are_among_what_is_compiled() -> None:
+    sources = taken_in(ROOT, ["firmware_py/bus/codec/receiver.py"])
+    assert {"firmware_py/bus/codec/crc.py", "firmware_py/bus/codec/message.py"} < sources.keys()
+
+
+def test_folder_that_cannot_be_read_does_not_stop_the_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written(tmp_path / "mine" / "sums.py", 200)
+    cache_of(tmp_path / "mine", 250)
+    scandir = os.scandir
+
+    def listed_but_gone(path: Path) -> object:
+        if Path(path).name == "__pycache__":
+            raise FileNotFoundError(path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", listed_but_gone)
+    forget_stale_code(tmp_path, "mine")
+    assert caches(tmp_path / "mine") == []
+
+
+def test_compiled_code_that_can_be_kept_nowhere_goes_to_a_folder_for_this_run(tmp_path: Path) -> None:
+    nowhere = written(tmp_path / "file", 100) / "folder"
+    open_folder = tmp_path / "home"
+    place = Path(passing_place(nowhere, {"XDG_CACHE_HOME": str(nowhere)}))
+    assert place.is_dir() and list(place.iterdir()) == []
+    place.rmdir()
+    assert passing_place(nowhere, {"XDG_CACHE_HOME": str(open_folder)}) == ""
+    assert passing_place(tmp_path / "package", {"XDG_CACHE_HOME": str(nowhere)}) == ""
+    assert passing_place(nowhere, {"XDG_CACHE_HOME": str(nowhere), CACHE_FOLDER: str(open_folder)}) == ""
