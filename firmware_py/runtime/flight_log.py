@@ -1,11 +1,11 @@
-"""A recorded flight read back tick by tick: what each tick took, sent and thought. Reads a torn log up to the tear."""
+"""A recorded flight read back tick by tick: what each tick took, sent and thought. Reads a torn or damaged log up to there."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,7 +70,7 @@ class FlightLog:
 
     Attributes:
         configuration: what the firmware was made of; None where the log holds none.
-        torn: where the log ends too early, in words; empty for a whole one. Known once `ticks` has come to its end.
+        torn: where the log ends too early or is damaged, in words; empty for a whole one. Known once `ticks` has come to its end.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -96,31 +96,46 @@ class FlightLog:
         return configuration
 
     def ticks(self) -> Iterator[LoggedTick]:
-        """Every tick that both files hold whole, in order. Raises LogError where they do not belong together.
+        """Every tick that both files hold whole, in order, up to where can.log is damaged. Raises LogError where its first tick is.
 
-        The last tick of a can.log that ends too early is left out: frames that it sent may be missing.
+        The last tick before the damage, or of a can.log that ends too early, is left out: frames that it sent may be missing.
         """
         groups, ticks = self._frames(), self._signal_ticks()
+        held: LoggedTick | None = None
+        first = 1
         for logged in ticks:
             group = next(groups, None)
             if group is None:
-                self.torn = self.torn or f"{CAN_LOG} ends before tick {logged.tick}"
+                self._tear(f"{CAN_LOG} ends {'before' if held is None else 'with'} tick {(held or logged).tick}")
                 return
-            if group.stamp != candump_stamp(logged.time_ns):
-                here = f"{self.folder / CAN_LOG}:{group.first}"
-                raise LogError(f"{here}: frames of {shown(group.stamp)} where {SIGNAL_LOG} has tick {logged.tick}")
-            self._sort_lines(group, logged)
-            wanted, came = _received_frames(logged), len(logged.received)
-            if group.is_last and (self.torn or came != wanted or next(ticks, None) is not None):
-                self.torn = self.torn or f"{CAN_LOG} ends with tick {logged.tick}"
+            try:
+                is_whole = self._take_lines(group, logged, groups)
+            except LogError as damage:
+                if held is None:
+                    raise
+                self._tear(self._damaged_from(held, first, damage))
                 return
-            if came != wanted:
-                after = next(groups)
-                here = f"{self.folder / CAN_LOG}:{after.first}"
-                raise LogError(f"{here}: {shown(after.lines[0])} after {came} frames for tick {logged.tick}, which took {wanted}")
-            yield logged
-        if next(groups, None) is not None:
-            self.torn = self.torn or f"{SIGNAL_LOG} ends before {CAN_LOG}"
+            if held is not None:
+                yield held
+            if not is_whole:
+                self._tear(f"{CAN_LOG} ends with tick {logged.tick}")
+                return
+            held, first = logged, group.first
+        goes_on = next(groups, None) is not None
+        if held is not None and (goes_on or not self.torn):
+            yield held
+        if goes_on:
+            self._tear(f"{SIGNAL_LOG} ends before {CAN_LOG}")
+
+    def _tear(self, where: str) -> None:
+        self.torn = self.torn or where
+
+    def _damaged_from(self, tick: LoggedTick, first: int, damage: LogError) -> str:
+        """What is wrong behind a tick whose lines begin with the `first`, and from where on can.log is not to be trusted."""
+        with (self.folder / CAN_LOG).open("rb") as file:
+            at = sum(map(len, islice(file, first - 1)))
+        what = str(damage).removeprefix(f"{self.folder}/")
+        return f"{CAN_LOG} is damaged from tick {tick.tick} on, time {candump_stamp(tick.time_ns)}, byte {at} ({what})"
 
     def _signal_ticks(self) -> Iterator[LoggedTick]:
         """The ticks of the signal log, without their frames."""
@@ -159,6 +174,19 @@ class FlightLog:
                 before = _Group(stamp, list(lines), False, first)
             if before is not None:
                 yield before._replace(is_last=True)
+
+    def _take_lines(self, group: _Group, logged: LoggedTick, groups: Iterator[_Group]) -> bool:
+        """Puts the frames of one tick where they belong; False where its last ones are missing at the end. Raises LogError on damage."""
+        if group.stamp != candump_stamp(logged.time_ns):
+            here = f"{self.folder / CAN_LOG}:{group.first}"
+            raise LogError(f"{here}: frames of {shown(group.stamp)} where {SIGNAL_LOG} has tick {logged.tick}")
+        self._sort_lines(group, logged)
+        wanted, came = _received_frames(logged), len(logged.received)
+        if came != wanted and not group.is_last:
+            after = next(groups)
+            here = f"{self.folder / CAN_LOG}:{after.first}"
+            raise LogError(f"{here}: {shown(after.lines[0])} after {came} frames for tick {logged.tick}, which took {wanted}")
+        return came == wanted
 
     def _sort_lines(self, group: _Group, logged: LoggedTick) -> None:
         """Puts the frames of one tick where they belong. Raises LogError."""

@@ -1,4 +1,4 @@
-"""Mends a log that kill -9 or a pulled plug has torn: keeps the ticks that both files hold whole, and closes both.
+"""Mends a log that kill -9 or a pulled plug has torn, or that is damaged: keeps the whole ticks before it, and closes both files.
 
 What was torn stays beside it, as `NAME.torn`.
 """

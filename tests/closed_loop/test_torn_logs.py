@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -96,6 +97,26 @@ def test_torn_log_is_read_up_to_the_tear_and_mended(log: Path, seed: int) -> Non
     mended = replay(log)
     assert (mended.first, mended.ticks, mended.torn) == (None, len(ticks), "")
     assert recover(log) == (len(ticks), "")
+
+
+@pytest.mark.parametrize("fill", [b"\0", b"\xff", b"\n", b"\r", b"7"])
+@pytest.mark.parametrize("begin", [100_000, 100_017])
+def test_can_log_with_a_spoilt_block_is_read_up_to_it_and_mended(log: Path, fill: bytes, begin: int) -> None:
+    """As a disk leaves it that lost its power, or a card that wears out."""
+    path = log / CAN_LOG
+    data = path.read_bytes()
+    path.write_bytes(data[:begin] + 4096 * fill + data[begin + 4096 :])
+    outcome = replay(log)
+    assert outcome.first is None
+    place = re.match(r"can\.log is damaged from tick (\d+) on, time (\(\d+\.\d+\)), byte (\d+) \(can\.log:\d+: ", outcome.torn)
+    assert place is not None, outcome.torn
+    tick, stamp, at = int(place[1]), place[2], int(place[3])
+    assert begin - 2000 < at <= begin and outcome.ticks == tick - 1
+    assert stamp == candump_stamp(tick * 1_000_000_000 // TICKS_A_SECOND)
+    assert recover(log) == (outcome.ticks, outcome.torn)
+    assert (log / f"{CAN_LOG}.torn").read_bytes() != data and data.startswith(path.read_bytes())
+    mended = replay(log)
+    assert (mended.first, mended.ticks, mended.torn) == (None, outcome.ticks, "")
 
 
 def test_mended_log_is_as_old_as_its_flight_so_that_nobody_is_armed_for_it(log: Path) -> None:
