@@ -27,6 +27,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from command_line import Parser, run_tool
 from flash_files import RefusedError, carry_compiled, file_digest, remove, run, sync_folder, unpack, watcher, watches, write_whole
 from flash_units import GUARD, as_root, guard_unit, installed_units, release_units
 
@@ -382,16 +383,15 @@ def made_by(wheels: dict[str, str], name: str) -> str:
     return next((wheel for wheel in wheels if wheel.startswith(f"{name}-")), "")
 
 
-def parse(words: Sequence[str]) -> argparse.Namespace:
+def parse(words: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
-    what = "flash_device.py ROOT COMMAND: installs and switches releases; flash.py runs it on the vehicle"
-    parser = argparse.ArgumentParser(prog="flash_device.py", description=what, usage=argparse.SUPPRESS)  # what is wrong, in one line
+    parser = Parser(prog="flash_device", description="Installs and switches releases; flash.py runs it on the vehicle.")
     parser.add_argument("root", type=Path, help="folder of the releases")
     parser.add_argument("command", choices=COMMANDS, help="all but boot and status take JSON on standard input")
     return parser.parse_args(words)
 
 
-def main(words: Sequence[str]) -> int:
+def main(words: Sequence[str] | None = None) -> int:
     """flash_device.py ROOT COMMAND, with the command's JSON on standard input where it takes any.
 
     Prints one line of JSON: {"error": line} or the command's result. Exit status 0 or 1; 2 where the words are wrong.
@@ -446,4 +446,4 @@ def alone(root: Path, command: str) -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run_tool(main)

@@ -320,4 +320,4 @@ def test_wrong_words_and_a_call_for_help_are_answered(words: list[str], status: 
         flash_device.main(words)
     assert ended.value.code == status
     said = capsys.readouterr()
-    assert "ROOT COMMAND" in said.out if status == 0 else len(said.err.splitlines()) == 1
+    assert "folder of the releases" in said.out if status == 0 else len(said.err.splitlines()) == 1
