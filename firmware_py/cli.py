@@ -208,7 +208,7 @@ def clear_estop(out: Annotated[Path, typer.Argument(help="folder for the logs, a
 
 @log_app.command()
 def recover(log: Annotated[Path, typer.Argument(help="folder that a run left: can.log and signals.mcap")]) -> None:
-    """Mend a log that is torn (kill -9, a pulled plug) or damaged: the whole ticks before it stay; the files as they were are kept as NAME.torn."""
+    """Mend a log that is torn (kill -9, a pulled plug) or damaged: whole ticks before that stay; what it was is kept as NAME.torn."""
     from firmware_py.runtime.log_recovery import recover as mend
 
     ticks, torn = mend(log)
