@@ -6,14 +6,15 @@ import argparse
 import math
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import typer
 from typer.exceptions import TyperException
 
 from firmware_py.description.schema import DescriptionError
-from hil.replaceable import check_replaceable, is_json_with
+from hil.replaceable import check_replaceable, is_json_with, made
 
 
 def whole(least: int) -> Callable[[str], int]:
@@ -53,6 +54,17 @@ def run_command(app: typer.Typer, name: str) -> None:
 def make_folder(out: Path) -> None:
     """Makes the folder of a tool's results and tries that it takes a file, before the minutes of the work. Raises DescriptionError."""
     _try_folder(out, out)
+
+
+@contextmanager
+def folder_for_results(out: Path | None) -> Iterator[None]:
+    """`make_folder`, where there is to be one; what of it was made goes again where no result came. Raises DescriptionError."""
+    with ExitStack() as stack:
+        if out is not None:
+            with suppress(OSError):  # make_folder says what is wrong
+                stack.enter_context(made(out))
+            make_folder(out)
+        yield
 
 
 def check_results(out: Path, key: str, *results: str) -> None:

@@ -144,6 +144,15 @@ def print_comparison(console: Console, vehicle: Vehicle, shapes: dict[str, list[
     console.print(view)
 
 
+def check_format(path: Path) -> None:
+    """Raises DescriptionError where the ending names no format of pictures: before the minutes of the work."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    known = sorted(FigureCanvasBase.get_supported_filetypes())
+    if path.suffix and path.suffix[1:].lower() not in known:
+        raise DescriptionError(f"--out {path}: no picture ends in {path.suffix}; there are {', '.join(known)}")
+
+
 def draw(path: Path, tables: dict[str, DragTable]) -> None:
     """The drag spaces: in each direction of motion, a point at the size of the force. Raises DescriptionError."""
     import matplotlib
@@ -192,6 +201,7 @@ def main(
     description = load_vehicle(vehicle)
     shapes = shapes_of(cells)
     check_docks(description, shapes)
+    check_format(out)
     make_room(out)
     modes = list(METHODS) if compare else [mode]
     tables = {shape: {m: table_of(description, placed, m, store) for m in modes} for shape, placed in shapes.items()}

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import cantools.database
-from command_line import Parser, run_tool
+from command_line import Parser, in_words, run_tool
 
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.load import MEAN_LIMIT, TICK_LIMIT, BusLoad, bus_load
@@ -94,10 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         looked_at = cases(given.fleet, given.rate)
         if given.dbc is not None:
             write_dbcs(given.dbc, looked_at)
-    except (DescriptionError, ValueError) as error:
-        return refuse(str(error))
-    except OSError as error:
-        return refuse(f"{error.filename}: {error.strerror}")
+    except (DescriptionError, ValueError, OSError) as error:
+        return refuse(in_words(error))
     codec, allowed = Codec.load(), True
     print(f"{'bus':28s} modules    Hz  mean %  fullest tick %")
     for name, numbers, rate in looked_at:

@@ -21,7 +21,7 @@ from typing import Any
 import characterise_blas  # noqa: F401
 import characterise_table as table
 import numpy as np
-from argument_types import check_results, make_folder, positive, whole
+from argument_types import check_results, folder_for_results, positive, whole
 from command_line import Parser, run_tool, worker_pool
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -91,8 +91,12 @@ def arguments() -> argparse.Namespace:
 
 def run(given: argparse.Namespace) -> None:
     """Does what is asked for. Raises DescriptionError."""
+    with folder_for_results(given.out):
+        _run(given)
+
+
+def _run(given: argparse.Namespace) -> None:
     if given.out:
-        make_folder(given.out)
         stem = "choice" if given.choose is not None else "table1" if given.table1 else "capability"
         key = "rank_by" if given.choose is not None else "vehicles"
         check_results(given.out, key, *(f"{stem}.{ending}" for ending in ENDINGS))

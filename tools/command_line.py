@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import signal
 import sys
@@ -12,6 +13,8 @@ from contextlib import contextmanager
 from multiprocessing import active_children, get_context
 from typing import NoReturn
 
+REASONS = {errno.EEXIST: "is a file; a folder is needed"}
+"""In place of the system's words, where these do not say what would be right."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C: 128 and SIGINT, as a shell has it."""
 
@@ -26,7 +29,7 @@ class Parser(argparse.ArgumentParser):
 def in_words(error: Exception) -> str:
     """What is wrong, in one line; of a file that the system refuses, its name first."""
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
+        return f"{error.filename}: {REASONS.get(error.errno or 0, error.strerror)}"
     return str(error)
 
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import cantools.database
 from cantools.database.can import c_source
-from command_line import Parser, run_tool
+from command_line import Parser, in_words, run_tool
 
 from firmware_py.bus.codec import Codec, Field, MessageCodec
 from firmware_py.bus.codec.crc import TABLE
@@ -143,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (folder / name).write_text(text, encoding="utf-8")
             print(f"wrote {folder / name}")
     except OSError as error:
-        print(f"generate_mcu_code: {error.filename}: {error.strerror}", file=sys.stderr)
+        print(f"generate_mcu_code: {in_words(error)}", file=sys.stderr)
         return 2
     return 0
 

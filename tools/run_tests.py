@@ -6,6 +6,7 @@ processes do. The exit status is the worst of pytest's two and lint's.
 """
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from command_line import run_tool
 
+MAKEFILE = Path(__file__).resolve().parents[1] / "Makefile"
 CLIENTS = Path(".venv-clients/.stamp")
 """There once every client is installed."""
 PYTEST = [sys.executable, "-m", "pytest"]
@@ -32,9 +34,18 @@ def is_installed(package: str) -> bool:
         return False
 
 
+def packages_of(makefile: str) -> list[str]:
+    """The Debian packages that the Makefile gives to this tool."""
+    return "".join(re.findall(r"^SYSTEM_PACKAGES := (.*)$", makefile, re.MULTILINE)).split()
+
+
 def main() -> int:
     if options := [word for word in sys.argv[1:] if word.startswith("-")]:
         print(f"run_tests: {options[0]}: no option is taken, only names of Debian packages", file=sys.stderr)
+        return 2
+    if strangers := sorted(set(sys.argv[1:]) - set(packages_of(MAKEFILE.read_text()))):
+        what = f"{strangers[0]!r} is none of SYSTEM_PACKAGES in the Makefile"
+        print(f"run_tests: {what}; for single tests: .venv/bin/python -m pytest ...", file=sys.stderr)
         return 2
     left_out = {"jetson": "they take half an hour (make test-flash)"}
     if missing := [package for package in sys.argv[1:] if not is_installed(package)]:

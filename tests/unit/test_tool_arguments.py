@@ -72,6 +72,9 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
         ),
         ("mutants", ["nosuch"], "mutants: nosuch: unknown; there are transitions, "),
         ("characterise", ["nosuch"], "characterise: vehicle 'nosuch' is unknown; there are "),
+        ("bus_load", ["--dbc", str(TOOLS / "bus_load.py")], f"bus_load: {TOOLS / 'bus_load.py'}: is a file; a folder is needed"),
+        ("generate_mcu_code", [__file__], f"generate_mcu_code: {__file__}: is a file; a folder is needed"),
+        ("run_tests", ["hover"], "run_tests: 'hover' is none of SYSTEM_PACKAGES in the Makefile; for single tests: "),
         ("mutants", ["--jobs", "0"], "mutants: argument --jobs: '0' is not a whole number above zero"),
     ],
 )  # fmt: skip
@@ -129,6 +132,7 @@ def test_every_tool_that_reads_arguments_ends_alike(tool: str) -> None:
             "build_drag_table", ["--vehicle", "bluerov2", "--cache", "/proc/self/none"],
             "build_drag_table: line of two of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --",
         ),
+        ("build_drag_table", ["--out", "x.foo"], "build_drag_table: --out x.foo: no picture ends in .foo; there are "),
         ("accept", ["--out", "/proc/self/accept.json"], "accept: --out /proc/self/accept.json: cannot be written: "),
         ("accept", ["--only", "nosuch"], "accept: Invalid value: nosuch: unknown; there are hover, spiral, "),
     ],
@@ -183,6 +187,12 @@ def test_files_that_no_earlier_run_left_are_not_written_over(
     assert f"{tmp_path} holds {name}, which no earlier run left there; move what is yours or give another --out" in line
     assert line.count("\n") == 1
     assert (tmp_path / name).read_text() == "mine"
+
+
+@pytest.mark.parametrize("arguments", [["nosuch"], ["--choose", "2", "--task", "nosuch.toml"]])
+def test_refusal_leaves_no_empty_folder(run: Run, arguments: list[str], tmp_path: Path) -> None:
+    assert run("characterise", *arguments, "--out", str(tmp_path / "a" / "b")) == 2
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_tables_of_the_readme_need_the_project_s_root(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
