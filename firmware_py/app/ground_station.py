@@ -16,7 +16,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from contextvars import ContextVar
+from ctypes import Array
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -55,23 +58,31 @@ _SAVE_EVERY_NS = 1_000_000_000
 _NOTHING = PlanJob(0, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), 0.1, 1.0)
 """A plan of no legs: makes the planning process load what it needs."""
 
+Awaited = Array[Any]
+"""Of each body the serial number of the job whose plan it waits for, shared by both processes."""
+_AWAITED: ContextVar[Awaited | None] = ContextVar("awaited", default=None)
+"""Set in the planning process alone."""
+
 
 def _plan_mission(job: PlanJob, body: Body | None) -> Plan:
     """In the planning process alone: its solvers take 20 MB that the vehicle's process has no need of."""
     from firmware_py.app.mission_plan import plan_mission
 
-    return plan_mission(job, body)
+    awaited = _AWAITED.get()
+    return plan_mission(job, body, lambda: awaited is None or awaited[job.body] == job.serial)
 
 
-def _planner() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_serve, initargs=(os.getpid(),))
+def _planner(awaited: Awaited) -> ProcessPoolExecutor:
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, mp_context=context, initializer=_serve, initargs=(os.getpid(), awaited))
 
 
-def _serve(parent: int) -> None:
+def _serve(parent: int, awaited: Awaited) -> None:
     """The planning process ends when the vehicle's does, and not by the Ctrl-C that asks the vehicle to disarm first."""
     use_ordinary_priority()  # one that takes the place of another is started by a thread of real-time priority
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     die_with(parent)
+    _AWAITED.set(awaited)
 
 
 class GroundSide:
@@ -105,6 +116,7 @@ class GroundSide:
             raise DescriptionError(str(error)) from None
         self._executor = executor
         self._plans: list[tuple[PlanJob, Future[Plan]]] = []
+        self._awaited: Awaited = multiprocessing.RawArray("q", len(firmware.fleet.module))
         self._ticks: deque[tuple[Inputs, Outputs]] = deque(maxlen=_MOST_TICKS)
         self._requests: deque[Request] = deque()
         self._thread: threading.Thread | None = None
@@ -235,6 +247,7 @@ class GroundSide:
 
     def _plan(self) -> None:
         """Hand out what is to be planned, in place of what was to be for the same body; take back what is."""
+        self._awaited[:] = self.station.awaited()  # before a job of them is begun; what is being planned for nobody ends by it
         bodies = {body.index: body for body in self._pipeline.bodies}
         for job in self.station.jobs():
             self._plans = [(other, future) for other, future in self._plans if other.body != job.body or not future.cancel()]
@@ -250,7 +263,7 @@ class GroundSide:
     def _start_planner(self) -> None:
         """By the thread, with which it ends whatever it is busy with (`die_with`); it takes seconds to be ready."""
         if self._executor is None:
-            self._executor = _planner()
+            self._executor = _planner(self._awaited)
             self._executor.submit(_plan_mission, _NOTHING, None)
 
     def _begin(self, job: PlanJob, body: Body | None) -> Future[Plan]:
@@ -260,7 +273,7 @@ class GroundSide:
                 return self._executor.submit(_plan_mission, job, body)
         except BrokenExecutor:
             pass
-        self._executor = _planner()
+        self._executor = _planner(self._awaited)
         return self._executor.submit(_plan_mission, job, body)
 
     def _save(self) -> None:

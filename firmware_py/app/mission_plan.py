@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Setpoint
 from firmware_py.ground.mission_flight import Leg, Plan, PlanJob
-from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, distinct, plan
+from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, distinct, plan
 from firmware_py.prepare.piecewise import Piecewise
 
 _SAME = 1e-3
@@ -40,8 +40,8 @@ class Consecutive:
         return part.sample(t_s - start)
 
 
-def plan_mission(job: PlanJob, body: Body | None) -> Plan:
-    """The plan of `job`; one that cannot be flown comes back with its reason."""
+def plan_mission(job: PlanJob, body: Body | None, wanted: Callable[[], bool] = lambda: True) -> Plan:
+    """The plan of `job`; one that cannot be flown, or is not `wanted` any more, comes back with its reason."""
     parts: list[tuple[float, Piecewise]] = []
     arrivals: list[float] = []
     at_s, p_wb, q_wb = 0.0, job.p_wb, job.q_wb
@@ -49,7 +49,7 @@ def plan_mission(job: PlanJob, body: Body | None) -> Plan:
         for section in _sections(job.legs):
             points, places = _waypoints(p_wb, q_wb, section)
             if len(points) > 1:
-                path = plan(points, None, _limits(job, section[0].speed_m_s), body)
+                path = plan(points, None, _limits(job, section[0].speed_m_s), body, wanted=wanted)
                 parts.append((at_s, path))
                 arrivals += [at_s + float(path.breaks[place]) for place in places]
                 at_s += path.duration_s
@@ -59,6 +59,8 @@ def plan_mission(job: PlanJob, body: Body | None) -> Plan:
             at_s += section[-1].hold_s
     except (InfeasibleError, ValueError) as error:
         return Plan(job.serial, None, (), str(error))
+    except UnwantedError:
+        return Plan(job.serial, None, (), "nobody waits for it any more")
     if not parts:
         parts.append((0.0, plan([Waypoint(job.p_wb, job.q_wb), Waypoint(job.p_wb, job.q_wb)], 1.0)))
     return Plan(job.serial, Consecutive(tuple(parts), max(at_s, 1e-3)), tuple(arrivals))

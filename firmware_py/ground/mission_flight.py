@@ -96,6 +96,11 @@ class _Flight:
     replaced: bool = False
     """It is of the mission before: of the one that is there now nothing is flown."""
 
+    @property
+    def of_mission(self) -> bool:
+        """Whether it is one of a mission, and no way to a single place."""
+        return self.legs[0].sequence != _GO_TO
+
 
 class MissionFlight:
     """The mission of one body."""
@@ -118,7 +123,9 @@ class MissionFlight:
     # ------------------------------------------------------------ what is asked
 
     def replace(self, items: tuple[Item, ...]) -> None:
-        """A new mission, ready to be started. What flies goes on, of the old one."""
+        """A new mission, ready to be started. What flies goes on, of the old one; what is still being planned of it is not flown."""
+        if self._flight is not None and self._flight.of_mission and not self._flight.arrivals_s:
+            self._end_before_it_began("its mission was replaced")
         self.amend(items)
         p = self._system.subject.progress
         p.total, p.current = max(len(items) - self._first, 0), min(self._first, max(len(items) - 1, 0))
@@ -134,6 +141,12 @@ class MissionFlight:
         """A MAV_MISSION_RESULT and why `item` is flown nowhere, by the fence as it is now; 0: it is."""
         place = item.place(self._system.subject.origin) if item.sequence >= self._first else None
         return (0, "") if place is None else beyond_fence(place, self._parameters().fence)
+
+    @property
+    def awaited(self) -> int:
+        """Serial number of the job whose plan is waited for; 0: of none."""
+        waits = self._flight is not None and self._plan_at_tick is None and not self._flight.arrivals_s
+        return self._serial if waits else 0
 
     @property
     def flies(self) -> bool:
@@ -247,8 +260,11 @@ class MissionFlight:
             return
         reason = self._against_waiting(flight)
         if reason:
-            self._system.say(WARNING, f"flight ended before it began: {reason}")
-            self._end(PAUSED)
+            self._end_before_it_began(reason)
+
+    def _end_before_it_began(self, reason: str) -> None:
+        self._system.say(WARNING, f"flight ended before it began: {reason}")
+        self._end(PAUSED)
 
     def _against_waiting(self, flight: _Flight) -> str:
         """Why a flight is not waited for any more; empty while it is."""
@@ -308,7 +324,7 @@ class MissionFlight:
     def _end(self, state: int) -> None:
         flight, self._flight, self._plan_at_tick = self._flight, None, None
         self.jobs.clear()
-        if flight is not None and flight.legs[0].sequence != _GO_TO and not flight.replaced:
+        if flight is not None and flight.of_mission and not flight.replaced:
             self._system.subject.progress.state = state
             self._left = flight.legs[flight.reached :] or flight.legs[-1:]
 

@@ -189,6 +189,10 @@ class GroundStation:
             services.flight.jobs.clear()
         return jobs
 
+    def awaited(self) -> list[int]:
+        """Of each body the serial number of the job whose plan it waits for; 0: of none."""
+        return [services.flight.awaited for services in self.services.values()]
+
     def frames(self, time_ns: int) -> list[Outgoing]:
         """What is to be sent now: telemetry that is due, and answers."""
         for system in self.present():

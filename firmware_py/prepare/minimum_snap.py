@@ -18,7 +18,7 @@ from firmware_py.prepare.snap_limits import InfeasibleError, Limits, crests, pla
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
 from firmware_py.prepare.snap_thrust import divide, sag, usage
 
-__all__ = ["InfeasibleError", "Limits", "Waypoint", "distinct", "plan"]
+__all__ = ["InfeasibleError", "Limits", "UnwantedError", "Waypoint", "distinct", "plan"]
 
 ATTITUDE_LEVER_M = 0.5
 """One radian counts as this many metres where time is divided among the pieces."""
@@ -41,6 +41,14 @@ _SAME = 1e-6
 
 class _UnreachableError(InfeasibleError):
     """However slow the path is, its body cannot fly it."""
+
+
+class UnwantedError(Exception):
+    """Nobody waits for the trajectory any more."""
+
+
+def _always() -> bool:
+    return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +74,7 @@ def plan(
     limits: Limits | None = None,
     body: Body | None = None,
     stretch: bool = True,
+    wanted: Callable[[], bool] = _always,
 ) -> Piecewise:
     """The trajectory of least snap through the waypoints, rest to rest.
 
@@ -77,17 +86,19 @@ def plan(
         limits: what the path may do.
         body: whose thrusters must be able to fly it, in still water, with the axes that they do not span left to buoyancy.
         stretch: lengthen the durations until everything fits; False takes them as they are.
+        wanted: asked before each attempt, of which there are a dozen; many waypoints take seconds each.
 
     Raises:
         InfeasibleError: which limit cannot be kept, and where.
         ValueError: too few waypoints, a velocity where the path rests, durations that do not match, or free durations without
             anything that bounds them.
+        UnwantedError: it is not `wanted` any more.
     """
     limits = limits or Limits()
     _check(waypoints)
     if not isinstance(durations_s, Sequence | np.ndarray):
         waypoints, _ = distinct(waypoints)
-    request = _Request.of(waypoints if len(waypoints) > 1 else [*waypoints, *waypoints], limits, body)
+    request = _Request.of(waypoints if len(waypoints) > 1 else [*waypoints, *waypoints], limits, body, wanted)
     base = request.durations(durations_s)
     if durations_s is not None and not stretch:
         return request.attempt(base)
@@ -165,9 +176,10 @@ class _Request:
     attitude: Knots
     limits: Limits
     body: Body | None
+    wanted: Callable[[], bool]
 
     @staticmethod
-    def of(waypoints: Sequence[Waypoint], limits: Limits, body: Body | None) -> _Request:
+    def of(waypoints: Sequence[Waypoint], limits: Limits, body: Body | None, wanted: Callable[[], bool] = _always) -> _Request:
         value = np.array([w.p_wb for w in waypoints], dtype=float)
         position = Knots.at_rest(value)
         attitude = Knots.at_rest(_continuous(waypoints))
@@ -177,7 +189,7 @@ class _Request:
             elif waypoint.velocity_w is not None:
                 position.fixed[k, 0] = True
                 position.derivative[k, 0] = waypoint.velocity_w
-        return _Request(position, attitude, limits, body)
+        return _Request(position, attitude, limits, body, wanted)
 
     def bounds_speed(self) -> bool:
         """Whether some limit, or the body, keeps the duration of this path from vanishing."""
@@ -223,7 +235,9 @@ class _Request:
             return None
 
     def attempt(self, durations: np.ndarray) -> Piecewise:
-        """The trajectory in exactly these durations. Raises InfeasibleError."""
+        """The trajectory in exactly these durations. Raises InfeasibleError and UnwantedError."""
+        if not self.wanted():
+            raise UnwantedError
         system = System.of(durations)
         unknown = solve(system, self.position)
         bounds = planes(self.position.value, self.limits)

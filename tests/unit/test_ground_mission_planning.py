@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from firmware_py.app.mission_plan import plan_mission
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode
 from firmware_py.ground.mission_flight import Plan, PlanJob
@@ -85,6 +86,41 @@ def test_flight_that_is_being_planned_ends_when_a_fail_safe_changes_the_mode(wor
     world.run(3)
     assert "flight ended before it began: the mode is SURFACE" in client.texts
     assert world.robot.mode[0] == Mode.POSHOLD
+
+
+@pytest.mark.parametrize("places", [[], PLACES[:2]], ids=["cleared", "another"])
+def test_flight_that_is_being_planned_ends_when_its_mission_is_replaced(
+    world: World, client: Client, places: list[tuple[int, int, float]]
+) -> None:
+    """The body flew, minutes later, what its operator had cleared."""
+    job = planning(world, client)
+    assert world.station.awaited() == [job.serial]
+    upload(world, client, [item(i, place) for i, place in enumerate(places)])
+    assert world.station.awaited() == [0] and "flight ended before it began: its mission was replaced" in client.texts
+    come_back(world, job)
+    world.run(120)
+    assert world.robot.mode[0] == Mode.POSHOLD
+    ready = mavlink.MISSION_STATE_NOT_STARTED if places else mavlink.MISSION_STATE_NO_MISSION
+    assert client.last("MISSION_CURRENT").mission_state == ready
+
+
+def test_way_to_a_place_goes_on_when_a_mission_comes_while_it_is_planned(world: World, client: Client) -> None:
+    client.command(400, 1)
+    world.run(3)
+    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 1.0, 302084010, 1201614000, -0.4)
+    world.run(10)
+    (job,) = world.station.jobs()
+    upload(world, client, [item(0, PLACES[0])])
+    come_back(world, job)
+    world.run(3)
+    assert world.robot.mode[0] == Mode.AUTO
+
+
+def test_plan_that_nobody_waits_for_any_more_is_not_made_to_its_end(world: World, client: Client) -> None:
+    """One of 150 places takes most of a minute, and the next waited behind it."""
+    asked = iter([True, True, False])
+    plan = plan_mission(planning(world, client), None, lambda: next(asked))
+    assert plan.trajectory is None and next(asked, "no more") == "no more"
 
 
 @pytest.mark.parametrize("parts", [False, True])

@@ -9,18 +9,19 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from queue import Queue
 
+import numpy as np
 import pytest
 
 from firmware_py.app.ground_station import _NOTHING, GroundSide
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.mission_flight import Plan, PlanJob
+from firmware_py.ground.mission_flight import Leg, Plan, PlanJob
 from tests.unit.ground_sides import PATIENCE_S, firmware_of, free_port, side_on
 
 
 def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
     killed = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
     assert isinstance(killed.submit(os._exit, 9).exception(), BrokenProcessPool)
-    monkeypatch.setattr("firmware_py.app.ground_station._planner", lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr("firmware_py.app.ground_station._planner", lambda awaited: ThreadPoolExecutor(1))
     monkeypatch.setattr("firmware_py.app.ground_station._plan_mission", lambda job, body: Plan(job.serial, None, ()))
     plans: Queue[Plan] = Queue()
     with closing(side_on(f"udpin:127.0.0.1:{free_port()}")) as side:
@@ -56,6 +57,21 @@ def test_plans_that_nobody_waits_for_any_more_are_not_made(monkeypatch: pytest.M
         wait([future for _, future in side._plans], PATIENCE_S)
         side.pump()
         assert side._plans == [] and planned == [(1, 0), (0, 99)]
+
+
+def test_planning_process_ends_a_plan_that_its_body_does_not_wait_for_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And goes on with the next, which waited behind it for as long as it took."""
+    leg = Leg(0, np.ones(3), None, 0.0, 0.3)
+    with closing(GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",)), firmware_of())) as side:
+        plans: list[Plan] = []
+        monkeypatch.setattr(side.station, "planned", lambda body, plan: plans.append(plan))
+        for serial in (1, 2):
+            monkeypatch.setattr(side.station, "awaited", lambda serial=serial: [serial])
+            side.station.services[1].flight.jobs.append(_NOTHING._replace(serial=serial, legs=(leg,)))
+            side.pump()
+        wait([future for _, future in side._plans])
+        side.pump()
+    assert [(plan.serial, plan.reason) for plan in plans] == [(1, "nobody waits for it any more"), (2, "")]
 
 
 def test_robot_that_is_stopped_waits_for_no_plan_that_is_being_made() -> None:
