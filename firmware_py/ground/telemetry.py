@@ -20,6 +20,8 @@ from firmware_py.ground.times import histograms, load_permille
 Values = Mapping[str, Any]
 _NAN = math.nan
 _UNKNOWN_16, _UNKNOWN_BATTERY = 0xFFFF, -1
+_UNKNOWN_TEMPERATURE = 0x7FFF
+"""As BATTERY_STATUS has it. SCALED_PRESSURE defines none, but its 0 would be water at the point of freezing."""
 _STATE_STANDBY, _STATE_ACTIVE, _STATE_EMERGENCY = 3, 4, 6
 _FRAME_LOCAL_NED, _FRAME_BODY_FRD = 1, 12
 _PWM_CENTRE, _PWM_HALF = 1500, 400
@@ -209,7 +211,7 @@ def vfr_hud(s: Subject) -> list[Values]:
 
 def battery_status(s: Subject) -> list[Values]:
     return [{
-        "id": i, "battery_function": 0, "type": 0, "temperature": 0x7FFF,
+        "id": i, "battery_function": 0, "type": 0, "temperature": _UNKNOWN_TEMPERATURE,
         "voltages": [_scaled(m.voltage_v, 1e3, _UNKNOWN_16), *[_UNKNOWN_16] * 9],
         "current_battery": _scaled(m.current_a, 1e2, -1), "current_consumed": -1, "energy_consumed": -1,
         "battery_remaining": _UNKNOWN_BATTERY,
@@ -242,7 +244,7 @@ def esc_info(s: Subject) -> list[Values]:
         "index": 8 * i + first, "time_usec": s.time_us, "counter": m.esc_frames & 0xFFFF, "count": count,
         "connection_type": _BY_CAN, "info": _online(s, m, first),
         "failure_flags": [_ESC_FAILURES[status] for status in m.esc_status[first : first + 4]],
-        "error_count": (0, 0, 0, 0), "temperature": (0x7FFF,) * 4,
+        "error_count": (0, 0, 0, 0), "temperature": (_UNKNOWN_TEMPERATURE,) * 4,
     } for i, m in enumerate(s.modules) for first in (0, 4)]  # fmt: skip
 
 
@@ -258,13 +260,13 @@ def scaled_pressure(s: Subject) -> list[Values]:
 
 
 def scaled_pressure2(s: Subject) -> list[Values]:
-    return [_pressure(s, s.modules[0].pressure_pa, 0.0)]
+    return [_pressure(s, s.modules[0].pressure_pa, _NAN)]
 
 
 def _pressure(s: Subject, pressure_pa: float, temperature_c: float) -> Values:
     return {
         "time_boot_ms": s.time_ms, "press_abs": pressure_pa / 100, "press_diff": 0.0,
-        "temperature": _scaled(temperature_c, 100, 0),
+        "temperature": _scaled(temperature_c, 100, _UNKNOWN_TEMPERATURE),
     }  # fmt: skip
 
 
