@@ -157,8 +157,9 @@ class MissionService:
         self._acknowledge(arrival, _ACCEPTED, kind)
 
     def _acknowledged(self, arrival: Arrival) -> None:
-        """Of a download: nothing to do. During an upload the client gives up."""
-        if self._upload is not None and _same(self._upload.arrival, arrival) and arrival.message["type"] != _ACCEPTED:
+        """Of a download: nothing to do. During an upload the client gives it up, but where it speaks of fences or rally points."""
+        upload, m = self._upload, arrival.message
+        if upload is not None and _same(upload.arrival, arrival) and m["mission_type"] == upload.kind and m["type"] != _ACCEPTED:
             self._upload = None
 
     # ------------------------------------------------------------ down

@@ -52,6 +52,18 @@ def test_last_item_that_comes_again_is_answered_again(world: World, client: Clie
     assert [ack.type for ack in client.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED]  # of the clearing alone
 
 
+@pytest.mark.parametrize(("kind", "asked_again"), [(0, 0), (1, 1), (2, 1)])
+def test_client_that_gives_up_fences_or_rally_points_goes_on_with_its_mission(
+    world: World, client: Client, kind: int, asked_again: int
+) -> None:
+    client.send("MISSION_COUNT", 1, 1, 2, 0)
+    world.run(1)
+    client.send("MISSION_ACK", 1, 1, mavlink.MAV_MISSION_OPERATION_CANCELLED, kind)
+    client.clear()
+    world.run(30)
+    assert len(client.all("MISSION_REQUEST_INT")) == asked_again
+
+
 def test_a_transfer_that_breaks_off_leaves_the_old_mission(world: World, client: Client) -> None:
     upload(world, client, [item(0, PLACES[0])])
     client.clear()
