@@ -140,6 +140,7 @@ class Steering:
     # ------------------------------------------------------------ pilot
 
     def _manual(self, arrival: Arrival) -> None:
+        """Sticks for all (target 0) would steer every body at once: they are nobody's, as ArduPilot has it. What stops is for all."""
         m = arrival.message
         extensions = m["enabled_extensions"]
         force = (_axis(m["x"]), _axis(m["y"]), -self._up(m["z"]))
@@ -149,7 +150,7 @@ class Steering:
             _axis(m["r"]),
         )
         fresh = self._pilots.freshly_pressed(arrival, m["buttons"] | m["buttons2"] << 16)
-        steers = self._steer(Sticks(force, moment), arrival)
+        steers = m["target"] == self._system.outbox.system and self._steer(Sticks(force, moment), arrival)
         for number, name in enumerate(self._buttons):
             if fresh >> number & 1 and (steers or _BUTTON_ACTIONS.get(name) in STOPPING):
                 self._do(name)

@@ -24,6 +24,17 @@ def test_manual_control_gives_six_axes(world: World, client: Client) -> None:
     assert max(map(abs, (*world.robot.asked[-1].argument.force, *world.robot.asked[-1].argument.moment))) == 0
 
 
+def test_sticks_for_all_steer_nobody_and_their_stop_is_for_all() -> None:
+    world = World(2)
+    client = world.client()
+    client.send("MANUAL_CONTROL", 0, 500, 0, 500, 0, 1 << 6 | 1 << 7)  # arm, e-stop
+    world.run(1)
+    assert [(r.action, r.body) for r in world.robot.asked] == [(Action.ESTOP, 0), (Action.ESTOP, 1)]
+    client.send("MANUAL_CONTROL", 2, 500, 0, 500, 0, 0)
+    world.run(1)
+    assert [(r.action, r.body) for r in world.robot.asked[2:]] == [(Action.STICKS, 1)]
+
+
 def test_stick_z_convention_is_a_parameter(world: World, client: Client) -> None:
     client.send("PARAM_SET", 1, 1, b"STICK_Z", 1.0, 9)
     client.send("MANUAL_CONTROL", 1, 0, 0, 500, 0, 0)
