@@ -154,6 +154,11 @@ class Watch:
         value, words = getattr(health, self.row.figure), self.row.words
         return words.replace(" for {:.1f} s", "") if value >= NEVER_S else words.format(value)
 
+    def ending(self, health: Health, mode: Mode, armed: bool) -> str:
+        """How it is when it ends: a cause that lasts is not over, but counts no more."""
+        no_more = f", which does not count {f'in {mode.name}' if armed else 'while disarmed'}" if self.beyond(health) else ""
+        return self.words(health) + no_more
+
     def reason(self, health: Health) -> str:
         """What is wrong, for people; what was wrong when it began, where its cause is gone."""
         return self.words(health) if self.beyond(health) else self.began
@@ -210,8 +215,9 @@ class Failsafes:
             was_active = watch.active
             if watch.step(health.time_ns, cause, armed):
                 again = was_active and watch.active
-                alarms.append(Alarm(watch.row.name, watch.words(health), watch.level, watch.active, again))
-                watch.began = alarms[-1].words if watch.active else watch.began
+                words = watch.words(health) if watch.active else watch.ending(health, mode, armed)
+                alarms.append(Alarm(watch.row.name, words, watch.level, watch.active, again))
+                watch.began = words if watch.active else watch.began
         return alarms
 
     @property

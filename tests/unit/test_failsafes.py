@@ -219,6 +219,23 @@ def test_every_alarm_has_its_words(name: str) -> None:
     assert Watch(ROWS[name], P).words(bad(name)) == WORDS[name]
 
 
+@pytest.mark.parametrize(
+    ("health", "armed", "says"),
+    [
+        (GOOD, True, "no tag for 0.0 s"),
+        (GOOD._replace(tag_age_s=9.0), True, "no tag for 9.0 s, which does not count in MANUAL"),
+        (GOOD._replace(tag_age_s=9.0), False, "no tag for 9.0 s, which does not count while disarmed"),
+        (GOOD._replace(tag_age_s=P.tag_lost_limit), True, f"no tag for {P.tag_lost_limit:.1f} s"),
+    ],
+)
+def test_fail_safe_that_ends_while_its_cause_lasts_says_that_it_does(health: Health, armed: bool, says: str) -> None:
+    """It told a pilot that "no tag" was over who still saw none."""
+    failsafes = Failsafes(quick("tag_lost"))
+    failsafes.step(GOOD._replace(tag_age_s=9.0), Mode.POSHOLD, False, True)
+    failsafes.step(at(health, 1.0), Mode.MANUAL, False, armed)
+    assert failsafes.step(at(health, 9.0), Mode.MANUAL, False, armed) == [Alarm("tag_lost", says, Level(P.tag_lost_action), False)]
+
+
 def test_what_was_never_heard_of_has_no_age_in_seconds() -> None:
     assert Watch(ROWS["tag_gone"], P).words(UPRIGHT) == "no tag"
 
