@@ -37,8 +37,9 @@ class Check(NamedTuple):
 
 def _estop(q: Question) -> str:
     """Raised, or still holding a module: one lets go when it hears, some time after the last frame, that it is disarmed."""
-    raised = q.estop_age_ms < q.parameters.supervision.estop_quiet_ms or q.health.stopped
-    return "e-stop raised" if raised else ""
+    if q.estop_age_ms < q.parameters.supervision.estop_quiet_ms:
+        return "e-stop raised"
+    return f"an e-stop holds module {', '.join(map(str, q.health.stopped))}" if q.health.stopped else ""
 
 
 def _answers(q: Question) -> str:

@@ -90,6 +90,8 @@ class Supervisor:
         decisions: list[Decision | None] = []
         if estop or (health.stopped and (self.armed or self._let_go)):  # a module has heard what the firmware has not
             self._estop_ns = health.time_ns
+            if not estop:
+                self._say(CRITICAL, f"e-stop: module {', '.join(map(str, health.stopped))} says that it heard one")
             decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
         decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger)]
         decisions += [self._request(request, health) for request in requests]

@@ -74,7 +74,7 @@ def test_e_stop_is_never_passed_over() -> None:
     for forced in (False, True):
         assert reasons(estop_age_ms=199.999, forced=forced) == ["e-stop raised"]
         assert reasons(estop_age_ms=200.0, forced=forced) == []
-        assert reasons(GOOD._replace(stopped=(1,)), estop_age_ms=1e4, forced=forced) == ["e-stop raised"]
+        assert reasons(GOOD._replace(stopped=(1,)), estop_age_ms=1e4, forced=forced) == ["an e-stop holds module 1"]
 
 
 def test_active_fail_safe_hinders_arming_and_force_passes_over_it() -> None:

@@ -8,7 +8,7 @@ import pytest
 from firmware_py.core.failsafes import Level
 from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.transitions import ARMED, ROWS, TABLE, Effect, Guard, State, Transition, Trigger
-from firmware_py.core.types import INFORMATION, WARNING, Action, Event, Mode, Request
+from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Event, Mode, Request
 from tests.unit.healths import BLIND, GOOD, at
 from tests.unit.supervisors import DOCK, REQUESTS, STICKS, P, ask, supervisor_in, texts
 
@@ -145,8 +145,10 @@ def test_robot_that_raised_an_e_stop_itself_is_armed_once_its_modules_have_let_g
     ask(supervisor, Action.ESTOP)
     ask(supervisor, Action.CLEAR_ESTOP, None, at(GOOD, 1.0))
     almost = at(GOOD, 1.2)
-    for health in (almost._replace(time_ns=almost.time_ns - 1), almost._replace(stopped=(0,))):
-        assert ask(supervisor, Action.ARM, True, health) == [] and texts(supervisor) == ["FORCED_ARM refused: e-stop raised"]
+    for health, why in (
+        (almost._replace(time_ns=almost.time_ns - 1), "e-stop raised"), (almost._replace(stopped=(1, 3)), "an e-stop holds module 1, 3"),
+    ):  # fmt: skip
+        assert ask(supervisor, Action.ARM, True, health) == [] and texts(supervisor) == [f"FORCED_ARM refused: {why}"]
         assert not supervisor.may_arm(health)
     assert ask(supervisor, Action.ARM, None, almost) and supervisor.armed
 
@@ -156,6 +158,8 @@ def test_module_that_heard_an_e_stop_which_the_firmware_missed_stops_the_robot()
     stopped = GOOD._replace(stopped=(0,))
     (decision,) = supervisor.step(False, stopped, [])
     assert decision.trigger == Trigger.ESTOP_FRAME and supervisor.state == State.ESTOP and not supervisor.raises_estop
+    assert supervisor.events[0] == Event(CRITICAL, "e-stop: module 0 says that it heard one")
+    assert supervisor.step(False, stopped, []) == [] and supervisor.events == [], "said once"
     assert ask(supervisor, Action.CLEAR_ESTOP, None, at(stopped, 0.1)) == []
     assert ask(supervisor, Action.CLEAR_ESTOP, None, at(stopped, 0.2)) and supervisor.state == State.DISARMED
     assert supervisor.step(False, stopped, []) == [], "a disarmed robot's modules let go by themselves"
@@ -187,7 +191,8 @@ def test_e_stop_that_only_a_module_has_heard_is_latched_after_another_was_cleare
     whole = Supervisor(P)
     whole.take_over([supervisor])
     for robot in (supervisor, whole):
-        robot.step(False, at(stopped, 9.02), [])
+        robot.step(False, at(stopped._replace(stopped=(2, 5)), 9.02), [])
+        assert texts(robot) == ["e-stop: module 2, 5 says that it heard one", "DISARMED POSHOLD -> ESTOP POSHOLD"]
         assert robot.state == State.ESTOP and ask(robot, Action.ARM, True, at(GOOD, 10.0)) == []
 
 
