@@ -5,7 +5,7 @@ The first row is the gravest. `Failsafes` keeps the time of each row; the superv
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from enum import IntEnum
 from operator import attrgetter
 from typing import NamedTuple
@@ -233,12 +233,13 @@ class Failsafes:
         """Those that are on and more than a warning, in words."""
         return [watch.reason(health) for watch in self._all if watch.active and watch.level > Level.WARN]
 
-    def against(self, mode: Mode, health: Health) -> list[str]:
-        """Why `mode` must not be entered now, in words; empty when it may."""
+    def against(self, mode: Mode, health: Health, but: Container[str] = ()) -> list[str]:
+        """Why `mode` must not be entered now, in words; empty when it may. Rows named in `but` are no reason."""
         return [
             watch.reason(health)
             for watch in self._all
             if mode not in PERMITTED[watch.level]
             and (watch.beyond(health) or (watch.active and watch.latched))
             and mode in watch.row.modes
+            and watch.row.name not in but
         ]

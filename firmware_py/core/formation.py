@@ -46,7 +46,7 @@ class Formation:
         bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.chains}
         waiting, holding = (self._armed_in(mode) if inputs.prepared else [] for mode in (Mode.DOCK, Mode.POSHOLD))
         decisions = self.docking.step(inputs, bodies, waiting, holding, self._resting())
-        self._miss_partners(outputs)
+        self._miss_partners(outputs, [parted.whole for parted in decisions.parts])
         outputs.docks += self.docking.records
         outputs.joints = self.docking.joints
         self._steer(decisions)
@@ -64,12 +64,14 @@ class Formation:
             self._steer(self.docking.leave(chain.body, surfaces))
             outputs.events += [event._replace(body=chain.body.index) for event in self.docking.events]
 
-    def _miss_partners(self, outputs: Outputs) -> None:
-        """Joints that are open though nobody asked: tells the bodies, and parts those that have come apart once their fail-safe is on."""
+    def _miss_partners(self, outputs: Outputs, parted: Sequence[int]) -> None:
+        """Joints that are open though nobody asked: tells the bodies, and parts those that have come apart once their fail-safe is on;
+        `parted` are so in this tick.
+        """
         loose = self.docking.open_joints(LOOSE)
         apart = self.docking.open_joints(APART) if loose else []
         for chain in self.chains:
-            if not chain.joints:
+            if not chain.joints or chain.body.index in parted:
                 continue
             chain.health.topology = _words_of([joint for joint in loose if joint.module in chain.body.modules])
             gone = [joint for joint in apart if joint.module in chain.body.modules]

@@ -20,6 +20,8 @@ LADDER = {
     Level.DISARM: (Trigger.FAILSAFE_DISARM,),
 }
 """What a fail-safe tries, one after the other until one is possible."""
+DESPITE: dict[Guard, tuple[str, ...]] = {Guard.MODE_PERMITTED: (), Guard.PARTING_PERMITTED: ("partner_lost",)}
+"""Guards that ask the fail-safes, and which of them are no reason against it."""
 MODE_LEVEL = {Mode.SURFACE: Level.SURFACE}
 """What a mode is worth as a fail-safe, whoever chose it: a milder one does not end it."""
 
@@ -182,8 +184,8 @@ class Supervisor:
             return against_arming(question, guard == Guard.FORCED_CHECKS)
         if guard == Guard.MODE_NEEDS:
             return missing(mode, health, self._p)
-        if guard == Guard.MODE_PERMITTED:
-            reasons = missing(mode, health, self._p) or self._failsafes.against(mode, health)
+        if guard in DESPITE:
+            reasons = missing(mode, health, self._p) or self._failsafes.against(mode, health, DESPITE[guard])
             if self._testing:  # and nobody has asked yet whether it may fly
                 reasons = reasons or self._reasons(Guard.ARMING_CHECKS, mode, health)
             return reasons

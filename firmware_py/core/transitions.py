@@ -76,6 +76,8 @@ class Guard(IntEnum):
     """A motor test has armed the body."""
     IN_DOCK = 8
     """The mode is DOCK."""
+    PARTING_PERMITTED = 9
+    """As MODE_PERMITTED; but a partner that is lost is what one lets go."""
 
 
 class Effect(IntEnum):
@@ -139,7 +141,7 @@ TABLE = (
     Transition(A, T.HOLD, G.MODE_PERMITTED, F.HOLD_AT, A, Mode.POSHOLD),
     Transition(A, T.TRACK, G.MODE_PERMITTED, F.FOLLOW, A, Mode.AUTO),
     Transition(A, T.DOCK, G.MODE_PERMITTED, F.ENTER_MODE, A, Mode.DOCK),
-    Transition(A, T.UNDOCK, G.MODE_PERMITTED, F.ENTER_MODE, A, Mode.DOCK),
+    Transition(A, T.UNDOCK, G.PARTING_PERMITTED, F.ENTER_MODE, A, Mode.DOCK),
     Transition(A, T.SET_POINT, G.ALWAYS, F.TAKE_POINT, A),
     Transition(A, T.STICKS, G.ALWAYS, F.TAKE_STICKS, A),
     Transition(A, T.MOTOR_TEST, G.IN_MOTOR_DETECT, F.TEST_MOTOR, A),

@@ -63,6 +63,18 @@ def test_current_alone_is_reported_and_parts_nothing_that_pictures_show_in_its_p
     assert (outputs.records[0].state, outputs.records[0].mode) == (State.ARMED, Mode.POSHOLD)
 
 
+def test_partner_that_may_be_lost_is_undocked_when_somebody_asks_for_that() -> None:
+    """Its magnets carry no current, pictures show it in its place: nobody else will part them."""
+    tank = Docked(RING[:2])
+    tank.fly()
+    tank.weak.add(1)
+    tank.run(2.0)
+    assert tank.when(LOST) and tank.shape == [(0, 1)]
+    outputs = tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.shape == [(0,), (1,)] and not [said for _, said in tank.said if "refused" in said]
+    assert [(record.state, record.mode) for record in outputs.records] == [(State.ARMED, Mode.POSHOLD)] * 2
+
+
 def test_neighbours_that_turn_two_probes_to_each_other_are_no_joint_that_could_be_lost() -> None:
     """Random shapes have such neighbours: a joint that was believed there kept the robot from arming."""
     ring = Docked(RING).pipeline.bodies[0]

@@ -10,7 +10,7 @@ from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.transitions import Effect, State, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Event, Mode, Request
 from tests.unit.healths import BLIND, GOOD, UPRIGHT, at
-from tests.unit.supervisors import QUICK, STICKS, P, ask, supervisor_in, texts
+from tests.unit.supervisors import DOCK, QUICK, STICKS, P, ask, supervisor_in, texts
 
 
 def test_fail_safe_that_is_on_is_known_by_its_name() -> None:
@@ -40,6 +40,22 @@ def test_pilot_takes_over_and_keeps_it_while_the_leak_lasts() -> None:
     assert supervisor.step(False, at(wet._replace(voltage_share=0.85), 2), []) == [], "a warning takes nothing away"
     (decision,) = supervisor.step(False, at(wet._replace(silent_s=1.0), 3), [])
     assert decision.mode == Mode.SURFACE, "but the next fail-safe does, to where the gravest leads"
+
+
+@pytest.mark.parametrize(
+    ("bad", "against"),
+    [
+        (GOOD._replace(topology="0 and 1"), {Action.DOCK: "a docked partner is lost", Action.UNDOCK: ""}),
+        (GOOD._replace(leak=True), {Action.DOCK: "water in a cabin", Action.UNDOCK: "water in a cabin"}),
+        (BLIND, {Action.DOCK: "no pose yet", Action.UNDOCK: "no pose yet"}),
+    ],
+)
+def test_lost_partner_keeps_from_docking_and_not_from_letting_it_go(bad: Health, against: dict[Action, str]) -> None:
+    for action, why in against.items():
+        supervisor = supervisor_in(mode=Mode.POSHOLD, parameters=QUICK)
+        decisions = ask(supervisor, action, DOCK, bad)
+        refusals = [text for text in texts(supervisor) if text.startswith(f"{action.name} refused: {why}")]
+        assert len(refusals) == 1 if why else decisions[0].mode == Mode.DOCK
 
 
 def test_milder_fail_safe_does_not_undo_a_graver() -> None:

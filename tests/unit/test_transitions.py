@@ -15,7 +15,7 @@ def test_numbers_are_those_of_the_logs() -> None:
         "FAILSAFE_DISARM",
     ]  # fmt: skip
     assert [int(trigger) for trigger in Trigger] == list(range(20))
-    assert [int(guard) for guard in Guard] == list(range(9))
+    assert [int(guard) for guard in Guard] == list(range(10))
     assert [int(effect) for effect in Effect] == list(range(9))
     assert [int(need) for need in Need] == list(range(4))
     assert {Trigger.DOCK, Trigger.UNDOCK} == DOCKING and {State.ARMED} == ARMED
@@ -85,7 +85,8 @@ def test_armed_robot_changes_its_mode_by_these_rows() -> None:
     assert row(a, Trigger.SET_MODE) == (permitted, Effect.ENTER_MODE, a, None)
     assert row(a, Trigger.HOLD) == (permitted, Effect.HOLD_AT, a, Mode.POSHOLD)
     assert row(a, Trigger.TRACK) == (permitted, Effect.FOLLOW, a, Mode.AUTO)
-    assert row(a, Trigger.DOCK) == row(a, Trigger.UNDOCK) == (permitted, Effect.ENTER_MODE, a, Mode.DOCK)
+    assert row(a, Trigger.DOCK) == (permitted, Effect.ENTER_MODE, a, Mode.DOCK)
+    assert row(a, Trigger.UNDOCK) == (Guard.PARTING_PERMITTED, Effect.ENTER_MODE, a, Mode.DOCK)
     assert row(a, Trigger.DOCK_OVER) == (Guard.IN_DOCK, Effect.ENTER_MODE, a, Mode.POSHOLD)
     assert row(a, Trigger.FAILSAFE_HOLD) == (needs, Effect.ENTER_LEVEL, a, Mode.POSHOLD)
     assert row(a, Trigger.FAILSAFE_DEPTH) == (needs, Effect.ENTER_LEVEL, a, Mode.ALT_HOLD)
