@@ -36,6 +36,8 @@ _LAST_SYSTEM = 254
 """255 is what ground stations take."""
 _MAY_STOP = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE", "MANUAL_CONTROL")
 """They go to services that know what stops."""
+_OF_NO_BODY = ("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END")
+"""Logs are the process's: who fetches one goes on with the same system when its body docks."""
 _NEVER_SIGNED = ("RADIO_STATUS",)
 """Taken from everybody, also with a key."""
 _NEVER_FORWARDED = ("SETUP_SIGNING", *_NEVER_SIGNED)
@@ -62,12 +64,14 @@ class Services:
         self._handlers = {name: handler for part in parts for name, handler in part.handlers().items()}
 
     def take(self, arrival: Arrival, addressed: bool) -> None:
-        """A message for this system, `addressed`, or for all. A system whose body is gone hears what may stop it; the rest it refuses."""
+        """A message for this system, `addressed`, or for all. A system whose body is gone hears what may stop it, and who wants logs; the
+        rest it refuses.
+        """
         name = arrival.message.name
         handler = self._handlers.get(name)
         if handler is None:
             return
-        if self.system.body_is_known or (addressed and name in _MAY_STOP):
+        if self.system.body_is_known or (addressed and name in (*_MAY_STOP, *_OF_NO_BODY)):
             handler(arrival)
         elif addressed:
             self.system.refuse(arrival.time_ns)
@@ -75,13 +79,13 @@ class Services:
     def step(self, time_ns: int) -> None:
         """Move on what takes longer than one message."""
         self.commands.step(time_ns)
+        self.logs.step()
         if not self.system.body_is_known:
             return
         self.parameters.step()
         self.missions.step(time_ns)
         self.flight.step(time_ns)
         self.steering.step(time_ns)
-        self.logs.step()
 
 
 class GroundStation:

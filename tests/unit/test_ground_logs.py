@@ -56,6 +56,24 @@ def test_flood_of_requests_for_the_list_of_logs_looks_at_the_folder_once(tmp_pat
     assert len(looks) == 1
 
 
+def test_log_that_is_being_fetched_comes_to_its_end_though_its_body_docks_meanwhile(tmp_path: Path) -> None:
+    """And what was lost of it is sent again: a client knows the log by the system that listed it."""
+    data = bytes(i % 251 for i in range(20_000))
+    (tmp_path / "can.log").write_bytes(data)
+    world = World(2, GroundConfig(logs=str(tmp_path)))
+    client = world.client()
+    client.send("LOG_REQUEST_DATA", 2, 1, 0, 0, 0xFFFFFFFF)
+    world.run(2)
+    world.robot.dock()
+    world.run(20)
+    pieces = client.all("LOG_DATA")
+    assert b"".join(bytes(p.data[: p.count]) for p in pieces) == data and {p.get_srcSystem() for p in pieces} == {2}
+    client.clear()
+    client.send("LOG_REQUEST_DATA", 2, 1, 0, 90, 90)
+    world.run(2)
+    assert bytes(client.last("LOG_DATA").data) == data[90:180] and "is not steered" not in client.texts
+
+
 @pytest.mark.parametrize(("identity", "first"), [("generic", 0), ("ardusub", 1)])
 def test_logs_are_listed_and_fetched(identity: str, first: int, tmp_path: Path) -> None:
     """QGroundControl finds no log whose number is that of their count, unless the autopilot is ArduPilot: it missed the newest."""
