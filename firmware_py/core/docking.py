@@ -13,7 +13,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Decisions, Join, Part, Prepared
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, TagTable
-from firmware_py.core.docking_pairs import APART, POSITION
+from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_sequence import (
     ENDED,
     DockingSequence,
@@ -27,7 +27,6 @@ from firmware_py.core.magnet_relays import MagnetRelays
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
 from firmware_py.core.types import (
     INFORMATION,
-    NEVER_NS,
     RELAY_OFF,
     RELAY_PULL,
     RELAY_PUSH,
@@ -63,7 +62,13 @@ class _Undock(NamedTuple):
 
     plan: UndockPlan
     chains: tuple[Any, ...]
+    since_ns: int
     until_ns: int
+
+    @property
+    def last_ns(self) -> int:
+        """While pictures show it in its place the magnets push on, as long again: a short push shows late."""
+        return 2 * self.until_ns - self.since_ns
 
 
 class DockingStage:
@@ -251,7 +256,7 @@ class DockingStage:
     def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
         apart = [modules_of(joint) for joint in self.open_joints(APART)]
         holds = any(modules_of(joint) not in apart for joint in plan.opens)
-        self._undocks.append(_Undock(plan, chains, time_ns + (round(self._p.release_s * 1e9) if holds else 0)))
+        self._undocks.append(_Undock(plan, chains, time_ns, time_ns + (round(self._p.release_s * 1e9) if holds else 0)))
         self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
 
     def _begin_dock(
@@ -329,9 +334,10 @@ class DockingStage:
         self.relays.switch(RELAY_PUSH, *plan.opens)
         whole = _body_of(request.module, estimates)
         changes = whole in decisions.joining or whole in [part.whole for part in decisions.parts]
-        if time_ns < undock.until_ns or changes:  # the next tick has no such body, and ends this
+        in_place = self._in_place(undock, time_ns)
+        if time_ns < (undock.last_ns if in_place else undock.until_ns) or changes:  # the next tick has no such body, and ends this
             return
-        if self._in_place(plan):
+        if in_place:
             self._undocks.remove(undock)
             self.relays.switch(RELAY_PULL, *plan.opens)
             self._say(WARNING, f"undock of module {request.module} ended: {IN_PLACE}")
@@ -350,13 +356,13 @@ class DockingStage:
         watched = [modules_of(joint.request) for joint in self._watched]
         return any(modules_of(joint) in watched for joint in plan.opens)
 
-    def _in_place(self, plan: UndockPlan) -> bool:
-        """Whether the joint is still seen as docked, as where a relay hangs: two bodies would fly against each other. Of several that part
-        at once the funnels hold back what leaves across, until thrusters draw it out.
+    def _in_place(self, undock: _Undock, time_ns: int) -> bool:
+        """Whether pictures show the joint closed in the latter half of the push, as where a relay hangs: two bodies would fly against each
+        other. Of several that part at once the funnels hold back what leaves across, until thrusters draw it out.
         """
-        watched = zip(self._watched, self._joints.rows, strict=True)
-        held = [modules_of(j.request) for j, row in watched if row["holds"][POSITION] and row["candidate_ns"][POSITION] == NEVER_NS]
-        return len(plan.opens) == 1 and modules_of(plan.opens[0]) in held
+        opens, half_ns = undock.plan.opens, (undock.since_ns + time_ns) // 2
+        held = [modules_of(joint.request) for joint, row in zip(self._watched, self._joints.rows, strict=True) if row["near_ns"] > half_ns]
+        return len(opens) == 1 and modules_of(opens[0]) in held
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))

@@ -64,7 +64,7 @@ class PairBank:
         for row, pair in zip(self.rows, pairs, strict=True):
             row["module"], row["face"] = (pair.module_a, pair.module_b), (pair.face_a, pair.face_b)
             row["offset_a"], row["turn_a"] = pair.offset_a, to_matrix(pair.q_ab).ravel()
-        for time in ("candidate_ns", "current_ns", "picture_ns"):
+        for time in ("candidate_ns", "current_ns", "picture_ns", "near_ns"):
             self.rows[time] = NEVER_NS
         for figure in ("current_ma", "error_m", "spread_m"):
             self.rows[figure] = np.nan

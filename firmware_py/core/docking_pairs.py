@@ -37,6 +37,7 @@ PAIR = np.dtype(
         ("current_ns", np.int64, 2),
         ("pictures", np.int64),  # relative positions since the last gap
         ("picture_ns", np.int64),
+        ("near_ns", np.int64),  # time of the newest picture that shows them no farther off than an open joint may be
         ("error_m", np.float64),
         ("spread_m", np.float64),
         ("fresh", np.int64),
@@ -150,13 +151,16 @@ def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[
     """Condition 2 by the pictures of this tick; whether those known are fresh."""
     i, j = _same_picture(first, seen, row.module[0], row.module[1])
     if i >= 0 and _as_turned(row, poses, i, j):
-        here = ring[row.pictures % PICTURES]
+        here, off = ring[row.pictures % PICTURES], 0.0
         for axis in range(3):
             here[axis] = 0.0
             for k in range(3):
                 here[axis] += poses[i, 3 + 3 * k + axis] * (poses[j, k] - poses[i, k])
+            off += (here[axis] - row.offset_a[axis]) ** 2
         row.pictures += 1
         row.picture_ns = seen[i, 1]
+        if math.sqrt(off) <= limits.open_m:
+            row.near_ns = row.picture_ns
         if row.pictures >= PICTURES:
             _judge_ring(row, ring)
             slack = limits.position_hysteresis_m if row.holds[POSITION] else 0.0

@@ -9,7 +9,7 @@ from firmware_py.core.joints import joints_of
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockFeedback, DockRequest, Mode, ModuleInputs, Request
 from firmware_py.description.parameters import Parameters
-from tests.unit.tanks import LOST, RING, Docked
+from tests.unit.tanks import LOST, RING, TAG_DELAY_TICKS, Docked
 
 
 def test_module_that_is_lost_is_parted_half_a_second_later_and_both_hold() -> None:
@@ -194,6 +194,29 @@ def test_undock_whose_pictures_show_it_leaving_is_done_though_that_is_not_yet_be
     first, tank._hear = len(tank.outputs), see_it_leave  # type: ignore[method-assign]
     tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert tank.shape == [(0,), (1,)] and not any(IN_PLACE in said for _, said in tank.said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stuck", [True, False])
+@pytest.mark.parametrize(("every", "release_s"), [(2, 1.0), (32, 1.0), (10, 0.3)], ids=["50 Hz", "3 Hz", "short"])
+def test_slow_camera_too_tells_a_module_that_leaves_from_one_that_a_hanging_relay_holds(every: int, release_s: float, stuck: bool) -> None:
+    tank = Docked(RING[:2], Parameters().replace("docking.release_s", release_s))
+    tank.fly()
+    tank.stuck, hear = True, tank._hear
+
+    def see_now_and_then(tick: int) -> list[ModuleInputs]:
+        modules, since_s = hear(tick), 0.01 * (tick - TAG_DELAY_TICKS - first)
+        for m, module in enumerate(modules):
+            for tag in module.tags if m == 1 and not stuck else []:
+                tag.p_wt[0] += 0.0 if since_s < 0.0 else 0.1 * since_s  # as the bench's magnets push
+            if (tick - TAG_DELAY_TICKS) % every:
+                module.tags.clear()
+        return modules
+
+    first, tank._hear = len(tank.outputs), see_now_and_then  # type: ignore[method-assign]
+    tank.run(2.2 * release_s, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.shape == ([(0, 1)] if stuck else [(0,), (1,)])
+    assert any(IN_PLACE in said for _, said in tank.said) == stuck
 
 
 @pytest.mark.slow
