@@ -22,7 +22,7 @@ from firmware_py.core.docking_sequence import (
     UndockPlan,
     nearest_pass,
 )
-from firmware_py.core.joints import Joint, modules_of
+from firmware_py.core.joints import Joint, modules_of, sides
 from firmware_py.core.magnet_relays import MagnetRelays
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
 from firmware_py.core.types import (
@@ -45,6 +45,7 @@ NO_LONGER = "its body is no longer in DOCK"
 ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
+TAKEN = "another dock is to close one of its faces: end that dock first"
 
 
 class _Dock(NamedTuple):
@@ -231,6 +232,8 @@ class DockingStage:
             return ANOTHER
         if mine in self._leaders(others):
             return LED
+        if any(_share_a_face(plan, dock.sequence.plan) for dock in self._docks if dock.active != mine):
+            return TAKEN
         return "" if self._p.approach == "straight" else _in_the_way(plan, *estimates[mine], *estimates[others], self._p.standoff_m)
 
     def _leaders(self, body: int) -> list[int]:
@@ -387,6 +390,11 @@ def _in_the_way(plan: DockPlan, active: Body, at: Estimate, target: Body, target
         return ""
     module = nearest_pass(plan, active, at, target, target_at, standoff_m)
     return "" if module is None else f"on its way it would come too near to module {module}: bring it before that face first"
+
+
+def _share_a_face(plan: DockPlan, other: DockPlan) -> bool:
+    mine, others = ({side for joint in each.closes for side in sides(joint)} for each in (plan, other))
+    return not mine.isdisjoint(others)
 
 
 def _fits(plan: DockPlan | UndockPlan, estimates: Mapping[int, tuple[Body, Estimate]]) -> bool:

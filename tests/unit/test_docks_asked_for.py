@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.docking import CHANGED
+from firmware_py.core.docking import CHANGED, TAKEN
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.transitions import State
@@ -96,6 +96,16 @@ def test_body_whose_dock_is_over_may_dock_again() -> None:
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
     outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     assert len(outputs.docks) == 1 and outputs.records[1].mode == Mode.DOCK
+
+
+@pytest.mark.parametrize("wanted", [DockRequest(2, 3, 0, 2), DockRequest(2, 2, 1, 3)], ids=["of the target", "of who docks"])
+def test_dock_to_a_face_that_another_dock_is_to_close_is_refused(wanted: DockRequest) -> None:
+    """Both would swim to one place, and hit each other there."""
+    tank = before_each_other(0.6, 1.2)
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    outputs = tank.run(0.1, Request(Action.DOCK, 2, wanted))
+    assert len(outputs.docks) == 1 and tank.when(f"dock refused: {TAKEN}")
+    assert outputs.records[2].mode == Mode.POSHOLD
 
 
 @pytest.mark.slow
