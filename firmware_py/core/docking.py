@@ -5,13 +5,13 @@ Works on the estimates of this tick; the pipeline carries out the joins and part
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.docking_decisions import Decisions, Join, Part, Prepared
+from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Part, Prepared
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_sequence import (
@@ -145,7 +145,7 @@ class DockingStage:
 
         An open joint is parted all the same: that its modules are apart is no wish.
         """
-        self.events, decisions = [], Decisions({}, [], [], [], {}, [])
+        self.events, decisions = [], Decisions()
         for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._holds(each.plan)]:
             self._undocks.remove(undock)
             self.relays.switch(RELAY_PULL, *undock.plan.opens)
@@ -160,7 +160,7 @@ class DockingStage:
     def step(
         self,
         inputs: Inputs,
-        estimates: Mapping[int, tuple[Body, Estimate]],
+        estimates: Estimated,
         waiting: Collection[int],
         holding: Collection[int],
         resting: Collection[tuple[int, int]],
@@ -168,13 +168,12 @@ class DockingStage:
         """One tick.
 
         Args:
-            estimates: body and its estimate, by the body's number.
             waiting: bodies in the mode DOCK: only these begin a dock. Looked at when a plan is there, as `holding` is.
             holding: bodies that hold a place which may be moved: only these come to meet another.
             resting: modules and faces whose magnets are off whatever is wanted.
         """
         self.events, self.records = [], []
-        decisions = Decisions({}, [], [], [], {}, [])
+        decisions = Decisions()
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)
@@ -192,7 +191,7 @@ class DockingStage:
         self,
         prepared: Prepared,
         time_ns: int,
-        estimates: Mapping[int, tuple[Body, Estimate]],
+        estimates: Estimated,
         waiting: Collection[int],
         holding: Collection[int],
         decisions: Decisions,
@@ -216,7 +215,7 @@ class DockingStage:
                 self._give_up(under_way, ANOTHER, decisions)
             self._begin_dock(prepared, plan, time_ns, estimates, holding)
 
-    def _refusal(self, prepared: Prepared, estimates: Mapping[int, tuple[Body, Estimate]], waiting: Collection[int]) -> str:
+    def _refusal(self, prepared: Prepared, estimates: Estimated, waiting: Collection[int]) -> str:
         """Why a plan is not begun; empty: it is."""
         plan = prepared.plan
         if plan is None:
@@ -267,7 +266,7 @@ class DockingStage:
         prepared: Prepared,
         plan: DockPlan,
         time_ns: int,
-        estimates: Mapping[int, tuple[Body, Estimate]],
+        estimates: Estimated,
         holding: Collection[int],
     ) -> None:
         request = prepared.request
@@ -285,7 +284,7 @@ class DockingStage:
         self,
         dock: _Dock,
         inputs: Inputs,
-        estimates: Mapping[int, tuple[Body, Estimate]],
+        estimates: Estimated,
         poses: ModulePoses,
         decisions: Decisions,
     ) -> None:
@@ -327,7 +326,7 @@ class DockingStage:
             decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))
             self._docks.remove(dock)
 
-    def _release(self, undock: _Undock, time_ns: int, estimates: Mapping[int, tuple[Body, Estimate]], decisions: Decisions) -> None:
+    def _release(self, undock: _Undock, time_ns: int, estimates: Estimated, decisions: Decisions) -> None:
         plan, request = undock.plan, undock.plan.opens[0]
         if not _fits(plan, estimates):
             self._undocks.remove(undock)
@@ -397,7 +396,7 @@ def _share_a_face(plan: DockPlan, other: DockPlan) -> bool:
     return not mine.isdisjoint(others)
 
 
-def _fits(plan: DockPlan | UndockPlan, estimates: Mapping[int, tuple[Body, Estimate]]) -> bool:
+def _fits(plan: DockPlan | UndockPlan, estimates: Estimated) -> bool:
     """Whether the bodies are still those that a plan is made for."""
     bodies = {frozenset(body.modules) for body, _ in estimates.values()}
     if isinstance(plan, UndockPlan):
@@ -408,5 +407,5 @@ def _fits(plan: DockPlan | UndockPlan, estimates: Mapping[int, tuple[Body, Estim
     return active != target and active | target == merged
 
 
-def _body_of(module: int, estimates: Mapping[int, tuple[Body, Estimate]]) -> int:
+def _body_of(module: int, estimates: Estimated) -> int:
     return next(number for number, (body, _) in estimates.items() if module in body.modules)

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from firmware_py.core.body import Body
 from firmware_py.core.docking_sequence import DockPlan, UndockPlan
 from firmware_py.core.setpoint import Wish
-from firmware_py.core.types import DockRequest, Setpoint
+from firmware_py.core.types import DockRequest, Estimate, Setpoint
+
+Estimated = Mapping[int, tuple[Body, Estimate]]
+"""The bodies of a tick, each with its estimate, by their numbers."""
 
 
 class Prepared(NamedTuple):
@@ -40,18 +46,19 @@ class Part(NamedTuple):
     away_w: np.ndarray
 
 
-class Decisions(NamedTuple):
-    """What the stage wants of the pipeline."""
+@dataclass(frozen=True, slots=True)
+class Decisions:
+    """What the stage wants of the pipeline; nothing at first."""
 
-    setpoints: dict[int, Setpoint | Wish]
+    setpoints: dict[int, Setpoint | Wish] = field(default_factory=dict)
     """By body: steers it in this tick."""
-    joins: list[Join]
-    parts: list[Part]
-    ended: list[int]
+    joins: list[Join] = field(default_factory=list)
+    parts: list[Part] = field(default_factory=list)
+    ended: list[int] = field(default_factory=list)
     """Bodies whose dock is over without a join: they hold where they are."""
-    meets: dict[int, np.ndarray]
+    meets: dict[int, np.ndarray] = field(default_factory=dict)
     """By body: (3,) how far it comes to meet the other, world, m, from where it holds."""
-    returning: list[int]
+    returning: list[int] = field(default_factory=list)
     """Bodies that came to meet one whose dock is called off."""
 
     @property
