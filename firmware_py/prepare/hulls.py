@@ -12,15 +12,21 @@ from firmware_py.prepare.projected_area import Solid, box
 
 _CONVEX_SHARE = 1e-9
 """A mesh counts as convex when its convex hull has its volume to this share."""
+_BOX_SHARE = 0.25
+"""How far, of an edge of the hull's box, a side of the mesh may lie from that of the box: fins do; millimetres, other axes and a
+corner as the origin do not."""
 
 
 def hull_of(vehicle: Vehicle) -> tuple[Solid, ...]:
     """Closed solids in the module frame: hull first, then payloads.
 
     Raises:
-        DescriptionError: the mesh cannot be read or is not closed.
+        DescriptionError: the mesh cannot be read, is not closed, or does not fill the hull's box.
     """
-    hull = load_mesh(vehicle.hull.mesh) if vehicle.hull.mesh else box(vehicle.hull.size_m)
+    hull = box(vehicle.hull.size_m)
+    if vehicle.hull.mesh:
+        hull = load_mesh(vehicle.hull.mesh)
+        _check_box(hull, vehicle.hull.size_m, vehicle.hull.mesh)
     carried = (box(p.size_m).placed(np.eye(3), p.position_m) for p in vehicle.payload)
     return (hull, *carried)
 
@@ -40,3 +46,14 @@ def load_mesh(path: str) -> Solid:
     mesh.fix_normals()
     convex = bool(abs(mesh.convex_hull.volume - mesh.volume) <= _CONVEX_SHARE * abs(mesh.volume))
     return Solid(np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64), convex)
+
+
+def _check_box(mesh: Solid, size_m: np.ndarray, path: str) -> None:
+    """Raises DescriptionError where a mesh does not lie about as the hull's box does; `size_m` (3,) are the box's edges."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    off = np.maximum(np.abs(low + 0.5 * size_m), np.abs(high - 0.5 * size_m))
+    if np.any(off > _BOX_SHARE * size_m):
+        reach = ", ".join(f"{name} {a:.4g} to {b:.4g}" for name, a, b in zip("xyz", low, high, strict=True))
+        edges = " x ".join(f"{edge:g}" for edge in size_m)
+        what = f"the mesh reaches along {reach} m, and hull.size_m is a box of {edges} m about the origin"
+        raise DescriptionError(f"{path}: {what}; both are in metres, forward, right, down from the middle of the hull")

@@ -1,12 +1,15 @@
 """What the water sees of a shape: exact outlines against closed forms, and the paper's alpha shape against them."""
 
+import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
 
 from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare import alpha, hulls
 from firmware_py.prepare.projected_area import (
     Solid,
@@ -159,6 +162,32 @@ def test_mesh_file_gives_its_solid(tmp_path) -> None:  # type: ignore[no-untyped
     assert not solid.convex
     expected, found = (areas_and_centroids([s], DIRECTIONS)[0] for s in (mesh, solid))
     np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("turn", "shift_m", "wrong"),
+    [
+        (1000.0 * np.eye(3), 0.0, "x -250 to 250, y -100 to 100, z -100 to 100 m"),
+        (np.eye(3)[[1, 0, 2]], 0.0, "x -0.1 to 0.1, y -0.25 to 0.25, z -0.1 to 0.1 m"),
+        (np.eye(3), 0.2, "x -0.05 to 0.45, y 0.1 to 0.3, z 0.1 to 0.3 m"),
+        (np.eye(3), 0.02, ""),
+    ],
+    ids=["millimetres", "other axes", "origin in a corner", "about right"],
+)
+def test_mesh_that_is_not_where_the_hull_is_is_refused(turn: np.ndarray, shift_m: float, wrong: str, tmp_path: Path) -> None:
+    drawn = box(np.array([0.5, 0.2, 0.2]))
+    lines = ["OFF", f"{len(drawn.vertices)} {len(drawn.triangles)} 0"]
+    lines += [" ".join(repr(float(c)) for c in v) for v in drawn.vertices @ turn.T + shift_m]
+    lines += ["3 " + " ".join(map(str, t)) for t in drawn.triangles]
+    path = tmp_path / "hull.off"
+    path.write_text("\n".join(lines) + "\n")
+    modcube = load_vehicle("modcube")
+    mine = dataclasses.replace(modcube, hull=dataclasses.replace(modcube.hull, size_m=np.array([0.5, 0.2, 0.2]), mesh=str(path)))
+    if wrong:
+        with pytest.raises(DescriptionError, match=f"hull.off: the mesh reaches along {wrong}, and hull.size_m is a box of 0.5 x 0.2"):
+            hulls.hull_of(mine)
+    else:
+        assert hulls.hull_of(mine)[0].vertices.shape == (8, 3)
 
 
 # ---------------------------------------------------------------- the paper's sampling
