@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import typing
 from collections.abc import Callable
 from typing import Any
 
@@ -36,12 +37,14 @@ def explained(limits: Limits) -> str:
 def to_toml(value: Any, comment: Callable[[Limits], str] = unit_of) -> str:
     """The TOML text of a dataclass of scalars, arrays, tables and lists of tables, each value with its `comment`."""
     head, tail = [], []
+    hints = typing.get_type_hints(type(value))
     for field in dataclasses.fields(value):
         item = getattr(value, field.name)
         if dataclasses.is_dataclass(item):
             tail.append(f"\n[{field.name}]\n{to_toml(item, comment)}")
-        elif isinstance(item, tuple) and item and dataclasses.is_dataclass(item[0]):
-            tail += [f"\n[[{field.name}]]\n{to_toml(each, comment)}" for each in item]
+        elif isinstance(item, tuple) and dataclasses.is_dataclass(of := typing.get_args(hints[field.name])[0]):
+            none = f"\n# [[{field.name}]]: none; keys: {', '.join(key.name for key in dataclasses.fields(of))}\n"  # TOML adds none to []
+            tail += [f"\n[[{field.name}]]\n{to_toml(each, comment)}" for each in item] or [none]
         else:
             note = comment(limits_of(type(value), field.name))
             head.append(f"{field.name} = {_literal(item)}{f'  # {note}' if note else ''}\n")

@@ -266,6 +266,17 @@ def test_printed_vehicle_is_the_vehicle(
     assert to_toml(load_vehicle(str(mine))) == to_toml(load_vehicle(name))
 
 
+def test_printed_vehicle_takes_tables_of_a_kind_that_it_had_none_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = printed(["vehicle", "modcube"], monkeypatch, capsys)
+    assert "# [[payload]]: none; keys: name, dry_kg, entrained_kg, size_m, position_m\n" in text
+    mine = tmp_path / "mine.toml"
+    arm = '[[payload]]\nname = "arm"\ndry_kg = 0.5\nsize_m = [0.1, 0.02, 0.02]\nposition_m = [0.15, 0, 0]\n'
+    mine.write_text(f"{text}\n{arm}")
+    assert [payload.name for payload in load_vehicle(str(mine)).payload] == ["arm"]
+
+
 def test_vehicles_are_printed_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert printed(["vehicle"], monkeypatch, capsys).split() == vehicle_names()
 
