@@ -1,5 +1,6 @@
 """Reachable wrenches against ERRATA's independently computed figures, and facets against linear programs."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -7,8 +8,9 @@ import pytest
 
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.capability import summary
 from firmware_py.prepare.capability.ellipsoid import largest_inscribed
-from firmware_py.prepare.capability.layout import FRAMES, Layout, of_modules, of_rows, of_vehicle
+from firmware_py.prepare.capability.layout import AXES, FRAMES, Layout, of_modules, of_rows, of_vehicle
 from firmware_py.prepare.capability.polycubes import polycubes, poses
 from firmware_py.prepare.capability.programs import ProgramSpace, reach_by_programs
 from firmware_py.prepare.capability.sphere import fibonacci
@@ -146,6 +148,15 @@ def test_vehicle_with_a_passive_degree_of_freedom_is_degenerate_until_it_is_decl
     assert force is not None and torque is not None
     assert (force.components, torque.components) == ((0, 1, 2), free)
     assert largest_inscribed(torque.normals, torque.offsets).volume > 0.0
+
+
+@pytest.mark.parametrize(("name", "axis", "passive"), [("bluerov2", 0, 4), ("girona500", 1, 3)])
+def test_axis_that_tilts_a_vehicle_is_pushed_once_the_tilt_is_declared_passive(name: str, axis: int, passive: int) -> None:
+    layout = one_of_seven(name)
+    declared, without = (summary.characterise(one, count=121, programs=False) for one in (layout, dataclasses.replace(layout, passive=())))
+    assert np.all(without.axes[axis] == 0.0) and f"cannot push {AXES[axis]}, {AXES[passive]} alone; passive: none" in without.notes[0]
+    assert np.all(declared.axes[axis] > 50.0) and np.all(declared.axes[passive] == 0.0)
+    assert declared.notes[0] == f"degenerate: rank 5; passive: {AXES[passive]}"
 
 
 def test_equal_total_thrust_gives_every_robot_eight_newtons() -> None:

@@ -56,13 +56,13 @@ class Capability:
     Attributes:
         layout: whose.
         rank: of its matrix.
-        unreachable: degrees of freedom that cannot be pushed alone.
+        unreachable: degrees of freedom that cannot be pushed alone, of all six.
         directions: (k, 3).
         reach: by frame and normalisation.
         declared: the same with the passive degrees of freedom declared; empty where there are none.
         power, power_shape: by frame.
         programs_differ: largest relative difference of linear programs from facets over both frames, NaN if not run.
-        axes: (6, 2) most that can be pushed along and against each component alone, N and N m.
+        axes: (6, 2) most that can be pushed along and against each component alone, N and N m; passive ones take what they are given.
     """
 
     layout: Layout
@@ -96,7 +96,8 @@ def characterise(
     directions = fibonacci(count)
     harmonics = Harmonics(directions)
     say = progress or (lambda text: None)
-    space = wrench_space(layout)
+    rest = layout.with_passive_declared()
+    space = wrench_space(rest)
     reach: dict[str, dict[str, Reach]] = {}
     power: dict[str, PowerSpace] = {}
     differ = 0.0 if programs else math.nan
@@ -109,7 +110,6 @@ def characterise(
             differ = max(differ, _difference(layout, frame, directions, reach[frame]["physical"].radius))
     declared: dict[str, dict[str, Reach]] = {}
     if layout.passive:
-        rest = layout.with_passive_declared()
         declared = {frame: _all_normalisations(rest, frame, directions, harmonics) for frame in FRAMES}
     return Capability(
         layout=layout,
@@ -181,9 +181,9 @@ def _notes(layout: Layout) -> tuple[str, ...]:
     notes = []
     if layout.rank < 6:
         held = ", ".join(AXES[c] for c in layout.passive) or "none declared"
-        notes.append(
-            f"degenerate: rank {layout.rank}, cannot push {', '.join(layout.unreachable())} alone; passive: {held}"
-        )
+        left = [name for name in layout.with_passive_declared().unreachable() if AXES.index(name) not in layout.passive]
+        lost = f", cannot push {', '.join(left)} alone" if left else ""
+        notes.append(f"degenerate: rank {layout.rank}{lost}; passive: {held}")
     if layout.assumption:
         notes.append(f"assumed: {layout.assumption}")
     return tuple(notes)
