@@ -176,9 +176,9 @@ def parse_toml(text: str, path: str) -> dict[str, Any]:
 
 def meant(word: str, known: Iterable[str]) -> str:
     """A question after the one of `known` that `word` is likely to be; empty where none is like it."""
-    names = list(known)
-    near = [name for name in names if name.startswith(f"{word}_")] or difflib.get_close_matches(word, names, 1)  # the unit was left out
-    return f"did you mean {near[0]}? " if near else ""
+    names, small = {name.lower(): name for name in known}, word.lower()
+    near = [name for name in names if name.startswith(f"{small}_")] or difflib.get_close_matches(small, names, 1)  # the unit was left out
+    return f"did you mean {names[near[0]]}? " if near else ""
 
 
 def is_file_name(name: str) -> bool:

@@ -110,6 +110,7 @@ WRONG = {
         TOP + "[[fin]]\nangle = 0.1\n\n[[fin]]\nangle = 0.1\nchord = 2\n",
         "8: fin[1].chord: unknown key; permitted here: angle, span_m",
     ),
+    "unknown key in capitals": (TOP + "CREW = 3\n", f"3: CREW: unknown key; did you mean crew? permitted here: {KNOWN}"),
     "unknown key like another": (TOP + "craw = 3\n", f"3: craw: unknown key; did you mean crew? permitted here: {KNOWN}"),
     "unknown word like another": (TOP + 'rig = "slop"\n', "3: rig: 'slop' is unknown; did you mean sloop? permitted: one of sloop, ketch"),
     "unit left out": (
