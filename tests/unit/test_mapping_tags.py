@@ -1,5 +1,10 @@
 """Two frames of a tag become one observation of the time of its picture, or none."""
 
+import re
+import textwrap
+from pathlib import Path
+
+import numpy as np
 import pytest
 
 from firmware_py.description.fleet import Fleet, Module
@@ -16,6 +21,21 @@ def test_tag_picture_gets_the_time_of_its_sync_and_offset():
     assert tag.capture_ns == 297 * TICK_NS + 3_300_000
     assert tag.p_wt == pytest.approx([0.5, -1.0, 2.0])
     assert tag.q_wt == pytest.approx([1.0, 0.0, 0.0, 0.0])
+
+
+def test_tag_camera_that_is_written_as_the_page_says_is_heard():
+    page = (Path(__file__).resolve().parents[2] / "docs" / "mcu.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"((?:^ {4}.*\n|^\n)*^ {4}.*pack_quaternion\(q_wt\).*\n(?:^ {4}.*\n)+)", page, re.MULTILINE)
+    turned = np.array([0.5, -0.5, 0.5, 0.5])
+    seen = {"number": 1, "p_wt": (0.5, -0.25, 1.0), "q_wt": turned, "tag_id": 5, "counter": 3, "tick": 300, "since_ms": 3.3}
+    exec(textwrap.dedent(code), seen)
+    robot = Robot()
+    robot.tick(300)
+    robot.collector.take(0, seen["frames"])
+    (tag,) = robot.tick(301).modules[0].tags
+    assert (tag.tag_id, tag.quality, tag.capture_ns) == (5, 7, 300 * TICK_NS + 3_300_000)
+    np.testing.assert_allclose(tag.p_wt, seen["p_wt"], atol=1e-9)
+    np.testing.assert_allclose(tag.q_wt * tag.q_wt[0] * 2.0, turned, atol=0.01)
 
 
 @pytest.mark.parametrize(("age_ticks", "passes"), [(1, True), (50, True), (51, False), (255, False)])
