@@ -125,7 +125,8 @@ def draw(path: Path, found: Found) -> None:
         gain.set_title(f"{modules} module{'s' if modules > 1 else ''}, {'rotation' if first else 'translation'}")
         for panel, title in ((gain, "gain margin, where the phase is -180 deg"), (phase, "phase margin, at crossover")):
             if panel.get_legend_handles_labels()[0]:
-                panel.legend(frameon=False, loc="lower left", fontsize=8, title=title, title_fontsize=8, alignment="left")
+                legend = panel.legend(frameon=True, loc="lower left", fontsize=8, title=title, title_fontsize=8, alignment="left")
+                legend.get_frame().set(alpha=0.85, edgecolor="none")  # a curve may pass below it
         phase.set_xlabel("frequency, rad/s")
     panels[0, 0].set(xscale="log", ylabel="loop gain, dB", ylim=(-40, 45))
     panels[1, 0].set(ylabel="phase, deg", ylim=(-400, 100), yticks=range(-360, 91, 90))
