@@ -30,7 +30,7 @@ MOST_LEAN = 0.2
 """rad by which a body may lean to leave a moment to buoyancy; a fifth of a force along one axis then goes into another."""
 
 _CHECK_POINTS = 48
-"""Points of each piece at which attitude rates and thrusters are checked; what may lie between them is added."""
+"""Points of each piece, or part of one, at which attitude rates and thrusters are checked; what may lie between them is added."""
 
 _LONGEST_STRETCH = 1024.0
 _STRETCH_TOLERANCE = 2e-3
@@ -249,15 +249,17 @@ class _Request:
         breaks = np.concatenate([[0.0], np.cumsum(durations)])
         cost = system.cost(self.position.value, unknown)
         found = Piecewise(np.ascontiguousarray(both), breaks, method, 1.0, cost)
-        self._check_turning(found)
+        fine = found.resolved(_CHECK_POINTS, _SHORTEST_QUATERNION)
+        grid = fine.grid(_CHECK_POINTS)
+        self._check_turning(grid, lambda k: _place(found, fine, k))
         if self.body is not None:
-            self._check_thrusters(found, self.body)
+            self._check_motion(self.body, grid[..., :19].reshape(-1, 19), lambda k: _place(found, fine, k), _CHECK_POINTS + 1)
         return found
 
-    def _check_turning(self, found: Piecewise) -> None:
-        grid = found.grid(_CHECK_POINTS)
+    def _check_turning(self, grid: np.ndarray, place: Callable[[int], str]) -> None:
+        """Refuse a grid (pieces, points, 20) that turns too far or too fast; `place` as for `_check_motion`."""
         if (shortest := float(grid[..., 19].min())) < _SHORTEST_QUATERNION:
-            where = _place(found, int(np.argmin(grid[..., 19])))
+            where = place(int(np.argmin(grid[..., 19])))
             raise InfeasibleError(f"attitude turns too far {where} (length {shortest:.2f}); add a waypoint there")
         rate, change = self.limits.angular_rate, self.limits.angular_acceleration
         for bound, columns, unit in ((rate, slice(10, 13), "rad/s"), (change, slice(16, 19), "rad/s^2")):
@@ -265,11 +267,7 @@ class _Request:
                 continue
             largest, at = _largest(np.linalg.norm(grid[..., columns], axis=-1))
             if largest > bound:
-                raise InfeasibleError(f"turning takes {largest:.3g} {unit} of at most {bound:g} {unit} {_place(found, at)}")
-
-    def _check_thrusters(self, found: Piecewise, body: Body) -> None:
-        motion = found.grid(_CHECK_POINTS)[..., :19].reshape(-1, 19)
-        self._check_motion(body, motion, lambda k: _place(found, k), _CHECK_POINTS + 1)
+                raise InfeasibleError(f"turning takes {largest:.3g} {unit} of at most {bound:g} {unit} {place(at)}")
 
     def check_standing(self) -> None:
         """Refuse attitudes that the body cannot even hold. Raises InfeasibleError."""
@@ -335,10 +333,11 @@ def _largest(size: np.ndarray) -> tuple[float, int]:
     return float(size.max()), int(np.argmax(size))
 
 
-def _place(found: Piecewise, flat: int) -> str:
-    """In words, the place of a flat index into `found.grid(_CHECK_POINTS)`."""
-    piece, i = divmod(flat, _CHECK_POINTS + 1)
-    time = found.breaks[piece] + i / _CHECK_POINTS * (found.breaks[piece + 1] - found.breaks[piece])
+def _place(found: Piecewise, fine: Piecewise, flat: int) -> str:
+    """In words, the place in `found` of a flat index into `fine.grid(_CHECK_POINTS)`, the same path in shorter pieces."""
+    part, i = divmod(flat, _CHECK_POINTS + 1)
+    time = fine.breaks[part] + i / _CHECK_POINTS * (fine.breaks[part + 1] - fine.breaks[part])
+    piece = int(np.searchsorted(found.breaks, fine.breaks[part], side="right")) - 1
     return f"between waypoints {piece} and {piece + 1}, at {time:.2f} s"
 
 

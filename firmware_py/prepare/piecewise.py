@@ -7,7 +7,7 @@ waypoints, and the same however world or body axes are chosen.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -16,6 +16,22 @@ from firmware_py.core.types import Setpoint
 
 CHANNELS = 7
 """x, y, z, then the four of the quaternion before it is normalised."""
+
+_DEGREE = 9
+_CLOSE = 0.1
+"""Share of its length by which the quaternion changes from point to point at most, where points are close enough to tell how fast it
+turns: of a crest between them less than a thousandth is lost."""
+
+
+def _halves() -> np.ndarray:
+    """(2, 10, 10) from the coefficients in u to those in the share of the first half of the piece, and of the second."""
+    power = np.arange(_DEGREE + 1)
+    second = np.array([[math.comb(i, j) for i in power] for j in power], dtype=float)
+    return np.asarray(np.stack([np.eye(_DEGREE + 1), second]) * 0.5**power)
+
+
+_HALVES = _halves()
+_HALVES.flags.writeable = False
 
 
 @njit("void(float64[:,::1], float64, float64, float64[:,::1])", cache=True)
@@ -119,3 +135,24 @@ class Piecewise:
     def grid(self, per_piece: int) -> np.ndarray:
         """(k, per_piece + 1, 20) p, q, v, w, a, alpha and the length of the quaternion before normalising."""
         return np.asarray(_grid(self.coefficients, self.breaks, per_piece))
+
+    def halved(self, which: np.ndarray) -> Piecewise:
+        """The same path, of whose pieces those of `which` (k,) are two."""
+        parts = [_HALVES @ piece if cut else piece[None] for piece, cut in zip(self.coefficients, which, strict=True)]
+        middles = 0.5 * (self.breaks[:-1] + self.breaks[1:])
+        return replace(self, coefficients=np.concatenate(parts), breaks=np.sort(np.concatenate([self.breaks, middles[which]])))
+
+    def resolved(self, per_piece: int, shortest: float) -> Piecewise:
+        """The same path in pieces so short that the points of `grid(per_piece)` do not miss a turn.
+
+        A quaternion far longer than 1, as a long piece beside a short one has, turns within a small part of its piece.
+
+        Args:
+            per_piece: of `grid`.
+            shortest: length below which a quaternion need not be told.
+        """
+        length = (grid := self.grid(per_piece))[..., 19:]
+        step = np.linalg.norm(np.diff(length * grid[..., 3:7], axis=1), axis=-1)
+        near = np.maximum(np.minimum(length[:, :-1, 0], length[:, 1:, 0]), shortest)
+        coarse = np.any(step > _CLOSE * near, axis=1)
+        return self.halved(coarse).resolved(per_piece, shortest) if coarse.any() else self
