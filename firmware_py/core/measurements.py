@@ -10,7 +10,7 @@ from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.observation import GRAVITY
-from firmware_py.core.rotations import M, V, conjugate, cross, difference, exp, multiply, to_matrix
+from firmware_py.core.rotations import M, V, conjugate, cross, difference, exp, multiply, skew, to_matrix
 from firmware_py.core.sensor_offsets import SensorOffsets
 from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservation
 from firmware_py.description.water import WATER_DENSITY
@@ -35,7 +35,7 @@ tells zeros or its limit: gravity off, for as long as it takes to be found."""
 TURN_NS = 100_000_000
 """Within so long each pressure sensor is heard, five times over (DEPTH comes at 50 Hz, DESIGN's bus); who is not is silent."""
 STILL_RAD_S = 0.05
-"""Slower than that the place of an IMU in the body makes no difference: 0.75 mm/s^2 over 0.3 m."""
+"""Slower than that the rate makes no difference to an IMU anywhere in the body: 0.75 mm/s^2 over 0.3 m."""
 
 
 Seen = list[tuple[TagObservation, int]]
@@ -53,7 +53,8 @@ class Measurements:
         self._r_bi, self._mean_r_bi = body.r_bi, body.r_bi.mean(axis=0)
         self._centred = bool(np.abs(self._mean_r_bi).max() < CENTRED_M)
         self._share = 1.0 - math.exp(-period_ns * 1e-9 / ALPHA_S)
-        self._gain = self._share / (period_ns * 1e-9) if period_ns else 0.0
+        self._per_s = 1e9 / period_ns if period_ns else 0.0
+        self._gain = self._share * self._per_s
         count = len(body.modules)
         self._apart = np.kron(np.ones((count, 1)), -self._mean_of_all)
         """(3 count, 3 count) readings of all modules -> how each differs from their mean, body frame."""
@@ -65,6 +66,9 @@ class Measurements:
         self._turn = max(1, TURN_NS // max(1, period_ns))
         self._depths_m, self._depth_age = np.zeros(count), np.full(count, self._turn)
         """Last depth of each sensor, and ticks with a depth since then."""
+        self._no_swing = np.zeros(3 * count)
+        self._swing_of = self._per_s * -np.vstack([skew(r) for r in self._r_bi - self._mean_r_bi])
+        """(3 count, 3) change of the rate within a tick -> by how much it lets each IMU differ from their mean."""
         self._is_still = False
         self._last_gyro: np.ndarray | None = None
         self._alpha = np.zeros(3)
@@ -80,12 +84,16 @@ class Measurements:
             q_wb: (4,) latest attitude, for the height of each pressure sensor above the centre of mass.
         """
         mine = [modules[i] for i in self._modules]
-        gyro = self._mean([m.gyro for m in mine], self._gyro_offsets)
+        gyro = self._mean([m.gyro for m in mine], self._gyro_offsets, self._no_swing if self._is_still else None)
         self._is_still = len(mine) > 1 and gyro is not None and float(gyro @ gyro) < STILL_RAD_S**2
         return Measured(gyro, self._accel([m.accel for m in mine], gyro), self._depth(mine, q_wb), self._poses(mine, q_wb))
 
-    def _mean(self, readings: list[np.ndarray | None], offsets: SensorOffsets) -> np.ndarray | None:
-        """Mean over all modules, body frame; where not all were heard, what it would be by the offsets of those that were."""
+    def _mean(self, readings: list[np.ndarray | None], offsets: SensorOffsets, swing: np.ndarray | None) -> np.ndarray | None:
+        """Mean over all modules, body frame; where not all were heard, what it would be by the offsets of those that were.
+
+        Args:
+            swing: (3 count,) what of their differences from the mean is no offset; None where nobody knows, and none is learnt.
+        """
         heard = [value for value in readings if value is not None]
         if not heard:
             return None
@@ -93,19 +101,28 @@ class Measurements:
         if len(heard) < len(readings):
             which = [value is not None for value in readings]
             return np.asarray(self._rotations[:, which].reshape(3, -1) @ stacked / len(heard) - offsets.of(which))
-        if self._is_still:
-            offsets.learn((self._apart @ stacked).reshape(-1, 3))
+        if swing is not None:
+            offsets.learn((self._apart @ stacked - swing).reshape(-1, 3))
         return np.asarray(self._mean_of_all.dot(stacked))
 
     def _accel(self, readings: list[np.ndarray | None], gyro: np.ndarray | None) -> np.ndarray | None:
         """Mean specific force (3,) less what turning adds at the mean place of those heard, as far as a gyro tells it."""
-        accel, heard = self._mean(readings, self._accel_offsets), [value is not None for value in readings]
+        swing, heard = self._swing(gyro), [value is not None for value in readings]
+        accel = self._mean(readings, self._accel_offsets, swing)
         if not self._centred or len(heard) > 1:
             self._follow(gyro)
         if accel is None or gyro is None or (self._centred and all(heard)):
             return accel
         lever = self._lever(heard)
         return np.asarray(accel - cross(self._alpha, lever) - cross(gyro, cross(gyro, lever)))
+
+    def _swing(self, gyro: np.ndarray | None) -> np.ndarray | None:
+        """(3 count,) by how much the IMUs of a body that is nearly still differ by its angular acceleration; None of any other. Of the
+        last tick alone: what noise and lag that has is gone from the mean of many, in which the gyro's differences cancel.
+        """
+        if not self._is_still or gyro is None or self._last_gyro is None:
+            return None
+        return np.asarray(self._swing_of @ (gyro - self._last_gyro))
 
     def _follow(self, gyro: np.ndarray | None) -> None:
         """Angular acceleration by the gyro's differences, averaged; from zero after a tick without."""

@@ -260,9 +260,7 @@ def test_imu_beside_the_centre_of_mass_of_a_lone_module_is_told_apart() -> None:
 
 
 @pytest.mark.parametrize("heard", [(0,), (1,), (2,), (1, 2), (0, 1, 2)])
-def test_depth_is_that_of_the_centre_of_mass_in_any_attitude(
-    measurements: Measurements, heard: tuple[int, ...]
-) -> None:
+def test_depth_is_that_of_the_centre_of_mass_in_any_attitude(measurements: Measurements, heard: tuple[int, ...]) -> None:
     modules = silent()
     for module in heard:
         z = (P_WB + R_WB.apply(ORIGINS_B[module]))[2]
@@ -343,6 +341,18 @@ def test_body_that_turns_tells_nothing_of_how_its_sensors_differ(body: Body) -> 
         biased(measurements, (0, 1, 2), RATE)
     measurements.fuse(silent(), Q_WB)  # or it would tell of the turn's sudden end
     np.testing.assert_allclose(biased(measurements, (1,), np.zeros(3)), BIASES[1], atol=1e-3)
+
+
+@pytest.mark.parametrize("heard", [(0,), (1,), (2,)])
+def test_body_that_swings_at_once_takes_no_angular_acceleration_for_a_bias(body: Body, heard: tuple[int, ...]) -> None:
+    """For as long as it turns so slowly that its sensors are compared."""
+    measurements, alpha = Measurements(body, PERIOD), 0.5 * ALPHA
+    for k in range(6):
+        turning(measurements, (0, 1, 2), alpha * k * PERIOD * 1e-9, alpha)
+    measurements.fuse(silent(), Q_WB)  # or it would tell of the turn's sudden end
+    measured = turning(measurements, heard, np.zeros(3), np.zeros(3))
+    assert measured.accel is not None
+    np.testing.assert_allclose(measured.accel, PUSHED, atol=1e-3)
 
 
 def test_depth_is_told_by_the_density_that_drags() -> None:
