@@ -153,7 +153,7 @@ class InputCollector:
 
     def _take_depth(self, index: int, module: ModuleInputs, row: Row) -> None:
         if self._is_usable(row[VALUES + 2]):
-            module.pressure_pa = row[VALUES]
+            module.pressure_pa, module.water_temperature_c = row[VALUES : VALUES + 2]
 
     def _take_power(self, index: int, module: ModuleInputs, row: Row) -> None:
         voltage, current, status = row[VALUES : VALUES + 3]

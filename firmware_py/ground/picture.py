@@ -29,6 +29,7 @@ class ModulePicture:
     voltage_v: float = math.nan
     current_a: float = math.nan
     pressure_pa: float = math.nan
+    water_temperature_c: float = math.nan
     cabin_pressure_pa: float = math.nan
     cabin_temperature_c: float = math.nan
     leak: bool = False
@@ -53,6 +54,8 @@ class ModulePicture:
             self.accel_ns = time_ns
         if inputs.pressure_pa is not None:
             self.pressure_ns, self.pressure_pa = time_ns, inputs.pressure_pa
+        if inputs.water_temperature_c is not None:
+            self.water_temperature_c = inputs.water_temperature_c
         if inputs.answered:
             self.answered_ns = time_ns
         if inputs.voltage_v is not None:

@@ -260,7 +260,8 @@ def scaled_pressure(s: Subject) -> list[Values]:
 
 
 def scaled_pressure2(s: Subject) -> list[Values]:
-    return [_pressure(s, s.modules[0].pressure_pa, _NAN)]
+    m = s.modules[0]
+    return [_pressure(s, m.pressure_pa, m.water_temperature_c)]
 
 
 def _pressure(s: Subject, pressure_pa: float, temperature_c: float) -> Values:

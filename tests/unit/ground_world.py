@@ -77,8 +77,9 @@ class Robot:
 
     def _inputs(self) -> ModuleInputs:
         return ModuleInputs(
-            gyro=ZERO, accel=ZERO, pressure_pa=106_000.0, docks=[DockFeedback(0, (100.0, 0.0, 0.0), (1, 0, 0))], voltage_v=12.1,
-            current_a=2.5, cabin_temperature_c=25.5, cabin_pressure_pa=101_300.0, leak=False, answered=True, heard=True,
+            gyro=ZERO, accel=ZERO, pressure_pa=106_000.0, water_temperature_c=12.75,
+            docks=[DockFeedback(0, (100.0, 0.0, 0.0), (1, 0, 0))], voltage_v=12.1, current_a=2.5,
+            cabin_temperature_c=25.5, cabin_pressure_pa=101_300.0, leak=False, answered=True, heard=True,
             esc=[EscFeedback(2, (900.0, -450.0), (1.5, 0.5), (0, 2)), EscFeedback(4, (0.0, 0.0), (0.0, 0.0), (1, 3))],
         )  # fmt: skip
 

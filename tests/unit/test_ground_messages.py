@@ -52,7 +52,7 @@ def test_every_streamed_message_arrives_with_the_robots_values(world: World, cli
     assert client.last("SERVO_OUTPUT_RAW").servo1_raw == 1100 and client.last("SERVO_OUTPUT_RAW").servo8_raw == 1900
     assert client.last("SCALED_PRESSURE").press_abs == pytest.approx(1013.0)
     assert client.last("SCALED_PRESSURE2").press_abs == pytest.approx(1060.0)
-    assert (client.last("SCALED_PRESSURE").temperature, client.last("SCALED_PRESSURE2").temperature) == (2550, 0x7FFF)  # of the water: none
+    assert (client.last("SCALED_PRESSURE").temperature, client.last("SCALED_PRESSURE2").temperature) == (2550, 1275)
     assert client.last("EXTENDED_SYS_STATE").landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
     assert client.last("HOME_POSITION").latitude == 302084000
     assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_NO_MISSION

@@ -32,7 +32,7 @@ def test_every_measurement_of_a_module_arrives_in_its_unit():
     robot.say("ESC_FEEDBACK_2", (2000, 1.5, 0, -1500, 0.5, 3))
     robot.say("MCU_STATUS", (0, 1, 0b100, 2))
     (module,) = robot.tick(0).modules
-    assert module.pressure_pa == 121_325
+    assert (module.pressure_pa, module.water_temperature_c) == (121_325, 18.5)
     assert (module.voltage_v, module.current_a) == pytest.approx((11.8, 4.2))
     assert (module.cabin_temperature_c, module.cabin_pressure_pa, module.leak) == (31.5, 99_000, True)
     assert module.docks == [(0, (70, -71, 0), (1, 2, 0)), (3, (0, 0, -8192), (0, 0, 3))]
