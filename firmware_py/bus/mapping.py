@@ -244,7 +244,6 @@ class OutputEncoder:
         self._sync = codec.message("SYNC")
         self._estop = codec.message("ESTOP")
         self._dock = codec.message("DOCK_CMD")
-        self._heartbeat = codec.message("HEARTBEAT")
         self._thrusters = (codec.message("THRUSTER_CMD_A"), codec.message("THRUSTER_CMD_B"))
         self._dock_counters = [0] * len(fleet.module)
         self._estop_due_ns: int | None = None
@@ -284,7 +283,6 @@ class OutputEncoder:
             return False
         due_ns = outputs.time_ns if self._estop_due_ns is None else self._estop_due_ns
         if outputs.time_ns < due_ns:
-            self._estop_due_ns = due_ns
             return False
         self._estop_due_ns = due_ns + ESTOP_PERIOD_NS
         return True

@@ -74,6 +74,7 @@ def test_failed_supply_measurement_says_nothing():
     robot = Robot()
     robot.say("POWER", (0.0, 0.0, 15))
     assert robot.tick(0).modules[0].voltage_v is None
+    assert robot.faults == {"sensor": 1}
 
 
 def test_errors_of_two_status_frames_add_up():
