@@ -31,7 +31,7 @@ class Ear:
         self.tick = 0
         self.time_ns = 0
         self.dropped = 0
-        self.foreign_command = False
+        self.foreign: dict[str, bool] = {}
 
     def hear(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: Any) -> Health:
         self.tick += 1
@@ -44,7 +44,7 @@ class Ear:
         )  # fmt: skip
         estimate = estimate._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
         self.monitor.pressure_heard = any(module.pressure_pa is not None for module in (modules[1], modules[3]))
-        inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, foreign_command=self.foreign_command)
+        inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, **self.foreign)
         return self.monitor.step(inputs, estimate, list(requests), ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6)))
 
     def wait(self, seconds: float, **more: object) -> Health:
@@ -133,6 +133,15 @@ def test_weakest_supply_and_hottest_cabin_count() -> None:
     assert health.voltage_share == pytest.approx(0.5, abs=0.01), "single readings are smoothed"
 
 
+def test_supply_that_sags_for_one_reading_is_not_low_and_one_that_stays_low_is_within_a_second() -> None:
+    ear = Ear()
+    ear.hear(here(voltage_v=12.0), here(voltage_v=12.0))
+    assert 0.85 < ear.hear(here(voltage_v=6.0), here(voltage_v=12.0)).voltage_share < 0.95
+    for _ in range(10):
+        health = ear.hear(here(voltage_v=6.0), here(voltage_v=12.0))
+    assert 0.5 < health.voltage_share < 0.56
+
+
 def test_readings_of_battery_and_cabin_are_as_old_as_the_module_s_that_was_silent_of_them_longest() -> None:
     """A sensor that died an hour ago tells neither of an empty battery nor of a hot cabin."""
     ear, well = Ear(), {"voltage_v": 12.0, "cabin_temperature_c": 31.0}
@@ -198,6 +207,16 @@ def test_body_that_takes_over_knows_what_its_modules_said_and_when_people_were_h
     assert pair.hear().leak and pair.hear().cabin_change_pa == 7e3
 
 
+def test_joined_body_knows_of_the_ticks_that_were_missed_before() -> None:
+    ear, both = Ear(), Ear()
+    ear.hear()
+    ear.time_ns += 20 * TICK_NS
+    missed = ear.hear().missed_ticks_per_s
+    both.monitor.take_over([ear.monitor, Ear().monitor])
+    both.time_ns = ear.time_ns
+    assert both.hear().missed_ticks_per_s == pytest.approx(missed, rel=0.02) == pytest.approx(20.0, rel=0.02)
+
+
 def test_fence_and_delays_may_change() -> None:
     ear = Ear()
     ear.monitor.retune(Parameters().replace("fence.north_m", 0.25).replace("supervision.answer_ms", 1000.0))
@@ -249,7 +268,10 @@ def test_bad_frames_and_missed_ticks_are_rates() -> None:
 def test_innovations_and_refusals_are_means_of_a_second() -> None:
     ear = Ear()
     assert ear.hear().nis_ratio == pytest.approx(1.0)
-    for _ in range(300):
+    for _ in range(60):
+        health = ear.hear(nis=30.0)  # type: ignore[arg-type]
+    assert health.nis_ratio == pytest.approx(1.0 + 4.0 * (1.0 - math.exp(-1.0)), rel=0.01), "a second of tags"
+    for _ in range(240):
         health = ear.hear(nis=30.0)  # type: ignore[arg-type]
     assert health.nis_ratio == pytest.approx(5.0, rel=0.02)
     health = ear.wait(1.0, nis=math.nan, nis_dof=0)
@@ -308,25 +330,36 @@ def test_depth_is_known_from_the_first_that_is_heard() -> None:
     assert whole._depth_heard
 
 
+def test_imu_is_as_old_as_its_last_sample_that_was_believed() -> None:
+    ear = Ear()
+    assert ear.wait(0.5).imu_age_s == 0.0
+    ear.monitor.imu_heard = False
+    assert ear.wait(0.3).imu_age_s == pytest.approx(0.3)
+    ear.monitor.imu_heard = True
+    assert ear.hear().imu_age_s == 0.0
+
+
 def test_robot_that_stands_by_gravity_alone_is_nowhere_but_ready() -> None:
     health = Ear().hear(tag_age_ns=1 << 60)  # type: ignore[arg-type]
     assert health.ready and not health.placed and math.isnan(health.outside_m)
     assert Ear().hear().placed and not Ear().hear(ready=False).placed  # type: ignore[arg-type]
 
 
-def test_command_of_somebody_else_is_remembered_for_a_second() -> None:
+@pytest.mark.parametrize("foreign", ["foreign_sync", "foreign_command"])
+def test_frame_of_somebody_else_is_remembered_for_a_second(foreign: str) -> None:
     ear = Ear()
-    assert not ear.hear().foreign_command
-    ear.foreign_command = True
-    assert ear.hear().foreign_command
-    ear.foreign_command = False
-    assert [ear.hear().foreign_command for _ in range(101)] == [True] * 100 + [False]
+    assert not getattr(ear.hear(), foreign)
+    ear.foreign = {foreign: True}
+    assert getattr(ear.hear(), foreign)
+    ear.foreign = {}
+    assert [getattr(ear.hear(), foreign) for _ in range(101)] == [True] * 100 + [False]
 
 
-def test_joined_body_remembers_a_command_that_one_of_its_parts_heard() -> None:
+@pytest.mark.parametrize("foreign", ["foreign_sync", "foreign_command"])
+def test_joined_body_remembers_a_frame_of_somebody_else_that_one_of_its_parts_heard(foreign: str) -> None:
     one, other, both = Ear(), Ear(), Ear()
-    other.foreign_command = True
+    other.foreign = {foreign: True}
     for ear in (one, other):
         ear.hear()
     both.monitor.take_over([one.monitor, other.monitor])
-    assert both.hear().foreign_command
+    assert getattr(both.hear(), foreign)
