@@ -16,7 +16,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults, by_channel
 from firmware_py.core.topology import in_both
-from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request, Sticks
+from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 
@@ -305,7 +305,7 @@ class HealthMonitor:
         for request in requests:
             if request.action == Action.GROUND_ALIVE:
                 self._ground_ns = now
-            elif request.action == Action.STICKS and is_sticks(request.argument):
+            elif request.action == Action.STICKS:
                 self._pilot_ns = now
                 self._stick = max(abs(value) for group in request.argument for value in group)
 
@@ -342,13 +342,6 @@ def _older(times_ns: list[int], oldest_ns: int) -> tuple[int, ...]:
     if min(times_ns) >= oldest_ns:
         return ()
     return tuple(i for i, time_ns in enumerate(times_ns) if time_ns < oldest_ns)
-
-
-def is_sticks(argument: object) -> bool:
-    """Whether a request's argument is six deflections within -1 to 1."""
-    if not isinstance(argument, Sticks):
-        return False
-    return all(len(group) == 3 and all(-1.0 <= value <= 1.0 for value in group) for group in argument)
 
 
 def beyond(p_w: np.ndarray, fence: Fence) -> dict[str, float]:

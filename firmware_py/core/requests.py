@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.health import is_sticks
 from firmware_py.core.transitions import MODES
-from firmware_py.core.types import FACES, WARNING, Action, DockRequest, Event, Mode, Request, Setpoint
+from firmware_py.core.types import FACES, WARNING, Action, DockRequest, Event, Mode, Request, Setpoint, Sticks
 
 QUARTERS = 4
 FARTHEST = 1e6
@@ -45,6 +44,13 @@ def _is_array(value: Any, size: int, may_lack: bool) -> bool:
     """Whether it is a (size,) array as compiled functions take it, of numbers that may be meant; NaN where `may_lack`."""
     whole = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == (size,) and value.flags.c_contiguous
     return whole and bool(np.all((np.abs(value) <= FARTHEST) | (np.isnan(value) & may_lack)))
+
+
+def _is_sticks(argument: Any) -> bool:
+    """Whether it is six deflections within -1 to 1."""
+    if not isinstance(argument, Sticks) or not all(isinstance(group, tuple) and len(group) == 3 for group in argument):
+        return False
+    return all(_is_real(value) and abs(value) <= 1.0 for group in argument for value in group)
 
 
 def is_setpoint(argument: Any, may_lack: bool = False) -> bool:
@@ -104,7 +110,7 @@ SOUND: Mapping[Action, Callable[[Any], bool]] = {
     Action.ESTOP: _anything,
     Action.CLEAR_ESTOP: _anything,
     Action.SET_MODE: _is_mode,
-    Action.STICKS: is_sticks,
+    Action.STICKS: _is_sticks,
     Action.SET_POINT: _is_point,
     Action.SET_PARAMETER: _is_parameter,
     Action.DOCK: _is_dock,

@@ -54,7 +54,10 @@ UNSOUND: list[tuple[Action, Any]] = [
     (Action.TRACK, type("Sampleless", (), {"duration_s": 1.0})()),
     (Action.TRACK, type("Endless", (), {"sample": lambda self, t: HERE})()),
     *[(Action.SET_MODE, x) for x in (3, None, "AUTO", Mode.DOCK)],
-    *[(Action.STICKS, x) for x in (None, STICKS._replace(force=(1.1, 0, 0)), STICKS._replace(moment=(NAN, 0, 0)), (1, 2))],
+    *[(Action.STICKS, x) for x in (
+        None, (1, 2), (0.0,) * 6, Sticks((1.01, 0.0, 0.0), (0.0,) * 3), Sticks((0.0,) * 3, (0.0, -1.01, 0.0)),
+        Sticks((0.0,) * 3, (NAN, 0.0, 0.0)), Sticks((0.0, 0.0), (0.0,) * 3), Sticks(("a", "b", "c"), (0.0,) * 3), Sticks(None, None),
+    )],
     *[(Action.SET_PARAMETER, x) for x in (None, "control.lead_s", ("control.lead_s",), (1, 2), ("control.lead_s", None), (["a"], 1.0))],
     *[(action, x) for action in (Action.DOCK, Action.UNDOCK) for x in (
         None, (1, 1, 0, 0), DOCK._replace(module=None), DOCK._replace(module=-1), DOCK._replace(face=6), DOCK._replace(face=0.5),
@@ -65,7 +68,7 @@ UNSOUND: list[tuple[Action, Any]] = [
 SOUND_ONES: list[tuple[Action, Any]] = [
     (Action.ARM, None), (Action.ARM, True), (Action.ARM, False), (Action.DISARM, object()), (Action.ESTOP, NAN), (Action.CLEAR_ESTOP, 1),
     (Action.GROUND_ALIVE, "?"), (Action.HOLD, None), (Action.HOLD, HERE), (Action.TRACK, Path()), (Action.TRACK, hold(HERE, 3.0)),
-    (Action.SET_MODE, Mode.AUTO), (Action.STICKS, STICKS), (Action.SET_POINT, HERE), (Action.SET_POINT, spoilt(p_wb=ZERO * NAN)),
+    (Action.SET_MODE, Mode.AUTO), (Action.STICKS, STICKS), (Action.STICKS, Sticks((1.0, -1.0, 0), (0.0,) * 3)), (Action.SET_POINT, HERE), (Action.SET_POINT, spoilt(p_wb=ZERO * NAN)),
     (Action.SET_POINT, spoilt(q_wb=LEVEL * NAN, v_w=np.array([NAN, 0.0, 0.1]))), (Action.SET_PARAMETER, ("control.lead_s", 0.1)),
     (Action.MOTOR_TEST, (7, -0.1, 2)), (Action.HOLD, spoilt(q_wb=LEVEL * 1.0009)), (Action.HOLD, spoilt(p_wb=np.full(3, 1e6))),
 ]  # fmt: skip
