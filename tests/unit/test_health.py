@@ -96,7 +96,6 @@ def test_module_that_starts_or_has_a_fault_is_unfit_until_it_says_otherwise() ->
         assert ear.hear(here(mcu_state=state), here(mcu_state=state)).unfit == ()
 
 
-
 def test_module_that_only_talks_has_not_answered() -> None:
     ear = Ear()
     ear.hear(here(), here())

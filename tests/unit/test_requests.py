@@ -68,7 +68,8 @@ UNSOUND: list[tuple[Action, Any]] = [
 SOUND_ONES: list[tuple[Action, Any]] = [
     (Action.ARM, None), (Action.ARM, True), (Action.ARM, False), (Action.DISARM, object()), (Action.ESTOP, NAN), (Action.CLEAR_ESTOP, 1),
     (Action.GROUND_ALIVE, "?"), (Action.HOLD, None), (Action.HOLD, HERE), (Action.TRACK, Path()), (Action.TRACK, hold(HERE, 3.0)),
-    (Action.SET_MODE, Mode.AUTO), (Action.STICKS, STICKS), (Action.STICKS, Sticks((1.0, -1.0, 0), (0.0,) * 3)), (Action.SET_POINT, HERE), (Action.SET_POINT, spoilt(p_wb=ZERO * NAN)),
+    (Action.STICKS, STICKS), (Action.STICKS, Sticks((1.0, -1.0, 0), (0.0,) * 3)), (Action.SET_MODE, Mode.AUTO),
+    (Action.SET_POINT, HERE), (Action.SET_POINT, spoilt(p_wb=ZERO * NAN)),
     (Action.SET_POINT, spoilt(q_wb=LEVEL * NAN, v_w=np.array([NAN, 0.0, 0.1]))), (Action.SET_PARAMETER, ("control.lead_s", 0.1)),
     (Action.MOTOR_TEST, (7, -0.1, 2)), (Action.HOLD, spoilt(q_wb=LEVEL * 1.0009)), (Action.HOLD, spoilt(p_wb=np.full(3, 1e6))),
 ]  # fmt: skip
