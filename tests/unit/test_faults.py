@@ -45,6 +45,16 @@ def test_esc_that_reports_a_failure_is_believed(water: Water, status: int) -> No
     assert found[0][0] <= 0.41 and found[0][1] == "thruster 7 has an ESC that failed: left out"
 
 
+def test_three_reports_of_a_failed_esc_in_a_row_are_enough_and_two_are_not(water: Water) -> None:
+    """Each ESC is heard ten times a second."""
+    water.run(1.0)
+    for status, seconds in ((1, 0.2), (0, 0.1), (1, 0.2), (0, 0.1)):
+        water.status[6] = status
+        assert water.run(seconds) == []
+    water.status[6] = 1
+    assert [words for _, words in water.run(0.3)] == ["thruster 7 has an ESC that failed: left out"]
+
+
 def test_hot_esc_is_no_failure(water: Water) -> None:
     water.status[6] = 2
     water.fly(2.0)
