@@ -153,7 +153,7 @@ class FaultDetector:
             measured, estimate: of this tick.
             force_n, mean_n: (n,) forces that the thrusters are believed to give now, and on the mean since the last tick, N.
             armed: while disarmed nothing is looked for but propellers that turn all the same.
-            free: no magnet pushes anything away; while one does, the motion says nothing of thrusters.
+            free: no magnet pulls at another body or pushes anything away; while one does, the motion says nothing of thrusters.
         """
         self.words, self.changed = [], False
         found = self._motion.step(measured, estimate, mean_n * self._share, self.now.alive, armed, free)

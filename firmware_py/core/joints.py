@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import FacePair
 from firmware_py.core.rotations import conjugate, multiply, rotate_back, to_matrix
-from firmware_py.core.types import DockRequest
+from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, DockRequest
 from firmware_py.description.vehicle import FACE_NORMALS
 
 
@@ -53,6 +54,12 @@ def joints_of(body: Body) -> list[Joint]:
         joints += [_joint(body, i, j) for j in sorted(neighbours) if j > i]
     faces = dict(zip(body.modules, body.faces, strict=True))
     return [joint for joint in joints if {faces[m][f] for m, f in sides(joint.request)} == {"P", "D"}]
+
+
+def holding(body: Body, joints: Sequence[Joint]) -> list[tuple[int, ...]]:
+    """Relay states of each module of a body that hold its joints and reach for nothing else."""
+    held = {side for joint in joints for side in sides(joint.request)}
+    return [tuple(RELAY_PULL if (m, face) in held else RELAY_OFF for face in range(FACES)) for m in body.modules]
 
 
 def _joint(body: Body, i: int, j: int) -> Joint:

@@ -103,7 +103,7 @@ class MissingThrust:
 
         Args:
             force_n: (n,) believed mean forces since the last tick, N.
-            free: no magnet pushes another body, or a module of this one, away.
+            free: no magnet pulls at another body, nor pushes a module of this one away.
         """
         if not estimate.ready:
             return None

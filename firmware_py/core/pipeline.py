@@ -18,7 +18,7 @@ from firmware_py.core.faults import FaultDetector
 from firmware_py.core.formation import Formation
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import HealthMonitor
-from firmware_py.core.joints import joints_of
+from firmware_py.core.joints import holding, joints_of
 from firmware_py.core.limiter import Limiter
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.motor_test import MotorTest
@@ -31,7 +31,7 @@ from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.transitions import DOCKING, Effect, State, Trigger
 from firmware_py.core.types import (
     CHANNELS,
-    RELAY_PUSH,
+    RELAY_OFF,
     WARNING,
     Action,
     BodyRecord,
@@ -60,6 +60,7 @@ class BodyPipeline:
     def __init__(self, body: Body, parameters: Parameters, period_ns: int) -> None:
         self.body, self.parameters = body, parameters
         self.joints = joints_of(body)
+        self._holding = holding(body, self.joints)
         self.sensors = SensorWatch(body.modules)
         self.measurements = Measurements(body, period_ns)
         self.estimator = ESTIMATORS[parameters.estimation.kind](body, parameters.estimation, period_ns)
@@ -106,10 +107,16 @@ class BodyPipeline:
 
     def _find_faults(self, inputs: Inputs, measured: Measured, estimate: Estimate, mean_n: np.ndarray) -> None:
         """Thrusters that are dead or lie leave the allocation at once."""
-        free = not any(RELAY_PUSH in magnets.states for magnets in self.limiter.magnets)
-        self.faults.step(inputs.modules, measured, estimate, self.lag.force_n, mean_n, self.supervisor.armed, free)
+        self.faults.step(inputs.modules, measured, estimate, self.lag.force_n, mean_n, self.supervisor.armed, self._is_free())
         if self.faults.changed:
             self.allocator.set_alive(self.faults.now.alive)
+
+    def _is_free(self) -> bool:
+        """Whether no magnet pulls at another body, which then pushes back, nor pushes a module of this one away."""
+        return all(
+            magnets.states == held or all(state in (RELAY_OFF, hold) for state, hold in zip(magnets.states, held, strict=True))
+            for magnets, held in zip(self.limiter.magnets, self._holding, strict=True)
+        )
 
     def decide(self, inputs: Inputs, estimate: Estimate, requests: Sequence[Request]) -> list[DockRequest]:
         """Sound requests and fail-safes -> state and mode. Returns the docks and undocks that were granted."""

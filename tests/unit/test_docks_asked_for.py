@@ -135,8 +135,11 @@ def test_magnets_of_every_face_that_will_meet_pull_in_a_dock_and_let_go_with_it(
         tank.run(0.01)
     states = tank.pipeline.formation.docking.relays.states
     assert [(state[2], state[3]) for state in states] == [(1, 0), (1, 0), (0, 1), (0, 1)]
+    tank.run(0.02)
+    assert not any(chain._is_free() for chain in tank.pipeline.formation.chains), "no thruster is judged by a motion that magnets shape"
     tank.run(0.1, Request(Action.SET_MODE, 2, Mode.POSHOLD))
     assert [sum(state) for state in tank.pipeline.formation.docking.relays.states] == [1] * 4, "the pairs hold"
+    assert all(chain._is_free() for chain in tank.pipeline.formation.chains)
 
 
 WANTED = Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
