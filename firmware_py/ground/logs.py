@@ -39,7 +39,8 @@ class LogService:
     def __init__(self, system: System, folder: Path | None) -> None:
         self._system, self._folder = system, folder
         self._first = system.subject.identity.first_log
-        self._transfer: _Transfer | None = None
+        self._transfers: dict[int, _Transfer] = {}
+        """By channel."""
         self._listings: dict[int, _Listing] = {}
         """By channel."""
         self._files: list[Path] = []
@@ -60,11 +61,11 @@ class LogService:
                 del self._listings[channel]
             elif channel not in self._system.busy:
                 self._tell(listing)
-        transfer = self._transfer
-        if transfer is not None and transfer.arrival.channel not in self._system.channels:
-            self._transfer = None
-        elif transfer is not None and transfer.arrival.channel not in self._system.busy:
-            self._carry(transfer)
+        for channel, transfer in list(self._transfers.items()):
+            if channel not in self._system.channels:
+                del self._transfers[channel]
+            elif channel not in self._system.busy:
+                self._carry(transfer)
 
     def _carry(self, t: _Transfer) -> None:
         try:
@@ -78,7 +79,7 @@ class LogService:
         if not data or t.left <= 0:
             if t.left > 0:
                 self._piece(t, b"")  # the end of the file, as the protocol tells it
-            self._transfer = None
+            del self._transfers[t.arrival.channel]
 
     def _piece(self, t: _Transfer, data: bytes) -> None:
         values = {"id": t.number, "ofs": t.at, "count": len(data), "data": tuple(data)}
@@ -118,10 +119,10 @@ class LogService:
             self._files = self._find()
         if number - self._first in range(len(self._files)):
             path = self._files[number - self._first]
-            self._transfer = _Transfer(arrival, number, path, arrival.message["ofs"], arrival.message["count"])
+            self._transfers[arrival.channel] = _Transfer(arrival, number, path, arrival.message["ofs"], arrival.message["count"])
 
     def _end(self, arrival: Arrival) -> None:
-        self._transfer = None
+        self._transfers.pop(arrival.channel, None)
 
     def _erase(self, arrival: Arrival) -> None:
         self._system.say(4, "logs are not erased from a ground station")

@@ -21,6 +21,21 @@ def test_each_of_two_clients_has_its_list_of_logs(tmp_path: Path) -> None:
     assert [len(client.all("LOG_ENTRY")) for client in clients] == [25, 25]
 
 
+def test_each_of_two_clients_has_the_log_that_it_fetches(tmp_path: Path) -> None:
+    """And ends no other's."""
+    data = bytes(i % 251 for i in range(20_000))
+    (tmp_path / "can.log").write_bytes(data)
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    clients = [world.client(), world.client(200)]
+    for client in clients:
+        client.send("LOG_REQUEST_DATA", 1, 1, 0, 0, 0xFFFFFFFF)
+        world.run(1)
+    world.client(201).send("LOG_REQUEST_END", 1, 1)
+    world.run(20)
+    for client in clients:
+        assert b"".join(bytes(p.data[: p.count]) for p in client.all("LOG_DATA")) == data
+
+
 def test_answers_find_their_way_while_a_log_is_fetched_over_a_radio(tmp_path: Path) -> None:
     (tmp_path / "can.log").write_bytes(bytes(1_000_000))
     world = World(config=GroundConfig(logs=str(tmp_path)))
@@ -43,7 +58,7 @@ def test_client_that_leaves_with_an_answer_to_come_leaves_nothing_behind(tmp_pat
     world.station.leave(client.channel)
     world.run(3)
     services = world.station.services[1]
-    assert not services.system.outbox._encoders and services.logs._transfer is None
+    assert not services.system.outbox._encoders and not services.logs._transfers
 
 
 def test_flood_of_requests_for_the_list_of_logs_looks_at_the_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
