@@ -36,6 +36,8 @@ _LAST_SYSTEM = 254
 """255 is what ground stations take."""
 _MAY_STOP = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE", "MANUAL_CONTROL")
 """They go to services that know what stops."""
+_STEERS_ONE = ("RC_CHANNELS_OVERRIDE", "SET_POSITION_TARGET_LOCAL_NED", "SET_ATTITUDE_TARGET")
+"""For all, they are for the one body that there is: several would be steered to one place. DroneKit sends everything to all."""
 _OF_NO_BODY = ("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END")
 """Logs are the process's: who fetches one goes on with the same system when its body docks."""
 _NEVER_SIGNED = ("RADIO_STATUS",)
@@ -229,9 +231,19 @@ class GroundStation:
         is_for_autopilots = component in (0, COMPONENT_AUTOPILOT)
         if not (is_for_autopilots and target in self.services):
             self._forward(packet, target, component, channel)
-        for number, services in self.services.items():
-            if is_for_autopilots and target in (0, number):
-                services.take(arrival, target == number)
+        if is_for_autopilots and not self._is_for_too_many(arrival, target):
+            for number, services in self.services.items():
+                if target in (0, number):
+                    services.take(arrival, target == number)
+
+    def _is_for_too_many(self, arrival: Arrival, target: int) -> bool:
+        """Whether it would steer several bodies at once; says so."""
+        present = self.present()
+        if target or arrival.message.name not in _STEERS_ONE or len(present) <= 1:
+            return False
+        for system in present:
+            system.refuse(arrival.time_ns, f"target 0, and there are {len(present)} bodies")
+        return True
 
     def _route(self, sender: Sender, channel: int) -> None:
         """It was heard there. Of too many the one that was silent longest is forgotten."""

@@ -90,14 +90,14 @@ class System:
         body = self.subject.leader if action in STOPPING else self.body
         self.requests.append(Request(action, body, argument))
 
-    def refuse(self, time_ns: int) -> None:
-        """Say who leads the body that is gone; what streams in is told of seldom."""
+    def refuse(self, time_ns: int, why: str = "") -> None:
+        """Say why the body is not steered, or who leads it that is gone; what streams in is told of seldom."""
         if time_ns - self._refused_ns < _SELDOM_NS:
             return
         self._refused_ns = time_ns
         own, leader = self.outbox.system, self.outbox.system - self.body + self.subject.leader
-        why = f"docked, system {leader} leads it now" if leader != own else "no tick has told of its body"
-        self.say(WARNING, f"system {own} is not steered: {why}")
+        gone = f"docked, system {leader} leads it now" if leader != own else "no tick has told of its body"
+        self.say(WARNING, f"system {own} is not steered: {why or gone}")
 
     def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
         """To one channel; what is for one that is gone goes nowhere, and leaves nothing behind."""

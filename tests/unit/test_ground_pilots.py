@@ -131,3 +131,29 @@ def test_override_that_ignores_every_channel_does_not_hold_the_sticks(world: Wor
     other.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, 0)
     world.run(1)
     assert sticks(world) == [0.5, 1.0]
+
+
+STEERS = {
+    "RC_CHANNELS_OVERRIDE": (0, 0, *[1500] * 4, 1700, *[65535] * 3),
+    "SET_POSITION_TARGET_LOCAL_NED": (0, 0, 0, 1, 0xDF8, 0.3, 0.1, 0.4, *[0.0] * 8),
+    "SET_ATTITUDE_TARGET": (0, 0, 0, 0x7, [1.0, 0.0, 0.0, 0.0], 0, 0, 0, 0.5),
+}
+"""Each for all, as DroneKit sends whatever it sends."""
+
+
+@pytest.mark.parametrize("name", STEERS)
+def test_what_steers_and_is_for_all_steers_the_one_body_and_of_several_none(name: str) -> None:
+    """Several would be steered to one place."""
+    world = World(2)
+    client = world.client()
+    for _ in range(3):
+        client.send(name, *STEERS[name])
+        world.run(1)
+    assert not world.robot.asked
+    for system in (1, 2):
+        assert client.texts.count(f"system {system} is not steered: target 0, and there are 2 bodies") == 1
+    world.robot.dock()
+    world.run(1)
+    client.send(name, *STEERS[name])
+    world.run(1)
+    assert [request.body for request in world.robot.asked] == [0]
