@@ -121,7 +121,7 @@ class MissionService:
         upload, ended = self._upload, self._ended
         if upload is None and ended is not None and _is_again(arrival, ended.item):
             self._acknowledge(arrival, ended.result, arrival.message["mission_type"])  # the answer to it was lost
-        if upload is None or not _same(upload.arrival, arrival) or arrival.message["mission_type"] != upload.kind:
+        if upload is None or not _brings(arrival, upload):
             return
         sequence = arrival.message["seq"]
         if sequence != len(upload.items):
@@ -159,7 +159,7 @@ class MissionService:
     def _acknowledged(self, arrival: Arrival) -> None:
         """Of a download: nothing to do. During an upload the client gives it up, but where it speaks of fences or rally points."""
         upload, m = self._upload, arrival.message
-        if upload is not None and _same(upload.arrival, arrival) and m["mission_type"] == upload.kind and m["type"] != _ACCEPTED:
+        if upload is not None and _brings(arrival, upload) and m["type"] != _ACCEPTED:
             self._upload = None
 
     # ------------------------------------------------------------ down
@@ -208,6 +208,12 @@ def _sent_frame(item: Item, whole: bool) -> int:
 
 def _is_again(item: Arrival, before: Arrival) -> bool:
     return _same(item, before) and all(item.message[name] == before.message[name] for name in ("seq", "mission_type"))
+
+
+def _brings(arrival: Arrival, upload: _Upload) -> bool:
+    """Whether it is of the transfer. Two stations may have one number, as all of QGroundControl have: the channel tells them apart."""
+    told = _same(upload.arrival, arrival) and arrival.channel == upload.arrival.channel
+    return told and arrival.message["mission_type"] == upload.kind
 
 
 def _same(a: Arrival, b: Arrival) -> bool:

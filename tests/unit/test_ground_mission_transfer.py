@@ -36,6 +36,19 @@ def test_an_item_that_is_lost_is_asked_for_again(world: World, client: Client) -
     assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_ACCEPTED
 
 
+def test_items_of_two_stations_of_one_number_do_not_mix(world: World, client: Client) -> None:
+    """As two of QGroundControl have it: the later transfer takes the place of the other."""
+    other = world.client()
+    client.send("MISSION_COUNT", 1, 1, 2, 0)
+    other.send("MISSION_COUNT", 1, 1, 2, 0)
+    for sender, place in ((client, PLACES[0]), (other, PLACES[1])):
+        for sequence in (0, 1):
+            sender.send("MISSION_ITEM_INT", *item(sequence, place), 0)
+    world.run(1)
+    assert not client.all("MISSION_ACK") and other.last("MISSION_ACK").type == mavlink.MAV_MISSION_ACCEPTED
+    assert {i.x for i in world.station.services[1].flight.items} == {PLACES[1][0]}
+
+
 @pytest.mark.parametrize("last", [item(1, PLACES[1]), item(1, PLACES[1], command=22)])
 def test_last_item_that_comes_again_is_answered_again(world: World, client: Client, last: tuple[float, ...]) -> None:
     """A client whose acknowledgement was lost sends it until it hears one."""
