@@ -17,6 +17,10 @@ MOST_ITEMS = 500
 _MISSION = 0
 _ACCEPTED, _ERROR, _UNSUPPORTED, _NO_SPACE, _INVALID_SEQUENCE, _DENIED, _CANCELLED = 0, 1, 3, 4, 13, 14, 15
 _ASK_AGAIN_NS, _MOST_ASKED = 250_000_000, 20
+_ASKED_ALIKE = 4
+"""Times that an item is asked for in one form, before the other has its turn. DroneKit hears the old one alone; others answer it in degrees
+of 32 bits, which tell a place to a metre, or refuse it.
+"""
 
 
 @dataclass(slots=True)
@@ -33,6 +37,12 @@ class _Upload:
     in_part: bool = False
     asked_ns: int = 0
     asked: int = 0
+    """Times, for the next item."""
+
+    @property
+    def in_old_form(self) -> bool:
+        """Whether the last request was."""
+        return (self.asked - 1) // _ASKED_ALIKE % 2 == 1
 
 
 class _Ended(NamedTuple):
@@ -115,7 +125,7 @@ class MissionService:
     def _ask(self, upload: _Upload, time_ns: int) -> None:
         upload.asked, upload.asked_ns = upload.asked + 1, time_ns
         values = {"seq": len(upload.items), "mission_type": upload.kind, **upload.arrival.sender}
-        self._system.send(upload.arrival.channel, "MISSION_REQUEST_INT", values)
+        self._system.send(upload.arrival.channel, "MISSION_REQUEST" if upload.in_old_form else "MISSION_REQUEST_INT", values)
 
     def _item(self, arrival: Arrival) -> None:
         upload, ended = self._upload, self._ended
@@ -159,7 +169,9 @@ class MissionService:
     def _acknowledged(self, arrival: Arrival) -> None:
         """Of a download: nothing to do. During an upload the client gives it up, but where it speaks of fences or rally points."""
         upload, m = self._upload, arrival.message
-        if upload is not None and _brings(arrival, upload) and m["type"] != _ACCEPTED:
+        if upload is None or not _brings(arrival, upload) or m["type"] == _ACCEPTED:
+            return
+        if not (m["type"] == _UNSUPPORTED and upload.in_old_form):  # MAVSDK refuses the old form so, and goes on
             self._upload = None
 
     # ------------------------------------------------------------ down

@@ -28,12 +28,40 @@ def test_mission_goes_up_and_comes_down_the_same(world: World, client: Client) -
 def test_an_item_that_is_lost_is_asked_for_again(world: World, client: Client) -> None:
     client.send("MISSION_COUNT", 1, 1, 2, 0)
     world.run(100)
-    assert [m.seq for m in client.all("MISSION_REQUEST_INT")] == [0] * 5
+    assert [(m.get_type(), m.seq) for m in client.all("MISSION_REQUEST_INT") + client.all("MISSION_REQUEST")] == (
+        [("MISSION_REQUEST_INT", 0)] * 4 + [("MISSION_REQUEST", 0)]
+    )
     client.send("MISSION_ITEM_INT", *item(0, PLACES[0]), 0)
     client.send("MISSION_ITEM_INT", *item(0, PLACES[0]), 0)
     client.send("MISSION_ITEM_INT", *item(1, PLACES[1]), 0)
     world.run(1)
     assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_ACCEPTED
+
+
+def test_client_that_knows_only_the_old_request_for_an_item_brings_its_mission_up(world: World, client: Client) -> None:
+    """DroneKit, for ArduPilot sends no other; it answers in degrees."""
+    client.send("MISSION_COUNT", 1, 1, 3, 0)
+    answered = 0
+    for _ in range(400):
+        world.run(1)
+        asked = client.all("MISSION_REQUEST")
+        for request in asked[answered:]:
+            client.send("MISSION_ITEM", 1, 1, request.seq, 3, 16, 0, 1, 0, 0, 0, 0, 30.2084, 120.1614, -0.4)
+        answered = len(asked)
+    assert [ack.type for ack in client.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED]
+
+
+def test_client_that_refuses_the_old_request_for_an_item_goes_on_with_the_new_one(world: World, client: Client) -> None:
+    """As MAVSDK does."""
+    client.send("MISSION_COUNT", 1, 1, 1, 0)
+    world.run_until(lambda: bool(client.all("MISSION_REQUEST")))
+    client.send("MISSION_ACK", 1, 1, mavlink.MAV_MISSION_UNSUPPORTED, 0)
+    client.clear()
+    world.run_until(lambda: bool(client.all("MISSION_REQUEST_INT")))
+    client.send("MISSION_ACK", 1, 1, mavlink.MAV_MISSION_UNSUPPORTED, 0)
+    client.clear()
+    world.run(100)
+    assert not client.all("MISSION_REQUEST_INT") and not client.all("MISSION_REQUEST"), "it gave the whole up"
 
 
 def test_items_of_two_stations_of_one_number_do_not_mix(world: World, client: Client) -> None:
