@@ -21,6 +21,8 @@ _ASKED_ALIKE = 4
 """Times that an item is asked for in one form, before the other has its turn. DroneKit hears the old one alone; others answer it in degrees
 of 32 bits, which tell a place to a metre, or refuse it.
 """
+_AT_ONCE = (2, 3)
+"""What stands for `current` in an item of no mission: ArduPilot's way to go to a place or to an altitude at once."""
 
 
 @dataclass(slots=True)
@@ -131,6 +133,9 @@ class MissionService:
         upload, ended = self._upload, self._ended
         if upload is None and ended is not None and _is_again(arrival, ended.item):
             self._acknowledge(arrival, ended.result, arrival.message["mission_type"])  # the answer to it was lost
+        elif upload is None and arrival.message["current"] in _AT_ONCE:
+            self._system.say(WARNING, "a place is gone to at once by DO_REPOSITION, as COMMAND_INT")
+            self._acknowledge(arrival, _UNSUPPORTED, arrival.message["mission_type"])
         if upload is None or not _brings(arrival, upload):
             return
         sequence = arrival.message["seq"]
