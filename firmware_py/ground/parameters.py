@@ -108,7 +108,8 @@ class ParameterService:
             dotted, kept = self._store.set(name, value)
         except (DescriptionError, OSError) as error:
             stays = f"parameter {name} stays, it cannot be stored"
-            self._system.say(WARNING, f"{stays}: {error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error))
+            wrong = str(error).replace(self._store.names[name][0], name)  # a client knows no other name of it
+            self._system.say(WARNING, f"{stays}: {error.filename}: {error.strerror}" if isinstance(error, OSError) else wrong)
             self._system.send(arrival.channel, "PARAM_VALUE", self._value(name))
             return
         for system in self._everybody():

@@ -66,7 +66,7 @@ def test_parameter_that_is_set_on_one_body_is_told_by_all_for_it_is_theirs_too()
 
 def test_out_of_range_is_refused_in_words_and_the_old_value_echoed(world: World, client: Client) -> None:
     assert put(world, client, "POS_BW", 1000.0) == SHIPPED
-    assert "out of range; permitted: 0.1 to 10 rad/s" in client.texts
+    assert "parameter POS_BW: 1000.0 is out of range; permitted: 0.1 to 10 rad/s" in client.texts
     for nonsense in (math.nan, math.inf, -math.inf):
         assert put(world, client, "POS_BW", nonsense) == SHIPPED
     assert not world.robot.asked
