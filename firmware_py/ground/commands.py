@@ -26,6 +26,9 @@ _FACES = 6
 SET_MODE, TERMINATE, REPOSITION, ARM = 176, 185, 192, 400
 DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
 """User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
+SET_CURRENT = 224
+_NEEDED = {ARM: 1, TERMINATE: 1, SET_CURRENT: 1, DOCK: 4, UNDOCK: 4}
+"""How many of its first parameters a command must name: what is none of them would be taken for 0, which disarms or clears an e-stop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +57,7 @@ class CommandService:
             REPOSITION: self._reposition,
             193: self._pause,
             209: self._motor_test,
-            224: self._set_current,
+            SET_CURRENT: self._set_current,
             246: self._reboot,
             300: lambda c: self._start_mission(c, max(0, int(c.get(1)))),
             ARM: self._arm,
@@ -113,6 +116,8 @@ class CommandService:
         handler = self._table.get(command.number)
         if not self._system.body_is_known and not _stops(command):
             answer: Answer = self._refuse(command)
+        elif not all(map(math.isfinite, command.parameters[: _NEEDED.get(command.number, 0)])):
+            answer = DENIED
         else:
             answer = UNSUPPORTED if handler is None else handler(command)
         if answer is not None:

@@ -40,6 +40,17 @@ def test_every_command_is_acknowledged_when_all_its_parameters_are_left_out() ->
         assert acknowledged(world, client, number) in (*range(mavlink.MAV_RESULT_FAILED + 1), mavlink.MAV_RESULT_COMMAND_INT_ONLY)
 
 
+@pytest.mark.parametrize("number", [185, 224, 400, 31010, 31011])
+@pytest.mark.parametrize("nothing", [NAN, math.inf])
+def test_command_that_does_not_say_what_is_denied(world: World, client: Client, number: int, nothing: float) -> None:
+    """One that named neither 0 nor 1 disarmed the robot, or cleared its e-stop."""
+    ask(world, client, 400, 1)
+    ask(world, client, 185, 1)
+    before = len(world.robot.asked)
+    assert ask(world, client, number, nothing, 0, 1, 1) == mavlink.MAV_RESULT_DENIED
+    assert len(world.robot.asked) == before
+
+
 @pytest.mark.parametrize(("speed", "answer"), [(0.0, 2), (0.009, 2), (0.02, 0), (2.0, 0), (2.1, 2), (-1.0, 0), (-2.0, 0), (-0.5, 2)])
 def test_speed_that_would_never_arrive_is_denied(world: World, client: Client, speed: float, answer: int) -> None:
     assert ask(world, client, 178, 1, speed) == answer
