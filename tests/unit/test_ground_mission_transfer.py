@@ -79,9 +79,7 @@ def test_items_of_two_stations_of_one_number_do_not_mix(world: World, client: Cl
 
 @pytest.mark.parametrize("current", [2, 3])
 @pytest.mark.parametrize("name", ["MISSION_ITEM", "MISSION_ITEM_INT"])
-def test_item_that_is_a_place_to_go_to_at_once_is_refused_and_told_of(
-    world: World, client: Client, name: str, current: int
-) -> None:
+def test_item_that_is_a_place_to_go_to_at_once_is_refused_and_told_of(world: World, client: Client, name: str, current: int) -> None:
     """ArduPilot's way before there was a command for it: DroneKit's simple_goto, and QGroundControl before 4.3."""
     client.send(name, 1, 1, 0, 3, 16, current, 1, 0, 0, 0, 0, 30, 120, -0.4)
     world.run(1)
