@@ -50,6 +50,8 @@ NORTH_DENSITY = 1e-4
 knowledge of it was noise: a bump turned the belief by a third of a circle."""
 KEPT, MOVING = np.r_[10:19, 21:25, 26:29], slice(6, 9)
 """Of the state: rates, biases, vertical force, moment and righting, which say the same whatever the heading. Of the error: velocity."""
+WAY_S = 0.01
+"""For which `accel_under_way` tells what a sample errs. A wrong mass errs alike in all samples of that time: more of them tell no more."""
 LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[22:25, 26:29], np.r_[21:24, 25:28], 5.0
 """Of the state, and of its error: moment and righting. A lost place does not spoil them as far as a filter that begins could believe them;
 what is farther off may be why tags were refused. Biases and vertical force take up what was refused meanwhile."""
@@ -100,8 +102,9 @@ class Estimator:
         self._density = self._process_noise()
         drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
         reach_m = self._body.reach_m
+        accel_way = p.accel_under_way * math.sqrt(WAY_S / self._dt)
         self._under_way = np.array([
-            drag_walk, drag_walk * reach_m, p.alpha_turning, p.accel_under_way, p.accel_under_way * reach_m,
+            drag_walk, drag_walk * reach_m, p.alpha_turning, accel_way, accel_way * reach_m,
         ])  # fmt: skip
         self._inertial_sigma = np.array([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m])
         self._tag_variance = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2

@@ -72,7 +72,12 @@ class Estimation:
         0.036, unit="m/s^2", low=1e-4, high=10, help="accelerometer noise, and what its place makes it feel", mavlink="ACC_SD"
     )
     accel_under_way: float = quantity(
-        0.33, unit="m/s^2/(m/s)", low=0, high=10, help="what motion adds to that: mass and drag are not as believed", mavlink="ACC_SD_WAY"
+        0.33,
+        unit="m/s^2/(m/s)",
+        low=0,
+        high=10,
+        help="what motion adds to that in 10 ms: mass and drag are not as believed",
+        mavlink="ACC_SD_WAY",
     )
     accel_bias_walk: float = quantity(
         1e-4, unit="m/s^2/sqrt(s)", low=0, high=1, help="accelerometer bias random walk", mavlink="ACC_WALK"

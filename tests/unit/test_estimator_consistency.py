@@ -311,6 +311,32 @@ def test_errors_are_as_large_as_the_sigmas_say(drawn: list[tuple[Flight, list[Es
         assert np.mean(per_axis) == pytest.approx(1.0, abs=0.35)
 
 
+def sigmas_under_way(body: Body, rate_hz: int, speed_m_s: float) -> np.ndarray:
+    """(6,) of the pose a second after the last tag, at a tick rate, by IMUs whose noise has the same density at each."""
+    period_ns, per_sample = 1_000_000_000 // rate_hz, np.sqrt(rate_hz * DT)
+    told = replace(P, gyro_sigma=P.gyro_sigma * per_sample, accel_sigma=P.accel_sigma * per_sample)
+    estimator, x, seen, tag_ns = Estimator(body, told, period_ns), start_state(), 0, 20_000_000
+    x[3:7], x[7] = from_euler(0.0, 0.0, 0.0), speed_m_s
+    for k in range(2 * rate_hz):
+        time_ns = k * period_ns
+        x[0], tags = speed_m_s * time_ns * 1e-9, []
+        while seen * tag_ns <= min(time_ns, 1_000_000_000):
+            there = np.r_[speed_m_s * seen * tag_ns * 1e-9, x[1:]]
+            tags, seen = [*tags, tag_of(there, seen * tag_ns)], seen + 1
+        felt = inertial_of(x, np.zeros(3))
+        depth_m = felt.depth_m if time_ns % 20_000_000 == 0 else None
+        estimate = estimator.step(time_ns, felt._replace(depth_m=depth_m, tags=tags), still(body, x))
+    return np.r_[estimate.sigma_p, estimate.sigma_q]
+
+
+@pytest.mark.parametrize("speed_m_s", [0.0, 1.0], ids=["at rest", "under way"])
+def test_filter_is_as_sure_at_every_tick_rate(body: Body, speed_m_s: float) -> None:
+    """Only noise that every sample draws anew is averaged away by more samples; a mass that is not as believed is none."""
+    usual = sigmas_under_way(body, 100, speed_m_s)
+    for rate_hz in (50, 200, 400):
+        np.testing.assert_allclose(sigmas_under_way(body, rate_hz, speed_m_s), usual, rtol=0.06, err_msg=f"{rate_hz} Hz")
+
+
 def test_narrowest_gate_refuses_few_good_tags(body: Body) -> None:
     """NIS of six axes is distributed as chi squared: 1.4 % lie beyond 4 squared."""
     narrowest = replace(P, tag_gate=limits_of(Estimation, "tag_gate").low)
