@@ -1,7 +1,14 @@
 """One module holds its place in the tank, closed loop over real frames."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from firmware_py.description.parameters import Parameters
+from hil.bench import fly_scenario
+from hil.metrics import rotation_vectors
+from hil.signals import read_flight
 from tests.closed_loop.flights import Fly, shortened
 
 HOVER_S = 20.0
@@ -34,3 +41,23 @@ def test_estimate_of_a_hovering_module_is_as_good_as_it_says(fly: Fly) -> None:
     assert 0.7 <= metrics["nis_mean"] <= 1.4
     assert metrics["sigma3_share"] >= 0.95
     assert metrics["estimate_position_rmse_m"] <= 0.003
+
+
+def errors_in_sigmas(folder: Path, seed: int, rate_hz: int) -> np.ndarray:
+    """(k, 6) errors of the estimated pose of a hover that has settled, in the sigmas that the estimator tells."""
+    folder.mkdir()
+    scenario = shortened("hover", 10.0)
+    fly_scenario(scenario, seed, Parameters(), folder, f"virtual:{folder.name}", rate_hz)
+    flight = read_flight(folder)
+    error = np.hstack([flight.firmware["p_wb"] - flight.p_wb, rotation_vectors(flight.firmware["q_wb"], flight.q_wb)])
+    sigmas = np.hstack([flight.firmware["sigma_p"], flight.firmware["sigma_q"]])
+    return (error / sigmas)[flight.time_s > scenario.task.settle_s]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate_hz", [50, 100, 200, 400])
+def test_estimate_is_as_good_as_it_says_at_every_tick_rate(rate_hz: int, tmp_path: Path) -> None:
+    """Over several seeds: how far off the tags of a flight are on the mean is one draw, which turns the whole flight alike (seed 3)."""
+    off = np.vstack([errors_in_sigmas(tmp_path / f"{rate_hz}-{seed}", seed, rate_hz) for seed in range(4)])
+    assert 0.5 <= np.mean(np.square(off)) <= 1.2
+    assert np.mean(np.abs(off) <= 3.0) >= 0.985
