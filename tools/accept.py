@@ -11,8 +11,11 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
+
+from command_line import run_tool
 
 import typer
 from accept_figures import Figure, Group, said
@@ -326,4 +329,4 @@ GROUPS: tuple[Group, ...] = (
 
 
 if __name__ == "__main__":
-    run_command(app, "accept")
+    run_tool(partial(run_command, app, "accept"))

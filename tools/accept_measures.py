@@ -13,9 +13,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from statistics import median
 
+from command_line import worker_pool
+
 import identify_plants
 import near_miss
-from command_line import worker_pool
 
 from firmware_py.description.parameters import CONTROLLERS
 from hil.campaign import run_campaign

@@ -39,16 +39,16 @@ def positive(text: str) -> float:
     return value
 
 
-def run_command(app: typer.Typer, name: str) -> None:
-    """Runs the tool called `name`; wrong arguments, and a DescriptionError, end in one line on stderr and status 2."""
+def run_command(app: typer.Typer, name: str) -> int:
+    """Runs the tool called `name`; its exit status. Wrong arguments, and a DescriptionError, give one line on stderr and status 2."""
     try:
-        sys.exit(app(prog_name=name, standalone_mode=False) or 0)
+        return int(app(prog_name=name, standalone_mode=False) or 0)
     except TyperException as error:
         line = " ".join(error.format_message().split())
     except DescriptionError as error:
         line = str(error)
     print(f"{name}: {line}", file=sys.stderr)
-    sys.exit(2)
+    return 2
 
 
 def make_folder(out: Path) -> None:

@@ -19,6 +19,8 @@ from importlib import resources
 from pathlib import Path
 from statistics import median
 
+from command_line import Parser, run_tool
+
 import can
 import cantools.database
 import numpy as np
@@ -30,7 +32,6 @@ from bench_fleet import TIMED_TICKS, Hold, cube_of
 from bench_flight import FlightTimes, measure_flight, time_additions, time_load
 from bench_ground import ground_entries
 from bench_lateness import lateness_entries
-from command_line import Parser, run_tool
 from rich import box as box_style
 from rich.console import Console
 from rich.table import Table

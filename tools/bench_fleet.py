@@ -13,8 +13,9 @@ from collections import deque
 from pathlib import Path
 from time import perf_counter_ns
 
-import numpy as np
 from command_line import Parser, run_tool
+
+import numpy as np
 
 from firmware_py.core import propagation
 from firmware_py.core.body import Body

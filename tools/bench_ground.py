@@ -14,9 +14,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 
+from command_line import Parser, run_tool
+
 import numpy as np
 from bench_entry import Entry
-from command_line import Parser, run_tool
 
 from firmware_py.app.firmware import Firmware
 from firmware_py.app.ground_station import GroundSide

@@ -19,9 +19,10 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
+from command_line import Parser, run_tool
+
 import numpy as np
 from bench_entry import Entry
-from command_line import Parser, run_tool
 
 from firmware_py.app.firmware import BusFrame
 from firmware_py.core.types import Inputs, Outputs

@@ -14,8 +14,9 @@ import argparse
 import math
 from typing import NamedTuple
 
-import numpy as np
 from command_line import Parser, run_tool
+
+import numpy as np
 from scipy.linalg import expm
 
 from firmware_py.description.vehicle import Vehicle, load_vehicle

@@ -10,8 +10,11 @@ import math
 import os
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
+
+from command_line import run_tool
 
 import numpy as np
 import typer
@@ -215,4 +218,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run_command(app, "build_drag_table")
+    run_tool(partial(run_command, app, "build_drag_table"))

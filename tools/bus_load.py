@@ -16,8 +16,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import cantools.database
 from command_line import Parser, in_words, run_tool
+
+import cantools.database
 
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.load import MEAN_LIMIT, TICK_LIMIT, BusLoad, bus_load

@@ -18,11 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from command_line import Parser, run_tool, worker_pool
+
 import characterise_blas  # noqa: F401
 import characterise_table as table
 import numpy as np
 from argument_types import check_results, folder_for_results, positive, whole
-from command_line import Parser, run_tool, worker_pool
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table

@@ -1,4 +1,7 @@
-"""For the tools: how a command line ends: what is wrong in one line, and Ctrl-C without a word, in its processes too."""
+"""For the tools: how a command line ends: what is wrong in one line, and Ctrl-C without a word, in its processes too.
+
+A tool imports this before all that takes long to import: from here on Ctrl-C ends it without a word.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context
+from pathlib import Path
+from types import FrameType
 from typing import NoReturn
 
 REASONS = {errno.EEXIST: "is a file; a folder is needed"}
@@ -33,8 +38,24 @@ def in_words(error: Exception) -> str:
     return str(error)
 
 
+def _end_at_once(number: int, frame: FrameType | None) -> NoReturn:
+    """Of a tool that is still being imported: it leaves nothing behind, and an exception would be lost in some of what it imports."""
+    os._exit(INTERRUPTED)
+
+
+def _is_tool(program: object) -> bool:
+    """Whether the program that runs is a tool: not a test that imports one, and none of the processes that a tool starts."""
+    return Path(getattr(program, "__file__", None) or "/").resolve().parent == Path(__file__).resolve().parent
+
+
+if _is_tool(sys.modules["__main__"]) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, _end_at_once)
+
+
 def run_tool(main: Callable[[], int | None]) -> NoReturn:
     """Ends with what the tool's `main` returns; Ctrl-C ends it in silence."""
+    if signal.getsignal(signal.SIGINT) is _end_at_once:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         sys.exit(main())
     except KeyboardInterrupt:

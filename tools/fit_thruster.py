@@ -18,9 +18,10 @@ import sys
 import tomllib
 from pathlib import Path
 
+from command_line import Parser, in_words, run_tool
+
 import numpy as np
 from argument_types import make_room
-from command_line import Parser, in_words, run_tool
 from scipy.optimize import nnls
 
 from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of, meant, read_toml

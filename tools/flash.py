@@ -24,6 +24,7 @@ from shlex import quote
 from typing import Any, NamedTuple
 
 from command_line import Parser, run_tool
+
 from flash_device import in_flight
 from flash_payload import Payload, PayloadError, make_payload
 from flash_ssh import LostError, Vehicle, VehicleError

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from command_line import Parser, run_tool
+
 from flash_files import RefusedError, carry_compiled, file_digest, remove, run, sync_folder, unpack, watcher, watches, write_whole
 from flash_units import GUARD, as_root, guard_unit, installed_units, release_units
 

@@ -18,9 +18,10 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from command_line import Parser, in_words, run_tool
+
 import cantools.database
 from cantools.database.can import c_source
-from command_line import Parser, in_words, run_tool
 
 from firmware_py.bus.codec import Codec, Field, MessageCodec
 from firmware_py.bus.codec.crc import TABLE

@@ -20,8 +20,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from argument_types import check_results, make_folder
 from command_line import Parser, in_words, run_tool
+
+from argument_types import check_results, make_folder
 from identify_excitation import MOTIONS, SPACE_M, check_space, excitation
 from identify_fit import Reference, fit
 from identify_log import Recording, read_recording

@@ -14,9 +14,10 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from command_line import Parser, in_words, run_tool, worker_pool
+
 import numpy as np
 from argument_types import check_results, make_folder, positive, whole
-from command_line import Parser, in_words, run_tool, worker_pool
 from fit_thruster import fit_curve
 from identify_excitation import MOTIONS, excitation
 from identify_fit import Reference, fit

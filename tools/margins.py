@@ -18,9 +18,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from command_line import Parser, in_words, run_tool, worker_pool
+
 import numpy as np
 from argument_types import check_results, make_folder, whole
-from command_line import Parser, in_words, run_tool, worker_pool
 from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure, read_off
 from rich import box
 from rich.console import Console

@@ -22,8 +22,9 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import NamedTuple
 
-from argument_types import whole
 from command_line import Parser, run_tool
+
+from argument_types import whole
 
 ROOT = Path(__file__).resolve().parents[1]
 TIMEOUT_S = 60

@@ -21,8 +21,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from argument_types import check_results, make_folder, positive, whole
 from command_line import INTERRUPTED, Parser, in_words, run_tool
+
+from argument_types import check_results, make_folder, positive, whole
 from tune_objective import Objective, detuned, load_objective, with_values
 
 from firmware_py.description.parameters import Parameters, load_parameters

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from command_line import worker_pool
+
 import numpy as np
 import optuna
-from command_line import worker_pool
 from loop_response import AXES, PERIOD_NS, STEP_TICKS, Response, margins, measure, step_responses
 from margins import bode
 from tune_objective import Objective

@@ -117,6 +117,32 @@ def test_interrupt_ends_a_tool_and_its_processes_without_a_word(tmp_path: Path, 
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
 
 
+IMPORTED = """
+import os, runpy, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell runs in the background ignores it
+
+
+class Presser:
+    def find_spec(self, name, path, target=None):
+        if name in ("numpy", "typer", "firmware_py"):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+sys.meta_path.insert(0, Presser())
+sys.path.insert(0, {tools!r})
+runpy.run_path({program!r}, run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize(
+    "tool", ["accept", "bench", "build_drag_table", "characterise", "identify", "identify_plants", "margins", "mutants", "tune_gains"]
+)
+def test_interrupt_ends_a_tool_without_a_word_while_it_imports(tool: str) -> None:
+    program = IMPORTED.format(tools=str(TOOLS), program=str(TOOLS / f"{tool}.py"))
+    ended = subprocess.run([sys.executable, "-c", program], start_new_session=True, capture_output=True, text=True, timeout=50)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
+
+
 @pytest.mark.parametrize("tool", sorted(path.stem for path in TOOLS.glob("*.py") if "Parser(" in path.read_text(encoding="utf-8")))
 def test_every_tool_that_reads_arguments_ends_alike(tool: str) -> None:
     text = (TOOLS / f"{tool}.py").read_text(encoding="utf-8")
