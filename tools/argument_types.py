@@ -51,19 +51,16 @@ def run_command(app: typer.Typer, name: str) -> int:
     return 2
 
 
-def make_folder(out: Path) -> None:
-    """Makes the folder of a tool's results and tries that it takes a file, before the minutes of the work. Raises DescriptionError."""
-    _try_folder(out, out)
-
-
 @contextmanager
 def folder_for_results(out: Path | None) -> Iterator[None]:
-    """`make_folder`, where there is to be one; what of it was made goes again where no result came. Raises DescriptionError."""
+    """Makes the folder of a tool's results, where there is to be one, and tries that it takes a file, before the minutes of the work.
+    What of it was made goes again where no result came. Raises DescriptionError.
+    """
     with ExitStack() as stack:
         if out is not None:
-            with suppress(OSError):  # make_folder says what is wrong
+            with suppress(OSError):  # _try_folder says what is wrong
                 stack.enter_context(made(out))
-            make_folder(out)
+            _try_folder(out, out)
         yield
 
 

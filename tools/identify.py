@@ -22,9 +22,9 @@ from pathlib import Path
 
 from command_line import Parser, in_words, run_tool
 
-from argument_types import check_results, make_folder
+from argument_types import check_results, folder_for_results
 from identify_excitation import MOTIONS, SPACE_M, check_space, excitation
-from identify_fit import Reference, fit
+from identify_fit import Fit, Reference, fit
 from identify_log import Recording, read_recording
 from identify_model import Equations, Weight
 from identify_motion import smooth
@@ -153,12 +153,17 @@ def identify(given: argparse.Namespace) -> int:
     check_fitted(vehicle)
     curve = read_curve(given.curve) if given.curve else vehicle.curve
     reference = reference_of(recordings[0], given.thruster, given.accuracy) if given.curve else None
-    make_folder(given.out)
-    check_results(given.out, "has_reference", *RESULTS)
-    flights = [Equations(recording, smooth(recording), curve, weight) for recording in recordings]
-    if weight is not None:
-        check_hung(weight, flights[0])
-    result = fit(flights, reference, weight is not None)
+    with folder_for_results(given.out):
+        check_results(given.out, "has_reference", *RESULTS)
+        flights = [Equations(recording, smooth(recording), curve, weight) for recording in recordings]
+        if weight is not None:
+            check_hung(weight, flights[0])
+        return leave(given, fit(flights, reference, weight is not None), recordings[0], curve)
+
+
+def leave(given: argparse.Namespace, result: Fit, recording: Recording, curve: ThrusterCurve) -> int:
+    """Prints and writes what was found with that curve; the exit status. Raises OSError."""
+    vehicle = recording.vehicle
     found, logs = findings(result, vehicle), ", ".join(given.logs)
     print_findings(found)
     wanted = missing(found)
@@ -177,7 +182,7 @@ def identify(given: argparse.Namespace) -> int:
         print(f"missing excitation: {motion}, for {', '.join(needing)}")
     if wanted:
         chosen = given.excitation or given.out / "excite.toml"
-        chosen.write_text(excitation(list(wanted), recordings[0].vehicle_name, given.space), encoding="utf-8")
+        chosen.write_text(excitation(list(wanted), recording.vehicle_name, given.space), encoding="utf-8")
         print(fly_it(chosen))
     return 1 if wanted else 0
 

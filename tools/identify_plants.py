@@ -17,7 +17,7 @@ from pathlib import Path
 from command_line import Parser, in_words, run_tool, worker_pool
 
 import numpy as np
-from argument_types import check_results, make_folder, positive, whole
+from argument_types import check_results, folder_for_results, positive, whole
 from fit_thruster import fit_curve
 from identify_excitation import MOTIONS, excitation
 from identify_fit import Reference, fit
@@ -121,9 +121,9 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/plants"), help="for logs and plants.json")
     given = parser.parse_args()
     try:
-        make_folder(given.out)
-        check_results(given.out, "covers", "plants.json")
-        found = examine_all(range(given.seed, given.seed + given.plants), given.jobs, given.out, given.seconds)
+        with folder_for_results(given.out):
+            check_results(given.out, "covers", "plants.json")
+            found = examine_all(range(given.seed, given.seed + given.plants), given.jobs, given.out, given.seconds)
     except (DescriptionError, OSError) as error:
         print(f"identify_plants: {in_words(error)}", file=sys.stderr)
         return 2

@@ -21,7 +21,7 @@ from typing import Any
 from command_line import Parser, in_words, run_tool, worker_pool
 
 import numpy as np
-from argument_types import check_results, make_folder, whole
+from argument_types import check_results, folder_for_results, whole
 from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure, read_off
 from rich import box
 from rich.console import Console
@@ -165,6 +165,17 @@ def bode(response: Response) -> tuple[np.ndarray, np.ndarray]:
     return gain, phase - 360.0 * round((phase[int(np.argmin(np.abs(gain)))] + 180.0) / 360.0)
 
 
+def leave(out: Path, found: Found) -> int:
+    """Prints the table and leaves margins.json and margins.png; the exit status. Raises OSError."""
+    table_rows = rows(found)
+    print_table(table_rows)
+    finite = [{k: v if not isinstance(v, float) or math.isfinite(v) else None for k, v in row.items()} for row in table_rows]
+    (out / "margins.json").write_text(json.dumps(finite, indent=2) + "\n", encoding="utf-8")
+    draw(out / "margins.png", found)
+    print(out / "margins.png")
+    return 0 if all(row["passed"] for row in table_rows) else 1
+
+
 def main() -> int:
     """The command line."""
     parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -177,19 +188,12 @@ def main() -> int:
     try:
         check_bodies(given.modules, given.vehicle)
         chosen = CONTROLLERS.get(given.controller) or load_parameters(Path(given.controller))
-        make_folder(given.out)
-        check_results(given.out, "crossover_rad_s", "margins.json", "margins.png")
-        found = measured(given.modules, chosen, given.vehicle, given.jobs)
+        with folder_for_results(given.out):
+            check_results(given.out, "crossover_rad_s", "margins.json", "margins.png")
+            return leave(given.out, measured(given.modules, chosen, given.vehicle, given.jobs))
     except (DescriptionError, OSError) as error:
         print(f"margins: {in_words(error)}", file=sys.stderr)
         return 2
-    table_rows = rows(found)
-    print_table(table_rows)
-    finite = [{k: v if not isinstance(v, float) or math.isfinite(v) else None for k, v in row.items()} for row in table_rows]
-    (given.out / "margins.json").write_text(json.dumps(finite, indent=2) + "\n", encoding="utf-8")
-    draw(given.out / "margins.png", found)
-    print(given.out / "margins.png")
-    return 0 if all(row["passed"] for row in table_rows) else 1
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from typing import Any
 
 from command_line import INTERRUPTED, Parser, in_words, run_tool
 
-from argument_types import check_results, make_folder, positive, whole
+from argument_types import check_results, folder_for_results, positive, whole
 from tune_objective import Objective, detuned, load_objective, with_values
 
 from firmware_py.description.parameters import Parameters, load_parameters
@@ -133,6 +133,18 @@ def arguments() -> argparse.Namespace:
     return given
 
 
+def begin(objective: Objective, start: Parameters, given: argparse.Namespace) -> int:
+    """Tunes the vehicle or on the bench; the exit status. Raises what makes it end before."""
+    if given.live:
+        from tune_live import tune_live
+
+        return tune_live(objective, given.live, given.trials, given.seconds or LOOK_S, given.out)
+    check_results(given.out, "search_seed", "tuning.json", "parameters.toml", "steps.png", "bode.png", "search.png")
+    with interrupted_once():
+        tune(objective, start, given, dask_cluster(given.dask) if given.dask else processes(given.jobs))
+    return 0
+
+
 def main() -> int:
     """The command line."""
     given = arguments()
@@ -141,14 +153,8 @@ def main() -> int:
         start = load_parameters(given.start) if given.start else Parameters()
         if given.detune is not None:
             start = detuned(objective, start, DETUNED, given.detune)
-        make_folder(given.out)
-        if given.live:
-            from tune_live import tune_live
-
-            return tune_live(objective, given.live, given.trials, given.seconds or LOOK_S, given.out)
-        check_results(given.out, "search_seed", "tuning.json", "parameters.toml", "steps.png", "bode.png", "search.png")
-        with interrupted_once():
-            tune(objective, start, given, dask_cluster(given.dask) if given.dask else processes(given.jobs))
+        with folder_for_results(given.out):
+            return begin(objective, start, given)
     except (DescriptionError, OSError) as error:
         print(f"tune_gains: {in_words(error)}", file=sys.stderr)
         return 2
@@ -158,7 +164,6 @@ def main() -> int:
     except KeyboardInterrupt:
         print(f"tune_gains: interrupted; the same command with --out {given.out} goes on where it was", file=sys.stderr)
         return INTERRUPTED
-    return 0
 
 
 if __name__ == "__main__":

@@ -171,9 +171,12 @@ def test_flight_that_only_holds_its_place_is_told_what_to_fly(
     assert wanted.task.yaw_turns and wanted.task.amplitude_m.any()
 
 
-def test_log_of_five_seconds_is_refused(flown: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, str(flown)) == 2
+def test_log_of_five_seconds_is_refused_and_leaves_no_empty_folder(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, str(flown), "--out", str(tmp_path / "a" / "b")) == 2
     assert "at least 10 s are needed" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("seed", [0, 4])

@@ -221,6 +221,22 @@ def test_refusal_leaves_no_empty_folder(run: Run, arguments: list[str], tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("tool", "arguments"),
+    [("margins", []), ("identify_plants", []), ("tune_gains", [str(TOOLS / "objectives" / "hover.toml")])],
+)
+def test_work_that_does_not_begin_leaves_no_empty_folder(run: Run, tool: str, arguments: list[str], tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="it began"):
+        run(tool, *arguments, "--out", str(tmp_path / "a" / "b"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("live", ["udp:1", "mavlink:"])
+def test_vehicle_without_an_address_leaves_no_empty_folder(run: Run, live: str, tmp_path: Path) -> None:
+    assert run("tune_gains", str(TOOLS / "objectives" / "hover.toml"), "--live", live, "--out", str(tmp_path / "a" / "b")) == 2
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_tables_of_the_readme_need_the_project_s_root(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for missing in ("README.md", "docs/figures.md"):
         assert run("readme_tables") == 2
