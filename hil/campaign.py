@@ -29,7 +29,7 @@ from firmware_py.description.vehicle import load_vehicle
 from firmware_py.runtime.disk import writing_to
 from hil.campaign_summary import Trial, summarise, table_of
 from hil.checks import Result
-from hil.flight import fly_and_judge
+from hil.flight import LOGS, fly_and_judge
 from hil.metrics import OUTCOMES
 from hil.plant.world_parameters import world_parameters
 from hil.replaceable import check_replaceable, is_json_with, made
@@ -106,11 +106,11 @@ def run_campaign(
 ) -> dict[str, Any]:
     """Flies every seed that `out` does not hold yet; writes campaign.json and trials.csv there; returns what the first holds.
 
-    Raises DescriptionError where `out` holds another campaign, which `anew` throws away, or files that are no campaign's, and for seeds
-    that kill their workers; OSError where the disk takes no more.
+    Raises DescriptionError where `out` holds another campaign, which `anew` throws away, a flight, or files that are no campaign's, and
+    for seeds that kill their workers; OSError where the disk takes no more.
     """
     with made(out), writing_to(out):
-        check_replaceable(out, (SUMMARY_FILE, TABLE_FILE), is_json_with(out / TRIALS_FILE, OWNER), "campaign")
+        check_replaceable(out, (SUMMARY_FILE, TABLE_FILE, *LOGS), is_json_with(out / TRIALS_FILE, OWNER), "campaign")
         with TrialFile(out / TRIALS_FILE, identity(scenario, parameters), anew=anew) as file:
             missing = [seed for seed in seeds if seed not in file.trials]
             for trial in _flown(scenario, parameters, missing, pool):

@@ -21,6 +21,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from hil.bench import fly_scenario
 from hil.fault_table import AT_S, NUMBER, PLACED, ROWS, Row
+from hil.flight import LOGS
 from hil.metrics import rotation_vectors
 from hil.replaceable import check_replaceable, is_json_with, made
 from hil.scenario import MODES, Scenario, load_scenario
@@ -130,10 +131,10 @@ def run_fault_campaign(
 ) -> list[Cell]:
     """Flies every cell and writes faults.json into `out`; returns the cells, row by row. `executor` replaces the processes.
 
-    Raises DescriptionError where `out` holds a faults.json that is none.
+    Raises DescriptionError where `out` holds a flight, or a faults.json that is none.
     """
     with made(out):
-        check_replaceable(out, (RESULT_FILE,), is_json_with(out / RESULT_FILE, "promise"), "campaign of faults")
+        check_replaceable(out, (RESULT_FILE, *LOGS), is_json_with(out / RESULT_FILE, "promise"), "campaign of faults")
         cells: list[Cell] = []
         with executor or ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             futures = [pool.submit(fly_cell, row, mode, seed) for row in ROWS for mode in MODES]

@@ -37,6 +37,7 @@ from hil.truth_log import TRUTH_LOG, is_truth_log
 
 LEFT_BEHIND = (RESULT_FILE, REPORT_FILE, DOCK_PLOT, *(f"{name}.png" for name in PLOTS))
 """What an earlier flight may have left in a folder, beside the logs, which are written anew."""
+LOGS = (CAN_LOG, SIGNAL_LOG, TRUTH_LOG)
 LATE_SHARE = 0.01
 """Of the ticks of a run in real time, frames of which may be lost on a bus with others on it."""
 ARMED_AT_ALL = 0.01
@@ -77,7 +78,7 @@ def fly_and_judge(
 def check_folder(folder: Path) -> None:
     """Raises DescriptionError where a flight into `folder` would write over what no flight left there."""
     is_flight = is_truth_log(folder / TRUTH_LOG) or is_json_with(folder / RESULT_FILE, "checks")
-    check_replaceable(folder, (CAN_LOG, SIGNAL_LOG, TRUTH_LOG, *LEFT_BEHIND), is_flight, "flight of the bench")
+    check_replaceable(folder, (*LOGS, *LEFT_BEHIND), is_flight, "flight of the bench")
 
 
 def _clear(folder: Path) -> None:

@@ -220,7 +220,9 @@ def test_plant_whose_bus_is_refused_leaves_no_folder(tmp_path: Path, monkeypatch
         (["run", "hover"], "result.json", "flight of the bench"),
         (["run", "hover"], "truth.mcap", "flight of the bench"),
         (["campaign", "hover"], "trials.csv", "campaign"),
+        (["campaign", "hover"], "can.log", "campaign"),
         (["campaign", "faults"], "faults.json", "campaign of faults"),
+        (["campaign", "faults"], "truth.mcap", "campaign of faults"),
         (["plant", "hover", "--bus", "udp:239.74.163.9:43119"], "truth.mcap", "plant"),
     ],
 )
