@@ -202,7 +202,7 @@ def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str |
     for key in table:
         if key not in fields:
             known = ", ".join(sorted(fields))
-            raise source.error((*keys, key), f"unknown key; {meant(key, fields)}permitted here: {known}")
+            raise source.error((*keys, key), f"unknown key; {meant(key, fields) or _helped(key, cls)}permitted here: {known}")
     values: dict[str, Any] = {}
     for name, field in fields.items():
         if name in table:
@@ -213,6 +213,12 @@ def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str |
         return cls(**values)
     except DescriptionError as error:
         raise source.error(keys, str(error), error.keys) from None
+
+
+def _helped(word: str, cls: type) -> str:
+    """A question after the one field whose help speaks of that word; empty where none does, or several do."""
+    told = [field.name for field in dataclasses.fields(cls) if word in re.findall(r"\w+", limits_of(cls, field.name).help)]
+    return f"did you mean {told[0]}? " if len(told) == 1 else ""
 
 
 def describe(limits: Limits) -> str:
