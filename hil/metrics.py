@@ -28,6 +28,10 @@ class Shown(NamedTuple):
     scale: float = 1.0
     digits: int = 2
     words: tuple[str, ...] = ()
+    low: float = 0.0
+    """Least value that a flight can have, before it is scaled."""
+    high: float = math.inf
+    """Largest."""
 
 
 OUTCOMES = ("as asked", "jammed", "unstable control", "refused", "gave up")
@@ -40,19 +44,19 @@ SHOWN = {
     "estimate_position_rmse_m": Shown("Position RMSE, estimate against truth", "mm", 1e3),
     "estimate_attitude_rmse_rad": Shown("Attitude RMSE, estimate against truth", "deg", math.degrees(1.0)),
     "nis_mean": Shown("Tag NIS per degree of freedom (ideal: 1)"),
-    "sigma3_share": Shown("Truth within 3 sigma, worst axis", "%", 100.0, 1),
-    **{f"sigma3_share_{axis}": Shown(f"Truth within 3 sigma, {axis}", "%", 100.0, 1) for axis in AXES},
+    "sigma3_share": Shown("Truth within 3 sigma, worst axis", "%", 100.0, 1, high=1.0),
+    **{f"sigma3_share_{axis}": Shown(f"Truth within 3 sigma, {axis}", "%", 100.0, 1, high=1.0) for axis in AXES},
     "thrust_rms_n": Shown("Thruster command, RMS", "N"),
     "thrust_rate_rms_n_s": Shown("Thruster command, rate of change, RMS", "N/s"),
     "supply_power_w": Shown("Electrical power of all modules, mean", "W"),
-    "wrench_margin_min": Shown("Thrust reserve, worst thruster and tick", "%", 100.0, 1),
+    "wrench_margin_min": Shown("Thrust reserve, worst thruster and tick", "%", 100.0, 1, low=-math.inf),
     "tags_rejected": Shown("Tag observations rejected by the gate", digits=0),
-    "armed_share": Shown("Time armed, share of the judged part", "%", 100.0, 1),
-    "docked": Shown("Docked and undocked as asked", words=("no", "yes")),
-    "gap_min_m": Shown("Gap between facing faces, smallest", "mm", 1e3),
+    "armed_share": Shown("Time armed, share of the judged part", "%", 100.0, 1, high=1.0),
+    "docked": Shown("Docked and undocked as asked", words=("no", "yes"), high=1.0),
+    "gap_min_m": Shown("Gap between facing faces, smallest", "mm", 1e3, low=-math.inf),
     "tries": Shown("Contacts of a probe with a funnel", digits=0),
     "jams": Shown("Jammed contacts", digits=0),
-    "outcome": Shown("Docking outcome", words=OUTCOMES),
+    "outcome": Shown("Docking outcome", words=OUTCOMES, high=len(OUTCOMES) - 1),
     "false_declarations": Shown("False declarations of a dock", digits=0),
     "docked_rmse_m": Shown("Position RMSE of docked bodies", "mm", 1e3),
     "join_jump_n": Shown("Thruster step when bodies join, largest", "N"),
@@ -91,7 +95,7 @@ def _force_shown(metric: str) -> Shown | None:
     of = f"{body} module{'' if body == 'one' else 's'}, {jets}"
     if what == "rmse":
         return Shown(f"Force RMSE per module, {of}", "N")
-    return Shown(f"Force fit, degree {degree}, {of}", digits=4)
+    return Shown(f"Force fit, degree {degree}, {of}", digits=4, low=-math.inf)
 
 
 def shown_value(metric: str, value: float) -> str:

@@ -13,11 +13,11 @@ from firmware_py.description.schema import is_file_name, limits_of, meant
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
-from hil.metrics import DOCKING, SHOWN
+from hil.metrics import DOCKING, SHOWN, shown
 from hil.starts import hulls_in_walls
 
 if TYPE_CHECKING:
-    from hil.scenario import Scenario
+    from hil.scenario import Check, Scenario
 
 ARM_FROM_S = 1.0
 """First attempt to arm, by whoever flies the scenario: the pose needs a few tags."""
@@ -200,6 +200,16 @@ def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
             yield ("check", i, "metric"), f"{check.metric} has neither low nor high; every value would pass"
         if check.low > check.high:
             yield ("check", i, "low"), f"{check.low:g} is above high, {check.high:g}; no value would pass"
+        yield from ((("check", i, key), what) for key, what in _out_of_reach(check))
+
+
+def _out_of_reach(check: Check) -> Iterator[tuple[str, str]]:
+    """A bound beyond all that a flight can have."""
+    can = shown(check.metric)
+    if check.high < can.low:
+        yield "high", f"{check.high:g}, and {check.metric} is {can.low:g} or more; no value would pass"
+    if check.low > can.high:
+        yield "low", f"{check.low:g}, and {check.metric} is {can.high:g} or less; no value would pass"
 
 
 RULES = (
