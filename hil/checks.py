@@ -50,7 +50,7 @@ class Check(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What a run came to, as result.json holds it, less `told`."""
+    """What a run came to, as result.json holds it, less `told` and `unseen`."""
 
     scenario: str
     seed: int
@@ -61,6 +61,8 @@ class Result(NamedTuple):
     """Warnings of the firmware, a line each (hil.metrics.told)."""
     unusual: tuple[str, ...] = ()
     """What flew otherwise than the scenario has it: vehicle, controller, sensors."""
+    unseen: str = ""
+    """Why no tag was seen in a flight that could not be flown for that, in words."""
 
     @property
     def flown(self) -> str:

@@ -125,5 +125,7 @@ def print_result(result: Result, report: Path | None = None, console: Console | 
     failed = [shown(c.name).label for c in result.checks if not c.passed]
     verdict = f"FAILED: {'; '.join(failed)}" if failed else "passed" if result.passed else "FAILED: nothing was checked"
     console.print(verdict, style="green" if result.passed else "bold red", highlight=False)
+    if result.unseen:
+        console.print(result.unseen, highlight=False, markup=False, soft_wrap=True)
     if report is not None:
         console.print(f"report: {report}", highlight=False, soft_wrap=True)

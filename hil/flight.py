@@ -125,7 +125,23 @@ def judge_logs(
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
     always = [Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"])), *_armed_at_all(scenario, whole, folder)]
-    return judge(scenario.name, seed, metrics, [*scenario.checks, *always], told(whole.events, start_of(whole)))
+    result = judge(scenario.name, seed, metrics, [*scenario.checks, *always], told(whole.events, start_of(whole)))
+    return result if result.passed else result._replace(unseen=unseen(scenario, whole))
+
+
+def unseen(scenario: Scenario, whole: Flight) -> str:
+    """Why no tag was seen in the `whole` flight, in words; empty where one was, or the robot was armed without."""
+    if whole.placed.any() or np.isin(whole.firmware["state"], list(ARMED)).any():
+        return ""
+    without = [module.vehicle for module in scenario.module if not load_vehicle(module.vehicle).tag]
+    tags = ", ".join(map(str, scenario.tags))
+    if not scenario.camera:
+        why = "the scenario has no [[camera]]"
+    elif len(without) == len(scenario.module):
+        why = f"the vehicle {without[0]} carries none"
+    else:
+        why = f"no [[camera]] read a tag of tags = [{tags}]; position_m, axis and half_view_deg tell what it sees"
+    return f"no tag was ever seen, and without a pose the robot is not armed: {why}"
 
 
 def _armed_at_all(scenario: Scenario, whole: Flight, folder: Path) -> list[Limit]:

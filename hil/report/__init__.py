@@ -88,7 +88,7 @@ def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plo
         "headline": _headline(result, scene),
         "tiles": _tiles(result),
         "table": _table(result),
-        "told": _told(result.told),
+        "told": _told(result),
         "plots": "\n".join(_plot(path) for path in plots),
         "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in (NOT_MEASURED, *scene.notes)),
         "style": _asset("style.css"),
@@ -223,10 +223,11 @@ def _table(result: Result) -> str:
     return "\n".join(rows)
 
 
-def _told(told: Sequence[str]) -> str:
-    """Warnings of the firmware, under the table; nothing where there is none."""
-    lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in told)
-    return f"<h3>Warnings of the firmware</h3>\n<ul>\n{lines}\n</ul>" if told else ""
+def _told(result: Result) -> str:
+    """What a flight lacked, and the firmware's warnings, under the table; nothing where there is none."""
+    lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in result.told)
+    lacked = [f"<p>{html.escape(result.unseen)}</p>"] if result.unseen else []
+    return "\n".join([*lacked, *([f"<h3>Warnings of the firmware</h3>\n<ul>\n{lines}\n</ul>"] if lines else [])])
 
 
 def _plot(path: Path) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from firmware_py.app.firmware import Firmware
@@ -14,8 +15,10 @@ from firmware_py.bus.codec import Frame
 from firmware_py.core.types import Action, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
+from hil.console import print_result
 from hil.flight import judge_logs
 from hil.plant.fault_spec import Fault
+from hil.plant.spec import CameraPose
 from hil.scenario import load_scenario
 from tests.closed_loop.broken_vehicles import failed, reversed_thruster, turned_tags
 from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
@@ -95,6 +98,29 @@ def test_robot_that_does_as_it_likes_fails_the_flight_however_well_it_does_it(
 def test_robot_that_never_armed_fails_where_nothing_else_is_checked(fly: Fly, deaf: Callable[..., None], name: str) -> None:
     deaf(Action.ARM)
     assert failed(fly(dataclasses.replace(shortened(name, 4.0, settle_s=2.0), check=()))) == {"armed_share"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "vehicle", "why"),
+    [
+        ({"camera": ()}, "modcube", "the scenario has no [[camera]]"),
+        ({"camera": (CameraPose(axis=np.array([0.0, 0.0, -1.0])),)}, "modcube", "no [[camera]] read a tag of tags = [0, 1, 2, 3, 4, 5]; p"),
+        ({}, "girona500", "the vehicle girona500 carries none"),
+    ],
+)
+def test_robot_that_no_camera_saw_is_said_to_lack_a_tag(
+    fly: Fly, changes: dict[str, Any], vehicle: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = fly(dataclasses.replace(shortened("mobius-1", 1.0, settle_s=2.0), **changes).with_vehicle(vehicle))
+    print_result(result)
+    assert f"no tag was ever seen, and without a pose the robot is not armed: {why}" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_robot_that_is_seen_and_never_armed_lacks_no_tag(fly: Fly, deaf: Callable[..., None]) -> None:
+    deaf(Action.ARM)
+    assert fly(shortened("hover", 1.0, settle_s=2.0)).unseen == ""
 
 
 @pytest.mark.slow

@@ -346,6 +346,7 @@ def test_table_and_report_say_what_the_firmware_warned_of(flight: Flight, result
     assert "thruster 4" in shown and "thruster 5" not in shown and "and 2 more" in shown
     page = write_report(tmp_path, warned, flight, scene(), []).read_text()
     assert "<li>5.5 s: thruster 6 &lt;weak&gt;</li>" in page
+    assert "<p>no tag &lt;5&gt;</p>" in write_report(tmp_path, result._replace(unseen="no tag <5>"), flight, scene(), []).read_text()
     assert "Warnings of the firmware</h3>" not in write_report(tmp_path, result, flight, scene(), []).read_text()
 
 
