@@ -217,4 +217,4 @@ def lines_of(findings: Sequence[Finding]) -> list[str]:
             lines.append(f"      {'':14s} -> {finding.advice}")
     failed = sum(finding.state == FAILED for finding in findings)
     warned = sum(finding.state == WARNING for finding in findings)
-    return [*lines, f"{failed} failed, {warned} warnings" if failed or warned else "all is well"]
+    return [*lines, f"{failed} failed, {warned} warning{'s' * (warned != 1)}" if failed or warned else "all is well"]

@@ -130,6 +130,7 @@ def test_every_complaint_comes_with_advice_beneath_it() -> None:
     lines = lines_of([check_disk(Path(), 0), check_interface("can0", lambda name: shown())])
     assert lines[1].strip().startswith("-> ")
     assert lines[-1] == "1 failed, 0 warnings"
+    assert lines_of([check_disk(Path(), 10**9)])[-1] == "0 failed, 1 warning"
     assert lines_of([check_interface("can0", lambda name: shown())])[-1] == "all is well"
 
 
