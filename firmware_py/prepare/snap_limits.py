@@ -6,8 +6,10 @@ is solved again, so that the limits hold everywhere and not at samples alone.
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 
 import numpy as np
@@ -246,7 +248,8 @@ class _Problem:
         solver = osqp.OSQP()
         solver.setup(self._form, self._linear, scaled, low, high, **_SOLVER)
         solver.warm_start(x=self._warm)
-        result = solver.solve(raise_error=False)
+        with redirect_stdout(io.StringIO()):  # "Polishing not needed" comes whatever verbose says (osqp/osqp issue 785)
+            result = solver.solve(raise_error=False)
         if result.info.status_val not in (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE):
             certificate = result.prim_inf_cert
             known = certificate is not None and len(certificate) == len(index) and np.all(np.isfinite(certificate))

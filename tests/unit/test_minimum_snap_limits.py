@@ -231,3 +231,10 @@ def test_velocity_where_the_path_rests_is_refused(k: int) -> None:
         plan(waypoints, 10.0)
     waypoints[k] = dataclasses.replace(waypoints[k], velocity_w=np.zeros(3))
     assert plan(waypoints, 10.0).duration_s == pytest.approx(10.0)
+
+
+def test_solver_that_need_not_polish_says_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    """In the terminal of a flight, among what the robot says."""
+    points = [Waypoint(np.array([0.0, 0.0, 0.5])), Waypoint(np.array([1.0, 0.0, 0.5]), stop=True), Waypoint(np.array([1.0, 1.0, 0.5]))]
+    assert plan(points, None, Limits(velocity=np.full(3, 1.5))).method == "osqp"
+    assert capfd.readouterr().out == ""
