@@ -124,7 +124,7 @@ class Device:
         # The release is renamed when it is whole, so nothing in it may know its own path.
         command.write_text(
             '#!/bin/sh\nhere=$(dirname "$(readlink -f "$0")")\n'
-            'exec "$here/python" -I -c "import sys; from firmware_py.cli import main; sys.exit(main())" "$@"\n'
+            'exec "$here/python" -I -c "from firmware_py.__main__ import main; main()" "$@"\n'
         )
         command.chmod(0o755)
         return packages

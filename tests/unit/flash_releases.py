@@ -16,7 +16,7 @@ def wheel(folder: Path, release: str) -> Path:
     path = folder / f"modcube-{release.replace('-', '_')}-py3-none-any.whl"
     files = {
         "firmware_py/__init__.py": "",
-        "firmware_py/cli.py": f"def main():\n    print({release!r})\n    return 0\n" + "#" * 2000,
+        "firmware_py/__main__.py": f"def main():\n    print({release!r})\n" + "#" * 2000,
         "firmware_py/deploy/modcube.service": unit_of(release),
         "modcube-1.data/purelib/extra.py": "",
         "modcube-1.data/scripts/left_out": "",
