@@ -27,7 +27,7 @@ from command_line import Parser, run_tool
 
 from flash_device import in_flight
 from flash_payload import Payload, PayloadError, make_payload
-from flash_ssh import LostError, Vehicle, VehicleError
+from flash_ssh import LostError, UntouchedError, Vehicle, VehicleError
 
 UNPACKED = 4.0
 """Bytes on the vehicle's disk per byte of wheel, compiled code included (3.3 measured)."""
@@ -129,6 +129,8 @@ def flash(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[str], None
     payload = make_payload(target.machine, target.version, given.cache, given.offline)
     check_room(vehicle, target, payload)
     if given.dry_run:
+        if was_flashed(vehicle):
+            check_disarmed(vehicle, vehicle.device("status")["service"], given.armed)
         size = payload.size_bytes / 1e6
         say(f"dry run: would install {payload.release} ({len(payload.wheels)} wheels, {size:.0f} MB) in {vehicle.root}")
         return 0
@@ -138,11 +140,15 @@ def flash(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[str], None
 
 
 def switch(vehicle: Vehicle, say: Callable[[str], None], command: str, given: Mapping[str, Any]) -> int:
-    """Has the vehicle activate or roll back; returns the exit status: nobody can say any more that nothing was changed."""
+    """Has the vehicle activate or roll back; returns the exit status. Raises UntouchedError where it refused before it began: of all
+    else nobody can say any more that nothing was changed.
+    """
     try:
         release = vehicle.device(command, given)
     except LostError as error:
         return refuse(f"{error}; the vehicle goes on by itself: see --status", 1)
+    except UntouchedError:
+        raise
     except VehicleError as error:
         return refuse(str(error), 1)
     say(f"{vehicle.host} runs {release}")
@@ -161,10 +167,21 @@ def status_lines(vehicle: Vehicle) -> list[str]:
     return [*lines, f"report    {service.get('StatusText') or 'none'}"]
 
 
+def was_flashed(vehicle: Vehicle) -> bool:
+    """Whether there is anything on it to ask. Raises VehicleError."""
+    return bool(vehicle.shell(f"test -e {quote(vehicle.root)}/flash/flash_device.py && echo yes || true").strip())
+
+
+def check_disarmed(vehicle: Vehicle, service: dict[str, str], armed: bool) -> None:
+    """Raises FlashError where its service may not be stopped, unless it may even `armed`."""
+    if not armed and (line := in_flight(service)):
+        raise FlashError(f"{vehicle.host}: {line}")
+
+
 def look_or_go_back(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[str], None]) -> int:
     """--status and --rollback; returns the exit status. Raises VehicleError and FlashError."""
     inspect(vehicle, given.python)
-    if not vehicle.shell(f"test -e {quote(vehicle.root)}/flash/flash_device.py && echo yes || true").strip():
+    if not was_flashed(vehicle):
         raise FlashError(f"{vehicle.host}: nothing was ever flashed to {vehicle.root}")
     if given.status:
         for line in status_lines(vehicle):
@@ -173,8 +190,7 @@ def look_or_go_back(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[
     found = vehicle.device("status")
     if not found["previous"] and not found["trial"]:
         raise FlashError(f"{vehicle.host}: there is no earlier release to go back to")
-    if not given.armed and (line := in_flight(found["service"])):
-        raise FlashError(f"{vehicle.host}: {line}")
+    check_disarmed(vehicle, found["service"], given.armed)
     return switch(vehicle, say, "rollback", {"armed": given.armed})
 
 

@@ -29,7 +29,19 @@ from typing import Any
 
 from command_line import Parser, run_tool
 
-from flash_files import RefusedError, carry_compiled, file_digest, remove, run, sync_folder, unpack, watcher, watches, write_whole
+from flash_files import (
+    RefusedError,
+    UntouchedError,
+    carry_compiled,
+    file_digest,
+    remove,
+    run,
+    sync_folder,
+    unpack,
+    watcher,
+    watches,
+    write_whole,
+)
 from flash_units import GUARD, as_root, guard_unit, installed_units, release_units
 
 SERVICE = "modcube.service"
@@ -266,9 +278,9 @@ class Device:
         return dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
 
     def check_disarmed(self) -> None:
-        """Raises RefusedError where the service controls an armed vehicle, or does not say that it controls none."""
+        """Raises UntouchedError where the service controls an armed vehicle, or does not say that it controls none."""
         if line := in_flight(self.service()):
-            raise RefusedError(line)
+            raise UntouchedError(line)
 
     def prune(self) -> None:
         """Removes releases beyond KEPT_RELEASES, and wheels that none of the rest needs."""
@@ -395,7 +407,8 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
 def main(words: Sequence[str] | None = None) -> int:
     """flash_device.py ROOT COMMAND, with the command's JSON on standard input where it takes any.
 
-    Prints one line of JSON: {"error": line} or the command's result. Exit status 0 or 1; 2 where the words are wrong.
+    Prints one line of JSON: {"error": line, "untouched": whether nothing was begun} or the command's result. Exit status 0 or 1; 2 where
+    the words are wrong.
     """
     # A lost connection must not end what it began.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -407,7 +420,7 @@ def main(words: Sequence[str] | None = None) -> int:
         with alone(device.root, command):
             answer = {"result": perform(device, command, given)}
     except (RefusedError, OSError) as error:
-        answer = {"error": str(error)}
+        answer = {"error": str(error), "untouched": isinstance(error, UntouchedError)}
     if command in ("activate", "rollback"):
         write_whole(device.root / "last.json", json.dumps(answer))
     with contextlib.suppress(BrokenPipeError):
@@ -442,7 +455,7 @@ def alone(root: Path, command: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise RefusedError("somebody else is flashing this vehicle") from None
+            raise UntouchedError("somebody else is flashing this vehicle") from None
         yield
 
 

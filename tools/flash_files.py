@@ -26,6 +26,10 @@ class RefusedError(Exception):
     """Something cannot be done; one line."""
 
 
+class UntouchedError(RefusedError):
+    """It was not begun: everything runs as before."""
+
+
 def unpack(wheel: Path, packages: Path) -> None:
     """A wheel's files into a site-packages folder (PEP 427); scripts and headers are left out."""
     with zipfile.ZipFile(wheel) as archive:

@@ -43,6 +43,10 @@ class VehicleError(Exception):
     """The vehicle cannot be reached, or refused; one line."""
 
 
+class UntouchedError(VehicleError):
+    """The vehicle refused before it began anything: it runs as before."""
+
+
 class LostError(VehicleError):
     """The connection went while a command ran: what it began may go on."""
 
@@ -106,7 +110,7 @@ class Vehicle:
         except LostError:
             raise
         except VehicleError as error:
-            raise VehicleError(_device_error(str(error))) from None
+            raise _refusal(str(error)) from None
         try:
             return json.loads(text.splitlines()[-1])["result"]
         except (ValueError, KeyError, IndexError):
@@ -123,12 +127,13 @@ class Vehicle:
         return VehicleError(said[-1] if said else f"{self.host}: a command ended with {status}")
 
 
-def _device_error(text: str) -> str:
-    """The line in flash_device.py's own answer, or the text as it is."""
+def _refusal(text: str) -> VehicleError:
+    """With the line in flash_device.py's own answer, or the text as it is."""
     try:
-        return str(json.loads(text)["error"])
-    except (ValueError, KeyError, TypeError):
-        return text
+        answer = json.loads(text)
+        return (UntouchedError if answer.get("untouched") else VehicleError)(str(answer["error"]))
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return VehicleError(text)
 
 
 def _anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:

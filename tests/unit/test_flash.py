@@ -8,6 +8,7 @@ import stat
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import flash
 import flash_device
@@ -183,7 +184,7 @@ def test_vehicle_that_is_or_may_be_armed_is_left_alone_unless_told_otherwise(
     assert put(GOOD) == put(BETTER) == 0
     (fake / "armed").write_text(report)
     restarts = (fake / "restarts").read_text()
-    for words in ((), ("--rollback",)):
+    for words in ((), ("--rollback",), ("--dry-run",)):
         capsys.readouterr()
         assert put("2.0-new", *words) == 2
         error = capsys.readouterr().err
@@ -191,6 +192,23 @@ def test_vehicle_that_is_or_may_be_armed_is_left_alone_unless_told_otherwise(
     assert current(fake) == BETTER and (fake / "restarts").read_text() == restarts
     assert put("2.0-new", "--armed") == 0 and current(fake) == "2.0-new"
     assert put("2.0-new", "--rollback", "--armed") == 0 and current(fake) == BETTER
+
+
+@pytest.mark.slow
+def test_vehicle_that_is_armed_at_the_last_look_is_left_as_it_was(
+    put: Callable[..., int], fake: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert put(GOOD) == 0
+    ship, restarts = flash.ship, (fake / "restarts").read_text()
+
+    def ship_and_arm(*given: Any) -> None:
+        ship(*given)
+        (fake / "armed").write_text("armed=1/1")
+
+    monkeypatch.setattr(flash, "ship", ship_and_arm)
+    assert put(BETTER) == 2
+    assert capsys.readouterr().err.startswith("flash: 1/1 modules are armed, and its service would be stopped")
+    assert current(fake) == GOOD and (fake / "restarts").read_text() == restarts
 
 
 def test_dry_run_changes_nothing(put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str]) -> None:
