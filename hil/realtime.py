@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import recording_times
 from firmware_py.app.firmware import compose
-from firmware_py.app.observers import Observer, recording
+from firmware_py.app.observers import Observer, recording, recording_buses
 from firmware_py.app.realtime import open_loop
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Outputs, Request
@@ -136,7 +136,8 @@ def fly_in_real_time(
         refused = stack.enter_context(real_time())
         loop = open_loop(stack, firmware, requests)
         times = recording_times(recorder, loop.rate_keeper, rate_hz)
-        loop.observers = [recording(recorder, rate_hz), times, lambda *_: check(), *observers]
+        buses = recording_buses(recorder, loop.ports, rate_hz)
+        loop.observers = [recording(recorder, rate_hz), times, buses, lambda *_: check(), *observers]
         use_priority(TICK_PRIORITY)
         stack.enter_context(quiet_garbage())
         handshake.begin.set()

@@ -53,6 +53,19 @@ def recording(recorder: Recorder, rate_hz: int) -> Observer:
     return observe
 
 
+def recording_buses(recorder: Recorder, ports: Sequence[Port], rate_hz: int) -> Observer:
+    """An observer that writes once a second to `recorder` what ports count."""
+    for bus, port in enumerate(ports):
+        recorder.expect_bus(bus, port.faults)
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        if outputs.tick % rate_hz == 0:
+            for bus, port in enumerate(ports):
+                recorder.record_bus(bus, outputs.tick, outputs.time_ns, port.faults)
+
+    return observe
+
+
 def watching_buses(ports: Sequence[Port], rate_hz: int) -> Observer:
     """An observer that looks once a second at what ports count, and warns of every kind that grows and did not in the second before."""
     counted = [dict(port.faults) for port in ports]

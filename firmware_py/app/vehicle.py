@@ -15,8 +15,8 @@ from firmware_py.app.estop_note import EstopNote, estop_stands, noting_estop
 from firmware_py.app.firmware import Firmware, compose, vehicles_of
 from firmware_py.app.last_flight import RECENT_NS, LastFlight, last_flight, outdate, to_arm
 from firmware_py.app.live_view import LiveView
-from firmware_py.app.observers import Observer, recording, telling, watching_buses
-from firmware_py.app.realtime import open_loop
+from firmware_py.app.observers import Observer, recording, recording_buses, telling, watching_buses
+from firmware_py.app.realtime import RealTimeLoop, open_loop
 from firmware_py.app.service import reporting
 from firmware_py.core.body import Body
 from firmware_py.core.transitions import State
@@ -30,7 +30,6 @@ from firmware_py.runtime.clock import boot_id, unix_ns
 from firmware_py.runtime.interrupts import endings_of_a_run, handled
 from firmware_py.runtime.log_folder import make_log_folder
 from firmware_py.runtime.notify import Notifier
-from firmware_py.runtime.rate_keeper import RateKeeper
 from firmware_py.runtime.realtime import (
     GROUND_PRIORITY,
     TICK_PRIORITY,
@@ -173,7 +172,7 @@ def run_vehicle(
             teller.say(f"warning: {line}")
         loop = open_loop(stack, firmware, requests)
         buses = watching_buses(loop.ports, fleet.rate_hz)
-        loop.observers = [*observers, *_watching(loop.rate_keeper, fleet.rate_hz, recorder, side, notifier), buses, *told]
+        loop.observers = [*observers, *_watching(loop, fleet.rate_hz, recorder, side, notifier), buses, *told]
         use_priority(TICK_PRIORITY)
         move_to_own_processor()
         loop.listen()
@@ -255,13 +254,15 @@ def _forget_failed_start(recorder: Recorder, folder: Path, out: Path) -> None:
 
 
 def _watching(
-    keeper: RateKeeper, rate_hz: int, recorder: Recorder | None, side: GroundSide | None, notifier: Notifier | None
+    loop: RealTimeLoop, rate_hz: int, recorder: Recorder | None, side: GroundSide | None, notifier: Notifier | None
 ) -> Iterator[Observer]:
-    """How ticks keep their deadlines, for the log, ground stations and the service manager."""
+    """How ticks keep their deadlines, for the log, ground stations and the service manager, and what ports count, for the log."""
+    keeper = loop.rate_keeper
     if side is not None:
         side.keeper = keeper
     if recorder is not None:
         yield recording_times(recorder, keeper, rate_hz)
+        yield recording_buses(recorder, loop.ports, rate_hz)
     if notifier is not None and notifier.is_heard:
         yield reporting(notifier, keeper, rate_hz)
 

@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 from firmware_py.description.schema import SHOWN_CHARACTERS, DescriptionError
 from firmware_py.description.signals import MCAP_MAGIC, Layout, LogMessage, TextLayout, is_closed, read_attachment, read_messages
 from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG, candump_stamp
-from firmware_py.runtime.tick_messages import REQUESTS, TICK_SIGNALS, TICKS, TIMES
+from firmware_py.runtime.tick_messages import REQUESTS, TICK_SIGNALS, TICKS, is_of_the_machine
 
 HIGHEST_ID, LONGEST_DATA = 0x1FFF_FFFF, 64
 """Of any frame: 29 bits, and the bytes of CAN FD."""
@@ -146,7 +146,7 @@ class FlightLog:
                     yield now
                 tick, time_ns, *_, prepared = self._values(message)
                 now = LoggedTick(int(tick), int(time_ns), int(prepared))
-            if now is None or message.topic == TIMES:
+            if now is None or is_of_the_machine(message.topic):
                 continue
             now.messages.append((message.topic, message.data))
             if message.topic == REQUESTS:

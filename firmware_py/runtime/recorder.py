@@ -35,6 +35,8 @@ from firmware_py.runtime.tick_messages import (
     TIMES_SIGNALS,
     TickMessages,
     body_topic,
+    bus_signals,
+    bus_topic,
     times_values,
 )
 
@@ -116,6 +118,7 @@ class Recorder:
             )
         self._messages = messages = TickMessages()
         self._times = Layout("Times", TIMES_SIGNALS)
+        self._buses: dict[int, Layout] = {}
         self._channels: dict[str, foxglove.Channel] = {}
         for topic, layout in ((TICKS, messages.ticks), (REQUESTS, messages.requests), (EVENTS, messages.events)):
             self._channel(topic, layout)
@@ -135,6 +138,11 @@ class Recorder:
     def expect_times(self) -> None:
         """Opens the channel of `record_times`."""
         self._channel(TIMES, self._times)
+
+    def expect_bus(self, bus: int, kinds: Iterable[str]) -> None:
+        """Opens the channel of `record_bus` for a bus whose port counts these kinds of faults."""
+        self._buses[bus] = Layout("Bus", bus_signals(kinds))
+        self._channel(bus_topic(bus), self._buses[bus])
 
     def sent(self, time_ns: int, bus: int, frames: Collection[tuple[int, bytes]]) -> None:
         """Frames (id, data) that the tick at `time_ns` put on bus number `bus`."""
@@ -166,6 +174,11 @@ class Recorder:
         """How the ticks that are done kept their deadlines. Real time only: another run is never the same."""
         data = self._times.row().encode(times_values(tick, time_ns, keeper))
         self._channel(TIMES, self._times).log(data, log_time=time_ns)
+
+    def record_bus(self, bus: int, tick: int, time_ns: int, faults: Mapping[str, int]) -> None:
+        """What the port of a bus has counted so far, by kind, as `expect_bus` was told them. Real time only, as `record_times`."""
+        data = self._buses[bus].row().encode((tick, time_ns, *faults.values()))
+        self._channel(bus_topic(bus), self._buses[bus]).log(data, log_time=time_ns)
 
     def flush(self, to_disk: bool = False) -> list[Event]:
         """Hand everything so far to the operating system; a warning, once, where that fails.

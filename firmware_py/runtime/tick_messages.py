@@ -8,12 +8,13 @@ Topics, in the order in which a tick writes them:
 - `/firmware/docks`: per dock under way its faces, stage and tries, both currents and both conditions.
 - `/events`: severity (syslog) and text.
 
-In real time `/firmware/times` says every half second how ticks kept their deadlines so far; no replay compares it.
+In real time the machine has topics too, which no replay compares: `/firmware/times` says every half second how ticks kept their deadlines
+so far, `/firmware/busN` every second what the port of bus N has counted so far (frames lost, errors, how often it was opened anew).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 from firmware_py.core.types import BodyRecord, Inputs, Outputs
@@ -22,7 +23,17 @@ from firmware_py.runtime.rate_keeper import LATENESS_EDGES_NS, RateKeeper
 from firmware_py.runtime.request_text import request_text
 
 TICKS, REQUESTS, DOCKS, EVENTS = "/firmware/ticks", "/firmware/requests", "/firmware/docks", "/events"
-TIMES = "/firmware/times"
+TIMES, BUS = "/firmware/times", "/firmware/bus"
+
+
+def bus_topic(index: int) -> str:
+    """Of the fleet's bus of that index."""
+    return f"{BUS}{index}"
+
+
+def is_of_the_machine(topic: str) -> bool:
+    """Whether a topic tells of the run and not of its ticks: in another run of the same inputs it tells something else."""
+    return topic == TIMES or topic.startswith(BUS)
 
 
 def body_topic(index: int) -> str:
@@ -122,6 +133,11 @@ TIMES_SIGNALS = (
     Signal("lateness_ticks", BINS, "ticks by how late they began: up to 1 us, 1.26 us, ... 1 s (ten bins to a decade), longer"),
     Signal("compute_ticks", BINS, "ticks by how long they ran, in the same bins"),
 )
+
+
+def bus_signals(kinds: Iterable[str]) -> tuple[Signal, ...]:
+    """Of a port that counts these kinds of faults."""
+    return Signal("tick", kind="int"), Signal("time_ns", unit="ns", kind="int"), *(Signal(kind, kind="int") for kind in kinds)
 
 
 def times_values(tick: int, time_ns: int, keeper: RateKeeper) -> tuple[Any, ...]:

@@ -1,19 +1,23 @@
 """Ticks against the clock: whoever watches them may fail, and they go on."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
 
 from firmware_py.app.firmware import BusFrame, Firmware, compose
 from firmware_py.app.lockstep import Lockstep
-from firmware_py.app.observers import Observer, telling, watching_buses
+from firmware_py.app.observers import Observer, recording, recording_buses, telling, watching_buses
 from firmware_py.app.realtime import RealTimeLoop, open_loop
+from firmware_py.bus.codec import Frame
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.fleet import single
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.signals import read_signals
+from firmware_py.runtime.flight_log import FlightLog
+from firmware_py.runtime.recorder import SIGNAL_LOG, Recorder
 
 
 @pytest.fixture
@@ -67,3 +71,15 @@ def test_what_a_bus_loses_is_told_once_while_it_goes_on(tmp_path: Path) -> None:
         99: [], 100: [f"bus {port.address}: in the last second 3 full"], 200: [], 300: [], 350: [],
         400: [f"bus {port.address}: in the last second 2 full"],
     }  # fmt: skip
+
+
+def test_what_a_bus_loses_is_in_the_log_second_by_second_and_in_nothing_that_a_replay_compares(tmp_path: Path) -> None:
+    with open_port(f"virtual:{tmp_path.name}") as port, closing(Recorder(tmp_path, {})) as recorder:
+        observers, sync = (recording(recorder, 2), recording_buses(recorder, [port], 2)), [(0, Frame(0x020, bytes(4)))]
+        for tick, lost in ((1, 3), (2, 0), (3, 4), (4, 1)):
+            port.faults["full"] += lost
+            for observe in observers:
+                observe([], sync, Inputs(tick, tick * 500_000_000, []), Outputs(tick, tick * 500_000_000, [], False, [], []))
+    counted = read_signals(tmp_path / SIGNAL_LOG)["/firmware/bus0"]
+    assert {name: counted[name].tolist() for name in ("tick", "full", "reopened")} == {"tick": [2, 4], "full": [3, 8], "reopened": [0, 0]}
+    assert {topic for logged in FlightLog(tmp_path).ticks() for topic, _ in logged.messages} == {"/firmware/ticks"}
