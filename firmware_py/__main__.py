@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import TextIO
 
 from firmware_py import PASSING_PLACE
+from firmware_py.runtime import disk
 from firmware_py.runtime.interrupts import INTERRUPTED, ended_at_once
 
 COMPILING = "modcube: compiles its numeric code, once, in a minute or so"
@@ -17,6 +18,7 @@ COMPILED_IN_PASSING = (
     "every start compiles the numeric code, in a minute or so (set NUMBA_CACHE_DIR to a folder that stays)"
 )
 NO_PLACE = "modcube: no folder takes compiled code: set NUMBA_CACHE_DIR to one that can be written"
+NO_ROOM = "modcube: compiled code cannot be kept: {}; make room on that disk, or set NUMBA_CACHE_DIR to a folder on another"
 
 
 def main() -> None:
@@ -33,6 +35,11 @@ def main() -> None:
         if "no locator available" not in str(error):
             raise
         print(NO_PLACE, file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:
+        if error.errno not in disk.FAILURES:
+            raise
+        print(NO_ROOM.format(error.strerror), file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)

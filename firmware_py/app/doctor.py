@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime.realtime import real_time
 
 OK, WARNING, FAILED = "ok", "warn", "FAIL"
@@ -144,7 +145,10 @@ def check_disk(folder: Path, free_bytes: int) -> Finding:
 
 def check_cache() -> Finding:
     """Whether compiled code is there: by how long a fresh process takes to load it."""
-    took_s = warm_up()
+    try:
+        took_s = warm_up()
+    except DescriptionError as error:
+        return Finding("compiled code", FAILED, str(error), "is there room where it is kept (NUMBA_CACHE_DIR), and memory?")
     if took_s <= SLOW_IMPORT_S:
         return Finding("compiled code", OK, f"loads in {took_s:.1f} s")
     advice = "it is compiled and cached now; if this comes again the cache cannot be written (NUMBA_CACHE_DIR)"
@@ -152,10 +156,15 @@ def check_cache() -> Finding:
 
 
 def warm_up() -> float:
-    """Loads what a tick calls, compiling what is not cached, in a process of its own; returns the seconds it took."""
+    """Loads what a tick calls, compiling what is not cached, in a process of its own; returns the seconds it took. Raises
+    DescriptionError where that process fails.
+    """
     began = time.perf_counter()
     words = "; ".join(f"import {name}" for name in WARM_MODULES)
-    subprocess.run([sys.executable, "-P", "-c", words], check=True)
+    done = subprocess.run([sys.executable, "-P", "-c", words], stderr=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        said = done.stderr.strip().splitlines() or [f"the process ended with status {done.returncode}"]
+        raise DescriptionError(f"what a tick calls cannot be loaded: {said[-1]}")
     return time.perf_counter() - began
 
 

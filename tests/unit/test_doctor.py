@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_py.app import doctor
 from firmware_py.app.doctor import (
     FAILED,
     OK,
     WARNING,
+    check_cache,
     check_clock,
     check_disk,
     check_governor,
@@ -124,6 +126,13 @@ def test_folder_that_is_not_there_yet_is_judged_by_the_one_it_would_lie_in(tmp_p
 def test_place_that_takes_no_logs_is_told_and_not_taken_for_full(place: str, says: str) -> None:
     finding = check_logs(Path(place))
     assert finding.state == FAILED and says in finding.text and "remove old logs" not in finding.advice and "--out" in finding.advice
+
+
+def test_compiled_code_that_cannot_be_loaded_is_a_finding_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "WARM_MODULES", ("no_such_module",))
+    finding = check_cache()
+    assert finding.state == FAILED
+    assert finding.text == "what a tick calls cannot be loaded: ModuleNotFoundError: No module named 'no_such_module'"
 
 
 def test_every_complaint_comes_with_advice_beneath_it() -> None:

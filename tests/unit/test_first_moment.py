@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import runpy
 import sys
@@ -10,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 from numba import njit
 
-from firmware_py.__main__ import COMPILING, NO_PLACE, compiling_told, main
+from firmware_py.__main__ import COMPILING, NO_PLACE, NO_ROOM, compiling_told, main
 
 
 class Terminal(io.StringIO):
@@ -46,3 +47,15 @@ def test_compiled_code_without_any_place_is_one_line(monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 2 and capsys.readouterr().err == f"{NO_PLACE}\n"
+
+
+def test_disk_that_is_full_at_the_first_start_is_one_line(monkeypatch, capsys):
+    """numba raises what it met when it kept the first function."""
+
+    def full():
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setitem(sys.modules, "firmware_py.cli", SimpleNamespace(main=full))
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2 and capsys.readouterr().err == f"{NO_ROOM.format('No space left on device')}\n"
