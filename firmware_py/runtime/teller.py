@@ -16,7 +16,7 @@ _STDOUT = 1
 
 def write_line(line: str) -> None:
     """One line on standard output. Past Python's buffer: a thread that stands still in it ends the process by an abort."""
-    data = f"{line}\n".encode()
+    data = f"{line}\n".encode(errors="backslashreplace")  # what the system calls a file need be no text
     while data:
         data = data[os.write(_STDOUT, data) :]
 

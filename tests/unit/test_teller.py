@@ -1,5 +1,6 @@
 """Whoever reads what the vehicle says may stand still or go away: no tick waits for him, and the process ends as it should."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -110,3 +111,12 @@ def test_lines_reach_standard_output(capfd: pytest.CaptureFixture[str]) -> None:
     said.say("Tiefe 3 m, Kurs 90°")
     said.close()
     assert capfd.readouterr().out == "Tiefe 3 m, Kurs 90°\n"
+
+
+def test_name_that_is_no_text_ends_nothing_that_is_said_after_it(capfd: pytest.CaptureFixture[str]) -> None:
+    """A folder's, as the system has it; such a line was the last."""
+    said, folder = Teller(), os.fsdecode(b"tank-\xe4")
+    said.say(f"warning: no log: {folder}: No space left on device")
+    said.say("armed")
+    said.close()
+    assert capfd.readouterr().out == "warning: no log: tank-\\udce4: No space left on device\narmed\n"
