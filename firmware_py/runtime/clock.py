@@ -6,6 +6,9 @@ import time
 from pathlib import Path
 from typing import Protocol
 
+MACHINE_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+"""Goes on while the machine sleeps, where the system has such a clock: a ground computer whose lid was shut for an hour finds that it has
+missed an hour, as one that stood still does, and disarms. By CLOCK_MONOTONIC it would go on with whatever it held in that place."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -35,7 +38,7 @@ class ManualClock:
 
 
 class MonotonicClock:
-    """The machine's CLOCK_MONOTONIC: the same for all processes of one machine."""
+    """The machine's MACHINE_CLOCK, which never goes back: the same for all processes of one machine."""
 
     def __init__(self, origin_ns: int = 0) -> None:
         """`origin_ns`: the machine's time that this clock calls zero."""
@@ -44,11 +47,11 @@ class MonotonicClock:
     @classmethod
     def started_now(cls) -> MonotonicClock:
         """A clock that shows zero now."""
-        return cls(time.clock_gettime_ns(time.CLOCK_MONOTONIC))
+        return cls(time.clock_gettime_ns(MACHINE_CLOCK))
 
     def now_ns(self) -> int:
         """Nanoseconds since the origin."""
-        return time.clock_gettime_ns(time.CLOCK_MONOTONIC) - self.origin_ns
+        return time.clock_gettime_ns(MACHINE_CLOCK) - self.origin_ns
 
 
 def boot_id() -> str:

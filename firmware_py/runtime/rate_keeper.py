@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from firmware_py.runtime.clock import Clock
+from firmware_py.runtime.clock import MACHINE_CLOCK, Clock
 
 NS_PER_S = 1_000_000_000
 LATENESS_EDGES_NS = tuple(int(10 ** (3 + i / 10)) for i in range(61))
@@ -28,7 +28,7 @@ class _Timespec(ctypes.Structure):
 
 
 def absolute_sleeper(clock: Clock) -> Callable[[int], None]:
-    """A function that sleeps until a time of CLOCK_MONOTONIC, ns.
+    """A function that sleeps until a time of MACHINE_CLOCK, ns.
 
     By clock_nanosleep(TIMER_ABSTIME), or a relative sleep by `clock` where the C library has none.
     """
@@ -41,7 +41,7 @@ def absolute_sleeper(clock: Clock) -> Callable[[int], None]:
 
     def sleep_until(deadline_ns: int) -> None:
         wanted.tv_sec, wanted.tv_nsec = divmod(deadline_ns, NS_PER_S)
-        while code := call(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(wanted), None):
+        while code := call(MACHINE_CLOCK, _TIMER_ABSTIME, ctypes.byref(wanted), None):
             if code != errno.EINTR:  # a signal: its handler has run, sleep on
                 raise OSError(code, os.strerror(code))
 

@@ -1,5 +1,7 @@
 """Ticks start at absolute deadlines, whatever the ticks before them did."""
 
+import time
+
 import pytest
 
 from firmware_py.app.deadlines import histogram_lines
@@ -120,3 +122,13 @@ def test_clock_of_the_bench_refuses_to_go_back() -> None:
 def test_period_must_be_positive() -> None:
     with pytest.raises(ValueError, match="above zero"):
         RateKeeper(0, ManualClock(), lambda _: None)
+
+
+def test_machine_that_slept_an_hour_finds_that_it_missed_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a process that stood still does, which disarms: CLOCK_MONOTONIC stands while a laptop's lid is shut."""
+    hour_ns, now_ns = 3_600_000_000_000, {time.CLOCK_MONOTONIC: 0, time.CLOCK_BOOTTIME: 0}
+    monkeypatch.setattr(time, "clock_gettime_ns", now_ns.__getitem__)
+    keeper = RateKeeper(10_000_000, MonotonicClock.started_now(), lambda deadline_ns: None)
+    keeper.wait()
+    now_ns[time.CLOCK_BOOTTIME] += hour_ns
+    assert keeper.wait() == hour_ns and keeper.skipped == 359_999
