@@ -139,8 +139,11 @@ class Piecewise:
     def halved(self, which: np.ndarray) -> Piecewise:
         """The same path, of whose pieces those of `which` (k,) are two."""
         parts = [_HALVES @ piece if cut else piece[None] for piece, cut in zip(self.coefficients, which, strict=True)]
-        middles = 0.5 * (self.breaks[:-1] + self.breaks[1:])
-        return replace(self, coefficients=np.concatenate(parts), breaks=np.sort(np.concatenate([self.breaks, middles[which]])))
+        return replace(self, coefficients=np.concatenate(parts), breaks=np.sort(np.concatenate([self.breaks, self._middles[which]])))
+
+    @property
+    def _middles(self) -> np.ndarray:
+        return np.asarray(0.5 * (self.breaks[:-1] + self.breaks[1:]))
 
     def resolved(self, per_piece: int, shortest: float) -> Piecewise:
         """The same path in pieces so short that the points of `grid(per_piece)` do not miss a turn.
@@ -154,5 +157,6 @@ class Piecewise:
         length = (grid := self.grid(per_piece))[..., 19:]
         step = np.linalg.norm(np.diff(length * grid[..., 3:7], axis=1), axis=-1)
         near = np.maximum(np.minimum(length[:, :-1, 0], length[:, 1:, 0]), shortest)
-        coarse = np.any(step > _CLOSE * near, axis=1)
+        divisible = (self.breaks[:-1] < self._middles) & (self._middles < self.breaks[1:])  # between neighbouring floats is none
+        coarse = np.any(step > _CLOSE * near, axis=1) & divisible
         return self.halved(coarse).resolved(per_piece, shortest) if coarse.any() else self

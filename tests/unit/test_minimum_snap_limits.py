@@ -223,6 +223,14 @@ def test_turning_keeps_its_limit_between_the_points_where_it_is_checked(limits: 
     assert 0.99 * bound < max(largest) <= bound
 
 
+def test_path_is_looked_at_in_no_shorter_pieces_than_time_can_tell() -> None:
+    """A piece of a day beside one of a nanosecond throws the quaternion far off, which turns back within no time at its end."""
+    found = plan(poses(4), [1e-9, 1e5, 1.0], stretch=False)
+    assert np.all(np.diff(found.resolved(48, 0.3).breaks) > 0.0)
+    with pytest.raises(InfeasibleError, match="turning takes"):
+        plan(poses(4), [1e-9, 1e5, 1.0], Limits(angular_rate=1.0), stretch=False)
+
+
 @pytest.mark.parametrize("k", [0, 1, 2])
 def test_velocity_where_the_path_rests_is_refused(k: int) -> None:
     waypoints = [Waypoint(np.array([float(i), 0, 0]), stop=i == 1) for i in range(3)]
