@@ -93,6 +93,6 @@ def _beside_sources(package: Path) -> list[Path]:
 
 
 def _takes_files(folder: Path) -> bool:
-    """Whether files can be made in `folder`, or it can itself."""
-    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    """Whether files can be made in `folder`, or it can itself. What is in somebody else's home is not there (Path.exists would raise)."""
+    there = next(path for path in (folder, *folder.absolute().parents) if os.path.exists(path))
+    return os.path.isdir(there) and os.access(there, os.W_OK | os.X_OK)

@@ -73,3 +73,24 @@ def test_compiled_code_that_can_be_kept_nowhere_goes_to_a_folder_for_this_run(tm
     assert passing_place(nowhere, {"XDG_CACHE_HOME": str(open_folder)}) == ""
     assert passing_place(tmp_path / "package", {"XDG_CACHE_HOME": str(nowhere)}) == ""
     assert passing_place(nowhere, {"XDG_CACHE_HOME": str(nowhere), CACHE_FOLDER: str(open_folder)}) == ""
+
+
+def test_home_of_somebody_else_is_no_place_for_compiled_code_and_does_not_stop_the_import(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after sudo -E, or in a service with another's HOME: nothing in there can even be asked after."""
+    home = tmp_path / "home"
+    home.mkdir()
+    stat, access = os.stat, os.access
+
+    def refused(path: str | Path, **how: object) -> os.stat_result:
+        if home in Path(path).parents:
+            raise PermissionError(13, "Permission denied", str(path))
+        return stat(path, **how)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(os, "stat", refused)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != home and access(path, mode))
+    assert passing_place(tmp_path / "package", {"XDG_CACHE_HOME": str(home / ".cache")}) == ""
+    place = Path(passing_place(home / "package", {"XDG_CACHE_HOME": str(home / ".cache")}))
+    assert place.is_dir()
+    place.rmdir()
