@@ -113,7 +113,8 @@ class FlightLog:
             except LogError as damage:
                 if held is None:
                     raise
-                self._tear(self._damaged_from(held, first, damage))
+                not_closed = f"{self.torn}; " if self.torn else ""
+                self.torn = f"{not_closed}{self._damaged_from(held, first, damage)}"
                 return
             if held is not None:
                 yield held

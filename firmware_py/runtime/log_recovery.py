@@ -87,11 +87,14 @@ def rewrite(source: Path, target: Path, keep: Callable[[str, Message], bool], at
 
 
 def _cut_frames(source: Path, target: Path, last: str) -> None:
-    """Copies whole lines up to the last one with the stamp `last`."""
+    """Copies whole lines up to the last of those in a row that have the stamp `last`: what is damaged may hold them once more."""
     stamp, end, here = f"{last} ".encode(), 0, 0
     with source.open("rb") as file:
         for line in file:
             here += len(line)
-            end = here if line.startswith(stamp) else end
+            if line.startswith(stamp):
+                end = here
+            elif end:
+                break
     shutil.copyfile(source, target)
     os.truncate(target, end)

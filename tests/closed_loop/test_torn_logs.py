@@ -119,6 +119,25 @@ def test_can_log_with_a_spoilt_block_is_read_up_to_it_and_mended(log: Path, fill
     assert (mended.first, mended.ticks, mended.torn) == (None, outcome.ticks, "")
 
 
+def test_block_that_can_log_holds_twice_is_not_kept_by_its_mending(log: Path) -> None:
+    """The ticks before the damage stand in it once more."""
+    path, begin = log / CAN_LOG, 100_017
+    data = path.read_bytes()
+    path.write_bytes(data[:begin] + data[begin - 8192 :])
+    ticks = recover(log).ticks
+    assert data.startswith(path.read_bytes())
+    mended = replay(log)
+    assert (mended.first, mended.ticks, mended.torn) == (None, ticks, "")
+
+
+def test_damage_is_told_of_a_log_that_was_not_closed_too(log: Path) -> None:
+    """As a lost supply leaves both: that the end is missing is the lesser loss."""
+    path = log / CAN_LOG
+    path.write_bytes(path.read_bytes()[:100_000] + 4096 * b"\0" + path.read_bytes()[104_096:])
+    tear(log / SIGNAL_LOG, 0.9)
+    assert replay(log).torn.startswith(f"{SIGNAL_LOG} was not closed; {CAN_LOG} is damaged from tick ")
+
+
 def test_mended_log_is_as_old_as_its_flight_so_that_nobody_is_armed_for_it(log: Path) -> None:
     tear(log / SIGNAL_LOG, 0.9)
     for name in (CAN_LOG, SIGNAL_LOG):
@@ -138,10 +157,9 @@ def test_log_of_a_flight_that_goes_on_is_not_mended(tmp_path: Path) -> None:
 
 def test_long_can_log_is_cut_without_being_held_in_memory(log: Path) -> None:
     path, last = log / CAN_LOG, max(ticks_of(log))
-    with (log / "long.log").open("wb") as long:
-        for _ in range(20):
-            long.write(path.read_bytes())
     stamp = candump_stamp(last * 1_000_000_000 // TICKS_A_SECOND)
+    before, end = path.read_bytes().split(stamp.encode(), 1)
+    (log / "long.log").write_bytes(20 * before + stamp.encode() + end)
     tracemalloc.start()
     _cut_frames(log / "long.log", log / "cut.log", stamp)
     held = tracemalloc.get_traced_memory()[1]
