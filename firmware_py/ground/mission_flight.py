@@ -131,7 +131,7 @@ class MissionFlight:
         p.total, p.current = max(len(items) - self._first, 0), min(self._first, max(len(items) - 1, 0))
         p.state = READY if items else NONE
         if self._flight is not None:
-            self._flight.replaced = True
+            self._flight.replaced = self._flight.of_mission
 
     def amend(self, items: tuple[Item, ...]) -> None:
         """The same mission with other items in it, while it does not fly: it goes on where it is."""

@@ -116,6 +116,19 @@ def test_way_to_a_place_goes_on_when_a_mission_comes_while_it_is_planned(world: 
     assert world.robot.mode[0] == Mode.AUTO
 
 
+def test_mission_that_comes_on_the_way_to_a_place_is_not_begun_by_choosing_its_item(world: World, client: Client) -> None:
+    client.command(400, 1)
+    world.run(3)
+    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 1.0, 302084010, 1201614000, -0.4)
+    world.run(10)
+    come_back(world, world.station.jobs()[0])
+    world.run(3)
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    client.send("MISSION_SET_CURRENT", 1, 1, 1)
+    world.run(10)
+    assert world.robot.mode[0] == Mode.AUTO and world.station.jobs() == []
+
+
 def test_plan_that_nobody_waits_for_any_more_is_not_made_to_its_end(world: World, client: Client) -> None:
     """One of 150 places takes most of a minute, and the next waited behind it."""
     asked = iter([True, True, False])
