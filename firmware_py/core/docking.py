@@ -22,9 +22,9 @@ from firmware_py.core.docking_sequence import (
     UndockPlan,
     nearest_pass,
 )
-from firmware_py.core.joints import Joint, modules_of, sides
+from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
-from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
+from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back, to_matrix
 from firmware_py.core.types import (
     INFORMATION,
     RELAY_OFF,
@@ -45,7 +45,7 @@ NO_LONGER = "its body is no longer in DOCK"
 ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
-TAKEN = "another dock is to close one of its faces: end that dock first"
+TAKEN = "another dock is to bring a module to the same place: end that dock first"
 
 
 class _Dock(NamedTuple):
@@ -231,7 +231,7 @@ class DockingStage:
             return ANOTHER
         if mine in self._leaders(others):
             return LED
-        if any(_share_a_face(plan, dock.sequence.plan) for dock in self._docks if dock.active != mine):
+        if any(_meet(plan, dock.sequence.plan) for dock in self._docks if dock.active != mine):
             return TAKEN
         return "" if self._p.approach == "straight" else _in_the_way(plan, *estimates[mine], *estimates[others], self._p.standoff_m)
 
@@ -391,9 +391,21 @@ def _in_the_way(plan: DockPlan, active: Body, at: Estimate, target: Body, target
     return "" if module is None else f"on its way it would come too near to module {module}: bring it before that face first"
 
 
-def _share_a_face(plan: DockPlan, other: DockPlan) -> bool:
-    mine, others = ({side for joint in each.closes for side in sides(joint)} for each in (plan, other))
-    return not mine.isdisjoint(others)
+def _meet(plan: DockPlan, other: DockPlan) -> bool:
+    """Whether both would bring a module to one place, beside a body that is to be part of both."""
+    common = set(plan.merged.modules).intersection(other.merged.modules)
+    if not common:
+        return False
+    mine, others = (_beside(each.merged, common) for each in (plan, other))
+    apart_m = np.linalg.norm(mine[:, None] - others, axis=-1)
+    return bool(apart_m.min() < 0.5 * np.linalg.norm(plan.place_t))
+
+
+def _beside(body: Body, common: Collection[int]) -> np.ndarray:
+    """(n, 3) places of those of its modules that are not `common`, in the frame of the first that is, m."""
+    first = body.modules.index(min(common))
+    places = (body.r_bm - body.r_bm[first]) @ to_matrix(np.ascontiguousarray(body.q_bm[first]))
+    return np.asarray(places[[module not in common for module in body.modules]])
 
 
 def _fits(plan: DockPlan | UndockPlan, estimates: Estimated) -> bool:

@@ -108,6 +108,19 @@ def test_dock_to_a_face_that_another_dock_is_to_close_is_refused(wanted: DockReq
     assert outputs.records[2].mode == Mode.POSHOLD
 
 
+def test_dock_that_would_bring_a_module_where_another_dock_brings_one_is_refused() -> None:
+    """Two pairs go to two faces of one robot, and the second module of each to one place, off its corner."""
+    tank = Docked([(0, 0, 0), (-1, 0, 0), (0, 0, 0), (1, 0, 0), (0, 0, 0), (0, 1, 0)], each=2)
+    for state, (north, east) in zip(tank.states, [(1.0, 0.0), (1.2, 0.6), (1.8, 0.1)], strict=True):
+        state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, body) for body in (0, 2, 4)))
+    tank.run(0.1, Request(Action.DOCK, 2, DockRequest(2, 3, 0, 2)))
+    outputs = tank.run(0.1, Request(Action.DOCK, 4, DockRequest(4, 1, 0, 0)))
+    assert len(outputs.docks) == 1 and tank.when(f"dock refused: {TAKEN}")
+    assert [record.mode for record in outputs.records] == [Mode.POSHOLD, Mode.DOCK, Mode.POSHOLD]
+
+
 @pytest.mark.slow
 def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> None:
     tank = before_each_other(0.6, 1.2)
