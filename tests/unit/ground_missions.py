@@ -56,6 +56,16 @@ def begin(world: World, client: Client) -> PlanJob:
     return job
 
 
+def go_to(world: World, client: Client) -> PlanJob:
+    """Arm, ask for a way to one place: what is to be planned."""
+    client.command(400, 1)
+    world.run(3)
+    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 1.0, 302084010, 1201614000, -0.4)
+    world.run(10)
+    (job,) = world.station.jobs()
+    return job
+
+
 def fly(world: World, client: Client, first_arrival_s: float = 10.0) -> PlanJob:
     """Arm, start by mode, plan: the body tracks."""
     job = begin(world, client)

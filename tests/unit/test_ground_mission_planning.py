@@ -9,7 +9,7 @@ from firmware_py.app.mission_plan import plan_mission
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode
 from firmware_py.ground.mission_flight import Plan, PlanJob
-from tests.unit.ground_missions import PLACES, Path, begin, continued, item, upload
+from tests.unit.ground_missions import PLACES, Path, begin, continued, go_to, item, upload
 from tests.unit.ground_world import Client, World
 
 
@@ -105,11 +105,7 @@ def test_flight_that_is_being_planned_ends_when_its_mission_is_replaced(
 
 
 def test_way_to_a_place_goes_on_when_a_mission_comes_while_it_is_planned(world: World, client: Client) -> None:
-    client.command(400, 1)
-    world.run(3)
-    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 1.0, 302084010, 1201614000, -0.4)
-    world.run(10)
-    (job,) = world.station.jobs()
+    job = go_to(world, client)
     upload(world, client, [item(0, PLACES[0])])
     come_back(world, job)
     world.run(3)
@@ -117,11 +113,7 @@ def test_way_to_a_place_goes_on_when_a_mission_comes_while_it_is_planned(world: 
 
 
 def test_mission_that_comes_on_the_way_to_a_place_is_not_begun_by_choosing_its_item(world: World, client: Client) -> None:
-    client.command(400, 1)
-    world.run(3)
-    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 1.0, 302084010, 1201614000, -0.4)
-    world.run(10)
-    come_back(world, world.station.jobs()[0])
+    come_back(world, go_to(world, client))
     world.run(3)
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     client.send("MISSION_SET_CURRENT", 1, 1, 1)
@@ -174,11 +166,7 @@ def test_mission_of_a_robot_that_was_part_of_another_meanwhile_is_not_complete_b
 
 
 def test_way_to_a_place_ends_by_pause_while_it_is_planned(world: World, client: Client) -> None:
-    client.command(400, 1)
-    world.run(3)
-    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 1.0, 302084010, 1201614000, -0.4)
-    world.run(10)
-    (job,) = world.station.jobs()
+    job = go_to(world, client)
     client.command(193, 0)
     come_back(world, job)
     world.run(3)
