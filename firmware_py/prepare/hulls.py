@@ -43,6 +43,8 @@ def load_mesh(path: str) -> Solid:
         raise DescriptionError(f"{path}: cannot be read as a mesh: {error}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not mesh.is_watertight:
         raise DescriptionError(f"{path}: the mesh is not closed; every edge needs two triangles")
+    if not mesh.is_winding_consistent:
+        raise DescriptionError(f"{path}: some triangles face outwards and others inwards; export it with all normals outwards")
     mesh.fix_normals()
     convex = bool(abs(mesh.convex_hull.volume - mesh.volume) <= _CONVEX_SHARE * abs(mesh.volume))
     return Solid(np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64), convex)

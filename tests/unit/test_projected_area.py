@@ -142,13 +142,17 @@ def test_normals_of_a_box_point_outward_and_close() -> None:
     assert np.all(np.einsum("ij,ij->i", solid.vertices[solid.triangles[:, 0]], solid.normals) > 0.0)
 
 
-def test_mesh_that_is_open_or_missing_is_refused(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_mesh_that_is_open_or_missing_or_turned_in_places_is_refused(tmp_path) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(DescriptionError, match="no such mesh"):
         hulls.load_mesh(str(tmp_path / "hull.off"))
     open_mesh = tmp_path / "open.off"
     open_mesh.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     with pytest.raises(DescriptionError, match="not closed"):
         hulls.load_mesh(str(open_mesh))
+    turned_over = tmp_path / "turned.off"
+    turned_over.write_text("OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 3 2\n")
+    with pytest.raises(DescriptionError, match=r"turned\.off: some triangles face outwards and others inwards; export it with all normals"):
+        hulls.load_mesh(str(turned_over))
 
 
 def test_mesh_file_gives_its_solid(tmp_path) -> None:  # type: ignore[no-untyped-def]
