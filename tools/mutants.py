@@ -19,7 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import ModuleType
 from typing import NamedTuple
 
 from command_line import Parser, run_tool
@@ -38,6 +38,10 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "firmware_py.core.limiter": ("tests/unit/test_limiter.py",),
 }
 """The tests of each module, those that must kill its mutants."""
+QUICKLY = (
+    "-x", "-q", "--assert=plain", "--tb=no", "-pno:cacheprovider", "-pno:unraisableexception", "-pno:threadexception",
+)  # fmt: skip
+"""pytest's options: whether a test fails is all that is asked."""
 HEAVY = (
     "numba", "numpy", "pytest", "scipy.spatial.transform", "firmware_py.core.drag_lookup", "firmware_py.core.rotations",
     "firmware_py.core.thruster", "firmware_py.core.missing_thrust", "firmware_py.core.body", "firmware_py.prepare.assembly",
@@ -91,7 +95,7 @@ def _at(tree: ast.Module, index: int) -> ast.AST:
 
 
 def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
-    """Nodes whose change means nothing at run time: annotations, how a function is compiled, and text alone on a line."""
+    """Nodes whose change means nothing at run time: annotations, how a function is compiled, zip's check, and text alone on a line."""
     for node in ast.walk(tree):
         roots: list[ast.AST | None] = []
         if isinstance(node, (ast.AnnAssign, ast.arg)):
@@ -100,6 +104,8 @@ def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
             roots += [node.returns, *(each for each in node.decorator_list if isinstance(each, ast.Call))]
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             roots.append(node)
+        elif isinstance(node, ast.keyword) and node.arg == "strict":
+            roots.append(node.value)
         for root in roots:
             if root is not None:
                 yield from ast.walk(root)
@@ -184,11 +190,19 @@ def _become(node: ast.AST, other: ast.AST) -> None:
 # ---------------------------------------------------------------- running one
 
 
+def _uncompiled(tree: ast.Module) -> ast.Module:
+    """The same in plain Python: Numba would spend seconds on each mutant, or hand it what it compiled before."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef):
+            node.decorator_list = [each for each in node.decorator_list if not ast.unparse(each).startswith("njit")]
+    return tree
+
+
 class Loader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Serves the mutant in place of its module."""
 
-    def __init__(self, name: str, code: CodeType) -> None:
-        self._name, self._code = name, code
+    def __init__(self, name: str, tree: ast.Module) -> None:
+        self._name, self._code = name, compile(_uncompiled(tree), name, "exec")
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -201,13 +215,13 @@ class Loader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         exec(self._code, module.__dict__)
 
 
-def start(name: str, mutant: Mutant | None) -> int:
-    """Forks a process that runs the tests of module `name` on a mutant; its exit status is pytest's. Returns its id."""
+def start(name: str, tree: ast.Module, quiet: bool) -> int:
+    """Forks a process that runs the tests of module `name` with `tree` in its place; its exit status is pytest's. Returns its id."""
     process = os.fork()
     if process:
         return process
-    sink = os.open(os.devnull, os.O_WRONLY)
-    if mutant is not None:
+    if quiet:
+        sink = os.open(os.devnull, os.O_WRONLY)
         os.dup2(sink, 1)
         os.dup2(sink, 2)
     signal.alarm(TIMEOUT_S)
@@ -215,9 +229,8 @@ def start(name: str, mutant: Mutant | None) -> int:
     try:
         import pytest
 
-        if mutant is not None:
-            sys.meta_path.insert(0, Loader(name, compile(mutant.tree, name, "exec")))
-        status = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *TARGETS[name]]))
+        sys.meta_path.insert(0, Loader(name, tree))
+        status = int(pytest.main([*QUICKLY, *TARGETS[name]]))
     except BaseException as error:  # whatever a mutant does, it ends here
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
     finally:
@@ -231,7 +244,7 @@ def run(name: str, todo: list[Mutant], jobs: int) -> list[Mutant]:
     while waiting or running:
         while waiting and len(running) < jobs:
             mutant = waiting.pop()
-            running[start(name, mutant)] = mutant
+            running[start(name, mutant.tree, quiet=True)] = mutant
         process, status = os.wait()
         mutant = running.pop(process)
         if os.waitstatus_to_exitcode(status) == 0:
@@ -262,12 +275,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     total = alive = 0
     for name in names:
-        todo = list(mutants((ROOT / (name.replace(".", "/") + ".py")).read_text()))
+        source = (ROOT / (name.replace(".", "/") + ".py")).read_text()
+        todo = list(mutants(source))
         if options.list:
             print("\n".join(f"{name}:{m.line}: {m.what}" for m in todo))
             continue
         began = time.monotonic()
-        _, status = os.waitpid(start(name, None), 0)
+        # served as its mutants are: what cannot even be imported so would count as killed
+        _, status = os.waitpid(start(name, ast.parse(source), quiet=False), 0)
         if os.waitstatus_to_exitcode(status) != 0:
             print(f"{name}: its tests fail without any mutant", file=sys.stderr)
             return 2

@@ -12,6 +12,7 @@ from firmware_py.core.limiter import (
     VOLTAGE_RANGE,
     Limiter,
     MagnetLimiter,
+    is_believed,
 )  # fmt: skip
 from firmware_py.core.thruster import total_power
 from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, RELAY_PUSH
@@ -303,6 +304,7 @@ ON = (1, 0, 0, 0, 0, 2)
 def test_magnet_may_be_on_for_ever_at_full_duty() -> None:
     magnets = MagnetLimiter(parameters.Limiter(relay_on_s=1.0, relay_duty=1.0), 0.5)
     assert all(magnets.step(ON) == ON for _ in range(100))
+    assert magnets.step((0,) * 6) == (0,) * 6, "and goes off when it is told to"
 
 
 def test_magnet_that_is_on_too_long_rests_until_it_is_half_cool() -> None:
@@ -330,6 +332,19 @@ def test_each_magnet_has_its_own_account() -> None:
     assert magnets.step((1, 1, 0, 0, 0, 0)) == (0, 1, 0, 0, 0, 0)
 
 
+def test_all_six_magnets_may_rest_at_once() -> None:
+    magnets = MagnetLimiter(MAGNETS, 0.25)
+    for _ in range(11):
+        magnets.step((1,) * 6)
+    assert magnets.resting == [0, 1, 2, 3, 4, 5]
+
+
+def test_magnets_with_full_accounts_that_nobody_wants_cost_nothing() -> None:
+    magnets = MagnetLimiter(MAGNETS, 0.25)
+    magnets.step((0,) * 6)
+    assert magnets.step((0,) * 6) is magnets.step((0,) * 6)
+
+
 def test_cool_magnet_saves_no_more_than_its_limit() -> None:
     magnets = MagnetLimiter(MAGNETS, 0.25)
     for _ in range(1000):
@@ -342,11 +357,12 @@ def test_relay_state_that_does_not_exist_is_off() -> None:
     assert MagnetLimiter(MAGNETS, 0.25).step((3, -1, 1, 7, 2, 0)) == (0, 0, 1, 0, 2, 0)
 
 
-def test_magnet_that_may_stay_on_for_longer_may_so_once_its_account_is_full() -> None:
-    magnets = MagnetLimiter(MAGNETS, 0.25)
+def test_magnet_that_may_stay_on_for_longer_may_so_once_its_account_is_full(body: Body) -> None:
+    limiter = Limiter(body, MAGNETS, 0.25)
+    magnets = limiter.magnets[1]
     for _ in range(4):
         magnets.step((0,) * 6)
-    magnets.retune(parameters.Limiter(relay_on_s=4.0, relay_duty=0.25, relay_w=6.0))
+    limiter.retune(parameters.Limiter(relay_on_s=4.0, relay_duty=0.25, relay_w=6.0))
     for _ in range(32):
         magnets.step((0,) * 6)
     lit = [magnets.step((1, 0, 0, 0, 0, 0))[0] for _ in range(40)]
@@ -355,7 +371,7 @@ def test_magnet_that_may_stay_on_for_longer_may_so_once_its_account_is_full() ->
 
 def test_magnets_that_are_on_take_their_power() -> None:
     magnets = MagnetLimiter(MAGNETS, 0.25)
-    assert magnets.power_w == 0.0
+    assert magnets.power_w == 0.0 and magnets.states == (0,) * 6
     magnets.step(ON)
     assert magnets.power_w == 12.0
     magnets.step((0,) * 6)
@@ -364,12 +380,16 @@ def test_magnets_that_are_on_take_their_power() -> None:
 
 @pytest.mark.parametrize("magnets_w", [10.0, 30.0, 40.0, 50.0])
 def test_thrusters_have_what_the_magnets_leave(body: Body, magnets_w: float) -> None:
+    """Of a supply that just sufficed without magnets too."""
     limiter = Limiter(replace(body, supply_power_w=np.array([40.0, 40.0])), QUICK, 1.0)
+    too_much = np.full(16, 5.0)
+    enough, _ = limiter.step(too_much, True, NOMINAL)
     limiter.magnets[1].power_w = magnets_w
-    force, _ = limiter.step(np.full(16, 5.0), True, NOMINAL)
     left = max(0.0, 40.0 - magnets_w)
-    assert 0.995 * 40.0 < power_of(body, force, 0) <= 40.0
-    assert 0.99 * left <= power_of(body, force, 1) <= left
+    for wanted in (too_much, enough):
+        force, _ = limiter.step(wanted.copy(), True, NOMINAL)
+        assert 0.995 * 40.0 < power_of(body, force, 0) <= 40.0
+        assert 0.99 * left <= power_of(body, force, 1) <= left
     assert len(limiter.magnets) == 2
 
 
@@ -410,6 +430,7 @@ def test_limits_are_made_of_these_numbers() -> None:
     assert (VOLTAGE_EXPONENT, VOLTAGE_RANGE, FACES) == (1.2, (0.6, 1.4), 6)
     assert (RELAY_OFF, RELAY_PULL, RELAY_PUSH) == (0, 1, 2)
     assert POWER_HALVINGS == 12, "replay compares bytes"
+    assert is_believed(np.array(VOLTAGE_RANGE)).all()
 
 
 @pytest.mark.parametrize(("volts", "believed"), [(7.21, 7.21), (7.19, 12.0), (16.79, 16.79), (16.81, 12.0)])
