@@ -1,13 +1,13 @@
 """The docking detector: both conditions, believed late and lost with their measurements; many pairs at once as each alone."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, PairStatus, TagTable
-from firmware_py.core.docking_pairs import CLOSED
+from firmware_py.core.docking_pairs import APART, CLOSED, LOOSE
 from firmware_py.core.joints import joints_of
 from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
 from firmware_py.core.types import DockFeedback, ModuleInputs, TagObservation
@@ -18,9 +18,9 @@ from firmware_py.prepare.assembly import assemble
 TICK_NS, PITCH_M = 10_000_000, 0.21
 P = Docking()
 TAG = 5
-LEVER, TURN = np.array([0.02, -0.01, -0.1]), from_euler(0.3, -0.2, 1.0)
+LEVERS, TURN = [np.array([0.02, -0.01, -0.1]) * way for way in (1.0, -0.5, 0.7, -1.0)], from_euler(0.3, -0.2, 1.0)
 """Of every module's one tag: its place in the module, and module frame to tag frame."""
-TAGS: TagTable = {(m, TAG): np.r_[LEVER, TURN] for m in range(4)}
+TAGS: TagTable = {(m, TAG): np.r_[LEVERS[m], TURN] for m in range(4)}
 ROW = [FacePair(m, 0, m + 1, 1, np.array([PITCH_M, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])) for m in range(3)]
 """Four modules in a row, the +x face of each against the -x face of the next."""
 
@@ -48,11 +48,11 @@ class Row:
                 module.docks.append(DockFeedback(0, (after, before, math.nan), (1, 1, 0)))
         if self.camera and self.tick % 2 == 0:
             for m, x in enumerate(np.cumsum([0.0, *(PITCH_M + gap for gap in self.gaps_m)])):
-                modules[m].tags.append(self._tag(float(x)))
+                modules[m].tags.append(self._tag(float(x), LEVERS[m]))
         return self.tick * TICK_NS, modules
 
-    def _tag(self, x: float) -> TagObservation:
-        p_wt = np.array([1.0, 2.0, 0.5]) + rotate(self.attitude, np.array([x, 0.0, 0.0]) + LEVER)
+    def _tag(self, x: float, lever: np.ndarray) -> TagObservation:
+        p_wt = np.array([1.0, 2.0, 0.5]) + rotate(self.attitude, np.array([x, 0.0, 0.0]) + lever)
         p_wt = p_wt + self.noise_m * self.rng.standard_normal(3)
         return TagObservation(TAG, 7, self.tick * TICK_NS - 40_000_000, p_wt, multiply(self.attitude, conjugate(TURN)))
 
@@ -85,15 +85,6 @@ def test_either_condition_alone_is_no_dock(row: Row) -> None:
     assert docked.docked
 
 
-def test_current_of_one_face_alone_does_not_count(row: Row) -> None:
-    bank = PairBank(ROW[:1], P)
-    for _ in range(100):
-        time_ns, modules = row.hear()
-        modules[1].docks.clear()
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
-    assert not bank.status(0).current
-
-
 def test_dock_that_holds_is_lost_later_than_it_was_won(row: Row) -> None:
     bank = PairBank(ROW, P)
     row.watch(bank, 1.0)
@@ -107,22 +98,121 @@ def test_dock_that_holds_is_lost_later_than_it_was_won(row: Row) -> None:
 
 
 @pytest.mark.parametrize(
-    ("gap_m", "current_ma", "camera", "is_open"),
+    ("current_ma", "docked"), [(71.0, True), (-71.0, True), (70.0, False), (-70.0, False), (69.5, False), (0.0, False)]
+)
+def test_dock_needs_more_than_seventy_milliamperes_of_either_sign(row: Row, current_ma: float, docked: bool) -> None:
+    row.currents_ma[0] = current_ma
+    assert row.watch(PairBank(ROW[:1], P), 1.0)[0].docked == docked
+
+
+@pytest.mark.parametrize("debounce_ms", [100.0, 120.0])
+def test_current_is_believed_by_the_first_measurement_after_the_debounce(row: Row, debounce_ms: float) -> None:
+    """Heard every 40 ms, from 40 ms on: at 160 ms."""
+    bank = PairBank(ROW[:1], replace(P, debounce_ms=debounce_ms))
+    assert [row.watch(bank, 0.01)[0].current for _ in range(16)] == [False] * 15 + [True]
+
+
+def test_pair_of_which_nothing_was_heard_is_neither_fresh_nor_open(row: Row) -> None:
+    bank = PairBank(ROW[:1], P)
+    row.camera, row.currents_ma = False, [math.nan] * 3
+    for _ in range(5):
+        (status,) = row.watch(bank, 0.01)
+        assert not (status.fresh or status.current or status.position) and bank.rows["open"][0] == CLOSED
+        assert math.isnan(status.position_error_m) and math.isnan(status.spread_m)
+
+
+@pytest.mark.parametrize("silent", [0, 1])
+@pytest.mark.parametrize("heard_s", [0.0, 1.0])
+def test_current_of_one_face_alone_does_not_count(row: Row, silent: int, heard_s: float) -> None:
+    """Whichever module is silent, and whether or not it was ever heard: no longer than currents are fresh."""
+    detector, seen = PairDetector(ROW[0], P), list[bool]()
+    while len(seen) < 200:
+        time_ns, modules = row.hear()
+        if len(seen) >= 100 * heard_s:
+            modules[silent].docks.clear()
+        seen.append(detector.step(time_ns, modules, ModulePoses(modules, TAGS)).current)
+    last_heard = round(100 * heard_s)
+    assert seen[last_heard - 1] == (heard_s > 0.0)
+    assert not any(seen[last_heard + round(P.current_fresh_ms / 10.0) :])
+    assert all(seen[last_heard : last_heard + round(P.current_fresh_ms / 10.0) - 1]) or heard_s == 0.0
+    assert math.isnan(detector.currents_ma[silent]) == (heard_s == 0.0) and detector.currents_ma[1 - silent] == 100.0
+
+
+def test_magnet_that_the_limiter_rests_tells_nothing(row: Row) -> None:
+    bank = PairBank(ROW[:2], P)
+    row.watch(bank, 1.0)
+    row.currents_ma = [0.0, 0.0, 0.0]
+    for _ in range(100):
+        time_ns, modules = row.hear()
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS), resting=[(0, 0), (1, 1), (7, 0)])
+    assert bank.rows["open"].tolist() == [CLOSED, LOOSE]
+
+
+@pytest.mark.parametrize("missing", range(4))
+def test_module_that_is_not_in_the_picture_is_not_placed_by_its_neighbours(row: Row, missing: int) -> None:
+    bank = PairBank(ROW, P)
+    for _ in range(100):
+        time_ns, modules = row.hear()
+        modules[missing].tags.clear()
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+    assert [bank.status(i).position for i in range(3)] == [missing not in (i, i + 1) for i in range(3)]
+
+
+def test_newest_of_several_pictures_counts(row: Row) -> None:
+    """Those that came in one tick, the older ones of modules that were still apart."""
+    bank = PairBank(ROW, P)
+    for _ in range(100):
+        row.gaps_m = [0.05, 0.05, 0.05]
+        _, older = row.hear()
+        row.tick, row.gaps_m = row.tick - 1, [0.0, 0.0, 0.0]
+        time_ns, modules = row.hear()
+        for module, before in zip(modules, older, strict=True):
+            module.tags[:0] = [tag._replace(capture_ns=tag.capture_ns - 16_000_000) for tag in before.tags]
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+    assert all(bank.status(i).docked for i in range(3))
+
+
+def test_position_is_judged_by_thirty_two_pictures_without_a_gap(row: Row) -> None:
+    bank = PairBank(ROW[:1], P)
+    for _ in range(2):
+        row.camera = True
+        errors = [row.watch(bank, 0.02)[0].position_error_m for _ in range(32)]
+        assert [math.isnan(error) for error in errors] == [True] * 31 + [False]
+        row.camera = False
+        row.watch(bank, 1.0)
+
+
+def test_joint_keeps_the_time_of_the_last_picture_that_showed_it_in_its_place(row: Row) -> None:
+    bank = PairBank(ROW[:1], P)
+    row.gaps_m[0] = 0.9 * P.open_m
+    row.watch(bank, 1.0)
+    row.gaps_m[0] = 1.1 * P.open_m
+    row.watch(bank, 1.0)
+    assert bank.rows["near_ns"][0] == 1_000_000_000 - 40_000_000
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "current_ma", "camera", "state"),
     [
-        (0.0, 100.0, True, False), (0.0, 50.0, True, True), (0.9 * P.open_m, 100.0, True, False), (1.1 * P.open_m, 100.0, True, True),
-        (1.1 * P.open_m, 100.0, False, False), (0.0, math.nan, True, False),
+        (0.0, 100.0, True, CLOSED), (0.0, 50.0, True, LOOSE), (0.0, 50.0, False, APART), (0.9 * P.open_m, 100.0, True, CLOSED),
+        (1.1 * P.open_m, 100.0, True, LOOSE), (1.1 * P.open_m, math.nan, True, APART), (1.1 * P.open_m, 50.0, True, APART),
+        (1.1 * P.open_m, 100.0, False, CLOSED), (0.0, math.nan, True, CLOSED), (0.0, math.nan, False, CLOSED),
     ],
 )  # fmt: skip
 def test_joint_is_open_by_what_is_measured_and_never_by_silence(
-    row: Row, gap_m: float, current_ma: float, camera: bool, is_open: bool
+    row: Row, gap_m: float, current_ma: float, camera: bool, state: int
 ) -> None:
+    """Apart where all that is measured says so, loose where something speaks against it; and closed once it is closed again."""
+    assert CLOSED < LOOSE < APART
     bank = PairBank(ROW[:1], P)
     row.watch(bank, 1.0)
     assert not bank.rows["open"].any()
     row.gaps_m[0], row.currents_ma[0], row.camera = gap_m, current_ma, camera
-    for _ in range(200):
-        row.watch(bank, 0.01)
-    assert bool(bank.rows["open"][0]) == is_open
+    row.watch(bank, 2.0)
+    assert bank.rows["open"][0] == state
+    row.gaps_m[0], row.currents_ma[0], row.camera = 0.0, 100.0, True
+    row.watch(bank, 1.0)
+    assert bank.rows["open"][0] == CLOSED
 
 
 def test_what_is_not_seen_any_more_is_not_believed(row: Row) -> None:
@@ -178,13 +268,14 @@ def test_locked_pair_is_found_in_noise_and_through_flipped_tags(row: Row) -> Non
         assert n < 100 or bank.status(0).docked
 
 
-def test_flipped_tag_that_is_off_by_a_quarter_turn_opens_no_joint(row: Row) -> None:
+@pytest.mark.parametrize("flip", [(math.pi / 2, 0.0, 0.0), (0.0, math.pi / 2, 0.0), (0.0, 0.0, -math.pi / 2)])
+def test_flipped_tag_that_is_off_by_a_quarter_turn_opens_no_joint(row: Row, flip: tuple[float, float, float]) -> None:
     """Seen from 45 degrees; its module would be seventy millimetres off, one picture in five."""
     bank = PairBank(ROW[:1], P)
     for n in range(400):
         time_ns, modules = row.hear()
         if n % 10 == 0:
-            modules[1].tags = [t._replace(q_wt=multiply(t.q_wt, from_euler(math.pi / 2, 0.0, 0.0))) for t in modules[1].tags]
+            modules[1].tags = [t._replace(q_wt=multiply(t.q_wt, from_euler(*flip))) for t in modules[1].tags]
         bank.step(time_ns, modules, ModulePoses(modules, TAGS))
         assert n < 100 or (bank.status(0).docked and bank.rows["open"][0] == CLOSED)
 
@@ -192,7 +283,7 @@ def test_flipped_tag_that_is_off_by_a_quarter_turn_opens_no_joint(row: Row) -> N
 @pytest.mark.parametrize("turn", [from_euler(0.0, 0.0, math.pi / 2), from_euler(math.pi, 0.0, 0.0)])
 def test_modules_that_are_docked_turned_are_found_so(row: Row, turn: np.ndarray) -> None:
     """As the pair says that they are turned, and no other way."""
-    tags: TagTable = {(0, TAG): TAGS[0, TAG], (1, TAG): np.r_[rotate(conjugate(turn), LEVER), multiply(TURN, turn)]}
+    tags: TagTable = {(0, TAG): TAGS[0, TAG], (1, TAG): np.r_[rotate(conjugate(turn), LEVERS[1]), multiply(TURN, turn)]}
     for q_ab, found in ((turn, True), (np.array([1.0, 0.0, 0.0, 0.0]), False)):
         bank = PairBank([ROW[0]._replace(q_ab=q_ab)], P)
         for _ in range(100):
