@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.rotations import difference
-from firmware_py.core.sensor_watch import DEPTH_REPEATS, LEAPS, REPEATS, SensorWatch
+from firmware_py.core.sensor_watch import LEAPS, REPEATS, SensorWatch
 from firmware_py.core.types import Action, Mode, ModuleInputs, Request
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -27,9 +27,9 @@ def hears(watch: SensorWatch, *modules: ModuleInputs) -> bool:
     return watch.imu_heard
 
 
-def test_sample_that_is_repeated_too_often_is_not_believed_until_it_changes() -> None:
+def test_sample_that_is_repeated_ten_times_is_not_believed_until_it_changes() -> None:
     watch = SensorWatch([0])
-    assert [hears(watch, sample(0.1)) for _ in range(REPEATS + 3)] == [True] * REPEATS + [False] * 3
+    assert [hears(watch, sample(0.1)) for _ in range(13)] == [True] * 10 + [False] * 3
     assert watch.frozen == [True]
     assert hears(watch, sample(0.2))
     assert watch.frozen == [False]
@@ -62,7 +62,7 @@ def test_pressure_that_is_repeated_for_two_seconds_is_not_believed_until_it_chan
         watch.step([ModuleInputs(pressure_pa=pressure_pa)])
         return watch.pressure_heard
 
-    assert [is_heard(1.1e5) for _ in range(DEPTH_REPEATS + 3)] == [True] * DEPTH_REPEATS + [False] * 3
+    assert [is_heard(1.1e5) for _ in range(103)] == [True] * 100 + [False] * 3, "at 50 Hz"
     joined = SensorWatch([0])
     joined.take_over([watch])
     joined.step([ModuleInputs(pressure_pa=1.1e5)])
@@ -174,6 +174,13 @@ def test_reading_that_leaps_is_left_out_and_one_that_stays_there_is_believed(nam
     assert readings(0.0, 5.0, -5.0, 0.0, name=name) == [True, False, False, True]
     assert readings(0.0, math.nan, 0.0, name=name) == [True, False, True]
     assert readings(5.0, 0.0, 0.0, name=name) == [True, False, True], "the first may be the wrong one"
+
+
+@pytest.mark.parametrize(("name", "moved", "leapt"), [("gyro", 0.7, 1.1), ("accel", 1.2, 2.1), ("pressure_pa", 1900.0, 2100.0)])
+def test_leap_is_more_than_thrusters_make_in_a_tick_of_20_ms_and_twenty_centimetres_of_water(name: str, moved: float, leapt: float) -> None:
+    """Full moment from none, 0.7 rad/s; a force that is reversed, 1.2 m/s^2."""
+    for step, believed in ((moved, True), (leapt, False)):
+        assert readings(0.0, step / LEAPS[name], name=name) == [True, believed]
 
 
 def test_only_the_reading_that_leaps_is_left_out() -> None:
