@@ -92,6 +92,14 @@ def test_two_feedbacks_of_a_clear_standstill_are_enough_and_one_is_not(water: Wa
     assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == [f"thruster {busy + 1} stands still: left out"]
 
 
+@pytest.mark.parametrize("thruster", range(8))
+def test_thruster_whose_esc_claims_twice_its_force_is_believed_to_push_as_it_was_told(water: Water, thruster: int) -> None:
+    """Or the motion would miss the force that was only claimed, and blame it."""
+    water.fly(1.0)
+    water.speed_factor[thruster] = 1.4
+    assert water.run(4.0, 2.0 * PUSH) == []
+
+
 def test_slow_thruster_below_its_deadband_is_healthy(water: Water) -> None:
     """At 0.09 N no propeller turns."""
     assert water.run(2.0, 0.15 * PUSH) == []
