@@ -78,9 +78,8 @@ class Allocator:
         self._least_power = parameters.mode == "least_power"
         self._thrusters = body.thrusters
         n = body.thrusters.f_max.size
-        weight = SHARE_WEIGHT * float(np.sum(body.thrusters.f_max**2))
-        self._weights = np.r_[np.ones(n), weight * PRIORITIES]
         reach = np.maximum(body.thrusters.f_max, -body.thrusters.f_min)
+        self._weights = np.r_[np.ones(n), SHARE_WEIGHT * float(np.sum(reach**2)) * PRIORITIES]
         self._most = np.array([np.linalg.norm(body.thrusters.matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
         self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
         self._preloaded: tuple[np.ndarray, np.ndarray] | None = None

@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse
 from scipy.optimize import linprog, lsq_linear
 
-from firmware_py.core.allocator import HOLD, PRIORITIES, SHARE_WEIGHT, Allocator
+from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.preload import preload
 from firmware_py.core.types import Room, Thrust
@@ -17,6 +17,9 @@ from firmware_py.description.parameters import Allocation
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
+HOLD, SHARE_WEIGHT, PRIORITIES = 0.05, 1e3, np.array([1e2, 1e2, 1.0])
+"""A twentieth of the largest push holds; that and the moment are each a hundred times as dear as the rest of the force, and this so much
+dearer than all thrusters at their limits."""
 PLAIN = replace(Allocation(), preload_n=0.0)
 SQUARE = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
 LOSES_RANK = {(4, 7), (5, 6), (2, 3)}
@@ -135,6 +138,21 @@ def test_saturation_keeps_the_directions_of_force_and_moment(body: Body, size: f
         np.testing.assert_allclose(thrust.achieved, np.r_[force * wrench[:3], moment * wrench[3:]], atol=1e-6)
         assert -1e-9 <= force <= 1.0 + 1e-5 and -1e-9 <= moment <= 1.0 + 1e-5
         assert_within_limits(body, thrust)
+
+
+@pytest.mark.parametrize("size", [0.15, 1.0, 3.0, 1000.0])
+def test_thrusters_that_are_mounted_the_other_way_round_push_backwards_as_they_pushed_forwards(body: Body, size: float) -> None:
+    """So they push harder in reverse; the wrench stays as it was."""
+    t = body.thrusters
+    turned = replace(
+        t, matrix=-t.matrix, pinv=-t.pinv, f_min=-t.f_max, f_max=-t.f_min, forward=t.reverse, reverse=t.forward,
+        power_forward=t.power_reverse, power_reverse=t.power_forward,
+    )  # fmt: skip
+    one, other = Allocator(body, PLAIN), Allocator(replace(body, thrusters=turned), PLAIN)
+    for wrench in wrenches(body, 10, size, seed=8):
+        before, after = one.step(wrench), other.step(wrench)
+        np.testing.assert_allclose(after.force_n, -before.force_n, atol=1e-8)
+        np.testing.assert_allclose([*after.scale, after.margin], [*before.scale, before.margin], atol=1e-8)
 
 
 def test_body_that_lacks_moment_leans_and_does_not_drift(single: Body) -> None:
