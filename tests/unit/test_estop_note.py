@@ -206,12 +206,16 @@ def test_folder_is_one_vehicle_s_while_that_runs(tmp_path: Path, is_there: bool,
         clear(folder)
     with pytest.raises(DescriptionError, match=r"another vehicle that runs logs into .*: end it first, or give this one another --out"):
         EstopNote(folder)
-    first.close()
+    for _ in range(2):
+        first.close()  # a second time does nothing
+    assert not first._thread.is_alive()
     assert clear(folder) and not estop_stands(folder)
     EstopNote(folder).close()
 
 
-@pytest.mark.parametrize(("text", "stands"), [(STANDS, True), (CLEAR, False), (b"", True), (b"\x00" * 7, True), (b"clear", True)])
+@pytest.mark.parametrize(
+    ("text", "stands"), [(STANDS, True), (CLEAR, False), (b"", True), (b"\x00" * 7, True), (b"clear", True), (b"clear \nand more", True)]
+)
 def test_note_that_says_neither_counts_as_a_stop(tmp_path: Path, text: bytes, stands: bool) -> None:
     (tmp_path / NOTE).write_bytes(text)
     assert estop_stands(tmp_path) == stands

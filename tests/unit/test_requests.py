@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.core.requests import SOUND, against_request, sift
+from firmware_py.core.requests import SOUND, against_request, follow, sift
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import State
@@ -68,6 +68,7 @@ UNSOUND: list[tuple[Action, Any]] = [
 SOUND_ONES: list[tuple[Action, Any]] = [
     (Action.ARM, None), (Action.ARM, True), (Action.ARM, False), (Action.DISARM, object()), (Action.ESTOP, NAN), (Action.CLEAR_ESTOP, 1),
     (Action.GROUND_ALIVE, "?"), (Action.HOLD, None), (Action.HOLD, HERE), (Action.TRACK, Path()), (Action.TRACK, hold(HERE, 3.0)),
+    (Action.TRACK, Path(duration_s=0.0)),
     (Action.STICKS, STICKS), (Action.STICKS, Sticks((1.0, -1.0, 0), (0.0,) * 3)), (Action.SET_MODE, Mode.AUTO),
     (Action.SET_POINT, HERE), (Action.SET_POINT, spoilt(p_wb=ZERO * NAN)),
     (Action.SET_POINT, spoilt(q_wb=LEVEL * NAN, v_w=np.array([NAN, 0.0, 0.1]))), (Action.SET_PARAMETER, ("control.lead_s", 0.1)),
@@ -132,6 +133,16 @@ def test_sound_requests_keep_their_order_and_the_others_are_answered() -> None:
     assert events == [
         Event(4, "HOLD refused: its argument makes no sense", 0), Event(4, "ARM refused: there is no body 3; there are 0, 1", 3),
     ]  # fmt: skip
+
+
+def test_disarm_reaches_every_body_that_has_a_module_of_the_one_that_it_names() -> None:
+    """In the tick in which bodies part or join: 0 and 1 were one body, or are one now; body 2 is another."""
+    other = single(2)
+    apart, joined = [*APART.values(), other], [PAIR, other]
+    requests = [Request(Action.DISARM, 0), Request(Action.ARM, 0), Request(Action.DISARM, 2)]
+    assert follow(requests, joined, {**APART, 2: other}) == [Request(Action.DISARM, 0), Request(Action.DISARM, 1), *requests[1:]]
+    assert follow([Request(Action.DISARM, 1)], apart, {0: PAIR, 2: other}) == [Request(Action.DISARM, 0)]
+    assert follow([Request(Action.DISARM, 7)], apart, {0: PAIR, 2: other}) == [Request(Action.DISARM, 7)], "which nobody is"
 
 
 # ---------------------------------------------------------------- in flight
