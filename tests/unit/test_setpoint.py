@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from firmware_py.core.rotations import from_euler
-from firmware_py.core.setpoint import Glider, Wish, ahead_of, limited, rest_at
+from firmware_py.core.rotations import difference, exp, from_euler, multiply
+from firmware_py.core.setpoint import Glider, Wish, ahead_of, leashed, leashed_turn, limited, rest_at
 from firmware_py.core.types import Setpoint
 
 ZERO = np.zeros(3)
@@ -81,6 +81,16 @@ def test_set_point_never_jumps() -> None:
 def test_vector_is_shortened_to_its_limit() -> None:
     np.testing.assert_allclose(limited(np.array([3.0, 4.0, 0.0]), 1.0), [0.6, 0.8, 0.0])
     np.testing.assert_array_equal(limited(np.array([0.3, 0.4, 0.0]), 0.5), [0.3, 0.4, 0.0])
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_set_point_leads_a_body_by_a_metre_along_each_axis_and_by_two_radians_at_the_most(way: float) -> None:
+    place, attitude, axis = np.array([1.0, -2.0, 3.0]), from_euler(0.3, -0.4, 2.0), way * np.array([0.6, 0.0, 0.8])
+    ahead = place + way * np.array([1.5, 0.4, -0.9])
+    np.testing.assert_allclose(leashed(ahead, place), place + way * np.array([1.0, 0.4, -0.9]), rtol=1e-12)
+    for turn, kept in ((1.9, 1.9), (2.5, 2.0)):
+        led = leashed_turn(multiply(attitude, exp(turn * axis)), attitude)
+        np.testing.assert_allclose(difference(led, attitude), kept * axis, atol=1e-12)
 
 
 def test_feed_forward_looks_ahead() -> None:
