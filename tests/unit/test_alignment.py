@@ -97,11 +97,12 @@ def test_mean_is_taken_over_what_came() -> None:
     (STILL, felt(Q_WB, (0.0, 0.0, -0.51))),
     (STILL + np.array([0.0, 0.51, 0.0]), felt(Q_WB)),
     (STILL, np.full((20, 3), np.nan)),
+    (STILL + [0.6, -0.6, 0.0], felt(Q_WB)),
     (np.full((20, 3), np.nan), felt(Q_WB)),
     (STILL, np.where(np.arange(20)[:, None] < 11, np.nan, felt(Q_WB))),
     (STILL[:0], felt(Q_WB, count=0)),
     (STILL, np.full((20, 3), np.inf)),
-], ids=["pushed down", "pushed up", "turning", "no accelerometer", "no gyro", "too few", "nothing", "infinite"])  # fmt: skip
+], ids=["pushed down", "pushed up", "turning", "turning about two axes", "no accelerometer", "no gyro", "too few", "nothing", "infinite"])  # fmt: skip
 def test_attitude_is_not_guessed_from_what_is_not_gravity(gyros: np.ndarray, accels: np.ndarray) -> None:
     assert upright(gyros, accels) is None
 
@@ -135,6 +136,14 @@ def test_tags_that_come_seldom_tell_the_same_of_a_robot_that_moves_and_nothing_a
     for n in range(5):
         sight.agrees(tag(n), np.zeros(3), Q_WB)
     sight.agrees(tag(4 + round(gap_s * 1e9), P_WB + np.array([moved_m, 0.0, 0.0])), np.zeros(3), Q_WB)
+    assert sight.count == count
+
+
+@pytest.mark.parametrize(("known_m", "count"), [(0.5, 2), (0.0, 1)])
+def test_tags_of_a_robot_that_moves_tell_the_same_where_its_way_is_known(known_m: float, count: int) -> None:
+    sight, way = FirstSight(), np.array([1.0, 0.0, 0.0])
+    sight.agrees(tag(0), np.zeros(3), Q_WB)
+    sight.agrees(tag(16_000_000, P_WB + 0.5 * way), known_m * way, Q_WB)
     assert sight.count == count
 
 
