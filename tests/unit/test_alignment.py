@@ -97,12 +97,14 @@ def test_mean_is_taken_over_what_came() -> None:
     (STILL, felt(Q_WB, (0.0, 0.0, -0.51))),
     (STILL + np.array([0.0, 0.51, 0.0]), felt(Q_WB)),
     (STILL, np.full((20, 3), np.nan)),
-    (STILL + [0.6, -0.6, 0.0], felt(Q_WB)),
+    (np.tile([0.6, -0.6, 0.0], (20, 1)), felt(Q_WB)),
     (np.full((20, 3), np.nan), felt(Q_WB)),
     (STILL, np.where(np.arange(20)[:, None] < 11, np.nan, felt(Q_WB))),
     (STILL[:0], felt(Q_WB, count=0)),
     (STILL, np.full((20, 3), np.inf)),
-], ids=["pushed down", "pushed up", "turning", "turning about two axes", "no accelerometer", "no gyro", "too few", "nothing", "infinite"])  # fmt: skip
+], ids=[
+    "pushed down", "pushed up", "turning", "swaying", "no accelerometer", "no gyro", "too few", "nothing", "infinite",
+])  # fmt: skip
 def test_attitude_is_not_guessed_from_what_is_not_gravity(gyros: np.ndarray, accels: np.ndarray) -> None:
     assert upright(gyros, accels) is None
 

@@ -7,6 +7,7 @@ from firmware_py.core import propagation
 from firmware_py.core.missing_thrust import CORIOLIS, CROSSED, FORCES, MUNK, RECENT, MissingThrust, add_coriolis, add_flow, add_model
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import from_euler
+from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
@@ -147,7 +148,13 @@ def test_a_thruster_is_not_blamed_for_what_the_water_does_to_a_body_that_turns_u
     assert watch._explain(np.ones(8, bool)) == (2 if sign == 0.0 else -1)
 
 
-def test_flow_is_what_a_turn_under_way_meets() -> None:
-    out = np.zeros(6)
-    add_flow(np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2]), out)
+def test_flow_is_what_a_turn_under_way_meets_and_every_block_has_it() -> None:
+    nu, out, watch = np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2]), np.zeros(6), MissingThrust(BODY, Faults(), TICK_NS)
+    add_flow(nu, out)
     np.testing.assert_allclose(out, [0.3 * 0.5, -0.4 * 0.4, 0.5 * 0.2, -0.02, 0.03, -0.06])
+    estimate = Estimate(
+        np.array([0.0, 0.0, 2.0]), from_euler(0.0, 0.0, 0.0), nu, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0, 1.0, 6, 0, True,
+    )  # fmt: skip
+    for _ in range(10):
+        watch.step(Measured(nu[3:], np.zeros(3), None, []), estimate, np.zeros(8), np.ones(8, bool), True, True)
+    np.testing.assert_allclose(watch._blocks[-1, CROSSED:FORCES], out)
