@@ -138,6 +138,19 @@ def test_current_of_one_face_alone_does_not_count(row: Row, silent: int, heard_s
     assert math.isnan(detector.currents_ma[silent]) == (heard_s == 0.0) and detector.currents_ma[1 - silent] == 100.0
 
 
+@pytest.mark.parametrize("faces", [(0, 1), (2, 3), (4, 5), (5, 0)])
+def test_current_of_every_face_is_heard(row: Row, faces: tuple[int, int]) -> None:
+    """Three come in a frame; those of all other faces are none."""
+    bank = PairBank([ROW[0]._replace(face_a=faces[0], face_b=faces[1])], P)
+    for _ in range(100):
+        time_ns, modules = row.hear()
+        for module, face in zip(modules, faces, strict=False):
+            currents = [100.0 if face == each else 0.0 for each in range(6)]
+            module.docks = [DockFeedback(first, tuple(currents[first : first + 3]), (1, 1, 1)) for first in (0, 3)]
+        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+    assert bank.status(0).docked
+
+
 def test_magnet_that_the_limiter_rests_tells_nothing(row: Row) -> None:
     bank = PairBank(ROW[:2], P)
     row.watch(bank, 1.0)
