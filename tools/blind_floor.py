@@ -5,7 +5,9 @@ noise of IMU and tags. Only what is drawn anew in every sample is unknown, and o
 chapter 5). The robot's own filter is told less, and its thrusters do not quite what they are told.
 
 What tilts the robot is the one figure left open: the gyro measures the turning, and a filter that also knew the moments would know the
-tilt better. So the floor is told for several errors of the moment that a filter believes the thrusters to make.
+tilt better. So the floor is told for several errors of the moment that a filter believes the thrusters to make. No moment tells a tilt from
+water that accelerates, though: the water's pressure gradient acts where the buoyancy does, so that the robot hangs along the gravity that
+it feels, and the accelerometer feels the same.
 """
 
 from __future__ import annotations
@@ -76,6 +78,7 @@ def model(world: WorldSpec, sensors: SensorSpec, vehicle: Vehicle, unforeseen_n_
     rates[TENDS, TENDS] = -1.0 / t1
     rates[TILT, RATE] = 1.0
     rates[RATE, [TILT, MOMENT, STEADY]] = np.array([-upright, 1.0, 1.0]) / inertia
+    rates[RATE] += rates[RATE, TILT] / world.gravity * rates[WATER]
     rates[MOMENT, MOMENT] = -1.0 / MOMENT_S
     noise = np.zeros(STATES)
     noise[TENDS] = tends**2 * (1.0 - math.exp(-2.0 * PERIOD_S / t1))
