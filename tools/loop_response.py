@@ -148,7 +148,7 @@ class Loop:
             pressure = sensors.pressure_pa(truth) if tick % PRESSURE_EVERY == 0 else None
             due = [s for s in self._seen if s.module == index and s.capture_ns + delay_ns <= time_ns]
             tags = [TagObservation(s.tag_id, s.quality, s.capture_ns, s.p_wt, s.q_wt) for s in due]
-            modules.append(ModuleInputs(sensors.gyro(truth), sensors.accel(truth), pressure, tags, answered=True, heard=True))
+            modules.append(ModuleInputs(sensors.gyro(truth), sensors.accel(truth), pressure, tags=tags, answered=True, heard=True))
         self._seen = [s for s in self._seen if s.capture_ns + delay_ns > time_ns]
         return Inputs(tick, time_ns, modules)
 

@@ -74,12 +74,12 @@ class ModuleInputs:
     accel: Array | None = None
     """(3,) specific force, module frame, m/s^2."""
     pressure_pa: float | None = None
-    water_temperature_c: float | None = None
     tags: list[TagObservation] = field(default_factory=list)
     docks: list[DockFeedback] = field(default_factory=list)
     esc: list[EscFeedback] = field(default_factory=list)
     voltage_v: float | None = None
     current_a: float | None = None
+    water_temperature_c: float | None = None
     cabin_temperature_c: float | None = None
     cabin_pressure_pa: float | None = None
     leak: bool | None = None
