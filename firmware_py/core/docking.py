@@ -336,10 +336,11 @@ class DockingStage:
         self.relays.switch(RELAY_PUSH, *plan.opens)
         whole = _body_of(request.module, estimates)
         changes = whole in decisions.joining or whole in [part.whole for part in decisions.parts]
-        in_place = self._in_place(undock, time_ns)
-        if time_ns < (undock.last_ns if in_place else undock.until_ns) or changes:  # the next tick has no such body, and ends this
+        if time_ns < undock.until_ns or changes:  # the next tick has no such body, and ends this
             return
-        if in_place:
+        if self._in_place(undock, time_ns):
+            if time_ns < undock.last_ns:
+                return
             self._undocks.remove(undock)
             self.relays.switch(RELAY_PULL, *plan.opens)
             self._say(WARNING, f"undock of module {request.module} ended: {IN_PLACE}")
@@ -363,7 +364,7 @@ class DockingStage:
         other. Of several that part at once the funnels hold back what leaves across, until thrusters draw it out.
         """
         opens, half_ns = undock.plan.opens, (undock.since_ns + time_ns) // 2
-        held = [modules_of(joint.request) for joint, row in zip(self._watched, self._joints.rows, strict=True) if row["near_ns"] > half_ns]
+        held = [modules_of(self._watched[i].request) for i in np.flatnonzero(self._joints.rows["near_ns"] > half_ns).tolist()]
         return len(opens) == 1 and modules_of(opens[0]) in held
 
     def _say(self, severity: int, text: str) -> None:
