@@ -114,6 +114,8 @@ class MissionFlight:
         self._flight: _Flight | None = None
         self._left: tuple[Leg, ...] = ()
         """Of the mission that is paused: jumps that were made are not made again."""
+        self._begun_at: int | None = None
+        """The item from which it was begun last; None where a jump is to begin it there once more."""
         self._plan_at_tick: int | None = None
         """None once it is asked for."""
         self._hold_by_tick = 0
@@ -154,25 +156,30 @@ class MissionFlight:
         return self._system.subject.progress.state == ACTIVE
 
     def start(self, first: int | None) -> str:
-        """Fly from item `first`, or go on where it stopped. Returns why not, or nothing."""
+        """Fly from item `first`, or go on where it stopped. What flies from there already flies on: a client that lost the answer asks again.
+
+        Returns why not, or nothing.
+        """
         s = self._system.subject
         self._end_if_taken()
         if not self.items:
             return "there is none"
         if not s.armed:
             return "the vehicle is disarmed"
-        if first is None and s.progress.state == ACTIVE:
+        wanted = first
+        if wanted is None:
+            wanted = s.progress.current if s.progress.state == PAUSED else 0
+        wanted = max(wanted, self._first)
+        if s.progress.state == ACTIVE and (first is None or wanted == self._begun_at):
             return ""
         left = self._left if first is None and s.progress.state == PAUSED else ()
-        if first is None:
-            first = s.progress.current if s.progress.state == PAUSED else self._first
         try:
-            legs = left or self._legs(max(first, self._first))
+            legs = left or self._legs(wanted)
         except MissionError as error:
             return str(error)
         if not legs:
             return "nothing is left to fly"
-        s.progress.state, s.progress.current = ACTIVE, legs[0].sequence
+        s.progress.state, s.progress.current, self._begun_at = ACTIVE, legs[0].sequence, wanted
         self._begin(legs)
         return ""
 
@@ -190,6 +197,7 @@ class MissionFlight:
         self._end_if_taken()
         p = self._system.subject.progress
         if self.flies or (self._flight is not None and self._flight.replaced):
+            self._begun_at = None
             return self.start(index)
         p.current, p.state, self._left = index, PAUSED, ()
         return ""

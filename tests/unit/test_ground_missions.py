@@ -5,7 +5,9 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.types import Action, Mode
-from tests.unit.ground_missions import PLACES, continued, fly, item, upload
+from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.mission_flight import Plan
+from tests.unit.ground_missions import PLACES, Path, continued, fly, item, upload
 from tests.unit.ground_requests import NAN
 from tests.unit.ground_world import Client, World
 
@@ -148,6 +150,45 @@ def test_mission_that_flies_is_not_begun_anew_when_it_is_asked_for_again(world: 
     client.command(176, 1, 4, 4)
     world.run(20)
     assert world.station.jobs() == [] and len(world.robot.asked) == before and world.robot.mode[0] == Mode.AUTO
+
+
+@pytest.mark.parametrize(("identity", "first", "begun"), [("generic", 0, 0), ("generic", 1, 1), ("ardusub", 0, 1)])
+def test_start_that_comes_again_because_its_answer_was_lost_does_not_begin_the_mission_anew(identity: str, first: int, begun: int) -> None:
+    """It stopped, and flew again from the beginning. ArduSub, which flies it already, does nothing either."""
+    world = World(config=GroundConfig(identity=identity))
+    client = world.client()
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    client.command(400, 1)
+    world.run(3)
+    client.command(300, first)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert job.legs[0].sequence == begun
+    world.station.planned(0, Plan(job.serial, Path(), (10.0, 20.0, 30.0)[: len(job.legs)]))
+    world.run(1100)
+    client.clear()
+    client.command(300, first)
+    world.run(20)
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+    assert world.station.jobs() == [] and world.robot.mode[0] == Mode.AUTO
+    for number, parameters in ((224, (begun,)), (300, (2,))):
+        client.command(number, *parameters)
+        world.run(20)
+        (job,) = world.station.jobs()
+        assert job.legs[0].sequence == parameters[0], "another item, or a jump to the same one, is gone to"
+
+
+def test_start_that_comes_again_while_its_mission_is_planned_is_waited_for_once(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    client.command(400, 1)
+    world.run(3)
+    for _ in range(2):
+        client.command(300, 0)
+        world.run(10)
+    (job,) = world.station.jobs()
+    world.station.planned(0, Plan(job.serial, Path(), (10.0, 20.0, 30.0)))
+    world.run(3)
+    assert world.robot.mode[0] == Mode.AUTO
 
 
 def test_items_at_one_place_are_all_told_to_be_reached(world: World, client: Client) -> None:
