@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from pymavlink.generator.mavcrc import x25crc
 
-from firmware_py.ground.dialect import Dialect, Message
+from firmware_py.ground.dialect import Definition, Dialect, Message
 from firmware_py.ground.signing import SIGNATURE_BYTES, Signing
 
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
@@ -33,6 +33,23 @@ class Packet(NamedTuple):
     raw: bytes
 
 
+class _Header(NamedTuple):
+    """Of a frame, or of what looks like one."""
+
+    size: int
+    length: int
+    """Of the payload."""
+    flags: int
+    system: int
+    component: int
+    number: int
+
+    @property
+    def frame_size(self) -> int:
+        """Bytes of the whole frame."""
+        return self.size + self.length + _CRC.size + (SIGNATURE_BYTES if self.flags & _SIGNED else 0)
+
+
 class Framer:
     """Cuts the bytes of one peer into frames."""
 
@@ -40,7 +57,7 @@ class Framer:
         self._dialect, self._signing = dialect, signing
         self._buffer = bytearray()
         self.counts = counts
-        """Frames by what became of them: good, checksum, unknown, flags, refused; bytes of no frame: garbage."""
+        """Frames by what became of them: good, checksum, unknown, flags, length, refused; bytes of no frame: garbage."""
 
     def feed(self, data: bytes) -> list[Packet]:
         """The believed messages that `data` completes."""
@@ -50,15 +67,16 @@ class Framer:
         while false < _MOST_FALSE and (start := self._next_magic(at)) is not None:
             self.counts["garbage"] += start - at
             at = start
-            size = self._frame_size(at)
-            if size is None or len(self._buffer) - at < size:
+            header = self._header(at)
+            definition = None if header is None else self._definition(header)
+            if header is None or (definition is not None and len(self._buffer) - at < header.frame_size):
                 break
-            packet = self._frame(bytes(self._buffer[at : at + size]))
+            packet = None if definition is None else self._frame(header, definition, bytes(self._buffer[at : at + header.frame_size]))
             if packet is None:
                 at += 1  # what looked like a frame may hold a real one
                 false += 1
                 continue
-            at += size
+            at += header.frame_size
             if packet.message.name:
                 packets.append(packet)
         else:
@@ -76,41 +94,43 @@ class Framer:
         found = _MAGIC.search(self._buffer, at)
         return None if found is None else found.start()
 
-    def _frame_size(self, at: int) -> int | None:
-        """Bytes of the frame at `at`, or None while its header is incomplete."""
-        if len(self._buffer) - at < 3:
+    def _header(self, at: int) -> _Header | None:
+        """The header at `at`, or None while it is incomplete."""
+        layout = _HEADER_1 if self._buffer[at] == _MAGIC_1 else _HEADER_2
+        if len(self._buffer) - at < layout.size:
             return None
-        length = self._buffer[at + 1]
-        if self._buffer[at] == _MAGIC_1:
-            return _HEADER_1.size + length + _CRC.size
-        signature = SIGNATURE_BYTES if self._buffer[at + 2] & _SIGNED else 0
-        return _HEADER_2.size + length + _CRC.size + signature
+        fields = layout.unpack_from(self._buffer, at)
+        if layout is _HEADER_1:
+            _, length, _, system, component, number = fields
+            return _Header(layout.size, length, 0, system, component, number)
+        _, length, flags, _, _, system, component, low, high = fields
+        return _Header(layout.size, length, flags, system, component, low | high << 16)
 
-    def _frame(self, raw: bytes) -> Packet | None:
-        """The message; None when this is no frame; a nameless one when it is a frame that is not believed."""
-        if raw[0] == _MAGIC_1:
-            _, length, _, system, component, number = _HEADER_1.unpack_from(raw)
-            header = _HEADER_1.size
-        else:
-            _, length, flags, _, _, system, component, low, high = _HEADER_2.unpack_from(raw)
-            number, header = low | high << 16, _HEADER_2.size
-            if flags & ~_SIGNED:
-                self.counts["flags"] += 1
-                return None
-        definition = self._dialect.by_number.get(number)
-        if definition is None:
+    def _definition(self, header: _Header) -> Definition | None:
+        """Of the message; None when this can be no frame: nothing more of it is waited for, a stop may stand behind one byte of noise."""
+        definition = self._dialect.by_number.get(header.number)
+        if header.flags & ~_SIGNED:
+            self.counts["flags"] += 1
+        elif definition is None:
             self.counts["unknown"] += 1
-            return None
-        end = header + length
+        elif header.size == _HEADER_1.size and header.length > definition.struct.size:  # only in MAVLink 2 a message may have grown
+            self.counts["length"] += 1
+        else:
+            return definition
+        return None
+
+    def _frame(self, header: _Header, definition: Definition, raw: bytes) -> Packet | None:
+        """The message; None when this is no frame; a nameless one when it is a frame that is not believed."""
+        end = header.size + header.length
         if checksum(raw[1:end], definition.crc_extra) != _CRC.unpack_from(raw, end)[0]:
             self.counts["checksum"] += 1
             return None
         signature = raw[end + _CRC.size :]
-        if not self._signing.believes(raw[: end + _CRC.size], signature, number, system, component):
+        if not self._signing.believes(raw[: end + _CRC.size], signature, header.number, header.system, header.component):
             self.counts["refused"] += 1
             return _REFUSED
         self.counts["good"] += 1
-        return Packet(Message(definition.name, definition.decode(raw[header:end]), system, component), raw)
+        return Packet(Message(definition.name, definition.decode(raw[header.size : end]), header.system, header.component), raw)
 
 
 _REFUSED = Packet(Message("", {}), b"")

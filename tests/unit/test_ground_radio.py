@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from firmware_py.core.types import Action, Event
 from firmware_py.ground.link import Links
 from firmware_py.ground.telemetry import DEFAULT_HZ
+from firmware_py.ground.wire import checksum
 from tests.unit.ground_sides import PATIENCE_S, free_port, heartbeat, pump, received, side_on
 from tests.unit.ground_world import Robot, World
 
@@ -47,6 +48,26 @@ def test_radio_status_makes_nobody_believed() -> None:
     mav = mavlink.MAVLink(None, srcSystem=51, srcComponent=68)
     assert not station.take(3, bytes(mavlink.MAVLink_radio_status_message(0, 0, 0, 0, 0, 0, 0).pack(mav)), 0)
     assert station.take(3, heartbeat(), 0)
+
+
+@pytest.mark.parametrize("noise", [b"\xfd", b"\xfe", b"\xfd\xfd", b"\xfe\xfe", b"\xfe\xfd", b"\xfd\x00\xfe"])
+def test_stop_behind_noise_that_looks_like_the_start_of_a_frame_is_heard_at_once(noise: bytes) -> None:
+    """It waited until as much had come as the length told that stood in the noise: at a heartbeat a second for ten seconds."""
+    world = World()
+    client = world.client()
+    stop = client.pack("COMMAND_LONG", 1, 1, 31012, 0, *[0] * 7)
+    assert world.station.take(client.channel, noise + stop, world.time_ns, datagram=False)
+    world.run(1)
+    assert [request.action for request in world.robot.asked] == [Action.ESTOP]
+
+
+def test_frame_of_the_old_protocol_is_no_longer_than_its_message_and_one_of_the_new_may_have_grown() -> None:
+    station = World().station
+    heartbeat_1 = b"\xfe\x0a\x00\xff\xbe\x00" + bytes(8)  # ten bytes, where there are nine
+    assert not station.take(0, heartbeat_1, 0, datagram=False) and station.counts["length"] == 1
+    grown = bytes([10, *heartbeat()[2:10], *bytes(9), 7])
+    frame = b"\xfd" + grown + checksum(grown, mavlink.MAVLink_heartbeat_message.crc_extra).to_bytes(2, "little")
+    assert station.take(0, frame, 0, datagram=False)
 
 
 class SlowLink:
