@@ -156,7 +156,7 @@ class MissionFlight:
         return self._system.subject.progress.state == ACTIVE
 
     def start(self, first: int | None) -> str:
-        """Fly from item `first`, or go on where it stopped. What flies from there already flies on: a client that lost the answer asks again.
+        """Fly from item `first`, or go on where it stopped. What flies from there already flies on: its answer may be lost.
 
         Returns why not, or nothing.
         """

@@ -27,7 +27,7 @@ from firmware_py.ground.pilots import Sender
 from firmware_py.ground.presence import Presence
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.steering import Steering
-from firmware_py.ground.system import Arrival, System
+from firmware_py.ground.system import NEVER_WAITS, Arrival, System
 from firmware_py.ground.telemetry import Subject
 from firmware_py.ground.wire import Framer, Packet
 
@@ -42,6 +42,8 @@ _OF_NO_BODY = ("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END")
 """Logs are the process's: who fetches one goes on with the same system when its body docks."""
 _NEVER_SIGNED = ("RADIO_STATUS",)
 """Taken from everybody, also with a key."""
+_TARGETS = frozenset({"target_system", "target"})
+"""Fields of what is meant for somebody, be it for all."""
 _NEVER_FORWARDED = ("SETUP_SIGNING", *_NEVER_SIGNED)
 
 
@@ -253,14 +255,18 @@ class GroundStation:
             del self._routes[next(iter(self._routes))]
 
     def _forward(self, packet: Packet, target: int, component: int, channel: int) -> None:
-        """To wherever the system that it is for was heard, of one of ours the component; what is for all, to everybody else."""
+        """To wherever the system that it is for was heard, of one of ours the component; what is for all, to everybody else.
+
+        What streams by waits for what a slow link carries: of a companion computer's that is too much for a radio.
+        """
         if packet.message.name in _NEVER_FORWARDED:
             return
         heard = {
             at for (system, part), at in self._routes.items()
             if target in (0, system) and (target not in self.services or component == part)
         }  # fmt: skip
-        self._frames += [Outgoing(other, packet.raw) for other in heard - {channel}]
+        streams = _TARGETS.isdisjoint(packet.message.values) and packet.message.name not in NEVER_WAITS
+        self._frames += [Outgoing(other, packet.raw) for other in heard - {channel} - (self._busy if streams else set())]
 
 
 def _dock_of(config: GroundConfig) -> DockRequest | None:

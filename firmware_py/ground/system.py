@@ -16,8 +16,8 @@ _TEXT = 50
 """Characters of one STATUSTEXT."""
 _SELDOM_NS = 5 * NS_PER_S
 """Between two texts about what streams in."""
-_NEVER_WAITS = ("HEARTBEAT",)
-"""Without it clients lose the vehicle."""
+NEVER_WAITS = ("HEARTBEAT", "STATUSTEXT")
+"""Without the one clients lose the vehicle; the other is said once."""
 STOPPING = frozenset({Action.ESTOP, Action.DISARM})
 """What reaches a module whichever body it is part of."""
 STEERING = STOPPING | {Action.SET_MODE, Action.HOLD, Action.DOCK, Action.UNDOCK, Action.MOTOR_TEST}
@@ -123,7 +123,7 @@ class System:
         """Send what is due on every channel; each message is made once. A slow link gets fewer of all kinds, and every heartbeat."""
         made: dict[str, list[bytes]] = {}
         for channel, rates in self.channels.items():
-            for name in rates.due(time_ns, _NEVER_WAITS if channel in self.busy else STREAMS):
+            for name in rates.due(time_ns, NEVER_WAITS if channel in self.busy else STREAMS):
                 if name not in made:
                     made[name] = [self.outbox.payload(name, values) for values in STREAMS[name](self.subject)]
                 for payload in made[name]:

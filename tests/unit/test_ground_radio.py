@@ -1,5 +1,6 @@
 """A radio on a serial line: it is slow, takes nothing for a while, and is pulled out and plugged in again."""
 
+import math
 import os
 import pty
 import socket
@@ -117,6 +118,35 @@ def test_radio_slower_than_what_streams_gets_less_of_everything_and_every_heartb
         assert got[system, "ATTITUDE"] < 100  # of 230
     assert got[1, "STATUSTEXT"] == 20
     assert got[1, "PARAM_VALUE"] >= 20
+
+
+def test_what_a_companion_computer_streams_to_all_leaves_a_radio_its_telemetry_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred estimates a second filled its queue: the station heard one message of each kind and every answer four seconds late."""
+    radio, cable, robot = SlowLink(57.6), SlowLink(math.inf), Robot()
+    links = iter((radio, cable))
+    monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address: next(links))
+    companion = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+    estimate = bytes(mavlink.MAVLink_vision_position_estimate_message(0, 1, 2, 3, 0.1, 0.2, 0.3, [0.1] * 21).pack(companion))
+    once_a_second = (
+        mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3),
+        mavlink.MAVLink_statustext_message(6, b"seen"),
+        mavlink.MAVLink_command_long_message(0, 0, 400, 0, 0, 0, 0, 0, 0, 0, 0),
+    )
+    with closing(side_on("radio", "cable")) as side:
+        side.station.take(0, heartbeat(), 0)
+        for second in range(10):
+            robot.events.append(Event(6, f"second {second}", 0))
+            for tick in range(100):
+                side.station.take(1, estimate, robot.tick * 10_000_000)
+                if tick == 50:
+                    side.station.take(1, b"".join(bytes(m.pack(companion)) for m in once_a_second), robot.tick * 10_000_000)
+                pump(side, robot)
+        assert not side.links.dropped
+    parser = mavlink.MAVLink(None)
+    got = Counter((m.get_srcComponent(), m.get_type()) for frame in radio.frames for m in parser.parse_buffer(frame))
+    assert got[1, "STATUSTEXT"] == 10 and got[1, "HEARTBEAT"] >= 10
+    assert [got[191, name] for name in ("HEARTBEAT", "STATUSTEXT", "COMMAND_LONG")] == [10, 10, 10]
+    assert got[1, "ATTITUDE"] > 20 and got[191, "VISION_POSITION_ESTIMATE"] > 20
 
 
 def test_serial_link_carries_frames_both_ways() -> None:
