@@ -210,6 +210,9 @@ class CommandService:
         latitude, longitude, altitude = command.parameters[4:7]
         if not all(map(math.isfinite, (latitude, longitude, altitude))):
             return DENIED
+        if self._system.is_one_of_several(command.arrival):
+            self._system.say(WARNING, "reposition refused: it is for all, and there are several bodies")
+            return DENIED
         reason = self._missions.go_to(latitude, longitude, altitude, command.parameters[3], command.get(1))
         if reason:
             self._system.say(WARNING, f"reposition refused: {reason}")

@@ -101,7 +101,7 @@ class MissionService:
         if count > MOST_ITEMS:
             self._acknowledge(arrival, _NO_SPACE, kind)
             return
-        if self._upload is not None and not _same(self._upload.arrival, arrival):
+        if self._denies(arrival):
             self._acknowledge(arrival, _DENIED, kind)
             return
         if count == 0:
@@ -118,11 +118,18 @@ class MissionService:
         known = self._flight.items
         if kind != _MISSION or not 0 <= first <= last < len(known):
             self._acknowledge(arrival, _UNSUPPORTED if kind != _MISSION else _INVALID_SEQUENCE, kind)
-        elif self._flight.flies or (self._upload is not None and not _same(self._upload.arrival, arrival)):
+        elif self._flight.flies or self._denies(arrival):
             self._acknowledge(arrival, _DENIED, kind)
         else:
             self._upload = _Upload(arrival, last + 1, kind, list(known[:first]), known[last + 1 :], in_part=True)
             self._ask(self._upload, arrival.time_ns)
+
+    def _denies(self, arrival: Arrival) -> bool:
+        """Whether no mission may come from there now: another client brings one, or it is for all and would fly several to one place."""
+        if self._system.is_one_of_several(arrival):
+            self._system.say(WARNING, "mission refused: it is for all, and there are several bodies")
+            return True
+        return self._upload is not None and not _same(self._upload.arrival, arrival)
 
     def _ask(self, upload: _Upload, time_ns: int) -> None:
         upload.asked, upload.asked_ns = upload.asked + 1, time_ns

@@ -99,6 +99,10 @@ class System:
         gone = f"docked, system {leader} leads it now" if leader != own else "no tick has told of its body"
         self.say(WARNING, f"system {own} is not steered: {why or gone}")
 
+    def is_one_of_several(self, arrival: Arrival) -> bool:
+        """Whether a message is for all, and this is not the one body that there is: they would be steered to one place."""
+        return arrival.message["target_system"] == 0 and len(self.subject.picture.records) > 1
+
     def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
         """To one channel; what is for one that is gone goes nowhere, and leaves nothing behind."""
         if channel in self.channels:

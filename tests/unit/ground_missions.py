@@ -30,10 +30,10 @@ def item(
     return (1, 1, sequence, frame, command, 0, 1, *p, *place)
 
 
-def upload(world: World, client: Client, items: list[tuple[float, ...]], kind: int = 0) -> int:
+def upload(world: World, client: Client, items: list[tuple[float, ...]], kind: int = 0, target: int = 1) -> int:
     """Send items as they are asked for; the result."""
     client.clear()
-    client.send("MISSION_COUNT", 1, 1, len(items), kind)
+    client.send("MISSION_COUNT", target, 1, len(items), kind)
     answered = 0
     for _ in range(400):
         world.run(1)
@@ -41,7 +41,7 @@ def upload(world: World, client: Client, items: list[tuple[float, ...]], kind: i
             return int(client.last("MISSION_ACK").type)
         asked = client.all("MISSION_REQUEST_INT")
         if len(asked) > answered:
-            client.send("MISSION_ITEM_INT", *items[asked[-1].seq], kind)
+            client.send("MISSION_ITEM_INT", target, *items[asked[-1].seq][1:], kind)
             answered = len(asked)
     raise AssertionError("no acknowledgement")
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.failsafes import PILOTED
 from firmware_py.core.supervisor import Supervisor
@@ -10,6 +11,8 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Event, Mode
 from firmware_py.description.parameters import Parameters
 from tests.unit.failsafe_causes import FIELDS, ROWS, bad, quick
+from tests.unit.ground_missions import PLACES, item, upload
+from tests.unit.ground_requests import NAN
 from tests.unit.ground_world import Client, World
 
 
@@ -157,3 +160,32 @@ def test_what_is_for_all_is_not_refused_by_a_docked_system(docked: World, client
     client.command(410, target=0)
     docked.run(2)
     assert answers(client) == [(1, 410, 0)] and not client.texts
+
+
+GOES_TO_PLACES = {
+    "COMMAND_INT": ((0, 0, 6, 192, 0, 0, -1, 1, 0, NAN, 302084010, 1201614000, -0.4), "COMMAND_ACK", "result", mavlink.MAV_RESULT_DENIED),
+    "MISSION_COUNT": ((0, 0, 1), "MISSION_ACK", "type", mavlink.MAV_MISSION_DENIED),
+    "MISSION_WRITE_PARTIAL_LIST": ((0, 0, 0, 0), "MISSION_ACK", "type", mavlink.MAV_MISSION_DENIED),
+}
+"""Each for all, and how it is refused where there are several."""
+
+
+@pytest.mark.parametrize("name", GOES_TO_PLACES)
+def test_place_that_is_for_all_is_gone_to_by_the_one_body_and_of_several_by_none(world: World, client: Client, name: str) -> None:
+    """Both planned a way to it."""
+    values, answer, field, denied = GOES_TO_PLACES[name]
+    for system in (1, 2):
+        upload(world, client, [item(0, PLACES[0])], target=system)
+    client.command(400, 1, target=0)
+    world.run(3)
+    client.clear()
+    client.send(name, *values)
+    world.run(10)
+    assert [getattr(m, field) for m in client.all(answer)] == [denied, denied]
+    assert world.station.jobs() == [] and not client.all("MISSION_REQUEST_INT")
+    assert client.texts.count("it is for all, and there are several bodies") == 2
+    world.robot.dock()
+    world.run(1)
+    client.send(name, *values)
+    world.run(10)
+    assert len(world.station.jobs()) + len(client.all("MISSION_REQUEST_INT")) == 1
