@@ -23,6 +23,8 @@ _UNKNOWN_16, _UNKNOWN_BATTERY = 0xFFFF, -1
 _UNKNOWN_TEMPERATURE = 0x7FFF
 """As BATTERY_STATUS has it. SCALED_PRESSURE defines none, but its 0 would be water at the point of freezing."""
 _STATE_STANDBY, _STATE_ACTIVE, _STATE_EMERGENCY = 3, 4, 6
+_NO_GPS = 0
+"""GPS_FIX_TYPE."""
 _FRAME_LOCAL_NED, _FRAME_BODY_FRD = 1, 12
 _PWM_CENTRE, _PWM_HALF = 1500, 400
 
@@ -303,6 +305,12 @@ def gps_global_origin(s: Subject) -> list[Values]:
     }]  # fmt: skip
 
 
+def gps_raw_int(s: Subject) -> list[Values]:
+    """That there is none, as ArduSub says it: DroneKit does not begin before it has heard of a GPS."""
+    unknown = dict.fromkeys(("eph", "epv", "vel", "cog"), _UNKNOWN_16)
+    return [{"time_usec": s.time_us, "fix_type": _NO_GPS, "satellites_visible": 0, **unknown}]
+
+
 def mission_current(s: Subject) -> list[Values]:
     p = s.progress
     return [{
@@ -347,6 +355,7 @@ STREAMS: Mapping[str, Callable[[Subject], list[Values]]] = {
     "EXTENDED_SYS_STATE": extended_sys_state,
     "HOME_POSITION": home_position,
     "GPS_GLOBAL_ORIGIN": gps_global_origin,
+    "GPS_RAW_INT": gps_raw_int,
     "MISSION_CURRENT": mission_current,
     "CURRENT_MODE": current_mode,
     "SYSTEM_TIME": system_time,
@@ -357,7 +366,7 @@ DEFAULT_HZ: Mapping[str, float] = {
     "HEARTBEAT": 1, "SYS_STATUS": 2, "ATTITUDE": 10, "ATTITUDE_QUATERNION": 10, "LOCAL_POSITION_NED": 10,
     "ODOMETRY": 5, "GLOBAL_POSITION_INT": 5, "VFR_HUD": 4, "BATTERY_STATUS": 1, "SERVO_OUTPUT_RAW": 2,
     "ESC_STATUS": 1, "ESC_INFO": 0.5, "SCALED_PRESSURE": 1, "SCALED_PRESSURE2": 1, "NAMED_VALUE_FLOAT": 2, "DEBUG_FLOAT_ARRAY": 0.2,
-    "EXTENDED_SYS_STATE": 1, "HOME_POSITION": 0.5, "MISSION_CURRENT": 1, "CURRENT_MODE": 0.5, "SYSTEM_TIME": 0.5,
+    "EXTENDED_SYS_STATE": 1, "HOME_POSITION": 0.5, "GPS_RAW_INT": 0.5, "MISSION_CURRENT": 1, "CURRENT_MODE": 0.5, "SYSTEM_TIME": 0.5,
 }  # fmt: skip
 """Before anybody asks for other rates."""
 

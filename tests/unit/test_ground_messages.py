@@ -62,6 +62,15 @@ def test_every_streamed_message_arrives_with_the_robots_values(world: World, cli
     assert client.all("DEBUG_FLOAT_ARRAY") == [] and client.last("SYS_STATUS").load == 0  # nobody is late in lockstep
 
 
+def test_all_that_dronekit_waits_for_comes_by_itself(world: World, client: Client) -> None:
+    """By default: parameters, gps_0, armed, mode and attitude. The first it asks for."""
+    world.run(200)
+    assert client.all("HEARTBEAT") and client.all("ATTITUDE")
+    gps = client.last("GPS_RAW_INT")
+    assert (gps.fix_type, gps.satellites_visible) == (mavlink.GPS_FIX_TYPE_NO_GPS, 0)
+    assert (gps.eph, gps.epv, gps.vel, gps.cog) == (65535, 65535, 65535, 65535), "unknown"
+
+
 def test_odometry_counts_how_often_the_estimate_began_anew() -> None:
     world = World(2)
     client = world.client()
