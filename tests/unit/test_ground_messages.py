@@ -62,6 +62,58 @@ def test_every_streamed_message_arrives_with_the_robots_values(world: World, cli
     assert client.all("DEBUG_FLOAT_ARRAY") == [] and client.last("SYS_STATUS").load == 0  # nobody is late in lockstep
 
 
+ROLL, PITCH, YAW = 0.1, -0.2, 0.3
+"""Of the robot that stands still; the rotation is written out here, and not the firmware's."""
+
+
+def told_of_motion() -> dict[tuple[str, str], float]:
+    """What a robot at 12.5 m above the sea tells of its motion, by message and field, in MAVLink's units: rad, cm/s, mm, deg and so on."""
+    ahead, below = (
+        np.array([[math.cos(YAW), -math.sin(YAW), 0], [math.sin(YAW), math.cos(YAW), 0], [0, 0, 1]])
+        @ [[math.cos(PITCH), 0, math.sin(PITCH)], [0, 1, 0], [-math.sin(PITCH), 0, math.cos(PITCH)]]
+        @ [[1, 0, 0], [0, math.cos(ROLL), -math.sin(ROLL)], [0, math.sin(ROLL), math.cos(ROLL)]]
+    ).T[[0, 2]]
+    north, east, down = 0.05 * ahead - 0.02 * below
+    rates = {"rollspeed": 0.01, "pitchspeed": 0.02, "yawspeed": 0.03}
+    told = {
+        "ATTITUDE": {"roll": ROLL, "pitch": PITCH, "yaw": YAW, **rates},
+        "ATTITUDE_QUATERNION": rates,
+        "ODOMETRY": {"x": 0.0, "y": 0.2, "z": 0.5, "vy": 0.0, "quality": 100, **rates},
+        "LOCAL_POSITION_NED": {"vx": north, "vy": east, "vz": down},
+        "GLOBAL_POSITION_INT": {
+            "vx": round(100 * north), "vy": round(100 * east), "vz": round(100 * down),
+            "hdg": round(100 * math.degrees(YAW)), "alt": 12_000,
+        },
+        "VFR_HUD": {
+            "groundspeed": math.hypot(north, east), "climb": -down, "alt": 12.0,
+            "throttle": round(100 * np.abs(np.linspace(-1, 1, 8)).mean()),
+        },
+        "SYS_STATUS": {"voltage_battery": 12_100, "current_battery": 250, "battery_remaining": -1},
+        "BATTERY_STATUS": {"temperature": 32767, "current_consumed": -1, "energy_consumed": -1, "battery_remaining": -1, "id": 0},
+        "HOME_POSITION": {"longitude": 1201614000, "altitude": 12_500},
+        "SERVO_OUTPUT_RAW": {"port": 0, "servo4_raw": round(1500 - 400 / 7), "servo9_raw": 0},
+    }  # fmt: skip
+    return {(message, field): value for message, fields in told.items() for field, value in fields.items()}
+
+
+@pytest.mark.parametrize(("message", "field"), told_of_motion())
+def test_number_that_is_told_is_in_the_unit_of_its_field(message: str, field: str) -> None:
+    world = World(altitude_m=12.5)
+    client = world.client()
+    client.command(512, getattr(mavlink, f"MAVLINK_MSG_ID_{message}"))
+    world.run(2)
+    assert getattr(client.last(message), field) == pytest.approx(told_of_motion()[message, field], abs=1e-6)
+
+
+def test_time_of_each_message_is_that_of_its_tick(world: World, client: Client) -> None:
+    world.run(400)
+    for message in client.inbox[-60:]:
+        for field, per_second in (("time_boot_ms", 1_000), ("time_usec", 1_000_000)):
+            if hasattr(message, field):
+                told = getattr(message, field) / per_second
+                assert round(told * 100) == pytest.approx(told * 100) and 3.0 < told <= world.time_ns / 1e9
+
+
 def test_all_that_dronekit_waits_for_comes_by_itself(world: World, client: Client) -> None:
     """By default: parameters, gps_0, armed, mode and attitude. The first it asks for."""
     world.run(200)
