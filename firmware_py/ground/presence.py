@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from firmware_py.core.types import INFORMATION, WARNING, Action
 from firmware_py.description.parameters import Parameters
@@ -23,15 +24,22 @@ VERSION = 0x00010000
 """0.1.0, as FIRMWARE_VERSION_TYPE packs it."""
 
 
+@dataclass(slots=True)
+class Watch:
+    """The ground station that must not be lost: the same for all bodies, for what tells one that it is there tells all."""
+
+    station: Station | None = None
+    heard_ns: int = 0
+
+
 class Presence:
     """The watch over one ground station, for one system."""
 
     def __init__(
-        self, system: System, config: GroundConfig, parameters: Callable[[], Parameters], signing: Signing
+        self, system: System, config: GroundConfig, parameters: Callable[[], Parameters], signing: Signing, watch: Watch
     ) -> None:
         self._system, self._config, self._parameters, self._signing = system, config, parameters, signing
-        self.watched: Station | None = None
-        self._heard_ns = 0
+        self._watch = watch
 
     def handlers(self) -> dict[str, Handler]:
         """By message name."""
@@ -49,13 +57,13 @@ class Presence:
         station: Station = (m.system, m.component, m["type"])
         if m["type"] != TYPE_GROUND_STATION or not self._config.watches(m.system, m.component):
             return
-        patience_ns = self._parameters().ground.watch_s * NS_PER_S
-        if self.watched is None or arrival.time_ns - self._heard_ns > patience_ns:
-            if self.watched != station:
+        watch, patience_ns = self._watch, self._parameters().ground.watch_s * NS_PER_S
+        if watch.station is None or arrival.time_ns - watch.heard_ns > patience_ns:
+            if watch.station != station:
                 self._system.say(INFORMATION, f"ground station {m.system}/{m.component} is watched")
-            self.watched = station
-        if self.watched == station:
-            self._heard_ns = arrival.time_ns
+            watch.station = station
+        if watch.station == station:
+            watch.heard_ns = arrival.time_ns
             self._system.ask(Action.GROUND_ALIVE)
 
     def _timesync(self, arrival: Arrival) -> None:

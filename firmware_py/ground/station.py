@@ -24,7 +24,7 @@ from firmware_py.ground.outbox import Outbox, Outgoing
 from firmware_py.ground.parameters import ParameterService, ParameterStore
 from firmware_py.ground.picture import Picture
 from firmware_py.ground.pilots import Sender
-from firmware_py.ground.presence import Presence
+from firmware_py.ground.presence import Presence, Watch
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.steering import Steering
 from firmware_py.ground.system import NEVER_WAITS, Arrival, System
@@ -56,7 +56,7 @@ class Services:
         self.flight = MissionFlight(system, lambda: store.values)
         self.missions = MissionService(system, self.flight)
         self.steering = Steering(system, lambda: store.values, _dock_of(config), config.watches)
-        self.presence = Presence(system, config, lambda: store.values, station.signing)
+        self.presence = Presence(system, config, lambda: store.values, station.signing, station.watch)
         self.logs = LogService(system, Path(config.logs) if config.logs else None)
         self.parameters = ParameterService(system, store, station.present)
         extra = {
@@ -108,6 +108,7 @@ class GroundStation:
         self.store = ParameterStore(parameters, config.parameter_file)
         self.counts: Counter[str] = Counter()
         self.picture = Picture(len(fleet.module), self.store.values.supervision)
+        self.watch = Watch()
         self._dialect = load_dialect()
         self._busy: set[int] = set()
         self._frames: list[Outgoing] = []

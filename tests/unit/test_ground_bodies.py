@@ -162,6 +162,27 @@ def test_what_is_for_all_is_not_refused_by_a_docked_system(docked: World, client
     assert answers(client) == [(1, 410, 0)] and not client.texts
 
 
+def test_body_that_has_parted_watches_the_station_that_all_watch(world: World, client: Client) -> None:
+    """It watched whoever it heard first, and told by that one that nobody is lost: the watched station's loss stopped no body."""
+    other, apart = world.client(254), world.robot.bodies
+    client.heartbeat()
+    world.robot.dock()
+    for _ in range(7):
+        client.heartbeat()
+        world.run(100)
+    world.robot.bodies = apart
+    world.run(1)
+    world.robot.asked.clear()
+    for _ in range(4):
+        other.heartbeat()
+        world.run(100)
+    assert not [request for request in world.robot.asked if request.action == Action.GROUND_ALIVE]
+    client.heartbeat()
+    world.run(1)
+    assert {request.body for request in world.robot.asked if request.action == Action.GROUND_ALIVE} == {0, 1}
+    assert "254/190 is watched" not in client.texts
+
+
 GOES_TO_PLACES = {
     "COMMAND_INT": ((0, 0, 6, 192, 0, 0, -1, 1, 0, NAN, 302084010, 1201614000, -0.4), "COMMAND_ACK", "result", mavlink.MAV_RESULT_DENIED),
     "MISSION_COUNT": ((0, 0, 1), "MISSION_ACK", "type", mavlink.MAV_MISSION_DENIED),
