@@ -26,8 +26,8 @@ _FACES = 6
 SET_MODE, TERMINATE, REPOSITION, ARM = 176, 185, 192, 400
 DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
 """User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
-SET_CURRENT = 224
-_NEEDED = {ARM: 1, TERMINATE: 1, SET_CURRENT: 1, DOCK: 4, UNDOCK: 4}
+SET_CURRENT, MOTOR_TEST = 224, 209
+_NEEDED = {ARM: 1, TERMINATE: 1, SET_CURRENT: 1, MOTOR_TEST: 3, DOCK: 4, UNDOCK: 4}
 """How many of its first parameters a command must name: what is none of them would be taken for 0, which disarms or clears an e-stop."""
 
 
@@ -56,7 +56,7 @@ class CommandService:
             TERMINATE: self._terminate,
             REPOSITION: self._reposition,
             193: self._pause,
-            209: self._motor_test,
+            MOTOR_TEST: self._motor_test,
             SET_CURRENT: self._set_current,
             246: self._reboot,
             300: lambda c: self._start_mission(c, max(0, int(c.get(1)))),
@@ -256,10 +256,11 @@ class CommandService:
         return self._ask(command, action, request, lambda: s.picture.mode(s.body) == Mode.DOCK)
 
     def _motor_test(self, command: Command) -> Answer:
-        """Motor (from 1), throttle type (0: -100 to 100 %, 1: PWM 1100 to 1900), throttle, seconds."""
-        count = 8 * len(self._system.subject.modules)
-        thruster, kind, throttle = int(command.get(1)) - 1, int(command.get(2)), command.get(3)
-        share = {0: throttle / 100, 1: (throttle - 1500) / 400}.get(kind)
+        """Motor, throttle type (0: %, 1: PWM 1100 to 1900), throttle, seconds; motors and % count from where the identity's do."""
+        count, identity = 8 * len(self._system.subject.modules), self._system.subject.identity
+        thruster, kind, throttle = int(command.get(1)) - identity.first_motor, int(command.get(2)), command.get(3)
+        rest = identity.rest_percent
+        share = {0: (throttle - rest) / (100 - rest), 1: (throttle - 1500) / 400}.get(kind)
         if thruster not in range(count) or share is None or not -1 <= share <= 1:
             return DENIED
         seconds = min(max(command.get(4, 1.0), 0.0), 10.0)

@@ -36,6 +36,8 @@ class Identity:
         pairs: the second and third parameter of DO_SET_MODE are a main and a sub mode, as PX4 has it.
         mission_has_home: item 0 of a mission is the home position and is not flown, as ArduPilot has it.
         first_log: number of the oldest log. QGroundControl counts from 1 for ArduPilot alone.
+        first_motor: of a motor test. ArduSub's, and who tests them, count from 0.
+        rest_percent: the throttle of a motor test at which the motor stands. ArduSub's reaches from 0, full reverse, to 100 %.
     """
 
     name: str
@@ -44,6 +46,8 @@ class Identity:
     pairs: bool
     mission_has_home: bool
     first_log: int
+    first_motor: int
+    rest_percent: float
 
     def custom_mode(self, mode: Mode) -> int:
         """The number that HEARTBEAT carries."""
@@ -88,6 +92,8 @@ GENERIC = Identity(
     pairs=True,
     mission_has_home=False,
     first_log=0,
+    first_motor=1,
+    rest_percent=0.0,
 )
 
 ARDUSUB = Identity(
@@ -97,6 +103,8 @@ ARDUSUB = Identity(
     pairs=False,
     mission_has_home=True,
     first_log=1,
+    first_motor=0,
+    rest_percent=50.0,
 )
 
 IDENTITIES = {identity.name: identity for identity in (GENERIC, ARDUSUB)}

@@ -40,7 +40,7 @@ def test_every_command_is_acknowledged_when_all_its_parameters_are_left_out() ->
         assert acknowledged(world, client, number) in (*range(mavlink.MAV_RESULT_FAILED + 1), mavlink.MAV_RESULT_COMMAND_INT_ONLY)
 
 
-@pytest.mark.parametrize("number", [185, 224, 400, 31010, 31011])
+@pytest.mark.parametrize("number", [185, 209, 224, 400, 31010, 31011])
 @pytest.mark.parametrize("nothing", [NAN, math.inf])
 def test_command_that_does_not_say_what_is_denied(world: World, client: Client, number: int, nothing: float) -> None:
     """One that named neither 0 nor 1 disarmed the robot, or cleared its e-stop."""
@@ -281,6 +281,20 @@ def test_throttle_of_a_motor_test_is_a_share_or_a_pulse_about_its_middle(
 def test_motor_test_of_no_thruster_or_beyond_full_throttle_is_denied(world: World, client: Client, parameters: tuple[float, ...]) -> None:
     assert ask(world, client, 209, *parameters, 1.0) == mavlink.MAV_RESULT_DENIED
     assert not world.robot.asked
+
+
+@pytest.mark.parametrize(
+    ("kind", "throttle", "share"), [(0, 50, 0.0), (0, 60, 0.2), (0, 100, 1.0), (0, 0, -1.0), (1, 1500, 0.0), (1, 1700, 0.5)]
+)
+def test_ardusub_identity_counts_motors_from_0_and_its_middle_is_50_percent(kind: int, throttle: float, share: float) -> None:
+    """As ArduSub does, and with it QGroundControl's page of motors and BlueOS's: the thruster beside the one that was meant turned."""
+    world = World(config=GroundConfig(identity="ardusub"))
+    client = world.client()
+    client.command(209, 0, kind, throttle, 1.0, 1, 2)
+    world.run(1)
+    assert world.robot.asked[-1].argument == (0, pytest.approx(share), 1.0)
+    for motor, throttle in ((8, 50), (-1, 50), (0, -20), (0, NAN), (NAN, 50)):
+        assert ask(world, client, 209, motor, 0, throttle, 1.0, 1, 2) == mavlink.MAV_RESULT_DENIED
 
 
 def test_dock_and_undock_are_user_commands() -> None:
