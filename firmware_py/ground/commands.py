@@ -49,6 +49,7 @@ class CommandService:
         self._pending: list[Pending] = []
         self.reboot_asked = False
         self._table: dict[int, Callable[[Command], Answer]] = {
+            17: lambda c: self._enter(c, Mode.POSHOLD),  # NAV_LOITER_UNLIM
             20: self._surface,  # NAV_RETURN_TO_LAUNCH
             21: self._surface,  # NAV_LAND
             SET_MODE: self._set_mode,

@@ -67,6 +67,13 @@ def test_return_and_land_both_surface(world: World, client: Client, number: int)
     assert world.robot.mode[0] == Mode.SURFACE
 
 
+def test_loiter_holds_the_place(world: World, client: Client) -> None:
+    """MAVProxy's `loiter`, as ArduSub takes it."""
+    world.robot.mode[0] = Mode.MANUAL
+    assert ask(world, client, mavlink.MAV_CMD_NAV_LOITER_UNLIM) == mavlink.MAV_RESULT_ACCEPTED
+    assert world.robot.mode[0] == Mode.POSHOLD
+
+
 @pytest.mark.parametrize(("component", "is_heard"), [(191, True), (1, False)])
 def test_companion_computer_of_the_same_system_is_heard_and_an_echo_is_not(world: World, component: int, is_heard: bool) -> None:
     """MAVLink gives the computers of a vehicle its system id, and each a component id of its own."""
