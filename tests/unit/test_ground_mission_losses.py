@@ -1,0 +1,88 @@
+"""Missions over links that lose, repeat and overtake, from two stations at once: what is kept is always one station's whole mission."""
+
+from random import Random
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from tests.unit.ground_missions import item
+from tests.unit.ground_world import Client, World
+
+SEEDS = range(20)
+LOSS, REPEAT, LATEST_TICKS = 0.15, 0.15, 10
+RESEND_TICKS = 150
+
+
+class Planner:
+    """A station that brings its mission up as the protocol has it: it answers requests, and asks anew while nothing comes."""
+
+    def __init__(self, world: World, client: Client, items: list[tuple[float, ...]], random: Random) -> None:
+        self._world, self._client, self._random = world, client, random
+        self.items = items
+        self.result: int | None = None
+        self._read = 0
+        self._on_the_way: list[tuple[int, Any]] = []
+        self._last: tuple[Any, ...] = ("MISSION_COUNT", 1, 1, len(items), 0)
+        self._sent_tick = -RESEND_TICKS
+
+    def step(self) -> None:
+        """One tick: what arrives here, what is said, and what arrives there."""
+        tick = self._world.robot.tick
+        told, self._read = self._client.inbox[self._read :], len(self._client.inbox)
+        for message in told:
+            if message.get_type() in ("MISSION_REQUEST_INT", "MISSION_REQUEST", "MISSION_ACK"):
+                self._lay_out(message, tick)
+        for what in self._due(tick):
+            if isinstance(what, bytes):
+                self._client.send_raw(what)
+            elif self.result is None:
+                self._hear(what, tick)
+        if self.result is None and tick - self._sent_tick >= RESEND_TICKS:
+            self._say(tick)
+
+    def _hear(self, message: Any, tick: int) -> None:
+        if message.get_type() == "MISSION_ACK":
+            self.result = message.type
+        elif message.seq < len(self.items):
+            self._last = ("MISSION_ITEM_INT", *self.items[message.seq], 0)
+            self._say(tick)
+
+    def _say(self, tick: int) -> None:
+        self._sent_tick = tick
+        self._lay_out(self._client.pack(*self._last), tick)
+
+    def _lay_out(self, what: Any, tick: int) -> None:
+        """It is lost, comes once or twice, and at any time."""
+        for _ in range(1 + (self._random.random() < REPEAT)):
+            if self._random.random() >= LOSS:
+                self._on_the_way.append((tick + self._random.randint(0, LATEST_TICKS), what))
+
+    def _due(self, tick: int) -> list[Any]:
+        due = [what for at, what in self._on_the_way if at <= tick]
+        self._on_the_way = [(at, what) for at, what in self._on_the_way if at > tick]
+        return due
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_mission_that_is_kept_is_a_whole_one_and_who_hears_that_his_is_taken_brought_it(seed: int) -> None:
+    random, world = Random(seed), World()
+    places = [[(302084010 + 100 * n + i, 1201614010, -0.4) for i in range(random.randint(1, 8))] for n in range(2)]
+    planners = [
+        Planner(world, world.client(255 - n), [item(i, place) for i, place in enumerate(each)], random) for n, each in enumerate(places)
+    ]
+    kept: list[tuple[int, ...]] = []
+    for _ in range(2000):
+        for planner in planners:
+            planner.step()
+        world.run(1)
+        now = tuple(item.x for item in world.station.services[1].flight.items)
+        if now and (not kept or now != kept[-1]):
+            kept.append(now)
+        if all(planner.result is not None for planner in planners):
+            break
+    whole = [tuple(x for x, _, _ in each) for each in places]
+    assert kept and all(each in whole for each in kept)
+    for planner, mission in zip(planners, whole, strict=True):
+        assert planner.result != mavlink.MAV_MISSION_ACCEPTED or mission in kept
+        assert planner.result is not None or mission in kept[:-1], "only who was taken, and then replaced, is not told any more"
