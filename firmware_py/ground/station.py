@@ -232,7 +232,7 @@ class GroundStation:
         arrival = Arrival(message, channel, time_ns, trusted)
         component = message.values.get("target_component", 0)
         is_for_autopilots = component in (0, COMPONENT_AUTOPILOT)
-        if not (is_for_autopilots and target in self.services):
+        if not (component == COMPONENT_AUTOPILOT and target in self.services):
             self._forward(packet, target, component, channel)
         if is_for_autopilots and not self._is_for_too_many(arrival, target):
             for number, services in self.services.items():
@@ -256,7 +256,7 @@ class GroundStation:
             del self._routes[next(iter(self._routes))]
 
     def _forward(self, packet: Packet, target: int, component: int, channel: int) -> None:
-        """To wherever the system that it is for was heard, of one of ours the component; what is for all, to everybody else.
+        """To wherever the system that it is for was heard, of one of ours the component (0: all); what is for all, to everybody else.
 
         What streams by waits for what a slow link carries: of a companion computer's that is too much for a radio.
         """
@@ -264,7 +264,7 @@ class GroundStation:
             return
         heard = {
             at for (system, part), at in self._routes.items()
-            if target in (0, system) and (target not in self.services or component == part)
+            if target in (0, system) and (target not in self.services or component in (0, part))
         }  # fmt: skip
         streams = _TARGETS.isdisjoint(packet.message.values) and packet.message.name not in NEVER_WAITS
         self._frames += [Outgoing(other, packet.raw) for other in heard - {channel} - (self._busy if streams else set())]

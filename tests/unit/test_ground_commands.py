@@ -93,6 +93,17 @@ def test_what_is_for_a_companion_computer_goes_where_it_was_heard(world: World, 
     assert not world.robot.asked and not client.all("COMMAND_ACK")
 
 
+def test_what_is_for_all_of_a_system_reaches_its_companion_computer_too(world: World, client: Client) -> None:
+    """As MAVLink has it routed; another system's computer does not hear it."""
+    companion, other = world.client(system=1, component=191), world.client(system=7, component=191)
+    for each in (companion, other):
+        each.heartbeat(mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
+    client.command(400, 1, component=0)
+    world.run(3)
+    assert [len(each.all("COMMAND_LONG")) for each in (companion, other)] == [1, 0]
+    assert [request.action for request in world.robot.asked] == [Action.ARM]
+
+
 def test_each_companion_computer_and_each_station_of_one_system_hears_what_is_for_it(world: World, client: Client) -> None:
     stations = [client, world.client(component=230)]
     companions = [world.client(system=1, component=component) for component in (191, 100)]
