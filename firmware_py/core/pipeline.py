@@ -160,8 +160,10 @@ class BodyPipeline:
         armed, alive = self.supervisor.armed, self.faults.now.alive
         force, command = self.limiter.step(thrust.force_n, armed, self.supply.voltage_v, alive)
         self.lag.command(force)
-        state, mode = self.supervisor.state, self.supervisor.mode
-        record = BodyRecord(self.body.index, state, mode, estimate, setpoint, wrench, thrust, force, self._may_arm(time_ns))
+        said, may_arm = self.supervisor, self._may_arm(time_ns)
+        record = BodyRecord(
+            self.body.index, said.state, said.mode, estimate, setpoint, wrench, thrust, force, may_arm, said.level
+        )
         return record, command
 
     def _may_arm(self, time_ns: int) -> bool:

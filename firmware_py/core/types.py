@@ -343,6 +343,8 @@ class BodyRecord(NamedTuple):
     """(n,) force of each thruster after the limiter."""
     may_arm: bool
     """Disarmed, and every arming check held when they were asked last, at most 0.1 s ago."""
+    level: int
+    """failsafes.Level: what a fail-safe has made of the mode; NONE when a person chose it."""
 
 
 class DockRecord(NamedTuple):

@@ -11,6 +11,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.estimator import ADRIFT_NS
+from firmware_py.core.failsafes import Level
 from firmware_py.core.transitions import ARMED, State
 from firmware_py.core.types import NEVER_NS, BodyRecord, Estimate, Event, Inputs, Mode, ModuleInputs, Outputs
 from firmware_py.description.parameters import Supervision
@@ -152,6 +153,11 @@ class Picture:
         """Whether the e-stop holds it."""
         record = self.records.get(body)
         return self.estop or (record is not None and record.state == State.ESTOP)
+
+    def is_in_failsafe(self, body: int) -> bool:
+        """Whether a fail-safe has chosen how it flies."""
+        record = self.records.get(body)
+        return record is not None and record.state in ARMED and record.level > Level.NONE
 
     def pose_is_fresh(self, body: int) -> bool:
         """Whether tags were seen lately."""

@@ -22,7 +22,7 @@ _NAN = math.nan
 _UNKNOWN_16, _UNKNOWN_BATTERY = 0xFFFF, -1
 _UNKNOWN_TEMPERATURE = 0x7FFF
 """As BATTERY_STATUS has it. SCALED_PRESSURE defines none, but its 0 would be water at the point of freezing."""
-_STATE_STANDBY, _STATE_ACTIVE, _STATE_EMERGENCY = 3, 4, 6
+_STATE_STANDBY, _STATE_ACTIVE, _STATE_CRITICAL, _STATE_EMERGENCY = 3, 4, 5, 6
 _NO_GPS = 0
 """GPS_FIX_TYPE."""
 _FRAME_LOCAL_NED, _FRAME_BODY_FRD = 1, 12
@@ -100,13 +100,20 @@ class Subject:
 
 
 def heartbeat(s: Subject) -> list[Values]:
-    stopped = s.picture.is_stopped(s.body)
-    state = _STATE_EMERGENCY if stopped else _STATE_ACTIVE if s.armed else _STATE_STANDBY
     mode = base_mode(s.picture.mode(s.body), s.armed)
     return [{
         "type": TYPE_SUBMARINE, "autopilot": s.identity.autopilot, "base_mode": mode, "custom_mode": s.custom_mode,
-        "system_status": state, "mavlink_version": 3,
+        "system_status": _state(s), "mavlink_version": 3,
     }]  # fmt: skip
+
+
+def _state(s: Subject) -> int:
+    """MAV_STATE, gravest first."""
+    if s.picture.is_stopped(s.body):
+        return _STATE_EMERGENCY
+    if s.picture.is_in_failsafe(s.body):
+        return _STATE_CRITICAL
+    return _STATE_ACTIVE if s.armed else _STATE_STANDBY
 
 
 SENSORS = {

@@ -78,7 +78,7 @@ def write_flight(
             wrench = np.r_[0.4 * np.sin(at), 0.4 * np.cos(at), -0.4, zero]
             result = Thrust(thrust[tick], wrench, (1.0, 1.0), MARGIN)
             setpoint = Setpoint(wanted, LEVEL, speed, zero, zero, zero)
-            record = BodyRecord(0, 1, 3 if at >= 0 else 16, estimate, setpoint, wrench, result, thrust[tick], False)
+            record = BodyRecord(0, 1, 3 if at >= 0 else 16, estimate, setpoint, wrench, result, thrust[tick], False, 0)
             events = [Event(6, "tracking the spiral")] if time_ns == START_NS else []
             recorder.record(Inputs(tick, time_ns, []), Outputs(tick, time_ns, [], False, events, [record]))
             if tick % 50 == 49:
@@ -112,6 +112,6 @@ def write_pair(
             estimate = Estimate(steered, q, np.zeros(6), zero, zero, np.full(3, 1e-3), np.full(3, 2e-3), 0, np.nan, 0, 0, True)
             setpoint = Setpoint(steered - np.array(offset_m), multiply(q, exp(np.full(3, 0.01))), zero, zero, zero, zero)
             thrust = Thrust(np.full(count, 2.0), np.zeros(6), (1.0, 1.0), MARGIN)
-            record = BodyRecord(0, 1, 3, estimate, setpoint, np.zeros(6), thrust, thrust.force_n, False)
+            record = BodyRecord(0, 1, 3, estimate, setpoint, np.zeros(6), thrust, thrust.force_n, False, 0)
             recorder.record(Inputs(tick, time_ns, []), Outputs(tick, time_ns, [], False, [], [record]))
     recorder.close()

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
+from firmware_py.core.failsafes import Level
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.transitions import State
 from firmware_py.core.types import (
@@ -51,7 +52,7 @@ class Robot:
         self.p_wb = [np.array([0.1 * n, 0.2, 0.5]) for n in range(modules)]
         self.q_wb = [from_euler(0.1, -0.2, 0.3) for _ in range(modules)]
         self.nu = np.array([0.05, 0.0, -0.02, 0.01, 0.02, 0.03])
-        self.tag_age_ns, self.ready, self.may_arm = 30_000_000, True, True
+        self.tag_age_ns, self.ready, self.may_arm, self.level = 30_000_000, True, True, Level.NONE
         self.refuse: dict[Action, str] = {}
         """Reason for each action that is refused."""
         self.asked: list[Request] = []
@@ -114,7 +115,7 @@ class Robot:
         thrust = Thrust(np.zeros(8), np.zeros(6), (1.0, 1.0), 0.75)
         values = {
             "body": body, "state": self.state[body], "estimate": estimate, "setpoint": setpoint, "wrench": np.zeros(6),
-            "thrust": thrust, "commanded_n": np.zeros(8), "mode": self.mode[body], "may_arm": self.may_arm,
+            "thrust": thrust, "commanded_n": np.zeros(8), "mode": self.mode[body], "may_arm": self.may_arm, "level": self.level,
         }  # fmt: skip
         return BodyRecord(**{name: values.get(name) for name in BodyRecord._fields})
 

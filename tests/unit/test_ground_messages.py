@@ -11,8 +11,10 @@ from pymavlink.dialects.v20 import all as mavlink
 from pymavlink.generator import mavgen
 
 from firmware_py.app.deadlines import times_of
+from firmware_py.core.failsafes import Level
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.rotations import rotate
+from firmware_py.core.transitions import State
 from firmware_py.core.types import NEVER_AGE_NS, Action
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
@@ -190,6 +192,18 @@ def test_system_status_tells_of_health_and_of_readiness_to_arm(world: World, cli
     world.robot.tag_age_ns = 2_000_000_000
     world.run(100)
     assert not client.last("SYS_STATUS").onboard_control_sensors_health & (vision | prearm)
+
+
+def test_heartbeat_is_critical_while_a_fail_safe_flies(world: World, client: Client) -> None:
+    world.robot.level = Level.SURFACE
+    world.run(100)
+    assert client.last("HEARTBEAT").system_status == mavlink.MAV_STATE_STANDBY
+    world.robot.state[0] = State.ARMED
+    world.run(100)
+    assert client.last("HEARTBEAT").system_status == mavlink.MAV_STATE_CRITICAL
+    world.robot.level = Level.NONE
+    world.run(100)
+    assert client.last("HEARTBEAT").system_status == mavlink.MAV_STATE_ACTIVE
 
 
 def test_battery_of_which_nothing_is_heard_any_more_is_not_well(world: World, client: Client) -> None:

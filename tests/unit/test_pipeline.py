@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from firmware_py.core.body import Body
+from firmware_py.core.failsafes import Level
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
-from firmware_py.core.types import Action, ModuleInputs, Request
+from firmware_py.core.types import Action, Mode, ModuleInputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -51,6 +52,14 @@ def test_record_says_whether_arm_would_be_granted(tank: Tank) -> None:
     armed = tank.run(DT, Request(Action.ARM))
     assert armed.modules[0].armed
     assert not armed.records[0].may_arm
+
+
+def test_record_says_what_a_fail_safe_has_made_of_the_mode(tank: Tank) -> None:
+    tank.run(0.5)
+    assert tank.run(DT, Request(Action.ARM)).records[0].level == Level.NONE
+    hot = [Request(Action.SET_PARAMETER, 0, (f"failsafes.cabin_hot_{name}", 0.0)) for name in ("limit", "delay_s")]
+    surfacing = tank.run(3 * DT, *hot).records[0]
+    assert (surfacing.mode, surfacing.level) == (Mode.SURFACE, Level.SURFACE)
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def body_record(rng: np.random.Generator, thrusters: int = 8) -> BodyRecord:
     )  # fmt: skip
     setpoint = Setpoint(rng.normal(size=3), q, *rng.normal(size=(4, 3)))
     thrust = Thrust(rng.normal(size=thrusters), rng.normal(size=6), (1.0, 0.75), 0.4)
-    return BodyRecord(0, 1, 3, estimate, setpoint, rng.normal(size=6), thrust, rng.normal(size=thrusters), False)
+    return BodyRecord(0, 1, 3, estimate, setpoint, rng.normal(size=6), thrust, rng.normal(size=thrusters), False, 4)
 
 
 def record_ticks(folder: Path, ticks: int = 120, seed: int = 1, killed: bool = False) -> list[BodyRecord]:
