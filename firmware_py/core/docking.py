@@ -20,11 +20,12 @@ from firmware_py.core.docking_sequence import (
     DockPlan,
     Stage,
     UndockPlan,
-    nearest_pass,
 )
+from firmware_py.core.docking_way import BEGINNING, WAY_SLACK, Way, nearest_pass, way_of_active, way_of_target
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back, to_matrix
+from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import (
     INFORMATION,
     RELAY_OFF,
@@ -33,7 +34,6 @@ from firmware_py.core.types import (
     WARNING,
     DockRecord,
     DockRequest,
-    Estimate,
     Event,
     Inputs,
 )
@@ -46,6 +46,8 @@ ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
 TAKEN = "another dock is to bring a module to the same place: end that dock first"
+REST = Wish(np.zeros(3), np.zeros(3))
+"""What a body that waits glides by."""
 
 
 class _Dock(NamedTuple):
@@ -203,7 +205,7 @@ class DockingStage:
         under_way = next((dock for dock in self._docks if dock.active == mine), None)
         if under_way is not None and under_way.prepared.request == request and under_way.sequence.stage not in ENDED:
             return
-        refusal = self._refusal(prepared, estimates, waiting)
+        refusal = self._refusal(prepared, estimates, waiting, holding)
         if plan is None or refusal:
             self._say(WARNING, f"dock refused: {refusal}")
             if under_way is None:
@@ -215,7 +217,7 @@ class DockingStage:
                 self._give_up(under_way, ANOTHER, decisions)
             self._begin_dock(prepared, plan, time_ns, estimates, holding)
 
-    def _refusal(self, prepared: Prepared, estimates: Estimated, waiting: Collection[int]) -> str:
+    def _refusal(self, prepared: Prepared, estimates: Estimated, waiting: Collection[int], holding: Collection[int]) -> str:
         """Why a plan is not begun; empty: it is."""
         plan = prepared.plan
         if plan is None:
@@ -233,7 +235,35 @@ class DockingStage:
             return LED
         if any(_meet(plan, dock.sequence.plan) for dock in self._docks if dock.active != mine):
             return TAKEN
-        return "" if self._p.approach == "straight" else _in_the_way(plan, *estimates[mine], *estimates[others], self._p.standoff_m)
+        return self._in_the_way(plan, mine, others, estimates, holding)
+
+    def _in_the_way(self, plan: DockPlan, mine: int, target: int, estimates: Estimated, holding: Collection[int]) -> str:
+        """Why a straight way of the two is none; empty: both are free, or nobody knows, which is for the sequence to say.
+
+        The paper's own is drawn through the target from wherever it begins.
+        """
+        active, other = estimates[mine], estimates[target]
+        if not (active[1].placed and other[1].placed):
+            return ""
+        staged, slack_m = self._p.approach == "staged", WAY_SLACK * self._p.standoff_m
+        way = way_of_active(plan, *active, *other, self._p.standoff_m if staged else 0.0)
+        met = nearest_pass(way, *other, slack_m) if staged else None
+        met = self._met(way, estimates, (mine, target)) if met is None else met
+        if met is not None:
+            return f"on its way it would come too near to module {met}: bring it before that face first"
+        met = self._met(way_of_target(plan, way, *other), estimates, (mine, target)) if self._comes(plan, target, holding) else None
+        return "" if met is None else f"module {plan.request.target_module}, which is to meet it, would come too near to module {met}"
+
+    def _met(self, way: Way, estimates: Estimated, pair: Collection[int]) -> int | None:
+        """A module of a third body that is where a way leads, as far as is known."""
+        thirds = (each for number, each in estimates.items() if number not in pair and each[1].placed)
+        passes = (nearest_pass(way, body, at, WAY_SLACK * self._p.standoff_m, BEGINNING) for body, at in thirds)
+        return next((module for module in passes if module is not None), None)
+
+    def _comes(self, plan: DockPlan, target: int, holding: Collection[int]) -> bool:
+        """Whether the target is to come half of the way."""
+        taken = any(target in (dock.active, dock.target) for dock in self._docks)
+        return (plan.request.both_approach or self._p.approach == "straight") and target in holding and not taken
 
     def _leaders(self, body: int) -> list[int]:
         """The bodies that this one is steered by: the target of its dock, the target of that one's, and so on. None is led by itself."""
@@ -271,8 +301,7 @@ class DockingStage:
     ) -> None:
         request = prepared.request
         active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
-        taken = any(target in (dock.active, dock.target) for dock in self._docks)
-        comes = (request.both_approach or self._p.approach == "straight") and target in holding and not taken
+        comes = self._comes(plan, target, holding)
         sequence = DockingSequence(plan, estimates[active][0], estimates[target][0], self._p, time_ns, comes)
         pair = FacePair(request.target_module, request.target_face, request.module, request.face, plan.place_t, plan.q_ta)
         self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared))
@@ -290,7 +319,7 @@ class DockingStage:
     ) -> None:
         active, target = estimates[dock.active][1], estimates[dock.target][1]
         status = dock.detector.step(inputs.time_ns, inputs.modules, poses)
-        before = dock.sequence.stage
+        before, waits = dock.sequence.stage, self._waits(dock, estimates)
         steering = dock.sequence.step(inputs.time_ns, active, target, status)
         stage = dock.sequence.stage
         self.relays.switch(steering.relay, *dock.sequence.plan.closes)
@@ -310,9 +339,21 @@ class DockingStage:
             self._docks.remove(dock)
             self._end(dock.active, decisions)
         else:
-            decisions.setpoints[dock.active] = steering.active
+            decisions.setpoints[dock.active] = REST if waits and stage == before else steering.active
         if steering.meets is not None:
             decisions.meets[dock.target] = steering.meets
+
+    def _waits(self, dock: _Dock, estimates: Estimated) -> bool:
+        """Whether a third body has come on its way to the stand-off; of each that is said once."""
+        if dock.sequence.stage != Stage.PRE_APPROACH or len(estimates) == 2:
+            return False
+        plan, pair = dock.sequence.plan, (dock.active, dock.target)
+        way = way_of_active(plan, *estimates[dock.active], *estimates[dock.target], self._p.standoff_m)
+        met = self._met(way, estimates, pair)
+        if met not in (None, dock.sequence.waits_for):
+            dock.sequence.waits_for = met
+            self._say(WARNING, f"dock of module {plan.request.module} waits: module {met} is on its way")
+        return met is not None
 
     def _end(self, active: int, decisions: Decisions) -> None:
         """The body is done with docking, but for what it still waits for the plan of, and an undock under way."""
@@ -382,14 +423,6 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
             q_tm = multiply(conjugate(np.ascontiguousarray(body.q_bt[k])), q_bm)
             table[body.modules[i], int(tag)] = np.concatenate([r_mt, q_tm])
     return table
-
-
-def _in_the_way(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, standoff_m: float) -> str:
-    """Why the straight way to the stand-off is none; empty: it is free, or nobody knows, which is for the sequence to say."""
-    if not (at.placed and target_at.placed):
-        return ""
-    module = nearest_pass(plan, active, at, target, target_at, standoff_m)
-    return "" if module is None else f"on its way it would come too near to module {module}: bring it before that face first"
 
 
 def _meet(plan: DockPlan, other: DockPlan) -> bool:

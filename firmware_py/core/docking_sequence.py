@@ -7,7 +7,6 @@ between the two faces; lateral and angle error are those of the active module ag
 
 from __future__ import annotations
 
-import math
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
-from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, rotate_back, to_matrix
+from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, rotate_back
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest, Estimate, Setpoint
 from firmware_py.description.parameters import Docking
@@ -28,14 +27,6 @@ RETREAT_M_S = 0.04
 """Fastest growth of the gap when backing off."""
 CONE = 1.5
 """The approach waits while the lateral error is above this many times the alignment limit, or the angle."""
-WAY_SAMPLES = 65
-"""Places on the way to the stand-off that are looked at, where the bodies are near each other."""
-WAY_SLACK = 0.25
-"""Share of the stand-off by which cubes that would clear each other level may come nearer than at the ends of the way."""
-WAY_NOISE_M = 0.005
-"""Nearer by so little is not nearer."""
-SQUARE_DIAGONAL, CUBE_DIAGONAL = 2.0**0.5, 3.0**0.5
-"""Centres of two cubes of edge 1 that are so far apart do not touch: level cubes side by side; and however they are turned."""
 
 
 class Stage(IntEnum):
@@ -139,8 +130,8 @@ class DockingSequence:
         self.plan = plan
         self._comes = comes
         self._p = parameters
-        self._r_a, self._q_a = _module_in(active, plan.request.module)
-        self._r_t, self._q_t = _module_in(target, plan.request.target_module)
+        self._r_a, self._q_a = module_in(active, plan.request.module)
+        self._r_t, self._q_t = module_in(target, plan.request.target_module)
         self._line_t, self._farthest_m = plan.axis_t, parameters.standoff_m
         self._fixed: Estimate | None = None
         """Where the target is to be met, at rest, for an approach that does not look at it again."""
@@ -150,6 +141,8 @@ class DockingSequence:
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
+        self.waits_for: int | None = None
+        """A module of a third body, the last that was on the way to the stand-off."""
         self._entered_ns = time_ns
         self._good_since_ns: int | None = None
         self._gap_m = self._farthest_m
@@ -176,8 +169,8 @@ class DockingSequence:
 
     def errors(self, active: Estimate, target: Estimate) -> Errors:
         """Errors by the two estimates."""
-        _, q_a = _pose_of(active, self._r_a, self._q_a)
-        _, q_t = _pose_of(target, self._r_t, self._q_t)
+        _, q_a = pose_of(active, self._r_a, self._q_a)
+        _, q_t = pose_of(target, self._r_t, self._q_t)
         off = self._offset(active, target)
         gap = float(off @ self.plan.axis_t)
         lateral = float(np.linalg.norm(off - gap * self.plan.axis_t))
@@ -186,15 +179,15 @@ class DockingSequence:
 
     def _offset(self, active: Estimate, target: Estimate) -> np.ndarray:
         """(3,) from its place to the active module, target module frame, m."""
-        p_a, _ = _pose_of(active, self._r_a, self._q_a)
-        p_t, q_t = _pose_of(target, self._r_t, self._q_t)
+        p_a, _ = pose_of(active, self._r_a, self._q_a)
+        p_t, q_t = pose_of(target, self._r_t, self._q_t)
         return np.asarray(rotate_back(q_t, p_a - p_t) - self.plan.place_t)
 
     def _set_off(self, active: Estimate, target: Estimate) -> np.ndarray | None:
         """Shares the way with the target if it comes, and draws the line of a straight approach; returns how far it comes."""
         self._under_way = True
         straight = self._p.approach == "straight"
-        off, (_, q_t) = self._offset(active, target), _pose_of(target, self._r_t, self._q_t)
+        off, (_, q_t) = self._offset(active, target), pose_of(target, self._r_t, self._q_t)
         left = 0.0 if straight else self._p.standoff_m
         meets = np.asarray(0.5 * rotate(q_t, off - left * self.plan.axis_t)) if self._comes else None
         self.met_w = np.zeros(3) if meets is None else meets
@@ -286,7 +279,7 @@ class DockingSequence:
 
     def _setpoint(self, target: Estimate, speed: float) -> Setpoint | Wish:
         """The active body's centre of mass such that its module is at the wanted gap before the target's face, moving with it."""
-        p_t, q_t = _pose_of(target, self._r_t, self._q_t)
+        p_t, q_t = pose_of(target, self._r_t, self._q_t)
         q_module = normalise(multiply(q_t, self._q_wanted()))
         q_wb = normalise(multiply(q_module, conjugate(self._q_a)))
         axis_w = rotate(q_t, self._line_t if self._gap_m > 0.0 else self.plan.axis_t)
@@ -304,50 +297,12 @@ class DockingSequence:
         return np.asarray(multiply(exp(self.plan.axis_t * self._turn), self.plan.q_ta))
 
 
-def nearest_pass(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, standoff_m: float) -> int | None:
-    """Module of the target that the active body would come nearest to, and too near, on the straight way to the stand-off; None: none.
-
-    Too near is nearer than at both ends of the way, and near enough for level cubes to touch; or for cubes in any attitude, and nearer by
-    WAY_SLACK.
-
-    Args:
-        active, target: the two bodies; at, target_at: where they are.
-        standoff_m: gap at which the way ends, m.
-    """
-    r_a, q_a = _module_in(active, plan.request.module)
-    p_t, q_t = _pose_of(target_at, *_module_in(target, plan.request.target_module))
-    q_end = normalise(multiply(multiply(q_t, plan.q_ta), conjugate(q_a)))
-    p_end = p_t + rotate(q_t, plan.place_t + plan.axis_t * standoff_m) - rotate(q_end, r_a)
-    turn = difference(q_end, at.q_wb)
-    others = target_at.p_wb + target.r_bm @ to_matrix(target_at.q_wb).T
-    shares = _near_part(at.p_wb - target_at.p_wb, p_end - at.p_wb, active.reach_m + target.reach_m)
-    gaps = np.empty((shares.size, len(active.modules), len(target.modules)))
-    for k, share in enumerate(shares):
-        rotation = to_matrix(multiply(at.q_wb, exp(share * turn)))
-        mine = at.p_wb + share * (p_end - at.p_wb) + active.r_bm @ rotation.T
-        gaps[k] = np.linalg.norm(mine[:, None] - others, axis=2)
-    least = gaps.min(axis=0)
-    ends, pitch_m = np.minimum(gaps[0], gaps[-1]), float(np.linalg.norm(plan.place_t))
-    near = np.minimum(CUBE_DIAGONAL * pitch_m, np.maximum(ends - WAY_SLACK * standoff_m, SQUARE_DIAGONAL * pitch_m))
-    touching = (least < ends - WAY_NOISE_M) & (least < near)
-    return target.modules[int(np.where(touching, least, np.inf).min(axis=0).argmin())] if touching.any() else None
-
-
-def _near_part(begin: np.ndarray, way: np.ndarray, reach_m: float) -> np.ndarray:
-    """Shares of a way (3,) that begins at `begin` (3,) off a place: its ends, and WAY_SAMPLES of where it is within reach of the place."""
-    length2 = max(float(way @ way), 1e-12)
-    middle = -float(begin @ way) / length2
-    half = math.sqrt(max(0.0, reach_m**2 - float(begin @ begin) + middle**2 * length2) / length2)
-    first, last = (min(max(share, 0.0), 1.0) for share in (middle - half, middle + half))
-    return np.concatenate([[0.0], np.linspace(first, last, WAY_SAMPLES), [1.0]])
-
-
-def _module_in(body: Body, module: int) -> tuple[np.ndarray, np.ndarray]:
+def module_in(body: Body, module: int) -> tuple[np.ndarray, np.ndarray]:
     """Place (3,) of a module's centre in its body, and module frame to body frame (4,)."""
     i = body.modules.index(module)
     return np.ascontiguousarray(body.r_bm[i]), np.ascontiguousarray(body.q_bm[i])
 
 
-def _pose_of(estimate: Estimate, r_b: np.ndarray, q_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pose_of(estimate: Estimate, r_b: np.ndarray, q_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pose of a module in the world by its body's estimate."""
     return estimate.p_wb + rotate(estimate.q_wb, r_b), normalise(multiply(estimate.q_wb, q_b))

@@ -138,3 +138,55 @@ def test_target_comes_to_meet_the_first_of_two_alone() -> None:
     goal = tank.pipeline.formation.chains[0].guidance._goal
     assert goal is not None and goal.p_wb is not None
     assert goal.p_wb[1] == pytest.approx(0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m), abs=0.01)
+
+
+def placed(*places: tuple[float, float], parameters: Parameters | None = None) -> Docked:
+    """Single modules at these places, north and east, m: armed, and holding there; no magnet draws current."""
+    modules = range(len(places))
+    tank = Docked([(0, m, 0) for m in modules], parameters, apart=True)
+    tank.weak = set(modules)
+    for state, (north, east) in zip(tank.states, places, strict=True):
+        state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in modules))
+    return tank
+
+
+@pytest.mark.parametrize("approach", ["staged", "straight"])
+def test_dock_whose_way_leads_through_a_third_body_is_refused(approach: str) -> None:
+    tank = placed((1.0, 0.0), (1.0, 2.0), (1.1, 1.0), parameters=Parameters().replace("docking.approach", approach))
+    outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    assert tank.when("dock refused: on its way it would come too near to module 2")
+    assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
+
+
+def test_dock_whose_target_would_come_through_a_third_body_is_refused() -> None:
+    """Who docks goes level to the stand-off; the target, which comes half of that way, has somebody at its side."""
+    tank = placed((1.0, 0.0), (2.0, 1.5), (1.0, 0.45))
+    tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 1, 0, 0, 0, True)))
+    assert tank.when("dock refused: module 0, which is to meet it, would come too near to module 2")
+    outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 1, 0, 0)))
+    assert len(outputs.docks) == 1
+
+
+@pytest.mark.parametrize("north_m", [0.45, -0.45])
+def test_dock_past_a_third_body_that_leaves_room_is_begun(north_m: float) -> None:
+    tank = placed((1.0, 0.0), (1.0, 2.0), (1.0 + north_m, 1.0))
+    outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    assert len(outputs.docks) == 1 and outputs.records[1].mode == Mode.DOCK
+
+
+@pytest.mark.slow
+def test_dock_waits_while_a_third_body_is_on_its_way_and_then_goes_on() -> None:
+    tank = placed((1.0, 0.0), (1.0, 2.0), (1.6, 1.0))
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    tank.run(8.0, Request(Action.HOLD, 2, rest_at(np.array([1.0, 1.0, 0.8]), np.array([1.0, 0.0, 0.0, 0.0]))))
+    assert tank.when("dock of module 1 waits: module 2 is on its way")
+    assert sum("waits" in said for _, said in tank.said) == 1
+    assert min(np.linalg.norm(past[1][:3] - past[2][:3]) for past in tank.past) > 0.4
+    assert tank.outputs[-1].docks[0].stage == Stage.PRE_APPROACH
+    tank.run(0.1, Request(Action.HOLD, 2, rest_at(np.array([1.6, 1.0, 0.8]), np.array([1.0, 0.0, 0.0, 0.0]))))
+    for _ in range(1500):
+        if tank.outputs[-1].docks[0].stage == Stage.PRE_APPROACH:
+            tank.run(0.01)
+    assert tank.outputs[-1].docks[0].stage == Stage.ALIGN

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
-from firmware_py.core.docking_sequence import DockingSequence, Stage, Steering, nearest_pass
+from firmware_py.core.docking_sequence import DockingSequence, Stage, Steering
+from firmware_py.core.docking_way import WAY_SLACK, nearest_pass, way_of_active
 from firmware_py.core.rotations import conjugate, difference, from_euler, multiply, rotate, rotate_back, to_matrix
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest, Estimate
@@ -124,7 +125,7 @@ def test_way_to_the_stand_off_is_free_where_it_keeps_clear_of_the_target(start: 
     plan = plan_dock(DockRequest(1, 1, 0, 0), active, target, [load_vehicle("modcube")] * 2)
     q_wb = from_euler(0.0, 0.0, yaw)
     at, there = (estimate(rotate(q_wb, np.array(p)))._replace(q_wb=q_wb) for p in (start, (0.0, 0.0, 0.0)))
-    found = nearest_pass(plan, active, at, target, there, 0.12)
+    found = nearest_pass(way_of_active(plan, active, at, target, there, 0.12), target, there, 0.03)
     assert found == (None if is_free else 0)
 
 
@@ -133,9 +134,10 @@ def test_module_beside_the_one_that_is_docked_to_may_be_in_the_way() -> None:
     vehicles = [load_vehicle("modcube")] * 3
     bar, active = assemble([(0, 0, 0), (0, 1, 0)], [0, 0], vehicles[:2], [0, 1]), assemble([(0, 0, 0)], [0], vehicles[:1], [2])
     plan = plan_dock(DockRequest(2, 1, 0, 0), active, bar, vehicles)
-    before = np.array([0.33, 0.0, 0.0]) + bar.r_bm[0]
-    assert nearest_pass(plan, active, estimate(before + np.array([0.3, 0.3, 0.0])), bar, estimate(np.zeros(3)), 0.12) is None
-    assert nearest_pass(plan, active, estimate(before + np.array([-0.5, 0.6, 0.0])), bar, estimate(np.zeros(3)), 0.12) == 1
+    before, there = np.array([0.33, 0.0, 0.0]) + bar.r_bm[0], estimate(np.zeros(3))
+    for offset, wanted in ([0.3, 0.3, 0.0], None), ([-0.5, 0.6, 0.0], 1):
+        way = way_of_active(plan, active, estimate(before + np.array(offset)), bar, there, 0.12)
+        assert nearest_pass(way, bar, there, 0.03) == wanted
 
 
 def test_body_that_is_turned_is_turned_before_it_is_aligned() -> None:
@@ -282,7 +284,7 @@ def test_module_that_comes_too_near_on_the_way_is_found_however_both_bodies_are_
     near = np.clip(ends - 0.25 * standoff_m, 2**0.5 * PITCH_M, 3**0.5 * PITCH_M)
     touching = (least < ends - 0.005) & (least < near)
     wanted = int(np.where(touching, least, np.inf).min(axis=0).argmin()) if touching.any() else None
-    assert nearest_pass(plan, active, at, target, there, standoff_m) == wanted
+    assert nearest_pass(way_of_active(plan, active, at, target, there, standoff_m), target, there, WAY_SLACK * standoff_m) == wanted
 
 
 def test_approach_slows_down_to_the_speed_of_contact() -> None:

@@ -1,0 +1,90 @@
+"""The straight ways that bodies go to a dock's stand-off, and whether they lead too near another body."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from firmware_py.core.body import Body
+from firmware_py.core.docking_sequence import DockPlan, module_in, pose_of
+from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, to_matrix
+from firmware_py.core.types import Estimate
+
+WAY_SAMPLES = 65
+"""Places on a way that are looked at, where the bodies are near each other."""
+WAY_SLACK = 0.25
+"""Share of the stand-off by which cubes that would clear each other level may come nearer than where that is not to be helped."""
+WAY_NOISE_M = 0.005
+"""Nearer by so little is not nearer."""
+SQUARE_DIAGONAL, CUBE_DIAGONAL = 2.0**0.5, 3.0**0.5
+"""Centres of two cubes of edge 1 that are so far apart do not touch: level cubes side by side; and however they are turned."""
+BOTH_ENDS, BEGINNING = (0, -1), (0,)
+"""Where on a way its body is as near to the other as it has to be: who docks begins where it is, and ends before the target."""
+
+
+class Way(NamedTuple):
+    """Of one body, which turns evenly as it goes."""
+
+    body: Body
+    p_begin: np.ndarray
+    """(3,) of its centre of mass, world, m."""
+    q_begin: np.ndarray
+    """(4,) body to world."""
+    p_end: np.ndarray
+    q_end: np.ndarray
+    pitch_m: float
+    """Edge of a lattice cell."""
+
+    def at(self, shares: Sequence[float]) -> np.ndarray:
+        """(k, m, 3) centres of its modules, world, m, after each of k shares of the way."""
+        turn = difference(self.q_end, self.q_begin)
+        turned = np.array([to_matrix(multiply(self.q_begin, exp(share * turn))) for share in shares])
+        centres = self.p_begin + np.outer(shares, self.p_end - self.p_begin)
+        return np.asarray(centres[:, None] + self.body.r_bm @ turned.transpose(0, 2, 1))
+
+
+def way_of_active(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, gap_m: float) -> Way:
+    """From where the active body is to a gap before the target's face."""
+    r_a, q_a = module_in(active, plan.request.module)
+    p_t, q_t = pose_of(target_at, *module_in(target, plan.request.target_module))
+    q_end = normalise(multiply(multiply(q_t, plan.q_ta), conjugate(q_a)))
+    p_end = p_t + rotate(q_t, plan.place_t + plan.axis_t * gap_m) - rotate(q_end, r_a)
+    return Way(active, at.p_wb, at.q_wb, p_end, q_end, float(np.linalg.norm(plan.place_t)))
+
+
+def way_of_target(plan: DockPlan, active: Way, target: Body, target_at: Estimate) -> Way:
+    """Of a target that comes half of the way to meet the active body."""
+    module = active.body.modules.index(plan.request.module)
+    begin, end = active.at((0.0, 1.0))[:, module]
+    met_w = 0.5 * (begin - end)
+    return Way(target, target_at.p_wb, target_at.q_wb, target_at.p_wb + met_w, target_at.q_wb, active.pitch_m)
+
+
+def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near: Sequence[int] = BOTH_ENDS) -> int | None:
+    """Module of the other body that a way comes nearest to, and too near; None: none.
+
+    Too near is nearer than at the ends `near`, and near enough for level cubes to touch; or for cubes in any attitude, and nearer by
+    `slack_m`.
+    """
+    others = other_at.p_wb + other.r_bm @ to_matrix(other_at.q_wb).T
+    reach_m = way.body.reach_m + other.reach_m
+    shares = _near_part(way.p_begin - other_at.p_wb, way.p_end - way.p_begin, reach_m)
+    gaps = np.linalg.norm(way.at(shares)[:, :, None] - others, axis=-1)
+    least, ends = gaps.min(axis=0), gaps[list(near)].min(axis=0)
+    limit = np.minimum(CUBE_DIAGONAL * way.pitch_m, np.maximum(ends - slack_m, SQUARE_DIAGONAL * way.pitch_m))
+    touching = (least < ends - WAY_NOISE_M) & (least < limit)
+    return other.modules[int(np.where(touching, least, np.inf).min(axis=0).argmin())] if touching.any() else None
+
+
+def _near_part(begin: np.ndarray, way: np.ndarray, reach_m: float) -> list[float]:
+    """Shares of a way (3,) that begins at `begin` (3,) off a place: its ends, where it is nearest to the place, and WAY_SAMPLES of where it
+    is within reach of it.
+    """
+    length2 = max(float(way @ way), 1e-12)
+    middle = -float(begin @ way) / length2
+    half = math.sqrt(max(0.0, reach_m**2 - float(begin @ begin) + middle**2 * length2) / length2)
+    first, last = (min(max(share, 0.0), 1.0) for share in (middle - half, middle + half))
+    return [0.0, *np.linspace(first, last, WAY_SAMPLES if last > first else 1).tolist(), 1.0]
