@@ -9,6 +9,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking import DockingStage
 from firmware_py.core.docking_decisions import Decisions, Join, Part
 from firmware_py.core.docking_pairs import APART, LOOSE
+from firmware_py.core.joints import modules_of
 from firmware_py.core.topology import in_both, join, part_of
 from firmware_py.core.types import WARNING, DockRequest, Estimate, Event, Inputs, Mode, Outputs, PartRequest
 from firmware_py.description.parameters import Parameters
@@ -73,7 +74,8 @@ class Formation:
         for chain in self.chains:
             if not chain.joints or chain.body.index in parted:
                 continue
-            chain.health.topology = _words_of([joint for joint in loose if joint.module in chain.body.modules])
+            mine = [joint for joint in loose if joint.module in chain.body.modules]
+            chain.health.topology, chain.health.open_joints = _words_of(mine), tuple(map(modules_of, mine))
             gone = [joint for joint in apart if joint.module in chain.body.modules]
             chain.parting = chain.parting if gone else []  # what closes for a moment may drop its plan: asked anew when it opens
             if gone and gone != chain.parting and chain.supervisor.armed and chain.supervisor.is_on("partner_lost"):

@@ -98,6 +98,9 @@ class Health(NamedTuple):
     unfit: tuple[int, ...] = ()
     """Fleet indices of modules that say that they start, or have a fault."""
 
+    open_joints: tuple[frozenset[int], ...] = ()
+    """Modules of each joint that is open though it should hold."""
+
     @property
     def placed(self) -> bool:
         """Whether tags have told heading and place."""
@@ -159,7 +162,7 @@ class HealthMonitor:
         """Whether an IMU that is to be believed was heard in this tick; set by whoever watches them."""
         self.pressure_heard = False
         """The same of a pressure sensor."""
-        self.topology = ""
+        self.topology, self.open_joints = "", tuple[frozenset[int], ...]()
         """Set by whoever watches the docked faces."""
         self.warm = True
         """Cleared and set by whoever compiles."""
@@ -245,6 +248,7 @@ class HealthMonitor:
             lost_axes=faults.lost_axes,
             warm=self.warm,
             topology=self.topology,
+            open_joints=self.open_joints,
             tag_gap_s=self._tag_gap_s(now),
             unfit=tuple([m for m, unfit in zip(self._modules, self._unfit, strict=True) if unfit]),
             battery_age_s=(now - min(self._read_ns["battery"])) * 1e-9,

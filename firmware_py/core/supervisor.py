@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from firmware_py.core.arming import Question, against_arming, missing
 from firmware_py.core.failsafes import Failsafes, Level
 from firmware_py.core.health import Health
+from firmware_py.core.joints import modules_of
 from firmware_py.core.transitions import ARMED, MODES, ROWS, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Event, Mode, Request
 from firmware_py.description.parameters import Parameters
@@ -153,7 +154,7 @@ class Supervisor:
             self._say(WARNING, f"{trigger.name} refused: not possible in {self.state.name}")
             return None
         mode = row.mode if row.mode is not None else argument if trigger == Trigger.SET_MODE else self._mode_after(row)
-        reasons = self._reasons(row.guard, mode, health)
+        reasons = self._reasons(_guard_of(row, argument, health), mode, health)
         if reasons:
             self._say(WARNING, f"{trigger.name} refused: {'; '.join(dict.fromkeys(reasons))}")
             return None
@@ -231,6 +232,13 @@ class Supervisor:
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))
+
+
+def _guard_of(row: Transition, argument: Any, health: Health) -> Guard:
+    """The row's; but a joint that holds is none of a partner that is lost."""
+    if row.guard == Guard.PARTING_PERMITTED and modules_of(argument) not in health.open_joints:
+        return Guard.MODE_PERMITTED
+    return row.guard
 
 
 TAKES_OVER = (Effect.ENTER_MODE, Effect.ENTER_LEVEL, Effect.HOLD_AT, Effect.FOLLOW)

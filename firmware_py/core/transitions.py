@@ -77,7 +77,7 @@ class Guard(IntEnum):
     IN_DOCK = 8
     """The mode is DOCK."""
     PARTING_PERMITTED = 9
-    """As MODE_PERMITTED; but a partner that is lost is what one lets go."""
+    """As MODE_PERMITTED; but a partner that is lost may be let go: by a joint of its own that is open."""
 
 
 class Effect(IntEnum):

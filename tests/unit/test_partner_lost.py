@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from firmware_py.core.docking import CHANGED, IN_PLACE
+from firmware_py.core.failsafes import Level
 from firmware_py.core.joints import joints_of
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockFeedback, DockRequest, Mode, ModuleInputs, Request
@@ -73,6 +74,20 @@ def test_partner_that_may_be_lost_is_undocked_when_somebody_asks_for_that() -> N
     outputs = tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert tank.shape == [(0,), (1,)] and not [said for _, said in tank.said if "refused" in said]
     assert [(record.state, record.mode) for record in outputs.records] == [(State.ARMED, Mode.POSHOLD)] * 2
+
+
+def test_joint_that_holds_is_not_undocked_while_a_partner_is_lost() -> None:
+    """Module 0 may be lost: 1 and 2 hold together. Nor does a word for what is no joint end what the fail-safe does."""
+    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)], Parameters().replace("failsafes.partner_lost_action", int(Level.SURFACE)))
+    tank.fly()
+    tank.weak.add(0)
+    tank.run(2.0)
+    for request in DockRequest(2, 1, 1, 0), DockRequest(2, 1, 0, 0):
+        outputs = tank.run(1.0, Request(Action.UNDOCK, 0, request))
+        assert outputs.records[0].mode == Mode.SURFACE and tank.shape == [(0, 1, 2)]
+    assert tank.when("UNDOCK refused: a docked partner is lost")
+    tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.shape == [(0,), (1, 2)]
 
 
 def test_neighbours_that_turn_two_probes_to_each_other_are_no_joint_that_could_be_lost() -> None:

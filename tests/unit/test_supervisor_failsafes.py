@@ -6,6 +6,7 @@ import pytest
 
 from firmware_py.core.failsafes import Level
 from firmware_py.core.health import Health
+from firmware_py.core.joints import modules_of
 from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.transitions import Effect, State, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Event, Mode, Request
@@ -45,7 +46,14 @@ def test_pilot_takes_over_and_keeps_it_while_the_leak_lasts() -> None:
 @pytest.mark.parametrize(
     ("bad", "against"),
     [
-        (GOOD._replace(topology="0 and 1"), {Action.DOCK: "a docked partner is lost", Action.UNDOCK: ""}),
+        (
+            GOOD._replace(topology="0 and 1", open_joints=(modules_of(DOCK),)),
+            {Action.DOCK: "a docked partner is lost", Action.UNDOCK: ""},
+        ),
+        (
+            GOOD._replace(topology="1 and 2", open_joints=(frozenset((1, 2)),)),
+            {Action.DOCK: "a docked partner is lost", Action.UNDOCK: "a docked partner is lost"},
+        ),
         (GOOD._replace(leak=True), {Action.DOCK: "water in a cabin", Action.UNDOCK: "water in a cabin"}),
         (BLIND, {Action.DOCK: "no pose yet", Action.UNDOCK: "no pose yet"}),
     ],
