@@ -67,11 +67,13 @@ class _Undock(NamedTuple):
     chains: tuple[Any, ...]
     since_ns: int
     until_ns: int
+    seen_ns: int
+    """By then pictures of the latter half of the push are there, if any still come."""
 
     @property
     def last_ns(self) -> int:
         """While pictures show it in its place the magnets push on, as long again: a short push shows late."""
-        return 2 * self.until_ns - self.since_ns
+        return max(2 * self.until_ns - self.since_ns, self.seen_ns)
 
 
 class DockingStage:
@@ -288,7 +290,8 @@ class DockingStage:
     def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
         apart = [modules_of(joint) for joint in self.open_joints(APART)]
         holds = any(modules_of(joint) not in apart for joint in plan.opens)
-        self._undocks.append(_Undock(plan, chains, time_ns, time_ns + (round(self._p.release_s * 1e9) if holds else 0)))
+        until_ns, seen_ns = (time_ns + (round(ns) if holds else 0) for ns in (self._p.release_s * 1e9, 2e6 * self._p.pose_fresh_ms))
+        self._undocks.append(_Undock(plan, chains, time_ns, until_ns, seen_ns))
         self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
 
     def _begin_dock(
@@ -379,7 +382,10 @@ class DockingStage:
         changes = whole in decisions.joining or whole in [part.whole for part in decisions.parts]
         if time_ns < undock.until_ns or changes:  # the next tick has no such body, and ends this
             return
-        if self._in_place(undock, time_ns):
+        alone = len(plan.opens) == 1
+        if alone and time_ns < undock.seen_ns and not self._since(undock, time_ns, "picture_ns"):
+            return
+        if alone and self._since(undock, time_ns, "near_ns"):
             if time_ns < undock.last_ns:
                 return
             self._undocks.remove(undock)
@@ -400,13 +406,14 @@ class DockingStage:
         watched = [modules_of(joint.request) for joint in self._watched]
         return any(modules_of(joint) in watched for joint in plan.opens)
 
-    def _in_place(self, undock: _Undock, time_ns: int) -> bool:
-        """Whether pictures show the joint closed in the latter half of the push, as where a relay hangs: two bodies would fly against each
-        other. Of several that part at once the funnels hold back what leaves across, until thrusters draw it out.
+    def _since(self, undock: _Undock, time_ns: int, picture: str) -> bool:
+        """Whether in the latter half of the push pictures were taken of the joint: any (`picture_ns`), or such as show it closed
+        (`near_ns`), as where a relay hangs: two bodies would fly against each other. Of several that part at once the funnels hold back
+        what leaves across, until thrusters draw it out: of these no picture tells.
         """
-        opens, half_ns = undock.plan.opens, (undock.since_ns + time_ns) // 2
-        held = [modules_of(self._watched[i].request) for i in np.flatnonzero(self._joints.rows["near_ns"] > half_ns).tolist()]
-        return len(opens) == 1 and modules_of(opens[0]) in held
+        half_ns = (undock.since_ns + time_ns) // 2
+        taken = [modules_of(self._watched[i].request) for i in np.flatnonzero(self._joints.rows[picture] > half_ns).tolist()]
+        return modules_of(undock.plan.opens[0]) in taken
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))

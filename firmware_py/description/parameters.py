@@ -275,7 +275,12 @@ class Docking:
         0.010, unit="m", low=0, high=0.1, help="how far beyond contact the set-point goes", mavlink="DOCK_PUSH"
     )
     release_s: float = quantity(
-        1.0, unit="s", low=0.01, high=60, help="how long the magnets push apart, after a jam and to undock", mavlink="DOCK_RELEASE"
+        1.0,
+        unit="s",
+        low=0.01,
+        high=60,
+        help="how long the magnets push apart, after a jam and to undock; longer while late pictures may still show a joint closed",
+        mavlink="DOCK_RELEASE",
     )
     sigma_m: float = quantity(
         0.005, unit="m", low=1e-4, high=0.1, help="relative sigma that aborts", mavlink="DOCK_SIGMA"
