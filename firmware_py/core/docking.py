@@ -5,7 +5,7 @@ Works on the estimates of this tick; the pipeline carries out the joins and part
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +28,7 @@ from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back,
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import (
     INFORMATION,
+    NEVER_NS,
     RELAY_OFF,
     RELAY_PULL,
     RELAY_PUSH,
@@ -41,6 +42,7 @@ from firmware_py.description.parameters import Docking
 
 CHANGED = "the bodies are others than those that it was planned for"
 IN_PLACE = "pictures show that it is still in its place"
+PULLED = "its magnets go on pulling"
 NO_LONGER = "its body is no longer in DOCK"
 ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
@@ -69,6 +71,8 @@ class _Undock(NamedTuple):
     until_ns: int
     seen_ns: int
     """By then pictures of the latter half of the push are there, if any still come."""
+    pulled: Mapping[frozenset[int], np.ndarray]
+    """By the modules of a joint: its currents (2,) before the push, mA."""
 
     @property
     def last_ns(self) -> int:
@@ -291,7 +295,7 @@ class DockingStage:
         apart = [modules_of(joint) for joint in self.open_joints(APART)]
         holds = any(modules_of(joint) not in apart for joint in plan.opens)
         until_ns, seen_ns = (time_ns + (round(ns) if holds else 0) for ns in (self._p.release_s * 1e9, 2e6 * self._p.pose_fresh_ms))
-        self._undocks.append(_Undock(plan, chains, time_ns, until_ns, seen_ns))
+        self._undocks.append(_Undock(plan, chains, time_ns, until_ns, seen_ns, self._strong(plan.opens)))
         self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
 
     def _begin_dock(
@@ -383,14 +387,16 @@ class DockingStage:
         if time_ns < undock.until_ns or changes:  # the next tick has no such body, and ends this
             return
         alone = len(plan.opens) == 1
-        if alone and time_ns < undock.seen_ns and not self._since(undock, time_ns, "picture_ns"):
+        seen = alone and self._since(undock, time_ns, "picture_ns")
+        if alone and not seen and time_ns < undock.seen_ns:
             return
-        if alone and self._since(undock, time_ns, "near_ns"):
+        held = seen and self._since(undock, time_ns, "near_ns")
+        if held or (not seen and self._pulls(undock, time_ns)):
             if time_ns < undock.last_ns:
                 return
             self._undocks.remove(undock)
             self.relays.switch(RELAY_PULL, *plan.opens)
-            self._say(WARNING, f"undock of module {request.module} ended: {IN_PLACE}")
+            self._say(WARNING, f"undock of module {request.module} ended: {IN_PLACE if held else PULLED}")
             self._end(whole, decisions)
             return
         self.relays.switch(RELAY_OFF, *plan.opens)
@@ -414,6 +420,18 @@ class DockingStage:
         half_ns = (undock.since_ns + time_ns) // 2
         taken = [modules_of(self._watched[i].request) for i in np.flatnonzero(self._joints.rows[picture] > half_ns).tolist()]
         return modules_of(undock.plan.opens[0]) in taken
+
+    def _pulls(self, undock: _Undock, time_ns: int) -> bool:
+        """Whether any joint is still held by both its magnets: their currents have not turned, as where relays hang."""
+        now = self._strong(undock.plan.opens, (undock.since_ns + time_ns) // 2)
+        return any(bool(np.all(now[joint] * before > 0.0)) for joint, before in undock.pulled.items() if joint in now)
+
+    def _strong(self, joints: Sequence[DockRequest], after_ns: int = NEVER_NS) -> dict[frozenset[int], np.ndarray]:
+        """Currents (2,), mA, of those of the joints whose magnets both are on, as far as they came after that time."""
+        rows, wanted = self._joints.rows, [modules_of(joint) for joint in joints]
+        strong = (np.abs(rows["current_ma"]) > self._p.current_threshold_ma) & (rows["current_ns"] > after_ns)
+        found = [(modules_of(self._watched[i].request), i) for i in np.flatnonzero(strong.all(axis=1)).tolist()]
+        return {joint: rows["current_ma"][i].copy() for joint, i in found if joint in wanted}
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))

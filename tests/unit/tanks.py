@@ -131,8 +131,8 @@ def _body_of(cells: list[tuple[int, int, int]], first: int) -> Body:
 
 
 class Docked(Tank):
-    """A tank in which the magnets of some modules carry no current, and some modules' tags are out of sight. Joints that push apart stay
-    in their places in pictures where they are `stuck`.
+    """A tank in which the magnets of some modules carry no current, those of others pull whatever they are told (`hung`), and some modules'
+    tags are out of sight. Joints that push apart stay in their places in pictures where they are `stuck`.
     """
 
     def __init__(
@@ -145,6 +145,7 @@ class Docked(Tank):
         self.cabin_pa = [101_325.0] * count
         self.weak: set[int] = set()
         self.hidden: set[int] = set()
+        self.hung: set[int] = set()
         self.stuck = False
         self.said: list[tuple[float, str]] = []
         self._delay, self._plans = delay, list[tuple[int, Prepared]]()
@@ -159,8 +160,9 @@ class Docked(Tank):
             if m in self.hidden or m in pushing[1:]:  # no picture shows two in their places that push each other apart
                 module.tags.clear()
             if tick % 4 == 0:
-                current = 0.0 if m in self.weak else 110.0
-                module.docks = [DockFeedback(first, (current,) * 3, (1, 1, 1)) for first in (0, 3)]
+                turned = [state == RELAY_PUSH and m not in self.hung for state in relays[m]]
+                current = [0.0 if m in self.weak else -110.0 if turns else 110.0 for turns in turned]
+                module.docks = [DockFeedback(first, (*current[first : first + 3],), (1, 1, 1)) for first in (0, 3)]  # type: ignore[arg-type]
         return modules
 
     def _step_with_plans(self, inputs: Inputs) -> Outputs:

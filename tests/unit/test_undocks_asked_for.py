@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from firmware_py.core.docking import PULLED
 from firmware_py.core.docking_decisions import Decisions, Join
 from firmware_py.core.types import Action, DockRequest, Mode, Request
 from firmware_py.description.parameters import Parameters
@@ -54,6 +55,30 @@ def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> 
     rest, corner = (chain.guidance._glider.at.p_wb for chain in tank.pipeline.formation.chains)
     assert outputs.records[1].mode == Mode.POSHOLD and np.linalg.norm(corner - rest) > 0.3
     assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1, 1, 0]
+
+
+@pytest.mark.parametrize("hung", [{2, 3}, {1, 3}, {2}, {3}], ids=str)
+def test_corner_of_a_ring_stays_where_the_relays_of_a_joint_hang(hung: set[int]) -> None:
+    """Funnels hold back what leaves across, so no picture tells; the currents of a joint that is held do not turn."""
+    tank = Docked(RING)
+    tank.fly()
+    tank.hung, tank.stuck = hung, True
+    outputs = tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
+    if len(hung) == 1:  # the other magnet pushes as hard as this one pulls
+        assert tank.shape == [(0, 1, 2), (3,)]
+        return
+    assert tank.when(f"undock of module 3 ended: {PULLED}") and tank.shape == [(0, 1, 2, 3)]
+    assert outputs.records[0].mode == Mode.POSHOLD
+    assert [sum(states) for states in tank.pipeline.formation.docking.relays.states] == [2] * 4, "and all pull again"
+
+
+@pytest.mark.parametrize("hung", [set(), {0, 1}], ids=str)
+def test_module_out_of_sight_is_undocked_unless_its_magnets_go_on_pulling(hung: set[int]) -> None:
+    tank = Docked(RING[:2])
+    tank.fly()
+    tank.hidden, tank.hung = {1}, hung
+    tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.shape == ([(0, 1)] if hung else [(0,), (1,)])
 
 
 def test_undock_that_ends_in_the_tick_of_a_join_is_not_said_to_be_done() -> None:
