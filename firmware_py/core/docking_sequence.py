@@ -7,6 +7,7 @@ between the two faces; lateral and angle error are those of the active module ag
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -244,7 +245,8 @@ class DockingSequence:
     def _time_out(self, time_ns: int, status: PairStatus) -> None:
         if TABLE[self.stage].on_timeout == Stage.RELEASE:
             only = "current alone" if status.current else "position alone" if status.position else "neither condition"
-            self.reason = f"jam: {only} after {self.stage.name}"
+            unseen = f", pictures of both are too few or older than {self._p.pose_fresh_ms:.0f} ms (DOCK_POSE_AGE)"
+            self.reason = f"jam: {only} after {self.stage.name}{unseen if math.isnan(status.position_error_m) else ''}"
             if self.tries >= self._p.tries:
                 self.reason += f", {self.tries} {'try' if self.tries == 1 else 'tries'}"
                 self._enter(Stage.FAILED, time_ns)
