@@ -11,6 +11,7 @@ from operator import attrgetter
 from typing import NamedTuple
 
 from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.transitions import MODE_TABLE, Need
 from firmware_py.core.types import Mode
 from firmware_py.description.failsafe_parameters import Failsafes as FailsafeParameters
 
@@ -30,10 +31,10 @@ class Level(IntEnum):
 
 ANY = frozenset(Mode)
 """The vehicle itself is at fault: counts in every mode, and disarmed too."""
-PLACED = frozenset({Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK})
+PLACED = frozenset(row.mode for row in MODE_TABLE if Need.POSITION in row.needs)
 """Modes that hold or follow a place."""
 MOVING = PLACED - {Mode.POSHOLD}
-PILOTED = frozenset({Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD})
+PILOTED = frozenset(row.mode for row in MODE_TABLE if row.by_pilot)
 
 PERMITTED = {
     Level.NONE: ANY,
