@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from firmware_py.core.rotations import heading
-from firmware_py.core.setpoint import rest_at
+from firmware_py.core.setpoint import Trajectory, rest_at
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, DockRequest, Mode, Outputs, Request
 from firmware_py.description.fleet import Fleet
@@ -139,13 +139,13 @@ class _Running:
         """In the tick before."""
 
 
-def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> paths.Trajectory:
+def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> Trajectory:
     here = rest_at(np.array(p_wb), np.array(q_wb))
     if step.do == "move":
         return paths.line(here, rest_at(np.array(step.position_m), np.array(q_wb)), step.duration_s)
     return _strip(step, scenario)
 
 
-def _strip(step: Step, scenario: Scenario) -> paths.Trajectory:
+def _strip(step: Step, scenario: Scenario) -> Trajectory:
     task = scenario.task
     return paths.moebius(task.centre_m, step.duration_s, task.radius_m, task.half_width_m, task.turns)

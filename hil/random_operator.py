@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.core.setpoint import rest_at
+from firmware_py.core.setpoint import Trajectory, rest_at
 from firmware_py.core.transitions import ARMED, State
 from firmware_py.core.types import (
     CHANNELS,
@@ -33,7 +33,7 @@ from firmware_py.core.types import (
 )
 from firmware_py.description.parameters import Parameters, registry
 from firmware_py.description.vehicle import FACE_NAMES
-from firmware_py.prepare.paths import Trajectory, circle
+from firmware_py.prepare.paths import circle
 from hil.bench import Bench, open_bench
 from hil.fault_table import ROWS
 from hil.plant.draw import stream

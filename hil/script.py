@@ -12,7 +12,7 @@ import numpy as np
 
 from firmware_py.app.firmware import vehicles_of
 from firmware_py.core import rotations
-from firmware_py.core.setpoint import rest_at
+from firmware_py.core.setpoint import Trajectory, rest_at
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Outputs, Request, Setpoint
 from firmware_py.description.fleet import Fleet
@@ -71,7 +71,7 @@ class Script:
         return False
 
 
-def refuse_outside(path: paths.Trajectory, scenario: Scenario) -> None:
+def refuse_outside(path: Trajectory, scenario: Scenario) -> None:
     """Raises DescriptionError where the body's centre would have to leave the tank."""
     for time_s in np.linspace(0.0, path.duration_s, LOOKS).tolist():
         place = path.sample(time_s).p_wb
@@ -81,7 +81,7 @@ def refuse_outside(path: paths.Trajectory, scenario: Scenario) -> None:
             raise DescriptionError(f"{what}: the path leaves the tank, a {scenario.tank}, {where}; keep it inside")
 
 
-def refuse_in_wall(path: paths.Trajectory, scenario: Scenario) -> None:
+def refuse_in_wall(path: Trajectory, scenario: Scenario) -> None:
     """Raises DescriptionError where a hull of the first body would have to go into a wall."""
     members = scenario.groups[0]
     hulls = np.concatenate([levers for m, (_, levers) in hull_levers(scenario).items() if m in members])
@@ -92,21 +92,21 @@ def refuse_in_wall(path: paths.Trajectory, scenario: Scenario) -> None:
             raise DescriptionError(f"{what}: after {time_s:.3g} s, at {wanted.p_wb.round(3).tolist()} m, a hull is {where}; keep it inside")
 
 
-def _hover(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
-    return paths.hold(paths.at_rest(task.centre_m, start.q_wb), task.duration_s)
+def _hover(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
+    return paths.Hold(paths.at_rest(task.centre_m, start.q_wb), task.duration_s)
 
 
-def _spiral(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
+def _spiral(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
     return paths.spiral(task.centre_m, task.radius_m, task.climb_m, task.turns, task.duration_s, attitude=start.q_wb)
 
 
-def _moebius(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
+def _moebius(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
     return paths.moebius(
         task.centre_m, task.duration_s, task.radius_m, task.half_width_m, task.turns, ramp_share=MOEBIUS_RAMP_SHARE
     )
 
 
-def _lissajous(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
+def _lissajous(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
     turning = (task.yaw_turns, task.roll_turns)
     return paths.lissajous(
         task.centre_m,
@@ -119,7 +119,7 @@ def _lissajous(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
     )
 
 
-def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> paths.Trajectory:
+def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
     """The path of the file as it is: what does not fit its limits, the thrusters, its task or the start is refused, not stretched."""
     mission = _from_start(read_mission(task.file_text, task.file), start)
     _refuse_unbounded(mission, task.file)
@@ -159,7 +159,7 @@ def _from_start(mission: Mission, start: Setpoint) -> Mission:
     return dataclasses.replace(mission, waypoint=(first, *others))
 
 
-TASKS: dict[str, Callable[[Task, Setpoint, Fleet], paths.Trajectory]] = {
+TASKS: dict[str, Callable[[Task, Setpoint, Fleet], Trajectory]] = {
     "hover": _hover,
     "lissajous": _lissajous,
     "moebius": _moebius,

@@ -27,7 +27,7 @@ LEASH_RAD = 2.0
 
 
 class Trajectory(Protocol):
-    """A motion over time. Built by `prepare.paths`; sampled in the tick."""
+    """A motion over time. Built by `prepare.paths` and `prepare.minimum_snap`; sampled in the tick, any number of times."""
 
     @property
     def duration_s(self) -> float:
@@ -37,6 +37,11 @@ class Trajectory(Protocol):
     def sample(self, t_s: float) -> Setpoint:
         """The set-point at `t_s`; before 0 and after `duration_s` it rests at the ends."""
         ...
+
+
+def as_setpoint(x: np.ndarray) -> Setpoint:
+    """(19,) p, q, v, w, a, alpha in one array, as compiled functions write them: views of its parts."""
+    return Setpoint(x[0:3], x[3:7], x[7:10], x[10:13], x[13:16], x[16:19])
 
 
 def rest_at(p_wb: np.ndarray, q_wb: np.ndarray) -> Setpoint:
@@ -132,7 +137,7 @@ class Glider:
         place = UNKNOWN if wish.p_wb is None else np.ascontiguousarray(wish.p_wb)
         attitude = UNKNOWN if wish.q_wb is None else np.ascontiguousarray(wish.q_wb)
         _glide(*self.at, wish.v_w, wish.w_b, place, attitude, self._w, self._speed, rate, dt_s, out)
-        self.at = Setpoint(out[0:3], out[3:7], out[7:10], out[10:13], out[13:16], out[16:19])
+        self.at = as_setpoint(out)
         return self.at
 
 

@@ -1,7 +1,7 @@
 """Trajectories in closed form: hold, spiral, Moebius strip, circle, Lissajous figure, line. Rest to rest.
 
 Made before they are needed; `sample` runs in the tick and is compiled. Others (minimum_snap) are the same
-`Trajectory`.
+`Trajectory` (core.setpoint).
 """
 
 from __future__ import annotations
@@ -9,26 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numba import njit
 
 from firmware_py.core import rotations
+from firmware_py.core.setpoint import as_setpoint
 from firmware_py.core.types import Setpoint
-
-
-class Trajectory(Protocol):
-    """Wanted motion over time."""
-
-    @property
-    def duration_s(self) -> float:
-        """Time from start to end; before and after it the ends are held."""
-        ...
-
-    def sample(self, t_s: float) -> Setpoint:
-        """Wanted motion `t_s` after the start; cheap enough for a tick, any number of times."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,11 +28,6 @@ class Hold:
     def sample(self, t_s: float) -> Setpoint:
         """The pose; `t_s` does not matter."""
         return self.setpoint
-
-
-def hold(setpoint: Setpoint, duration_s: float = 0.0) -> Hold:
-    """Stay at `setpoint`."""
-    return Hold(setpoint, duration_s)
 
 
 def at_rest(p_wb: Sequence[float] | np.ndarray, q_wb: Sequence[float] | np.ndarray = (1.0, 0.0, 0.0, 0.0)) -> Setpoint:
@@ -129,8 +111,7 @@ class Harmonic:
 
     def sample(self, t_s: float) -> Setpoint:
         """Wanted motion at `t_s`, world NED and wanted body frame; the ends are held."""
-        x = _harmonic(self.terms, self.head, self.duration_s, self.end_phase, self.ramp_share, t_s)
-        return Setpoint(x[0:3], x[3:7], x[7:10], x[10:13], x[13:16], x[16:19])
+        return as_setpoint(_harmonic(self.terms, self.head, self.duration_s, self.end_phase, self.ramp_share, t_s))
 
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
+from firmware_py.core.setpoint import as_setpoint
 from firmware_py.core.types import Setpoint
 
 CHANNELS = 7
@@ -129,8 +130,7 @@ class Piecewise:
 
     def sample(self, t_s: float) -> Setpoint:
         """Wanted motion at `t_s`, world NED and wanted body frame; the ends are held at rest."""
-        x = _sample(self.coefficients, self.breaks, t_s)
-        return Setpoint(x[0:3], x[3:7], x[7:10], x[10:13], x[13:16], x[16:19])
+        return as_setpoint(_sample(self.coefficients, self.breaks, t_s))
 
     def grid(self, per_piece: int) -> np.ndarray:
         """(k, per_piece + 1, 20) p, q, v, w, a, alpha and the length of the quaternion before normalising."""

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from firmware_py.core import rotations
+from firmware_py.core.setpoint import Trajectory
 from firmware_py.description.schema import DescriptionError
 from firmware_py.prepare import paths
-from firmware_py.prepare.paths import Trajectory, at_rest
+from firmware_py.prepare.paths import at_rest
 from firmware_py.prepare.waypoints import read_mission
 
 TILTED = np.array([0.5, 0.5, -0.5, 0.5])

@@ -31,7 +31,7 @@ REQUESTS = [
     Request(Action.SET_PARAMETER, 0, ("control.position_bandwidth", 2.1)),
     Request(Action.DOCK, 2, DockRequest(2, 1, 0, 0, 3, True)),
     Request(Action.MOTOR_TEST, 0, (3, np.float64(0.05), np.int64(2))),
-    Request(Action.TRACK, 0, paths.hold(PLACE, 5.0)),
+    Request(Action.TRACK, 0, paths.Hold(PLACE, 5.0)),
     Request(Action.TRACK, 0, paths.spiral(np.zeros(3), 0.3, 0.4, 2.0, 40.0)),
     Request(Action.TRACK, 0, paths.line(PLACE, PLACE, 4.0)),
     Request(Action.TRACK, 0, SNAP),

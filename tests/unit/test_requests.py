@@ -13,7 +13,7 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Event, Mode, Request, Setpoint, Sticks
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
-from firmware_py.prepare.paths import hold
+from firmware_py.prepare.paths import Hold
 from tests.unit.tanks import DT, Tank, single
 
 NAN, LEVEL, ZERO = math.nan, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
@@ -67,7 +67,7 @@ UNSOUND: list[tuple[Action, Any]] = [
 ]  # fmt: skip
 SOUND_ONES: list[tuple[Action, Any]] = [
     (Action.ARM, None), (Action.ARM, True), (Action.ARM, False), (Action.DISARM, object()), (Action.ESTOP, NAN), (Action.CLEAR_ESTOP, 1),
-    (Action.GROUND_ALIVE, "?"), (Action.HOLD, None), (Action.HOLD, HERE), (Action.TRACK, Path()), (Action.TRACK, hold(HERE, 3.0)),
+    (Action.GROUND_ALIVE, "?"), (Action.HOLD, None), (Action.HOLD, HERE), (Action.TRACK, Path()), (Action.TRACK, Hold(HERE, 3.0)),
     (Action.TRACK, Path(duration_s=0.0)),
     (Action.STICKS, STICKS), (Action.STICKS, Sticks((1.0, -1.0, 0), (0.0,) * 3)), (Action.SET_MODE, Mode.AUTO),
     (Action.SET_POINT, HERE), (Action.SET_POINT, spoilt(p_wb=ZERO * NAN)),

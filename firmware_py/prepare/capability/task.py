@@ -13,6 +13,7 @@ import numpy as np
 from firmware_py.core import rigid_body, rotations
 from firmware_py.core.body import Body
 from firmware_py.core.drag_lookup import drag_wrench
+from firmware_py.core.setpoint import Trajectory
 from firmware_py.core.types import Setpoint
 from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
 from firmware_py.prepare import paths
@@ -36,7 +37,7 @@ class TrajectoryTable:
     )
     samples: int = quantity(100, low=2, high=10000, help="moments at which the wrench is looked at")
 
-    def path(self) -> paths.Trajectory:
+    def path(self) -> Trajectory:
         """The trajectory, world NED."""
         origin = np.zeros(3)
         if self.kind == "spiral":
@@ -73,7 +74,7 @@ def load_task(path: Path) -> Task:
     return task
 
 
-def wrenches_along(path: paths.Trajectory, body: Body, samples: int) -> np.ndarray:
+def wrenches_along(path: Trajectory, body: Body, samples: int) -> np.ndarray:
     """(samples, 6) wrench that a body needs at even times along a trajectory, N and N m, body frame, in still water."""
     times = np.linspace(0.0, path.duration_s, samples)
     return np.array([required_wrench(body, path.sample(float(t))) for t in times])
