@@ -16,6 +16,8 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from firmware_py.core.body import Body
+from firmware_py.core.types import Setpoint
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.description.water import WATER_DENSITY
@@ -26,8 +28,9 @@ from firmware_py.prepare.capability.choice import fitness, rank
 from firmware_py.prepare.capability.layout import of_modules, of_vehicle
 from firmware_py.prepare.capability.polycubes import canonical, polycubes, poses
 from firmware_py.prepare.capability.programs import reach_by_programs
-from firmware_py.prepare.capability.task import Task, load_task, required_wrench, wrenches_along
+from firmware_py.prepare.capability.task import Task, load_task, wrenches_along
 from firmware_py.prepare.capability.wrench import WrenchSpace
+from firmware_py.prepare.snap_thrust import wrenches
 from tests.unit.capability_layouts import ROOT
 
 PUSH = np.array([[20.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
@@ -90,11 +93,16 @@ def test_guaranteed_margin_holds_whichever_thruster_dies() -> None:
     assert choice.guaranteed_margin == pytest.approx(worst, rel=1e-9)
 
 
+def wrench_of(body: Body, wanted: Setpoint) -> np.ndarray:
+    """(6,) that one motion takes."""
+    return wrenches(body, np.concatenate(wanted)[None])[0]
+
+
 def test_standing_still_needs_no_wrench_and_drag_needs_one() -> None:
     body = assemble_vehicle(load_vehicle("bluerov2_heavy"))
-    assert required_wrench(body, paths.at_rest([0.0, 0.0, 1.0])) == pytest.approx(np.zeros(6))
+    assert wrench_of(body, paths.at_rest([0.0, 0.0, 1.0])) == pytest.approx(np.zeros(6))
     moving = paths.at_rest([0.0, 0.0, 1.0])._replace(v_w=np.array([0.5, 0.0, 0.0]))
-    assert required_wrench(body, moving) == pytest.approx([13.7 * 0.5 + 141.0 * 0.25, 0, 0, 0, 0, 0])
+    assert wrench_of(body, moving) == pytest.approx([13.7 * 0.5 + 141.0 * 0.25, 0, 0, 0, 0, 0])
 
 
 def test_steady_circle_asks_for_the_pull_towards_its_middle_and_for_drag() -> None:
@@ -107,7 +115,7 @@ def test_steady_circle_asks_for_the_pull_towards_its_middle_and_for_drag() -> No
     half_rho = 0.5 * WATER_DENSITY
     drag, damping = half_rho * 1.05 * 0.21**2 * 0.5**2, half_rho * 1.1 * 6.0 * 0.105**5 * 0.8**2
     pull = (2.6 + 6.7 + 6.2) * 0.5**2 / (0.5 / 0.8)
-    np.testing.assert_allclose(required_wrench(body, circling), [drag, pull, 0.0, 0.0, 0.0, damping], rtol=2e-3, atol=1e-9)
+    np.testing.assert_allclose(wrench_of(body, circling), [drag, pull, 0.0, 0.0, 0.0, damping], rtol=2e-3, atol=1e-9)
 
 
 def test_trajectory_asks_for_momentums_change() -> None:

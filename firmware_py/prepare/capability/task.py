@@ -10,13 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.core import rigid_body, rotations
 from firmware_py.core.body import Body
-from firmware_py.core.drag_lookup import drag_wrench
 from firmware_py.core.setpoint import Trajectory
-from firmware_py.core.types import Setpoint
 from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
 from firmware_py.prepare import paths
+from firmware_py.prepare.snap_thrust import wrenches
 
 RANKINGS = ("margin", "power", "variance")
 
@@ -77,17 +75,4 @@ def load_task(path: Path) -> Task:
 def wrenches_along(path: Trajectory, body: Body, samples: int) -> np.ndarray:
     """(samples, 6) wrench that a body needs at even times along a trajectory, N and N m, body frame, in still water."""
     times = np.linspace(0.0, path.duration_s, samples)
-    return np.array([required_wrench(body, path.sample(float(t))) for t in times])
-
-
-def required_wrench(body: Body, wanted: Setpoint) -> np.ndarray:
-    """(6,) M dnu/dt + C(nu) nu + D(nu) + g of Fossen's equations for one wanted motion in still water."""
-    q = np.ascontiguousarray(wanted.q_wb)
-    w = np.ascontiguousarray(wanted.w_b)
-    v = rotations.rotate_back(q, np.ascontiguousarray(wanted.v_w))
-    a = rotations.rotate_back(q, np.ascontiguousarray(wanted.a_w)) - np.cross(w, v)
-    nu = np.concatenate([v, w])
-    drag = drag_wrench(body.drag.nodes, body.drag.rotational, body.drag.linear, nu)
-    tau = body.mass @ np.concatenate([a, wanted.alpha_b]) + rigid_body.coriolis_wrench(body.mass, nu) - drag
-    tau[3:] -= rigid_body.restoring_moment(np.ascontiguousarray(body.righting), q)
-    return np.asarray(tau)
+    return wrenches(body, np.array([np.concatenate(path.sample(float(t))) for t in times]))
