@@ -12,7 +12,7 @@ import numpy as np
 
 from firmware_py.description.vehicle import Vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
-from firmware_py.prepare.capability.layout import FRAMES, Layout, of_modules, of_thrusters
+from firmware_py.prepare.capability.layout import Layout, of_modules, of_thrusters
 from firmware_py.prepare.capability.polycubes import Cells, polycubes, poses
 from firmware_py.prepare.capability.power import electrical_power, least_squares_forces
 from firmware_py.prepare.capability.programs import reach_by_programs
@@ -103,14 +103,14 @@ def rank(
 
 def fitness(cells: Cells, layout: Layout, wrenches: np.ndarray) -> Fitness:
     """How one layout does against (k, 6) wrenches, N and N m."""
-    asked = wrenches[np.linalg.norm(wrenches / _rows(layout), axis=1) > _STILL]
     forces = least_squares_forces(layout, wrenches)
-    margin = float(reach_by_programs(layout, asked).min()) if len(asked) else np.inf
+    margin = float(reach_by_programs(layout, _asked(layout, wrenches)).min(initial=np.inf))
     return Fitness(cells, margin, float(electrical_power(layout, forces).mean()), float(forces.var()))
 
 
-def _rows(layout: Layout) -> np.ndarray:
-    return np.array([1.0, 1.0, 1.0, *[layout.lever_m] * 3])
+def _asked(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
+    """Those of the (k, 6) wrenches that ask for something."""
+    return np.asarray(wrenches[np.linalg.norm(wrenches / layout.levers, axis=1) > _STILL])
 
 
 def _order(task: Task, part: Fitness) -> tuple[bool, float, float]:
@@ -127,15 +127,5 @@ def _rounded(value: float) -> float:
 def _choice(best: Fitness, count: int, layout: Layout, wrenches: np.ndarray, dead: int) -> Choice:
     whole = WrenchSpace(layout)
     left = whole.with_dead(dead)
-    asked = wrenches[np.linalg.norm(wrenches / _rows(layout), axis=1) > _STILL]
-    margin = float(left.reach(asked).min()) if len(asked) else np.inf
-    worst = {(space, frame): space.worst(frame) for space in (whole, left) for frame in FRAMES}
-    return Choice(
-        best,
-        count,
-        margin,
-        worst[left, "force"],
-        worst[left, "torque"],
-        worst[whole, "force"],
-        worst[whole, "torque"],
-    )
+    margin = float(left.reach(_asked(layout, wrenches)).min(initial=np.inf))
+    return Choice(best, count, margin, *(space.worst(frame) for space in (left, whole) for frame in ("force", "torque")))

@@ -168,7 +168,7 @@ def normals_of(layout: Layout) -> np.ndarray:
     out = np.zeros((max(subsets(layout), 1), 6))
     count = _normals(_TERMS, _START, np.ascontiguousarray(left.T), columns, _DEPENDENT, out)
     found = out[:count]
-    found[:, 3:] /= layout.lever_m
+    found /= layout.levers
     return np.ascontiguousarray(found)
 
 

@@ -79,9 +79,14 @@ class Layout:
         return size if size > 0.0 else 1.0
 
     @property
+    def levers(self) -> np.ndarray:
+        """(6,) what a wrench is divided by so that its force and torque compare: 1, and the lever arm."""
+        return np.array([1.0, 1.0, 1.0, *[self.lever_m] * 3])
+
+    @property
     def scaled(self) -> np.ndarray:
         """(6, n) matrix with torque over the lever arm, N."""
-        return np.asarray(self.matrix / np.array([1.0, 1.0, 1.0, *[self.lever_m] * 3])[:, None])
+        return np.asarray(self.matrix / self.levers[:, None])
 
     @property
     def rank(self) -> int:

@@ -46,8 +46,7 @@ def _batch(layout: Layout, wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray
     from scipy.sparse import block_diag
 
     unit = float(max(layout.f_max.max(), -layout.f_min.min()))
-    rows = np.array([1.0, 1.0, 1.0, *[layout.lever_m] * 3])
-    targets = wrenches / rows
+    targets = wrenches / layout.levers
     sizes = np.linalg.norm(targets, axis=1)
     sizes = np.where(sizes > 0.0, sizes, 1.0)
     targets = targets / sizes[:, None]
@@ -66,7 +65,7 @@ def _batch(layout: Layout, wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray
     factor = result.x.reshape(k, n + 1)[:, -1] * unit / sizes
     dual = result.eqlin.marginals.reshape(k, 6)
     along = np.sum(dual * targets, axis=1)
-    return factor, dual / np.where(along == 0.0, 1.0, along)[:, None] / rows / sizes[:, None]
+    return factor, dual / np.where(along == 0.0, 1.0, along)[:, None] / layout.levers / sizes[:, None]
 
 
 class ProgramSpace:

@@ -119,7 +119,7 @@ def free_components(layout: Layout, frame: str) -> tuple[int, ...]:
 
 def in_span(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
     """(k,) whether each of (k, 6) wrenches is a combination of the thrusters."""
-    scaled = wrenches / np.array([1.0, 1.0, 1.0, *[layout.lever_m] * 3])
+    scaled = wrenches / layout.levers
     left = np.linalg.svd(layout.scaled)[0][:, layout.rank :]
     size = np.linalg.norm(scaled, axis=1)
     return np.asarray(np.linalg.norm(scaled @ left, axis=1) <= 1e-6 * np.maximum(size, 1e-300))
