@@ -57,7 +57,7 @@ def assemble(
     modules = tuple(range(count)) if modules is None else tuple(int(m) for m in modules)
     if not 1 <= count <= MOST_MODULES or not len(cells) == len(rotation) == len(modules) == count:
         raise DescriptionError(f"a body has 1 to {MOST_MODULES} modules with cell, rotation and vehicle, not {count}")
-    placements = _placements(cells, rotation, vehicles)
+    placements = place(cells, rotation, vehicles)
     check_joints(placements, modules, pitch_m)
     return _body(placements, modules, pitch_m, cache, name or _name(placements))
 
@@ -79,7 +79,7 @@ def check_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> None:
         if len(vehicle.thruster) > CHANNELS:
             raise DescriptionError(f"vehicle {name}: {len(vehicle.thruster)} thrusters; a module's frames carry {CHANNELS}")
     for members in _groups(fleet):
-        check_joints(_placements(*_described(fleet, members, vehicles)), [fleet.label(i) for i in members], fleet.pitch_m)
+        check_joints(place(*_described(fleet, members, vehicles)), [fleet.label(i) for i in members], fleet.pitch_m)
 
 
 def _groups(fleet: Fleet) -> list[list[int]]:
@@ -99,9 +99,10 @@ def _described(
     return cells, [m.rotation for m in chosen], [vehicles[m.vehicle] for m in chosen]
 
 
-def _placements(
+def place(
     cells: Sequence[Sequence[int]] | np.ndarray, rotation: Sequence[int], vehicles: Sequence[Vehicle]
 ) -> list[Placement]:
+    """Where each module sits; arguments as `assemble`."""
     turned = zip(vehicles, cells, rotation, strict=True)
     return [Placement(v, (int(c[0]), int(c[1]), int(c[2])), int(r)) for v, c, r in turned]
 
@@ -116,14 +117,10 @@ def _name(placements: Sequence[Placement]) -> str:
 def _body(
     placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: float, cache: DragCache | None, name: str
 ) -> Body:
-    turns = np.array([MATRICES[p.rotation] for p in placements])
-    origins = pitch_m * np.array([p.cell for p in placements], dtype=float)
-    lumps = [lump for p, origin in zip(placements, origins, strict=True) for lump in _lumps(p, origin)]
-    rigid_mass = sum(lump.mass for lump in lumps)
-    com = np.sum([lump.mass * lump.centre for lump in lumps], axis=0) / rigid_mass
-    r_bm = origins - com
+    balance = Balance.of(placements, pitch_m)
+    r_bm = balance.r_bm
     q_bm = np.array([QUATERNIONS[p.rotation] for p in placements])
-    mass = _mass_matrix(lumps, placements, com, r_bm)
+    mass = _mass_matrix(balance, placements)
     tags = [(k, tag) for k, p in enumerate(placements) for tag in p.vehicle.tag]
     return Body(
         name=name,
@@ -135,14 +132,14 @@ def _body(
         r_bi=r_bm.copy(),
         mass=mass,
         mass_inv=np.ascontiguousarray(np.linalg.inv(mass)),
-        rigid_mass_kg=float(rigid_mass),
+        rigid_mass_kg=balance.mass_kg,
         righting=sum((_righting(p) for p in placements), np.zeros(3)),
         righting_sigma=_righting_sigma(placements, r_bm),
-        thrusters=thruster_set([p.vehicle for p in placements], turns, r_bm),
-        drag=drag_table.build(placements, com, pitch_m, cache),
+        thrusters=thruster_set(placements, r_bm),
+        drag=drag_table.build(placements, balance.centre, pitch_m, cache),
         tag_ids=np.array([tag.id for _, tag in tags], dtype=np.int64),
         tag_module=np.array([k for k, _ in tags], dtype=np.int64),
-        r_bt=np.array([r_bm[k] + turns[k] @ tag.position_m for k, tag in tags]).reshape(-1, 3),
+        r_bt=np.array([r_bm[k] + MATRICES[placements[k].rotation] @ tag.position_m for k, tag in tags]).reshape(-1, 3),
         q_bt=np.array([_turned(q_bm[k], tag.quaternion) for k, tag in tags]).reshape(-1, 4),
         supply_power_w=np.array([_power(p.vehicle) for p in placements]),
         reach_m=max(_reach_m(p.vehicle, r) for p, r in zip(placements, r_bm, strict=True)),
@@ -188,6 +185,31 @@ class _Lump:
     inertia: np.ndarray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Balance:
+    """Where docked modules balance, entrained water included.
+
+    Attributes:
+        lumps: their rigid parts; mass_kg: of all.
+        centre: (3,) common centre of mass in the lattice frame, m.
+        r_bm: (m, 3) module origins from there, m.
+    """
+
+    lumps: list[_Lump]
+    mass_kg: float
+    centre: np.ndarray
+    r_bm: np.ndarray
+
+    @staticmethod
+    def of(placements: Sequence[Placement], pitch_m: float) -> Balance:
+        """That of placed modules."""
+        origins = pitch_m * np.array([p.cell for p in placements], dtype=float)
+        lumps = [lump for p, origin in zip(placements, origins, strict=True) for lump in _lumps(p, origin)]
+        mass_kg = sum(lump.mass for lump in lumps)
+        centre = np.sum([lump.mass * lump.centre for lump in lumps], axis=0) / mass_kg
+        return Balance(lumps, float(mass_kg), centre, origins - centre)
+
+
 def _lumps(placement: Placement, origin: np.ndarray) -> list[_Lump]:
     inertial, turn = placement.vehicle.inertial, MATRICES[placement.rotation]
     lumps = [_Lump(inertial.wet_kg, origin + turn @ inertial.com_m, turn @ inertial.inertia @ turn.T)]
@@ -198,18 +220,16 @@ def _lumps(placement: Placement, origin: np.ndarray) -> list[_Lump]:
     return lumps
 
 
-def _mass_matrix(
-    lumps: Sequence[_Lump], placements: Sequence[Placement], com: np.ndarray, r_bm: np.ndarray
-) -> np.ndarray:
+def _mass_matrix(balance: Balance, placements: Sequence[Placement]) -> np.ndarray:
     """(6, 6) rigid, entrained and added mass about the body's centre of mass, body axes.
 
     Each part contributes H^T M_i H, where H = [I, -S(r); 0, I] takes the body's velocity to a point r of the module
     (Fossen's system transformation): the centre of mass of a rigid lump, the hull's centre for added mass.
     """
     parts = []
-    for lump in lumps:
-        parts.append((_blocks(lump.mass * np.eye(3), lump.inertia), lump.centre - com))
-    for placement, origin in zip(placements, r_bm, strict=True):
+    for lump in balance.lumps:
+        parts.append((_blocks(lump.mass * np.eye(3), lump.inertia), lump.centre - balance.centre))
+    for placement, origin in zip(placements, balance.r_bm, strict=True):
         turn, added = MATRICES[placement.rotation], placement.vehicle.inertial.added
         parts.append((_blocks(turn @ np.diag(added[:3]) @ turn.T, turn @ np.diag(added[3:]) @ turn.T), origin))
     total = np.zeros((6, 6))
@@ -226,13 +246,15 @@ def _blocks(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def thruster_set(vehicles: Sequence[Vehicle], turns: np.ndarray, r_bm: np.ndarray) -> ThrusterSet:
+def thruster_set(placements: Sequence[Placement], r_bm: np.ndarray) -> ThrusterSet:
     """All thrusters in module order; columns [direction; position x direction] about the centre of mass.
 
     The paper's Jacobian with its two words put right.
     """
     columns = []
-    for vehicle, turn, origin in zip(vehicles, turns, r_bm, strict=True):
+    vehicles = [p.vehicle for p in placements]
+    for vehicle, placement, origin in zip(vehicles, placements, r_bm, strict=True):
+        turn = MATRICES[placement.rotation]
         direction = vehicle.directions @ turn.T
         position = vehicle.positions @ turn.T + origin
         columns.append(np.hstack([direction, np.cross(position, direction)]))

@@ -14,9 +14,8 @@ import numpy as np
 from firmware_py.core.body import ThrusterSet
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
-from firmware_py.prepare.assembly import PITCH_M, thruster_set
-from firmware_py.prepare.joints import Placement, check_joints
-from firmware_py.prepare.lattice import MATRICES
+from firmware_py.prepare.assembly import PITCH_M, Balance, place, thruster_set
+from firmware_py.prepare.joints import check_joints
 
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 """Degrees of freedom, in the order of a wrench."""
@@ -154,29 +153,12 @@ def of_modules(
     Raises:
         DescriptionError: placements that cannot be docked.
     """
-    placed = zip(vehicles, cells, rotation, strict=True)
-    placements = [Placement(v, (int(c[0]), int(c[1]), int(c[2])), int(r)) for v, c, r in placed]
+    placements = place(cells, rotation, vehicles)
     check_joints(placements, range(len(placements)), pitch_m)
-    turns = np.array([MATRICES[p.rotation] for p in placements])
-    origins = pitch_m * np.array([p.cell for p in placements], dtype=float)
-    lumps = [
-        (mass, origin + turn @ at)
-        for p, turn, origin in zip(placements, turns, origins, strict=True)
-        for mass, at in _lumps(p.vehicle)
-    ]
-    total = sum(mass for mass, _ in lumps)
-    r_bm = origins - np.sum([mass * at for mass, at in lumps], axis=0) / total
     passive = tuple(AXES.index(a) for a in vehicles[0].passive_dof) if len(vehicles) == 1 else ()
     assumption = "; ".join(dict.fromkeys(v.assumption for v in vehicles if v.assumption))
-    thrusters = thruster_set(vehicles, turns, r_bm)
+    thrusters = thruster_set(placements, Balance.of(placements, pitch_m).r_bm)
     return of_thrusters(name or f"{len(vehicles)} x {vehicles[0].name}", thrusters, passive, assumption)
-
-
-def _lumps(vehicle: Vehicle) -> list[tuple[float, np.ndarray]]:
-    """Masses of a module and what it carries, entrained water included, kg, and where, module frame, m."""
-    own = vehicle.inertial
-    carried = [(load.dry_kg + load.entrained_kg, load.position_m) for load in vehicle.payload]
-    return [(own.wet_kg, own.com_m), *carried]
 
 
 def of_thrusters(name: str, thrusters: ThrusterSet, passive: tuple[int, ...] = (), assumption: str = "") -> Layout:
