@@ -53,10 +53,8 @@ class Harmonics:
     def __init__(self, directions: np.ndarray, l_max: int = L_MAX) -> None:
         if len(directions) < (l_max + 1) ** 2:
             raise ValueError(f"{len(directions)} directions are too few for harmonics of degree {l_max}")
-        self.l_max = l_max
         polar, azimuth = angles(directions)
-        (values,) = _legendre(polar, l_max, 0)
-        order = _orders(l_max)
+        values, order = _legendre(polar, l_max), _orders(l_max)
         turning = np.where(
             order[:, 1] >= 0, np.cos(np.outer(azimuth, order[:, 1])), -np.sin(np.outer(azimuth, order[:, 1]))
         )
@@ -102,7 +100,8 @@ class Quadrature:
         polar = np.arccos(x)
         azimuth = 2.0 * np.pi * np.arange(_AZIMUTH) / _AZIMUTH
         self._order = _orders(l_max)
-        self._legendre = _legendre(polar, l_max, 2)
+        values = _legendre(polar, l_max)
+        self._tables = (values, *_derivatives(polar, values))
         turns = np.outer(np.arange(l_max + 1), azimuth)
         self._cosine, self._sine = np.cos(turns), np.sin(turns)
         self._sin, self._cos = np.sin(polar)[:, None], np.cos(polar)[:, None]
@@ -132,7 +131,7 @@ class Quadrature:
     def _radius(self, coefficients: np.ndarray) -> tuple[np.ndarray, ...]:
         """r and its derivatives p, a, pp, pa, aa (polar, azimuth), each (polar nodes, azimuth nodes)."""
         parts = []
-        for table in self._legendre:
+        for table in self._tables:
             c, s = np.zeros((2, *table.shape[::2]))
             for a, (degree, m) in zip(coefficients, self._order, strict=True):
                 (c if m >= 0 else s)[:, abs(m)] += a * table[:, degree, abs(m)]
@@ -155,15 +154,14 @@ def _orders(l_max: int) -> np.ndarray:
     return np.array([(degree, m) for degree in range(l_max + 1) for m in range(-degree, degree + 1)])
 
 
-def _legendre(polar: np.ndarray, l_max: int, derivatives: int) -> tuple[np.ndarray, ...]:
-    """Arrays (n, l, m >= 0): orthonormal real harmonics without their turning, and derivatives by the polar angle.
+def _legendre(polar: np.ndarray, l_max: int) -> np.ndarray:
+    """(n, l, m >= 0) orthonormal real harmonics without their turning.
 
     Fully normalised associated Legendre functions by the standard recurrence from degree to degree (Holmes and
-    Featherstone, J. Geodesy 76, 2002, eqs. 11 to 13); the second derivative is Legendre's equation. Derivatives need
-    sin(polar) > 0.
+    Featherstone, J. Geodesy 76, 2002, eqs. 11 to 13).
     """
     x, s = np.cos(polar), np.sin(polar)
-    values, slopes = np.zeros((2, len(polar), l_max + 1, l_max + 1))
+    values = np.zeros((len(polar), l_max + 1, l_max + 1))
     values[:, 0, 0] = math.sqrt(0.25 / math.pi)
     for degree in range(1, l_max + 1):
         top = math.sqrt((2 * degree + 1) / (2 * degree)) * (math.sqrt(2.0) if degree == 1 else 1.0)
@@ -174,12 +172,17 @@ def _legendre(polar: np.ndarray, l_max: int, derivatives: int) -> tuple[np.ndarr
             if degree >= m + 2:
                 b = math.sqrt(((degree - 1) ** 2 - m**2) / (4 * (degree - 1) ** 2 - 1))
                 values[:, degree, m] -= a * b * values[:, degree - 2, m]
-    if derivatives == 0:
-        return (values,)
-    orders, degrees = np.arange(l_max + 1), np.arange(l_max + 1)[:, None]
-    for degree in range(1, l_max + 1):
+    return values
+
+
+def _derivatives(polar: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First and second derivative of `_legendre` by the polar angle, the second by Legendre's equation. They need sin(polar) > 0."""
+    x, s, slopes = np.cos(polar), np.sin(polar), np.zeros_like(values)
+    orders = np.arange(values.shape[1])
+    degrees = orders[:, None]
+    for degree in orders[1:]:
         c = np.sqrt(np.maximum((2 * degree + 1) / (2 * degree - 1) * (degree**2 - orders**2), 0.0))
         slopes[:, degree] = (degree * x[:, None] * values[:, degree] - c * values[:, degree - 1]) / s[:, None]
     square = (s**2)[:, None, None]
     bends = -(x / s)[:, None, None] * slopes - (degrees * (degrees + 1) - orders**2 / square) * values
-    return values, slopes, bends
+    return slopes, bends
