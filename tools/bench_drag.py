@@ -74,7 +74,7 @@ def drag_entries() -> list[Entry]:
     errors = [100.0 * _rms(np.linalg.norm(each[:, :3], axis=1) / truth - 1.0) for each in (ours, theirs)]
     peer = "nearest of 1000 directions"
     name, exact_s = "drag table of one module", build(areas_and_centroids)
-    builds = compare(name, "s", exact_s, {"alpha shapes of 1000 points": build(alpha.lattice_method())})
+    builds = compare(name, "s", exact_s, {"alpha shapes of 1000 points": build(alpha.lattice_method)})
     if importlib.util.find_spec("alphashape") is not None:  # it takes minutes: once
         builds += compare(name, "s", exact_s, {"the alphashape package": build(_alphashape_package)}, repetitions=1)
     return [

@@ -56,7 +56,7 @@ WIDTH = 100
 RANDOM_SEED = 0
 METHODS = {
     "exact": areas_and_centroids,
-    "alpha": alpha.lattice_method(),
+    "alpha": alpha.lattice_method,
     "random": alpha.random_method(RANDOM_SEED),
 }
 app = typer.Typer(add_completion=False)

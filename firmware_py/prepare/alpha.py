@@ -38,7 +38,7 @@ class Cloud:
     radius: float
 
 
-def lattice_points(solids: Sequence[Solid], per_solid: int = POINTS_PER_MODULE) -> Cloud:
+def lattice_points(solids: Sequence[Solid]) -> Cloud:
     """Points on a lattice of each solid's bounding box, boundary included; a solid that is no box gives its surface.
 
     The projection of a closed surface fills the same outline as that of the volume within.
@@ -46,7 +46,7 @@ def lattice_points(solids: Sequence[Solid], per_solid: int = POINTS_PER_MODULE) 
     clouds, spacing = [], 0.0
     for solid in solids:
         low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
-        step = float(np.cbrt(np.prod(high - low) / per_solid))
+        step = float(np.cbrt(np.prod(high - low) / POINTS_PER_MODULE))
         counts = np.maximum(np.rint((high - low) / step), 2).astype(int)
         if len(solid.vertices) == 8 and _is_box(solid, low, high):
             axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
@@ -59,18 +59,18 @@ def lattice_points(solids: Sequence[Solid], per_solid: int = POINTS_PER_MODULE) 
     return Cloud(points, RADIUS_IN_SPACINGS * spacing)
 
 
-def random_points(solids: Sequence[Solid], generator: np.random.Generator, per_solid: int = POINTS_PER_MODULE) -> Cloud:
+def random_points(solids: Sequence[Solid], generator: np.random.Generator) -> Cloud:
     """Points drawn evenly inside convex solids: the paper's sampling, which misses the rim and so underestimates."""
     clouds, volume = [], 0.0
     for solid in solids:
         low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
         inside = np.empty((0, 3))
-        while len(inside) < per_solid:
-            drawn = generator.uniform(low, high, (per_solid, 3))
+        while len(inside) < POINTS_PER_MODULE:
+            drawn = generator.uniform(low, high, (POINTS_PER_MODULE, 3))
             inside = np.concatenate([inside, drawn[_inside_convex(solid, drawn)]])
-        clouds.append(inside[:per_solid])
+        clouds.append(inside[:POINTS_PER_MODULE])
         volume = max(volume, float(np.prod(high - low)))
-    spacing = float(np.cbrt(volume / per_solid))
+    spacing = float(np.cbrt(volume / POINTS_PER_MODULE))
     return Cloud(np.concatenate(clouds), RADIUS_IN_SPACINGS * spacing)
 
 
@@ -106,20 +106,16 @@ def alpha_shape(points: np.ndarray, radius: float) -> tuple[float, np.ndarray]:
     return total, area[kept] @ triangles[kept].mean(axis=1) / total
 
 
-def lattice_method(per_solid: int = POINTS_PER_MODULE) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+def lattice_method(solids: Sequence[Solid], directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The `method` of drag_table.build that takes areas from lattice points."""
-
-    def method(solids: Sequence[Solid], directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return outlines_of(lattice_points(solids, per_solid), directions)
-
-    return method
+    return outlines_of(lattice_points(solids), directions)
 
 
-def random_method(seed: int, per_solid: int = POINTS_PER_MODULE) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+def random_method(seed: int) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """The `method` of drag_table.build that takes areas from random interior points."""
 
     def method(solids: Sequence[Solid], directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return outlines_of(random_points(solids, np.random.default_rng(seed), per_solid), directions)
+        return outlines_of(random_points(solids, np.random.default_rng(seed)), directions)
 
     return method
 

@@ -38,7 +38,6 @@ def build(
     mode: str = "exact",
     method: Outlines = areas_and_centroids,
     nodes_per_rim: int = NODES_PER_RIM,
-    density: float = WATER_DENSITY,
 ) -> DragTable:
     """The drag table of docked modules.
 
@@ -50,7 +49,6 @@ def build(
         mode: name of `method` in the key.
         method: how outlines are found.
         nodes_per_rim: grid of each side of the cube-map.
-        density: kg/m^3.
 
     Returns:
         Arrays for core.drag_lookup; body axes are those of the lattice.
@@ -61,9 +59,9 @@ def build(
     by_area = [p for p in placements if not p.vehicle.drag.quadratic.size]
     if by_area:
         outline = _outlines(by_area, pitch_m, cache, mode, method, nodes_per_rim)
-        nodes[..., 0] = 0.5 * density * coefficient(by_area, directions) * outline[..., 0]
+        nodes[..., 0] = 0.5 * WATER_DENSITY * coefficient(by_area, directions) * outline[..., 0]
         nodes[..., 1:] = outline[..., 1:] - centre
-        rotational += rotational_damping(placements, centre, pitch_m, density)
+        rotational += rotational_damping(placements, centre, pitch_m)
     for placement in placements:
         turn = MATRICES[placement.rotation]
         linear += (np.abs(turn) @ placement.vehicle.drag.linear.reshape(2, 3).T).T.ravel()
@@ -102,9 +100,7 @@ def _add_published(
     nodes[..., 0] = total
 
 
-def rotational_damping(
-    placements: Sequence[Placement], centre: np.ndarray, pitch_m: float, density: float = WATER_DENSITY
-) -> np.ndarray:
+def rotational_damping(placements: Sequence[Placement], centre: np.ndarray, pitch_m: float) -> np.ndarray:
     """(3,) quadratic damping about the body axes through `centre`, N m s^2.
 
     The hull's surface under the law of the drag table, dF = -1/2 rho Cd max(n . v, 0) v dS with v = w x r: for unit w
@@ -121,7 +117,7 @@ def rotational_damping(
             r = points - centre
             speed = np.maximum(np.einsum("ti,kti->kt", normals, np.cross(np.eye(3)[:, None], r[None])), 0.0)
             off_axis = np.sum(r * r, axis=1) - r.T**2
-            total += 0.5 * density * placement.vehicle.drag.rotational_cd * np.sum(speed * off_axis, axis=1)
+            total += 0.5 * WATER_DENSITY * placement.vehicle.drag.rotational_cd * np.sum(speed * off_axis, axis=1)
     return total
 
 

@@ -128,7 +128,7 @@ def _make(
     offset: Vector,
     duration_s: float,
     end_phase: float,
-    ramp_share: float,
+    ramp_share: float = LONGEST_RAMP,
     slope: Vector = (0.0, 0.0, 0.0),
     first: Vector = LEVEL,
     turning: tuple[float, float] = (0.0, 0.0),
@@ -156,7 +156,6 @@ def spiral(
     duration_s: float,
     start_angle_rad: float = 0.0,
     attitude: Vector = LEVEL,
-    ramp_share: float = LONGEST_RAMP,
 ) -> Harmonic:
     """The paper's cylindrical spiral, clockwise seen from above, holding its attitude.
 
@@ -168,12 +167,11 @@ def spiral(
         duration_s: rest to rest.
         start_angle_rad: where on the circle it starts, from north towards east.
         attitude: (4,) q_wb held all the way.
-        ramp_share: see `progress`.
     """
     end = 2.0 * math.pi * turns
     terms = [[0, radius_m, 1.0, start_angle_rad], _sine(1, radius_m, 1.0, start_angle_rad)]
     slope = [0.0, 0.0, -climb_m / end]
-    return _make(terms, centre, duration_s, end, ramp_share, slope=slope, first=attitude)
+    return _make(terms, centre, duration_s, end, slope=slope, first=attitude)
 
 
 def circle(
@@ -184,7 +182,6 @@ def circle(
     start_angle_rad: float = 0.0,
     attitude: Vector = LEVEL,
     face_along: bool = False,
-    ramp_share: float = LONGEST_RAMP,
 ) -> Harmonic:
     """A level circle, clockwise seen from above; arguments as `spiral`.
 
@@ -193,9 +190,9 @@ def circle(
     terms = [[0, radius_m, 1.0, start_angle_rad], _sine(1, radius_m, 1.0, start_angle_rad)]
     end = 2.0 * math.pi * turns
     if not face_along:
-        return _make(terms, centre, duration_s, end, ramp_share, first=attitude)
+        return _make(terms, centre, duration_s, end, first=attitude)
     ahead = rotations.from_euler(0.0, 0.0, start_angle_rad + 0.5 * math.pi)
-    return _make(terms, centre, duration_s, end, ramp_share, first=ahead, turning=(1.0, 0.0), last=attitude)
+    return _make(terms, centre, duration_s, end, first=ahead, turning=(1.0, 0.0), last=attitude)
 
 
 def moebius(
@@ -204,7 +201,6 @@ def moebius(
     radius_m: float = 1.0,
     half_width_m: float = 0.3,
     laps: float = 2.0,
-    start_angle_rad: float = 0.0,
     attitude: Vector = LEVEL,
     ramp_share: float = LONGEST_RAMP,
 ) -> Harmonic:
@@ -219,15 +215,14 @@ def moebius(
         radius_m: of the centre circle, R.
         half_width_m: of the strip, h; 0 follows the centre circle.
         laps: two close it.
-        start_angle_rad: turns the whole strip about the vertical.
         attitude: (4,) body in the strip's frame.
         ramp_share: see `progress`.
     """
-    a, h = start_angle_rad, half_width_m
-    terms = [[0, radius_m, 1.0, a], _sine(1, radius_m, 1.0, a)]
-    terms += [[0, 0.5 * h, 1.5, a], [0, 0.5 * h, 0.5, a], _sine(1, 0.5 * h, 1.5, a), _sine(1, 0.5 * h, 0.5, a)]
+    h = half_width_m
+    terms = [[0, radius_m, 1.0, 0.0], _sine(1, radius_m, 1.0, 0.0)]
+    terms += [[0, 0.5 * h, 1.5, 0.0], [0, 0.5 * h, 0.5, 0.0], _sine(1, 0.5 * h, 1.5, 0.0), _sine(1, 0.5 * h, 0.5, 0.0)]
     terms += [_sine(2, h, 0.5, 0.0)]
-    first = rotations.from_euler(0.0, 0.0, a + 0.5 * math.pi)
+    first = rotations.from_euler(0.0, 0.0, 0.5 * math.pi)
     end = 2.0 * math.pi * laps
     return _make(terms, centre, duration_s, end, ramp_share, first=first, turning=(1.0, -0.5), last=attitude)
 
@@ -241,7 +236,6 @@ def lissajous(
     turns: float = 1.0,
     attitude: Vector = LEVEL,
     turning: tuple[float, float] = (0.0, 0.0),
-    ramp_share: float = LONGEST_RAMP,
 ) -> Harmonic:
     """p_k = centre_k + amplitude_k sin(frequency_k u + angle_k), u from 0 to 2 pi turns: closed where they are whole.
 
@@ -251,14 +245,13 @@ def lissajous(
         turns: of the phase u.
         attitude: (4,) q_wb at the start.
         turning: yaw and then roll, rad per rad of u, about world-down and the body's x axis.
-        ramp_share: see `progress`.
     """
     terms = [_sine(k, float(amplitude_m[k]), float(frequency[k]), float(angle_rad[k])) for k in range(3)]
     end = 2.0 * math.pi * turns
-    return _make(terms, centre, duration_s, end, ramp_share, turning=turning, last=attitude)
+    return _make(terms, centre, duration_s, end, turning=turning, last=attitude)
 
 
-def line(start: Setpoint, end: Setpoint, duration_s: float, ramp_share: float = LONGEST_RAMP) -> Harmonic:
+def line(start: Setpoint, end: Setpoint, duration_s: float) -> Harmonic:
     """Straight from pose to pose, turning about one axis on the way; the set-points' motion does not matter."""
     turn = rotations.difference(end.q_wb, start.q_wb)
     angle = float(np.linalg.norm(turn))
@@ -266,7 +259,7 @@ def line(start: Setpoint, end: Setpoint, duration_s: float, ramp_share: float = 
     first = rotations.multiply(start.q_wb, align)
     last = rotations.conjugate(align)
     slope = end.p_wb - start.p_wb
-    return _make([], start.p_wb, duration_s, 1.0, ramp_share, slope=slope, first=first, turning=(0.0, angle), last=last)
+    return _make([], start.p_wb, duration_s, 1.0, slope=slope, first=first, turning=(0.0, angle), last=last)
 
 
 def _x_axis_to(axis: np.ndarray) -> np.ndarray:

@@ -100,12 +100,12 @@ def use_ordinary_priority() -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def use_fine_timers(slack_ns: int = 1) -> str:
+def use_fine_timers() -> str:
     """Timers of this thread, and of those that it starts, fire on time instead of up to 50 us late; "" or why not.
 
     Threads of real-time priority have no slack anyway: this is for those that may not have it.
     """
-    return _ask_kernel("fine timers", _PR_SET_TIMERSLACK, slack_ns)
+    return _ask_kernel("fine timers", _PR_SET_TIMERSLACK, 1)
 
 
 def use_small_pages() -> str:

@@ -217,7 +217,7 @@ def test_payload_adds_to_the_outline(modcube: Vehicle) -> None:
 def test_alpha_mode_gives_the_same_table_within_one_percent(modcube: Vehicle) -> None:
     placements = [Placement(modcube, (0, 0, 0), 0)]
     exact = drag_table.build(placements, np.zeros(3), PITCH, nodes_per_rim=5)
-    sampled = drag_table.build(placements, np.zeros(3), PITCH, mode="alpha", method=lattice_method(), nodes_per_rim=5)
+    sampled = drag_table.build(placements, np.zeros(3), PITCH, mode="alpha", method=lattice_method, nodes_per_rim=5)
     np.testing.assert_allclose(sampled.nodes[..., 0], exact.nodes[..., 0], rtol=0.01)
 
 

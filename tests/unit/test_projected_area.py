@@ -201,7 +201,7 @@ def test_mesh_that_is_not_where_the_hull_is_is_refused(turn: np.ndarray, shift_m
 def test_alpha_shape_on_a_lattice_with_boundary_is_within_one_percent(cells: Cells) -> None:
     directions = DIRECTIONS[:: 6 * len(cells)]
     exact, centres = areas_and_centroids(solids(cells), directions)
-    sampled, sampled_centres = alpha.lattice_method()(solids(cells), directions)
+    sampled, sampled_centres = alpha.lattice_method(solids(cells), directions)
     error = sampled / exact - 1.0
     assert math.sqrt(np.mean(error**2)) <= 0.005
     assert np.abs(error).max() <= 0.01
@@ -217,6 +217,6 @@ def test_random_interior_points_underestimate_the_area() -> None:
 def test_alpha_shape_of_a_mesh_agrees_with_its_exact_outline() -> None:
     mesh = [_octahedron_with_a_dent()]
     exact = areas_and_centroids(mesh, DIRECTIONS[::16])[0]
-    sampled = alpha.lattice_method()(mesh, DIRECTIONS[::16])[0]
+    sampled = alpha.lattice_method(mesh, DIRECTIONS[::16])[0]
     assert np.abs(sampled / exact - 1.0).max() <= 0.05
     assert math.sqrt(np.mean((sampled / exact - 1.0) ** 2)) <= 0.02

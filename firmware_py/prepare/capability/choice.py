@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.description.vehicle import Vehicle
-from firmware_py.prepare.assembly import PITCH_M, assemble
+from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.capability.layout import Layout, of_modules, of_thrusters
 from firmware_py.prepare.capability.polycubes import Cells, polycubes, poses
 from firmware_py.prepare.capability.power import electrical_power, least_squares_forces
@@ -67,7 +67,6 @@ def rank(
     count: int,
     vehicle: Vehicle,
     cache: DragCache | None = None,
-    pitch_m: float = PITCH_M,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Choice]:
     """Every distinct polycube of `count` modules, best first.
@@ -86,9 +85,9 @@ def rank(
         tried: list[tuple[Fitness, Layout, np.ndarray]] = []
         for cells in poses(shape):
             if path is None or task.trajectory is None:
-                layout, wrenches = of_modules(cells, [0] * count, [vehicle] * count, pitch_m), task.wrench
+                layout, wrenches = of_modules(cells, [0] * count, [vehicle] * count), task.wrench
             else:
-                body = assemble(cells, [0] * count, [vehicle] * count, pitch_m=pitch_m, cache=cache)
+                body = assemble(cells, [0] * count, [vehicle] * count, cache=cache)
                 layout, wrenches = (
                     of_thrusters(body.name, body.thrusters),
                     wrenches_along(path, body, task.trajectory.samples),
