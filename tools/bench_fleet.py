@@ -50,9 +50,9 @@ class FleetInWater:
     """The body in water that is the controller's own model, with noise; every module answers in every tick."""
 
     def __init__(self, body: Body, seed: int) -> None:
-        drag, t, modules = body.drag, body.thrusters, range(len(body.modules))
+        t, modules = body.thrusters, range(len(body.modules))
         self._body, self._rng = body, np.random.default_rng(seed)
-        self._plant = (body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear)
+        self._plant = body.plant
         self._acts, self._tau = ThrusterLag(t, PERIOD_S), np.zeros(6)
         self.x = np.zeros(STATES)
         """(32,) true state, as core.propagation orders it."""

@@ -14,6 +14,8 @@ CRUISE_M_S = 0.2
 BUOYANCY_SIGMA_N, ARM_SIGMA_M, TRIM_SIGMA_M = 0.5, 0.003, 0.002
 """Buoyancy of a module, its righting arm (times its weight with the entrained water a moment) and its trim along each axis (times its
 dry weight) may be off by this much: felt when the body tilts. One sigma of what the bench draws: 5 and 3 mm to either side."""
+Plant = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Mass, its inverse, righting, drag nodes, rotational and linear damping, as core.propagation.PLANT has their types."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,3 +114,14 @@ class Body:
     def index(self) -> int:
         """The body's number: that of its leader, its first module."""
         return self.modules[0]
+
+    @property
+    def nominal_v(self) -> np.ndarray:
+        """(m,) supply of each module for which its thrusters' curves stand."""
+        t = self.thrusters
+        return np.array([t.voltage_v[t.module == m][0] for m in range(len(self.modules))])
+
+    @property
+    def plant(self) -> Plant:
+        """What the process model takes of it."""
+        return self.mass, self.mass_inv, self.righting, self.drag.nodes, self.drag.rotational, self.drag.linear

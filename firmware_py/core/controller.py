@@ -26,9 +26,7 @@ class Controller:
 
     def __init__(self, body: Body, parameters: Control) -> None:
         p = parameters
-        self._plant = (
-            body.mass, body.mass_inv, body.righting, body.drag.nodes, body.drag.rotational, body.drag.linear,
-        )  # fmt: skip
+        self._plant = body.plant
         self._kp = np.repeat([p.position_bandwidth**2, p.attitude_bandwidth**2], 3)
         self._kd = np.repeat(
             [2 * p.position_damping * p.position_bandwidth, 2 * p.attitude_damping * p.attitude_bandwidth], 3

@@ -78,10 +78,7 @@ class Estimator:
 
     def __init__(self, body: Body, parameters: Estimation, period_ns: int) -> None:
         self._body = body
-        self._p = parameters
-        self._plant = (
-            body.mass, body.mass_inv, body.righting, body.drag.nodes, body.drag.rotational, body.drag.linear,
-        )  # fmt: skip
+        self._plant = body.plant
         self._dt = period_ns * 1e-9
         self._history = History(period_ns)
         self._now = np.eye(1, STATES, 3)[0]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -127,12 +126,11 @@ class HealthMonitor:
 
     def __init__(self, body: Body, parameters: Parameters, period_ns: int) -> None:
         count = len(body.modules)
-        t = body.thrusters
         self._modules = body.modules
         self._period_ns = period_ns
-        self._nominal_v = [float(t.voltage_v[t.module == m][0]) for m in range(count)]
+        self._nominal_v = body.nominal_v.tolist()
         self._thruster_at = by_channel(body)
-        self._esc_ns = [NEVER_NS] * t.module.size
+        self._esc_ns = [NEVER_NS] * body.thrusters.module.size
         self._heard_ns = [0] * count
         self._answered_ns = [NEVER_NS] * count
         self._stopped_ns: dict[int, int] = {}
@@ -271,15 +269,15 @@ class HealthMonitor:
                 self._wet_ns[index] = now if module.leak and self._wet[index] else self._wet_ns[index]
                 self._leak[index] = module.leak or now - self._wet_ns[index] < DRY_NS
                 self._wet[index] = module.leak
-            if module.voltage_v is not None and isfinite(module.voltage_v):
+            if module.voltage_v is not None and math.isfinite(module.voltage_v):
                 self._read_ns["battery"][index] = now
                 share = module.voltage_v / self._nominal_v[index]
                 before = self._voltage_share.get(index, share)
                 self._voltage_share[index] = before + VOLTAGE_SHARE * (share - before)
-            if module.cabin_temperature_c is not None and isfinite(module.cabin_temperature_c):
+            if module.cabin_temperature_c is not None and math.isfinite(module.cabin_temperature_c):
                 self._read_ns["cabin"][index] = now
                 self._cabin_c[index] = module.cabin_temperature_c
-            if module.cabin_pressure_pa is not None and isfinite(module.cabin_pressure_pa):
+            if module.cabin_pressure_pa is not None and math.isfinite(module.cabin_pressure_pa):
                 start = self._cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
                 self._cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
             if module.esc:

@@ -38,7 +38,7 @@ class Limiter:
         self._power = [(np.ascontiguousarray(t.power_forward[i]), np.ascontiguousarray(t.power_reverse[i])) for i in self._of_module]
         self._curves = (t.forward, t.reverse, t.deadband_n)
         self._full, self._all = np.ones(t.f_max.size), np.ones(t.f_max.size, dtype=bool)
-        self._nominal_v = np.array([t.voltage_v[i].max() for i in self._of_module])
+        self._nominal_v = body.nominal_v
         self._scale, self._scaled_for = self._full, b""
         self._room: Room | None = None
         self._room_for: tuple[object, ...] = ()

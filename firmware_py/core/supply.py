@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from firmware_py.core.body import Body
 from firmware_py.core.limiter import is_believed
 from firmware_py.core.types import ModuleInputs
@@ -22,9 +20,8 @@ class SupplyMeter:
     """
 
     def __init__(self, body: Body) -> None:
-        t = body.thrusters
         self._modules = body.modules
-        self._nominal_v = np.array([t.voltage_v[t.module == m][0] for m in range(len(body.modules))])
+        self._nominal_v = body.nominal_v
         self.voltage_v = self._nominal_v.copy()
 
     def step(self, modules: Sequence[ModuleInputs]) -> None:

@@ -18,11 +18,6 @@ NOTHING = Measured(None, None, None, [])
 DELAY_TICKS = 5
 
 
-def plant(body: Body) -> tuple[np.ndarray, ...]:
-    drag = body.drag
-    return body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear
-
-
 def world(q_wb: np.ndarray) -> Rotation:
     return Rotation.from_quat(q_wb[[1, 2, 3, 0]])
 

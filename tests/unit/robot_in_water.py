@@ -59,9 +59,8 @@ class Water:
         self.believed.command(wanted)
         self.acts.command(np.where(np.abs(wanted) < self.deadband, 0.0, wanted))
         b, tau = self.body, self.body.thrusters.matrix @ (self.gain * acting)
-        plant = (b.mass, b.mass_inv, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear)
-        felt = propagation.inertial_acceleration(self.x, tau, *plant)
-        self.x = propagation.step(self.x, tau, DT, *plant)
+        felt = propagation.inertial_acceleration(self.x, tau, *b.plant)
+        self.x = propagation.step(self.x, tau, DT, *b.plant)
         estimate = Estimate(
             self.x[:3].copy(), self.x[3:7].copy(), self.x[7:13].copy(), ZERO, ZERO, np.full(3, 0.002), np.full(3, 0.0009),
             self.tag_age_ns, 1.0, 6, 0, True,

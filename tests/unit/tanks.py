@@ -76,13 +76,13 @@ class Tank:
         end = wanted + (self.forces[n] - wanted) * np.exp(-DT / t.lag_s)
         self.wrenches[n] = t.matrix @ (wanted + (self.forces[n] - end) * t.lag_s / DT)
         self.forces[n] = end
-        self.states[n] = propagation.step(self.states[n], self.wrenches[n], DT, *plant(self.bodies[n]))
+        self.states[n] = propagation.step(self.states[n], self.wrenches[n], DT, *self.bodies[n].plant)
 
     def _hear(self, tick: int) -> list[ModuleInputs]:
         modules = [ModuleInputs(answered=True, heard=True) for body in self.bodies for _ in body.modules]
         for n, body in enumerate(self.bodies):
             x = self.states[n]
-            felt = propagation.inertial_acceleration(x, self.wrenches[n], *plant(body))
+            felt = propagation.inertial_acceleration(x, self.wrenches[n], *body.plant)
             felt = felt + world(x).inv().apply([0.0, 0.0, -9.80665])
             for k, m in enumerate(body.modules):
                 r_mb = Rotation.from_quat(body.q_bm[k][[1, 2, 3, 0]]).inv()
@@ -107,11 +107,6 @@ class Tank:
         row = int(np.flatnonzero((body.tag_module == k) & (body.tag_ids == TOP_FACE))[0])
         q_wt = multiply(x[3:7].copy(), np.ascontiguousarray(body.q_bt[row]))
         return TagObservation(TOP_FACE, 7, tick * PERIOD, x[:3] + world(x).apply(body.r_bt[row]), q_wt)
-
-
-def plant(body: Body) -> tuple[np.ndarray, ...]:
-    drag = body.drag
-    return body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear
 
 
 def world(x: np.ndarray) -> Rotation:

@@ -33,11 +33,6 @@ def body(request: pytest.FixtureRequest) -> Body:
     return assemble(cells, [0, 4, 12][: request.param], [load_vehicle("modcube")] * request.param)
 
 
-def plant(body: Body) -> tuple[np.ndarray, ...]:
-    drag = body.drag
-    return body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear
-
-
 def believed(p_wb: np.ndarray, q_wb: np.ndarray, nu: np.ndarray, disturbance: np.ndarray | None = None) -> Estimate:
     """disturbance: (6,) force in the world, moment in the body."""
     zero, d = np.zeros(3), np.zeros(6) if disturbance is None else disturbance
@@ -74,7 +69,7 @@ def surprise(body: Body, parameters: Control, q_wb: np.ndarray) -> float:
     wrench = Controller(body, parameters).step(setpoint, setpoint, estimate)
     turn = Rotation.from_quat(q_wb[[1, 2, 3, 0]])
     external = wrench + np.r_[turn.inv().apply(disturbance[:3]), disturbance[3:]]
-    return float(np.abs(propagation.acceleration(nu, q_wb, external, *plant(body)) - acceleration_of(setpoint)).max())
+    return float(np.abs(propagation.acceleration(nu, q_wb, external, *body.plant) - acceleration_of(setpoint)).max())
 
 
 @pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
@@ -103,7 +98,7 @@ def test_model_that_is_not_the_robots_would_be_noticed(body: Body, term: str) ->
     setpoint = moving(ATTITUDES["rolled"])
     nu = velocity_of(setpoint)
     wrench = Controller(spoilt, Control()).step(setpoint, setpoint, believed(setpoint.p_wb, setpoint.q_wb, nu))
-    got = propagation.acceleration(nu, setpoint.q_wb, wrench, *plant(body))
+    got = propagation.acceleration(nu, setpoint.q_wb, wrench, *body.plant)
     assert np.abs(got - acceleration_of(setpoint)).max() > 0.01
 
 
@@ -221,7 +216,7 @@ def fly(body: Body, x: np.ndarray, aim: Setpoint, seconds: float, parameters: Co
     for _ in range(round(seconds / 0.01)):
         x = states[-1]
         wrench = controller.step(aim, aim, believed(x[:3].copy(), x[3:7].copy(), x[7:13].copy()))
-        states.append(propagation.step(x, wrench, 0.01, *plant(body)))
+        states.append(propagation.step(x, wrench, 0.01, *body.plant))
     return np.array(states)
 
 
@@ -261,5 +256,5 @@ def test_steady_run_with_current_is_followed_without_error(body: Body) -> None:
     for k in range(200):
         aim = setpoint._replace(p_wb=setpoint.v_w * 0.01 * k)
         wrench = controller.step(aim, aim, believed(x[:3].copy(), x[3:7].copy(), x[7:13].copy(), disturbance))
-        x = propagation.step(x, wrench, 0.01, *plant(body))
+        x = propagation.step(x, wrench, 0.01, *body.plant)
     np.testing.assert_allclose(x[:3], setpoint.v_w * 2.0, atol=1e-9)

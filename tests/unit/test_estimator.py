@@ -14,7 +14,7 @@ from firmware_py.core.rotations import difference, exp, from_euler, multiply
 from firmware_py.core.types import NEVER_AGE_NS, Measured
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
-from tests.unit.estimated_robot import DELAY_TICKS, NOTHING, P_WB, PERIOD, Q_WB, P, Robot, assert_rests, holding, plant, sensors, tag, world
+from tests.unit.estimated_robot import DELAY_TICKS, NOTHING, P_WB, PERIOD, Q_WB, P, Robot, assert_rests, holding, sensors, tag, world
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +186,7 @@ def test_velocity_of_a_steady_run_is_found(body: Body) -> None:
     robot = Robot(body)
     nu = np.r_[0.2, np.zeros(5)]
     drag_free = np.zeros(6)
-    robot.tau = -np.linalg.solve(body.mass_inv, propagation.acceleration(nu, Q_WB, drag_free, *plant(body)))
+    robot.tau = -np.linalg.solve(body.mass_inv, propagation.acceleration(nu, Q_WB, drag_free, *body.plant))
     for _ in range(500):
         now, then = (P_WB + velocity_w * 1e-9 * t for t in (robot.time_ns, robot.time_ns - 5 * PERIOD))
         seen = [tag(robot.time_ns - 5 * PERIOD, then)] if robot.tick % 2 else []

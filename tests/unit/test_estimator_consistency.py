@@ -32,11 +32,6 @@ def body() -> Body:
     return assemble([(0, 0, 0), (1, 0, 0)], [0, 4], [load_vehicle("modcube")] * 2)
 
 
-def plant(body: Body) -> tuple[np.ndarray, ...]:
-    drag = body.drag
-    return body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear
-
-
 def tag_of(x: np.ndarray, capture_ns: int, noise: np.ndarray | None = None, lever: np.ndarray = LEVER) -> BodyPose:
     """What a tag says of a robot in state `x`; noise (6,) of position and attitude."""
     e = np.zeros(6) if noise is None else noise
@@ -118,17 +113,17 @@ def fly(
         if k:
             surprise = process_sigma(body, p, x) * np.sqrt(DT) * rng.normal(size=ERRORS)
             surprise[3:6] = 0.5 * DT * surprise[9:12]  # what turned it in this tick has turned it for half of it
-            x = propagation.inject(propagation.step(x, tau, DT, *plant(body)), surprise)
+            x = propagation.inject(propagation.step(x, tau, DT, *body.plant), surprise)
         while taken < len(pictures) and pictures[taken] <= t:
             capture = pictures[taken]
             part = (capture - t) * 1e-9 + DT
-            seen = x if capture == t else propagation.step(before, tau, part, *plant(body))
+            seen = x if capture == t else propagation.step(before, tau, part, *body.plant)
             due = -(-(capture + round(delay_ms(taken) * 1e6)) // PERIOD)
             arriving.setdefault(due, []).append(tag_of(seen, capture, tag_sigma * rng.normal(size=6)))
             taken += 1
         flight.truth.append(x)
         flight.tau.append(tau)
-        moved = propagation.inertial_acceleration(x, tau, *plant(body)) + surprise[6:9] / DT  # felt, though no model foresaw it
+        moved = propagation.inertial_acceleration(x, tau, *body.plant) + surprise[6:9] / DT  # felt, though no model foresaw it
         flight.measured.append(inertial_of(x, moved, rng, accel_sigma(body, p, x))._replace(tags=arriving.pop(k, [])))
     return flight
 
@@ -140,7 +135,7 @@ class InOrder:
     """
 
     def __init__(self, body: Body, first: BodyPose, p: Estimation) -> None:
-        self.plant = plant(body)
+        self.plant = body.plant
         self.x = np.zeros(STATES)
         self.x[3:7] = first.q_wb
         self.x[:3] = first.p_wt - self._turn(self.x).apply(first.lever_b)
@@ -259,7 +254,7 @@ def test_late_tags_count_as_if_they_had_come_in_time(body: Body, delay_ms: Calla
     x, last = reference.x, reference.time_ns
     for time_ns, tau, measured in flight.ticks():
         if time_ns > last:
-            x = propagation.step(x, tau, (time_ns - max(last, time_ns - PERIOD)) * 1e-9, *plant(body))
+            x = propagation.step(x, tau, (time_ns - max(last, time_ns - PERIOD)) * 1e-9, *body.plant)
             x[10:13] = measured.gyro - x[13:16]
     e = estimates[-1]
     np.testing.assert_allclose(e.p_wb, x[:3], atol=2e-6)
@@ -387,8 +382,8 @@ def test_wrong_arm_and_trim_are_learned_by_tilting(body: Body) -> None:
     for k in range(1200):
         alpha = 0.07 * np.cos(2.0 * np.pi / 12.0 * k * DT)
         tau = still(body, x) + np.r_[0.0, 0.0, 0.0, body.mass[3:, 3:] @ np.array([0.0, alpha, 0.0])]
-        before, x = x, propagation.step(x, tau, DT, *plant(body))
-        felt = inertial_of(x, propagation.inertial_acceleration(before, tau, *plant(body)), rng, P.accel_sigma)
+        before, x = x, propagation.step(x, tau, DT, *body.plant)
+        felt = inertial_of(x, propagation.inertial_acceleration(before, tau, *body.plant), rng, P.accel_sigma)
         estimator.step(k * PERIOD, felt._replace(tags=[tag_of(x, k * PERIOD)]), tau)
     known, covariance = estimator.motion.x, estimator.motion.covariance[TURNING]
     for pitch in (-0.5, -0.25, 0.0, 0.25, 0.5):
@@ -410,8 +405,8 @@ def test_righting_of_a_robot_that_hovers_is_found_by_no_noise() -> None:
     for k in range(30_000):
         tau = tau + (wanted - tau) * (1.0 - np.exp(-DT / 0.08))  # the thrusters' lag
         surprise[6:9], surprise[9:12] = np.sqrt(DT) * np.array([[P.accel_process], [P.alpha_process]]) * rng.normal(size=(2, 3))
-        before, x = x, propagation.inject(propagation.step(x, tau, DT, *plant(body)), surprise)
-        moved = propagation.inertial_acceleration(before, tau, *plant(body)) + surprise[6:9] / DT
+        before, x = x, propagation.inject(propagation.step(x, tau, DT, *body.plant), surprise)
+        moved = propagation.inertial_acceleration(before, tau, *body.plant) + surprise[6:9] / DT
         tags = [tag_of(x, k * PERIOD, noise * rng.normal(size=6))] if k % 2 == 0 else []
         wanted = controller.step(aim, aim, estimator.step(k * PERIOD, inertial_of(x, moved, rng, P.accel_sigma)._replace(tags=tags), tau))
     found, sigma = estimator.motion.x[26:29], np.sqrt(estimator.motion.covariance.diagonal()[25:])

@@ -114,13 +114,12 @@ def test_weak_thruster_whose_speed_says_so_does_not_lie_and_one_that_says_too_li
 def test_motion_of_a_body_whose_water_is_heavier_along_one_axis_than_along_another_misses_no_thrust(name: str) -> None:
     """What the model leaves out of a healthy body's motion, a Munk moment say, would be blamed on a thruster."""
     b = assemble_vehicle(load_vehicle(name))
-    plant = (b.mass, b.mass_inv, b.righting, b.drag.nodes, b.drag.rotational, b.drag.linear)
     rng = np.random.default_rng(5)
     x, tau, modelled = np.zeros(STATES), rng.normal(size=6), np.zeros(6)
     x[3:7], x[7:13] = from_euler(0.3, -0.2, 0.9), [0.5, 0.2, -0.3, 0.2, -0.1, 0.3]
-    felt = propagation.inertial_acceleration(x, tau, *plant)
-    turning = propagation.acceleration(x[7:13].copy(), x[3:7].copy(), tau, *plant)[3:]
-    add_model(*plant[2:], x[7:13].copy(), x[3:7].copy(), modelled)
+    felt = propagation.inertial_acceleration(x, tau, *b.plant)
+    turning = propagation.acceleration(x[7:13].copy(), x[3:7].copy(), tau, *b.plant)[3:]
+    add_model(*b.plant[2:], x[7:13].copy(), x[3:7].copy(), modelled)
     add_coriolis(b.mass, x[7:13].copy(), modelled)
     np.testing.assert_allclose(b.mass @ np.r_[felt, turning], tau + modelled, atol=1e-9)
 

@@ -40,11 +40,6 @@ def body(request: pytest.FixtureRequest) -> Body:
     return assemble(cells, [0, 4, 12][: request.param], [load_vehicle("modcube")] * request.param)
 
 
-def plant(body: Body) -> tuple[np.ndarray, ...]:
-    drag = body.drag
-    return body.mass, body.mass_inv, body.righting, drag.nodes, drag.rotational, drag.linear
-
-
 def state(seed: int) -> np.ndarray:
     """A fast, tilted robot under a disturbance."""
     rng = np.random.default_rng(seed)
@@ -72,19 +67,19 @@ def differences(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, h: 
 def transition(x: np.ndarray, dt: float, body: Body, tau: np.ndarray = TAU) -> np.ndarray:
     """(28, 28) the whole of F."""
     still = np.eye(ERRORS)[propagation.MOVING :]
-    return np.vstack([propagation.transition(x, tau, dt, *plant(body)), still])
+    return np.vstack([propagation.transition(x, tau, dt, *body.plant), still])
 
 
 def stepped(x: np.ndarray, body: Body, after: np.ndarray, dt: float) -> np.ndarray:
     """Where `x` is a step later, as the error from `after`."""
-    return error_between(propagation.step(x, TAU, dt, *plant(body)), after)
+    return error_between(propagation.step(x, TAU, dt, *body.plant), after)
 
 
 @pytest.fixture(scope="module", params=range(5))
 def jacobians(body: Body, request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray]:
     """(F - I) / dt as the estimator has it, and by finite differences of the step."""
     x = state(request.param)
-    step = partial(stepped, body=body, after=propagation.step(x, TAU, DT, *plant(body)), dt=DT)
+    step = partial(stepped, body=body, after=propagation.step(x, TAU, DT, *body.plant), dt=DT)
     numeric = differences(step, x)
     return (transition(x, DT, body) - np.eye(ERRORS)) / DT, (numeric - np.eye(ERRORS)) / DT
 
@@ -135,7 +130,7 @@ def test_transition_is_second_order_in_the_step(body: Body) -> None:
     x = state(1)
     errors = []
     for dt in (0.02, 0.01, 0.005):
-        step = partial(stepped, body=body, after=propagation.step(x, TAU, dt, *plant(body)), dt=dt)
+        step = partial(stepped, body=body, after=propagation.step(x, TAU, dt, *body.plant), dt=dt)
         numeric = differences(step, x)
         errors.append(np.abs(transition(x, dt, body) - numeric).max())
     assert errors[1] < 0.35 * errors[0]
@@ -152,13 +147,13 @@ def test_step_follows_the_equations_of_motion(body: Body) -> None:
         nu = np.ascontiguousarray(y[7:13])
         external = TAU + np.r_[turn.inv().apply(x[19:22]), x[22:25]]
         external[3:] += np.cross(x[26:29], turn.inv().apply([0.0, 0.0, -1.0]))
-        acceleration = propagation.acceleration(nu, q, external, *plant(body))
+        acceleration = propagation.acceleration(nu, q, external, *body.plant)
         return np.r_[turn.apply(nu[:3]), 0.5 * multiply(q, np.r_[0.0, nu[3:]]), acceleration]
 
     exact = solve_ivp(rates, (0.0, 0.5), x[:13], method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
     y = x
     for _ in range(50):
-        y = propagation.step(y, TAU, 0.01, *plant(body))
+        y = propagation.step(y, TAU, 0.01, *body.plant)
     exact_turn = np.ascontiguousarray(exact[3:7] / np.linalg.norm(exact[3:7]))
     np.testing.assert_allclose(y[:3], exact[:3], atol=2e-4)
     np.testing.assert_allclose(difference(np.ascontiguousarray(y[3:7]), exact_turn), 0.0, atol=1e-3)
@@ -168,7 +163,7 @@ def test_step_follows_the_equations_of_motion(body: Body) -> None:
 
 def test_acceleration_is_force_over_mass_at_rest(body: Body) -> None:
     level = np.array([1.0, 0.0, 0.0, 0.0])
-    got = propagation.acceleration(np.zeros(6), level, TAU, *plant(body))
+    got = propagation.acceleration(np.zeros(6), level, TAU, *body.plant)
     np.testing.assert_allclose(body.mass @ got, TAU + np.r_[0, 0, 0, np.cross(body.righting, [0, 0, -1])], atol=1e-12)
 
 
@@ -181,12 +176,12 @@ def test_injected_error_is_a_turn_in_the_body_frame() -> None:
 def test_carried_rate_is_the_gyros_less_its_bias(body: Body) -> None:
     x = state(4)
     gyros = np.array([[0.1, 0.2, 0.3], [np.nan] * 3, [-0.1, 0.4, 0.2]])
-    carried = propagation.carry(x, np.tile(TAU, (3, 1)), gyros, 0.01, 0.004, *plant(body))
+    carried = propagation.carry(x, np.tile(TAU, (3, 1)), gyros, 0.01, 0.004, *body.plant)
     np.testing.assert_allclose(carried[10:13], gyros[2] - x[13:16], atol=1e-15)
-    by_hand = propagation.step(x, TAU, 0.004, *plant(body))
+    by_hand = propagation.step(x, TAU, 0.004, *body.plant)
     by_hand[10:13] = gyros[0] - x[13:16]
-    by_hand = propagation.step(by_hand, TAU, 0.01, *plant(body))
-    by_hand = propagation.step(by_hand, TAU, 0.01, *plant(body))
+    by_hand = propagation.step(by_hand, TAU, 0.01, *body.plant)
+    by_hand = propagation.step(by_hand, TAU, 0.01, *body.plant)
     np.testing.assert_allclose(carried[:10], by_hand[:10], atol=1e-15)
 
 
@@ -196,10 +191,10 @@ def test_carried_pose_is_as_uncertain_as_its_derivatives_say(body: Body) -> None
     x[7:13] *= 0.1
     gyros = np.tile(x[10:13] + x[13:16], (20, 1))
     taus = np.tile(0.1 * TAU, (20, 1))
-    now = propagation.carry(x, taus, gyros, 0.01, 0.01, *plant(body))
+    now = propagation.carry(x, taus, gyros, 0.01, 0.01, *body.plant)
 
     def carried(y: np.ndarray) -> np.ndarray:
-        return error_between(propagation.carry(y, taus, gyros, 0.01, 0.01, *plant(body)), now)[:6]
+        return error_between(propagation.carry(y, taus, gyros, 0.01, 0.01, *body.plant), now)[:6]
 
     jacobian = differences(carried, x)
     sigma = np.repeat([1e-4, 1e-4, 0.02, 0.0, 0.01, 0.0, 2.0, 0.0, 0.0, 0.0], [3, 3, 3, 3, 3, 3, 3, 3, 1, 3])
@@ -248,7 +243,7 @@ def test_accelerometer_s_jacobian_is_the_derivative_by_tilt_bias_and_disturbance
     mobility = np.ascontiguousarray(body.mass_inv[:3, :3])
 
     def residual(y: np.ndarray) -> np.ndarray:
-        moved = propagation.inertial_acceleration(y, TAU, *plant(body))
+        moved = propagation.inertial_acceleration(y, TAU, *body.plant)
         return observation.inertial(y, gyro, accel, np.nan, np.ones(3), moved, mobility)[0]
 
     _, h, _ = observation.inertial(x, gyro, accel, np.nan, np.ones(3), np.zeros(3), mobility)
@@ -278,10 +273,10 @@ def test_accelerometer_feels_what_moves_the_robot() -> None:
 
 def test_acceleration_against_the_world_is_the_change_of_the_velocity_in_it(body: Body) -> None:
     x, h = state(2), 1e-6
-    later = propagation.step(x, TAU, h, *plant(body))
+    later = propagation.step(x, TAU, h, *body.plant)
     before, after = (Rotation.from_quat(y[[4, 5, 6, 3]]).apply(y[7:10]) for y in (x, later))
     expected = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply((after - before) / h)
-    np.testing.assert_allclose(propagation.inertial_acceleration(x, TAU, *plant(body)), expected, atol=1e-4)
+    np.testing.assert_allclose(propagation.inertial_acceleration(x, TAU, *body.plant), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("gyro", [True, False])
@@ -378,7 +373,7 @@ def test_prediction_is_that_of_filterpy(body: Body, seed: int) -> None:
         pair = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])
         q[pair] += Q_continuous_white_noise(2, DT, density[9 + i] + moving[9 + i] ** 2) - np.diag([0.0, q[9 + i, 9 + i]])
     _, expected = kalman.predict(np.zeros(ERRORS), covariance, f, q)
-    x, got = propagation.predict(state(seed), covariance, TAU, DT, density, np.array([0.7, 0.2, 0.3]), *plant(body))
+    x, got = propagation.predict(state(seed), covariance, TAU, DT, density, np.array([0.7, 0.2, 0.3]), *body.plant)
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(got, got.T)
-    np.testing.assert_array_equal(x, propagation.step(state(seed), TAU, DT, *plant(body)))
+    np.testing.assert_array_equal(x, propagation.step(state(seed), TAU, DT, *body.plant))

@@ -72,8 +72,7 @@ def test_vehicle_that_leaves_an_axis_to_buoyancy_has_its_missions_planned(passiv
 @pytest.mark.parametrize("place", [NORTH, EAST, 5.0 * NORTH], ids=["north", "east", "far and deep"])
 def test_mission_of_such_a_vehicle_is_flown_and_it_leans_no_more_than_planned(passive: Body, place: np.ndarray) -> None:
     """As fast as it can: the moment of the added mass, which tips a body under way, counts beside buoyancy."""
-    drag, period_s = passive.drag, 0.01
-    plant = (passive.mass, passive.mass_inv, passive.righting, drag.nodes, drag.rotational, drag.linear)
+    period_s = 0.01
     path = flown(plan_mission(job(place, speed_m_s=1.5), passive))
     controller, allocator = Controller(passive, Control()), Allocator(passive, Allocation())
     x = np.zeros(propagation.STATES)
@@ -84,7 +83,7 @@ def test_mission_of_such_a_vehicle_is_flown_and_it_leans_no_more_than_planned(pa
         planned = max(planned, float(divide(passive, np.concatenate(list(wanted))[None]).lean[0]))
         leant = max(leant, float(np.linalg.norm(rotations.difference(wanted.q_wb.copy(), x[3:7].copy()))))
         error = max(error, float(np.linalg.norm(wanted.p_wb - x[:3])))
-        x = propagation.step(x, allocator.step(controller.step(wanted, wanted, believed(x))).achieved, period_s, *plant)
+        x = propagation.step(x, allocator.step(controller.step(wanted, wanted, believed(x))).achieved, period_s, *passive.plant)
     assert planned <= 1.01 * MOST_LEAN
     assert leant <= 1.1 * planned + 0.01
     assert error < 0.01
