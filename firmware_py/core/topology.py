@@ -103,7 +103,7 @@ def _common(a: Body, b: Body) -> tuple[int, int]:
 
 
 def _place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of mass of `part` from that of `whole` (3,), and (3, 3) whole frame to part frame."""
+    """Centre of mass of `part` from that of `whole` (3,), and (3, 3) whole frame to part frame; either may be the larger."""
     i, j = _common(part, whole)
     q_wp = multiply(np.ascontiguousarray(whole.q_bm[j]), conjugate(np.ascontiguousarray(part.q_bm[i])))
     r_wp = to_matrix(normalise(q_wp))
@@ -133,13 +133,8 @@ def _position(old: Body, x: np.ndarray, new: Body, q_new: np.ndarray) -> np.ndar
 
 def _biases(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
     """(6,) gyro and accelerometer bias in the axes of `new`."""
-    _, turn = _place(new, old) if len(new.modules) <= len(old.modules) else _inverse_place(old, new)
+    _, turn = _place(new, old)
     return np.concatenate([turn @ x[13:16], turn @ x[16:19]])
-
-
-def _inverse_place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
-    lever_b, turn = _place(part, whole)
-    return -turn @ lever_b, np.ascontiguousarray(turn.T)
 
 
 def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body, shock: Sequence[float]) -> np.ndarray:
