@@ -9,7 +9,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import FacePair
-from firmware_py.core.rotations import conjugate, multiply, rotate_back, to_matrix
+from firmware_py.core.rotations import conjugate, multiply, rotate_back
 from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, DockRequest
 from firmware_py.description.vehicle import FACE_NORMALS
 
@@ -65,9 +65,8 @@ def holding(body: Body, joints: Sequence[Joint]) -> list[tuple[int, ...]]:
 def _joint(body: Body, i: int, j: int) -> Joint:
     """Between the modules i and j of the body, which are neighbours."""
     step = (body.cells[j] - body.cells[i]).astype(np.float64)
-    turn_i, turn_j = (to_matrix(np.ascontiguousarray(body.q_bm[k])) for k in (i, j))
-    near = int(np.argmax(FACE_NORMALS @ (turn_i.T @ step)))
-    far = int(np.argmax(FACE_NORMALS @ (turn_j.T @ -step)))
     q_bi, q_bj = (np.ascontiguousarray(body.q_bm[k]) for k in (i, j))
+    near = int(np.argmax(FACE_NORMALS @ rotate_back(q_bi, step)))
+    far = int(np.argmax(FACE_NORMALS @ rotate_back(q_bj, -step)))
     offset = rotate_back(q_bi, body.r_bm[j] - body.r_bm[i])
     return Joint(DockRequest(body.modules[j], far, body.modules[i], near), offset, multiply(conjugate(q_bi), q_bj))
