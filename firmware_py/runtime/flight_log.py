@@ -54,6 +54,8 @@ class LoggedTick:
 
     tick: int
     time_ns: int
+    taken: int
+    """Frames that it took."""
     prepared: int
     """Results of the worker that it took."""
     messages: list[tuple[str, bytes]] = field(default_factory=list)
@@ -145,8 +147,8 @@ class FlightLog:
             if message.topic == TICKS:
                 if now is not None:
                     yield now
-                tick, time_ns, *_, prepared = self._values(message)
-                now = LoggedTick(int(tick), int(time_ns), int(prepared))
+                tick, time_ns, taken, *_, prepared = self._values(message)
+                now = LoggedTick(int(tick), int(time_ns), int(taken), int(prepared))
             if now is None or is_of_the_machine(message.topic):
                 continue
             now.messages.append((message.topic, message.data))
@@ -182,12 +184,12 @@ class FlightLog:
             here = f"{self.folder / CAN_LOG}:{group.first}"
             raise LogError(f"{here}: frames of {shown(group.stamp)} where {SIGNAL_LOG} has tick {logged.tick}")
         self._sort_lines(group, logged)
-        wanted, came = _received_frames(logged), len(logged.received)
-        if came != wanted and not group.is_last:
+        came = len(logged.received)
+        if came != logged.taken and not group.is_last:
             after = next(groups)
             here = f"{self.folder / CAN_LOG}:{after.first}"
-            raise LogError(f"{here}: {shown(after.lines[0])} after {came} frames for tick {logged.tick}, which took {wanted}")
-        return came == wanted
+            raise LogError(f"{here}: {shown(after.lines[0])} after {came} frames for tick {logged.tick}, which took {logged.taken}")
+        return came == logged.taken
 
     def _sort_lines(self, group: _Group, logged: LoggedTick) -> None:
         """Puts the frames of one tick where they belong. Raises LogError."""
@@ -214,10 +216,6 @@ class _Group(NamedTuple):
 
 _TICK = Layout("Tick", TICK_SIGNALS)
 _REQUEST = TextLayout("Request", ["tick"], "request")
-
-
-def _received_frames(logged: LoggedTick) -> int:
-    return int(_TICK.values(logged.messages[0][1])[2])
 
 
 def _stamp(line: str) -> str:
