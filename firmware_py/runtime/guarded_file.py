@@ -38,12 +38,7 @@ class GuardedFile:
 
     def write(self, data: bytes | bytearray) -> int:
         """Append; always says that all was taken."""
-        if self.error is None:
-            try:
-                self._append(data)
-            except OSError as error:
-                self.error = error
-                self._date_back()
+        self._attempt(partial(self._append, data))
         self._position += len(data)
         return len(data)
 
@@ -61,9 +56,13 @@ class GuardedFile:
 
     def sync(self) -> None:
         """What was written is to outlive a power cut too."""
+        self._attempt(self._to_disk)
+
+    def _attempt(self, job: Callable[[], None]) -> None:
+        """Does what the disk may refuse, unless it has before."""
         if self.error is None:
             try:
-                self._to_disk()
+                job()
             except OSError as error:
                 self.error = error
                 self._date_back()
