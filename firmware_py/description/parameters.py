@@ -319,8 +319,7 @@ class Parameters:
         if isinstance(getattr(group, name), int) and isinstance(value, float) and value.is_integer():
             value = int(value)  # MAVLink sends every number as a float
         fits = type(value) is type(getattr(group, name)) or (type(value) is int and type(getattr(group, name)) is float)
-        ok = fits and (value in limits.choices if limits.choices else limits.low <= value <= limits.high)  # type: ignore[operator]
-        if not ok:
+        if not (fits and limits.permits(value)):
             raise DescriptionError(f"parameter {dotted}: {value!r} is out of range; permitted: {describe(limits)}")
         kept = type(getattr(group, name))(value)  # an int where compiled functions want a float would end the tick
         return dataclasses.replace(self, **{group_name: dataclasses.replace(group, **{name: kept})})
@@ -371,8 +370,7 @@ def invalid(parameters: Parameters) -> list[str]:
     reasons = []
     for group, name, limits in _TUNABLES:
         value = getattr(getattr(parameters, group), name)
-        ok = value in limits.choices if limits.choices else limits.low <= value <= limits.high
-        if not ok:
+        if not limits.permits(value):
             reasons.append(f"parameter {group}.{name}: {value!r} is out of range; permitted: {describe(limits)}")
     return reasons
 

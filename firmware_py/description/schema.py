@@ -59,6 +59,10 @@ class Limits:
     choices: tuple[str, ...] = ()
     mavlink: str = ""
 
+    def permits(self, value: Any) -> bool:
+        """Whether a field may hold this number or word."""
+        return bool(value in self.choices if self.choices else self.low <= value <= self.high)
+
 
 def quantity(
     default: Any = dataclasses.MISSING,
