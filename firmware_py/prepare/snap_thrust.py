@@ -149,7 +149,7 @@ def usage(body: Body, wanted: np.ndarray, least: float = 0.0, sags: np.ndarray |
     above = _bound(body, wanted, pinv) + between
     best, where = 0.0, int(np.argmax(above))
     while above[k := int(np.argmax(above))] > max(best, least):
-        share, forces = _least(body, wanted[k])
+        share, forces = least_usage(body, wanted[k])
         if share + between[k] > best:
             best, where = share + float(between[k]), k
         above = np.minimum(above, _bound(body, wanted, _division(body, share, forces)) + between)
@@ -183,13 +183,11 @@ def _share(body: Body, forces: np.ndarray) -> np.ndarray:
     return np.asarray(np.maximum(forces / body.thrusters.f_max, forces / body.thrusters.f_min).max(axis=1))
 
 
-def least_usage(body: Body, wrench: np.ndarray) -> float:
-    """The share of one wrench (6,); infinite for a wrench outside the thrusters' span."""
-    return _least(body, wrench)[0]
+def least_usage(body: Body, wrench: np.ndarray) -> tuple[float, np.ndarray]:
+    """The share of one wrench (6,), and forces (n,) with which it is reached, N, by linear program (HiGHS).
 
-
-def _least(body: Body, wrench: np.ndarray) -> tuple[float, np.ndarray]:
-    """The same, and forces (n,) with which it is reached, N, by linear program (HiGHS)."""
+    The share is infinite for a wrench outside the thrusters' span.
+    """
     thrusters = body.thrusters
     n = thrusters.matrix.shape[1]
     cost = np.zeros(n + 1)
