@@ -14,6 +14,7 @@ from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS, Vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
+from firmware_py.prepare.joints import hanging_with
 from firmware_py.prepare.lattice import MATRICES, QUATERNIONS, nearest
 
 
@@ -81,11 +82,11 @@ def plan_undock(
     if wanted not in pairs:
         raise DescriptionError(f"modules {near} and {far} are not docked to each other")
     opened = [wanted, *(modules_of(joint) for joint in lost)]
-    piece = _reachable(far, [pair for pair in pairs if pair not in opened])
+    piece = hanging_with(far, [pair for pair in pairs if pair not in opened])
     if near in piece and not lost:
         piece = {far}
     stays = [m for m in whole.modules if m not in piece]
-    if near in piece or _reachable(near, [pair for pair in pairs if not pair & piece]) != set(stays):
+    if near in piece or hanging_with(near, [pair for pair in pairs if not pair & piece]) != set(stays):
         raise DescriptionError(f"modules {near} and {far} are also held together by other modules: undock those first")
     opens = [joint if joint.module in piece else turned(joint) for joint in joints if len(modules_of(joint) & piece) == 1]
     opens.sort(key=lambda joint: modules_of(joint) != wanted)
@@ -138,15 +139,6 @@ def _mated(turn_t: np.ndarray, request: DockRequest, normal: np.ndarray) -> np.n
     least = max(fits, key=lambda m: float(np.trace(turn_t.T @ m)))
     quarter = rotations.to_matrix(rotations.exp(normal * (0.5 * np.pi * request.quarter_turns)))
     return np.asarray(MATRICES[nearest(quarter @ least)])
-
-
-def _reachable(start: int, joints: Sequence[frozenset[int]]) -> set[int]:
-    """Modules that hang together with `start` by these joints."""
-    reached, before = {start}, set[int]()
-    while reached != before:
-        before = reached
-        reached = reached.union(*(joint for joint in joints if joint & reached))
-    return reached
 
 
 def _turn_of(body: Body, module: int) -> np.ndarray:

@@ -48,14 +48,13 @@ def check_joints(placements: Sequence[Placement], modules: Sequence[object], pit
             raise DescriptionError(f"module {modules[i]}: rotation {placement.rotation} is none of 0 to 23")
         at[placement.cell] = i
     _check_payloads(placements, modules, at, pitch_m)
-    joints: dict[int, list[int]] = {i: [] for i in range(len(placements))}
+    joints: list[frozenset[int]] = []
     for i, placement in enumerate(placements):
         for axis in range(3):
             j = at.get(_neighbour(placement.cell, axis))
             if j is not None and _joined(placements, modules, i, j, axis):
-                joints[i].append(j)
-                joints[j].append(i)
-    reached = _reached(joints)
+                joints.append(frozenset((i, j)))
+    reached = hanging_with(0, joints)
     if lost := [str(modules[i]) for i in range(len(placements)) if i not in reached]:
         raise DescriptionError(f"no docked face joins module {', '.join(lost)} to module {modules[0]}")
 
@@ -67,10 +66,8 @@ def _neighbour(cell: Cell, axis: int) -> Cell:
 
 def _joined(placements: Sequence[Placement], modules: Sequence[object], i: int, j: int, axis: int) -> bool:
     """Whether the faces between neighbours i and j (i below j along `axis`) dock. A probe needs a drogue before it."""
-    unit = [0, 0, 0]
-    unit[axis] = 1
-    upper = face_towards(placements[i].rotation, (unit[0], unit[1], unit[2]))
-    lower = face_towards(placements[j].rotation, (-unit[0], -unit[1], -unit[2]))
+    step = np.eye(3)[axis]
+    upper, lower = face_towards(placements[i].rotation, step), face_towards(placements[j].rotation, -step)
     kinds = placements[i].vehicle.faces[upper] + placements[j].vehicle.faces[lower]
     if kinds in ("PP", "P-", "-P"):
         what = "probe" if kinds == "PP" else "a face without drogue"
@@ -82,13 +79,12 @@ def _joined(placements: Sequence[Placement], modules: Sequence[object], i: int, 
     return set(kinds) == {"P", "D"}
 
 
-def _reached(joints: Mapping[int, Sequence[int]]) -> set[int]:
-    reached, open_ends = {0}, [0]
-    while open_ends:
-        for j in joints[open_ends.pop()]:
-            if j not in reached:
-                reached.add(j)
-                open_ends.append(j)
+def hanging_with(start: int, joints: Sequence[frozenset[int]]) -> set[int]:
+    """Modules that hang together with `start` by these joints, each between two."""
+    reached, before = {start}, set[int]()
+    while reached != before:
+        before = reached
+        reached = reached.union(*(joint for joint in joints if joint & reached))
     return reached
 
 

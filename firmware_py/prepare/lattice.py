@@ -46,9 +46,9 @@ INVERSE = np.argmax(PRODUCT == 0, axis=1)
 INVERSE.flags.writeable = False
 
 
-def face_towards(rotation: int, direction: tuple[int, int, int]) -> int:
-    """Face (0..5, description.vehicle.FACE_NAMES) of a turned module that looks into a lattice direction (one of the six unit vectors)."""
-    return int(np.argmax(FACE_NORMALS @ (MATRICES[rotation].T @ np.array(direction, dtype=float))))
+def face_towards(rotation: int, direction: np.ndarray) -> int:
+    """Face (0..5, description.vehicle.FACE_NAMES) of a turned module that looks into a lattice direction (3,), a unit vector."""
+    return int(np.argmax(FACE_NORMALS @ (MATRICES[rotation].T @ direction)))
 
 
 def nearest(matrix: np.ndarray) -> int:
