@@ -7,17 +7,17 @@ import pytest
 
 from firmware_py.core.thruster import total_power
 from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.capability.layout import FRAMES, of_vehicle
-from firmware_py.prepare.capability.power import (
-    electrical_power,
-    least_squares_forces,
-    mean_square_effort,
-    power_space,
-)
+from firmware_py.prepare.capability.layout import FRAMES, Layout, of_vehicle
+from firmware_py.prepare.capability.power import electrical_power, least_squares_forces, power_space
 from firmware_py.prepare.capability.sphere import fibonacci
 from tests.unit.capability_layouts import one_of_seven, raw
 
 AUTHORS = {"A_single": 1, "B_double_line": 2, "C_quad_2x2": 4}
+
+
+def mean_square_effort(layout: Layout, frame: str) -> float:
+    """Mean over unit directions of sum f^2, N^2 per N^2 or per (N m)^2."""
+    return power_space(layout, frame, fibonacci(121)).variance * layout.count
 
 
 @pytest.mark.parametrize(("name", "modules"), AUTHORS.items())

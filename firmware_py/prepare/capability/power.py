@@ -97,10 +97,3 @@ def least_squares_forces(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
         if flag == _SOLVED:
             forces[k] = x
     return np.asarray(forces)
-
-
-def mean_square_effort(layout: Layout, frame: str) -> float:
-    """Mean over unit directions of sum f^2 under the pseudo-inverse, N^2 per N^2 or per (N m)^2."""
-    components = free_components(layout, frame)
-    pinv = np.linalg.pinv(layout.matrix, rcond=1e-9)
-    return float(np.sum(pinv[:, components] ** 2)) / len(components)
