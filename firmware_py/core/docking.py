@@ -154,9 +154,8 @@ class DockingStage:
         An open joint is parted all the same: that its modules are apart is no wish.
         """
         self.events, decisions = [], Decisions()
-        for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._holds(each.plan)]:
-            self._undocks.remove(undock)
-            self.relays.switch(RELAY_PULL, *undock.plan.opens)
+        for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._left(each.plan)]:
+            self._call_off(undock)
             self._say(WARNING, f"undock of module {undock.plan.opens[0].module} ended: {NO_LONGER}")
         for dock in [each for each in self._docks if each.active == body.index]:
             self._give_up(dock, NO_LONGER, decisions)
@@ -377,8 +376,7 @@ class DockingStage:
     def _release(self, undock: _Undock, time_ns: int, estimates: Estimated, decisions: Decisions) -> None:
         plan, request = undock.plan, undock.plan.opens[0]
         if not _fits(plan, estimates):
-            self._undocks.remove(undock)
-            self.relays.switch(RELAY_PULL if self._holds(plan) else RELAY_OFF, *plan.opens)
+            self._call_off(undock)
             self._say(WARNING, f"undock ended: {CHANGED}")
             return
         self.relays.switch(RELAY_PUSH, *plan.opens)
@@ -394,8 +392,7 @@ class DockingStage:
         if held or (not seen and self._pulls(undock, time_ns)):
             if time_ns < undock.last_ns:
                 return
-            self._undocks.remove(undock)
-            self.relays.switch(RELAY_PULL, *plan.opens)
+            self._call_off(undock)
             self._say(WARNING, f"undock of module {request.module} ended: {IN_PLACE if held else PULLED}")
             self._end(whole, decisions)
             return
@@ -407,10 +404,17 @@ class DockingStage:
         self._undocks.remove(undock)
         self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
 
-    def _holds(self, plan: UndockPlan) -> bool:
-        """Whether there still is a joint to be undone."""
+    def _call_off(self, undock: _Undock) -> None:
+        """Ends an undock before its end: magnets pull again where there still is a joint, and let go where another has undone it."""
+        self._undocks.remove(undock)
+        left = self._left(undock.plan)
+        self.relays.switch(RELAY_OFF, *(joint for joint in undock.plan.opens if joint not in left))
+        self.relays.switch(RELAY_PULL, *left)
+
+    def _left(self, plan: UndockPlan) -> list[DockRequest]:
+        """The joints that still are to be undone."""
         watched = [modules_of(joint.request) for joint in self._watched]
-        return any(modules_of(joint) in watched for joint in plan.opens)
+        return [joint for joint in plan.opens if modules_of(joint) in watched]
 
     def _since(self, undock: _Undock, time_ns: int, picture: str) -> bool:
         """Whether in the latter half of the push pictures were taken of the joint: any (`picture_ns`), or such as show it closed

@@ -81,6 +81,15 @@ def test_module_out_of_sight_is_undocked_unless_its_magnets_go_on_pulling(hung: 
     assert tank.shape == ([(0, 1)] if hung else [(0,), (1,)])
 
 
+def test_two_corners_of_a_ring_undocked_at_once_leave_no_magnet_on_between_them() -> None:
+    """The second undock is ended by the first, which has undone one of its two joints: that one would pull the leaving module back."""
+    tank = Docked(RING)
+    tank.fly()
+    tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)), Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.shape == [(0, 1, 2), (3,)] and tank.when("undock of module 1 ended")
+    assert tank.pipeline.formation.docking.relays.states == [[1, 0, 1, 0, 0, 0], [0, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
+
+
 def test_undock_that_ends_in_the_tick_of_a_join_is_not_said_to_be_done() -> None:
     tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], Parameters().replace("docking.push_m", 0.0))
     tank.fly()
