@@ -124,9 +124,7 @@ class Steering(NamedTuple):
 class DockingSequence:
     """One dock of one active body to one target body."""
 
-    def __init__(
-        self, plan: DockPlan, active: Body, target: Body, parameters: Docking, time_ns: int, comes: bool = False
-    ) -> None:
+    def __init__(self, plan: DockPlan, active: Body, target: Body, parameters: Docking, time_ns: int, comes: bool) -> None:
         """`comes`: the target is free to come half of the way."""
         self.plan = plan
         self._comes = comes
