@@ -61,14 +61,16 @@ def test_quarter_turns_are_counted_about_the_targets_face_outwards(
 @pytest.mark.parametrize("gap_m", [0.02, 0.12, 0.2, 0.6])
 @pytest.mark.parametrize("parameters", [Docking(), PAPER.docking])
 def test_dock_that_fails_ends_apart_however_near_it_began(parameters: Docking, gap_m: float) -> None:
-    sequence, p_t, p_a = begin(parameters, gap_m)
+    sequence, p_t, p_a = begin(parameters, gap_m, comes=False)
     for tick in range(1, 40_000):
         steering = sequence.step(tick * TICK_NS, estimate(p_a), estimate(p_t), NEITHER)
         if sequence.stage in (Stage.FAILED, Stage.ABORTED) and steering.is_apart:
             break
         p_a = steering.active.p_wb
     assert sequence.stage in (Stage.FAILED, Stage.ABORTED)
-    assert steering.is_apart
+    assert steering.is_apart and steering.relay == RELAY_OFF
+    ends_m = sequence.errors(estimate(steering.active.p_wb), estimate(p_t)).gap_m
+    assert ends_m == pytest.approx(parameters.standoff_m, abs=0.0005)
 
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])
@@ -239,8 +241,10 @@ def test_tilted_target_comes_half_of_the_way_in_the_world(approach: str) -> None
     steering = dock.step()
     if approach == "straight":
         assert np.linalg.norm(dock.at.p_wb + rotate(dock.at.q_wb, r_a) - before) < 0.001, "it begins where it is"
+        assert np.linalg.norm(steering.active.v_w) == pytest.approx(STAGED.speed_m_s), "however long the line is"
     left = STAGED.standoff_m if approach == "staged" else 0.0
     np.testing.assert_allclose(steering.meets, 0.5 * (way - left * dock.outward), atol=1e-9)
+    np.testing.assert_array_equal(dock.sequence.met_w, steering.meets, "so that it can be sent back")
     if approach == "straight":  # it meets the target where that comes to rest
         dock.until(Stage.PUSH)
         np.testing.assert_allclose(dock.at.p_wb + rotate(dock.at.q_wb, r_a), centre + PITCH_M * dock.outward + steering.meets, atol=0.002)
@@ -372,6 +376,20 @@ def test_module_that_does_not_get_away_stays_in_back_off_until_its_time_is_over(
     assert dock.sequence.reason == "BACK_OFF took longer than 20 s"
 
 
+def test_module_backs_off_slowly_as_far_as_the_stand_off() -> None:
+    dock, gaps = Follower(), list[float]()
+    dock.until(Stage.BACK_OFF)
+    while dock.sequence.stage == Stage.BACK_OFF:
+        steering = dock.step()
+        np.testing.assert_allclose(steering.active.v_w, 0.04 * dock.outward, atol=1e-9)
+        gaps.append(dock.sequence.errors(dock.at, dock.there).gap_m)
+    np.testing.assert_allclose(np.diff(gaps), 0.0004, atol=1e-9)
+    for _ in range(80):
+        steering = dock.step()
+    np.testing.assert_allclose(steering.active.v_w, 0.0, atol=1e-12)
+    assert dock.sequence.errors(dock.at, dock.there).gap_m == pytest.approx(STAGED.standoff_m, abs=1e-9)
+
+
 def test_faces_that_are_still_near_while_they_push_apart_are_no_dock() -> None:
     dock = Follower()
     dock.until(Stage.RELEASE)
@@ -396,6 +414,7 @@ def test_dock_needs_both_places_known_but_backs_off_blindly(side: str) -> None:
     dock.until(Stage.ALIGN)
     dock.step()
     assert dock.sequence.stage == Stage.ABORTED
+    assert dock.sequence.reason == "relative sigma 6.1 mm, 5.0 permitted"
 
 
 def test_push_of_no_time_is_a_jam_at_once() -> None:
