@@ -5,45 +5,40 @@ Works on the estimates of this tick; the pipeline carries out the joins and part
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Part, Prepared
-from firmware_py.core.docking_detector import FacePair, ModulePoses, PairBank, PairDetector, TagTable
+from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
-from firmware_py.core.docking_sequence import (
-    ENDED,
-    DockingSequence,
-    DockPlan,
-    Stage,
-    UndockPlan,
-)
-from firmware_py.core.docking_way import BEGINNING, WAY_SLACK, Way, nearest_pass, way_of_active, way_of_target
+from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan
+from firmware_py.core.docking_way import first_met, obstacle, to_one_place, way_of_active
+from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
-from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back, to_matrix
+from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import (
     INFORMATION,
-    NEVER_NS,
     RELAY_OFF,
     RELAY_PULL,
     RELAY_PUSH,
     WARNING,
     DockRecord,
     DockRequest,
+    Estimate,
     Event,
     Inputs,
 )
+from firmware_py.core.undocking import Undock
 from firmware_py.description.parameters import Docking
 
 CHANGED = "the bodies are others than those that it was planned for"
-IN_PLACE = "pictures show that it is still in its place"
-PULLED = "its magnets go on pulling"
 NO_LONGER = "its body is no longer in DOCK"
+HOLDS = "its body is not in DOCK, and the joint may still hold"
 ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
@@ -62,24 +57,6 @@ class _Dock(NamedTuple):
     prepared: Prepared
 
 
-class _Undock(NamedTuple):
-    """An undock under way: magnets push until the body parts, which is at once where every joint is open already."""
-
-    plan: UndockPlan
-    chains: tuple[Any, ...]
-    since_ns: int
-    until_ns: int
-    seen_ns: int
-    """By then pictures of the latter half of the push are there, if any still come."""
-    pulled: Mapping[frozenset[int], np.ndarray]
-    """By the modules of a joint: its currents (2,) before the push, mA."""
-
-    @property
-    def last_ns(self) -> int:
-        """While pictures show it in its place the magnets push on, as long again: a short push shows late."""
-        return max(2 * self.until_ns - self.since_ns, self.seen_ns)
-
-
 class DockingStage:
     """All docks and joints of the fleet."""
 
@@ -88,23 +65,21 @@ class DockingStage:
         self._tags = tags
         self.relays = MagnetRelays(modules)
         self._docks: list[_Dock] = []
-        self._undocks: list[_Undock] = []
+        self._undocks: list[Undock] = []
         self._expected: dict[int, DockRequest] = {}
         """By body: the newest dock or undock that waits for its plan."""
-        self._joints = PairBank([], parameters)
-        self._watched: Sequence[Joint] = ()
+        self._joints = JointWatch(parameters)
         self.events: list[Event] = []
         self.records: list[DockRecord] = []
 
     def retune(self, parameters: Docking) -> None:
         """Takes other parameters for joints, and for docks that begin from now on."""
         self._p = parameters
-        self._joints = PairBank([joint.pair for joint in self._watched], parameters, self._joints)
+        self._joints.retune(parameters)
 
     def watch_joints(self, joints: Sequence[Joint]) -> None:
         """Watches these joints, all that there are in the fleet; their magnets hold."""
-        self._watched = joints
-        self._joints = PairBank([joint.pair for joint in joints], self._p, self._joints)
+        self._joints.watch(joints)
         for joint in joints:
             self.relays.switch(RELAY_PULL, joint.request)
 
@@ -112,22 +87,18 @@ class DockingStage:
         """Joints that are `least` LOOSE or APART though they should hold, as requests that name their faces. Those that are being
         undocked are left out.
         """
-        if not self._joints.rows.size:
-            return []
         parting = [modules_of(joint) for undock in self._undocks for joint in undock.plan.opens]
-        found = [self._watched[k].request for k in np.flatnonzero(self._joints.rows["open"] >= least).tolist()]
-        return [joint for joint in found if modules_of(joint) not in parting]
+        return [joint for joint in self._joints.that_are_open(least) if modules_of(joint) not in parting]
 
     @property
     def joints(self) -> np.ndarray:
         """(k,) of PAIR: what is known of every joint in this tick; a copy."""
-        rows = self._joints.rows
-        return rows.copy() if rows.size else rows
+        return self._joints.rows
 
     @property
     def has_work(self) -> bool:
         """Whether there is anything to watch or to steer."""
-        return self.under_way or self._joints.rows.size > 0
+        return self.under_way or len(self._joints) > 0
 
     @property
     def under_way(self) -> bool:
@@ -154,7 +125,7 @@ class DockingStage:
         An open joint is parted all the same: that its modules are apart is no wish.
         """
         self.events, decisions = [], Decisions()
-        for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._left(each.plan)]:
+        for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._joints.left(each.plan.opens)]:
             self._call_off(undock)
             self._say(WARNING, f"undock of module {undock.plan.opens[0].module} ended: {NO_LONGER}")
         for dock in [each for each in self._docks if each.active == body.index]:
@@ -184,8 +155,7 @@ class DockingStage:
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)
-        if self._joints.rows.size:
-            self._joints.step(inputs.time_ns, inputs.modules, poses, resting)
+        self._joints.step(inputs.time_ns, inputs.modules, poses, resting)
         for dock in list(self._docks):
             self._steer(dock, inputs, estimates, poses, decisions)
         for undock in list(self._undocks):
@@ -230,7 +200,8 @@ class DockingStage:
         if not _fits(plan, estimates):
             return CHANGED
         if isinstance(plan, UndockPlan):
-            return ""
+            whole = _body_of(plan.opens[0].module, estimates)
+            return HOLDS if self._holds(plan) and whole not in waiting else ""
         mine, others = (_body_of(module, estimates) for module in (plan.request.module, plan.request.target_module))
         if mine not in waiting:
             return NO_LONGER
@@ -238,32 +209,10 @@ class DockingStage:
             return ANOTHER
         if mine in self._leaders(others):
             return LED
-        if any(_meet(plan, dock.sequence.plan) for dock in self._docks if dock.active != mine):
+        if any(to_one_place(plan, dock.sequence.plan) for dock in self._docks if dock.active != mine):
             return TAKEN
-        return self._in_the_way(plan, mine, others, estimates, holding)
-
-    def _in_the_way(self, plan: DockPlan, mine: int, target: int, estimates: Estimated, holding: Collection[int]) -> str:
-        """Why a straight way of the two is none; empty: both are free, or nobody knows, which is for the sequence to say.
-
-        The paper's own is drawn through the target from wherever it begins.
-        """
-        active, other = estimates[mine], estimates[target]
-        if not (active[1].placed and other[1].placed):
-            return ""
-        staged, slack_m = self._p.approach == "staged", WAY_SLACK * self._p.standoff_m
-        way = way_of_active(plan, *active, *other, self._p.standoff_m if staged else 0.0)
-        met = nearest_pass(way, *other, slack_m) if staged else None
-        met = self._met(way, estimates, (mine, target)) if met is None else met
-        if met is not None:
-            return f"on its way it would come too near to module {met}: bring it before that face first"
-        met = self._met(way_of_target(plan, way, *other), estimates, (mine, target)) if self._comes(plan, target, holding) else None
-        return "" if met is None else f"module {plan.request.target_module}, which is to meet it, would come too near to module {met}"
-
-    def _met(self, way: Way, estimates: Estimated, pair: Collection[int]) -> int | None:
-        """A module of a third body that is where a way leads, as far as is known."""
-        thirds = (each for number, each in estimates.items() if number not in pair and each[1].placed)
-        passes = (nearest_pass(way, body, at, WAY_SLACK * self._p.standoff_m, BEGINNING) for body, at in thirds)
-        return next((module for module in passes if module is not None), None)
+        comes = self._comes(plan, others, holding)
+        return obstacle(plan, estimates[mine], estimates[others], _thirds(estimates, mine, others), comes, self._p)
 
     def _comes(self, plan: DockPlan, target: int, holding: Collection[int]) -> bool:
         """Whether the target is to come half of the way."""
@@ -291,11 +240,13 @@ class DockingStage:
             decisions.returning.append(dock.target)
 
     def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
-        apart = [modules_of(joint) for joint in self.open_joints(APART)]
-        holds = any(modules_of(joint) not in apart for joint in plan.opens)
-        until_ns, seen_ns = (time_ns + (round(ns) if holds else 0) for ns in (self._p.release_s * 1e9, 2e6 * self._p.pose_fresh_ms))
-        self._undocks.append(_Undock(plan, chains, time_ns, until_ns, seen_ns, self._strong(plan.opens)))
+        self._undocks.append(Undock.begun(plan, chains, time_ns, self._holds(plan), self._p, self._joints))
         self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
+
+    def _holds(self, plan: UndockPlan) -> bool:
+        """Whether magnets have to push it open: not all that is seen says that it is."""
+        apart = [modules_of(joint) for joint in self.open_joints(APART)]
+        return any(modules_of(joint) not in apart for joint in plan.opens)
 
     def _begin_dock(
         self,
@@ -353,9 +304,9 @@ class DockingStage:
         """Whether a third body has come on its way to the stand-off; of each that is said once."""
         if dock.sequence.stage != Stage.PRE_APPROACH or len(estimates) == 2:
             return False
-        plan, pair = dock.sequence.plan, (dock.active, dock.target)
+        plan = dock.sequence.plan
         way = way_of_active(plan, *estimates[dock.active], *estimates[dock.target], self._p.standoff_m)
-        met = self._met(way, estimates, pair)
+        met = first_met(way, _thirds(estimates, dock.active, dock.target), self._p)
         if met not in (None, dock.sequence.waits_for):
             dock.sequence.waits_for = met
             self._say(WARNING, f"dock of module {plan.request.module} waits: module {met} is on its way")
@@ -373,7 +324,7 @@ class DockingStage:
             decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))
             self._docks.remove(dock)
 
-    def _release(self, undock: _Undock, time_ns: int, estimates: Estimated, decisions: Decisions) -> None:
+    def _release(self, undock: Undock, time_ns: int, estimates: Estimated, decisions: Decisions) -> None:
         plan, request = undock.plan, undock.plan.opens[0]
         if not _fits(plan, estimates):
             self._call_off(undock)
@@ -382,18 +333,14 @@ class DockingStage:
         self.relays.switch(RELAY_PUSH, *plan.opens)
         whole = _body_of(request.module, estimates)
         changes = whole in decisions.joining or whole in [part.whole for part in decisions.parts]
-        if time_ns < undock.until_ns or changes:  # the next tick has no such body, and ends this
+        if changes or undock.pushes(time_ns, self._joints):  # changes: the next tick has no such body, and ends this
             return
-        alone = len(plan.opens) == 1
-        seen = alone and self._since(undock, time_ns, "picture_ns")
-        if alone and not seen and time_ns < undock.seen_ns:
+        held_by = undock.held_by(time_ns, self._joints)
+        if held_by and time_ns < undock.last_ns:
             return
-        held = seen and self._since(undock, time_ns, "near_ns")
-        if held or (not seen and self._pulls(undock, time_ns)):
-            if time_ns < undock.last_ns:
-                return
+        if held_by:
             self._call_off(undock)
-            self._say(WARNING, f"undock of module {request.module} ended: {IN_PLACE if held else PULLED}")
+            self._say(WARNING, f"undock of module {request.module} ended: {held_by}")
             self._end(whole, decisions)
             return
         self.relays.switch(RELAY_OFF, *plan.opens)
@@ -404,38 +351,12 @@ class DockingStage:
         self._undocks.remove(undock)
         self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
 
-    def _call_off(self, undock: _Undock) -> None:
+    def _call_off(self, undock: Undock) -> None:
         """Ends an undock before its end: magnets pull again where there still is a joint, and let go where another has undone it."""
         self._undocks.remove(undock)
-        left = self._left(undock.plan)
+        left = self._joints.left(undock.plan.opens)
         self.relays.switch(RELAY_OFF, *(joint for joint in undock.plan.opens if joint not in left))
         self.relays.switch(RELAY_PULL, *left)
-
-    def _left(self, plan: UndockPlan) -> list[DockRequest]:
-        """The joints that still are to be undone."""
-        watched = [modules_of(joint.request) for joint in self._watched]
-        return [joint for joint in plan.opens if modules_of(joint) in watched]
-
-    def _since(self, undock: _Undock, time_ns: int, picture: str) -> bool:
-        """Whether in the latter half of the push pictures were taken of the joint: any (`picture_ns`), or such as show it closed
-        (`near_ns`), as where a relay hangs: two bodies would fly against each other. Of several that part at once the funnels hold back
-        what leaves across, until thrusters draw it out: of these no picture tells.
-        """
-        half_ns = (undock.since_ns + time_ns) // 2
-        taken = [modules_of(self._watched[i].request) for i in np.flatnonzero(self._joints.rows[picture] > half_ns).tolist()]
-        return modules_of(undock.plan.opens[0]) in taken
-
-    def _pulls(self, undock: _Undock, time_ns: int) -> bool:
-        """Whether any joint is still held by both its magnets: their currents have not turned, as where relays hang."""
-        now = self._strong(undock.plan.opens, (undock.since_ns + time_ns) // 2)
-        return any(bool(np.all(now[joint] * before > 0.0)) for joint, before in undock.pulled.items() if joint in now)
-
-    def _strong(self, joints: Sequence[DockRequest], after_ns: int = NEVER_NS) -> dict[frozenset[int], np.ndarray]:
-        """Currents (2,), mA, of those of the joints whose magnets both are on, as far as they came after that time."""
-        rows, wanted = self._joints.rows, [modules_of(joint) for joint in joints]
-        strong = (np.abs(rows["current_ma"]) > self._p.current_threshold_ma) & (rows["current_ns"] > after_ns)
-        found = [(modules_of(self._watched[i].request), i) for i in np.flatnonzero(strong.all(axis=1)).tolist()]
-        return {joint: rows["current_ma"][i].copy() for joint, i in found if joint in wanted}
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))
@@ -454,23 +375,6 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
     return table
 
 
-def _meet(plan: DockPlan, other: DockPlan) -> bool:
-    """Whether both would bring a module to one place, beside a body that is to be part of both."""
-    common = set(plan.merged.modules).intersection(other.merged.modules)
-    if not common:
-        return False
-    mine, others = (_beside(each.merged, common) for each in (plan, other))
-    apart_m = np.linalg.norm(mine[:, None] - others, axis=-1)
-    return bool(apart_m.min() < 0.5 * np.linalg.norm(plan.place_t))
-
-
-def _beside(body: Body, common: Collection[int]) -> np.ndarray:
-    """(n, 3) places of those of its modules that are not `common`, in the frame of the first that is, m."""
-    first = body.modules.index(min(common))
-    places = (body.r_bm - body.r_bm[first]) @ to_matrix(np.ascontiguousarray(body.q_bm[first]))
-    return np.asarray(places[[module not in common for module in body.modules]])
-
-
 def _fits(plan: DockPlan | UndockPlan, estimates: Estimated) -> bool:
     """Whether the bodies are still those that a plan is made for."""
     bodies = {frozenset(body.modules) for body, _ in estimates.values()}
@@ -484,3 +388,8 @@ def _fits(plan: DockPlan | UndockPlan, estimates: Estimated) -> bool:
 
 def _body_of(module: int, estimates: Estimated) -> int:
     return next(number for number, (body, _) in estimates.items() if module in body.modules)
+
+
+def _thirds(estimates: Estimated, *pair: int) -> list[tuple[Body, Estimate]]:
+    """The bodies beside a pair."""
+    return [placed for number, placed in estimates.items() if number not in pair]

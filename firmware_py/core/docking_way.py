@@ -1,9 +1,9 @@
-"""The straight ways that bodies go to a dock's stand-off, and whether they lead too near another body."""
+"""The straight ways that bodies go to a dock's stand-off: whether they lead too near another body, or two of them to one place."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking_sequence import DockPlan, module_in, pose_of
 from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, to_matrix
 from firmware_py.core.types import Estimate
+from firmware_py.description.parameters import Docking
 
 WAY_SAMPLES = 65
 """Places on a way that are looked at, where the bodies are near each other."""
@@ -77,6 +78,56 @@ def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near
     limit = np.minimum(CUBE_DIAGONAL * way.pitch_m, np.maximum(ends - slack_m, SQUARE_DIAGONAL * way.pitch_m))
     touching = (least < ends - WAY_NOISE_M) & (least < limit)
     return other.modules[int(np.where(touching, least, np.inf).min(axis=0).argmin())] if touching.any() else None
+
+
+def first_met(way: Way, thirds: Sequence[tuple[Body, Estimate]], p: Docking) -> int | None:
+    """A module of bodies that have nothing to do with the dock which is where a way leads, as far as is known; None: none."""
+    passes = (nearest_pass(way, body, at, WAY_SLACK * p.standoff_m, BEGINNING) for body, at in thirds if at.placed)
+    return next((module for module in passes if module is not None), None)
+
+
+def obstacle(
+    plan: DockPlan,
+    active: tuple[Body, Estimate],
+    target: tuple[Body, Estimate],
+    thirds: Sequence[tuple[Body, Estimate]],
+    comes: bool,
+    p: Docking,
+) -> str:
+    """Why a straight way of the two is none; empty: both are free, or nobody knows, which is for the sequence to say.
+
+    The paper's own approach is drawn through the target from wherever it begins.
+
+    Args:
+        comes: the target comes to meet the active body.
+    """
+    if not (active[1].placed and target[1].placed):
+        return ""
+    staged = p.approach == "staged"
+    way = way_of_active(plan, *active, *target, p.standoff_m if staged else 0.0)
+    met = nearest_pass(way, *target, WAY_SLACK * p.standoff_m) if staged else None
+    met = first_met(way, thirds, p) if met is None else met
+    if met is not None:
+        return f"on its way it would come too near to module {met}: bring it before that face first"
+    met = first_met(way_of_target(plan, way, *target), thirds, p) if comes else None
+    return "" if met is None else f"module {plan.request.target_module}, which is to meet it, would come too near to module {met}"
+
+
+def to_one_place(plan: DockPlan, other: DockPlan) -> bool:
+    """Whether both would bring a module to one place, beside a body that is to be part of both."""
+    common = set(plan.merged.modules).intersection(other.merged.modules)
+    if not common:
+        return False
+    mine, others = (_beside(each.merged, common) for each in (plan, other))
+    apart_m = np.linalg.norm(mine[:, None] - others, axis=-1)
+    return bool(apart_m.min() < 0.5 * np.linalg.norm(plan.place_t))
+
+
+def _beside(body: Body, common: Collection[int]) -> np.ndarray:
+    """(n, 3) places of those of its modules that are not `common`, in the frame of the first that is, m."""
+    first = body.modules.index(min(common))
+    places = (body.r_bm - body.r_bm[first]) @ to_matrix(np.ascontiguousarray(body.q_bm[first]))
+    return np.asarray(places[[module not in common for module in body.modules]])
 
 
 def _near_part(begin: np.ndarray, way: np.ndarray, reach_m: float) -> list[float]:

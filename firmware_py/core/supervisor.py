@@ -154,7 +154,7 @@ class Supervisor:
             self._say(WARNING, f"{trigger.name} refused: not possible in {self.state.name}")
             return None
         mode = row.mode if row.mode is not None else argument if trigger == Trigger.SET_MODE else self._mode_after(row)
-        reasons = self._reasons(_guard_of(row, argument, health), mode, health)
+        reasons = self._reasons(row.guard, mode, health, argument)
         if reasons:
             self._say(WARNING, f"{trigger.name} refused: {'; '.join(dict.fromkeys(reasons))}")
             return None
@@ -178,15 +178,19 @@ class Supervisor:
             self._testing = False
         self.state, self.mode = row.next_state, mode
 
-    def _reasons(self, guard: Guard, mode: Mode, health: Health) -> list[str]:
-        """Why `guard` does not hold, in words; empty when it does."""
+    def _reasons(self, guard: Guard, mode: Mode, health: Health, argument: Any = None) -> list[str]:
+        """Why `guard` does not hold, in words; empty when it does. Those of an undock ask for its `argument`."""
         if guard in (Guard.ARMING_CHECKS, Guard.FORCED_CHECKS):
             question = Question(health, mode, self._p, self._failsafes, self._estop_age_ms(health))
             return against_arming(question, guard == Guard.FORCED_CHECKS)
         if guard == Guard.MODE_NEEDS:
             return missing(mode, health, self._p)
+        holds = guard in (Guard.PARTING_PERMITTED, Guard.JOINT_OPEN) and modules_of(argument) not in health.open_joints
+        if guard == Guard.JOINT_OPEN and holds:
+            return ["the body is disarmed, and the joint is not open"]
         if guard in DESPITE:
-            reasons = missing(mode, health, self._p) or self._failsafes.against(mode, health, DESPITE[guard])
+            despite = DESPITE[Guard.MODE_PERMITTED if holds else guard]
+            reasons = missing(mode, health, self._p) or self._failsafes.against(mode, health, despite)
             if self._testing:  # and nobody has asked yet whether it may fly
                 reasons = reasons or self._reasons(Guard.ARMING_CHECKS, mode, health)
             return reasons
@@ -232,13 +236,6 @@ class Supervisor:
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))
-
-
-def _guard_of(row: Transition, argument: Any, health: Health) -> Guard:
-    """The row's; but a joint that holds is none of a partner that is lost."""
-    if row.guard == Guard.PARTING_PERMITTED and modules_of(argument) not in health.open_joints:
-        return Guard.MODE_PERMITTED
-    return row.guard
 
 
 TAKES_OVER = (Effect.ENTER_MODE, Effect.ENTER_LEVEL, Effect.HOLD_AT, Effect.FOLLOW)

@@ -78,6 +78,8 @@ class Guard(IntEnum):
     """The mode is DOCK."""
     PARTING_PERMITTED = 9
     """As MODE_PERMITTED; but a partner that is lost may be let go: by a joint of its own that is open."""
+    JOINT_OPEN = 10
+    """The joint is open though it should hold: a body that has come apart while disarmed could not be armed in any other way."""
 
 
 class Effect(IntEnum):
@@ -128,6 +130,7 @@ TABLE = (
     Transition(D, T.ARM, G.ARMING_CHECKS, F.ENTER_MODE, A),
     Transition(D, T.FORCED_ARM, G.FORCED_CHECKS, F.ENTER_MODE, A),
     Transition(D, T.SET_MODE, G.ALWAYS, F.NOTHING, D),
+    Transition(D, T.UNDOCK, G.JOINT_OPEN, F.NOTHING, D),
     Transition(D, T.SET_POINT, G.ALWAYS, F.TAKE_POINT, D),
     Transition(D, T.STICKS, G.ALWAYS, F.TAKE_STICKS, D),
     Transition(D, T.MOTOR_TEST, G.FORCED_CHECKS, F.TEST_MOTOR, A, Mode.MOTOR_DETECT),

@@ -254,7 +254,12 @@ class CommandService:
             return DENIED
         request = DockRequest(module, face, target, target_face, turns, command.get(6) >= 0.5)
         s = self._system.subject
-        return self._ask(command, action, request, lambda: s.picture.mode(s.body) == Mode.DOCK)
+
+        def is_done() -> bool:
+            """A body that is disarmed undocks without a mode, where it has come apart."""
+            return s.picture.mode(s.body) == Mode.DOCK or (action == Action.UNDOCK and s.picture.leader(module) != s.picture.leader(target))
+
+        return self._ask(command, action, request, is_done)
 
     def _motor_test(self, command: Command) -> Answer:
         """Motor, throttle type (0: %, 1: PWM 1100 to 1900), throttle, seconds; motors and % count from where the identity's do."""

@@ -73,6 +73,19 @@ def test_docked_bodies_are_their_leaders_system_with_everything_of_every_module(
     assert [(r.action, r.body) for r in world.robot.asked] == [(Action.STICKS, 0), (Action.MOTOR_TEST, 0)]
 
 
+def test_undock_of_a_disarmed_body_is_accepted_once_it_is_two(world: World, client: Client) -> None:
+    """It enters no mode."""
+    apart = world.robot.bodies
+    world.robot.dock()
+    world.run(10)
+    client.command(31011, 1, 1, 0, 0)
+    world.run(10)
+    assert not client.all("COMMAND_ACK")
+    world.robot.bodies = apart
+    world.run(2)
+    assert [(ack.command, ack.result) for ack in client.all("COMMAND_ACK")] == [(31011, mavlink.MAV_RESULT_ACCEPTED)]
+
+
 def test_parted_bodies_are_two_systems_again(world: World, client: Client) -> None:
     apart = world.robot.bodies
     world.robot.dock()

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from firmware_py.core.docking import CHANGED, IN_PLACE
+from firmware_py.core.docking import CHANGED, HOLDS
 from firmware_py.core.failsafes import Level
 from firmware_py.core.joints import joints_of
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, DockFeedback, DockRequest, Mode, ModuleInputs, Request
+from firmware_py.core.types import RELAY_PULL, Action, DockFeedback, DockRequest, Mode, ModuleInputs, Request
+from firmware_py.core.undocking import IN_PLACE
 from firmware_py.description.parameters import Parameters
 from tests.unit.tanks import LOST, RING, TAG_DELAY_TICKS, Docked
 
@@ -122,6 +123,30 @@ def test_disarmed_pair_stays_one_body_and_may_not_arm() -> None:
     outputs = tank.run(0.2, Request(Action.ARM))
     assert tank.shape == [(0, 1)] and outputs.records[0].state == State.DISARMED
     assert any("ARM refused" in text and "do not hold together" in text for _, text in tank.said)
+
+
+def test_body_that_has_come_apart_while_disarmed_is_undocked_and_flies_on_as_two() -> None:
+    tank = Docked(RING[:2])
+    undock = Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0))
+    tank.run(0.5)
+    tank.run(0.5, undock)
+    assert tank.when("UNDOCK refused: the body is disarmed, and the joint is not open") and tank.shape == [(0, 1)]
+    tank.lose(1)
+    tank.run(2.0)
+    outputs = tank.run(0.2, undock)
+    assert tank.shape == [(0,), (1,)] and [record.state for record in outputs.records] == [State.DISARMED] * 2
+    assert not [states for states in tank.pipeline.formation.docking.relays.states if any(states)]
+    tank.run(2.5)
+    assert tank.run(0.2, Request(Action.ARM, 0)).records[0].state == State.ARMED
+
+
+def test_disarmed_body_whose_joint_pictures_show_closed_is_not_undocked() -> None:
+    tank = Docked(RING[:2])
+    tank.weak.add(1)
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.when(f"dock refused: {HOLDS}") and tank.shape == [(0, 1)]
+    assert {max(states) for states in tank.pipeline.formation.docking.relays.states} == {RELAY_PULL}
 
 
 def test_fail_safe_that_is_switched_off_parts_nothing() -> None:

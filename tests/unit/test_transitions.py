@@ -15,7 +15,7 @@ def test_numbers_are_those_of_the_logs() -> None:
         "FAILSAFE_DISARM",
     ]  # fmt: skip
     assert [int(trigger) for trigger in Trigger] == list(range(20))
-    assert [int(guard) for guard in Guard] == list(range(10))
+    assert [int(guard) for guard in Guard] == list(range(11))
     assert [int(effect) for effect in Effect] == list(range(9))
     assert [int(need) for need in Need] == list(range(4))
     assert {Trigger.DOCK, Trigger.UNDOCK} == DOCKING and {State.ARMED} == ARMED
@@ -26,7 +26,7 @@ def row(state: State, trigger: Trigger) -> tuple[Guard, Effect, State, Mode | No
 
 
 def test_table_has_one_row_for_a_state_and_a_trigger() -> None:
-    assert len(ROWS) == len(TABLE) == 36
+    assert len(ROWS) == len(TABLE) == 37
 
 
 @pytest.mark.parametrize("state", State, ids=lambda state: state.name)
@@ -70,8 +70,9 @@ def test_disarmed_robot_takes_a_mode_a_point_and_sticks_and_does_nothing() -> No
     rest = {r.trigger for r in TABLE if r.state == State.DISARMED}
     assert rest == {
         Trigger.ESTOP_FRAME, Trigger.ESTOP, Trigger.CLEAR_ESTOP, Trigger.DISARM, Trigger.ARM, Trigger.FORCED_ARM,
-        Trigger.SET_MODE, Trigger.SET_POINT, Trigger.STICKS, Trigger.MOTOR_TEST,
+        Trigger.SET_MODE, Trigger.UNDOCK, Trigger.SET_POINT, Trigger.STICKS, Trigger.MOTOR_TEST,
     }  # fmt: skip
+    assert row(State.DISARMED, Trigger.UNDOCK) == (Guard.JOINT_OPEN, Effect.NOTHING, State.DISARMED, None)
 
 
 @pytest.mark.parametrize("state", State, ids=lambda state: state.name)

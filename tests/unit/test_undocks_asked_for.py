@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.docking import PULLED
 from firmware_py.core.docking_decisions import Decisions, Join
 from firmware_py.core.types import Action, DockRequest, Mode, Request
+from firmware_py.core.undocking import PULLED
 from firmware_py.description.parameters import Parameters
 from tests.unit.tanks import RING, Docked
 

@@ -1,0 +1,62 @@
+"""One undock under way: its magnets push, and then pictures, or else currents, tell whether its joints have opened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from firmware_py.core.docking_sequence import UndockPlan
+from firmware_py.core.joint_watch import JointWatch
+from firmware_py.core.types import DockRequest
+from firmware_py.description.parameters import Docking
+
+IN_PLACE = "pictures show that it is still in its place"
+PULLED = "its magnets go on pulling"
+
+
+class Undock(NamedTuple):
+    """Magnets push until the body parts, which is at once where every joint is open already."""
+
+    plan: UndockPlan
+    chains: tuple[Any, ...]
+    since_ns: int
+    until_ns: int
+    seen_ns: int
+    """By then pictures of the latter half of the push are there, if any still come."""
+    last_ns: int
+    """While a joint holds, the magnets push on, as long again: a short push shows late."""
+    before_ma: Mapping[DockRequest, np.ndarray | None]
+    """Currents (2,) of the joints before the push, where both of their magnets were on."""
+
+    @staticmethod
+    def begun(plan: UndockPlan, chains: tuple[Any, ...], time_ns: int, holds: bool, p: Docking, joints: JointWatch) -> Undock:
+        """One that begins now; `holds`: not every joint is open."""
+        push_ns, seen_ns = (round(ns) if holds else 0 for ns in (p.release_s * 1e9, 2e6 * p.pose_fresh_ms))
+        last_ns = time_ns + max(2 * push_ns, seen_ns)
+        before_ma = {joint: joints.strong_ma(joint) for joint in plan.opens}
+        return Undock(plan, chains, time_ns, time_ns + push_ns, time_ns + seen_ns, last_ns, before_ma)
+
+    def pushes(self, time_ns: int, joints: JointWatch) -> bool:
+        """Whether it is too early to ask what holds: a picture of a single joint is waited for."""
+        awaited = len(self.plan.opens) == 1 and not self._is_seen(time_ns, joints)
+        return time_ns < (max(self.until_ns, self.seen_ns) if awaited else self.until_ns)
+
+    def held_by(self, time_ns: int, joints: JointWatch) -> str:
+        """What tells that a joint holds, as where a relay hangs: two bodies would fly against each other. Empty: nothing does.
+
+        Of several that part at once the funnels hold back what leaves across, until thrusters draw it out: of these no picture tells.
+        """
+        half_ns, joint = self._half_ns(time_ns), self.plan.opens[0]
+        if len(self.plan.opens) == 1 and self._is_seen(time_ns, joints):
+            return IN_PLACE if joints.newest_ns(joint, "near_ns") > half_ns else ""
+        pulled = ((before, joints.strong_ma(joint, half_ns)) for joint, before in self.before_ma.items())
+        return PULLED if any(a is not None and b is not None and np.all(a * b > 0.0) for a, b in pulled) else ""
+
+    def _is_seen(self, time_ns: int, joints: JointWatch) -> bool:
+        """Whether a picture shows the first joint in the latter half of the push."""
+        return joints.newest_ns(self.plan.opens[0], "picture_ns") > self._half_ns(time_ns)
+
+    def _half_ns(self, time_ns: int) -> int:
+        return (self.since_ns + time_ns) // 2
