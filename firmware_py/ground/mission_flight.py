@@ -86,7 +86,7 @@ class _Flight:
     legs: tuple[Leg, ...]
     arrivals_s: tuple[float, ...] = ()
     taken: int = 0
-    """System.taken when it began."""
+    """System.taken when it began, and while it is followed, as of the last tick."""
     members: tuple[int, ...] = ()
     """Fleet indices of the body's modules then: it is planned for these."""
     holds: bool = False
@@ -166,6 +166,8 @@ class MissionFlight:
             return "there is none"
         if not s.armed:
             return "the vehicle is disarmed"
+        if self._flight is not None and self._system.taken != self._flight.taken:
+            self._end(PAUSED)  # the next tick would, by what was asked before this: it flies on no more
         wanted = first
         if wanted is None:
             wanted = s.progress.current if s.progress.state == PAUSED else 0
@@ -256,6 +258,7 @@ class MissionFlight:
             if tracking and flight.started_ns is None:
                 flight.started_ns = time_ns
             if tracking:
+                flight.taken = self._system.taken  # of what was asked nothing has taken the body
                 self._advance(flight, time_ns)
             elif flight.started_ns is not None:
                 self._end(PAUSED)

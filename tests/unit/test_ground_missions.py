@@ -178,6 +178,33 @@ def test_start_that_comes_again_because_its_answer_was_lost_does_not_begin_the_m
         assert job.legs[0].sequence == parameters[0], "another item, or a jump to the same one, is gone to"
 
 
+@pytest.mark.parametrize(("again", "planned"), [((300, 0), [0, 1, 2]), ((193, 1), [1, 2])])
+@pytest.mark.parametrize("taken_by", [(193, 0), (21,), (17,), (176, 1, 1)])
+def test_start_right_behind_what_takes_the_body_for_something_else_is_flown(
+    world: World, client: Client, taken_by: tuple[int, ...], again: tuple[int, ...], planned: list[int]
+) -> None:
+    """A radio brings both at once: the start was granted, for it still flew, and then it was paused for good."""
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    world.run(1200)
+    client.command(*taken_by)
+    client.command(*again)
+    world.run(20)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == planned
+
+
+def test_start_that_comes_again_behind_a_mode_that_is_refused_does_not_begin_the_mission_anew(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    world.robot.refuse[Action.SET_MODE] = "the pilot is not there"
+    client.command(176, 1, 1)
+    world.run(3)
+    client.command(300, 0)
+    world.run(20)
+    assert world.station.jobs() == [] and world.robot.mode[0] == Mode.AUTO
+
+
 def test_start_that_comes_again_while_its_mission_is_planned_is_waited_for_once(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     client.command(400, 1)
