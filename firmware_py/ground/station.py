@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence, Set
 from pathlib import Path
+from typing import NamedTuple
 
 from firmware_py.core.body import Body
 from firmware_py.core.types import WARNING, DockRequest, Inputs, Outputs, Request
@@ -13,7 +14,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.commands import CommandService
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.dialect import load_dialect
+from firmware_py.ground.dialect import Message, load_dialect
 from firmware_py.ground.geodesy import Origin
 from firmware_py.ground.identity import COMPONENT_AUTOPILOT
 from firmware_py.ground.logs import LogService
@@ -45,6 +46,15 @@ _NEVER_SIGNED = ("RADIO_STATUS",)
 _TARGETS = frozenset({"target_system", "target"})
 """Fields of what is meant for somebody, be it for all."""
 _NEVER_FORWARDED = ("SETUP_SIGNING", *_NEVER_SIGNED)
+_STREAM_NS = 1_000_000_000
+"""What comes again within this time streams."""
+
+
+class _Heard(NamedTuple):
+    """Where somebody was heard, and when each message of it that is for nobody by name came last."""
+
+    channel: int
+    came_ns: dict[str, int]
 
 
 class Services:
@@ -113,7 +123,7 @@ class GroundStation:
         self._busy: set[int] = set()
         self._frames: list[Outgoing] = []
         self._framers: dict[int, Framer] = {}
-        self._routes: dict[Sender, int] = {}
+        self._routes: dict[Sender, _Heard] = {}
         origin = Origin(fleet.latitude_deg, fleet.longitude_deg, fleet.altitude_m)
         self.services: dict[int, Services] = {}
         for body in range(len(fleet.module)):
@@ -156,7 +166,7 @@ class GroundStation:
     def leave(self, channel: int) -> None:
         """A channel is gone."""
         self._framers.pop(channel, None)
-        self._routes = {sender: at for sender, at in self._routes.items() if at != channel}
+        self._routes = {sender: heard for sender, heard in self._routes.items() if heard.channel != channel}
         for services in self.services.values():
             services.system.remove_channel(channel)
 
@@ -233,7 +243,7 @@ class GroundStation:
         component = message.values.get("target_component", 0)
         is_for_autopilots = component in (0, COMPONENT_AUTOPILOT)
         if not (component == COMPONENT_AUTOPILOT and target in self.services):
-            self._forward(packet, target, component, channel)
+            self._forward(packet, target, component, channel, time_ns)
         if is_for_autopilots and not self._is_for_too_many(arrival, target):
             for number, services in self.services.items():
                 if target in (0, number):
@@ -250,24 +260,32 @@ class GroundStation:
 
     def _route(self, sender: Sender, channel: int) -> None:
         """It was heard there. Of too many the one that was silent longest is forgotten."""
-        self._routes.pop(sender, None)
-        self._routes[sender] = channel
+        before = self._routes.pop(sender, None)
+        self._routes[sender] = _Heard(channel, {} if before is None else before.came_ns)
         if len(self._routes) > _SENDERS:
             del self._routes[next(iter(self._routes))]
 
-    def _forward(self, packet: Packet, target: int, component: int, channel: int) -> None:
+    def _forward(self, packet: Packet, target: int, component: int, channel: int, time_ns: int) -> None:
         """To wherever the system that it is for was heard, of one of ours the component (0: all); what is for all, to everybody else.
 
         What streams by waits for what a slow link carries: of a companion computer's that is too much for a radio.
         """
         if packet.message.name in _NEVER_FORWARDED:
             return
-        heard = {
-            at for (system, part), at in self._routes.items()
+        wanted = {
+            heard.channel for (system, part), heard in self._routes.items()
             if target in (0, system) and (target not in self.services or component in (0, part))
         }  # fmt: skip
-        streams = _TARGETS.isdisjoint(packet.message.values) and packet.message.name not in NEVER_WAITS
-        self._frames += [Outgoing(other, packet.raw) for other in heard - {channel} - (self._busy if streams else set())]
+        waits = self._busy if self._streams(packet.message, time_ns) else set()
+        self._frames += [Outgoing(other, packet.raw) for other in wanted - {channel} - waits]
+
+    def _streams(self, message: Message, time_ns: int) -> bool:
+        """Whether it came a moment ago too, and does not say for whom it is. What comes seldom may be an answer: some do not say it."""
+        if message.name in NEVER_WAITS or not _TARGETS.isdisjoint(message.values):
+            return False
+        came_ns = self._routes[message.system, message.component].came_ns
+        before_ns, came_ns[message.name] = came_ns.get(message.name), time_ns
+        return before_ns is not None and time_ns - before_ns < _STREAM_NS
 
 
 def _dock_of(config: GroundConfig) -> DockRequest | None:
