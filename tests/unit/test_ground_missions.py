@@ -200,6 +200,7 @@ def test_start_that_comes_again_behind_a_mode_that_is_refused_does_not_begin_the
     world.robot.refuse[Action.SET_MODE] = "the pilot is not there"
     client.command(176, 1, 1)
     world.run(3)
+    world.robot.refuse.clear()
     client.command(300, 0)
     world.run(20)
     assert world.station.jobs() == [] and world.robot.mode[0] == Mode.AUTO

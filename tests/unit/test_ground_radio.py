@@ -71,6 +71,15 @@ def test_frame_of_the_old_protocol_is_no_longer_than_its_message_and_one_of_the_
     assert station.take(0, frame, 0, datagram=False)
 
 
+def test_frame_with_a_flag_that_nobody_here_knows_is_not_believed() -> None:
+    """As MAVLink has it: it may mean anything, also that the payload is another one."""
+    station = World().station
+    unknown = bytes([9, 0x02, *heartbeat()[3:-2]])
+    frame = b"\xfd" + unknown + checksum(unknown, mavlink.MAVLink_heartbeat_message.crc_extra).to_bytes(2, "little")
+    assert not station.take(0, frame, 0, datagram=False) and station.counts["flags"] == 1
+    assert station.take(0, heartbeat(), 0, datagram=False)
+
+
 class SlowLink:
     """A radio that carries so many bytes a tick."""
 
@@ -127,27 +136,29 @@ def test_what_a_companion_computer_streams_to_all_leaves_a_radio_its_telemetry_a
     monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address: next(links))
     companion = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     estimate = bytes(mavlink.MAVLink_vision_position_estimate_message(0, 1, 2, 3, 0.1, 0.2, 0.3, [0.1] * 21).pack(companion))
-    once_a_second = (
+    seldom = (mavlink.MAVLink_param_value_message(b"EXPOSURE", 1.0, 9, 1, 0), mavlink.MAVLink_message_interval_message(30, 100_000))
+    often = (
         mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3),
         mavlink.MAVLink_statustext_message(6, b"seen"),
         mavlink.MAVLink_command_long_message(0, 0, 400, 0, 0, 0, 0, 0, 0, 0, 0),
-        mavlink.MAVLink_param_value_message(b"EXPOSURE", 1.0, 9, 1, 0),
-        mavlink.MAVLink_message_interval_message(30, 100_000),
+        mavlink.MAVLink_manual_control_message(255, 0, 0, 0, 0, 0),
     )
+    said = {30: (*seldom, *often), 60: often}
+    """By the tick of each second."""
     with closing(side_on("radio", "cable")) as side:
         side.station.take(0, heartbeat(), 0)
         for second in range(10):
             robot.events.append(Event(6, f"second {second}", 0))
             for tick in range(100):
                 side.station.take(1, estimate, robot.tick * 10_000_000)
-                if tick == 50:
-                    side.station.take(1, b"".join(bytes(m.pack(companion)) for m in once_a_second), robot.tick * 10_000_000)
+                side.station.take(1, b"".join(bytes(m.pack(companion)) for m in said.get(tick, ())), robot.tick * 10_000_000)
                 pump(side, robot)
         assert not side.links.dropped
     parser = mavlink.MAVLink(None)
     got = Counter((m.get_srcComponent(), m.get_type()) for frame in radio.frames for m in parser.parse_buffer(frame))
     assert got[1, "STATUSTEXT"] == 10 and got[1, "HEARTBEAT"] >= 10
-    assert [got[191, message.get_type()] for message in once_a_second] == [10] * 5, "answers too, of which two name nobody"
+    assert [got[191, message.get_type()] for message in often] == [20] * len(often)
+    assert [got[191, message.get_type()] for message in seldom] == [10] * len(seldom), "answers that name nobody"
     assert got[1, "ATTITUDE"] > 20 and got[191, "VISION_POSITION_ESTIMATE"] > 20
 
 
