@@ -242,8 +242,7 @@ class GroundStation:
         arrival = Arrival(message, channel, time_ns, trusted)
         component = message.values.get("target_component", 0)
         is_for_autopilots = component in (0, COMPONENT_AUTOPILOT)
-        if not (component == COMPONENT_AUTOPILOT and target in self.services):
-            self._forward(packet, target, component, channel, time_ns)
+        self._forward(packet, target, component, channel, time_ns)
         if is_for_autopilots and not self._is_for_too_many(arrival, target):
             for number, services in self.services.items():
                 if target in (0, number):
