@@ -48,8 +48,9 @@ STILL_DENSITY = 0.0003
 NORTH_DENSITY = 1e-4
 """Of the noise of the heading before the first tag, rad^2 s: it says where north is, and so is known. What the filter else took for
 knowledge of it was noise: a bump turned the belief by a third of a circle."""
-KEPT, MOVING = np.r_[10:19, 21:25, 26:29], slice(6, 9)
-"""Of the state: rates, biases, vertical force, moment and righting, which say the same whatever the heading. Of the error: velocity."""
+KEPT, MOVING, GYROS = np.r_[10:19, 21:25, 26:29], slice(6, 9), slice(12, 15)
+"""Of the state: rates, biases, vertical force, moment and righting, which say the same whatever the heading. Of the error: velocity; gyro
+biases, of which it is as sure as before, or the next bump, that no model knows, would be taken for a bias."""
 WAY_S = 0.01
 """For which `accel_under_way` tells what a sample errs. A wrong mass errs alike in all samples of that time: more of them tell no more."""
 LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[22:25, 26:29], np.r_[21:24, 25:28], 5.0
@@ -231,10 +232,12 @@ class Estimator:
             return
         self._refused_in_row = 0
         if self._first_sight.count >= READY_AFTER:
-            kept = self._anchor.x[KEPT]
+            before, had_north = self._anchor, self._has_north
             self._start(pose)
-            self._anchor.x[KEPT], self._accepted = kept, READY_AFTER
+            self._anchor.x[KEPT], self._accepted = before.x[KEPT], READY_AFTER
             self._anchor.covariance[MOVING, MOVING] = SPEED_SIGMA**2 * np.eye(3)
+            if had_north:  # one that made its heading up is too sure of them
+                self._anchor.covariance[GYROS, GYROS] = before.covariance[GYROS, GYROS]
 
     def _advanced(self, start: Belief, to_ns: int) -> Belief:
         """The filter at `to_ns`, the inertial and depth measurements on the way fused."""

@@ -59,6 +59,13 @@ class Robot:
             estimate = self.step()
         return estimate
 
+    def turn(self, rate: np.ndarray, ticks: int) -> Estimate:
+        """Turned about its centre by something that no model knows, at `rate` (3,) rad/s, body."""
+        for _ in range(ticks):
+            self.q_wb = multiply(self.q_wb, exp(rate * PERIOD * 1e-9))
+            estimate = self.step(gyro=rate)
+        return estimate
+
     def see(self, count: int, p_wb: np.ndarray = P_WB, q_wb: np.ndarray = Q_WB) -> Estimate:
         for _ in range(count):
             estimate = self.step(tag(self.time_ns - 2 * PERIOD, p_wb, q_wb))
@@ -389,6 +396,28 @@ def test_robot_that_was_adrift_for_long_believes_ten_tags_and_not_one() -> None:
     estimate = robot.see(1, there)
     np.testing.assert_allclose(estimate.p_wb, there, atol=5e-3)
     assert estimate.rejected == 0 and estimate.tag_age_ns == 3 * PERIOD and estimate.sigma_p[0] < 0.05
+
+
+def test_robot_that_was_adrift_bumps_into_a_wall_and_still_knows_its_gyros() -> None:
+    robot, bump = Robot(), np.array([0.4, -0.3, 0.5])
+    robot.rest(20)
+    robot.see(2000)
+    robot.rest(1100)
+    robot.see(30)
+    robot.turn(bump, 50)
+    robot.turn(-bump, 50)
+    estimate = robot.rest(200)
+    np.testing.assert_allclose(difference(estimate.q_wb, robot.q_wb), 0.0, atol=0.01)
+    np.testing.assert_allclose(robot.estimator._anchor.x[13:16], 0.0, atol=0.001)
+
+
+def test_robot_that_made_its_heading_up_learns_its_gyros_when_tags_come() -> None:
+    robot, bias = Robot(), np.array([0.0, 0.0, 0.01])
+    for _ in range(6000):
+        robot.step(gyro=bias)
+    for _ in range(300):
+        estimate = robot.step(tag(robot.time_ns - 2 * PERIOD), gyro=bias)
+    np.testing.assert_allclose(difference(estimate.q_wb, Q_WB), 0.0, atol=0.005)
 
 
 def test_parted_body_that_never_saw_a_tag_stands_on() -> None:
