@@ -141,7 +141,7 @@ class Mcu:
 
     def _apply(self, command: list[float]) -> None:
         self._applied = command
-        self._world.set_command(self.module, command[: self._thrusters], True)
+        self._world.set_command(self.module, command[: self._thrusters])
 
     def _switch(self, relays: list[int]) -> None:
         self.relays = relays

@@ -136,7 +136,7 @@ class Loop:
         nothing, full = np.zeros(force_n.size), np.ones(force_n.size)
         commands(np.ascontiguousarray(force_n), full, t.forward, t.reverse, nothing, full, u)
         for module in range(len(self.body.modules)):
-            self._world.set_command(module, u[t.module == module].tolist(), True)
+            self._world.set_command(module, u[t.module == module].tolist())
 
     def _sample(self, tick: int) -> Inputs:
         """What the sensors say at SYNC, and the tags that have arrived."""

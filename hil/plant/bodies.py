@@ -292,16 +292,15 @@ def observe(bodies, modules, rates, gravity, out):
         out[m, 6] = c[b, 3] * q[m, 3] + c[b, 4] * q[m, 2] - c[b, 5] * q[m, 1] + c[b, 6] * q[m, 0]
 
 
-@compiled(types.void(F1, V3, F2, F1))
-def steered(x, nominal, rigid, out):
-    """Writes where the nominal centre of mass is (0:3), its velocity (3:6), and where the true one is (6:9), world.
+@compiled(types.void(F1, V3, F1))
+def steered(x, nominal, out):
+    """Writes where the nominal centre of mass is (0:3), and its velocity (3:6), world.
 
     Args:
-        x: (13,) state of one body; nominal: from its origin; rigid: (6, 6) its rigid mass matrix about the origin.
+        x: (13,) state of one body; nominal: from its origin.
     """
     r, place = matrix_of(x[3], x[4], x[5], x[6]), (x[0], x[1], x[2])
     v, w = (x[7], x[8], x[9]), (x[10], x[11], x[12])
-    com = times(1.0 / rigid[0, 0], (rigid[5, 1], rigid[3, 2], rigid[4, 0]))
-    at, velocity, true = plus(place, turn(r, nominal)), turn(r, plus(v, cross(w, nominal))), plus(place, turn(r, com))
+    at, velocity = plus(place, turn(r, nominal)), turn(r, plus(v, cross(w, nominal)))
     for i in range(3):
-        out[i], out[3 + i], out[6 + i] = at[i], velocity[i], true[i]
+        out[i], out[3 + i] = at[i], velocity[i]

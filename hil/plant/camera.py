@@ -92,8 +92,6 @@ class Camera:
         self._errors = [_Errors(spec, seed, index * 64 + m) for m in range(len(vehicles))]
         self._tag_errors = [_Errors(spec, seed, ALL_TAGS + (index * 64 + m) * 16 + t.id) for m, t in self._tags]
         self._before, self._before_ns = np.zeros((len(vehicles), 16)), 0
-        self.bias_m = np.zeros(3)
-        """Constant error of every position, world; a fault."""
 
     def watch(self, world: World) -> list[Sighting]:
         """Sightings of all pictures due up to the world's time. To be called at the start and after every advance."""
@@ -150,7 +148,7 @@ class Camera:
             q = rotations.multiply(rotations.multiply(np.concatenate([[0.0], sight]), q), HALF_TURN_Z)
         spec = self._spec
         sigma = (spec.tag_sigma_m, spec.tag_sigma_axis_m, math.radians(spec.tag_sigma_deg))
-        return _smear(p + self.bias_m, q, drawn.noise, axis, *sigma)
+        return _smear(p, q, drawn.noise, axis, *sigma)
 
 
 @njit("Tuple((float64[::1],float64[::1]))(float64[::1],float64[::1],float64[::1],float64[::1],float64,float64,float64)", cache=True)

@@ -72,8 +72,6 @@ class BodyTruth(NamedTuple):
     v_w: np.ndarray
     """(3,) velocity of that point, world."""
     w_b: np.ndarray
-    com_w: np.ndarray
-    """(3,) where the centre of mass, water included, really is."""
 
 
 class Arrays(NamedTuple):
@@ -157,9 +155,9 @@ class World(DockedBodies):
         self._power_magnets()
         self._step(0)
 
-    def set_command(self, module: int, u: Sequence[float] | np.ndarray, armed: bool) -> None:
-        """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call; disarmed is zero."""
-        wanted = np.array(u, dtype=np.float64) if armed else np.zeros(len(u))
+    def set_command(self, module: int, u: Sequence[float] | np.ndarray) -> None:
+        """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call."""
+        wanted = np.array(u, dtype=np.float64)
         if self._broken:
             wanted = self._as_broken(module, wanted)
         arrays = self._thrusters
@@ -299,9 +297,9 @@ class World(DockedBodies):
         """The truth about one body, by its index in `bodies`."""
         modules = self.bodies[body]
         x = self._body_arrays.state[body]
-        seen = np.empty(9)
-        steered(x, self._centres[body], self._body_arrays.rigid[body], seen)
-        return BodyTruth(self.time_ns, modules, seen[:3], x[3:7].copy(), seen[3:6], x[10:13].copy(), seen[6:])
+        seen = np.empty(6)
+        steered(x, self._centres[body], seen)
+        return BodyTruth(self.time_ns, modules, seen[:3], x[3:7].copy(), seen[3:], x[10:13].copy())
 
     def esc(self, module: int) -> np.ndarray:
         """(t, 2) speed (1/min) and current (A) of each thruster of a module; the same array until the world moves on."""

@@ -26,7 +26,7 @@ def pushes(count: int, ticks: int = TICKS) -> np.ndarray:
 def one_by_one(world: World, commands: np.ndarray) -> np.ndarray:
     rows = []
     for u in commands:
-        world.set_command(0, u, True)
+        world.set_command(0, u)
         world.advance(PERIOD_NS)
         rows.append(world.seen()[0])
     return np.array(rows)

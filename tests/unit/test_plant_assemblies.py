@@ -117,7 +117,7 @@ def test_docked_pair_starts_with_its_centre_of_mass_on_the_path() -> None:
 
 def test_docked_modules_keep_supplies_of_their_own() -> None:
     world = make_world(load_scenario("mobius-2").with_calm_world(), 0, PERIOD_NS)
-    world.set_command(1, np.full(8, 0.9), True)
+    world.set_command(1, np.full(8, 0.9))
     for _ in range(50):
         world.advance(PERIOD_NS)
     assert world.truth(1).current_a > 5.0 > world.truth(0).current_a

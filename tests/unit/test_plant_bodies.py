@@ -245,7 +245,7 @@ def test_accelerometer_feels_what_the_motion_says() -> None:
     """Specific force against numerical differences of the velocity, while the module tumbles under thrust."""
     world = ocean(vehicle(added=UNEVEN, com_m=np.array([0.01, 0.0, 0.005])), thruster_lag_s=0.08)
     world.set_motion(0, [0.2, 0.0, 0.1], [0.4, -0.5, 0.6])
-    world.set_command(0, np.array([0.5, -0.4, 0.3, 0.6, -0.5, 0.2, 0.4, -0.3]), True)
+    world.set_command(0, np.array([0.5, -0.4, 0.3, 0.6, -0.5, 0.2, 0.4, -0.3]))
     run(world, 0.5)
     before = world.truth(0)
     world.advance(PERIOD_NS)

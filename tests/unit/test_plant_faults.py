@@ -95,7 +95,7 @@ def broken(nodes: Nodes) -> list[object]:
     world, mcus = nodes.world, nodes.mcus.values()
     for mcu in mcus:
         world.set_relays(mcu.module, [1, 0, 1, 1, 1, 1])
-        world.set_command(mcu.module, [0.5] * 8, True)
+        world.set_command(mcu.module, [0.5] * 8)
     levels = world._thrusters.level[:, 0].tolist(), world._thrusters.constants[:, 0].tolist()
     supply = world._thrusters.supply[:, 1].tolist()
     told = [(m.frozen, m.leaks, m.unread) for m in mcus]

@@ -19,7 +19,7 @@ def test_a_stronger_pull_than_the_magnets_opens_the_joint() -> None:
     assert world._pull_on(world.docks.joints[0]) < 1.0
     along = VEHICLE.directions[:, 0]
     for module, sign in ((0, -1.0), (1, 1.0)):
-        world.set_command(module, np.clip(sign * along / np.abs(along).max(), -0.8, 0.8), True)
+        world.set_command(module, np.clip(sign * along / np.abs(along).max(), -0.8, 0.8))
     run(world, 0.5)
     pull = world._pull_on(world.docks.joints[0]) if world.docks.joints else np.inf
     assert pull > 15.0, "two modules pull against each other"
@@ -27,7 +27,7 @@ def test_a_stronger_pull_than_the_magnets_opens_the_joint() -> None:
     weak.docks.faces.coil[:] *= 0.2
     weak.docks.busy = False
     for module, sign in ((0, -1.0), (1, 1.0)):
-        weak.set_command(module, np.clip(sign * along / np.abs(along).max(), -0.8, 0.8), True)
+        weak.set_command(module, np.clip(sign * along / np.abs(along).max(), -0.8, 0.8))
     run(weak, 0.5)
     assert weak.bodies == [(0,), (1,)]
 
@@ -38,7 +38,7 @@ def test_pins_bear_a_turn_about_the_joint_and_magnets_a_bending() -> None:
     for axis in (3, 4):  # about the joint's normal, and across it
         world, turn = docked_pair(), np.linalg.pinv(columns)[:, axis]
         for module, sign in ((0, -0.5), (1, 0.5)):
-            world.set_command(module, sign * turn / np.abs(turn).max(), True)
+            world.set_command(module, sign * turn / np.abs(turn).max())
         run(world, 0.3)
         pulls.append(world._pull_on(world.docks.joints[0]))
     assert abs(pulls[0]) < 0.2 * pulls[1]
@@ -77,7 +77,7 @@ def test_what_touches_one_of_two_loads_their_joint_with_half_its_force() -> None
 def test_jet_on_one_of_two_loads_their_joint_as_a_hand_would() -> None:
     world = start_docked(0.6, jet_strength=0.3)
     along = VEHICLE.directions[:, 0]
-    world.set_command(2, 0.8 * along / np.abs(along).max(), True)
+    world.set_command(2, 0.8 * along / np.abs(along).max())
     run(world, 0.2)
     world._step(0)
     jet, load = world._hands[1].copy(), world._pull_on(world.docks.joints[0])

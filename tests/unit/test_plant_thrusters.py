@@ -52,7 +52,7 @@ def run(world: World, ticks: int) -> None:
 @pytest.mark.parametrize("u", [1.0, 0.4, -0.3, -1.0])
 def test_thruster_follows_its_curve_with_a_first_order_lag(u: float) -> None:
     world = still(thruster_lag_s=0.08)
-    world.set_command(0, one(u), True)
+    world.set_command(0, one(u))
     for tick in range(1, 60):
         world.advance(PERIOD_NS)
         expected = static_force(u) * (1.0 - math.exp(-0.01 * tick / 0.08))
@@ -63,22 +63,15 @@ def test_command_within_the_deadband_gives_no_force() -> None:
     world = still(deadband_low_n=0.2, deadband_high_n=0.2)
     for u, moves in [(0.08, False), (0.10, True), (-0.10, False), (-0.13, True)]:
         assert (abs(static_force(u)) > 0.2) == moves
-        world.set_command(0, one(u), True)
+        world.set_command(0, one(u))
         run(world, 1)
         assert (world.truth(0).force_n[2] != 0.0) == moves
-
-
-def test_disarmed_module_gives_no_force() -> None:
-    world = still()
-    world.set_command(0, np.ones(8), False)
-    run(world, 10)
-    assert not world.truth(0).force_n.any()
 
 
 def test_wrong_gain_scales_the_force_and_not_the_speed() -> None:
     true, wrong = still(), still(gain_spread=0.05)
     for world in (true, wrong):
-        world.set_command(0, np.full(8, 0.5), True)
+        world.set_command(0, np.full(8, 0.5))
         run(world, 5)
     ratio = wrong.truth(0).force_n / true.truth(0).force_n
     np.testing.assert_allclose(ratio, wrong.draw(0).gain)
@@ -88,7 +81,7 @@ def test_wrong_gain_scales_the_force_and_not_the_speed() -> None:
 
 def test_speed_goes_with_the_root_of_the_force() -> None:
     world = still()
-    world.set_command(0, one(-0.5), True)
+    world.set_command(0, one(-0.5))
     run(world, 5)
     rpm = CURVE.rpm_at_full * math.sqrt(static_force(-0.5) / static_force(-1.0))
     assert world.esc(0)[2, 0] == pytest.approx(-rpm, rel=1e-9)
@@ -97,7 +90,7 @@ def test_speed_goes_with_the_root_of_the_force() -> None:
 
 def test_voltage_sags_so_that_supply_and_load_agree() -> None:
     world = still(supply_resistance_ohm=0.2)
-    world.set_command(0, np.full(8, 0.5), True)
+    world.set_command(0, np.full(8, 0.5))
     run(world, 5)
     truth = world.truth(0)
     assert truth.voltage_v == pytest.approx(12.0 - 0.2 * truth.current_a, rel=1e-9)
@@ -109,7 +102,7 @@ def test_voltage_sags_so_that_supply_and_load_agree() -> None:
 
 def test_supply_gives_no_more_than_its_current() -> None:
     world = still(supply_limit=True)
-    world.set_command(0, np.ones(8), True)
+    world.set_command(0, np.ones(8))
     run(world, 5)
     truth = world.truth(0)
     assert truth.current_a == pytest.approx(10.0, rel=1e-9)
@@ -138,7 +131,7 @@ def test_each_thruster_turns_and_pushes_as_its_place_says() -> None:
     body = load_vehicle("modcube")
     for channel in range(8):
         world = still(body=body)
-        world.set_command(0, one(0.5, channel), True)
+        world.set_command(0, one(0.5, channel))
         world.advance(PERIOD_NS)
         truth, thruster = world.truth(0), body.thruster[channel]
         force = static_force(0.5)
@@ -151,13 +144,13 @@ def test_jet_pushes_the_module_in_its_way_and_no_other() -> None:
     # thruster 3 (index 2) pushes along (-1, -1, 0), so its jet leaves along (1, 1, 0)
     behind, beside = [0.4, 0.4, 399.93], [-0.4, 0.4, 399.93]
     world = still([[0.0, 0.0, 400.0], behind, beside], jet_strength=0.3)
-    world.set_command(0, one(1.0), True)
+    world.set_command(0, one(1.0))
     run(world, 2)
     pushed = world.truth(1).v_w
     assert pushed[0] > 1e-5 and pushed[0] == pytest.approx(pushed[1], rel=0.1)
     assert not world.truth(2).v_w.any()
     calm = still([[0.0, 0.0, 400.0], behind, beside], jet_strength=0.0)
-    calm.set_command(0, one(1.0), True)
+    calm.set_command(0, one(1.0))
     run(calm, 2)
     assert not calm.truth(1).v_w.any()
 
@@ -165,7 +158,7 @@ def test_jet_pushes_the_module_in_its_way_and_no_other() -> None:
 def test_jet_pushes_less_from_farther_away() -> None:
     def pushed(distance: float) -> float:
         world = still([[0.0, 0.0, 400.0], [distance, distance, 399.93]], jet_strength=0.3)
-        world.set_command(0, one(1.0), True)
+        world.set_command(0, one(1.0))
         run(world, 2)
         return float(np.linalg.norm(world.truth(1).v_w))
 
@@ -198,7 +191,7 @@ def test_same_seed_gives_the_same_world_and_another_does_not() -> None:
         world = World(
             WorldSpec(), Tank(), [load_vehicle("modcube")], [Start(np.array([0.0, 0.0, 0.4]), LEVEL)], seed, PERIOD_NS
         )
-        world.set_command(0, np.full(8, 0.2), True)
+        world.set_command(0, np.full(8, 0.2))
         run(world, 200)
         return np.concatenate(world.truth(0)[1:6])
 
@@ -270,7 +263,7 @@ def test_finer_steps_change_the_flight_by_less_than_a_micrometre() -> None:
     def flight(step_ns: int) -> np.ndarray:
         start = [Start(np.array([0.0, 0.0, 400.0]), rotations.from_euler(0.3, 0.2, 0.1))]
         world = World(WorldSpec(), OCEAN, [load_vehicle("modcube")], start, 3, PERIOD_NS, step_ns)
-        world.set_command(0, np.array([0.5, -0.4, 0.3, 0.6, -0.5, 0.2, 0.4, -0.3]), True)
+        world.set_command(0, np.array([0.5, -0.4, 0.3, 0.6, -0.5, 0.2, 0.4, -0.3]))
         run(world, 300)
         return world.truth(0).p_wm
 
