@@ -97,10 +97,9 @@ class Steering:
         parameters: Callable[[], Parameters],
         dock: DockRequest | None,
         may_steer: Callable[[int, int], bool],
-        buttons: Sequence[str] = BUTTONS,
     ) -> None:
         """`dock` is what the buttons `dock` and `undock` ask for; `may_steer`: whose sticks are taken, by system and component."""
-        self._system, self._parameters, self._dock, self._buttons = system, parameters, dock, buttons
+        self._system, self._parameters, self._dock = system, parameters, dock
         self._pilots = Pilots(system, may_steer, lambda: parameters().steering.stick_timeout_s)
         self._sticks = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self._overrides: dict[Sender, list[_Override]] = {}
@@ -151,7 +150,7 @@ class Steering:
         )
         fresh = self._pilots.freshly_pressed(arrival, m["buttons"] | m["buttons2"] << 16)
         steers = m["target"] == self._system.outbox.system and self._steer(Sticks(force, moment), arrival)
-        for number, name in enumerate(self._buttons):
+        for number, name in enumerate(BUTTONS):
             if fresh >> number & 1 and (steers or _BUTTON_ACTIONS.get(name) in STOPPING):
                 self._do(name)
 

@@ -48,7 +48,6 @@ class Subject:
     identity: Identity
     origin: Origin
     progress: Progress = field(default_factory=Progress)
-    boot_ns: int = 0
     mode_number: int | None = None
     """The client's own number of the present mode, where several name the same."""
     neutral: bool = True
@@ -72,12 +71,12 @@ class Subject:
     @property
     def time_ms(self) -> int:
         """Since start, in 32 bits: it begins anew after 49.7 days."""
-        return (self.picture.time_ns - self.boot_ns) // 1_000_000 & 0xFFFFFFFF
+        return self.picture.time_ns // 1_000_000 & 0xFFFFFFFF
 
     @property
     def time_us(self) -> int:
         """Since start."""
-        return (self.picture.time_ns - self.boot_ns) // 1_000
+        return self.picture.time_ns // 1_000
 
     @property
     def v_w(self) -> np.ndarray:
