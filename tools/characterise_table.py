@@ -103,24 +103,20 @@ class Row:
 
 def rows_of(found: Mapping[str, Capability]) -> list[Row]:
     """Rows of table1.csv in its order, then ours: normalisations, passive degrees of freedom declared, quality."""
-
-    def row(space: str, frame: str, metric: str, better: str, cells: dict[str, Cell]) -> Row:
-        return Row(space, frame, metric, better, cells)
-
     rows: list[Row] = []
     for frame in FRAMES:
         power = {name: (c.power[frame], c.power_shape[frame]) for name, c in found.items()}
         rows += [
-            row("power", frame, "dirichlet_energy", "lower", {n: s.dirichlet for n, (_, s) in power.items()}),
-            row("power", frame, "willmore_energy", "lower", {n: s.willmore for n, (_, s) in power.items()}),
-            row("power", frame, "total_power_w", "lower", {n: float(p.power_w.mean()) for n, (p, _) in power.items()}),
-            row("power", frame, "thrust_variance", "lower", {n: p.variance for n, (p, _) in power.items()}),
+            Row("power", frame, "dirichlet_energy", "lower", {n: s.dirichlet for n, (_, s) in power.items()}),
+            Row("power", frame, "willmore_energy", "lower", {n: s.willmore for n, (_, s) in power.items()}),
+            Row("power", frame, "total_power_w", "lower", {n: float(p.power_w.mean()) for n, (p, _) in power.items()}),
+            Row("power", frame, "thrust_variance", "lower", {n: p.variance for n, (p, _) in power.items()}),
         ]
         reach = {name: c.reach[frame][TABLE_NORMALISATION] for name, c in found.items()}
         rows += [
-            row("wrench", frame, "dirichlet_energy", "lower", {n: _energy(r, "dirichlet") for n, r in reach.items()}),
-            row("wrench", frame, "willmore_energy", "lower", {n: _energy(r, "willmore") for n, r in reach.items()}),
-            row("wrench", frame, "max_inscribed_ellipsoid_volume", "higher", {n: _volume(r) for n, r in reach.items()}),
+            Row("wrench", frame, "dirichlet_energy", "lower", {n: _energy(r, "dirichlet") for n, r in reach.items()}),
+            Row("wrench", frame, "willmore_energy", "lower", {n: _energy(r, "willmore") for n, r in reach.items()}),
+            Row("wrench", frame, "max_inscribed_ellipsoid_volume", "higher", {n: _volume(r) for n, r in reach.items()}),
         ]
     return rows + _further_rows(found)
 

@@ -111,9 +111,6 @@ def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
                 yield from ast.walk(root)
 
 
-Change = tuple[str, "object"]
-
-
 def _changes(node: ast.AST) -> list[tuple[str, Callable[[], object]]]:
     """What can be changed at a node: a name, and the function that changes it in place."""
     found: list[tuple[str, Callable[[], object]]] = []
@@ -148,12 +145,11 @@ def _changes(node: ast.AST) -> list[tuple[str, Callable[[], object]]]:
 def _cells(call: ast.Call) -> list[tuple[str, Callable[[], object]]]:
     """Cells of a table's row."""
     found: list[tuple[str, Callable[[], object]]] = []
-    for i, cell in enumerate(call.args):
+    for cell in call.args:
         if isinstance(cell, ast.Attribute) and isinstance(cell.value, ast.Name) and CELLS.get(cell.value.id, cell.attr) != cell.attr:
             found.append((f"{ast.unparse(cell)} -> {CELLS[cell.value.id]}", lambda c=cell: setattr(c, "attr", CELLS[c.value.id])))
         elif isinstance(cell, ast.Name) and cell.id in STATES and isinstance(call.func, ast.Name) and call.func.id == "Transition":
             found.append((f"{cell.id} -> {STATES[cell.id]}", lambda c=cell: setattr(c, "id", STATES[c.id])))
-        del i
     return found
 
 
