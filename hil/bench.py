@@ -27,6 +27,7 @@ from hil.faults import Faults
 from hil.force_script import ForceScript
 from hil.mode_script import ModeScript
 from hil.nodes import Nodes, make_nodes
+from hil.orders import Orders
 from hil.scenario import Scenario, make_world
 from hil.script import Script
 from hil.truth_log import TruthRecorder
@@ -34,10 +35,7 @@ from hil.truth_log import TruthRecorder
 DEFAULT_BUS = "virtual:modcube"
 LOOK_S = 0.005
 """Between two looks at a bus that is listened to: SYNC comes at 50 Hz at least."""
-Orders = Script | DockScript | ForceScript | ModeScript
-
-
-SCRIPTS: dict[str, type[Orders]] = {"dock": DockScript, "force": ForceScript, "mode": ModeScript}
+SCRIPTS: dict[str, Callable[[Scenario, Fleet], Orders]] = {"dock": DockScript, "force": ForceScript, "mode": ModeScript}
 """By kind of task; a trajectory's is Script."""
 
 

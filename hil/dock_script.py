@@ -13,11 +13,10 @@ from firmware_py.core.types import Action, DockRequest, Mode, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare import paths
+from hil.orders import Orders, is_time_to_arm
 from hil.scenario import Scenario, Step
-from hil.scenario_rules import ARM_FROM_S
 from hil.script import refuse_outside
 
-ARM_EVERY_S = 0.5
 NOBODY = -1
 """Index of a module that a step is not about."""
 SPEED_M_S = 0.05
@@ -26,7 +25,7 @@ AFTERWARDS_NS = 3_000_000_000
 """The run goes on so long after the last step: what was joined or parted must stay so."""
 
 
-class DockScript:
+class DockScript(Orders):
     """The requests of one run with [[step]]s. Raises DescriptionError for a strip that leaves the tank."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
@@ -41,9 +40,7 @@ class DockScript:
         self._armed: set[int] = set()
         """Modules that have been."""
         self._over_ns: int | None = None
-        self.begin_ns = round(scenario.task.settle_s * 1e9)
-        self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
-        self.ticks = self.end_ns // fleet.period_ns
+        self.ticks = scenario.task.end_ns // fleet.period_ns
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
         """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
@@ -51,7 +48,7 @@ class DockScript:
             return []
         self._bodies = _bodies_of(last, len(self._fleet.module))
         asked = self._arm(time_ns, last)
-        if time_ns < self.begin_ns:
+        if time_ns < self._scenario.task.begin_ns:
             return asked
         if any([self._is_given_up(r, last) for r in self._running]):  # the steps after it have lost their sense
             self._running, self._steps = [], []
@@ -72,15 +69,13 @@ class DockScript:
     def _arm(self, time_ns: int, last: Outputs) -> list[Request]:
         """Arms every body once; then each hovers level where it is, whichever way it hung until it was armed."""
         asked: list[Request] = []
-        every = round(ARM_EVERY_S * self._fleet.rate_hz)
-        due = time_ns >= ARM_FROM_S * 1e9 and (time_ns // self._fleet.period_ns) % every == 0
         for record in last.records:
             if record.body not in self._armed:
                 if record.state in ARMED:
                     self._armed |= self._bodies[record.body]
                     here = rest_at(record.estimate.p_wb, heading(record.estimate.q_wb))
                     asked.append(Request(Action.HOLD, record.body, here))
-                elif due:
+                elif is_time_to_arm(time_ns, self._fleet):
                     asked.append(Request(Action.ARM, record.body))
         return asked
 

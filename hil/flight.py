@@ -111,9 +111,8 @@ def judge_logs(
         lost_share: of the ticks, which a log may lack.
     """
     whole = read_flight(folder)
-    period_ns, duration_ns = period_of(whole.ticks), round(scenario.task.duration_s * 1e9)
-    begin_ns = begin_of(scenario, whole)
-    flight = whole.between(begin_ns, begin_ns + duration_ns)
+    period_ns, begin_ns = period_of(whole.ticks), begin_of(scenario, whole)
+    flight = whole.between(begin_ns, begin_ns + scenario.task.duration_ns)
     share = len(flight.firmware["tick"]) / len(whole.firmware["tick"])
     wanted = wanted_in(scenario, flight, begin_ns)
     metrics = flight_metrics(flight, wanted=wanted, wall_s=wall_s * share, deadline_misses=deadline_misses)
@@ -170,7 +169,7 @@ def as_wanted(scenario: Scenario, flight: Flight) -> Flight:
     """The same with what the task wants in place of the firmware's own set-points, in the ticks that are judged by it."""
     begin_ns = begin_of(scenario, flight)
     time_ns = flight.firmware["time_ns"]
-    judged = (time_ns >= begin_ns) & (time_ns <= begin_ns + round(scenario.task.duration_s * 1e9))
+    judged = (time_ns >= begin_ns) & (time_ns <= begin_ns + scenario.task.duration_ns)
     if (wanted := wanted_in(scenario, flight, begin_ns)) is None:
         return flight
     points = {"setpoint_p_wb": wanted.p_wb, "setpoint_q_wb": wanted.q_wb}
@@ -186,13 +185,12 @@ def begin_of(scenario: Scenario, flight: Flight) -> int:
 
 def ticks_of(scenario: Scenario, period_ns: int) -> int:
     """Ticks of the task, both ends among them: the one in which it begins and the last of the run."""
-    end_ns = round(scenario.task.settle_s * 1e9) + round(scenario.task.duration_s * 1e9)
-    return end_ns // period_ns - _first_tick(scenario, period_ns) + 1
+    return scenario.task.end_ns // period_ns - _first_tick(scenario, period_ns) + 1
 
 
 def _first_tick(scenario: Scenario, period_ns: int) -> int:
     """The first tick that is not before the task."""
-    return -(-round(scenario.task.settle_s * 1e9) // period_ns)
+    return -(-scenario.task.begin_ns // period_ns)
 
 
 def start_of(flight: Flight) -> int:

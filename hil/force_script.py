@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Mode, Outputs, Request, Sticks
 from firmware_py.description.fleet import Fleet
+from hil.orders import Orders, is_time_to_arm
 from hil.scenario import Scenario
 from hil.scenario_rules import ARM_FROM_S
 
-ARM_EVERY_S = 0.5
 STICKS_EVERY_S = 0.02
 WAVES = ((0.6, 0.1), (0.4, 0.25))
 """Share and frequency (Hz) of the sines that make up the trajectory."""
@@ -24,16 +24,14 @@ def stick_at(t_s: float, amplitude: float) -> float:
     return amplitude * sum(share * math.sin(2.0 * math.pi * hertz * t_s) for share, hertz in WAVES)
 
 
-class ForceScript:
+class ForceScript(Orders):
     """The requests of one run: the same stick for every body, so the same share of what it can."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         self._fleet, self._task = fleet, scenario.task
         self._leaders = [members[0] for members in scenario.groups]
         self._manual: set[int] = set()
-        self.begin_ns = round(scenario.task.settle_s * 1e9)
-        self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
-        self.ticks = self.end_ns // fleet.period_ns
+        self.ticks = scenario.task.end_ns // fleet.period_ns
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
         """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
@@ -41,11 +39,11 @@ class ForceScript:
             return []
         tick, rate = time_ns // self._fleet.period_ns, self._fleet.rate_hz
         asked: list[Request] = []
-        if tick % round(ARM_EVERY_S * rate) == 0:
+        if is_time_to_arm(time_ns, self._fleet):
             asked += [Request(Action.ARM, r.body) for r in last.records if r.state not in ARMED]
-        manual = time_ns >= self.begin_ns - MANUAL_BEFORE_S * 1e9
+        manual = time_ns >= self._task.begin_ns - MANUAL_BEFORE_S * 1e9
         if manual and tick % max(1, round(STICKS_EVERY_S * rate)) == 0:
-            moved = 0.0 if time_ns < self.begin_ns else stick_at(1e-9 * (time_ns - self.begin_ns), self._task.stick)
+            moved = 0.0 if time_ns < self._task.begin_ns else stick_at(1e-9 * (time_ns - self._task.begin_ns), self._task.stick)
             sticks = Sticks((moved, 0.0, 0.0), (0.0, 0.0, 0.0))
             for body in self._leaders:
                 asked.append(Request(Action.STICKS, body, sticks))
@@ -53,7 +51,3 @@ class ForceScript:
                     self._manual.add(body)
                     asked.append(Request(Action.SET_MODE, body, Mode.MANUAL))
         return asked
-
-    def is_over(self, time_ns: int) -> bool:
-        """The trajectory is flown to its end."""
-        return False

@@ -12,10 +12,9 @@ from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Mode, Outputs, Request, Setpoint, Sticks
 from firmware_py.description.fleet import Fleet
 from firmware_py.prepare import paths
+from hil.orders import Orders, is_time_to_arm
 from hil.scenario import Scenario
-from hil.scenario_rules import ARM_FROM_S
 
-ARM_EVERY_S = 0.5
 STREAM_EVERY_S = 0.1
 """Sticks and set-points."""
 PILOTED = (Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD)
@@ -24,37 +23,30 @@ RADIUS_M, TURN_S = 0.25, 15.0
 """Circle of AUTO and of GUIDED's set-points, and the time of one round."""
 
 
-class ModeScript:
+class ModeScript(Orders):
     """The requests of one run. Once armed it never arms again: what a fault has disarmed stays so."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         self._fleet, self._task = fleet, scenario.task
         self._mode = Mode[scenario.task.mode]
-        self.begin_ns = round(scenario.task.settle_s * 1e9)
-        self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
-        self.ticks = self.end_ns // fleet.period_ns
+        self.ticks = scenario.task.end_ns // fleet.period_ns
         self._armed = self._begun = False
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
         """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
-        if last is None or time_ns < ARM_FROM_S * 1e9:
+        if last is None:
             return []
-        tick, rate = time_ns // self._fleet.period_ns, self._fleet.rate_hz
         self._armed = self._armed or last.records[0].state in ARMED
         if not self._armed:
-            return [Request(Action.ARM)] if tick % round(ARM_EVERY_S * rate) == 0 else []
-        if time_ns < self.begin_ns:
+            return [Request(Action.ARM)] if is_time_to_arm(time_ns, self._fleet) else []
+        if time_ns < self._task.begin_ns:
             return []
         asked = [] if self._begun else self._begin()
         self._begun = True
-        if tick % max(1, round(STREAM_EVERY_S * rate)) == 0:
-            asked += self._stream(1e-9 * (time_ns - self.begin_ns)) if time_ns < self._task.pilot_until_s * 1e9 else []
+        if time_ns // self._fleet.period_ns % max(1, round(STREAM_EVERY_S * self._fleet.rate_hz)) == 0:
+            asked += self._stream(1e-9 * (time_ns - self._task.begin_ns)) if time_ns < self._task.pilot_until_s * 1e9 else []
             asked += [Request(Action.GROUND_ALIVE)] if time_ns < self._task.ground_until_s * 1e9 else []
         return asked
-
-    def is_over(self, time_ns: int) -> bool:
-        """The time is flown to its end."""
-        return False
 
     def _begin(self) -> list[Request]:
         if self._mode == Mode.AUTO:

@@ -36,6 +36,7 @@ from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare.paths import circle
 from hil.bench import Bench, open_bench
 from hil.fault_table import ROWS
+from hil.orders import Orders
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
 from hil.scenario import load_scenario
@@ -56,7 +57,7 @@ SOON = 2
 """Ticks within which a request is acted on."""
 
 
-class RandomOperator:
+class RandomOperator(Orders):
     """The orders of one flight of a fleet; seeded."""
 
     def __init__(self, rng: np.random.Generator, modules: int, ticks: int) -> None:
@@ -64,10 +65,6 @@ class RandomOperator:
         self.asked = dict.fromkeys(Action, -math.inf)
         """Tick in which each action was asked for last."""
         self._rng, self._modules, self._is_there = rng, modules, True
-
-    def is_over(self, time_ns: int) -> bool:
-        """The time is flown to its end."""
-        return False
 
     def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
         """What is asked for in the tick after `last`."""
@@ -201,7 +198,7 @@ def fly_with_random_operator(seed: int, duration_s: float) -> Operated:
     operator = RandomOperator(rng, len(scenario.module), operated.ticks)
     with ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, Parameters(), f"virtual:operator{seed}")
-        bench.script = operator  # type: ignore[assignment]
+        bench.script = operator
         before: dict[int, int] = {}
 
         def watch(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:

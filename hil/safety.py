@@ -25,6 +25,7 @@ from hil.bench import fly_scenario, open_bench
 from hil.fault_table import ROWS
 from hil.flight import wanted_in
 from hil.metrics import Poses, flight_metrics, rotation_vectors
+from hil.orders import Orders
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
 from hil.scenario import MODES, Scenario, load_scenario
@@ -46,9 +47,8 @@ def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None) -
 
 def in_task(scenario: Scenario, flight: Flight) -> tuple[Flight, Poses]:
     """The ticks of the task, and where its path wants the body in each: not the firmware's own set-point, which may be any."""
-    begin_ns = round(scenario.task.settle_s * 1e9)
-    part = flight.between(begin_ns, round(scenario.duration_s * 1e9))
-    wanted = wanted_in(scenario, part, begin_ns)
+    part = flight.between(scenario.task.begin_ns, scenario.task.end_ns)
+    wanted = wanted_in(scenario, part, scenario.task.begin_ns)
     assert wanted is not None, scenario.task.kind
     return part, wanted
 
@@ -92,7 +92,7 @@ def spiral_with(broken: Sequence[int], kind: str = "thruster_dead", value: float
         for text, at in zip(whole.events["text"], whole.events["log_time"], strict=True)
         if (found := LEFT_OUT.search(str(text)))
     }
-    after = whole.between(round(at_s * 1e9), round(base.duration_s * 1e9))
+    after = whole.between(round(at_s * 1e9), base.task.end_ns)
     return ThrusterFlight(
         float(np.sqrt(np.mean(off[kept] ** 2))), float(off[kept].max()), float(turn[kept].max()),
         tuple(_found_after(after, index, left_out) for index in broken), tuple(sorted(set(left_out) - set(broken))),
@@ -217,7 +217,7 @@ def fly_to_estop(seed: int) -> StoppedFlight:
 
     with ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, Parameters(), f"virtual:estop{seed}")
-        bench.script = _Nagging(bench.script, rng, at_s, by_frame)  # type: ignore[assignment]
+        bench.script = _Nagging(bench.script, rng, at_s, by_frame)
         bench.fly([watch])
     return StoppedFlight(int(state["ticks"]), int(state["violations"]), bool(state["was_armed"]))
 
@@ -229,7 +229,7 @@ OWN_FIGURES = ("process_killed", "estop")
 class _Nagging:
     """A script, and somebody who from the e-stop on asks for everything but its release; and at `estop_s` for it, unless it is pressed."""
 
-    def __init__(self, script: Any, rng: np.random.Generator, estop_s: float, is_pressed: bool) -> None:
+    def __init__(self, script: Orders, rng: np.random.Generator, estop_s: float, is_pressed: bool) -> None:
         self._script, self._rng, self._estop_s, self._is_asked = script, rng, estop_s, is_pressed
         self.ticks, self.is_over = script.ticks, script.is_over
 

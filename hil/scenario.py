@@ -134,6 +134,21 @@ class Task:
         help="hover: place; spiral: bottom of its axis; moebius: centre",
     )
 
+    @property
+    def begin_ns(self) -> int:
+        """When it begins, since the start of the run."""
+        return round(self.settle_s * 1e9)
+
+    @property
+    def duration_ns(self) -> int:
+        """How long it takes."""
+        return round(self.duration_s * 1e9)
+
+    @property
+    def end_ns(self) -> int:
+        """When it ends, and the run with it."""
+        return self.begin_ns + self.duration_ns
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Polycube:

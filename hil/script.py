@@ -20,14 +20,12 @@ from firmware_py.description.schema import DescriptionError, frozen_array
 from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble_fleet
 from firmware_py.prepare.waypoints import Mission, read_mission
+from hil.orders import Orders, is_time_to_arm
 from hil.scenario import Scenario, Task
-from hil.scenario_rules import ARM_FROM_S
 from hil.starts import hull_levers, in_wall
 
 MOEBIUS_RAMP_SHARE = 0.25
 """Share of the time over which the speed rises, and falls again: 0.25 keeps the peak at 4/3 of the mean, so drag errors stay small."""
-ARM_EVERY_S = 0.5
-"""Then again so often until it is granted."""
 APART_M, APART_DEG = 0.01, 1.0
 """Between the first waypoint and the start: what a spreadsheet may round, and no move of its own before the task."""
 LOOKS = 500
@@ -36,39 +34,31 @@ LONGER_S = 1e-6
 """By which rounding may make a path longer than its task."""
 
 
-class Script:
+class Script(Orders):
     """The requests of one run. Raises DescriptionError for a path that leaves the tank and a file of waypoints that cannot be flown."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         self._fleet = fleet
         self._task = scenario.task
         start = scenario.module[0].start
-        self.start_pose = rest_at(np.array(start.p_wm, dtype=float), np.array(start.q_wm, dtype=float))
-        self.trajectory = TASKS[scenario.task.kind](scenario.task, self.start_pose, fleet)
+        self.trajectory = TASKS[scenario.task.kind](scenario.task, rest_at(start.p_wm, start.q_wm), fleet)
         refuse_outside(self.trajectory, scenario)
         refuse_in_wall(self.trajectory, scenario)
-        self.begin_ns = round(scenario.task.settle_s * 1e9)
-        self.end_ns = self.begin_ns + round(scenario.task.duration_s * 1e9)
-        self.ticks = self.end_ns // fleet.period_ns
+        self.ticks = scenario.task.end_ns // fleet.period_ns
         self._armed = False
         self._begun = False
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
         """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
-        if time_ns >= self.begin_ns and not self._begun:
+        if time_ns >= self._task.begin_ns and not self._begun:
             self._begun = True
             return [Request(Action.TRACK, 0, self.trajectory)]
-        if self._armed or last is None or time_ns < ARM_FROM_S * 1e9:
+        if self._armed or last is None:
             return []
         if last.records[0].state in ARMED:
             self._armed = True
             return [Request(Action.HOLD, 0, self.trajectory.sample(0.0))]
-        every = round(ARM_EVERY_S * self._fleet.rate_hz)
-        return [Request(Action.ARM)] if (time_ns // self._fleet.period_ns) % every == 0 else []
-
-    def is_over(self, time_ns: int) -> bool:
-        """Whether the run may end before its time; a trajectory is flown to its end."""
-        return False
+        return [Request(Action.ARM)] if is_time_to_arm(time_ns, self._fleet) else []
 
 
 def refuse_outside(path: Trajectory, scenario: Scenario) -> None:

@@ -30,6 +30,7 @@ from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.rate_keeper import RateKeeper, absolute_sleeper
 from firmware_py.runtime.realtime import GROUND_PRIORITY, TICK_PRIORITY, quiet_garbage, real_time
 from hil.bench import open_bench
+from hil.orders import Orders
 from hil.scenario import load_scenario
 
 RATE_HZ = 50
@@ -47,18 +48,15 @@ class Ticks:
     def __init__(self) -> None:
         self._inputs: list[Inputs] = []
 
-        class Script:
+        class Script(Orders):
             ticks = RECORDED_TICKS
 
             def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
                 return []
 
-            def is_over(self, time_ns: int) -> bool:
-                return False
-
         with ExitStack() as stack:
             bench = open_bench(stack, load_scenario("hover"), 0, Parameters())
-            bench.script = Script()  # type: ignore[assignment]
+            bench.script = Script()
             bench.fly([lambda received, sent, given, outputs: self._inputs.append(given)])
         self.firmware: Firmware = bench.firmware
         self._number = itertools.count(RECORDED_TICKS + 1)

@@ -61,7 +61,7 @@ def flight() -> tuple[Pilot, np.ndarray, np.ndarray]:
         bench = open_bench(stack, load_scenario("mobius-2"), 0, Parameters())
         station = GroundStation(GroundConfig(), bench.fleet, Parameters())
         pilot = Pilot(station)
-        bench.script = pilot  # type: ignore[assignment]
+        bench.script = pilot
 
         def observe(received: object, sent: object, inputs: Inputs, outputs: Outputs) -> None:
             station.observe(inputs, outputs, bench.firmware.pipeline.bodies)

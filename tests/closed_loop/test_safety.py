@@ -124,7 +124,7 @@ def fly(scenario: str, seconds: float, fault: Fault, prepare: Callable[[Bench], 
         bench = open_bench(stack, dataclasses.replace(load_scenario(scenario), fault=(fault,)), 1, Parameters(), "virtual:one-fault")
         prepare(bench)
         script = SimpleNamespace(ticks=round(100 * seconds), is_over=lambda time_ns: False, requests=requests)
-        bench.script = script  # type: ignore[assignment]
+        bench.script = script
         bench.fly([lambda received, sent, inputs, outputs: watch(bench, outputs)])
 
 

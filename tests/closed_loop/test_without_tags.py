@@ -59,7 +59,7 @@ class Flight:
         self.words: list[str] = []
         with ExitStack() as stack:
             bench = open_bench(stack, scenario, seed, Parameters(), "virtual:without-tags")
-            bench.script = pilot  # type: ignore[assignment]
+            bench.script = pilot
 
             def watch(received: list[BusFrame], sent: list[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
                 self.truth.append(bench.nodes.world.body_truth(0))

@@ -207,7 +207,7 @@ def test_wait_is_about_no_module(load: Load) -> None:
     renumbered = dataclasses.replace(scenario, module=tuple(dataclasses.replace(m, number=m.number + 2) for m in scenario.module))
     script = DockScript(renumbered, fleet_of(renumbered, "virtual:wait", 100))
     nothing = Outputs(tick=1, time_ns=0, modules=[], estop=False, events=[], records=[])
-    begin_ns = script.begin_ns
+    begin_ns = scenario.task.begin_ns
     ends_ns = begin_ns + round(1e9 * scenario.step[0].duration_s)
     for time_ns in (begin_ns, ends_ns, ends_ns + AFTERWARDS_NS):
         assert script.requests(time_ns, nothing) == []
