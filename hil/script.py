@@ -83,7 +83,7 @@ def refuse_in_wall(path: Trajectory, scenario: Scenario) -> None:
 
 
 def _hover(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
-    return paths.Hold(paths.at_rest(task.centre_m, start.q_wb), task.duration_s)
+    return paths.Hold(rest_at(np.array(task.centre_m), start.q_wb), task.duration_s)
 
 
 def _spiral(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:

@@ -30,12 +30,6 @@ class Hold:
         return self.setpoint
 
 
-def at_rest(p_wb: Sequence[float] | np.ndarray, q_wb: Sequence[float] | np.ndarray = (1.0, 0.0, 0.0, 0.0)) -> Setpoint:
-    """Set-point without motion."""
-    q = rotations.normalise(np.array(q_wb, dtype=np.float64))
-    return Setpoint(np.array(p_wb, dtype=np.float64), q, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-
-
 @njit("UniTuple(float64, 3)(float64, float64)", cache=True)
 def progress(tau, ramp):  # type: ignore[no-untyped-def]
     """Share of the way, its first and second derivative, at the share `tau` of the time (0 to 1), rest to rest.

@@ -17,6 +17,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body
+from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Setpoint
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
@@ -34,6 +35,7 @@ from firmware_py.prepare.snap_thrust import wrenches
 from tests.unit.capability_layouts import ROOT
 
 PUSH = np.array([[20.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
+UNDER_WATER = rest_at(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0, 0.0]))
 TABLE1_COLUMNS = "space,frame,metric,better"
 
 
@@ -100,8 +102,8 @@ def wrench_of(body: Body, wanted: Setpoint) -> np.ndarray:
 
 def test_standing_still_needs_no_wrench_and_drag_needs_one() -> None:
     body = assemble_vehicle(load_vehicle("bluerov2_heavy"))
-    assert wrench_of(body, paths.at_rest([0.0, 0.0, 1.0])) == pytest.approx(np.zeros(6))
-    moving = paths.at_rest([0.0, 0.0, 1.0])._replace(v_w=np.array([0.5, 0.0, 0.0]))
+    assert wrench_of(body, UNDER_WATER) == pytest.approx(np.zeros(6))
+    moving = UNDER_WATER._replace(v_w=np.array([0.5, 0.0, 0.0]))
     assert wrench_of(body, moving) == pytest.approx([13.7 * 0.5 + 141.0 * 0.25, 0, 0, 0, 0, 0])
 
 
@@ -109,7 +111,7 @@ def test_steady_circle_asks_for_the_pull_towards_its_middle_and_for_drag() -> No
     """With added mass, m v^2 / r; the robot turns with its way, so nothing else changes in its own frame."""
     body, attitude = assemble_vehicle(load_vehicle("modcube")), Rotation.from_euler("xyz", [0.4, -0.3, 1.1])
     body, v, w = dataclasses.replace(body, righting=np.zeros(3)), np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.0, 0.8])
-    circling = paths.at_rest([0.0, 0.0, 1.0])._replace(
+    circling = UNDER_WATER._replace(
         q_wb=attitude.as_quat()[[3, 0, 1, 2]], v_w=attitude.apply(v), w_b=w, a_w=attitude.apply(np.cross(w, v))
     )
     half_rho = 0.5 * WATER_DENSITY
@@ -121,7 +123,7 @@ def test_steady_circle_asks_for_the_pull_towards_its_middle_and_for_drag() -> No
 def test_trajectory_asks_for_momentums_change() -> None:
     """Without drag, wrench over time adds up to momentum: a line from rest to rest gives none in sum."""
     body = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
-    line = paths.line(paths.at_rest([0.0, 0.0, 1.0]), paths.at_rest([1.0, 0.5, 1.0]), 10.0)
+    line = paths.line(UNDER_WATER, UNDER_WATER._replace(p_wb=np.array([1.0, 0.5, 1.0])), 10.0)
     forces = wrenches_along(line, body, 201)
     first, last = forces[:100], forces[101:]
     assert first[:, 0].sum() > 0.0 > last[:, 0].sum() - first[:, 0].sum()

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from firmware_py.core import rotations
-from firmware_py.core.setpoint import Trajectory
+from firmware_py.core.setpoint import Trajectory, rest_at
 from firmware_py.description.schema import DescriptionError
 from firmware_py.prepare import paths
-from firmware_py.prepare.paths import at_rest
 from firmware_py.prepare.waypoints import read_mission
 
 TILTED = np.array([0.5, 0.5, -0.5, 0.5])
+START = rest_at(np.zeros(3), TILTED)
+END = rest_at(np.array([1.0, 2.0, 3.0]), rotations.normalise(np.array([-0.1, 0.2, 0.7, 0.4])))
 MAKERS: dict[str, Callable[[], Trajectory]] = {
     "spiral": lambda: paths.spiral((0.65, 0.6, 0.55), 0.3, 0.4, 2.0, 40.0, 0.7, TILTED),
     "circle": lambda: paths.circle((1.0, 2.0, 0.5), 0.8, 1.5, 30.0),
@@ -21,7 +22,7 @@ MAKERS: dict[str, Callable[[], Trajectory]] = {
     "moebius": lambda: paths.moebius((0.0, 0.0, 1.5)),
     "moebius, long cruise": lambda: paths.moebius((0.0, 0.0, 1.5), ramp_share=0.1, attitude=TILTED),
     "lissajous": lambda: paths.lissajous((0, 0, 1), (1, 0.5, 0.3), (1, 2, 3), 30.0, (0.1, 0.2, 0.3), turning=(1, 0.5)),
-    "line": lambda: paths.line(at_rest((0, 0, 0), TILTED), at_rest((1, 2, 3), (-0.1, 0.2, 0.7, 0.4)), 5.0),
+    "line": lambda: paths.line(START, END, 5.0),
 }
 
 
@@ -111,14 +112,13 @@ def test_robot_looks_along_its_circle() -> None:
 
 
 def test_line_arrives_at_its_pose_on_the_shortest_way() -> None:
-    start, end = at_rest((0, 0, 0), TILTED), at_rest((1, 2, 3), (-0.1, 0.2, 0.7, 0.4))
-    line = paths.line(start, end, 5.0)
+    line = paths.line(START, END, 5.0)
     arrived = line.sample(5.0)
-    np.testing.assert_allclose(arrived.p_wb, end.p_wb, atol=1e-12)
-    np.testing.assert_allclose(rotations.difference(arrived.q_wb.copy(), end.q_wb), 0.0, atol=1e-12)
-    turned = rotations.difference(line.sample(2.5).q_wb.copy(), start.q_wb)
-    np.testing.assert_allclose(turned, 0.5 * rotations.difference(end.q_wb, start.q_wb), atol=1e-12)
-    np.testing.assert_allclose(paths.line(start, start, 1.0).sample(0.5).q_wb, start.q_wb, atol=1e-12)
+    np.testing.assert_allclose(arrived.p_wb, END.p_wb, atol=1e-12)
+    np.testing.assert_allclose(rotations.difference(arrived.q_wb.copy(), END.q_wb), 0.0, atol=1e-12)
+    turned = rotations.difference(line.sample(2.5).q_wb.copy(), START.q_wb)
+    np.testing.assert_allclose(turned, 0.5 * rotations.difference(END.q_wb, START.q_wb), atol=1e-12)
+    np.testing.assert_allclose(paths.line(START, START, 1.0).sample(0.5).q_wb, START.q_wb, atol=1e-12)
 
 
 @pytest.mark.parametrize("ramp", [0.0, 0.6, -1.0])

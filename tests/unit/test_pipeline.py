@@ -8,11 +8,12 @@ import pytest
 from firmware_py.core.body import Body
 from firmware_py.core.failsafes import Level
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
+from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Action, Mode, ModuleInputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
-from firmware_py.prepare.paths import at_rest, line
+from firmware_py.prepare.paths import line
 from tests.unit.tanks import DT, PERIOD, START, Tank, has_power, single
 
 
@@ -79,8 +80,8 @@ def test_robot_follows_a_path_to_its_end(tank: Tank) -> None:
     tank.run(0.5)
     tank.run(0.5, Request(Action.ARM))
     x = tank.states[0]
-    goal = at_rest(x[:3] + np.array([0.4, -0.3, 0.2]), from_euler(0.0, 0.5, 1.5))
-    path = line(at_rest(x[:3], x[3:7]), goal, 5.0)
+    goal = rest_at(x[:3] + np.array([0.4, -0.3, 0.2]), from_euler(0.0, 0.5, 1.5))
+    path = line(rest_at(x[:3], x[3:7]), goal, 5.0)
     tank.run(7.0, Request(Action.TRACK, 0, path))
     first = len(tank.outputs) - 700
     errors = [
@@ -105,7 +106,7 @@ def test_force_that_the_limiter_took_is_not_believed_in() -> None:
     tank = Tank([single()], Parameters().replace("limiter.force_share", 0.1))
     tank.run(0.5)
     tank.run(0.3, Request(Action.ARM))
-    tank.run(2.0, Request(Action.HOLD, 0, at_rest(tank.states[0][:3] + np.array([1.0, 0.0, 0.0]), START)))
+    tank.run(2.0, Request(Action.HOLD, 0, rest_at(tank.states[0][:3] + np.array([1.0, 0.0, 0.0]), START)))
     record = tank.outputs[-1].records[0]
     assert np.linalg.norm(record.wrench[:3]) > 5.0 > 4.0 > np.linalg.norm(record.thrust.achieved[:3])
     assert np.linalg.norm(record.estimate.force_w) < 0.5
@@ -226,7 +227,7 @@ def test_mistake_in_the_body_shows_in_the_flight(mistake: str) -> None:
     tank = Tank([body], believed=[spoilt(body, mistake)])
     tank.run(0.5)
     tank.run(0.5, Request(Action.ARM))
-    goal = at_rest(np.array([1.0, 0.0, 0.8]), START)
+    goal = rest_at(np.array([1.0, 0.0, 0.8]), START)
     tank.run(4.0, Request(Action.HOLD, 0, goal))
     off = np.linalg.norm(tank.states[0][:3] - goal.p_wb)
     turned = np.linalg.norm(difference(tank.states[0][3:7].copy(), goal.q_wb))
