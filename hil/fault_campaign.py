@@ -22,7 +22,7 @@ from firmware_py.description.vehicle import load_vehicle
 from hil.bench import fly_scenario
 from hil.fault_table import AT_S, NUMBER, PLACED, ROWS, Row
 from hil.flight import LOGS
-from hil.metrics import rotation_vectors
+from hil.metrics import errors
 from hil.replaceable import check_replaceable, is_json_with, made
 from hil.scenario import MODES, Scenario, load_scenario
 from hil.signals import Flight, read_flight
@@ -73,7 +73,7 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Any) -> Cell:
     events = zip(flight.events["text"], flight.events["log_time"] * 1e-9 - AT_S, strict=True)
     told = [(str(text), float(at_s)) for text, at_s in events if at_s >= 0.0]
     said_s = [at_s for text, at_s in told if row.says and row.says in text]
-    error_m, angle_deg = errors(after, names)
+    error_m, angle_deg = worst_errors(after, names)
     commanded = after.firmware["commanded_n"]
     still = np.array([name in ("DISARMED", "ESTOP") for name in names])
     blamed = {f"thruster {found[1]}" for text, _ in told for found in BLAMED.finditer(text)} - ({NUMBER} if row.leaves_out else set())
@@ -96,7 +96,7 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Any) -> Cell:
     return Cell(row.name, mode, happened, tuple(words for words, is_so in broken.items() if is_so))
 
 
-def errors(flight: Flight, names: Sequence[str]) -> tuple[float, float]:
+def worst_errors(flight: Flight, names: Sequence[str]) -> tuple[float, float]:
     """Largest distance from the set-point, m, and angle, deg, in modes with a place; NaN without one, infinite where either is no number.
 
     After a mode without a place the body has SETTLE_TICKS to come to rest, and without tags nobody knows the place.
@@ -106,9 +106,7 @@ def errors(flight: Flight, names: Sequence[str]) -> tuple[float, float]:
     held = (ticks - lost >= SETTLE_TICKS) & (flight.firmware["tag_age_ns"] < KNOWN_NS)
     if not held.any():
         return float("nan"), float("nan")
-    off = np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
-    turn = np.linalg.norm(rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"]), axis=1)
-    worst_m, worst_rad = (float(np.nan_to_num(each[held], nan=np.inf).max()) for each in (off, turn))
+    worst_m, worst_rad = (float(np.nan_to_num(each[held], nan=np.inf).max()) for each in errors(flight))
     return worst_m, math.degrees(worst_rad)
 
 

@@ -141,6 +141,12 @@ class Poses(NamedTuple):
     """(k, 4)."""
 
 
+def errors(flight: Flight, wanted: Poses | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """(k,) distance, m, and (k,) angle, rad, of the truth from where it is wanted; from the firmware's own set-points when left out."""
+    wanted = wanted or Poses(flight.firmware["setpoint_p_wb"], flight.firmware["setpoint_q_wb"])
+    return np.linalg.norm(flight.p_wb - wanted.p_wb, axis=1), np.linalg.norm(rotation_vectors(flight.q_wb, wanted.q_wb), axis=1)
+
+
 def flight_metrics(
     flight: Flight,
     *,
@@ -159,9 +165,7 @@ def flight_metrics(
     firmware = flight.firmware
     if not len(firmware["tick"]):
         return dict.fromkeys((name for name in SHOWN if name not in DOCKING), math.nan)
-    wanted = wanted or Poses(firmware["setpoint_p_wb"], firmware["setpoint_q_wb"])
-    error = np.linalg.norm(flight.p_wb - wanted.p_wb, axis=1)
-    angle = np.linalg.norm(rotation_vectors(flight.q_wb, wanted.q_wb), axis=1)
+    error, angle = errors(flight, wanted)
     estimate_error = firmware["p_wb"] - flight.p_wb
     estimate_angle = rotation_vectors(flight.q_wb, firmware["q_wb"])
     time_s = flight.time_s

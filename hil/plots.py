@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.metrics import nis_mean, refused, rotation_vectors
+from hil.metrics import errors, nis_mean, refused, rotation_vectors
 from hil.signals import Flight
 
 TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
@@ -97,8 +97,8 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
     inside = _inside(flight, window)
     _path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m, inside)
     time_s = flight.time_s
-    error_mm, angle_deg = errors(flight)
-    for row, (values, unit, what) in enumerate(((error_mm, "mm", "Position"), (angle_deg, "deg", "Attitude"))):
+    error_m, angle_rad = errors(flight)
+    for row, (values, unit, what) in enumerate(((1e3 * error_m, "mm", "Position"), (np.degrees(angle_rad), "deg", "Attitude"))):
         axes = figure.add_subplot(grid[row, 1])
         rms = float(np.sqrt(np.mean(values[inside] ** 2)))
         axes.plot(time_s, _once_placed(flight, values), color=TRUTH, linewidth=1.0)
@@ -115,12 +115,6 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
     if bands:
         figure.legend(handles=bands[:1], loc="outside lower right")
     return figure
-
-
-def errors(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
-    """(k,) distance, mm, and (k,) angle, deg, of the truth from the reference."""
-    error_mm = 1e3 * np.linalg.norm(flight.p_wb - flight.firmware["setpoint_p_wb"], axis=1)
-    return error_mm, np.degrees(np.linalg.norm(rotation_vectors(flight.q_wb, flight.firmware["setpoint_q_wb"]), axis=1))
 
 
 def _once_placed(flight: Flight, values: np.ndarray) -> np.ndarray:

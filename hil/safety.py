@@ -24,7 +24,7 @@ from firmware_py.description.parameters import Parameters
 from hil.bench import fly_scenario, open_bench
 from hil.fault_table import ROWS
 from hil.flight import wanted_in
-from hil.metrics import Poses, flight_metrics, rotation_vectors
+from hil.metrics import Poses, errors, flight_metrics
 from hil.orders import Orders
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
@@ -84,8 +84,7 @@ def spiral_with(broken: Sequence[int], kind: str = "thruster_dead", value: float
     faults = tuple(Fault(kind=kind, at_s=at_s, index=index, value=value) for index in broken)
     whole = flown(dataclasses.replace(base, fault=faults), seed)
     flight, wanted = in_task(base, whole)
-    off = np.linalg.norm(flight.p_wb - wanted.p_wb, axis=1)
-    turn = np.degrees(np.linalg.norm(rotation_vectors(flight.q_wb, wanted.q_wb), axis=1))
+    off, turn = errors(flight, wanted)
     kept = np.logical_and.accumulate(flight.firmware["mode"] == Mode.AUTO)
     left_out = {
         int(found[1]) - 1: float(at) * 1e-9
@@ -94,7 +93,7 @@ def spiral_with(broken: Sequence[int], kind: str = "thruster_dead", value: float
     }
     after = whole.between(round(at_s * 1e9), base.task.end_ns)
     return ThrusterFlight(
-        float(np.sqrt(np.mean(off[kept] ** 2))), float(off[kept].max()), float(turn[kept].max()),
+        float(np.sqrt(np.mean(off[kept] ** 2))), float(off[kept].max()), float(np.degrees(turn[kept].max())),
         tuple(_found_after(after, index, left_out) for index in broken), tuple(sorted(set(left_out) - set(broken))),
         Mode(int(flight.firmware["mode"][-1])).name,
     )  # fmt: skip

@@ -17,8 +17,8 @@ import numpy as np
 from firmware_py.description.signals import Columns
 from firmware_py.description.vehicle import Vehicle
 from hil.checks import Result
-from hil.metrics import metric_order, shown, shown_limit, shown_value
-from hil.plots import Window, errors
+from hil.metrics import errors, metric_order, shown, shown_limit, shown_value
+from hil.plots import Window
 from hil.signals import Flight
 
 REPORT_FILE = "report.html"
@@ -114,7 +114,7 @@ def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
     keep = slice(None, None, max(1, round(1.0 / (FRAMES_HZ * period_s))))
     firmware = flight.firmware
     member = flight.truth["member"]
-    error_mm, angle_deg = (np.where(flight.placed, error, np.nan) for error in errors(flight))
+    error_m, angle_rad = (np.where(flight.placed, error, np.nan) for error in errors(flight))
     return {
         "tank": {"kind": scene.tank, "low": _short(scene.tank_m[0], 3), "high": _short(scene.tank_m[1], 3)},
         "window": list(scene.window),
@@ -124,8 +124,8 @@ def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
         "q": _short(flight.q_wb[keep], 5),
         "ref_p": _short(firmware["setpoint_p_wb"][keep], 5),
         "ref_q": _short(firmware["setpoint_q_wb"][keep], 5),
-        "error_mm": _known(error_mm[keep]),
-        "angle_deg": _known(angle_deg[keep]),
+        "error_mm": _known(1e3 * error_m[keep]),
+        "angle_deg": _known(np.degrees(angle_rad[keep])),
         "cuts": _cuts(flight, keep),
         "modules": [
             _module(vehicle, truth, member[:, m], keep)
