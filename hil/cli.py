@@ -204,9 +204,10 @@ def _fly_faults(jobs: int, seed: int, out: Path | None) -> int:
     from hil.fault_matrix import print_faults
     from hil.fault_table import ROWS
     from hil.scenario import MODES
+    from hil.workers import processes
 
     with campaign_progress("every fault in every mode", len(ROWS) * len(MODES)) as progress:
-        cells = run_fault_campaign(jobs, out if out is not None else Path("runs") / "faults-campaign", seed, progress=progress)
+        cells = run_fault_campaign(processes(jobs), out if out is not None else Path("runs") / "faults-campaign", seed, progress)
     print_faults(cells)
     return FAILED if any(cell.broken for cell in cells) else 0
 

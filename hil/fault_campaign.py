@@ -8,17 +8,15 @@ import math
 import re
 import tempfile
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from firmware_py.core.transitions import ARMED, State
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.bench import fly_scenario
 from hil.fault_table import AT_S, NUMBER, PLACED, ROWS, Row
 from hil.flight import LOGS
@@ -26,6 +24,7 @@ from hil.metrics import errors
 from hil.replaceable import check_replaceable, is_json_with, made
 from hil.scenario import MODES, Scenario, load_scenario
 from hil.signals import Flight, read_flight
+from hil.workers import Pool
 
 SCENARIO = "faults"
 RESULT_FILE = "faults.json"
@@ -62,7 +61,7 @@ def fly_cell(row: Row, mode: str, seed: int, parameters: Parameters | None = Non
     return judge(row, mode, flight, load_vehicle(scenario.module[0].vehicle))
 
 
-def judge(row: Row, mode: str, flight: Flight, vehicle: Any) -> Cell:
+def judge(row: Row, mode: str, flight: Flight, vehicle: Vehicle) -> Cell:
     """What happened after the fault, and which promises it broke."""
     after = flight.between(round((AT_S - BEFORE_S) * 1e9), 1 << 62)
     time_s = after.firmware["time_ns"] * 1e-9 - AT_S
@@ -85,12 +84,12 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Any) -> Cell:
         f"{error_m * 1e3:.0f} mm off": error_m > row.error_m,
         f"{angle_deg:.0f} deg off": angle_deg > row.angle_deg,
         f"did not say {row.says!r}": bool(row.says) and mode in row.says_in and not said_s,
-        f"blamed {', '.join(sorted(blamed))}": bool(blamed) or (not row.leaves_out and _blames(told)),
+        f"blamed {', '.join(sorted(blamed))}": bool(blamed) or (not row.leaves_out and any("left out" in text for text, _ in told)),
         "a command was no number": not np.isfinite(commanded).all(),
         "a command was beyond its limits": bool((commanded > vehicle.force_max_n).any() or (commanded < vehicle.force_min_n).any()),
         "a thruster turned while stopped": bool(commanded[still].any()),
     }
-    happened = f"{wanted if names[-1] == wanted else names[-1]} {reached_s:.2f} s" if changes else "as before"
+    happened = f"{names[-1]} {reached_s:.2f} s" if changes else "as before"
     happened += f", said {said_s[0]:.1f} s" if said_s and not changes else ""
     happened += f", {error_m * 1e3:.0f} mm" if np.isfinite(error_m) else ""
     return Cell(row.name, mode, happened, tuple(words for words, is_so in broken.items() if is_so))
@@ -120,22 +119,16 @@ def _name(state: int, mode: int) -> str:
     return Mode(mode).name if state in ARMED else State(state).name
 
 
-def _blames(told: Sequence[tuple[str, float]]) -> bool:
-    return any("left out" in text for text, _ in told)
-
-
-def run_fault_campaign(
-    jobs: int, out: Path, seed: int = 0, executor: Executor | None = None, progress: Callable[[int, int], None] | None = None
-) -> list[Cell]:
-    """Flies every cell and writes faults.json into `out`; returns the cells, row by row. `executor` replaces the processes.
+def run_fault_campaign(pool: Pool, out: Path, seed: int = 0, progress: Callable[[int, int], None] | None = None) -> list[Cell]:
+    """Flies every cell and writes faults.json into `out`; returns the cells, row by row.
 
     Raises DescriptionError where `out` holds a flight, or a faults.json that is none.
     """
     with made(out):
         check_replaceable(out, (RESULT_FILE, *LOGS), is_json_with(out / RESULT_FILE, "promise"), "campaign of faults")
         cells: list[Cell] = []
-        with executor or ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            futures = [pool.submit(fly_cell, row, mode, seed) for row in ROWS for mode in MODES]
+        with pool() as executor:
+            futures = [executor.submit(fly_cell, row, mode, seed) for row in ROWS for mode in MODES]
             for future in futures:
                 cells.append(future.result())
                 if progress is not None:

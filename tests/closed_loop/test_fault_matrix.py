@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -66,7 +67,7 @@ def test_promise_of_less_error_than_there_is_is_broken() -> None:
 
 def test_campaign_writes_every_cell_with_its_promise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hil.fault_campaign, "fly_cell", lambda row, mode, seed: Cell(row.name, mode, "as before", ()))
-    cells = run_fault_campaign(1, tmp_path, executor=ThreadPoolExecutor(1))
+    cells = run_fault_campaign(partial(ThreadPoolExecutor, 1), tmp_path)
     entries = json.loads((tmp_path / "faults.json").read_text())
     assert len(cells) == len(entries) == len(ROWS) * len(MODES)
     assert entries[0] == {

@@ -9,6 +9,7 @@ import pytest
 import hil.campaign
 import hil.fault_campaign
 import hil.plant_process
+import hil.workers
 from firmware_py.__main__ import INTERRUPTED
 from firmware_py.cli import main
 from firmware_py.description.schema import DescriptionError
@@ -32,10 +33,11 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
     """With what the matrix of faults was asked to fly; it flies nothing."""
     asked: list[tuple[object, ...]] = []
 
-    def fly(jobs: int, out: Path, seed: int, **_: object) -> list[Cell]:
-        asked.append((jobs, out, seed))
+    def fly(pool: object, out: Path, seed: int, progress: object) -> list[Cell]:
+        asked.append((pool, out, seed))
         return []
 
+    monkeypatch.setattr(hil.workers, "processes", lambda jobs: jobs)
     monkeypatch.setattr(hil.fault_campaign, "run_fault_campaign", fly)
     return asked
 
