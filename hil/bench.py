@@ -138,8 +138,7 @@ def open_bench(
     fleet = fleet_of(scenario, bus, rate_hz)
     firmware = compose(fleet, parameters)
     world = make_world(scenario, seed, fleet.period_ns)
-    numbers = {module.number: index for index, module in enumerate(fleet.module)}
-    nodes = make_nodes(world, Codec.load(), numbers, scenario)
+    nodes = make_nodes(world, Codec.load(), scenario)
     faults = nodes.faults = Faults(nodes, scenario.fault)
     ports = [stack.enter_context(open_port(bus)) for _ in range(2)]
     return Bench(scenario, seed, fleet, firmware, nodes, script_of(scenario, fleet), ports[0], ports[1], faults, parameters)

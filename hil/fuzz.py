@@ -98,7 +98,7 @@ def fuzz_flight(frames: int, seed: int = 0, a_tick: int = 100) -> Fuzzed:
     codec = Codec.load()
     firmware = compose(fleet, Parameters())
     world = make_world(scenario, seed, fleet.period_ns)
-    nodes = make_nodes(world, codec, {1: 0}, scenario)
+    nodes = make_nodes(world, codec, scenario)
     fuzzer, result, listener = Fuzzer(codec, seed), Fuzzed(), Receiver(codec)
     halves = {codec.message(name).id_of(1): codec.message(name) for name in ("THRUSTER_CMD_A", "THRUSTER_CMD_B")}
     sent: list[Frame] = []

@@ -7,16 +7,17 @@ accepted command, sample and answer, MCU_STATUS last. Nothing here knows the con
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
-from firmware_py.bus.codec import Codec, Frame, Receiver
+from firmware_py.bus.codec import Codec, Frame, MessageCodec, Receiver
 from firmware_py.bus.codec.receiver import KINDS, MESSAGE, NUMBER, VALUES
 from firmware_py.description.schema import DescriptionError
 from hil.plant.camera import Camera
 from hil.plant.draw import Noise, stream
 from hil.plant.sensors import Sensors
 from hil.plant.spec import SensorSpec
-from hil.plant.world import World
+from hil.plant.world import Truth, World
+from hil.scenario import Scenario
 from hil.tag_camera import TagCamera
 
 TIMEOUT_NS = 100_000_000
@@ -158,7 +159,7 @@ class Mcu:
             return TIMED_OUT
         return DISARMED if disarmed else ARMED
 
-    def _reading(self, name: str, truth: Any) -> list[float]:
+    def _reading(self, name: str, truth: Truth) -> list[float]:
         """Values of one slow message, in the order of its fields."""
         if name == "DEPTH":
             return [self._sensors.pressure_pa(truth), self._world.spec.temperature_c, 0]
@@ -306,7 +307,7 @@ class Nodes:
             mcu.errors |= ERROR_BITS.get(kind, 0)
 
 
-def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[Any, int, int]]:
+def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[MessageCodec, int, int]]:
     """(message, every so many ticks, in which of them): staggered by message and module."""
     slow = []
     for index, name in enumerate(SLOW):
@@ -316,8 +317,9 @@ def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[Any, int,
     return slow
 
 
-def make_nodes(world: World, codec: Codec, numbers: Mapping[int, int], scenario: Any, tick_ns: int = 0) -> Nodes:
-    """The nodes of a scenario on one bus; `numbers` maps numbers on the bus to modules."""
+def make_nodes(world: World, codec: Codec, scenario: Scenario, tick_ns: int = 0) -> Nodes:
+    """The nodes of a scenario, all on one bus; `tick_ns` as in `Nodes`."""
+    numbers = {module.number: index for index, module in enumerate(scenario.module)}
     cameras = [
         Camera(
             pose,

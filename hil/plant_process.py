@@ -64,11 +64,10 @@ class PlantProcess:
     def __init__(self, scenario: Scenario, seed: int, rate_hz: int, out: Path | None) -> None:
         check_served(scenario)
         self._world = make_world(scenario, seed, CHUNK_NS)
-        numbers = {module.number: index for index, module in enumerate(scenario.module)}
         codec = Codec.load()
         self._sync = codec.message("SYNC")
         self._guarded_ticks = rate_hz
-        self._nodes: Nodes = make_nodes(self._world, codec, numbers, scenario, tick_ns=1_000_000_000 // rate_hz)
+        self._nodes: Nodes = make_nodes(self._world, codec, scenario, tick_ns=1_000_000_000 // rate_hz)
         self._nodes.faults = Faults(self._nodes, scenario.fault)
         self._out = out
         self._truth: TruthRecorder | None = None

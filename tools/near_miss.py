@@ -55,7 +55,7 @@ def fly_by(seed: int) -> Pass:
     scenario, velocity, relays = _drawn(seed)
     fleet, vehicle = fleet_of(scenario, "virtual:near-miss", 100), load_vehicle(scenario.module[0].vehicle)
     world, codec = make_world(scenario, seed, PERIOD_NS), _codec()
-    nodes = make_nodes(world, codec, {m.number: i for i, m in enumerate(fleet.module)}, scenario)
+    nodes = make_nodes(world, codec, scenario)
     collector, encoder = InputCollector(fleet, codec), OutputEncoder(fleet, codec)
     bodies = assemble_fleet(fleet, {vehicle.name: vehicle})
     detector = PairDetector(

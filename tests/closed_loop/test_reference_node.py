@@ -72,7 +72,7 @@ def test_hover_with_the_c_node_is_the_hover_with_the_plants_own_frame_for_frame(
 def nodes(library: CDLL) -> CNodes:
     scenario = shortened("hover", 1.0)
     world = make_world(scenario, 0, PERIOD_NS)
-    return CNodes(make_nodes(world, CODEC, {NUMBER: 0}, scenario), scenario, library, RATE_HZ)
+    return CNodes(make_nodes(world, CODEC, scenario), scenario, library, RATE_HZ)
 
 
 def command(share: float, counter: int, mode: int = 1) -> list[Frame]:
@@ -166,7 +166,7 @@ def test_estop_ends_pushing_at_once_and_until_it_is_released(nodes: CNodes) -> N
 def test_c_node_switches_its_magnets_as_the_plants_own_does_frame_for_frame(nodes: CNodes) -> None:
     """Frames come, stay away, and come again around the 2 s and an e-stop."""
     scenario = shortened("hover", 1.0)
-    own = make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, {NUMBER: 0}, scenario)
+    own = make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, scenario)
     stop, release = [Frame(0x000, b"")], command(0.0, 2, mode=0)
     script = {1: [dock(PUSHES, 1)], 203: [dock(PUSHES, 2)], 300: stop, 310: [dock(PUSHES, 3)], 330: release, 340: [dock(PUSHES, 4)]}
     pushed = []

@@ -146,7 +146,7 @@ def test_every_complaint_comes_with_advice_beneath_it() -> None:
 @pytest.fixture
 def nodes() -> Nodes:
     scenario = load_scenario("hover")
-    return make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, {1: 0}, scenario)
+    return make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, scenario)
 
 
 @pytest.fixture

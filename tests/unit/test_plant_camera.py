@@ -199,7 +199,7 @@ def test_order_in_which_cameras_are_listed_changes_no_picture() -> None:
     due = []
     for cameras in ((scenario.camera[0], carried), (carried, scenario.camera[0])):
         listed = dataclasses.replace(scenario, camera=cameras)
-        nodes = make_nodes(make_world(listed, 3, 10_000_000), Codec.load(), {1: 0}, listed)
+        nodes = make_nodes(make_world(listed, 3, 10_000_000), Codec.load(), listed)
         due.append([(camera.carrier, camera.next_ns) for camera in nodes.cameras[0]._cameras])
     assert due[0] == due[1]
     assert due[0][0][1] == due[0][1][1]

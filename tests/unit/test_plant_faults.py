@@ -20,8 +20,7 @@ FRAMES = [Frame(0x100 + i, bytes([i] * 6)) for i in range(20)]
 
 def nodes_with(*faults: Fault, scenario: str = "hover") -> Nodes:
     flown = load_scenario(scenario)
-    numbers = {module.number: m for m, module in enumerate(flown.module)}
-    nodes = make_nodes(make_world(flown, 0, PERIOD_NS), CODEC, numbers, flown)
+    nodes = make_nodes(make_world(flown, 0, PERIOD_NS), CODEC, flown)
     nodes.faults = Faults(nodes, faults)
     return nodes
 
@@ -170,7 +169,7 @@ def test_hand_pushes_with_its_force_for_its_time_from_a_side_of_the_seed_s_own()
     calm = load_scenario("hover").with_calm_world()
     gained = []
     for seed in (0, 1):
-        nodes = make_nodes(make_world(calm, seed, PERIOD_NS), CODEC, {1: 0}, calm)
+        nodes = make_nodes(make_world(calm, seed, PERIOD_NS), CODEC, calm)
         nodes.faults = Faults(nodes, [Fault(kind="push", value=2.0, at_s=0.1, until_s=0.2)])
         fly(nodes, 9, u=0.0)
         assert np.abs(nodes.world.truth(0).v_w).max() == 0.0

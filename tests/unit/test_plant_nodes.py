@@ -24,7 +24,7 @@ def calm(name: str = "hover") -> Scenario:
 
 def nodes_of(scenario: Scenario, seed: int = 0, period_ns: int = PERIOD_NS) -> Nodes:
     world = make_world(scenario, seed, period_ns)
-    return make_nodes(world, CODEC, {m.number: i for i, m in enumerate(scenario.module)}, scenario)
+    return make_nodes(world, CODEC, scenario)
 
 
 def sync(tick: int) -> Frame:

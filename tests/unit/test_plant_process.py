@@ -52,7 +52,7 @@ def tick_of(k: int) -> list[Frame]:
 )  # fmt: skip
 def test_fault_is_per_tick_as_in_lockstep(fault: Fault) -> None:
     scenario = dataclasses.replace(load_scenario("hover"), fault=(fault,))
-    nodes = make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, {1: 0}, scenario)
+    nodes = make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, scenario)
     nodes.faults = Faults(nodes, scenario.fault)
     lockstep = [frame.id for k in range(1, 51) for frame in nodes.step(tick_of(k))]
     plant, port = PlantProcess(scenario, 0, 100, None), Sent()
