@@ -18,7 +18,7 @@ from hil.plant.build import make_bodies
 from hil.plant.integrator import advance
 from hil.plant.lanes import CHANNELS, LANES, ROWS, fly_lanes, gather, scatter
 from hil.plant.thrusters import THRUSTERS, command
-from hil.plant.vectors import F2, F3, F8, compiled
+from hil.plant.vectors import F2, F3, F8, I8, compiled
 from hil.plant.water import WATER
 from hil.plant.world import Arrays, World
 
@@ -90,7 +90,7 @@ def _fly_some(parts: Sequence[Arrays], commands: np.ndarray, out: np.ndarray) ->
         _fly_alone(*part, given, seen)
 
 
-@compiled(types.void(BODIES, MODULES, THRUSTERS, WATER, F2, F2, types.int64, F8, F3, F2, F2, F2, F2), nogil=True)
+@compiled(types.void(BODIES, MODULES, THRUSTERS, WATER, F2, F2, I8, F8, F3, F2, F2, F2, F2), nogil=True)
 def _fly_alone(bodies, modules, thrusters, water, gusts, external, steps, step_s, stage, thrust, seen, commands, out):
     """One world over all ticks; its arrays are those of `plant.world.Arrays`. commands: (k, t); out: (k, 16) is written."""
     for i in range(6):

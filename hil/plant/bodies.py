@@ -43,7 +43,6 @@ from hil.plant.vectors import (
 )  # fmt: skip
 from hil.plant.water import is_clear, push_of_walls, room
 
-I8 = types.int64
 NEAR_M = 1e-6
 """Beyond its half diagonal: what rounding could hide."""
 

@@ -19,6 +19,7 @@ from hil.plant.vectors import (
     F3,
     F8,
     I1,
+    I8,
     callee,
     column,
     compiled,
@@ -34,7 +35,6 @@ from hil.plant.vectors import (
 )
 from hil.plant.water import WATER
 
-I8 = types.int64
 NEAR_M = 0.14
 """Modules whose hulls' circumscribed spheres are further apart do not act on each other."""
 FRICTION = 0.3

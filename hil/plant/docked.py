@@ -203,7 +203,7 @@ class DockedBodies(ABC):
         out = np.empty((len(self.bodies), 6))
         for b, x in enumerate(self._body_arrays.state[: len(self.bodies)]):
             r_wb = rotations.to_matrix(x[3:7])
-            flow = np.concatenate([r_wb.T @ (self._water.flow[0] + self._water.flow[1]), np.zeros(3)])
+            flow = np.concatenate([r_wb.T @ self._flow(), np.zeros(3)])
             total = self._body_arrays.rigid[b] @ x[7:] + self._body_arrays.added[b] @ (x[7:] - flow)
             p = r_wb @ total[:3]
             out[b] = np.concatenate([p, r_wb @ total[3:] + np.cross(x[:3], p)])

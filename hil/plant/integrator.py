@@ -9,10 +9,8 @@ from numba import types
 from hil.plant.bodies import BODIES, MODULES, accelerate, load, observe
 from hil.plant.contact import FACES, interact
 from hil.plant.thrusters import THRUSTERS, forces_after, load_supplies, settle
-from hil.plant.vectors import F2, F3, F8, callee, compiled, inlined, plus, times, triple
+from hil.plant.vectors import F2, F3, F8, I8, callee, compiled, inlined, plus, times, triple
 from hil.plant.water import WATER, flow_at
-
-I8 = types.int64
 
 
 @inlined

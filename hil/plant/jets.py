@@ -8,9 +8,8 @@ from numba import types
 
 from hil.plant.bodies import BODIES, MODULES, add_force
 from hil.plant.thrusters import THRUSTERS
-from hil.plant.vectors import F2, F8, V3, compiled, dot, matrix_of, minus, plus, times, triple, turn, turn_back
+from hil.plant.vectors import F2, F8, I8, V3, compiled, dot, matrix_of, minus, plus, times, triple, turn, turn_back
 
-I8 = types.int64
 SPREADING = 0.1
 """Widening of a round jet per length (Pope, Turbulent Flows, 2000, section 5.1: 0.094)."""
 SAME_M = 1e-6

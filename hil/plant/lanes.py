@@ -19,6 +19,7 @@ from hil.plant.vectors import (
     F2,
     F3,
     F8,
+    I8,
     callee,
     compiled,
     cross,
@@ -31,7 +32,6 @@ from hil.plant.vectors import (
 )  # fmt: skip
 from hil.plant.water import WATER, room
 
-I8 = types.int64
 pasted = njit(inline="always")
 """Numba's own way to make a function a part of its caller. The compiler's (`vectors.inlined`) is too late here: it no longer sees that an
 index is not negative."""

@@ -13,10 +13,9 @@ import math
 import numpy as np
 from numba import types
 
-from hil.plant.vectors import F1, F2, F8, V3, callee, compiled, matrix_of, minus, triple, turn_back
+from hil.plant.vectors import F1, F2, F8, I8, V3, callee, compiled, matrix_of, minus, triple, turn_back
 
-I8 = types.int64
-F3, F4, F5 = F8[:, :, ::1], F8[:, :, :, ::1], F8[:, :, :, :, ::1]
+F4, F5 = F8[:, :, :, ::1], F8[:, :, :, :, ::1]
 GRAZING = 1e-9
 """A ray that stays in a hull for less (m) passes it: docked faces lie in one plane."""
 FINE, COARSE = (13, 8), (7, 4)

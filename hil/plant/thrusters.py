@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from hil.plant.vectors import F1, F2, F3, I1, compiled, inlined
+from hil.plant.vectors import F1, F2, F3, I1, I8, compiled, inlined
 
 
 class Thrusters(NamedTuple):
@@ -56,7 +56,7 @@ def polynomial(curves, t, side, x):
     return total
 
 
-@compiled(types.void(F3, F2, F2, types.int64, F1))
+@compiled(types.void(F3, F2, F2, I8, F1))
 def command(force_curve, constants, level, first, u):
     """Gives thrusters `first` and on the commands u, -1 to 1; a force within the deadband is none. The arrays are those of Thrusters."""
     for i in range(u.shape[0]):
@@ -127,7 +127,7 @@ def settle(thrusters):
         level[t, 1] = level[t, 0] + (level[t, 1] - level[t, 0]) * thrusters.decay[t, 2]
 
 
-@compiled(types.void(THRUSTERS, types.int64, F2))
+@compiled(types.void(THRUSTERS, I8, F2))
 def feedback(thrusters, first, out):
     """Writes rpm (1/min) and current (A) of thrusters `first` and on into out (n, 2).
 

@@ -7,9 +7,9 @@ from typing import Any, cast
 
 from numba import njit, types
 
-F8 = types.float64
+F8, I8 = types.float64, types.int64
 F1, F2, F3 = F8[::1], F8[:, ::1], F8[:, :, ::1]
-I1 = types.int64[::1]
+I1 = I8[::1]
 V3 = types.UniTuple(F8, 3)
 M3 = types.UniTuple(V3, 3)
 MASS = types.UniTuple(M3, 4)

@@ -285,7 +285,7 @@ class World(DockedBodies):
         first, last = self._first[module], self._first[module + 1]
         return Truth(
             self.time_ns, seen[:3], seen[3:7], seen[7:10], seen[10:13], seen[13:16],
-            self._thrusters.force[first:last].copy(), self._water.flow[0] + self._water.flow[1],
+            self._thrusters.force[first:last].copy(), self._flow(),
             float(power[0]), float(power[1]),
         )  # fmt: skip
 
