@@ -132,26 +132,41 @@ def _press(modules, faces, x, i, j, seats, wrench):
     turn_apart(wrench, x, first, second, turn(r_i, moment))
 
 
+@callee
+def _outward(r, f):
+    """Unit vector out of face f of a module with axes r."""
+    return times(1.0 if f % 2 == 0 else -1.0, column(r, f // 2))
+
+
+@callee
+def _facing(modules, i, j, seats):
+    """Faces of i and j that look at each other, their outward normals, their middles, the gap and how far they are beside it; world."""
+    (p_i, r_i), (p_j, r_j) = seats
+    d = minus(p_j, p_i)
+    f_i, f_j = face_to(r_i, d), face_to(r_j, times(-1.0, d))
+    n_i, n_j = _outward(r_i, f_i), _outward(r_j, f_j)
+    a = plus(p_i, times(0.5 * modules.size[i, f_i // 2], n_i))
+    b = plus(p_j, times(0.5 * modules.size[j, f_j // 2], n_j))
+    way = minus(b, a)
+    gap = dot(way, n_i)
+    return (f_i, f_j), (n_i, n_j), (a, b), gap, minus(way, times(gap, n_i))
+
+
+@callee
+def _roll(seats, facing, normal):
+    """Turn of the second of two faces about the first one's normal, from the nearest of four."""
+    (_, r_i), (_, r_j) = seats
+    u, w = column(r_i, (facing[0] // 2 + 1) % 3), column(r_j, (facing[1] // 2 + 1) % 3)
+    angle, quarter = math.atan2(dot(w, cross(normal, u)), dot(w, u)), 0.5 * math.pi
+    return angle - quarter * round(angle / quarter)
+
+
 @compiled(types.UniTuple(F8, 8)(MODULES, FACES, F2, I8, I8))
 def mating(modules, faces, x, i, j):
     """(face of i, face of j, gap, lateral error, tilt, turn from the nearest of four, closing speed, whether probe and drogue)."""
-    p_i, r_i = pose_of(modules, x, i)
-    p_j, r_j = pose_of(modules, x, j)
-    d = minus(p_j, p_i)
-    f_i, f_j = face_to(r_i, d), face_to(r_j, times(-1.0, d))
-    k_i, k_j = f_i // 2, f_j // 2
-    n_i = times(1.0 if f_i % 2 == 0 else -1.0, column(r_i, k_i))
-    n_j = times(1.0 if f_j % 2 == 0 else -1.0, column(r_j, k_j))
-    a = plus(p_i, times(0.5 * modules.size[i, k_i], n_i))
-    b = plus(p_j, times(0.5 * modules.size[j, k_j], n_j))
-    way = minus(b, a)
-    gap = dot(way, n_i)
-    side = minus(way, times(gap, n_i))
-    tilt = math.acos(max(-1.0, min(1.0, -dot(n_i, n_j))))
-    u, w = column(r_i, (k_i + 1) % 3), column(r_j, (k_j + 1) % 3)
-    angle = math.atan2(dot(w, cross(n_i, u)), dot(w, u))
-    quarter = 0.5 * math.pi
-    roll = angle - quarter * round(angle / quarter)
+    seats = (pose_of(modules, x, i), pose_of(modules, x, j))
+    (f_i, f_j), (n_i, n_j), (a, b), gap, side = _facing(modules, i, j, seats)
+    tilt, roll = math.acos(max(-1.0, min(1.0, -dot(n_i, n_j)))), _roll(seats, (f_i, f_j), n_i)
     middle = times(0.5, plus(a, b))
     closing = -dot(minus(velocity_at(x, modules.body[j], middle), velocity_at(x, modules.body[i], middle)), n_i)
     fits = 1.0 if faces.kind[i, f_i] * faces.kind[j, f_j] < 0.0 else 0.0
@@ -161,20 +176,10 @@ def mating(modules, faces, x, i, j):
 @callee
 def _mate(modules, faces, x, i, j, seats, wrench):
     """Magnets, funnel and jam of the two faces that look at each other."""
-    (p_i, r_i), (p_j, r_j) = seats
-    d = minus(p_j, p_i)
-    f_i, f_j = face_to(r_i, d), face_to(r_j, times(-1.0, d))
+    (f_i, f_j), (n_i, n_j), (_, b), gap, side = _facing(modules, i, j, seats)
     if faces.kind[i, f_i] * faces.kind[j, f_j] >= 0.0:
         return
-    k_i, k_j = f_i // 2, f_j // 2
-    n_i = times(1.0 if f_i % 2 == 0 else -1.0, column(r_i, k_i))
-    n_j = times(1.0 if f_j % 2 == 0 else -1.0, column(r_j, k_j))
-    a = plus(p_i, times(0.5 * modules.size[i, k_i], n_i))
-    b = plus(p_j, times(0.5 * modules.size[j, k_j], n_j))
-    way, g0 = minus(b, a), faces.magnet_gap
-    gap = dot(way, n_i)
-    side = minus(way, times(gap, n_i))
-    first, second = modules.body[i], modules.body[j]
+    g0, first, second = faces.magnet_gap, modules.body[i], modules.body[j]
     coil = 0.5 * (faces.coil[i, f_i] + faces.coil[j, f_j])
     if coil != 0.0:
         far = math.sqrt((max(0.0, gap) + g0) ** 2 + dot(side, side))  # the gradient of -1/far: a loop takes no work
@@ -195,9 +200,7 @@ def _mate(modules, faces, x, i, j, seats, wrench):
         turn_apart(wrench, x, first, second, times(-faces.turning_damping, spin))
         return
     push_apart(wrench, x, first, second, b, plus(times(-faces.guide, side), times(-faces.guide_damping, sideways)))
-    u, w = column(r_i, (k_i + 1) % 3), column(r_j, (k_j + 1) % 3)
-    angle = math.atan2(dot(w, cross(n_i, u)), dot(w, u))
-    roll = angle - 0.5 * math.pi * round(angle / (0.5 * math.pi))
+    roll = _roll(seats, (f_i, f_j), n_i)
     moment = minus(times(faces.turning, cross(n_j, times(-1.0, n_i))), times(faces.turning * roll, n_i))
     turn_apart(wrench, x, first, second, minus(moment, times(faces.turning_damping, spin)))
 
