@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+RANK_TOLERANCE = 1e-6
+"""Singular values of what thrusters make that are below this share of the largest count as zero."""
 CRUISE_M_S = 0.2
 """Speed of a robot under way, by which a change of the water's own speed is turned into a change of drag."""
 BUOYANCY_SIGMA_N, ARM_SIGMA_M, TRIM_SIGMA_M = 0.5, 0.003, 0.002

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from firmware_py.core.body import Body
+from firmware_py.core.body import RANK_TOLERANCE, Body
 from firmware_py.core.missing_thrust import MissingThrust
 from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
@@ -28,8 +28,6 @@ DOWN, STANDS, DISOBEYS = range(len(WHY))
 """What the feedback of an ESC may show often enough in a row, the gravest first."""
 NEITHER = (-1, -1)
 """Thrusters of a feedback that the vehicle does not have."""
-RANK_TOLERANCE = 1e-6
-"""Singular values below this share of the largest count as zero."""
 LEAST_LEVER = 0.1
 """Moment in a lost axis (a unit vector) with which force is kept: with less, a newton costs 10 N m and more; 1e16 where it is rounding."""
 FAST_SHARE = 2.0

@@ -12,7 +12,7 @@ import daqp
 import numpy as np
 from numba import njit
 
-from firmware_py.core.body import ThrusterSet
+from firmware_py.core.body import RANK_TOLERANCE, ThrusterSet
 from firmware_py.core.thruster import total_power
 
 PASSES = 3
@@ -21,8 +21,6 @@ ITERATIONS = 200
 """Most changes of the active set in one program; a 2x2 of modules needs about 40."""
 LEAST_BEND = 0.02
 """Smallest curvature, W/N^2: a fitted curve may bend down somewhere, a program may not."""
-RANK_TOLERANCE = 1e-6
-"""Singular values below this share of the largest count as zero."""
 SOLVED = 1
 """daqp's exit flag for optimal."""
 

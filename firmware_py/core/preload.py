@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.core.body import ThrusterSet
+from firmware_py.core.body import RANK_TOLERANCE, ThrusterSet
 
-RANK_TOLERANCE = 1e-6
-"""Singular values below this share of the largest count as zero."""
 DIRECTIONS = 720
 """Directions tried in the null space; half a degree apart where it is a plane."""
 TIE = 1e-9

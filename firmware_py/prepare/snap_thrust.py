@@ -11,15 +11,13 @@ import scipy.sparse as sparse
 from scipy.optimize import linprog
 
 from firmware_py.core import rotations
-from firmware_py.core.body import Body
+from firmware_py.core.body import RANK_TOLERANCE, Body
 from firmware_py.core.drag_lookup import drag_wrench
 from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
 
 _FULL = 1e-6
 """Share of a thruster's range within which it gives all that it may."""
 
-RANK_TOLERANCE = 1e-6
-"""Share of the largest singular value below which an axis is outside the thrusters' span."""
 _OUTSIDE = 1e-6
 """Share of a wrench that may be outside by rounding."""
 _NOTHING = 1e-9
