@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from firmware_py.bus.load import BIT_RATE
 from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime.realtime import real_time
 
@@ -193,8 +194,8 @@ def judge_controller(title: str, name: str, data: dict[str, Any], queue: int) ->
     restart = int(data.get("restart_ms", 0))
     text = f"{rate // 1000} kbit/s, {state}, restart-ms {restart}, queue {queue}"
     set_up = f"sudo systemctl restart modcube-can@{name}"
-    if rate != 1_000_000:
-        return Finding(title, FAILED, text, f"the bit rate must be 1000 kbit/s: {set_up}")
+    if rate != BIT_RATE:
+        return Finding(title, FAILED, text, f"the bit rate must be {BIT_RATE // 1000} kbit/s: {set_up}")
     if state in ("BUS-OFF", "STOPPED"):
         return Finding(title, FAILED, text, "look at wiring, termination (60 ohm across), power of the nodes")
     if state != "ERROR-ACTIVE":

@@ -20,9 +20,8 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus, channels_lock
 
 from firmware_py.bus.codec import Frame
+from firmware_py.bus.load import BIT_RATE
 
-BIT_RATE = 1_000_000
-"""bit/s, of every bus of the robot; an slcan adapter is set to it."""
 WAITING_FRAMES = 4096
 """Most frames that wait unread in a virtual bus or behind a reader; half a second of a full bus."""
 SOCKET_BUFFER_BYTES = 1 << 20
