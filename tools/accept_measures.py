@@ -21,6 +21,7 @@ import near_miss
 from firmware_py.description.parameters import CONTROLLERS
 from hil.campaign import run_campaign
 from hil.console import campaign_progress
+from hil.flight import LOGS
 from hil.scenario import load_scenario
 from hil.workers import processes
 
@@ -29,7 +30,6 @@ JOBS = 2
 PLANTS = 10
 PASSES, CHUNK = 10_000, 250
 """Near misses in all, and those that a process counts at a time."""
-LOGS = ("can.log", "signals.mcap", "truth.mcap")
 
 FIGURE = re.compile(r"^figure: (?P<name>.+) = (?P<value>\S+)", re.MULTILINE)
 """A line of tests/figures.py."""

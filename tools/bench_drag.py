@@ -13,6 +13,7 @@ from firmware_py.core.drag_lookup import add_drag
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare import alpha, drag_table
+from firmware_py.prepare.capability.sphere import fibonacci
 from firmware_py.prepare.joints import Placement
 from firmware_py.prepare.projected_area import Solid, areas_and_centroids, box, plane_basis
 
@@ -37,13 +38,6 @@ def _nearest_all(directions, coefficients, velocities, out):  # type: ignore[no-
             if cosine > best:
                 best, where = cosine, k
         out[i, :3] = -coefficients[where] * np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2) * v[:3]
-
-
-def fibonacci(n: int) -> np.ndarray:
-    """(n, 3) unit vectors: the paper's Algorithm 1 with the errata's phi."""
-    i = np.arange(n)
-    z, phi = 1.0 - (2.0 * i + 1.0) / n, np.pi * (1.0 + np.sqrt(5.0)) * i
-    return np.column_stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z])
 
 
 def drag_entries() -> list[Entry]:

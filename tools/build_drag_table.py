@@ -29,6 +29,7 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from firmware_py.prepare import alpha, drag_table, shape_key
 from firmware_py.prepare.assembly import PITCH_M, assemble
+from firmware_py.prepare.capability.sphere import fibonacci
 from firmware_py.prepare.drag_cache import DragCache, default_folder
 from firmware_py.prepare.joints import Placement, check_joints
 from firmware_py.prepare.projected_area import areas_and_centroids
@@ -104,13 +105,6 @@ def force_at(table: DragTable, flow: Sequence[float]) -> tuple[float, float]:
     nu = np.concatenate([SPEED_M_S * unit, np.zeros(3)])
     wrench = drag_lookup.drag_wrench(table.nodes, table.rotational, table.linear, nu)
     return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
-
-
-def fibonacci(n: int) -> np.ndarray:
-    """(n, 3) directions of Algorithm 1 with its poles put right."""
-    i = np.arange(n)
-    phi, theta = np.arccos(1.0 - (2 * i + 1) / n), math.pi * (1.0 + math.sqrt(5.0)) * i
-    return np.stack([np.cos(theta) * np.sin(phi), np.sin(theta) * np.sin(phi), np.cos(phi)], axis=1)
 
 
 def print_forces(console: Console, tables: dict[str, dict[str, DragTable]]) -> None:
