@@ -6,7 +6,6 @@ Positions and directions are in the module frame: FRD, origin at the hull's cent
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -310,13 +309,3 @@ def _beside(folder: Path, name: str) -> str:
     """A vehicle's `name`; a file's with the folder before it, unless it lies in the working directory alone."""
     path = folder / name
     return str(path) if name.endswith(".toml") and (path.exists() or not Path(name).exists()) else name
-
-
-def flu_to_frd(vectors: np.ndarray) -> np.ndarray:
-    """(..., 3) positions or directions from FLU to FRD: diag(1, -1, -1), a half-turn about x."""
-    return np.asarray(np.asarray(vectors) * np.array([1.0, -1.0, -1.0]))
-
-
-def is_right_handed(matrix: np.ndarray) -> bool:
-    """Whether a (3, 3) change of frame keeps handedness."""
-    return math.isclose(float(np.linalg.det(matrix)), 1.0, abs_tol=1e-9)

@@ -1,7 +1,9 @@
 """Published layouts, read once for the tests of prepare.capability."""
 
+import dataclasses
 import functools
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,8 @@ from firmware_py.prepare.capability.layout import Layout, of_modules, of_rows, o
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "tools" / "data"
 SEVEN = ("modcube_sim", "double", "quad", "chasing_m2", "girona500", "bluerov2_heavy", "bluerov2")
+FLU_TO_FRD = np.diag([1.0, -1.0, -1.0])
+"""Of positions and of directions, on either side."""
 LINE = [(0, 0, 0), (0, 1, 0)]
 SQUARE = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
 
@@ -25,6 +29,13 @@ def published(name: str) -> dict[str, Any]:
 def raw(name: str) -> Layout:
     entry = published(name)
     return of_rows(name, np.array(entry["thrusters"]), entry["f_min"], entry["f_max"], load_vehicle("modcube_sim"))
+
+
+def without(layout: Layout, dead: Sequence[int]) -> Layout:
+    """What is left when these thrusters (from 0 on) give nothing."""
+    alive = np.setdiff1d(np.arange(layout.count), dead)
+    own = {name: getattr(layout, name)[alive] for name in ("f_min", "f_max", "power_forward", "power_reverse")}
+    return dataclasses.replace(layout, matrix=layout.matrix[:, alive], **own)
 
 
 def one_of_seven(name: str) -> Layout:

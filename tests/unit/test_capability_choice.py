@@ -32,7 +32,7 @@ from firmware_py.prepare.capability.programs import reach_by_programs
 from firmware_py.prepare.capability.task import Task, load_task, wrenches_along
 from firmware_py.prepare.capability.wrench import WrenchSpace
 from firmware_py.prepare.snap_thrust import wrenches
-from tests.unit.capability_layouts import ROOT
+from tests.unit.capability_layouts import ROOT, without
 
 PUSH = np.array([[20.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
 UNDER_WATER = rest_at(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -91,7 +91,7 @@ def test_guaranteed_margin_holds_whichever_thruster_dies() -> None:
     vehicle = load_vehicle("modcube")
     choice = rank(Task(name="push", wrench=PUSH, dead=1), 2, vehicle)[0]
     layout = of_modules(choice.best.cells, [0] * 2, [vehicle] * 2)
-    worst = min(WrenchSpace(layout.without([k])).reach(PUSH)[0] for k in range(16))
+    worst = min(WrenchSpace(without(layout, [k])).reach(PUSH)[0] for k in range(16))
     assert choice.guaranteed_margin == pytest.approx(worst, rel=1e-9)
 
 
@@ -244,8 +244,8 @@ def test_space_that_rounding_left_of_none_is_called_degenerate_and_has_no_ticks(
     drawing = importlib.import_module("characterise_draw")
     drawn: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure))
-    module = of_modules([(0, 0, 0)], [0], [load_vehicle("modcube")]).without(range(3, 8))
-    layout = dataclasses.replace(module, matrix=np.vstack([np.eye(3), 1e-10 * np.eye(3)[::-1]]))
+    three = without(of_modules([(0, 0, 0)], [0], [load_vehicle("modcube")]), range(3, 8))
+    layout = dataclasses.replace(three, matrix=np.vstack([np.eye(3), 1e-10 * np.eye(3)[::-1]]))
     drawing.draw(tmp_path / "three.png", {"three": summary.characterise(layout, count=121)}, {"three": "three"})
     panels = drawn[0].axes
     written = ["degenerate" in [text.get_text() for text in panel.texts] for panel in panels]

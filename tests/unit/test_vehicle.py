@@ -16,12 +16,11 @@ from firmware_py.description.vehicle import (
     FACE_NAMES,
     FACE_NORMALS,
     Vehicle,
-    flu_to_frd,
-    is_right_handed,
     load_vehicle,
     vehicle_names,
 )
 from firmware_py.prepare.assembly import assemble_vehicle
+from tests.unit.capability_layouts import FLU_TO_FRD
 
 MODULES = ("modcube", "modcube_sim")
 S, A, B = 0.70710678, 0.848048, 0.529919
@@ -72,18 +71,16 @@ def test_every_shipped_vehicle_has_a_published_layout_here() -> None:
 def test_thrusters_are_the_published_ones_in_frd(name: str) -> None:
     axes, rows = PUBLISHED[name]
     published = np.array(rows, dtype=float)
-    turn = flu_to_frd if axes == "FLU" else np.asarray
+    turn = FLU_TO_FRD if axes == "FLU" else np.eye(3)
     vehicle = load_vehicle(name)
-    np.testing.assert_allclose(vehicle.positions, turn(published[:, :3]), atol=1e-12)
-    np.testing.assert_allclose(vehicle.directions, turn(published[:, 3:]), atol=1e-4)
+    np.testing.assert_allclose(vehicle.positions, published[:, :3] @ turn, atol=1e-12)
+    np.testing.assert_allclose(vehicle.directions, published[:, 3:] @ turn, atol=1e-4)
 
 
 def test_flu_becomes_frd_by_a_half_turn_about_x() -> None:
     """Left and up change sign, ahead does not; handedness stays. Singular values alone would not notice a mirror."""
-    np.testing.assert_array_equal(flu_to_frd(np.eye(3)), np.diag([1.0, -1.0, -1.0]))
-    np.testing.assert_allclose(flu_to_frd(np.eye(3)), Rotation.from_euler("x", np.pi).as_matrix(), atol=1e-15)
-    assert is_right_handed(flu_to_frd(np.eye(3)))
-    assert not is_right_handed(np.diag([1.0, -1.0, 1.0]))
+    np.testing.assert_allclose(FLU_TO_FRD, Rotation.from_euler("x", np.pi).as_matrix(), atol=1e-15)
+    assert np.linalg.det(FLU_TO_FRD) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy"])

@@ -110,18 +110,6 @@ class Layout:
         matrix[list(self.passive)] = 0.0
         return dataclasses.replace(self, matrix=matrix)
 
-    def without(self, dead: Sequence[int]) -> Layout:
-        """The layout that is left when the thrusters in `dead` (0-based) give nothing."""
-        alive = np.setdiff1d(np.arange(self.count), dead)
-        return dataclasses.replace(
-            self,
-            matrix=self.matrix[:, alive],
-            f_min=self.f_min[alive],
-            f_max=self.f_max[alive],
-            power_forward=self.power_forward[alive],
-            power_reverse=self.power_reverse[alive],
-        )
-
     def normalised(self, how: str) -> Layout:
         """The layout with the force limits of one of NORMALISATIONS.
 
