@@ -44,11 +44,6 @@ log_app = typer.Typer(help="Logs that runs left.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 
 
-@app.callback()
-def modcube() -> None:
-    """Controller of a self-reconfigurable underwater robot."""
-
-
 @app.command()
 def run(
     bus: Annotated[
@@ -149,7 +144,8 @@ def doctor(
     warm: Annotated[bool, typer.Option("--warm", help="only compile what a tick calls, into the cache")] = False,
 ) -> None:
     """Say whether this machine and its buses are fit to fly."""
-    from firmware_py.app.doctor_report import examine, warm_up
+    from firmware_py.app.doctor import warm_up
+    from firmware_py.app.doctor_report import examine
 
     if warm:
         typer.echo(f"compiled code is there, after {warm_up():.1f} s")
@@ -213,11 +209,6 @@ def recover(log: Annotated[Path, typer.Argument(help="folder that a run left: ca
 
     ticks, torn = mend(log)
     typer.echo(f"{log}: {torn}; mended, {ticks} ticks" if torn else f"{log}: whole, {ticks} ticks; nothing to do")
-
-
-@log_app.callback()
-def logs() -> None:
-    """Logs that runs left."""
 
 
 def fill_standard_streams() -> None:

@@ -6,13 +6,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from firmware_py.app.doctor import FAILED, Finding, check_interface, check_machine, lines_of, warm_up
+from firmware_py.app.doctor import FAILED, Finding, check_interface, check_machine, lines_of
 from firmware_py.app.doctor_bus import judge, look_at
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.port import PortError, open_port
 from firmware_py.description.fleet import Fleet
-
-__all__ = ["examine", "warm_up"]
 
 UNFIT = 1
 """Exit status when a check failed."""
