@@ -54,9 +54,11 @@ class JointWatch:
         return [request for request in requests if modules_of(request) in there]
 
     def newest_ns(self, request: DockRequest, what: str) -> int:
-        """Time of its newest picture (`picture_ns`), or of the newest that shows it closed (`near_ns`)."""
+        """Time of its newest picture (`picture_ns`), of the newest that shows it closed (`near_ns`), or of the staler of its two currents
+        (`current_ns`).
+        """
         row = self._row(request)
-        return NEVER_NS if row is None else int(row[what])
+        return NEVER_NS if row is None else int(np.min(row[what]))
 
     def strong_ma(self, request: DockRequest, after_ns: int = NEVER_NS) -> np.ndarray | None:
         """(2,) currents of its faces, mA, where both are on and came after that time."""

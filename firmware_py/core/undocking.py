@@ -24,7 +24,7 @@ class Undock(NamedTuple):
     since_ns: int
     until_ns: int
     seen_ns: int
-    """By then pictures of the latter half of the push are there, if any still come."""
+    """By then pictures, and currents too, of the latter half of the push are there, if any still come."""
     last_ns: int
     """While a joint holds, the magnets push on, as long again: a short push shows late."""
     before_ma: Mapping[DockRequest, np.ndarray | None]
@@ -39,9 +39,9 @@ class Undock(NamedTuple):
         return Undock(plan, chains, time_ns, time_ns + push_ns, time_ns + seen_ns, last_ns, before_ma)
 
     def pushes(self, time_ns: int, joints: JointWatch) -> bool:
-        """Whether it is too early to ask what holds: a picture of a single joint is waited for."""
-        awaited = len(self.plan.opens) == 1 and not self._is_seen(time_ns, joints)
-        return time_ns < (max(self.until_ns, self.seen_ns) if awaited else self.until_ns)
+        """Whether it is too early to ask what holds: a picture of a single joint is waited for, of several their currents."""
+        is_told = self._is_seen if len(self.plan.opens) == 1 else self._is_felt
+        return time_ns < (self.until_ns if is_told(time_ns, joints) else max(self.until_ns, self.seen_ns))
 
     def held_by(self, time_ns: int, joints: JointWatch) -> str:
         """What tells that a joint holds, as where a relay hangs: two bodies would fly against each other. Empty: nothing does.
@@ -57,6 +57,11 @@ class Undock(NamedTuple):
     def _is_seen(self, time_ns: int, joints: JointWatch) -> bool:
         """Whether a picture shows the first joint in the latter half of the push."""
         return joints.newest_ns(self.plan.opens[0], "picture_ns") > self._half_ns(time_ns)
+
+    def _is_felt(self, time_ns: int, joints: JointWatch) -> bool:
+        """Whether currents of all joints that had any came in the latter half of the push."""
+        felt = [joint for joint, before in self.before_ma.items() if before is not None]
+        return all(joints.newest_ns(joint, "current_ns") > self._half_ns(time_ns) for joint in felt)
 
     def _half_ns(self, time_ns: int) -> int:
         return (self.since_ns + time_ns) // 2

@@ -1,10 +1,12 @@
 """Undocks as people ask for them: twice, under way, ended, and across a ring."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from firmware_py.core.docking_decisions import Decisions, Join
-from firmware_py.core.types import Action, DockRequest, Mode, Request
+from firmware_py.core.types import Action, DockRequest, Mode, ModuleInputs, Request
 from firmware_py.core.undocking import PULLED
 from firmware_py.description.parameters import Parameters
 from tests.unit.tanks import RING, Docked
@@ -79,6 +81,28 @@ def test_module_out_of_sight_is_undocked_unless_its_magnets_go_on_pulling(hung: 
     tank.hidden, tank.hung = {1}, hung
     tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert tank.shape == ([(0, 1)] if hung else [(0,), (1,)])
+
+
+@pytest.mark.parametrize("hung", [set(), {2, 3}], ids=str)
+def test_push_shorter_than_currents_need_tells_a_corner_that_leaves_from_one_that_hanging_relays_hold(hung: set[int]) -> None:
+    tank = Docked(RING, Parameters().replace("docking.release_s", 0.01))
+    tank.fly()
+    tank.hung, tank.stuck = hung, True
+    tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
+    assert tank.shape == ([(0, 1, 2, 3)] if hung else [(0, 1, 2), (3,)])
+
+
+def test_corner_whose_currents_do_not_come_is_undocked_in_the_end() -> None:
+    tank = Docked(RING, Parameters().replace("docking.release_s", 0.01))
+    tank.fly()
+    hear, tank.stuck = tank._hear, True
+
+    def hear_no_current(tick: int) -> list[ModuleInputs]:
+        return [replace(module, docks=[]) for module in hear(tick)]
+
+    tank._hear = hear_no_current  # type: ignore[method-assign]
+    tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
+    assert tank.shape == [(0, 1, 2), (3,)]
 
 
 def test_two_corners_of_a_ring_undocked_at_once_leave_no_magnet_on_between_them() -> None:
