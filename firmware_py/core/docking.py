@@ -78,17 +78,22 @@ class DockingStage:
         self._joints.retune(parameters)
 
     def watch_joints(self, joints: Sequence[Joint]) -> None:
-        """Watches these joints, all that there are in the fleet; their magnets hold."""
+        """Watches these joints, all that there are in the fleet; their magnets hold, but for those of an undock under way."""
         self._joints.watch(joints)
-        for joint in joints:
-            self.relays.switch(RELAY_PULL, joint.request)
+        parting = self._parting
+        self.relays.switch(RELAY_PULL, *(joint.request for joint in joints if modules_of(joint.request) not in parting))
 
     def open_joints(self, least: int) -> list[DockRequest]:
         """Joints that are `least` LOOSE or APART though they should hold, as requests that name their faces. Those that are being
         undocked are left out.
         """
-        parting = [modules_of(joint) for undock in self._undocks for joint in undock.plan.opens]
+        parting = self._parting
         return [joint for joint in self._joints.that_are_open(least) if modules_of(joint) not in parting]
+
+    @property
+    def _parting(self) -> list[frozenset[int]]:
+        """Modules of each joint that is being undocked."""
+        return [modules_of(joint) for undock in self._undocks for joint in undock.plan.opens]
 
     @property
     def joints(self) -> np.ndarray:

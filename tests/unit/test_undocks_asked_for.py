@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core.docking_decisions import Decisions, Join
-from firmware_py.core.types import Action, DockRequest, Mode, ModuleInputs, Request
+from firmware_py.core.types import RELAY_PUSH, Action, DockRequest, Mode, ModuleInputs, Request
 from firmware_py.core.undocking import PULLED
 from firmware_py.description.parameters import Parameters
 from tests.unit.tanks import RING, Docked
@@ -103,6 +103,18 @@ def test_corner_whose_currents_do_not_come_is_undocked_in_the_end() -> None:
     tank._hear = hear_no_current  # type: ignore[method-assign]
     tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
     assert tank.shape == [(0, 1, 2), (3,)]
+
+
+def test_magnets_that_push_one_body_apart_push_on_while_another_parts() -> None:
+    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)], each=2)
+    tank.fly()
+    tank.run(0.5, Request(Action.ARM, 2))
+    tank.run(0.3, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    tank.run(0.05, Request(Action.UNDOCK, 2, DockRequest(3, 1, 2, 0)))
+    while (2, 3) in tank.shape:
+        assert tank.pipeline.formation.docking.relays.states[2][0] == RELAY_PUSH
+        tank.run(0.01)
+    assert tank.when("module 1 is undocked") < tank.when("module 3 is undocked")
 
 
 def test_two_corners_of_a_ring_undocked_at_once_leave_no_magnet_on_between_them() -> None:
