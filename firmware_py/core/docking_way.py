@@ -70,9 +70,11 @@ def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near
     Too near is nearer than at the ends `near`, and near enough for level cubes to touch; or for cubes in any attitude, and nearer by
     `slack_m`.
     """
+    apart_m = CUBE_DIAGONAL * way.pitch_m + sum(float(np.linalg.norm(body.r_bm, axis=1).max()) for body in (way.body, other))
+    shares = _near_part(way.p_begin - other_at.p_wb, way.p_end - way.p_begin, apart_m)
+    if not shares:
+        return None
     others = other_at.p_wb + other.r_bm @ to_matrix(other_at.q_wb).T
-    reach_m = way.body.reach_m + other.reach_m
-    shares = _near_part(way.p_begin - other_at.p_wb, way.p_end - way.p_begin, reach_m)
     gaps = np.linalg.norm(way.at(shares)[:, :, None] - others, axis=-1)
     least, ends = gaps.min(axis=0), gaps[list(near)].min(axis=0)
     limit = np.minimum(CUBE_DIAGONAL * way.pitch_m, np.maximum(ends - slack_m, SQUARE_DIAGONAL * way.pitch_m))
@@ -130,12 +132,12 @@ def _beside(body: Body, common: Collection[int]) -> np.ndarray:
     return np.asarray(places[[module not in common for module in body.modules]])
 
 
-def _near_part(begin: np.ndarray, way: np.ndarray, reach_m: float) -> list[float]:
-    """Shares of a way (3,) that begins at `begin` (3,) off a place: its ends, where it is nearest to the place, and WAY_SAMPLES of where it
-    is within reach of it.
+def _near_part(begin: np.ndarray, way: np.ndarray, apart_m: float) -> list[float]:
+    """Shares of a way (3,) that begins at `begin` (3,) off a place: its ends, and WAY_SAMPLES of where it is nearer than `apart_m` to the
+    place; none where it never is.
     """
     length2 = max(float(way @ way), 1e-12)
     middle = -float(begin @ way) / length2
-    half = math.sqrt(max(0.0, reach_m**2 - float(begin @ begin) + middle**2 * length2) / length2)
+    half = math.sqrt(max(0.0, apart_m**2 - float(begin @ begin) + middle**2 * length2) / length2)
     first, last = (min(max(share, 0.0), 1.0) for share in (middle - half, middle + half))
-    return [0.0, *np.linspace(first, last, WAY_SAMPLES if last > first else 1).tolist(), 1.0]
+    return [0.0, *np.linspace(first, last, WAY_SAMPLES).tolist(), 1.0] if last > first else []
