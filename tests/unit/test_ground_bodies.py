@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from firmware_py.core.failsafes import PILOTED
 from firmware_py.core.supervisor import Supervisor
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, Event, Mode
+from firmware_py.core.types import WARNING, Action, Event, Mode
 from firmware_py.description.parameters import Parameters
 from tests.unit.failsafe_causes import FIELDS, ROWS, bad, quick
 from tests.unit.ground_missions import PLACES, item, upload
@@ -84,6 +84,17 @@ def test_undock_of_a_disarmed_body_is_accepted_once_it_is_two(world: World, clie
     world.robot.bodies = apart
     world.run(2)
     assert [(ack.command, ack.result) for ack in client.all("COMMAND_ACK")] == [(31011, mavlink.MAV_RESULT_ACCEPTED)]
+
+
+def test_undock_of_modules_that_are_apart_is_not_accepted_before_it_is_refused(world: World, client: Client) -> None:
+    """A tick that was over when it was asked for decides nothing."""
+    world.run(10)
+    client.command(31011, 0, 0, 1, 1)
+    world.run(2)
+    assert not client.all("COMMAND_ACK")
+    world.robot.events = [Event(WARNING, "UNDOCK refused: modules 0 and 1 are not of one body", 0)]
+    world.run(2)
+    assert [(ack.command, ack.result) for ack in client.all("COMMAND_ACK")] == [(31011, mavlink.MAV_RESULT_DENIED)]
 
 
 def test_parted_bodies_are_two_systems_again(world: World, client: Client) -> None:
