@@ -312,8 +312,8 @@ class DockingStage:
         plan = dock.sequence.plan
         way = way_of_active(plan, *estimates[dock.active], *estimates[dock.target], self._p.standoff_m)
         met = first_met(way, _thirds(estimates, dock.active, dock.target), self._p)
-        if met not in (None, dock.sequence.waits_for):
-            dock.sequence.waits_for = met
+        if met is not None and met not in dock.sequence.waited_for:
+            dock.sequence.waited_for.add(met)
             self._say(WARNING, f"dock of module {plan.request.module} waits: module {met} is on its way")
         return met is not None
 

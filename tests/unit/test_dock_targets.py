@@ -1,5 +1,7 @@
 """The body that others dock to: it feels no blow, comes to meet one of them, and goes back where it was."""
 
+from itertools import cycle
+
 import numpy as np
 import pytest
 
@@ -190,3 +192,14 @@ def test_dock_waits_while_a_third_body_is_on_its_way_and_then_goes_on() -> None:
         if tank.outputs[-1].docks[0].stage == Stage.PRE_APPROACH:
             tank.run(0.01)
     assert tank.outputs[-1].docks[0].stage == Stage.ALIGN
+
+
+def test_dock_says_of_each_module_once_that_it_waits_though_two_are_as_near() -> None:
+    """Noise tells which of two modules that are on the way is the nearer."""
+    tank = placed((1.0, 0.0), (1.0, 2.0), (1.6, 0.9), (1.6, 1.3))
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    met = cycle([2, 3])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("firmware_py.core.docking.first_met", lambda way, thirds, p: next(met))
+        tank.run(0.2)
+    assert [said for _, said in tank.said if "waits" in said] == [f"dock of module 1 waits: module {m} is on its way" for m in (2, 3)]
