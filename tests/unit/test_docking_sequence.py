@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
 from firmware_py.core.docking_sequence import DockingSequence, Stage, Steering
-from firmware_py.core.docking_way import WAY_SLACK, nearest_pass, way_of_active
+from firmware_py.core.docking_way import WAY_SLACK, nearest_pass, obstacle, way_of_active
 from firmware_py.core.rotations import conjugate, difference, from_euler, multiply, rotate, rotate_back, to_matrix
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest, Estimate
@@ -140,6 +140,24 @@ def test_module_beside_the_one_that_is_docked_to_may_be_in_the_way() -> None:
     for offset, wanted in ([0.3, 0.3, 0.0], None), ([-0.5, 0.6, 0.0], 1):
         way = way_of_active(plan, active, estimate(before + np.array(offset)), bar, there, 0.12)
         assert nearest_pass(way, bar, there, 0.03) == wanted
+
+
+@pytest.mark.parametrize(
+    ("approach", "third_m", "is_placed", "is_met"),
+    [
+        ("staged", (0.3, 0.33, 0.0), True, True),  # beside the stand-off
+        ("staged", (0.3, 0.33, 0.0), False, False),
+        ("staged", (0.27, 0.0, 0.0), True, False),  # beside the target
+        ("straight", (0.27, 0.0, 0.0), True, True),
+    ],
+)
+def test_third_body_is_met_where_the_way_ends_too(approach: str, third_m: tuple[float, ...], is_placed: bool, is_met: bool) -> None:
+    vehicle = load_vehicle("modcube")
+    target, active, third = (assemble([(0, 0, 0)], [0], [vehicle], [m]) for m in range(3))
+    plan = plan_dock(DockRequest(1, 3, 0, 2), active, target, [vehicle] * 2)
+    start, there, at = (estimate(np.array(p)) for p in ((0.0, 1.5, 0.0), (0.0, 0.0, 0.0), third_m))
+    found = obstacle(plan, (active, start), (target, there), [(third, at._replace(ready=is_placed))], False, Docking(approach=approach))
+    assert ("too near to module 2" in found) == is_met
 
 
 def test_body_that_is_turned_is_turned_before_it_is_aligned() -> None:
