@@ -187,7 +187,8 @@ class DockingStage:
             return
         refusal = self._refusal(prepared, estimates, waiting, holding)
         if plan is None or refusal:
-            self._say(WARNING, f"dock refused: {refusal}")
+            what = "undock" if mine == _body_of(request.target_module, estimates) else "dock"
+            self._say(WARNING, f"{what} refused: {refusal}")
             if under_way is None:
                 self._end(mine, decisions)
         elif isinstance(plan, UndockPlan):

@@ -279,7 +279,7 @@ class Docking:
         unit="s",
         low=0.01,
         high=60,
-        help="how long the magnets push apart, after a jam and to undock; longer while late pictures may still show a joint closed",
+        help="how long the magnets push apart, after a jam and to undock; longer while what comes late may still show a joint closed",
         mavlink="DOCK_RELEASE",
     )
     sigma_m: float = quantity(

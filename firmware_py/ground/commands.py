@@ -254,12 +254,11 @@ class CommandService:
             return DENIED
         request = DockRequest(module, face, target, target_face, turns, command.get(6) >= 0.5)
         s = self._system.subject
-        leaders = s.picture.leader(module), s.picture.leader(target)
+        parts = action == Action.UNDOCK and s.picture.leader(module) == s.picture.leader(target)
 
         def is_done() -> bool:
             """A body that is disarmed undocks without a mode, where it has come apart."""
-            undocks = action == Action.UNDOCK and leaders[0] == leaders[1]
-            return s.picture.mode(s.body) == Mode.DOCK or (undocks and s.picture.leader(module) != s.picture.leader(target))
+            return s.picture.mode(s.body) == Mode.DOCK or (parts and s.picture.leader(module) != s.picture.leader(target))
 
         return self._ask(command, action, request, is_done)
 
