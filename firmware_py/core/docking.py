@@ -55,6 +55,8 @@ class _Dock(NamedTuple):
     active: int
     target: int
     prepared: Prepared
+    waited_for: set[int]
+    """Modules of third bodies that have been on the way to the stand-off."""
 
 
 class DockingStage:
@@ -267,7 +269,7 @@ class DockingStage:
         comes = self._comes(plan, target, holding)
         sequence = DockingSequence(plan, estimates[active][0], estimates[target][0], self._p, time_ns, comes)
         pair = FacePair(request.target_module, request.target_face, request.module, request.face, plan.place_t, plan.q_ta)
-        self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared))
+        self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared, set()))
         self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
 
     # ------------------------------------------------------------ each tick
@@ -313,8 +315,8 @@ class DockingStage:
         plan = dock.sequence.plan
         way = way_of_active(plan, *estimates[dock.active], *estimates[dock.target], self._p.standoff_m)
         met = first_met(way, _thirds(estimates, dock.active, dock.target), self._p)
-        if met is not None and met not in dock.sequence.waited_for:
-            dock.sequence.waited_for.add(met)
+        if met is not None and met not in dock.waited_for:
+            dock.waited_for.add(met)
             self._say(WARNING, f"dock of module {plan.request.module} waits: module {met} is on its way")
         return met is not None
 

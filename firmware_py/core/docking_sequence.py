@@ -140,8 +140,6 @@ class DockingSequence:
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
-        self.waited_for: set[int] = set()
-        """Modules of third bodies that have been on the way to the stand-off."""
         self._entered_ns = time_ns
         self._good_since_ns: int | None = None
         self._gap_m = self._farthest_m

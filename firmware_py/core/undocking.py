@@ -41,7 +41,7 @@ class Undock(NamedTuple):
     def pushes(self, time_ns: int, joints: JointWatch) -> bool:
         """Whether it is too early to ask what holds: a picture of a single joint is waited for, of several their currents."""
         is_told = self._is_seen if len(self.plan.opens) == 1 else self._is_felt
-        return time_ns < (self.until_ns if is_told(time_ns, joints) else max(self.until_ns, self.seen_ns))
+        return time_ns < self.until_ns or (time_ns < self.seen_ns and not is_told(time_ns, joints))
 
     def held_by(self, time_ns: int, joints: JointWatch) -> str:
         """What tells that a joint holds, as where a relay hangs: two bodies would fly against each other. Empty: nothing does.

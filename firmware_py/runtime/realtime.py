@@ -31,6 +31,8 @@ SWITCH_INTERVAL_S = 1e-4
 (5.0 ms) while a reader worked through a flood of frames."""
 
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK, _PR_SET_THP_DISABLE = 1, 29, 41  # linux/prctl.h
+_LEAST_SLACK_NS = 1
+"""Of a timer; 0 would set the system's own again."""
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # sys/mman.h
 _MADV_DONTNEED = 4  # sys/mman.h
 _MAPS = Path("/proc/self/maps")
@@ -105,7 +107,7 @@ def use_fine_timers() -> str:
 
     Threads of real-time priority have no slack anyway: this is for those that may not have it.
     """
-    return _ask_kernel("fine timers", _PR_SET_TIMERSLACK, 1)
+    return _ask_kernel("fine timers", _PR_SET_TIMERSLACK, _LEAST_SLACK_NS)
 
 
 def use_small_pages() -> str:

@@ -141,6 +141,7 @@ class Docked(Tank):
         self.weak: set[int] = set()
         self.hidden: set[int] = set()
         self.hung: set[int] = set()
+        self.pull_ma = 110.0
         self.stuck = False
         self.said: list[tuple[float, str]] = []
         self._delay, self._plans = delay, list[tuple[int, Prepared]]()
@@ -156,7 +157,7 @@ class Docked(Tank):
                 module.tags.clear()
             if tick % 4 == 0:
                 turned = [state == RELAY_PUSH and m not in self.hung for state in relays[m]]
-                current = [0.0 if m in self.weak else -110.0 if turns else 110.0 for turns in turned]
+                current = [0.0 if m in self.weak else -self.pull_ma if turns else self.pull_ma for turns in turned]
                 module.docks = [DockFeedback(first, (*current[first : first + 3],), (1, 1, 1)) for first in (0, 3)]  # type: ignore[arg-type]
         return modules
 
@@ -189,13 +190,19 @@ class Docked(Tank):
         return next(at for at, said in self.said if text in said)
 
 
-def before_each_other(*y_m: float, parameters: Parameters | None = None, armed: tuple[int, ...] = (0, 1, 2)) -> Docked:
-    """Armed modules in one line, the first at 0, the others so far from it; no magnet draws current."""
-    modules = range(len(y_m) + 1)
+def placed(*places: tuple[float, float], parameters: Parameters | None = None, armed: tuple[int, ...] | None = None) -> Docked:
+    """Single modules at these places, north and east, m, that hold there once armed: all, or those that are named. No magnet draws current.
+    """
+    modules = range(len(places))
     tank = Docked([(0, m, 0) for m in modules], parameters, apart=True)
     tank.weak = set(modules)
-    for state, y in zip(tank.states, (0.0, *y_m), strict=True):
-        state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    for state, (north, east) in zip(tank.states, places, strict=True):
+        state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
-    tank.run(0.5, *(Request(Action.ARM, m) for m in modules if m in armed))
+    tank.run(0.5, *(Request(Action.ARM, m) for m in modules if armed is None or m in armed))
     return tank
+
+
+def before_each_other(*y_m: float, parameters: Parameters | None = None, armed: tuple[int, ...] | None = None) -> Docked:
+    """Modules in one line, the first at 0, the others so far east of it, as `placed` has them."""
+    return placed(*((1.0, y) for y in (0.0, *y_m)), parameters=parameters, armed=armed)

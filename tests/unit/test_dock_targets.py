@@ -12,7 +12,7 @@ from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Action, DockRequest, Mode, Request, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.prepare.assembly import PITCH_M
-from tests.unit.tanks import Docked, before_each_other
+from tests.unit.tanks import Docked, before_each_other, placed
 
 
 @pytest.mark.slow
@@ -51,12 +51,7 @@ def test_target_that_is_disarmed_is_not_expected_to_come(approach: str) -> None:
 @pytest.mark.parametrize("ring", [False, True])
 def test_bodies_that_are_to_dock_to_each_other_do_not_chase_each_other(ring: bool) -> None:
     places = [(1.0, 0.0), (1.5, 0.5), (0.4, 0.8)][: 3 if ring else 2]
-    tank = Docked([(0, m, 0) for m in range(len(places))], apart=True)
-    tank.weak = set(range(len(places)))
-    for state, (north, east) in zip(tank.states, places, strict=True):
-        state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
-    tank.run(2.0)
-    tank.run(0.5, *(Request(Action.ARM, m) for m in range(len(places))))
+    tank = placed(*places)
     wanted = [DockRequest(1, 3, 0, 2), DockRequest(2, 3, 1, 2), DockRequest(0, 1, 2, 0)] if ring else [
         DockRequest(1, 3, 0, 2), DockRequest(0, 0, 1, 1)
     ]
@@ -140,18 +135,6 @@ def test_target_comes_to_meet_the_first_of_two_alone() -> None:
     goal = tank.pipeline.formation.chains[0].guidance._goal
     assert goal is not None and goal.p_wb is not None
     assert goal.p_wb[1] == pytest.approx(0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m), abs=0.01)
-
-
-def placed(*places: tuple[float, float], parameters: Parameters | None = None) -> Docked:
-    """Single modules at these places, north and east, m: armed, and holding there; no magnet draws current."""
-    modules = range(len(places))
-    tank = Docked([(0, m, 0) for m in modules], parameters, apart=True)
-    tank.weak = set(modules)
-    for state, (north, east) in zip(tank.states, places, strict=True):
-        state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
-    tank.run(2.0)
-    tank.run(0.5, *(Request(Action.ARM, m) for m in modules))
-    return tank
 
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])

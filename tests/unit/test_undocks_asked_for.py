@@ -74,6 +74,15 @@ def test_corner_of_a_ring_stays_where_the_relays_of_a_joint_hang(hung: set[int])
     assert [sum(states) for states in tank.pipeline.formation.docking.relays.states] == [2] * 4, "and all pull again"
 
 
+def test_corner_of_a_ring_whose_hanging_relays_have_nothing_before_them_any_more_is_undocked() -> None:
+    """Their currents have not turned, and are those of idle coils; so are the others', which is to bother nobody here."""
+    tank = Docked(RING, Parameters().replace("failsafes.partner_lost_action", 0))
+    tank.fly()
+    tank.hung, tank.stuck, tank.pull_ma = {2, 3}, True, 40.0
+    tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
+    assert tank.shape == [(0, 1, 2), (3,)]
+
+
 @pytest.mark.parametrize("hung", [set(), {0, 1}], ids=str)
 def test_module_out_of_sight_is_undocked_unless_its_magnets_go_on_pulling(hung: set[int]) -> None:
     tank = Docked(RING[:2])
