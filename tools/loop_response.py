@@ -133,8 +133,7 @@ class Loop:
     def _push(self, force_n: np.ndarray) -> None:
         """At SYNC the plant takes the forces that were commanded in the tick before."""
         t, u = self.body.thrusters, np.zeros(force_n.size)
-        nothing, full = np.zeros(force_n.size), np.ones(force_n.size)
-        commands(np.ascontiguousarray(force_n), full, t.forward, t.reverse, nothing, full, u)
+        commands(np.ascontiguousarray(force_n), np.ones(force_n.size), t.forward, t.reverse, np.zeros(force_n.size), u)
         for module in range(len(self.body.modules)):
             self._world.set_command(module, u[t.module == module].tolist())
 

@@ -37,9 +37,9 @@ class Limiter:
         self._of_module = [np.flatnonzero(t.module == m) for m in range(len(body.modules))]
         self._power = [(np.ascontiguousarray(t.power_forward[i]), np.ascontiguousarray(t.power_reverse[i])) for i in self._of_module]
         self._curves = (t.forward, t.reverse, t.deadband_n)
-        self._full, self._all = np.ones(t.f_max.size), np.ones(t.f_max.size, dtype=bool)
+        self._all = np.ones(t.f_max.size, dtype=bool)
         self._nominal_v = body.nominal_v
-        self._scale, self._scaled_for = self._full, b""
+        self._scale, self._scaled_for = np.ones(t.f_max.size), b""
         self._room: Room | None = None
         self._room_for: tuple[object, ...] = ()
         self.magnets = [MagnetLimiter(parameters, dt_s) for _ in body.modules]
@@ -97,7 +97,7 @@ class Limiter:
                 self._limit_power(wanted, module, supply_w - magnets.power_w)
         self.force_n = wanted
         out = np.empty_like(wanted)
-        commands(wanted, scale, *self._curves, self._full, out)
+        commands(wanted, scale, *self._curves, out)
         return wanted, out
 
     def _limit_power(self, wanted: np.ndarray, module: int, supply: float) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import ThrusterSet
+from firmware_py.core.rotations import M, V
 
 RESOLUTION = 2.0**-40
 """Of a command found by `inverse`: far below the bus's 1/2048."""
@@ -57,25 +58,22 @@ def inverse(c, value):  # type: ignore[no-untyped-def]
     return x
 
 
-@njit(
-    "void(float64[::1],float64[::1],float64[:,::1],float64[:,::1],float64[::1],float64[::1],float64[::1])",
-    cache=True,
-)
-def commands(force, scale, forward, reverse, deadband, limit_share, out):  # type: ignore[no-untyped-def]
+@njit(f"void({V},{V},{M},{M},{V},{V})", cache=True)
+def commands(force, scale, forward, reverse, deadband, out):  # type: ignore[no-untyped-def]
     """(n,) command of each thruster for its wanted force.
 
     Args:
         force: (n,) N. scale: (n,) force at this voltage over force at the curve's voltage.
-        forward, reverse: (n, 5) polynomials. deadband: (n,) N. limit_share: (n,) largest command. out: (n,) is written.
+        forward, reverse: (n, 5) polynomials. deadband: (n,) N. out: (n,) is written.
     """
     for i in range(force.shape[0]):
         f = force[i] / scale[i]
         if abs(f) < 0.5 * deadband[i]:
             out[i] = 0.0
         elif f > 0.0:
-            out[i] = min(inverse(forward[i], f), limit_share[i])
+            out[i] = inverse(forward[i], f)
         else:
-            out[i] = -min(inverse(reverse[i], -f), limit_share[i])
+            out[i] = -inverse(reverse[i], -f)
 
 
 @njit("float64(float64[::1],float64[:,::1],float64[:,::1])", cache=True)

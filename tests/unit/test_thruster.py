@@ -20,7 +20,7 @@ def thrusters() -> ThrusterSet:
     return assemble_vehicle(load_vehicle("modcube")).thrusters
 
 
-def commands(thrusters: ThrusterSet, force: np.ndarray, scale: float = 1.0, share: float = 1.0) -> np.ndarray:
+def commands(thrusters: ThrusterSet, force: np.ndarray, scale: float = 1.0) -> np.ndarray:
     n = force.size
     out = np.full(n, np.nan)
     rows = np.zeros(n, dtype=int)
@@ -30,7 +30,6 @@ def commands(thrusters: ThrusterSet, force: np.ndarray, scale: float = 1.0, shar
         np.ascontiguousarray(thrusters.forward[rows]),
         np.ascontiguousarray(thrusters.reverse[rows]),
         thrusters.deadband_n[rows].copy(),
-        np.full(n, share),
         out,
     )
     return out
@@ -80,10 +79,6 @@ def test_force_within_half_the_deadband_is_not_asked_for(thrusters: ThrusterSet)
     u = commands(thrusters, edge * np.array([0.0, 0.999, -0.999, 1.001, -1.001]))
     np.testing.assert_array_equal(u[:3], 0.0)
     assert u[3] > 0.0 > u[4]
-
-
-def test_command_stays_within_its_share(thrusters: ThrusterSet) -> None:
-    np.testing.assert_array_equal(commands(thrusters, np.array([10.0, -8.0]), share=0.25), [0.25, -0.25])
 
 
 @pytest.mark.parametrize("name", vehicle_names())
