@@ -16,6 +16,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.box_program import nearest
 from firmware_py.core.least_power import LeastPower
 from firmware_py.core.preload import preload
+from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import module_power
 from firmware_py.core.types import Room, Thrust
 from firmware_py.description.parameters import Allocation
@@ -37,7 +38,7 @@ LEFT = 1e-3
 """Largest difference from the directions of force and moment, N and N m, that is taken; a hundred thousand times what is usual."""
 
 
-@njit("float64(float64[::1],float64[::1],float64[::1])", cache=True)
+@njit(f"float64({V},{V},{V})", cache=True)
 def busiest(force, f_min, f_max):  # type: ignore[no-untyped-def]
     """Share of its range that the busiest thruster gives."""
     most = 0.0
@@ -46,13 +47,13 @@ def busiest(force, f_min, f_max):  # type: ignore[no-untyped-def]
     return most
 
 
-@njit("boolean(float64[::1],float64[::1],float64[::1])", cache=True)
+@njit(f"boolean({V},{V},{V})", cache=True)
 def are_within(force, f_min, f_max):  # type: ignore[no-untyped-def]
     """Whether every force is within its limits; one that is not a number is not."""
     return bool(np.all((force >= f_min) & (force <= f_max)))
 
 
-@njit("boolean(float64[::1],float64[:,::1],float64[:,::1],int64[::1],float64[::1])", cache=True)
+@njit(f"boolean({V},{M},{M},int64[::1],{V})", cache=True)
 def are_fed(force, power_forward, power_reverse, module, supply):  # type: ignore[no-untyped-def]
     """Whether the (m,) supplies, W, are enough for the forces; a power that is not a number is no reason against."""
     return not np.any(module_power(force, power_forward, power_reverse, module, supply.size) > supply)

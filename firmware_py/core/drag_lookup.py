@@ -11,7 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
-V = "float64[::1]"
+from firmware_py.core.rotations import V
+
 NODES = "float64[:,:,:,::1]"
 STILL = 1e-12
 """m/s; below it there is no direction, and no drag."""

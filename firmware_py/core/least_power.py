@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import RANK_TOLERANCE, ThrusterSet
+from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import total_power
 
 PASSES = 3
@@ -25,7 +26,7 @@ SOLVED = 1
 """daqp's exit flag for optimal."""
 
 
-@njit("void(float64[::1],float64[:,::1],float64[:,::1],float64[::1],float64[::1])", cache=True)
+@njit(f"void({V},{M},{M},{V},{V})", cache=True)
 def slopes(force, power_forward, power_reverse, slope, bend):  # type: ignore[no-untyped-def]
     """Writes d(power)/d(force), W/N, and its derivative, W/N^2, of each thruster; (n,) each, polynomials (n, 5) over |N|."""
     for i in range(force.shape[0]):

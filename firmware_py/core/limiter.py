@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import Body
+from firmware_py.core.rotations import V
 from firmware_py.core.thruster import commands, module_power, polynomial, total_power
 from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, RELAY_PUSH, Room
 from firmware_py.description.parameters import Limiter as LimiterParameters
@@ -122,10 +123,7 @@ class Limiter:
         return self._scale
 
 
-@njit(
-    "void(float64[::1],float64[::1],boolean[::1],float64[::1],float64[::1],float64[::1],float64[::1],float64[::1],float64,float64[::1])",
-    cache=True,
-)
+@njit(f"void({V},{V},boolean[::1],{V},{V},{V},{V},{V},float64,{V})", cache=True)
 def limit_forces(wanted, last, alive, scale, low, high, full_low, full_high, step, out):  # type: ignore[no-untyped-def]
     """Writes the limited force of each thruster, N; all but `step` are (n,).
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import BUOYANCY_SIGMA_N, CRUISE_M_S, Body
-from firmware_py.core.drag_lookup import add_drag
+from firmware_py.core.drag_lookup import NODES, add_drag
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
 from firmware_py.core.rotations import M, V, cross, rotate_back, turned_back
@@ -166,7 +166,7 @@ class MissingThrust:
 DOWN = np.array([0.0, 0.0, GRAVITY])
 
 
-@njit(f"void({V},float64[:,:,:,::1],{V},{V},{V},{V},{V})", cache=True)
+@njit(f"void({V},{NODES},{V},{V},{V},{V},{V})", cache=True)
 def add_model(righting, nodes, rotational, linear, nu, q_wb, out):  # type: ignore[no-untyped-def]
     """Adds to `out` (6,) what drag and buoyancy do to the body."""
     add_drag(nodes, rotational, linear, nu, out)
@@ -198,7 +198,7 @@ def add_motion(accel, q_wb, out):  # type: ignore[no-untyped-def]
         out[i] += accel[i] + down[i]
 
 
-@njit(f"float64({V},{V},{V},{M},{V},float64[:,:,:,::1],{V},{V},{V},{V},{V},{V})", cache=True)
+@njit(f"float64({V},{V},{V},{M},{V},{NODES},{V},{V},{V},{V},{V},{V})", cache=True)
 def add_tick(nu, q_wb, force_n, mass, righting, nodes, rotational, linear, model, coriolis, flow, forces):  # type: ignore[no-untyped-def]
     """Adds one tick to the sums of a block, the last four, and returns the speed, m/s."""
     add_model(righting, nodes, rotational, linear, nu, q_wb, model)

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
-from firmware_py.core.drag_lookup import add_drag
+from firmware_py.core.drag_lookup import NODES, add_drag
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
 from firmware_py.core.rotations import M, V, cross, exp, multiply, normalise, rotate_back, skew, to_matrix, turn, turned, turned_back
 
@@ -28,8 +28,7 @@ goes with the noise that the innovations are made of. Gains that took it for til
 surer by the minute."""
 MOVING = 12
 """Errors of pose and velocity, which come first; those of biases, disturbance and righting stand still in a prediction."""
-N = "float64[:,:,:,::1]"
-PLANT = f"{M},{M},{V},{N},{V},{V}"
+PLANT = f"{M},{M},{V},{NODES},{V},{V}"
 """Types of the body's arrays: mass, mass_inv, righting, drag nodes, rotational and linear damping."""
 STATE = f"Tuple(({V},{M}))"
 """Types of a state and its covariance."""

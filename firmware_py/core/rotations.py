@@ -9,6 +9,7 @@ from numba import njit
 
 V = "float64[::1]"
 M = "float64[:,::1]"
+"""Types of a vector and of a matrix, for the signature of a compiled function."""
 
 
 @njit(cache=True)

@@ -20,7 +20,7 @@ MOST_STEPS = 60
 """Of its search; six are usual."""
 
 
-@njit("float64(float64[::1],float64)", cache=True)
+@njit(f"float64({V},float64)", cache=True)
 def polynomial(c, x):  # type: ignore[no-untyped-def]
     """c[0] x + c[1] x^2 + ... without a constant term, so that no command is no force."""
     value = 0.0
@@ -29,7 +29,7 @@ def polynomial(c, x):  # type: ignore[no-untyped-def]
     return value
 
 
-@njit("float64(float64[::1],float64)", cache=True)
+@njit(f"float64({V},float64)", cache=True)
 def inverse(c, value):  # type: ignore[no-untyped-def]
     """The x in 0..1 with polynomial(c, x) = value; 0 below and 1 above the range. c must rise over 0..1.
 
@@ -76,7 +76,7 @@ def commands(force, scale, forward, reverse, deadband, out):  # type: ignore[no-
             out[i] = -inverse(reverse[i], -f)
 
 
-@njit("float64(float64[::1],float64[:,::1],float64[:,::1])", cache=True)
+@njit(f"float64({V},{M},{M})", cache=True)
 def total_power(force, power_forward, power_reverse):  # type: ignore[no-untyped-def]
     """Electrical power of all thrusters, W."""
     total = 0.0
@@ -85,7 +85,7 @@ def total_power(force, power_forward, power_reverse):  # type: ignore[no-untyped
     return total
 
 
-@njit("float64[::1](float64[::1],float64[:,::1],float64[:,::1],int64[::1],int64)", cache=True)
+@njit(f"{V}({V},{M},{M},int64[::1],int64)", cache=True)
 def module_power(force, power_forward, power_reverse, module, count):  # type: ignore[no-untyped-def]
     """(count,) electrical power of the thrusters of each module, W; `module` (n,) says whose a thruster is."""
     out = np.zeros(count)
@@ -94,7 +94,7 @@ def module_power(force, power_forward, power_reverse, module, count):  # type: i
     return out
 
 
-@njit("void(float64[::1],float64[::1],float64[::1],float64[::1],float64[::1])", cache=True)
+@njit(f"void({V},{V},{V},{V},{V})", cache=True)
 def lagged(acting, decay, lag_over_dt, force, mean):  # type: ignore[no-untyped-def]
     """Moves `force` (n,), N, on by a tick towards `acting` (n,), N; writes to `mean` (n,) what it is on the mean of that tick, N.
 
