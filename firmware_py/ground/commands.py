@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from firmware_py.core.types import WARNING, Action, DockRequest, Event, Mode
+from firmware_py.core.types import CHANNELS, FACES, WARNING, Action, DockRequest, Event, Mode
 from firmware_py.ground.command import ACCEPTED, COMMAND_INT_ONLY, DENIED, FAILED, TEMPORARILY_REJECTED, UNSUPPORTED, Answer, Command
 from firmware_py.ground.dialect import Message
 from firmware_py.ground.identity import CUSTOM_MODE_ENABLED, SETTABLE
@@ -21,7 +21,6 @@ DECISION_NS = 400_000_000
 """The supervisor decides within a tick or two; clients ask again after 0.5 s."""
 _FORCED = (21196, 2989)
 """Second parameter of a forced arm or disarm: MAVLink's, and ArduPilot's for arming."""
-_FACES = 6
 
 SET_MODE, TERMINATE, REPOSITION, ARM = 176, 185, 192, 400
 DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
@@ -247,7 +246,7 @@ class CommandService:
     def _dock(self, command: Command, action: Action) -> Answer:
         module, face, target, target_face, turns = (int(command.get(i)) for i in range(1, 6))
         known = len(self._system.subject.picture.modules)
-        faces_exist = face in range(_FACES) and target_face in range(_FACES)
+        faces_exist = face in range(FACES) and target_face in range(FACES)
         if module not in range(known) or target not in range(known) or module == target or not faces_exist:
             return DENIED
         if turns not in range(4):
@@ -264,7 +263,7 @@ class CommandService:
 
     def _motor_test(self, command: Command) -> Answer:
         """Motor, throttle type (0: %, 1: PWM 1100 to 1900), throttle, seconds; motors and % count from where the identity's do."""
-        count, identity = 8 * len(self._system.subject.modules), self._system.subject.identity
+        count, identity = CHANNELS * len(self._system.subject.modules), self._system.subject.identity
         thruster, kind, throttle = int(command.get(1)) - identity.first_motor, int(command.get(2)), command.get(3)
         rest = identity.rest_percent
         share = {0: (throttle - rest) / (100 - rest), 1: (throttle - 1500) / 400}.get(kind)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from firmware_py.core.types import WARNING
 from firmware_py.ground.system import Arrival, Handler, System
 
 _PIECE = 90
@@ -125,7 +126,7 @@ class LogService:
         self._transfers.pop(arrival.channel, None)
 
     def _erase(self, arrival: Arrival) -> None:
-        self._system.say(4, "logs are not erased from a ground station")
+        self._system.say(WARNING, "logs are not erased from a ground station")
 
     def _find(self) -> list[Path]:
         if self._folder is None:

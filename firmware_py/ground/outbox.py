@@ -10,8 +10,6 @@ from firmware_py.ground.identity import COMPONENT_AUTOPILOT
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.wire import Encoder
 
-NS_PER_US = 1_000
-
 
 class Outgoing(NamedTuple):
     """A frame for one channel."""

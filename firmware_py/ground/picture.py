@@ -13,11 +13,10 @@ from firmware_py.core.body import Body
 from firmware_py.core.estimator import ADRIFT_NS
 from firmware_py.core.failsafes import Level
 from firmware_py.core.transitions import ARMED, State
-from firmware_py.core.types import NEVER_NS, BodyRecord, Estimate, Event, Inputs, Mode, ModuleInputs, Outputs
+from firmware_py.core.types import CHANNELS, FACES, NEVER_NS, BodyRecord, Estimate, Event, Inputs, Mode, ModuleInputs, Outputs
 from firmware_py.description.parameters import Supervision
 from firmware_py.ground.times import Times
 
-_THRUSTERS = 8
 ESC_SILENT = 3
 """EscStatus of one that is not heard."""
 _MOST_EVENTS = 64
@@ -34,12 +33,12 @@ class ModulePicture:
     cabin_pressure_pa: float = math.nan
     cabin_temperature_c: float = math.nan
     leak: bool = False
-    dock_current_ma: list[float] = field(default_factory=lambda: [math.nan] * 6)
-    rpm: list[float] = field(default_factory=lambda: [0.0] * _THRUSTERS)
-    esc_current_a: list[float] = field(default_factory=lambda: [0.0] * _THRUSTERS)
-    esc_status: list[int] = field(default_factory=lambda: [ESC_SILENT] * _THRUSTERS)
+    dock_current_ma: list[float] = field(default_factory=lambda: [math.nan] * FACES)
+    rpm: list[float] = field(default_factory=lambda: [0.0] * CHANNELS)
+    esc_current_a: list[float] = field(default_factory=lambda: [0.0] * CHANNELS)
+    esc_status: list[int] = field(default_factory=lambda: [ESC_SILENT] * CHANNELS)
     esc_frames: int = 0
-    command: np.ndarray = field(default_factory=lambda: np.zeros(_THRUSTERS))
+    command: np.ndarray = field(default_factory=lambda: np.zeros(CHANNELS))
     """(8,) share of full command, as sent."""
     gyro_ns: int = NEVER_NS
     accel_ns: int = NEVER_NS

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from firmware_py.core.rotations import rotate, to_euler
-from firmware_py.core.types import BodyRecord
+from firmware_py.core.types import CHANNELS, BodyRecord
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.ground.geodesy import Origin
 from firmware_py.ground.identity import TYPE_SUBMARINE, Identity, base_mode
@@ -235,7 +235,7 @@ def servo_output_raw(s: Subject) -> list[Values]:
 
 def esc_status(s: Subject) -> list[Values]:
     return [{
-        "index": 8 * i + first, "time_usec": s.time_us, "rpm": [round(r) for r in m.rpm[first : first + 4]],
+        "index": CHANNELS * i + first, "time_usec": s.time_us, "rpm": [round(r) for r in m.rpm[first : first + 4]],
         "voltage": [m.voltage_v] * 4, "current": m.esc_current_a[first : first + 4],
     } for i, m in enumerate(s.modules) for first in (0, 4)]  # fmt: skip
 
@@ -247,9 +247,9 @@ _BY_CAN = 4
 
 
 def esc_info(s: Subject) -> list[Values]:
-    count = 8 * len(s.modules)
+    count = CHANNELS * len(s.modules)
     return [{
-        "index": 8 * i + first, "time_usec": s.time_us, "counter": m.esc_frames & 0xFFFF, "count": count,
+        "index": CHANNELS * i + first, "time_usec": s.time_us, "counter": m.esc_frames & 0xFFFF, "count": count,
         "connection_type": _BY_CAN, "info": _online(s, m, first),
         "failure_flags": [_ESC_FAILURES[status] for status in m.esc_status[first : first + 4]],
         "error_count": (0, 0, 0, 0), "temperature": (_UNKNOWN_TEMPERATURE,) * 4,
