@@ -144,9 +144,7 @@ class Picture:
     def mode(self, body: int) -> Mode:
         """How it is steered, or would be once armed."""
         record = self.records.get(body)
-        if record is None:
-            return Mode.POSHOLD
-        return Mode(getattr(record, "mode", Mode.POSHOLD))
+        return Mode.POSHOLD if record is None else Mode(record.mode)
 
     def is_stopped(self, body: int) -> bool:
         """Whether the e-stop holds it."""
