@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from firmware_py.core.transitions import MODE_TABLE
 from firmware_py.core.types import Mode
 
 AUTOPILOT_GENERIC, AUTOPILOT_ARDUPILOT = 0, 3
@@ -110,9 +111,7 @@ ARDUSUB = Identity(
 IDENTITIES = {identity.name: identity for identity in (GENERIC, ARDUSUB)}
 """By the name that the command line takes."""
 
-SETTABLE = (
-    Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.SURFACE, Mode.MOTOR_DETECT,
-)  # fmt: skip
+SETTABLE = tuple(row.mode for row in MODE_TABLE if row.request)
 """Modes that a person may choose; DOCK is entered by asking for it."""
 
 NAMES: Mapping[Mode, str] = {
