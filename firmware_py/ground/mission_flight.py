@@ -28,10 +28,8 @@ from firmware_py.ground.mission_items import (
     flight_order,
 )
 from firmware_py.ground.system import NS_PER_S, System
-from firmware_py.ground.telemetry import mission_current
+from firmware_py.ground.telemetry import ACTIVE, DONE, NO_MISSION, PAUSED, READY, mission_current
 
-NONE, READY, ACTIVE, PAUSED, DONE = 1, 2, 3, 4, 5
-"""MISSION_STATE."""
 _SETTLE_TICKS = 3
 """Ticks from asking for a hold to reading where it is held."""
 _HOLD_TICKS = 100
@@ -131,7 +129,7 @@ class MissionFlight:
         self.amend(items)
         p = self._system.subject.progress
         p.total, p.current = max(len(items) - self._first, 0), min(self._first, max(len(items) - 1, 0))
-        p.state = READY if items else NONE
+        p.state = READY if items else NO_MISSION
         if self._flight is not None:
             self._flight.replaced = self._flight.of_mission
 

@@ -27,6 +27,8 @@ _NO_GPS = 0
 """GPS_FIX_TYPE."""
 _FRAME_LOCAL_NED, _FRAME_BODY_FRD = 1, 12
 _PWM_CENTRE, _PWM_HALF = 1500, 400
+NO_MISSION, READY, ACTIVE, PAUSED, DONE = 1, 2, 3, 4, 5
+"""MISSION_STATE."""
 
 
 @dataclass(slots=True)
@@ -35,8 +37,7 @@ class Progress:
 
     current: int = 0
     total: int = 0
-    state: int = 1
-    """MISSION_STATE: 1 no mission, 2 not started, 3 active, 4 paused, 5 complete."""
+    state: int = NO_MISSION
 
 
 @dataclass(slots=True)
@@ -321,7 +322,7 @@ def mission_current(s: Subject) -> list[Values]:
     p = s.progress
     return [{
         "seq": p.current, "total": p.total or _UNKNOWN_16, "mission_state": p.state,
-        "mission_mode": 1 if p.state == 3 else 2,
+        "mission_mode": 1 if p.state == ACTIVE else 2,
     }]  # fmt: skip
 
 
