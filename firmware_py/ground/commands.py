@@ -132,14 +132,16 @@ class CommandService:
         values = {"command": command.number, "result": result, **command.arrival.sender}
         self._system.send(command.arrival.channel, "COMMAND_ACK", values)
 
-    def _later(self, command: Command, action: Action, is_done: Callable[[], bool]) -> None:
-        deadline_ns = command.arrival.time_ns + DECISION_NS
-        self._pending.append(Pending(command, action, is_done, deadline_ns))
-
     def _ask(self, command: Command, action: Action, argument: Any, is_done: Callable[[], bool]) -> Answer:
         self._system.ask(action, argument)
-        self._later(command, action, is_done)
+        self._pending.append(Pending(command, action, is_done, command.arrival.time_ns + DECISION_NS))
         return None
+
+    def _unless(self, reason: str, what: str, refusal: int) -> Answer:
+        """Accepted where there is no reason against it; else the reason is told, and the answer is `refusal`."""
+        if reason:
+            self._system.say(WARNING, f"{what} refused: {reason}")
+        return refusal if reason else ACCEPTED
 
     # ------------------------------------------------------------ arming and modes
 
@@ -185,11 +187,7 @@ class CommandService:
     # ------------------------------------------------------------ missions
 
     def _start_mission(self, command: Command, first: int | None) -> Answer:
-        reason = self._missions.start(first)
-        if reason:
-            self._system.say(WARNING, f"mission refused: {reason}")
-            return TEMPORARILY_REJECTED
-        return ACCEPTED
+        return self._unless(self._missions.start(first), "mission", TEMPORARILY_REJECTED)
 
     def _pause(self, command: Command) -> Answer:
         if command.get(1) >= 0.5:
@@ -197,11 +195,7 @@ class CommandService:
         return self._enter(command, Mode.POSHOLD)
 
     def _set_current(self, command: Command) -> Answer:
-        reason = self._missions.jump(int(command.get(1)))
-        if reason:
-            self._system.say(WARNING, f"mission refused: {reason}")
-            return DENIED
-        return ACCEPTED
+        return self._unless(self._missions.jump(int(command.get(1))), "mission", DENIED)
 
     def _change_speed(self, command: Command) -> Answer:
         return ACCEPTED if command.get(1) not in ONE_WAY_SPEEDS and self._missions.set_speed(command.get(2)) else DENIED
@@ -211,13 +205,9 @@ class CommandService:
         if not all(map(math.isfinite, (latitude, longitude, altitude))):
             return DENIED
         if self._system.is_one_of_several(command.arrival):
-            self._system.say(WARNING, "reposition refused: it is for all, and there are several bodies")
-            return DENIED
+            return self._unless("it is for all, and there are several bodies", "reposition", DENIED)
         reason = self._missions.go_to(latitude, longitude, altitude, command.parameters[3], command.get(1))
-        if reason:
-            self._system.say(WARNING, f"reposition refused: {reason}")
-            return TEMPORARILY_REJECTED
-        return ACCEPTED
+        return self._unless(reason, "reposition", TEMPORARILY_REJECTED)
 
     # ------------------------------------------------------------ safety, docking, thrusters
 
@@ -237,11 +227,8 @@ class CommandService:
             return UNSUPPORTED
         picture = self._system.subject.picture  # of the fleet: it is one process for all of them
         reason = "a body is armed" if picture.any_armed else "the e-stop is not cleared" if picture.any_stopped else ""
-        if reason:
-            self._system.say(WARNING, f"reboot refused: {reason}")
-            return DENIED
-        self.reboot_asked = True
-        return ACCEPTED
+        self.reboot_asked = self.reboot_asked or not reason
+        return self._unless(reason, "reboot", DENIED)
 
     def _dock(self, command: Command, action: Action) -> Answer:
         module, face, target, target_face, turns = (int(command.get(i)) for i in range(1, 6))
