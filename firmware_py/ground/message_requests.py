@@ -67,4 +67,4 @@ class MessageRequests:
         return ACCEPTED
 
     def _name(self, number: float) -> str:
-        return self._system.name_of(int(number))
+        return self._system.outbox.name_of(int(number))

@@ -69,10 +69,6 @@ class System:
         """Whether a tick has told of it."""
         return self.body in self.subject.picture.records
 
-    def name_of(self, number: int) -> str:
-        """Name of a message number; empty when there is none."""
-        return self.outbox.name_of(number)
-
     def add_channel(self, channel: int, time_ns: int) -> None:
         """Somebody came."""
         if channel not in self.channels:
