@@ -116,7 +116,7 @@ class Guidance:
             elif effect == Effect.HOLD_AT and argument is not None:
                 self._goal = Wish(ZERO, ZERO, self._inside(argument.p_wb), argument.q_wb)
             elif effect == Effect.FOLLOW:
-                self.follow(argument)
+                self._trajectory, self._start_ns = argument, None
 
     def _level(self) -> None:
         """A body that is steeper than a hold may keep is to turn upright where it is."""
@@ -138,10 +138,6 @@ class Guidance:
         self.mode, self._wrench, self._blend = mode, wrench, True
         if before is not None:
             self._sticks, self._sticks_ns = before._sticks, before._sticks_ns
-
-    def follow(self, trajectory: Trajectory) -> None:
-        """AUTO's next trajectory."""
-        self._trajectory, self._start_ns = trajectory, None
 
     def dock(self, where: Setpoint | Wish) -> None:
         """Where the docking sequence wants the body in this tick: just there, or on its way there."""
@@ -167,12 +163,6 @@ class Guidance:
         """POSHOLD's place, or the one that it is on its way to."""
         at = self._glider.at
         return self._goal or Wish(ZERO, ZERO, at.p_wb, at.q_wb)
-
-    def finished(self, time_ns: int) -> bool:
-        """Whether no trajectory is under way."""
-        if self.mode != Mode.AUTO or self._trajectory is None:
-            return True
-        return self._start_ns is not None and (time_ns - self._start_ns) * 1e-9 >= self._trajectory.duration_s
 
     def _enter(self, mode: Mode, time_ns: int, estimate: Estimate) -> None:
         if STEERING[self.mode] != STEERING[Mode.POSHOLD]:

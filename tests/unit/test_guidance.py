@@ -130,7 +130,7 @@ def test_loop_that_stood_still_goes_on_from_the_body_and_not_from_where_it_would
     flight = Flight()
     flight.do(Effect.ENTER_MODE, mode)
     if mode == Mode.AUTO:
-        flight.guidance.follow(Ramp())
+        flight.do(Effect.FOLLOW, mode, Ramp())
     elif mode == Mode.POSHOLD:
         flight.do(Effect.HOLD_AT, mode, rest_at(np.array([0.6, 0.0, 1.0]), LEVEL))
     before = flight.run(1.0)
