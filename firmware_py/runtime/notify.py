@@ -8,18 +8,11 @@ from __future__ import annotations
 import socket
 from collections.abc import Mapping
 
-NS_PER_US = 1000
-
 
 class Notifier:
-    """The socket to the service manager, when there is one.
+    """The socket to the service manager, when there is one."""
 
-    Attributes:
-        watchdog_ns: the service is killed when `send` was not given WATCHDOG=1 for so long; 0: never.
-    """
-
-    def __init__(self, address: str = "", watchdog_ns: int = 0) -> None:
-        self.watchdog_ns = watchdog_ns
+    def __init__(self, address: str = "") -> None:
         self._socket: socket.socket | None = None
         if address:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
@@ -32,8 +25,7 @@ class Notifier:
     @classmethod
     def of(cls, environment: Mapping[str, str]) -> Notifier:
         """As the service manager's environment says."""
-        watchdog = environment.get("WATCHDOG_USEC", "")
-        return cls(environment.get("NOTIFY_SOCKET", ""), NS_PER_US * int(watchdog) if watchdog.isdigit() else 0)
+        return cls(environment.get("NOTIFY_SOCKET", ""))
 
     @property
     def is_heard(self) -> bool:
