@@ -20,23 +20,6 @@ class Clock(Protocol):
         ...
 
 
-class ManualClock:
-    """Time that stands until it is set: lockstep, where the bench owns time."""
-
-    def __init__(self, start_ns: int = 0) -> None:
-        self._now_ns = start_ns
-
-    def now_ns(self) -> int:
-        """The time that was set last."""
-        return self._now_ns
-
-    def set(self, now_ns: int) -> None:
-        """Move to `now_ns`. Raises ValueError for a step back."""
-        if now_ns < self._now_ns:
-            raise ValueError(f"time cannot go back from {self._now_ns} to {now_ns} ns")
-        self._now_ns = now_ns
-
-
 class MonotonicClock:
     """The machine's MACHINE_CLOCK, which never goes back: the same for all processes of one machine."""
 

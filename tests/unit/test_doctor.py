@@ -36,7 +36,7 @@ from firmware_py.app.service import reporting
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.port import Port, open_port
 from firmware_py.core.types import Inputs, ModuleInputs, Outputs
-from firmware_py.runtime.clock import ManualClock
+from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.rate_keeper import RateKeeper
 from hil.nodes import Nodes, make_nodes
@@ -237,7 +237,7 @@ def test_service_tells_that_it_is_ready_alive_and_how_it_fares(tmp_path: Path) -
         manager.bind(str(tmp_path / "notify"))
         manager.setblocking(False)
         notifier = Notifier.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
-        keeper = RateKeeper(PERIOD_NS, ManualClock(), lambda deadline_ns: None)
+        keeper = RateKeeper(PERIOD_NS, MonotonicClock(), lambda deadline_ns: None)
         observe = reporting(notifier, keeper, 100)
         heard: list[tuple[int, str]] = []
         for tick in range(1, 301):
@@ -259,7 +259,7 @@ def test_service_tells_that_it_is_ready_alive_and_how_it_fares(tmp_path: Path) -
 
 def test_service_is_ready_once_after_a_second_at_every_rate() -> None:
     """One that never says so is killed by systemd after 90 s, in flight."""
-    keeper = RateKeeper(PERIOD_NS, ManualClock(), lambda deadline_ns: None)
+    keeper = RateKeeper(PERIOD_NS, MonotonicClock(), lambda deadline_ns: None)
     for rate_hz in range(50, 401):
         said: list[str] = []
         notifier: Any = SimpleNamespace(is_heard=True, send=said.append)
@@ -275,7 +275,7 @@ def test_service_says_at_once_that_a_module_is_armed_and_that_it_is_not() -> Non
     """flash.py asks before it stops the service; a second is long."""
     said: list[str] = []
     notifier: Any = SimpleNamespace(is_heard=True, send=said.append)
-    observe = reporting(notifier, RateKeeper(PERIOD_NS, ManualClock(), lambda deadline_ns: None), 100)
+    observe = reporting(notifier, RateKeeper(PERIOD_NS, MonotonicClock(), lambda deadline_ns: None), 100)
     for tick, armed in enumerate((False, True, True, False, False), 1):
         observe([], [], Inputs(tick, 0, [ModuleInputs()], [], False, 0, False), outputs(tick, [SimpleNamespace(armed=armed)]))
     assert [re.findall(r"tick=\d|armed=\S+", text) for text in said] == [["tick=2", "armed=1/1"], ["tick=4", "armed=0/1"]]

@@ -25,7 +25,7 @@ from firmware_py.ground.telemetry import STREAMS
 from firmware_py.ground.times import Times
 from firmware_py.ground.wire import checksum
 from firmware_py.prepare.assembly import assemble_vehicle
-from firmware_py.runtime.clock import ManualClock
+from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.rate_keeper import RateKeeper
 from tests.unit.ground_requests import ask
 from tests.unit.ground_world import PERIOD_NS, Client, World
@@ -169,7 +169,7 @@ def test_estimate_that_is_thrown_away_for_what_tags_say_is_counted(jump_m: float
 
 
 def test_robot_on_a_clock_tells_how_its_ticks_keep_their_deadlines(world: World, client: Client) -> None:
-    keeper = RateKeeper(10_000_000, ManualClock(), lambda deadline_ns: None)
+    keeper = RateKeeper(10_000_000, MonotonicClock(), lambda deadline_ns: None)
     for duration_ns in (4_000, 150_000, 160_000):
         keeper.lateness.add(duration_ns)
         keeper.compute.add(10 * duration_ns)
