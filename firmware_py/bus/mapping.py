@@ -39,7 +39,6 @@ class InputCollector:
         faults: frames that passed the codec's checks and were not used, by kind: `module` (not in the fleet),
             `tag_unpaired`, `tag_stale`, `tag_future`, `sensor` (its status says fault or stale), `foreign_sync` and
             `foreign_command` (somebody else controls this bus).
-        heartbeats: last node state by (bus, number).
         unmet: fleet indices of modules that have not said yet how they are.
     """
 
@@ -54,7 +53,6 @@ class InputCollector:
         self._estop = self._foreign_sync = self._foreign_command = False
         kinds = ("module", "tag_unpaired", "tag_stale", "tag_future", "sensor", "foreign_sync", "foreign_command")
         self.faults: dict[str, int] = dict.fromkeys(kinds, 0)
-        self.heartbeats: dict[tuple[int, int], int] = {}
         self.unmet = set(range(len(fleet.module)))
         named = self._make_handlers()
         self._handlers = [named.get(message.name) for message in codec.messages]
@@ -83,7 +81,7 @@ class InputCollector:
                 continue
             handler = self._handlers[which]
             if handler is None:
-                self._take_other(bus, self._names[which], row)
+                self._take_other(self._names[which])
                 continue
             index = self._index.get((bus, row[NUMBER]))
             if index is None:
@@ -131,15 +129,13 @@ class InputCollector:
             handlers[f"ESC_FEEDBACK_{pair + 1}"] = _esc_handler(2 * pair)
         return handlers
 
-    def _take_other(self, bus: int, name: str, row: Row) -> None:
+    def _take_other(self, name: str) -> None:
         if name == "ESTOP":
             self._estop = True
-        elif name == "HEARTBEAT":
-            self.heartbeats[bus, int(row[NUMBER])] = int(row[VALUES])
         elif name == "SYNC":
             self._foreign_sync = True
             self.faults["foreign_sync"] += 1
-        else:
+        elif name != "HEARTBEAT":  # which says no more than that a node is there
             self._foreign_command = True
             self.faults["foreign_command"] += 1
 

@@ -162,10 +162,10 @@ def test_module_that_is_not_in_the_fleet_changes_nothing():
     assert robot.faults == {"module": 1}
 
 
-def test_heartbeats_are_kept_by_bus_and_number():
+def test_heartbeat_of_another_node_is_no_command():
     robot = Robot(TWO_BUSES)
     robot.say("HEARTBEAT", (1, 7), number=30, bus=1)
-    assert robot.collector.heartbeats == {(1, 30): 1}
+    assert not robot.tick(0).foreign_command and not robot.faults
 
 
 def test_dropped_frames_of_all_buses_are_counted_from_the_start():
