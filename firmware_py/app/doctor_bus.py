@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from firmware_py.app.doctor import FAILED, OK, WARNING, Finding
 from firmware_py.bus.codec import Codec, Frame, Received, Receiver
-from firmware_py.bus.load import BIT_RATE, MEAN_LIMIT, bus_load, frame_bits
+from firmware_py.bus.load import BIT_RATE, MEAN_LIMIT, bus_load, frame_bits, is_of_a_module
 from firmware_py.bus.port import Port
 
 LISTEN_S = 0.3
@@ -159,7 +159,7 @@ def judge_module(title: str, number: int, seen: Seen, codec: Codec) -> Finding:
 
 def expected_of(codec: Codec) -> set[str]:
     """What every module sends."""
-    return {m.name for m in codec.messages if 0x100 >> 5 <= m.function < 0x700 >> 5}
+    return {message.name for message in codec.messages if is_of_a_module(message)}
 
 
 def judge_load(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec) -> Finding:

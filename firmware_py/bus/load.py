@@ -55,7 +55,7 @@ def frame_bits(length: int) -> int:
 
 def slow_schedule(codec: Codec, number: int, rate_hz: int) -> list[tuple[MessageCodec, int, int]]:
     """(message, every so many ticks, in which of them) of a module's slow frames, staggered by message and module."""
-    slow = [message for message in codec.messages if _from_module(message) and not message.per_tick]
+    slow = [message for message in codec.messages if is_of_a_module(message) and not message.per_tick]
     every = [max(1, round(message.cycle_ms * rate_hz / 1000)) for message in slow]
     return [(m, n, (i + NUMBER_STEP * number) % n) for i, (m, n) in enumerate(zip(slow, every, strict=True))]
 
@@ -76,7 +76,7 @@ def bus_load(codec: Codec, numbers: Sequence[int], rate_hz: int) -> BusLoad:
     return BusLoad(sum(m.share for m in messages), fullest * rate_hz / BIT_RATE, tuple(messages))
 
 
-def _from_module(message: MessageCodec) -> bool:
+def is_of_a_module(message: MessageCodec) -> bool:
     """GYRO and everything behind it up to HEARTBEAT: by the DBC's ids what a module's MCU says."""
     return 0x100 >> 5 <= message.function < 0x700 >> 5
 
@@ -90,7 +90,7 @@ def _steady_bits(codec: Codec, modules: int, rate_hz: int) -> int:
     """Bits in a tick of everything but the modules' slow frames."""
     bits = 0
     for message in codec.messages:
-        if message.per_tick or not _from_module(message):
+        if message.per_tick or not is_of_a_module(message):
             times = 1 if message.per_tick else math.ceil(1000 / (message.cycle_ms * rate_hz))
             bits += _senders(message, modules) * times * frame_bits(message.length)
     return bits
