@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.faults import ThrusterFaults, by_channel
+from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
 from firmware_py.core.topology import in_both
 from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request
 from firmware_py.description.failsafe_parameters import Fence
@@ -300,7 +300,7 @@ class HealthMonitor:
     def _hear_escs(self, thruster_at: dict[int, int], escs: list[EscFeedback], now: int) -> None:
         for esc in escs:
             for channel, status in enumerate(esc.status, esc.first):
-                if status in ESC_ALIVE and channel in thruster_at:
+                if status not in ESC_DOWN and channel in thruster_at:
                     self._esc_ns[thruster_at[channel]] = now
 
     def _people(self, requests: list[Request], now: int) -> None:
@@ -329,8 +329,6 @@ class HealthMonitor:
             self._rejected_share += TAG_SHARE * (1.0 - self._rejected_share)
 
 
-ESC_ALIVE = (0, 2)
-"""EscStatus OK and OVERTEMPERATURE."""
 TAG_SHARE = 1.0 / 60.0
 """Weight of one tag observation in a mean of a second: tags come at 60 Hz."""
 
