@@ -20,7 +20,7 @@ from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
-from firmware_py.core.setpoint import Wish
+from firmware_py.core.setpoint import REST
 from firmware_py.core.types import (
     INFORMATION,
     RELAY_OFF,
@@ -43,8 +43,6 @@ ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
 TAKEN = "another dock is to bring a module to the same place: end that dock first"
-REST = Wish(np.zeros(3), np.zeros(3))
-"""What a body that waits glides by."""
 
 
 class _Dock(NamedTuple):

@@ -14,7 +14,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.health import Health
 from firmware_py.core.rotations import difference, heading, rotate, rotate_back
-from firmware_py.core.setpoint import Glider, Trajectory, Wish, ahead_of, at_estimate, on_leash, rest_at
+from firmware_py.core.setpoint import REST, Glider, Trajectory, Wish, ahead_of, at_estimate, on_leash, rest_at
 from firmware_py.core.supervisor import TAKES_OVER, Decision
 from firmware_py.core.transitions import Effect
 from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
@@ -242,13 +242,13 @@ class Guidance:
             up = -p.surface_speed_m_s if at.p_wb[2] > p.surface_depth_m else 0.0
             return Wish(np.array([0.0, 0.0, up]), ZERO, None, heading(at.q_wb))
         if self.mode in (Mode.AUTO, Mode.DOCK):
-            return self._docking if isinstance(self._docking, Wish) else Wish(ZERO, ZERO)
+            return self._docking if isinstance(self._docking, Wish) else REST
         sticks = self._read_sticks(time_ns)
         rate = p.rate_rad_s * np.array(sticks.moment)
         if any(sticks.force) or any(sticks.moment):
             self._goal = None
         if self.mode == Mode.ALT_HOLD:
-            turn = self._goal or Wish(ZERO, ZERO)
+            turn = self._goal or REST
             return turn._replace(v_w=np.array([0.0, 0.0, p.speed_m_s * sticks.force[2]]), w_b=rate, p_wb=None)
         if self._goal is not None:
             return self._goal
@@ -258,7 +258,7 @@ class Guidance:
     def _guided(self, time_ns: int) -> Wish:
         """The newest set-point, moved on by its own speed; without a successor it moves no more."""
         if self._point is None:
-            return Wish(ZERO, ZERO)
+            return REST
         came_ns, point = self._point
         age_s = (time_ns - came_ns) * 1e-9
         v_w, w_b = (np.where(np.isnan(value), 0.0, value) for value in (point.v_w, point.w_b))

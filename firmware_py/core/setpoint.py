@@ -72,6 +72,8 @@ class Wish(NamedTuple):
     """Largest turning rate to `q_wb`; None: the glider's."""
 
 
+REST = Wish(np.zeros(3), np.zeros(3))
+"""To come to rest, wherever that is."""
 UNKNOWN = np.full(4, np.nan)
 """No place or attitude is wished for."""
 
