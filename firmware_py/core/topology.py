@@ -94,17 +94,9 @@ def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
     return Motion(x, covariance, motion.accepted, motion.tag_ns)
 
 
-def _common(a: Body, b: Body) -> tuple[int, int]:
-    """Index within each body of the first module that both hold."""
-    for i, module in enumerate(a.modules):
-        if module in b.modules:
-            return i, b.modules.index(module)
-    raise ValueError(f"bodies {a.modules} and {b.modules} share no module")
-
-
 def _place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
     """Centre of mass of `part` from that of `whole` (3,), and (3, 3) whole frame to part frame; either may be the larger."""
-    i, j = _common(part, whole)
+    i, j = in_both(part.modules, whole.modules)[0]
     q_wp = multiply(np.ascontiguousarray(whole.q_bm[j]), conjugate(np.ascontiguousarray(part.q_bm[i])))
     r_wp = to_matrix(normalise(q_wp))
     return whole.r_bm[j] - r_wp @ part.r_bm[i], np.ascontiguousarray(r_wp.T)
@@ -120,13 +112,13 @@ def _transport(lever_b: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 def _attitude(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
     """(4,) attitude of `new` from that of `old`, by a module that both hold."""
-    i, j = _common(old, new)
+    i, j = in_both(old.modules, new.modules)[0]
     turn = multiply(np.ascontiguousarray(old.q_bm[i]), conjugate(np.ascontiguousarray(new.q_bm[j])))
     return np.asarray(normalise(multiply(x[3:7].copy(), turn)))
 
 
 def _position(old: Body, x: np.ndarray, new: Body, q_new: np.ndarray) -> np.ndarray:
-    i, j = _common(old, new)
+    i, j = in_both(old.modules, new.modules)[0]
     p_wm = x[:3] + rotate(x[3:7].copy(), np.ascontiguousarray(old.r_bm[i]))
     return np.asarray(p_wm - rotate(q_new, np.ascontiguousarray(new.r_bm[j])))
 
