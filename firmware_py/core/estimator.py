@@ -21,7 +21,7 @@ import numpy as np
 from firmware_py.core import observation
 from firmware_py.core.alignment import FirstSight, upright
 from firmware_py.core.body import CRUISE_M_S, Body
-from firmware_py.core.history import WINDOW_S, History
+from firmware_py.core.history import WINDOW_NS, History
 from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rigid_body import restoring_moment
 from firmware_py.core.rotations import heading, multiply, rotate, to_matrix
@@ -121,7 +121,7 @@ class Estimator:
             tau: (6,) mean thruster wrench since the previous tick, body frame.
         """
         self._nis, self._nis_dof = math.nan, 0
-        if self._history.newest >= 0 and time_ns - self._history.newest_ns > int(WINDOW_S * 1e9):
+        if self._history.newest >= 0 and time_ns - self._history.newest_ns > WINDOW_NS:
             self._accepted = self._waited = 0  # the process stood still: what is remembered joins on to nothing
         self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
         self._felt_ns = time_ns if measured.accel is not None else self._felt_ns
@@ -134,7 +134,7 @@ class Estimator:
         if not self._accepted:
             self._wait(time_ns)
         if self._accepted:
-            self._anchor = self._advanced(self._anchor, time_ns - int(WINDOW_S * 1e9))
+            self._anchor = self._advanced(self._anchor, time_ns - WINDOW_NS)
             self._lead(time_ns)
             if self._is_adrift:
                 self._anchor, self._head = self._stilled(self._anchor), self._stilled(self._head)

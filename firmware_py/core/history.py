@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-WINDOW_S = 0.5
+WINDOW_NS = 500_000_000
 """Tag poses older than this are refused on the bus already."""
 
 
@@ -15,7 +15,7 @@ class History:
 
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
-        self.length = int(WINDOW_S * 1e9) // period_ns + 2
+        self.length = WINDOW_NS // period_ns + 2
         self._rows = np.full((2 * self.length, 4), np.nan)
         self._tau = np.zeros((2 * self.length, 6))
         self._gyro = np.full((2 * self.length, 3), np.nan)

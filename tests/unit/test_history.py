@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.history import WINDOW_S, History
+from firmware_py.core.history import WINDOW_NS, History
 
 PERIOD = 10_000_000
 
@@ -27,7 +27,7 @@ def sample(history: History, index: int) -> tuple[float, np.ndarray, np.ndarray,
 def test_half_a_second_is_kept_at_every_rate(rate_hz: int) -> None:
     period = 1_000_000_000 // rate_hz
     history = filled(3 * rate_hz, period)
-    oldest = history.first_after(history.newest_ns - int(WINDOW_S * 1e9))
+    oldest = history.first_after(history.newest_ns - WINDOW_NS)
     for index in range(oldest, history.newest + 1):
         tau, gyro, accel, depth = sample(history, index)
         assert (tau, gyro[0], accel[0], depth) == (index, 100.0 + index, 200.0 + index, 300.0 + index)
@@ -55,7 +55,7 @@ def test_first_sample_after_a_time_is_strictly_later() -> None:
 
 def test_what_is_older_than_the_ring_is_not_asked_for() -> None:
     history = filled(200)
-    oldest = history.first_after(history.newest_ns - 10 * int(WINDOW_S * 1e9))
+    oldest = history.first_after(history.newest_ns - 10 * WINDOW_NS)
     assert oldest == 200 - history.length
     assert sample(history, oldest)[0] == oldest
 
