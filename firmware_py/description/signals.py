@@ -100,18 +100,17 @@ class Layout:
 
 
 class Row:
-    """One message that is filled again and again: `set` values by name, then take its `bytes`."""
+    """One message that is filled again and again."""
 
     def __init__(self, layout: Layout) -> None:
         self._array = np.zeros((), layout.dtype)
         for number, signal in enumerate(layout.signals, 1):
             self._array[f"{signal.name}#"] = np.frombuffer(_prefix(number, signal), "u1")
-        self.views: tuple[np.ndarray, ...] = tuple(self._array[signal.name] for signal in layout.signals)
-        """Views into the row, in the order of the layout's signals; assign with `view[...] = value`."""
+        self._views = [self._array[signal.name] for signal in layout.signals]
 
     def encode(self, values: Iterable[Any]) -> bytes:
         """The message of `values`, one per signal, in the layout's order."""
-        for view, value in zip(self.views, values, strict=True):
+        for view, value in zip(self._views, values, strict=True):
             view[...] = value
         return self._array.tobytes()
 
@@ -121,9 +120,8 @@ class TextLayout:
 
     def __init__(self, name: str, numbers: Sequence[str], text: str) -> None:
         self.name = name
-        file = descriptor_pb2.FileDescriptorProto(name=f"{PACKAGE}/{name}.proto", package=PACKAGE, syntax="proto3")
-        self._file = file
-        message = file.message_type.add(name=name)
+        self._file = descriptor_pb2.FileDescriptorProto(name=f"{PACKAGE}/{name}.proto", package=PACKAGE, syntax="proto3")
+        message = self._file.message_type.add(name=name)
         for i, each in enumerate((*numbers, text), 1):
             kind = _FIELD.TYPE_STRING if each == text else _FIELD.TYPE_SFIXED64
             message.field.add(name=each, number=i, label=_FIELD.LABEL_OPTIONAL, type=kind)
