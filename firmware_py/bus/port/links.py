@@ -41,8 +41,6 @@ class PortError(Exception):
 class Link(ABC):
     """One kind of bus: how to open it, and how one frame passes."""
 
-    send_timeout_s: float = 0.0
-
     def __init__(self, address: str) -> None:
         self.address = address
 
@@ -65,7 +63,7 @@ class Link(ABC):
     def send(self, bus: Any, frame: Frame) -> None:
         """Hands one frame to `bus`; raises what python-can raises."""
         message = can.Message(arbitration_id=frame[0], is_extended_id=False, data=frame[1])
-        bus.send(message, self.send_timeout_s)
+        bus.send(message, 0.0)
 
     def read(self, bus: Any, timeout_s: float) -> Frame | can.Message | None:
         """One frame from `bus`, or None when there is none."""
