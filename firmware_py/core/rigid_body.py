@@ -6,27 +6,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from firmware_py.core.rotations import M, V, skew
-
-
-@njit(cache=True)
-def coriolis(mass, nu):  # type: ignore[no-untyped-def]
-    """(6, 6) Coriolis and centripetal matrix of a symmetric (6, 6) mass matrix; skew-symmetric for every nu.
-
-    Fossen (2011), theorem 3.2: C = [[0, -S(M11 v + M12 w)], [-S(M11 v + M12 w), -S(M21 v + M22 w)]].
-    """
-    momentum = mass @ nu
-    c = np.zeros((6, 6))
-    linear = skew(momentum[:3])
-    c[:3, 3:] = -linear
-    c[3:, :3] = -linear
-    c[3:, 3:] = -skew(momentum[3:])
-    return c
+from firmware_py.core.rotations import M, V
 
 
 @njit(cache=True)
 def take_coriolis(mass, nu, out):  # type: ignore[no-untyped-def]
-    """Takes the (6,) wrench C(nu) nu from `out`, without the matrix and without an allocation."""
+    """Takes the (6,) wrench C(nu) nu from `out`, without an allocation: C is never made.
+
+    Fossen (2011), theorem 3.2, of a symmetric (6, 6) mass matrix: C = [[0, -S(M11 v + M12 w)], [-S(M11 v + M12 w), -S(M21 v + M22 w)]].
+    """
     px, py, pz, hx, hy, hz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(6):
         px += mass[0, i] * nu[i]

@@ -31,17 +31,8 @@ def nu(request: pytest.FixtureRequest) -> np.ndarray:
     return np.random.default_rng(request.param).normal(size=6)
 
 
-def test_coriolis_matrix_is_skew_symmetric(mass: np.ndarray, nu: np.ndarray) -> None:
-    c = rigid_body.coriolis(mass, nu)
-    np.testing.assert_array_equal(c + c.T, np.zeros((6, 6)))
-    assert float(nu @ c @ nu) == pytest.approx(0.0, abs=1e-11 * float(nu @ mass @ nu))
-
-
-def test_coriolis_wrench_is_the_matrix_times_the_velocity(mass: np.ndarray, nu: np.ndarray) -> None:
-    scale = float(np.abs(mass).max() * (nu @ nu))
-    np.testing.assert_allclose(
-        rigid_body.coriolis_wrench(mass, nu), rigid_body.coriolis(mass, nu) @ nu, atol=1e-14 * scale
-    )
+def test_coriolis_forces_do_no_work(mass: np.ndarray, nu: np.ndarray) -> None:
+    assert float(nu @ rigid_body.coriolis_wrench(mass, nu)) == pytest.approx(0.0, abs=1e-11 * float(nu @ mass @ nu))
 
 
 def test_coriolis_wrench_is_kirchhoffs(mass: np.ndarray, nu: np.ndarray) -> None:
