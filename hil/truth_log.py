@@ -59,7 +59,7 @@ def body_signals(modules: int) -> tuple[Signal, ...]:
 
 
 def dock_signals(modules: int) -> tuple[Signal, ...]:
-    """Truth of all docking faces in one tick, in the order of `TruthRecorder.record_docks`."""
+    """Truth of all docking faces in one tick, in the order in which `TruthRecorder.record_world` gives it."""
     return (
         Signal("tick", kind="int"),
         Signal("time_ns", unit="ns", kind="int"),
