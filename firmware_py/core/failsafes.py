@@ -188,13 +188,11 @@ class Failsafes:
 
     def __init__(self, parameters: FailsafeParameters) -> None:
         self._all = [Watch(row, parameters) for row in TABLE]
-        self.retune(parameters)
 
     def retune(self, parameters: FailsafeParameters) -> None:
         """Takes other limits and actions; what is on stays on."""
         for watch in self._all:
             watch.retune(parameters)
-        self._limits = [(watch, watch.row.below, watch.limit) for watch in self._all]
 
     def take_over(self, before: Sequence[Failsafes]) -> None:
         """Goes on from those of the bodies that this one is made of, or was part of."""
@@ -207,10 +205,9 @@ class Failsafes:
         Args:
             forced: a fail-safe and no person chose `mode`.
         """
-        alarms, values = [], FIGURES(health)
-        for i, (watch, below, limit) in enumerate(self._limits):
-            value = values[i]
-            cause = (value < limit if below else value > limit) and watch.counts(mode, forced, armed)
+        alarms = []
+        for watch, value in zip(self._all, FIGURES(health), strict=True):
+            cause = (value < watch.limit if watch.row.below else value > watch.limit) and watch.counts(mode, forced, armed)
             if not cause and not watch.active and watch._since_ns is None:
                 continue
             was_active = watch.active
