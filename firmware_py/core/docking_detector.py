@@ -45,8 +45,6 @@ class PairStatus(NamedTuple):
     """Distance between the means of the two newest quarters of the pictures: what `settled` is judged by."""
     docked: bool
     """Both hold."""
-    fresh: bool
-    """Both conditions rest on measurements that are young enough."""
 
 
 class PairBank:
@@ -100,7 +98,7 @@ class PairBank:
         """Of pair `i`."""
         row = self.rows[i]
         current, position = map(bool, row["holds"].tolist())
-        return PairStatus(current, position, float(row["error_m"]), float(row["spread_m"]), current and position, bool(row["fresh"]))
+        return PairStatus(current, position, float(row["error_m"]), float(row["spread_m"]), current and position)
 
 
 class PairDetector:

@@ -40,7 +40,6 @@ PAIR = np.dtype(
         ("near_ns", np.int64),  # time of the newest picture that shows them no farther off than an open joint may be
         ("error_m", np.float64),
         ("spread_m", np.float64),
-        ("fresh", np.int64),
         ("open", np.int64),  # CLOSED, LOOSE or APART
     ],
     align=True,
@@ -186,7 +185,6 @@ def watch(rows, rings, heard_ma, first, seen, poses, time_ns, limits):  # type: 
         row = rows[k]
         fresh_current = _take_currents(row, heard_ma, time_ns, limits)
         fresh_pose = _take_pose(row, rings[k], first, seen, poses, time_ns, limits)
-        row.fresh = fresh_current and fresh_pose
         weak = fresh_current and row.holds[CURRENT] == 0 and row.candidate_ns[CURRENT] == NEVER_NS
         far = fresh_pose and row.error_m > limits.open_m
         row.open = CLOSED

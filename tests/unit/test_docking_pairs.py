@@ -73,7 +73,7 @@ def test_pair_is_docked_once_both_conditions_were_seen_long_enough(row: Row) -> 
     bank = PairBank(ROW, P)
     assert not any(status.docked for status in row.watch(bank, 0.14)), "not before the debounce is over"
     for status in row.watch(bank, 0.8):
-        assert status.docked and status.fresh
+        assert status.docked
         assert status.position_error_m < 1e-9 and status.spread_m < 1e-9
 
 
@@ -112,12 +112,12 @@ def test_current_is_believed_by_the_first_measurement_after_the_debounce(row: Ro
     assert [row.watch(bank, 0.01)[0].current for _ in range(16)] == [False] * 15 + [True]
 
 
-def test_pair_of_which_nothing_was_heard_is_neither_fresh_nor_open(row: Row) -> None:
+def test_pair_of_which_nothing_was_heard_neither_holds_nor_is_open(row: Row) -> None:
     bank = PairBank(ROW[:1], P)
     row.camera, row.currents_ma = False, [math.nan] * 3
     for _ in range(5):
         (status,) = row.watch(bank, 0.01)
-        assert not (status.fresh or status.current or status.position) and bank.rows["open"][0] == CLOSED
+        assert not (status.current or status.position) and bank.rows["open"][0] == CLOSED
         assert math.isnan(status.position_error_m) and math.isnan(status.spread_m)
 
 
@@ -235,10 +235,10 @@ def test_what_is_not_seen_any_more_is_not_believed(row: Row) -> None:
     row.camera = False
     assert all(status.position for status in row.watch(bank, 0.2))
     for status in row.watch(bank, 0.2):
-        assert status.current and not status.position and not status.fresh and math.isnan(status.position_error_m)
+        assert status.current and not status.position and math.isnan(status.position_error_m)
     row.camera, row.currents_ma = True, [math.nan] * 3
     assert all(status.current for status in row.watch(bank, 0.2))
-    assert not any(status.current or status.fresh for status in row.watch(bank, 0.1))
+    assert not any(status.current for status in row.watch(bank, 0.1))
 
 
 def test_pair_that_still_moves_is_not_settled(row: Row) -> None:

@@ -19,7 +19,7 @@ from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.docking import plan_dock
 
 TICK_NS = 10_000_000
-NEITHER = PairStatus(False, False, 0.01, 0.001, False, True)
+NEITHER = PairStatus(False, False, 0.01, 0.001, False)
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -311,7 +311,7 @@ def test_module_that_comes_too_near_on_the_way_is_found_however_both_bodies_are_
 
 def test_jam_that_a_camera_too_slow_makes_is_told_by_the_parameter_that_helps() -> None:
     dock = Follower(Docking(tries=1))
-    dock.until(Stage.FAILED, NEITHER._replace(current=True, position_error_m=math.nan, spread_m=math.nan, fresh=False))
+    dock.until(Stage.FAILED, NEITHER._replace(current=True, position_error_m=math.nan, spread_m=math.nan))
     assert dock.sequence.reason == (
         "jam: current alone after VERIFY, pictures of both are too few or older than 300 ms (DOCK_POSE_AGE), 1 try"
     )
