@@ -94,13 +94,11 @@ class RateKeeper:
         self._next_ns = deadline_ns + self.period_ns
         return deadline_ns
 
-    def finish(self) -> int:
-        """The tick is done. Returns how long it ran, ns."""
+    def finish(self) -> None:
+        """The tick is done."""
         now_ns = self._clock.now_ns()
-        ran_ns = now_ns - self._began_ns
-        self.compute.add(ran_ns)
+        self.compute.add(now_ns - self._began_ns)
         self.overruns += self._next_ns is not None and now_ns > self._next_ns
-        return ran_ns
 
 
 class Histogram:
