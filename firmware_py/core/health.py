@@ -27,6 +27,8 @@ DRY_NS = 3_000_000_000
 """A cabin that was wet in two readings running is dry when its sensor has been for so long: water in it moves. ArduSub waits as long."""
 FOREIGN_NS = 1_000_000_000
 """So long a frame of somebody else is remembered: one that sends as slowly as once a second is one stranger."""
+TAG_SHARE = 1.0 / 60.0
+"""Weight of one tag observation in a mean of a second: tags come at 60 Hz."""
 VOLTAGE_SHARE = 0.2
 """Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
 
@@ -327,10 +329,6 @@ class HealthMonitor:
             self._rejected_share -= TAG_SHARE * self._rejected_share
         if refused > 0:
             self._rejected_share += TAG_SHARE * (1.0 - self._rejected_share)
-
-
-TAG_SHARE = 1.0 / 60.0
-"""Weight of one tag observation in a mean of a second: tags come at 60 Hz."""
 
 
 def _age_s(at_ns: int | None, now_ns: int) -> float:
