@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from firmware_py.core.requests import QUARTERS
 from firmware_py.core.types import CHANNELS, FACES, WARNING, Action, DockRequest, Event, Mode
 from firmware_py.ground.command import ACCEPTED, COMMAND_INT_ONLY, DENIED, FAILED, TEMPORARILY_REJECTED, UNSUPPORTED, Answer, Command
 from firmware_py.ground.dialect import Message
@@ -233,10 +234,8 @@ class CommandService:
     def _dock(self, command: Command, action: Action) -> Answer:
         module, face, target, target_face, turns = (int(command.get(i)) for i in range(1, 6))
         known = len(self._system.subject.picture.modules)
-        faces_exist = face in range(FACES) and target_face in range(FACES)
-        if module not in range(known) or target not in range(known) or module == target or not faces_exist:
-            return DENIED
-        if turns not in range(4):
+        faces_fit = face in range(FACES) and target_face in range(FACES) and turns in range(QUARTERS)
+        if module not in range(known) or target not in range(known) or module == target or not faces_fit:
             return DENIED
         request = DockRequest(module, face, target, target_face, turns, command.get(6) >= 0.5)
         s = self._system.subject
