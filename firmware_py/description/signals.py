@@ -155,7 +155,6 @@ class LogMessage(NamedTuple):
     """One message of a log, as it stands there."""
 
     topic: str
-    log_time_ns: int
     data: bytes
 
 
@@ -164,7 +163,7 @@ def read_messages(path: Path) -> Iterator[LogMessage]:
     topics: dict[int, str] = {}
     for record in log_records(path):
         if isinstance(record, Message):
-            yield LogMessage(topics[record.channel_id], record.log_time, record.data)
+            yield LogMessage(topics[record.channel_id], record.data)
         elif isinstance(record, Channel):
             topics[record.id] = record.topic
 
