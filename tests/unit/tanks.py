@@ -1,6 +1,7 @@
 """Tanks in which whole ticks are run: a world of the controller's own model, without the bus."""
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
 from firmware_py.app.preparation import prepare
@@ -35,6 +36,7 @@ class Tank:
 
     def __init__(self, bodies: list[Body], parameters: Parameters | None = None, believed: list[Body] | None = None):
         self.bodies = bodies
+        self.r_mb = [[Rotation.from_quat(q_bm[[1, 2, 3, 0]]).inv() for q_bm in body.q_bm] for body in bodies]
         self.pipeline = Pipeline(believed or bodies, parameters or Parameters(), PERIOD)
         self.states = [self._start(n) for n in range(len(bodies))]
         self.forces = [np.zeros(b.thrusters.f_max.size) for b in bodies]
@@ -72,7 +74,7 @@ class Tank:
         t = self.bodies[n].thrusters
         u = self.acting[n][t.module, t.channel]
         curves = np.where(u[:, None] >= 0.0, t.forward, t.reverse)
-        wanted = np.copysign([np.polyval(np.r_[c[::-1], 0.0], abs(v)) for c, v in zip(curves, u, strict=True)], u)
+        wanted = np.copysign(polyval(np.abs(u), np.c_[np.zeros(len(u)), curves].T, tensor=False), u)
         end = wanted + (self.forces[n] - wanted) * np.exp(-DT / t.lag_s)
         self.wrenches[n] = t.matrix @ (wanted + (self.forces[n] - end) * t.lag_s / DT)
         self.forces[n] = end
@@ -81,14 +83,13 @@ class Tank:
     def _hear(self, tick: int) -> list[ModuleInputs]:
         modules = [ModuleInputs(answered=True, heard=True) for body in self.bodies for _ in body.modules]
         for n, body in enumerate(self.bodies):
-            x = self.states[n]
+            x, r_wb = self.states[n], world(self.states[n])
             felt = propagation.inertial_acceleration(x, self.wrenches[n], *body.plant)
-            felt = felt + world(x).inv().apply([0.0, 0.0, -9.80665])
+            felt = felt + r_wb.inv().apply([0.0, 0.0, -9.80665])
             for k, m in enumerate(body.modules):
-                r_mb = Rotation.from_quat(body.q_bm[k][[1, 2, 3, 0]]).inv()
-                heard = modules[m]
+                r_mb, heard = self.r_mb[n][k], modules[m]
                 heard.gyro, heard.accel = r_mb.apply(x[10:13]), r_mb.apply(felt)
-                heard.pressure_pa = 101_325.0 + WATER_DENSITY * 9.80665 * float((x[:3] + world(x).apply(body.r_bi[k]))[2])
+                heard.pressure_pa = 101_325.0 + WATER_DENSITY * 9.80665 * float((x[:3] + r_wb.apply(body.r_bi[k]))[2])
                 heard.voltage_v, heard.current_a, heard.leak, heard.cabin_temperature_c = 12.0, 3.0, False, 30.0
                 if tick % 10 == 0:
                     heard.esc = self._escs(n, k)
