@@ -7,9 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import tune_gains
 
 from tests.clients.bench_process import ROOT
 from tests.closed_loop.short_hover import SCENARIO
+from tests.unit.campaigns import Inline
 
 TRIALS = 4
 FILES = ("search.jsonl", "parameters.toml", "tuning.json")
@@ -27,25 +29,32 @@ def objective(folder: Path) -> Path:
     return path
 
 
-def tune(path: Path, out: Path) -> subprocess.Popen[bytes]:
-    command = [sys.executable, str(ROOT / "tools/tune_gains.py"), str(path), "--trials", str(TRIALS), "--jobs", "1", "--no-plots"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen([*command, "--out", str(out)], stdout=subprocess.PIPE, env=environment, start_new_session=True)
+def words(path: Path, out: Path) -> list[str]:
+    """The command line."""
+    return [str(ROOT / "tools/tune_gains.py"), str(path), "--trials", str(TRIALS), "--jobs", "1", "--no-plots", "--out", str(out)]
 
 
 @pytest.mark.slow
-def test_tuning_that_was_killed_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+def test_tuning_that_was_killed_goes_on_to_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Who is not killed tunes in this process."""
     path, whole, torn = objective(tmp_path), tmp_path / "whole", tmp_path / "torn"
-    with tune(path, whole) as process:
-        process.communicate()
-    assert process.returncode == 0
-    with tune(path, torn) as process:
+    monkeypatch.setattr(tune_gains, "processes", lambda jobs: Inline)
+
+    def tuned(out: Path) -> str:
+        monkeypatch.setattr("sys.argv", words(path, out))
+        assert tune_gains.main() == 0
+        return capsys.readouterr().out
+
+    assert "trial    1 of 4" in tuned(whole)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, *words(path, torn)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, start_new_session=True) as process:
         assert process.stdout is not None and b"trial    1 of 4" in process.stdout.readline()
         os.killpg(process.pid, signal.SIGKILL)
     kept = (torn / "search.jsonl").read_bytes()
     assert kept.count(b'"totals"') in range(1, TRIALS)
-    with tune(path, torn) as process:
-        said, _ = process.communicate()
-    assert process.returncode == 0 and b"trial    1 of 4" not in said
+    assert "trial    1 of 4" not in tuned(torn)
     assert (torn / "search.jsonl").read_bytes().startswith(kept)
     assert [(torn / name).read_bytes() for name in FILES] == [(whole / name).read_bytes() for name in FILES]
