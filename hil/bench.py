@@ -13,7 +13,6 @@ from firmware_py.app.firmware import BusFrame, Firmware, compose
 from firmware_py.app.lockstep import PATIENCE_LOOKS, Lockstep, drain, send
 from firmware_py.app.observers import Observer, recording
 from firmware_py.app.realtime import LISTEN_NS, OTHER_SYNC
-from firmware_py.bus.codec import Codec
 from firmware_py.bus.port import Port, PortError, open_port
 from firmware_py.core.types import Outputs
 from firmware_py.description.fleet import Fleet, Module
@@ -138,7 +137,7 @@ def open_bench(
     fleet = fleet_of(scenario, bus, rate_hz)
     firmware = compose(fleet, parameters)
     world = make_world(scenario, seed, fleet.period_ns)
-    nodes = make_nodes(world, Codec.load(), scenario)
+    nodes = make_nodes(world, firmware.codec, scenario)
     faults = nodes.faults = Faults(nodes, scenario.fault)
     ports = [stack.enter_context(open_port(bus)) for _ in range(2)]
     return Bench(scenario, seed, fleet, firmware, nodes, script_of(scenario, fleet), ports[0], ports[1], faults, parameters)
