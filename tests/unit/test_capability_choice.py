@@ -5,8 +5,8 @@ import dataclasses
 import importlib
 import json
 import re
-import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import characterise_choose
@@ -174,9 +174,17 @@ def test_power_of_a_held_wrench_is_that_of_its_forces() -> None:
     assert part.power_w > 0.0 and part.margin == pytest.approx(25.4558 / 5.0, rel=1e-4)
 
 
-def characterise(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "tools" / "characterise.py"), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+@pytest.fixture
+def characterise(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """characterise(*arguments): what the tool prints."""
+    monkeypatch.syspath_prepend(ROOT / "tools")
+
+    def run(*arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["characterise.py", *arguments])
+        importlib.import_module("characterise").main()
+        return capsys.readouterr().out
+
+    return run
 
 
 @pytest.mark.parametrize(
@@ -206,11 +214,8 @@ def test_wrong_command_line_is_answered_in_one_line(
     assert shown.out == "" and shown.err.count("\n") == 1, shown.err
 
 
-def test_table_has_labels_with_units_and_no_keys_of_the_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.syspath_prepend(ROOT / "tools")
-    monkeypatch.setattr(sys, "argv", ["characterise.py", "bluerov2", "--directions", "121", "--force", "2"])
-    importlib.import_module("characterise").main()
-    shown = capsys.readouterr().out
+def test_table_has_labels_with_units_and_no_keys_of_the_json(characterise: Callable[..., str]) -> None:
+    shown = characterise("bluerov2", "--directions", "121", "--force", "2")
     assert re.findall(r"\w+_\w+|\w+\[", shown) == []
     for label in (
         "surge, most + / -, N", "power of 2 N in any direction", "power above idle, mean, W", "Dirichlet energy, W^2", "passive axes",
@@ -271,9 +276,8 @@ def test_figure_counts_thrusters_from_one_and_its_legend_has_the_colours_that_ar
 
 
 @pytest.mark.slow
-def test_characterising_writes_table_figure_and_report(tmp_path: Path) -> None:
-    result = characterise("bluerov2", "--directions", "300", "--out", str(tmp_path))
-    assert result.returncode == 0, result.stderr
+def test_characterising_writes_table_figure_and_report(characterise: Callable[..., str], tmp_path: Path) -> None:
+    characterise("bluerov2", "--directions", "300", "--out", str(tmp_path))
     text = (tmp_path / "capability.csv").read_text()
     assert text.startswith(f"{TABLE1_COLUMNS},bluerov2\n")
     rows = {(r["space"], r["frame"], r["metric"]): r["bluerov2"] for r in csv.DictReader(text.splitlines())}
@@ -282,18 +286,16 @@ def test_characterising_writes_table_figure_and_report(tmp_path: Path) -> None:
     assert (tmp_path / "capability.png").read_bytes()[:4] == b"\x89PNG"
     page = (tmp_path / "capability.html").read_text()
     assert "degenerate" in page and not re.search("(src|href)=.(?!data:)", page)
-    again = characterise("bluerov2", "--directions", "300", "--out", str(tmp_path / "again"))
-    assert again.returncode == 0
+    characterise("bluerov2", "--directions", "300", "--out", str(tmp_path / "again"))
     assert (tmp_path / "again" / "capability.csv").read_text() == text
 
 
 @pytest.mark.slow
-def test_papers_table_is_printed_beside_ours_with_a_word_on_each_cell(tmp_path: Path) -> None:
-    result = characterise("--table1", "--directions", "200", "--out", str(tmp_path))
-    assert result.returncode == 0, result.stderr
+def test_papers_table_is_printed_beside_ours_with_a_word_on_each_cell(characterise: Callable[..., str], tmp_path: Path) -> None:
+    shown = characterise("--table1", "--directions", "200", "--out", str(tmp_path))
     for word in ("agrees", "differs by", "inconsistent in"):
-        assert word in result.stdout
-    assert "authors' files 16 : 4 : 1" in result.stdout
+        assert word in shown
+    assert "authors' files 16 : 4 : 1" in shown
     with (tmp_path / "table1.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     with (ROOT / "tools" / "data" / "table1.csv").open(newline="") as file:
