@@ -5,6 +5,7 @@ Works on the estimates of this tick; the pipeline carries out the joins and part
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
@@ -15,12 +16,12 @@ from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Part,
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan
-from firmware_py.core.docking_way import first_met, obstacle, to_one_place, way_of_active
+from firmware_py.core.docking_way import WAY_SLACK, Way, first_met, obstacle, to_one_place, way_of_active
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
-from firmware_py.core.setpoint import REST
+from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import (
     INFORMATION,
     RELAY_OFF,
@@ -43,6 +44,9 @@ ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
 TAKEN = "another dock is to bring a module to the same place: end that dock first"
+AHEAD = {Stage.PRE_APPROACH: (1.0, WAY_SLACK), Stage.APPROACH: (0.0, math.inf)}
+"""Stages in which the active body is on a way: the gap that it ends at, and the slack that it leaves to others, as shares of the stand-off.
+The last piece is waited with only for those that it would touch: beside the target's face there may be others."""
 
 
 class _Dock(NamedTuple):
@@ -53,8 +57,10 @@ class _Dock(NamedTuple):
     active: int
     target: int
     prepared: Prepared
-    waited_for: set[int]
-    """Modules of third bodies that have been on the way to the stand-off."""
+    began: Wish
+    """Where the active body was: there it gives way to others."""
+    said: set[str]
+    """What has been said of its waiting."""
 
 
 class DockingStage:
@@ -69,6 +75,8 @@ class DockingStage:
         self._expected: dict[int, DockRequest] = {}
         """By body: the newest dock or undock that waits for its plan."""
         self._joints = JointWatch(parameters)
+        self._awaited: set[int] = set()
+        """Modules that docks which began earlier wait for, in this tick."""
         self.events: list[Event] = []
         self.records: list[DockRecord] = []
 
@@ -161,6 +169,7 @@ class DockingStage:
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)
         self._joints.step(inputs.time_ns, inputs.modules, poses, resting)
+        self._awaited.clear()
         for dock in list(self._docks):
             self._steer(dock, inputs, estimates, poses, decisions)
         for undock in list(self._undocks):
@@ -242,7 +251,7 @@ class DockingStage:
         """Ends a dock before its end; a target that was coming goes back to where it held."""
         self._drop(dock)
         self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: {reason}")
-        if dock.sequence.met_w.any():
+        if dock.sequence.meets_at_w is not None:
             decisions.returning.append(dock.target)
 
     def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
@@ -267,7 +276,9 @@ class DockingStage:
         comes = self._comes(plan, target, holding)
         sequence = DockingSequence(plan, estimates[active][0], estimates[target][0], self._p, time_ns, comes)
         pair = FacePair(request.target_module, request.target_face, request.module, request.face, plan.place_t, plan.q_ta)
-        self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared, set()))
+        at = estimates[active][1]
+        began = REST._replace(p_wb=at.p_wb.copy(), q_wb=at.q_wb.copy())
+        self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared, began, set()))
         self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
 
     # ------------------------------------------------------------ each tick
@@ -280,10 +291,14 @@ class DockingStage:
         poses: ModulePoses,
         decisions: Decisions,
     ) -> None:
+        if blocked := self._blocked(dock, estimates):
+            self._give_up(dock, blocked, decisions)
+            self._end(dock.active, decisions)
+            return
         active, target = estimates[dock.active][1], estimates[dock.target][1]
         status = dock.detector.step(inputs.time_ns, inputs.modules, poses)
-        before, waits = dock.sequence.stage, self._waits(dock, estimates)
-        steering = dock.sequence.step(inputs.time_ns, active, target, status)
+        before = dock.sequence.stage
+        steering = dock.sequence.step(inputs.time_ns, active, target, status, self._waits(dock, estimates))
         stage = dock.sequence.stage
         self.relays.switch(steering.relay, *dock.sequence.plan.closes)
         errors, pair = dock.sequence.errors(active, target), dock.detector.pair
@@ -302,21 +317,43 @@ class DockingStage:
             self._docks.remove(dock)
             self._end(dock.active, decisions)
         else:
-            decisions.setpoints[dock.active] = REST if waits and stage == before else steering.active
+            decisions.setpoints[dock.active] = steering.active
         if steering.meets is not None:
             decisions.meets[dock.target] = steering.meets
 
-    def _waits(self, dock: _Dock, estimates: Estimated) -> bool:
-        """Whether a third body has come on its way to the stand-off; of each that is said once."""
-        if dock.sequence.stage != Stage.PRE_APPROACH or len(estimates) == 2:
-            return False
-        plan = dock.sequence.plan
-        way = way_of_active(plan, *estimates[dock.active], *estimates[dock.target], self._p.standoff_m)
-        met = first_met(way, _thirds(estimates, dock.active, dock.target), self._p)
-        if met is not None and met not in dock.waited_for:
-            dock.waited_for.add(met)
-            self._say(WARNING, f"dock of module {plan.request.module} waits: module {met} is on its way")
-        return met is not None
+    def _blocked(self, dock: _Dock, estimates: Estimated) -> str:
+        """Why a target that comes to meet the active body can come no farther; empty: it can, or it does not come."""
+        thirds, to_w = _thirds(estimates, dock.active, dock.target), dock.sequence.meets_at_w
+        if not thirds or to_w is None:
+            return ""
+        plan, (body, at) = dock.sequence.plan, estimates[dock.target]
+        met = first_met(Way(body, at.p_wb, at.q_wb, to_w, at.q_wb, plan.pitch_m), thirds, WAY_SLACK * self._p.standoff_m)
+        return "" if met is None else f"module {met} is where module {plan.request.target_module} comes to meet it"
+
+    def _waits(self, dock: _Dock, estimates: Estimated) -> Wish | None:
+        """What the active body glides by while a third body is on its way; None: none is."""
+        thirds, stage = _thirds(estimates, dock.active, dock.target), dock.sequence.stage
+        if not thirds or stage not in AHEAD or not dock.sequence.under_way:  # before its first tick its beginning has just been looked at
+            return None
+        plan, (gap, slack) = dock.sequence.plan, (self._p.standoff_m * share for share in AHEAD[stage])
+        body, target_at = estimates[dock.target]
+        way = way_of_active(plan, *estimates[dock.active], body, dock.sequence.met(target_at), gap)
+        met = first_met(way, thirds, slack)
+        if met is None:
+            return None
+        self._say_once(dock, f"dock of module {plan.request.module} waits: module {met} is on its way")
+        wish = REST if self._awaited.isdisjoint(way.body.modules) else self._gives_way(dock, way, thirds)
+        self._awaited.add(met)
+        return wish
+
+    def _gives_way(self, dock: _Dock, way: Way, thirds: Sequence[tuple[Body, Estimate]]) -> Wish:
+        """Back to where it began, if nobody is there: one that waits for it while it waits itself would wait for ever."""
+        assert dock.began.p_wb is not None and dock.began.q_wb is not None
+        back = way._replace(p_end=dock.began.p_wb, q_end=dock.began.q_wb)
+        if first_met(back, thirds, WAY_SLACK * self._p.standoff_m) is not None:
+            return REST
+        self._say_once(dock, f"dock of module {dock.prepared.request.module} gives way to one that began before it")
+        return dock.began
 
     def _end(self, active: int, decisions: Decisions) -> None:
         """The body is done with docking, but for what it still waits for the plan of, and an undock under way."""
@@ -363,6 +400,11 @@ class DockingStage:
         left = self._joints.left(undock.plan.opens)
         self.relays.switch(RELAY_OFF, *(joint for joint in undock.plan.opens if joint not in left))
         self.relays.switch(RELAY_PULL, *left)
+
+    def _say_once(self, dock: _Dock, text: str) -> None:
+        if text not in dock.said:
+            dock.said.add(text)
+            self._say(WARNING, text)
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))

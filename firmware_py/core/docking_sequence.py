@@ -88,6 +88,11 @@ class DockPlan(NamedTuple):
     q_ta: np.ndarray
     """(4,) active module frame to target module frame when docked."""
 
+    @property
+    def pitch_m(self) -> float:
+        """Edge of a lattice cell."""
+        return float(np.linalg.norm(self.place_t))
+
 
 class UndockPlan(NamedTuple):
     """An undock, prepared: the two bodies that there will be."""
@@ -134,9 +139,10 @@ class DockingSequence:
         self._line_t, self._farthest_m = plan.axis_t, parameters.standoff_m
         self._fixed: Estimate | None = None
         """Where the target is to be met, at rest, for an approach that does not look at it again."""
-        self._under_way = False
-        self.met_w = np.zeros(3)
-        """How far the target was told to come, world, m."""
+        self.under_way = False
+        """Whether it has been stepped."""
+        self.meets_at_w: np.ndarray | None = None
+        """(3,) where the target's centre of mass was told to come, world, m; None: it was told nothing."""
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
@@ -146,16 +152,16 @@ class DockingSequence:
         self._last_ns = time_ns
         self._turn = 0.0
 
-    def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus) -> Steering:
-        """Moves the sequence on by one tick."""
-        meets = None if self._under_way else self._set_off(active, target)
+    def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus, waits: Wish | None = None) -> Steering:
+        """Moves the sequence on by one tick. `waits`: somebody is on its way; until it is before the face, it glides by this instead."""
+        meets = None if self.under_way else self._set_off(active, target)
         errors = self.errors(active, target)
         dt = (time_ns - self._last_ns) * 1e-9
         self._last_ns = time_ns
         self._decide(time_ns, active, target, errors, status)
-        speed = self._speed(errors)
+        speed = self._speed(errors, waits is not None)
         self._gap_m = float(np.clip(self._gap_m + speed * dt, -self._p.push_m, self._farthest_m))
-        setpoint = self._setpoint(target if self._fixed is None else self._fixed, speed)
+        setpoint = self._setpoint(self.met(target), speed, waits)
         is_apart = self._gap_m >= self._p.standoff_m
         return Steering(setpoint, TABLE[self.stage].relay, is_apart, None if self.stage in ENDED else meets)
 
@@ -163,6 +169,10 @@ class DockingSequence:
         """Ends the dock; both hold apart."""
         self.reason = reason
         self._enter(Stage.ABORTED, time_ns)
+
+    def met(self, target: Estimate) -> Estimate:
+        """The target where it is to be met: where it is, or where a straight approach looked for it."""
+        return target if self._fixed is None else self._fixed
 
     def errors(self, active: Estimate, target: Estimate) -> Errors:
         """Errors by the two estimates."""
@@ -182,12 +192,12 @@ class DockingSequence:
 
     def _set_off(self, active: Estimate, target: Estimate) -> np.ndarray | None:
         """Shares the way with the target if it comes, and draws the line of a straight approach; returns how far it comes."""
-        self._under_way = True
+        self.under_way = True
         straight = self._p.approach == "straight"
         off, (_, q_t) = self._offset(active, target), pose_of(target, self._r_t, self._q_t)
         left = 0.0 if straight else self._p.standoff_m
         meets = np.asarray(0.5 * rotate(q_t, off - left * self.plan.axis_t)) if self._comes else None
-        self.met_w = np.zeros(3) if meets is None else meets
+        self.meets_at_w = None if meets is None else target.p_wb + meets
         if straight:
             self._fixed = target._replace(p_wb=target.p_wb + (0.0 if meets is None else meets), nu=np.zeros(6))
             off = self._offset(active, self._fixed)
@@ -261,12 +271,12 @@ class DockingSequence:
 
     # ------------------------------------------------------------ where to be
 
-    def _speed(self, errors: Errors) -> float:
+    def _speed(self, errors: Errors, waits: bool) -> float:
         """Rate of the wanted gap, m/s."""
         p = self._p
         if self.stage == Stage.APPROACH:
             astray = errors.lateral_m > CONE * p.align_m or errors.angle_rad > CONE * p.align_rad
-            if astray and p.approach == "staged":
+            if waits or (astray and p.approach == "staged"):
                 return 0.0
             return -float(np.clip(SLOWING_PER_S * self._gap_m, p.contact_speed_m_s, p.speed_m_s))
         if self.stage in (Stage.PUSH, Stage.VERIFY):
@@ -275,7 +285,7 @@ class DockingSequence:
             return RETREAT_M_S if self._gap_m < p.standoff_m else 0.0
         return 0.0
 
-    def _setpoint(self, target: Estimate, speed: float) -> Setpoint | Wish:
+    def _setpoint(self, target: Estimate, speed: float, waits: Wish | None) -> Setpoint | Wish:
         """The active body's centre of mass such that its module is at the wanted gap before the target's face, moving with it."""
         p_t, q_t = pose_of(target, self._r_t, self._q_t)
         q_module = normalise(multiply(q_t, self._q_wanted()))
@@ -285,7 +295,7 @@ class DockingSequence:
         v_w = rotate(target.q_wb, target.nu[:3].copy()) + axis_w * speed
         p_wb, zero = np.asarray(p_module - rotate(q_wb, self._r_a)), np.zeros(3)
         if self.stage == Stage.PRE_APPROACH:
-            return Wish(np.asarray(v_w), zero, p_wb, q_wb)
+            return waits or Wish(np.asarray(v_w), zero, p_wb, q_wb)
         return Setpoint(p_wb, q_wb, v_w, zero, zero, zero)
 
     def _q_wanted(self) -> np.ndarray:

@@ -53,7 +53,7 @@ def way_of_active(plan: DockPlan, active: Body, at: Estimate, target: Body, targ
     p_t, q_t = pose_of(target_at, *module_in(target, plan.request.target_module))
     q_end = normalise(multiply(multiply(q_t, plan.q_ta), conjugate(q_a)))
     p_end = p_t + rotate(q_t, plan.place_t + plan.axis_t * gap_m) - rotate(q_end, r_a)
-    return Way(active, at.p_wb, at.q_wb, p_end, q_end, float(np.linalg.norm(plan.place_t)))
+    return Way(active, at.p_wb, at.q_wb, p_end, q_end, plan.pitch_m)
 
 
 def way_of_target(plan: DockPlan, active: Way, target: Body, target_at: Estimate) -> Way:
@@ -82,9 +82,9 @@ def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near
     return other.modules[int(np.where(touching, least, np.inf).min(axis=0).argmin())] if touching.any() else None
 
 
-def first_met(way: Way, thirds: Sequence[tuple[Body, Estimate]], p: Docking) -> int | None:
+def first_met(way: Way, thirds: Sequence[tuple[Body, Estimate]], slack_m: float) -> int | None:
     """A module of bodies that have nothing to do with the dock which is where a way leads, as far as is known; None: none."""
-    passes = (nearest_pass(way, body, at, WAY_SLACK * p.standoff_m, BEGINNING) for body, at in thirds if at.placed)
+    passes = (nearest_pass(way, body, at, slack_m, BEGINNING) for body, at in thirds if at.placed)
     return next((module for module in passes if module is not None), None)
 
 
@@ -105,13 +105,13 @@ def obstacle(
     """
     if not (active[1].placed and target[1].placed):
         return ""
-    staged = p.approach == "staged"
+    staged, slack_m = p.approach == "staged", WAY_SLACK * p.standoff_m
     way = way_of_active(plan, *active, *target, p.standoff_m if staged else 0.0)
-    met = nearest_pass(way, *target, WAY_SLACK * p.standoff_m) if staged else None
-    met = first_met(way, thirds, p) if met is None else met
+    met = nearest_pass(way, *target, slack_m) if staged else None
+    met = first_met(way, thirds, slack_m) if met is None else met
     if met is not None:
         return f"on its way it would come too near to module {met}: bring it before that face first"
-    met = first_met(way_of_target(plan, way, *target), thirds, p) if comes else None
+    met = first_met(way_of_target(plan, way, *target), thirds, slack_m) if comes else None
     return "" if met is None else f"module {plan.request.target_module}, which is to meet it, would come too near to module {met}"
 
 
@@ -122,7 +122,7 @@ def to_one_place(plan: DockPlan, other: DockPlan) -> bool:
         return False
     mine, others = (_beside(each.merged, common) for each in (plan, other))
     apart_m = np.linalg.norm(mine[:, None] - others, axis=-1)
-    return bool(apart_m.min() < 0.5 * np.linalg.norm(plan.place_t))
+    return bool(apart_m.min() < 0.5 * plan.pitch_m)
 
 
 def _beside(body: Body, common: Collection[int]) -> np.ndarray:

@@ -44,7 +44,7 @@ def test_target_that_is_disarmed_is_not_expected_to_come(approach: str) -> None:
     tank = before_each_other(2.0, parameters=Parameters().replace("docking.approach", approach), armed=(1,))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     (dock,) = tank.pipeline.formation.docking._docks
-    assert not dock.sequence.met_w.any() and tank.pipeline.formation.chains[0].guidance._goal is None
+    assert dock.sequence.meets_at_w is None and tank.pipeline.formation.chains[0].guidance._goal is None
 
 
 @pytest.mark.slow
@@ -183,6 +183,73 @@ def test_dock_says_of_each_module_once_that_it_waits_though_two_are_as_near() ->
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     met = cycle([2, 3])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("firmware_py.core.docking.first_met", lambda way, thirds, p: next(met))
+        patch.setattr("firmware_py.core.docking.first_met", lambda way, thirds, slack_m: next(met))
         tank.run(0.2)
     assert [said for _, said in tank.said if "waits" in said] == [f"dock of module 1 waits: module {m} is on its way" for m in (2, 3)]
+
+
+LEVEL, DIAGONAL = (from_euler(0.0, 0.0, yaw) for yaw in (0.0, 0.25 * np.pi))
+CLEAR_M = 2.0**0.5 * PITCH_M
+"""Level cubes whose centres are so far apart do not touch, whichever way they are turned."""
+
+
+def send(module: int, north_m: float, east_m: float, q_wb: np.ndarray = LEVEL) -> Request:
+    """A module to another place at the depth of all."""
+    return Request(Action.HOLD, module, rest_at(np.array([north_m, east_m, 0.8]), q_wb))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("approach", "east_m", "there"),
+    [("straight", 0.8, (1.0, 0.4, LEVEL)), ("staged", 0.34, (1.26, 0.2, DIAGONAL))],
+    ids=["of a straight line", "before the face"],
+)
+def test_approach_waits_while_a_third_body_is_in_its_way_and_then_goes_on(
+    approach: str, east_m: float, there: tuple[float, float, np.ndarray]
+) -> None:
+    parameters = Parameters().replace("docking.approach", approach)
+    tank = placed((1.0, 0.0), (1.0, east_m), (1.6, there[1]), parameters=parameters, armed=(1, 2))
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    tank.run(10.0, send(2, *there))
+    (dock,) = tank.outputs[-1].docks
+    assert dock.stage == Stage.APPROACH and dock.gap_m > 0.03
+    assert [said for _, said in tank.said if "waits" in said] == ["dock of module 1 waits: module 2 is on its way"]
+    assert min(np.linalg.norm(past[1][:3] - past[2][:3]) for past in tank.past) > 0.26
+    tank.run(0.1, send(2, 1.6, there[1]))
+    while tank.outputs[-1].docks[0].stage == Stage.APPROACH and len(tank.outputs) < 6000:
+        tank.run(0.01)
+    assert tank.outputs[-1].docks[0].stage == Stage.PUSH
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("approach", ["staged", "straight"])
+def test_target_that_comes_stops_before_a_third_body_and_goes_back(approach: str) -> None:
+    tank = placed((1.0, 0.0), (1.0, 2.4), (1.6, 0.75), parameters=Parameters().replace("docking.approach", approach))
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    outputs = tank.run(8.0, send(2, 1.0, 0.75))
+    assert tank.when("dock of module 1 ended: module 2 is where module 0 comes to meet it")
+    assert outputs.docks == [] and [record.mode for record in outputs.records] == [Mode.POSHOLD] * 3
+    assert min(np.linalg.norm(past[0][:3] - past[2][:3]) for past in tank.past) > CLEAR_M
+    assert abs(tank.states[0][1]) < 0.05
+
+
+@pytest.mark.slow
+def test_later_of_two_docks_that_are_on_each_other_s_ways_makes_room() -> None:
+    tank = placed((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0))
+    wanted = DockRequest(1, 3, 0, 2), DockRequest(3, 1, 2, 0)
+    tank.run(0.1, *(Request(Action.DOCK, request.module, request) for request in wanted))
+    outputs = tank.run(12.0)
+    assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] * 2
+    assert sum("gives way" in said for _, said in tank.said) == 1 and tank.when("dock of module 3 gives way to one that began before it")
+    assert min(np.linalg.norm(past[1][:3] - past[3][:3]) for past in tank.past) > 0.35
+
+
+@pytest.mark.slow
+def test_dock_that_cannot_go_back_to_make_room_stays_where_it_is() -> None:
+    tank = placed((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0), (2.2, 1.6))
+    wanted = DockRequest(1, 3, 0, 2), DockRequest(3, 1, 2, 0)
+    tank.run(0.1, *(Request(Action.DOCK, request.module, request) for request in wanted))
+    outputs = tank.run(6.0, send(4, 1.9, 1.0))
+    assert [dock.stage for dock in outputs.docks] == [Stage.PRE_APPROACH] * 2
+    assert not any("gives way" in said for _, said in tank.said)
+    assert min(np.linalg.norm(past[3][:3] - past[4][:3]) for past in tank.past) > 0.35

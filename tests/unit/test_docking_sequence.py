@@ -262,7 +262,7 @@ def test_tilted_target_comes_half_of_the_way_in_the_world(approach: str) -> None
         assert np.linalg.norm(steering.active.v_w) == pytest.approx(STAGED.speed_m_s), "however long the line is"
     left = STAGED.standoff_m if approach == "staged" else 0.0
     np.testing.assert_allclose(steering.meets, 0.5 * (way - left * dock.outward), atol=1e-9)
-    np.testing.assert_array_equal(dock.sequence.met_w, steering.meets, "so that it can be sent back")
+    np.testing.assert_array_equal(dock.sequence.meets_at_w, dock.there.p_wb + steering.meets)
     if approach == "straight":  # it meets the target where that comes to rest
         dock.until(Stage.PUSH)
         np.testing.assert_allclose(dock.at.p_wb + rotate(dock.at.q_wb, r_a), centre + PITCH_M * dock.outward + steering.meets, atol=0.002)
