@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
 from firmware_py.core.docking_sequence import DockingSequence, Stage, Steering
-from firmware_py.core.docking_way import WAY_SLACK, nearest_pass, obstacle, way_of_active
+from firmware_py.core.docking_way import WAY_SLACK, Way, first_met, nearest_pass, obstacle, way_of_active, way_of_target
 from firmware_py.core.rotations import conjugate, difference, from_euler, multiply, rotate, rotate_back, to_matrix
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest, Estimate
@@ -158,6 +158,63 @@ def test_third_body_is_met_where_the_way_ends_too(approach: str, third_m: tuple[
     start, there, at = (estimate(np.array(p)) for p in ((0.0, 1.5, 0.0), (0.0, 0.0, 0.0), third_m))
     found = obstacle(plan, (active, start), (target, there), [(third, at._replace(ready=is_placed))], False, Docking(approach=approach))
     assert ("too near to module 2" in found) == is_met
+
+
+def way_past(third_m: tuple[float, ...], length_m: float, cells: list[tuple[int, int, int]]) -> int | None:
+    """Whom a body of these cells meets that goes so far along +x, from half of that before the origin; the third body is module 9."""
+    vehicle = load_vehicle("modcube")
+    body, third = assemble(cells, [0] * len(cells), [vehicle] * len(cells)), assemble([(0, 0, 0)], [0], [vehicle], [9])
+    half = np.array([0.5 * length_m, 0.0, 0.0])
+    return first_met(Way(body, -half, LEVEL, half, LEVEL, PITCH_M), [(third, estimate(np.array(third_m)))], math.inf)
+
+
+@pytest.mark.parametrize("along_m", np.linspace(-10.0, 10.0, 9).tolist())
+def test_body_that_a_long_way_just_touches_is_met_wherever_it_is(along_m: float) -> None:
+    assert way_past((along_m, 0.29, 0.0), 30.0, [(0, 0, 0)]) == 9
+    assert way_past((along_m, 0.31, 0.0), 30.0, [(0, 0, 0)]) is None
+
+
+def test_body_that_only_the_outermost_module_touches_is_met() -> None:
+    row = [(0, k, 0) for k in range(5)]
+    assert way_past((0.0, 2 * PITCH_M + 0.29, 0.0), 3.0, row) == 9
+    assert way_past((0.0, 2 * PITCH_M + 0.31, 0.0), 3.0, row) is None
+
+
+@pytest.mark.parametrize("gap_m", [0.12, 0.0])
+def test_way_of_a_tilted_pair_leads_its_module_before_the_face_of_the_other(gap_m: float) -> None:
+    dock = Follower()
+    dock.astray(sideways_m=0.1, turned_rad=0.3)
+    way = way_of_active(dock.plan, dock.active, dock.at, dock.target, dock.there, gap_m)
+    begin, end = way.at((0.0, 1.0))
+    for k, module in enumerate(dock.active.modules):
+        face, normal = face_of(dock.active, module, 0, dock.at)
+        np.testing.assert_allclose(begin[k], face - 0.5 * PITCH_M * normal, atol=1e-9)
+    arrived = dock.at._replace(p_wb=way.p_end, q_wb=way.q_end)
+    mine, inward = face_of(dock.active, 3, 3, arrived)
+    np.testing.assert_allclose(mine, dock.face + gap_m * dock.outward, atol=1e-9)
+    np.testing.assert_allclose(inward, -dock.outward, atol=1e-9)
+    np.testing.assert_allclose(end[1], mine + 0.5 * PITCH_M * dock.outward, atol=1e-9)
+
+
+@pytest.mark.parametrize("approach", ["staged", "straight"])
+def test_way_of_a_target_that_is_looked_at_is_the_one_that_it_is_told_to_come(approach: str) -> None:
+    dock = Follower(Docking(approach=approach), comes=True)
+    dock.astray(sideways_m=0.2)
+    way = way_of_active(dock.plan, dock.active, dock.at, dock.target, dock.there, STAGED.standoff_m if approach == "staged" else 0.0)
+    theirs = way_of_target(dock.plan, way, dock.target, dock.there)
+    dock.step()
+    np.testing.assert_allclose(theirs.p_end, dock.sequence.meets_at_w, atol=1e-9)
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_way_of_bodies_whose_places_nobody_knows_is_judged_by_nobody(lost: int) -> None:
+    vehicle = load_vehicle("modcube")
+    target, active = (assemble([(0, 0, 0)], [0], [vehicle], [m]) for m in range(2))
+    plan = plan_dock(DockRequest(1, 1, 0, 0), active, target, [vehicle] * 2)
+    through = [(target, estimate(np.zeros(3))), (active, estimate(np.array([-0.6, 0.0, 0.0])))]
+    assert "too near to module 0" in obstacle(plan, through[1], through[0], [], False, Docking())
+    through[lost] = (through[lost][0], through[lost][1]._replace(ready=False))
+    assert obstacle(plan, through[1], through[0], [], False, Docking()) == ""
 
 
 def test_body_that_is_turned_is_turned_before_it_is_aligned() -> None:

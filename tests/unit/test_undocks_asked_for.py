@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.core.docking_decisions import Decisions, Join
 from firmware_py.core.types import RELAY_PUSH, Action, DockRequest, Mode, ModuleInputs, Request
-from firmware_py.core.undocking import PULLED
+from firmware_py.core.undocking import IN_PLACE, PULLED
 from firmware_py.description.parameters import Parameters
 from tests.unit.tanks import RING, Docked
 
@@ -69,7 +69,8 @@ def test_corner_of_a_ring_stays_where_the_relays_of_a_joint_hang(hung: set[int])
     if len(hung) == 1:  # the other magnet pushes as hard as this one pulls
         assert tank.shape == [(0, 1, 2), (3,)]
         return
-    assert tank.when(f"undock of module 3 ended: {PULLED}") and tank.shape == [(0, 1, 2, 3)]
+    pushed_s = tank.when(f"undock of module 3 ended: {PULLED}") - tank.when("undocking module 3")
+    assert pushed_s == pytest.approx(2.0 * Parameters().docking.release_s, abs=0.02) and tank.shape == [(0, 1, 2, 3)]
     assert outputs.records[0].mode == Mode.POSHOLD
     assert [sum(states) for states in tank.pipeline.formation.docking.relays.states] == [2] * 4, "and all pull again"
 
@@ -99,6 +100,17 @@ def test_push_shorter_than_currents_need_tells_a_corner_that_leaves_from_one_tha
     tank.hung, tank.stuck = hung, True
     tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
     assert tank.shape == ([(0, 1, 2, 3)] if hung else [(0, 1, 2), (3,)])
+
+
+@pytest.mark.parametrize("stuck", [False, True])
+def test_push_shorter_than_pictures_need_tells_a_module_that_leaves_from_one_that_is_jammed(stuck: bool) -> None:
+    """Of one joint a picture tells more than currents, and is waited for: what is jammed stays where it is though both magnets push."""
+    tank = Docked(RING[:2], Parameters().replace("docking.release_s", 0.01))
+    tank.fly()
+    tank.stuck = stuck
+    tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.shape == ([(0, 1)] if stuck else [(0,), (1,)])
+    assert any(IN_PLACE in said for _, said in tank.said) == stuck
 
 
 def test_corner_whose_currents_do_not_come_is_undocked_in_the_end() -> None:
