@@ -91,6 +91,8 @@ def test_module_out_of_sight_is_undocked_unless_its_magnets_go_on_pulling(hung: 
     tank.hidden, tank.hung = {1}, hung
     tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert tank.shape == ([(0, 1)] if hung else [(0,), (1,)])
+    pushed_s = (tank.when("undock of module 1 ended") if hung else tank.when("module 1 is undocked")) - tank.when("undocking module 1")
+    assert pushed_s == pytest.approx((2.0 if hung else 1.0) * Parameters().docking.release_s, abs=0.02)
 
 
 @pytest.mark.parametrize("hung", [set(), {2, 3}], ids=str)
