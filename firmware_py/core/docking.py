@@ -5,7 +5,6 @@ Works on the estimates of this tick; the pipeline carries out the joins and part
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
@@ -16,7 +15,8 @@ from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Part,
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan
-from firmware_py.core.docking_way import WAY_SLACK, Way, first_met, obstacle, to_one_place, way_of_active
+from firmware_py.core.docking_traffic import Traffic, thirds_of
+from firmware_py.core.docking_way import obstacle, to_one_place
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
@@ -30,7 +30,6 @@ from firmware_py.core.types import (
     WARNING,
     DockRecord,
     DockRequest,
-    Estimate,
     Event,
     Inputs,
 )
@@ -44,9 +43,6 @@ ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
 TAKEN = "another dock is to bring a module to the same place: end that dock first"
-AHEAD = {Stage.PRE_APPROACH: (1.0, WAY_SLACK), Stage.APPROACH: (0.0, math.inf)}
-"""Stages in which the active body is on a way: the gap that it ends at, and the slack that it leaves to others, as shares of the stand-off.
-The last piece is waited with only for those that it would touch: beside the target's face there may be others."""
 
 
 class _Dock(NamedTuple):
@@ -75,8 +71,6 @@ class DockingStage:
         self._expected: dict[int, DockRequest] = {}
         """By body: the newest dock or undock that waits for its plan."""
         self._joints = JointWatch(parameters)
-        self._awaited: set[int] = set()
-        """Modules that docks which began earlier wait for, in this tick."""
         self.events: list[Event] = []
         self.records: list[DockRecord] = []
 
@@ -169,9 +163,9 @@ class DockingStage:
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)
         self._joints.step(inputs.time_ns, inputs.modules, poses, resting)
-        self._awaited.clear()
+        traffic = Traffic(estimates, self._p)
         for dock in list(self._docks):
-            self._steer(dock, inputs, estimates, poses, decisions)
+            self._steer(dock, inputs, estimates, poses, traffic, decisions)
         for undock in list(self._undocks):
             self._release(undock, inputs.time_ns, estimates, decisions)
         return decisions
@@ -227,7 +221,7 @@ class DockingStage:
         if any(to_one_place(plan, dock.sequence.plan) for dock in self._docks if dock.active != mine):
             return TAKEN
         comes = self._comes(plan, others, holding)
-        return obstacle(plan, estimates[mine], estimates[others], _thirds(estimates, mine, others), comes, self._p)
+        return obstacle(plan, estimates[mine], estimates[others], thirds_of(estimates, mine, others), comes, self._p)
 
     def _comes(self, plan: DockPlan, target: int, holding: Collection[int]) -> bool:
         """Whether the target is to come half of the way."""
@@ -289,16 +283,17 @@ class DockingStage:
         inputs: Inputs,
         estimates: Estimated,
         poses: ModulePoses,
+        traffic: Traffic,
         decisions: Decisions,
     ) -> None:
-        if blocked := self._blocked(dock, estimates):
+        if blocked := traffic.blocked(dock.sequence, dock.active, dock.target):
             self._give_up(dock, blocked, decisions)
             self._end(dock.active, decisions)
             return
         active, target = estimates[dock.active][1], estimates[dock.target][1]
         status = dock.detector.step(inputs.time_ns, inputs.modules, poses)
         before = dock.sequence.stage
-        steering = dock.sequence.step(inputs.time_ns, active, target, status, self._waits(dock, estimates))
+        steering = dock.sequence.step(inputs.time_ns, active, target, status, self._wish(dock, traffic))
         stage = dock.sequence.stage
         self.relays.switch(steering.relay, *dock.sequence.plan.closes)
         errors, pair = dock.sequence.errors(active, target), dock.detector.pair
@@ -321,39 +316,15 @@ class DockingStage:
         if steering.meets is not None:
             decisions.meets[dock.target] = steering.meets
 
-    def _blocked(self, dock: _Dock, estimates: Estimated) -> str:
-        """Why a target that comes to meet the active body can come no farther; empty: it can, or it does not come."""
-        thirds, to_w = _thirds(estimates, dock.active, dock.target), dock.sequence.meets_at_w
-        if not thirds or to_w is None:
-            return ""
-        plan, (body, at) = dock.sequence.plan, estimates[dock.target]
-        met = first_met(Way(body, at.p_wb, at.q_wb, to_w, at.q_wb, plan.pitch_m), thirds, WAY_SLACK * self._p.standoff_m)
-        return "" if met is None else f"module {met} is where module {plan.request.target_module} comes to meet it"
-
-    def _waits(self, dock: _Dock, estimates: Estimated) -> Wish | None:
-        """What the active body glides by while a third body is on its way; None: none is."""
-        thirds, stage = _thirds(estimates, dock.active, dock.target), dock.sequence.stage
-        if not thirds or stage not in AHEAD or not dock.sequence.under_way:  # before its first tick its beginning has just been looked at
+    def _wish(self, dock: _Dock, traffic: Traffic) -> Wish | None:
+        """What the active body glides by while a third body is on its way; what it then does is said once."""
+        wait = traffic.wait(dock.sequence, dock.active, dock.target, dock.began)
+        if wait is None:
             return None
-        plan, (gap, slack) = dock.sequence.plan, (self._p.standoff_m * share for share in AHEAD[stage])
-        body, target_at = estimates[dock.target]
-        way = way_of_active(plan, *estimates[dock.active], body, dock.sequence.met(target_at), gap)
-        met = first_met(way, thirds, slack)
-        if met is None:
-            return None
-        self._say_once(dock, f"dock of module {plan.request.module} waits: module {met} is on its way")
-        wish = REST if self._awaited.isdisjoint(way.body.modules) else self._gives_way(dock, way, thirds)
-        self._awaited.add(met)
-        return wish
-
-    def _gives_way(self, dock: _Dock, way: Way, thirds: Sequence[tuple[Body, Estimate]]) -> Wish:
-        """Back to where it began, if nobody is there: one that waits for it while it waits itself would wait for ever."""
-        assert dock.began.p_wb is not None and dock.began.q_wb is not None
-        back = way._replace(p_end=dock.began.p_wb, q_end=dock.began.q_wb)
-        if first_met(back, thirds, WAY_SLACK * self._p.standoff_m) is not None:
-            return REST
-        self._say_once(dock, f"dock of module {dock.prepared.request.module} gives way to one that began before it")
-        return dock.began
+        if wait.words not in dock.said:
+            dock.said.add(wait.words)
+            self._say(WARNING, f"dock of module {dock.prepared.request.module} {wait.words}")
+        return wait.wish
 
     def _end(self, active: int, decisions: Decisions) -> None:
         """The body is done with docking, but for what it still waits for the plan of, and an undock under way."""
@@ -401,11 +372,6 @@ class DockingStage:
         self.relays.switch(RELAY_OFF, *(joint for joint in undock.plan.opens if joint not in left))
         self.relays.switch(RELAY_PULL, *left)
 
-    def _say_once(self, dock: _Dock, text: str) -> None:
-        if text not in dock.said:
-            dock.said.add(text)
-            self._say(WARNING, text)
-
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))
 
@@ -436,8 +402,3 @@ def _fits(plan: DockPlan | UndockPlan, estimates: Estimated) -> bool:
 
 def _body_of(module: int, estimates: Estimated) -> int:
     return next(number for number, (body, _) in estimates.items() if module in body.modules)
-
-
-def _thirds(estimates: Estimated, *pair: int) -> list[tuple[Body, Estimate]]:
-    """The bodies beside a pair."""
-    return [placed for number, placed in estimates.items() if number not in pair]

@@ -139,8 +139,7 @@ class DockingSequence:
         self._line_t, self._farthest_m = plan.axis_t, parameters.standoff_m
         self._fixed: Estimate | None = None
         """Where the target is to be met, at rest, for an approach that does not look at it again."""
-        self.under_way = False
-        """Whether it has been stepped."""
+        self._under_way = False
         self.meets_at_w: np.ndarray | None = None
         """(3,) where the target's centre of mass was told to come, world, m; None: it was told nothing."""
         self.stage = Stage.PRE_APPROACH
@@ -154,7 +153,7 @@ class DockingSequence:
 
     def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus, waits: Wish | None = None) -> Steering:
         """Moves the sequence on by one tick. `waits`: somebody is on its way; until it is before the face, it glides by this instead."""
-        meets = None if self.under_way else self._set_off(active, target)
+        meets = None if self._under_way else self._set_off(active, target)
         errors = self.errors(active, target)
         dt = (time_ns - self._last_ns) * 1e-9
         self._last_ns = time_ns
@@ -192,7 +191,7 @@ class DockingSequence:
 
     def _set_off(self, active: Estimate, target: Estimate) -> np.ndarray | None:
         """Shares the way with the target if it comes, and draws the line of a straight approach; returns how far it comes."""
-        self.under_way = True
+        self._under_way = True
         straight = self._p.approach == "straight"
         off, (_, q_t) = self._offset(active, target), pose_of(target, self._r_t, self._q_t)
         left = 0.0 if straight else self._p.standoff_m
