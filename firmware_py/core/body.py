@@ -65,9 +65,14 @@ class DragTable:
     linear: np.ndarray
 
     @property
+    def mean(self) -> float:
+        """Force per squared speed, mean of all directions, N s^2/m^2."""
+        return float(self.nodes[..., 0].mean())
+
+    @property
     def cruise_slope(self) -> float:
         """What a change of the water's speed does to the force on a robot under way, mean of all directions, N s/m: dF/dv = 2 c v."""
-        return 2.0 * CRUISE_M_S * float(self.nodes[..., 0].mean())
+        return 2.0 * CRUISE_M_S * self.mean
 
 
 @dataclass(frozen=True, slots=True, eq=False)

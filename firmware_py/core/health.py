@@ -29,6 +29,8 @@ FOREIGN_NS = 1_000_000_000
 """So long a frame of somebody else is remembered: one that sends as slowly as once a second is one stranger."""
 TAG_SHARE = 1.0 / 60.0
 """Weight of one tag observation in a mean of a second: tags come at 60 Hz."""
+UNSEEN_S = 0.5
+"""Without a tag, until nobody sees what a push does to the body: longer than frames that are lost leave it alone."""
 VOLTAGE_SHARE = 0.2
 """Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
 
@@ -101,6 +103,15 @@ class Health(NamedTuple):
 
     open_joints: tuple[frozenset[int], ...] = ()
     """Modules of each joint that is open though it should hold."""
+    push_m_s: float = 0.0
+    """Speed of the current that would push the body sideways as hard as is believed, mean of a second."""
+
+    @property
+    def unseen_push_m_s(self) -> float:
+        """The same while no tag tells what it does to the body, else none. A wall or a hand pushes as no model foresees: believed speed and
+        disturbance then run away together, as the accelerometer cannot tell one from the other.
+        """
+        return self.push_m_s if self.tag_age_s > UNSEEN_S else 0.0
 
     @property
     def placed(self) -> bool:
@@ -157,6 +168,7 @@ class HealthMonitor:
         self._errors, self._error_rate = 0, 0.0
         self._time_ns: int | None = None
         self._missed_rate = 0.0
+        self._drag, self._push_n = body.drag.mean, 0.0
         self.now: Health
         self.imu_heard = True
         """Whether an IMU that is to be believed was heard in this tick; set by whoever watches them."""
@@ -199,6 +211,7 @@ class HealthMonitor:
         self._stick = max(other._stick for other in before)
         self._errors, self._error_rate = max((other._errors, other._error_rate) for other in before)
         self._missed_rate = max(other._missed_rate for other in before)
+        self._push_n = max(other._push_n for other in before)
 
     def step(self, inputs: Inputs, estimate: Estimate, requests: list[Request], faults: ThrusterFaults) -> Health:
         """The figures of this tick; `now` keeps them."""
@@ -253,6 +266,7 @@ class HealthMonitor:
             unfit=tuple([m for m, unfit in zip(self._modules, self._unfit, strict=True) if unfit]),
             battery_age_s=(now - min(self._read_ns["battery"])) * 1e-9,
             cabin_age_s=(now - min(self._read_ns["cabin"])) * 1e-9,
+            push_m_s=math.sqrt(self._push_n / self._drag),
         )
         return self.now
 
@@ -320,6 +334,7 @@ class HealthMonitor:
         self._error_rate = keep * self._error_rate + errors / MEAN_S
         missed = max(0, round(dt_s * 1e9 / self._period_ns) - 1)
         self._missed_rate = keep * self._missed_rate + missed / MEAN_S
+        self._push_n += (1.0 - keep) * (math.hypot(*estimate.force_w[:2].tolist()) - self._push_n)
         refused, self._rejected = estimate.rejected - self._rejected, estimate.rejected
         before_ns, self._tag_ns = self._tag_ns, inputs.time_ns - estimate.tag_age_ns
         taken = estimate.ready and refused == 0 and self._tag_ns > before_ns  # the paper's estimator tells of no innovations

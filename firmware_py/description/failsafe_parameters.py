@@ -117,6 +117,13 @@ class Failsafes:
     tag_lost_delay_s: float = delay(0.0, "FS_TAGL_S")
     tag_lost_action: int = action(3, "FS_TAGL_ACT")
     tag_lost_latched: int = latched(0, "FS_TAGL_LAT")
+    # a wall, a hand or a rope pushes, and nobody sees where to: the believed place runs away
+    pushed_limit: float = quantity(
+        0.5, unit="m/s", low=0.05, high=10, help="without tags pushed harder than by such a current on the mean", mavlink="FS_PUSH_LIM"
+    )
+    pushed_delay_s: float = delay(0.5, "FS_PUSH_S")
+    pushed_action: int = action(3, "FS_PUSH_ACT")
+    pushed_latched: int = latched(0, "FS_PUSH_LAT")
     # position uncertain
     tag_late_limit: float = quantity(
         1.0, unit="s", low=0.05, high=60, help="no tag for longer while on the move", mavlink="FS_TAGM_LIM"

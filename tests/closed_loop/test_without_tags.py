@@ -8,6 +8,7 @@ import pytest
 
 from firmware_py.app.firmware import BusFrame
 from firmware_py.core.rotations import heading, rotate, to_matrix
+from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, BodyRecord, Inputs, Mode, Outputs, Request, Sticks
 from firmware_py.description.parameters import Parameters
@@ -45,6 +46,18 @@ class Pilot:
 
     def is_over(self, time_ns: int) -> bool:
         return False
+
+
+class Traveller(Pilot):
+    """Holds its place, and asks for another one at half past six, s."""
+
+    def __init__(self, duration_s: float, north_m: float) -> None:
+        super().__init__(Mode.POSHOLD, duration_s)
+        self._place = rest_at(np.array([north_m, 0.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
+        goes = [Request(Action.HOLD, 0, self._place)] if time_ns == 6_500_000_000 else []
+        return super().requests(time_ns, last) + goes
 
 
 class Flight:
@@ -175,6 +188,28 @@ def test_robot_whose_pilot_falls_silent_holds_its_depth_before_it_comes_up() -> 
     for begin_s, end_s, mode in ((5.0, 6.9, Mode.STABILIZE), (7.1, 28.9, Mode.ALT_HOLD), (29.1, 35.0, Mode.SURFACE)):
         assert {record.mode for _, record in flight.between(begin_s, end_s)} == {mode}
     assert "fail-safe on: no tag" in flight.words
+
+
+@pytest.mark.slow
+def test_blind_robot_that_a_wall_stops_lets_go_of_the_place_that_it_cannot_reach() -> None:
+    """It took what the wall did for a current, and believed to go on: 0.4 m beyond the wall after five seconds."""
+    flight = Flight(Traveller(14.0, north_m=1.4), blind_s=(6.0, 1e6), size_m=1.6)
+    touches_s = next(t for t, truth in enumerate(flight.truth) if truth.p_wb[0] > 0.68) / 100
+    assert "ARMED POSHOLD -> ARMED ALT_HOLD" in flight.words
+    assert any(words.startswith("fail-safe on: pushed as by") for words in flight.words)
+    assert {record.mode for _, record in flight.between(6.0, touches_s)} == {Mode.POSHOLD}
+    after = flight.between(touches_s + 2.0, 14.0)
+    assert {record.mode for _, record in after} == {Mode.ALT_HOLD}
+    assert all(np.linalg.norm(record.wrench[:2]) < 10.0 for _, record in after)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("push_n", [0.0, 5.0])
+def test_blind_robot_that_goes_through_water_is_not_taken_for_one_that_is_held(push_n: float) -> None:
+    hand = Fault(kind="push", at_s=8.0, until_s=12.0, value=push_n or 1e-9)
+    flight = Flight(Traveller(13.9, north_m=2.0), hand, blind_s=(6.0, 1e6))
+    assert {record.mode for _, record in flight.between(1.0, 13.9)} == {Mode.POSHOLD}
+    assert flight.truth[-1].p_wb[0] > 1.5
 
 
 def test_no_mode_that_keeps_a_place_is_armed_without_a_tag() -> None:

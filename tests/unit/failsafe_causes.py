@@ -16,11 +16,12 @@ FIELDS: dict[str, str] = {
     "foreign_command": "foreign_command", "battery_critical": "voltage_share",
     "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
     "tag_gone": "tag_age_s", "partner_lost": "topology", "estimator": "nis_ratio", "rejected": "rejected_share",
-    "tag_lost": "tag_age_s", "tag_late": "tag_age_s", "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
+    "tag_lost": "tag_age_s", "pushed": "push_m_s", "tag_late": "tag_age_s",
+    "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
     "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
     "thruster_lost": "dead", "cabin_unknown": "cabin_age_s", "battery_unknown": "battery_age_s", "battery_low": "voltage_share",
 }  # fmt: skip
-"""Which figure of Health each fail-safe judges; depth_unknown needs two."""
+"""Which figure of Health each fail-safe judges; depth_unknown and pushed need two."""
 YES: dict[str, Any] = {
     "leak": True, "foreign_sync": True, "foreign_command": True, "axis_lost": 1, "partner_lost": "0 and 1", "thruster_lost": (3,),
 }  # fmt: skip
@@ -30,6 +31,8 @@ def spoilt(name: str, value: float) -> Health:
     """`GOOD` with the figure of fail-safe `name` at `value`."""
     if name == "depth_unknown":
         return GOOD._replace(tag_age_s=value, depth_age_s=value)
+    if name == "pushed":
+        return GOOD._replace(tag_age_s=0.6, push_m_s=value)
     return GOOD._replace(**{FIELDS[name]: value})
 
 

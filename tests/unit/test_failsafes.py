@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from firmware_py.core.failsafes import ANY, MOVING, PERMITTED, PILOTED, PLACED, TABLE, Alarm, Failsafes, Level, Row, Watch
-from firmware_py.core.health import Health
+from firmware_py.core.failsafes import ANY, FREE, MOVING, PERMITTED, PILOTED, PLACED, TABLE, Alarm, Failsafes, Level, Row, Watch
+from firmware_py.core.health import UNSEEN_S, Health
 from firmware_py.core.types import Mode
 from firmware_py.description.failsafe_parameters import Failsafes as Parameters
 from tests.unit.failsafe_causes import FIELDS, ROWS, YES, P, bad, quick, spoilt
@@ -67,12 +67,19 @@ def test_depth_is_known_by_pressure_or_by_tags() -> None:
     assert alarms_of(quick("depth_unknown"), GOOD._replace(depth_age_s=lost, tag_age_s=lost))
 
 
+def test_push_counts_only_while_no_tag_tells_what_it_does() -> None:
+    pushed = GOOD._replace(push_m_s=3.0)
+    assert alarms_of(quick("pushed"), pushed._replace(tag_age_s=UNSEEN_S)) == []
+    assert alarms_of(quick("pushed"), pushed._replace(tag_age_s=math.nextafter(UNSEEN_S, math.inf)))
+
+
 COUNTS = {
     "depth_unknown": POSE_MODES | {Mode.ALT_HOLD},
     "tag_gone": POSE_MODES,
     "estimator": POSE_MODES,
     "rejected": POSE_MODES,
     "tag_lost": POSE_MODES,
+    "pushed": POSE_MODES - {Mode.DOCK},
     "tag_late": POSE_MODES - {Mode.POSHOLD},
     "fence": POSE_MODES - {Mode.POSHOLD},
     "ground_lost": set(Mode) - {Mode.AUTO, Mode.SURFACE},
@@ -199,6 +206,7 @@ WORDS = {
     "estimator": "sensors and model disagree: 5.0 of the expected",
     "rejected": "80% of the tags refused",
     "tag_lost": "no tag for 8.0 s",
+    "pushed": "pushed as by a current of 0.5 m/s, and no tag tells where to",
     "tag_late": "no tag for 1.0 s",
     "depth_lost": "no pressure for 1.0 s",
     "imu_lost": "no IMU for 0.5 s",
@@ -251,7 +259,7 @@ def test_pilot_may_take_over_from_every_fail_safe_but_disarming() -> None:
     extra = {Mode.POSHOLD, Mode.SURFACE, Mode.MOTOR_DETECT}
     assert PERMITTED[Level.HOLD] - PILOTED == extra
     assert PERMITTED[Level.DEPTH] - PILOTED == PERMITTED[Level.SURFACE] - PILOTED == {Mode.SURFACE}
-    assert PLACED == POSE_MODES and POSE_MODES - {Mode.POSHOLD} == MOVING and set(Mode) == ANY
+    assert PLACED == POSE_MODES and POSE_MODES - {Mode.POSHOLD} == MOVING and POSE_MODES - {Mode.DOCK} == FREE and set(Mode) == ANY
 
 
 @pytest.mark.parametrize("name", FIELDS)

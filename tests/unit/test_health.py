@@ -356,3 +356,25 @@ def test_joined_body_remembers_a_frame_of_somebody_else_that_one_of_its_parts_he
         ear.hear()
     both.monitor.take_over([one.monitor, other.monitor])
     assert getattr(both.hear(), foreign)
+
+
+def test_push_is_told_as_the_current_that_would_push_so_sideways_on_the_mean_of_a_second() -> None:
+    """What lifts or sinks the body is a payload, and depth tells where that takes it."""
+    ear, current_m_s = Ear(), 0.7
+    push_n = BODY.drag.mean * current_m_s**2
+    force = push_n * np.array([0.6, -0.8, 0.0]) + np.array([0.0, 0.0, 50.0])
+    ear.hear()
+    assert ear.wait(1.0, force_w=force).push_m_s == pytest.approx(current_m_s * math.sqrt(1.0 - math.exp(-1.0)))
+    assert ear.wait(9.0, force_w=force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+    assert ear.hear(force_w=-force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+
+
+def test_push_is_known_to_a_body_that_two_have_become() -> None:
+    ear, other = Ear(), Ear()
+    for each, push_n in ((ear, 3.0), (other, 8.0)):
+        each.hear()
+        each.wait(9.0, force_w=np.array([push_n, 0.0, 0.0]))
+    joined = Ear()
+    joined.time_ns = ear.time_ns
+    joined.monitor.take_over([ear.monitor, other.monitor])
+    assert joined.hear(force_w=np.array([8.0, 0.0, 0.0])).push_m_s == pytest.approx(math.sqrt(8.0 / BODY.drag.mean), rel=1e-3)
