@@ -105,6 +105,8 @@ class Health(NamedTuple):
     """Modules of each joint that is open though it should hold."""
     push_m_s: float = 0.0
     """Speed of the current that would push the body sideways as hard as is believed, mean of a second."""
+    rate_rad_s: float = 0.0
+    """At which the body turns."""
 
     @property
     def unseen_push_m_s(self) -> float:
@@ -267,6 +269,7 @@ class HealthMonitor:
             battery_age_s=(now - min(self._read_ns["battery"])) * 1e-9,
             cabin_age_s=(now - min(self._read_ns["cabin"])) * 1e-9,
             push_m_s=math.sqrt(self._push_n / self._drag),
+            rate_rad_s=math.hypot(*estimate.nu[3:].tolist()),
         )
         return self.now
 
