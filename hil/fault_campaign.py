@@ -49,7 +49,7 @@ def scenario_of(row: Row, mode: str) -> Scenario:
     """The flight of one cell."""
     base = load_scenario(SCENARIO)
     task = dataclasses.replace(base.task, mode=mode, **row.task)
-    return dataclasses.replace(base, task=task, fault=(row.fault,) if row.fault is not None else ())
+    return dataclasses.replace(base, task=task, fault=(row.fault, *row.also) if row.fault is not None else ())
 
 
 def fly_cell(row: Row, mode: str, seed: int, parameters: Parameters | None = None) -> Cell:

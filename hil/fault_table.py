@@ -35,6 +35,8 @@ class Row:
     promise: str
     """In words."""
     fault: Fault | None = None
+    also: tuple[Fault, ...] = ()
+    """What is broken besides."""
     ends: Mapping[str, str] = field(default_factory=dict)
     """Where it ends, by mode: a mode, DISARMED or ESTOP; the mode itself where it is not named."""
     within_s: float = math.inf
@@ -108,6 +110,10 @@ ROWS = (
     Row(
         "tags absent", "holds after 1 s, depth after 8 s", _fault("tag_absent"), ends=_to("ALT_HOLD", *PLACED), within_s=8.1,
         says="no tag for", says_in=PLACED,
+    ),
+    Row(
+        "pushed, tags absent", "lets go of the place", _fault("push", 40.0), also=(_fault("tag_absent"),), ends=_to("ALT_HOLD", *PLACED),
+        within_s=3.0, says="pushed as by a current", says_in=PLACED,
     ),
     Row("camera off by 5 mm", "as before; 20 mm", _fault("camera_bias", 0.005), error_m=0.020),
     Row("battery low", "warns; 30 mm", _fault("battery_sag", 1.8), error_m=0.030, says="battery low"),

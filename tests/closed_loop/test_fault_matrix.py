@@ -17,8 +17,8 @@ from hil.plant.fault_spec import TAKES
 from hil.scenario import MODES
 
 BY_NAME = {row.name: row for row in ROWS}
-ELSEWHERE = {"magnet", "jets", "push"}
-"""Faults of docking bodies, and somebody's hand."""
+ELSEWHERE = {"magnet", "jets"}
+"""Faults of docking bodies."""
 
 
 def test_table_breaks_everything_that_can_break() -> None:
