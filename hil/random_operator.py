@@ -35,7 +35,7 @@ from firmware_py.description.parameters import Parameters, registry
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare.paths import circle
 from hil.bench import Bench, open_bench
-from hil.fault_table import ROWS
+from hil.fault_table import ALONE
 from hil.orders import Orders
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
@@ -50,7 +50,7 @@ LEAVES = 0.01
 FACING = (FACE_NAMES.index("-x"), FACE_NAMES.index("+x"))
 """Faces with which the second module of these scenarios meets the first."""
 MOST_FAULTS = 5
-BREAKS = [row.fault for row in ROWS if row.fault is not None and row.fault.kind != "process_killed"]
+BREAKS = [fault for fault in ALONE if fault.kind != "process_killed"]
 """What may break: all of the fault matrix but the process itself, which forgets what it was asked."""
 REGISTRY = tuple(registry())
 SOON = 2
