@@ -16,7 +16,7 @@ Patch = pytest.MonkeyPatch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, 1, 5])  # one in each scenario
 def test_no_rule_is_broken_whatever_is_asked(seed: int) -> None:
     operated = fly_with_random_operator(seed, 20.0)
     assert not operated.broken
