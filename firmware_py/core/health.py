@@ -104,7 +104,7 @@ class Health(NamedTuple):
     open_joints: tuple[frozenset[int], ...] = ()
     """Modules of each joint that is open though it should hold."""
     push_m_s: float = 0.0
-    """Speed of the current that would push the body sideways as hard as is believed, mean of a second."""
+    """Speed of the current that would push the body sideways as hard as is believed, root of the mean square of a second."""
     rate_rad_s: float = 0.0
     """At which the body turns."""
 
@@ -170,7 +170,7 @@ class HealthMonitor:
         self._errors, self._error_rate = 0, 0.0
         self._time_ns: int | None = None
         self._missed_rate = 0.0
-        self._drag, self._push_n = body.drag.mean, 0.0
+        self._drag, self._push_m2_s2 = (body.drag.mean, float(body.drag.linear[:3].mean())), 0.0
         self.now: Health
         self.imu_heard = True
         """Whether an IMU that is to be believed was heard in this tick; set by whoever watches them."""
@@ -213,7 +213,7 @@ class HealthMonitor:
         self._stick = max(other._stick for other in before)
         self._errors, self._error_rate = max((other._errors, other._error_rate) for other in before)
         self._missed_rate = max(other._missed_rate for other in before)
-        self._push_n = max(other._push_n for other in before)
+        self._push_m2_s2 = max(other._push_m2_s2 for other in before)
 
     def step(self, inputs: Inputs, estimate: Estimate, requests: list[Request], faults: ThrusterFaults) -> Health:
         """The figures of this tick; `now` keeps them."""
@@ -268,7 +268,7 @@ class HealthMonitor:
             unfit=tuple([m for m, unfit in zip(self._modules, self._unfit, strict=True) if unfit]),
             battery_age_s=(now - min(self._read_ns["battery"])) * 1e-9,
             cabin_age_s=(now - min(self._read_ns["cabin"])) * 1e-9,
-            push_m_s=math.sqrt(self._push_n / self._drag),
+            push_m_s=math.sqrt(self._push_m2_s2),
             rate_rad_s=math.hypot(*estimate.nu[3:].tolist()),
         )
         return self.now
@@ -337,7 +337,8 @@ class HealthMonitor:
         self._error_rate = keep * self._error_rate + errors / MEAN_S
         missed = max(0, round(dt_s * 1e9 / self._period_ns) - 1)
         self._missed_rate = keep * self._missed_rate + missed / MEAN_S
-        self._push_n += (1.0 - keep) * (math.hypot(*estimate.force_w[:2].tolist()) - self._push_n)
+        current_m_s = _current_m_s(math.hypot(*estimate.force_w[:2].tolist()), *self._drag)
+        self._push_m2_s2 += (1.0 - keep) * (current_m_s**2 - self._push_m2_s2)
         refused, self._rejected = estimate.rejected - self._rejected, estimate.rejected
         before_ns, self._tag_ns = self._tag_ns, inputs.time_ns - estimate.tag_age_ns
         taken = estimate.ready and refused == 0 and self._tag_ns > before_ns  # the paper's estimator tells of no innovations
@@ -351,6 +352,12 @@ class HealthMonitor:
 
 def _age_s(at_ns: int | None, now_ns: int) -> float:
     return math.nan if at_ns is None else (now_ns - at_ns) * 1e-9
+
+
+def _current_m_s(push_n: float, squared: float, linear: float) -> float:
+    """Speed at which water whose drag is `squared` v^2 + `linear` v, N, pushes so hard; 0 where it never pushes."""
+    slope = linear + math.sqrt(linear**2 + 4.0 * squared * push_n)
+    return 2.0 * push_n / slope if slope > 0.0 else 0.0
 
 
 def _older(times_ns: list[int], oldest_ns: int) -> tuple[int, ...]:

@@ -1,5 +1,6 @@
 """Health: ages, means and worst cases of what the modules of a body say."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -20,6 +21,7 @@ from firmware_py.prepare.assembly import assemble
 TICK_NS = 10_000_000
 START_NS = 3600 * 10**9
 BODY = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2, [1, 3])
+SINGLE = assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [1])
 ZERO = np.zeros(3)
 
 
@@ -367,6 +369,29 @@ def test_push_is_told_as_the_current_that_would_push_so_sideways_on_the_mean_of_
     assert ear.wait(1.0, force_w=force).push_m_s == pytest.approx(current_m_s * math.sqrt(1.0 - math.exp(-1.0)))
     assert ear.wait(9.0, force_w=force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
     assert ear.hear(force_w=-force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+
+
+def test_push_upon_a_body_whose_drag_is_linear_too_is_no_more_current_than_there_is() -> None:
+    body, current_m_s = assemble([(0, 0, 0)], [0], [load_vehicle("bluerov2")], [1]), 0.4
+    ear, push_n = Ear(body), body.drag.mean * current_m_s**2 + body.drag.linear[:3].mean() * current_m_s
+    ear.hear()
+    assert ear.wait(9.0, force_w=np.array([push_n, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+
+
+def test_push_upon_a_body_without_drag_is_no_current() -> None:
+    ear = Ear(dataclasses.replace(BODY, drag=dataclasses.replace(BODY.drag, nodes=0.0 * BODY.drag.nodes)))
+    assert ear.wait(9.0, force_w=np.array([5.0, 0.0, 0.0])).push_m_s == 0.0
+
+
+def test_module_that_leaves_a_large_body_feels_the_current_that_this_one_felt() -> None:
+    """It took over the force on all of it: a module that parted out of sight in 0.4 m/s let go of its place."""
+    row = assemble([(0, k, 0) for k in range(4)], [0] * 4, [load_vehicle("modcube")] * 4, [1, 3, 0, 2])
+    whole, part, current_m_s = Ear(row), Ear(SINGLE), 0.4
+    whole.hear()
+    whole.wait(9.0, force_w=np.array([row.drag.mean * current_m_s**2, 0.0, 0.0]))
+    part.monitor.take_over([whole.monitor])
+    part.time_ns = whole.time_ns
+    assert part.hear(force_w=np.array([SINGLE.drag.mean * current_m_s**2, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
 
 
 def test_push_is_known_to_a_body_that_two_have_become() -> None:
