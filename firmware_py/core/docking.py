@@ -148,6 +148,7 @@ class DockingStage:
         estimates: Estimated,
         waiting: Collection[int],
         holding: Collection[int],
+        coming: Collection[int],
         resting: Collection[tuple[int, int]],
     ) -> Decisions:
         """One tick.
@@ -155,6 +156,7 @@ class DockingStage:
         Args:
             waiting: bodies in the mode DOCK: only these begin a dock. Looked at when a plan is there, as `holding` is.
             holding: bodies that hold a place which may be moved: only these come to meet another.
+            coming: those that are on their way to do so.
             resting: modules and faces whose magnets are off whatever is wanted.
         """
         self.events, self.records = [], []
@@ -163,7 +165,7 @@ class DockingStage:
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)
         self._joints.step(inputs.time_ns, inputs.modules, poses, resting)
-        traffic = Traffic(estimates, self._p)
+        traffic = Traffic(estimates, coming, self._p)
         for dock in list(self._docks):
             self._steer(dock, inputs, estimates, poses, traffic, decisions)
         for undock in list(self._undocks):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 from firmware_py.core.body import Body
@@ -30,8 +30,10 @@ class Wait(NamedTuple):
 class Traffic:
     """The bodies of one tick. Docks ask in the order in which they began."""
 
-    def __init__(self, estimates: Estimated, parameters: Docking) -> None:
+    def __init__(self, estimates: Estimated, coming: Collection[int], parameters: Docking) -> None:
+        """`coming`: bodies that are on their way to meet another."""
         self._estimates = estimates
+        self._coming = coming
         self._p = parameters
         self._awaited: set[int] = set()
         """Modules that the docks before wait for."""
@@ -39,7 +41,7 @@ class Traffic:
     def blocked(self, sequence: DockingSequence, active: int, target: int) -> str:
         """Why a target that comes to meet the active body can come no farther; empty: it can, or it does not come."""
         thirds, to_w, plan = thirds_of(self._estimates, active, target), sequence.meets_at_w, sequence.plan
-        if not thirds or to_w is None:
+        if not thirds or to_w is None or target not in self._coming:
             return ""
         body, at = self._estimates[target]
         way = Way(body, at.p_wb, at.q_wb, to_w, at.q_wb, plan.pitch_m)

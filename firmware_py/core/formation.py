@@ -46,7 +46,8 @@ class Formation:
             return
         bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.chains}
         waiting, holding = (self._armed_in(mode) if inputs.prepared else [] for mode in (Mode.DOCK, Mode.POSHOLD))
-        decisions = self.docking.step(inputs, bodies, waiting, holding, self._resting())
+        coming = [chain.body.index for chain in self.chains if chain.guidance.comes]
+        decisions = self.docking.step(inputs, bodies, waiting, holding, coming, self._resting())
         self._miss_partners(outputs, [parted.whole for parted in decisions.parts])
         outputs.docks += self.docking.records
         outputs.joints = self.docking.joints

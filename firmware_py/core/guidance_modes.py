@@ -26,6 +26,8 @@ STILL_S = 0.1
 """Between two ticks: after more, the microcontrollers have ended all thrust (DESIGN), and the set-point goes on from the body."""
 NEAR_M, NEAR_RAD = 0.2, 0.35
 """A set-point no farther from the body is gone on from; otherwise the body itself is."""
+COME_M = 0.005
+"""A set-point so near to where the body is to meet another has come there."""
 
 
 class Keep(IntEnum):
@@ -153,6 +155,13 @@ class Guidance:
         before = self._held()
         self.move_by(by_w)
         self._met = before, self._goal
+
+    @property
+    def comes(self) -> bool:
+        """Whether it is on its way to meet another body: not yet where it was to come, and not sent or steered elsewhere since."""
+        if self._met is None or self._goal is not self._met[1]:
+            return False
+        return bool(np.linalg.norm(self._held().p_wb - self._glider.at.p_wb) > COME_M)
 
     def go_back(self) -> None:
         """To where it held before it came to meet another body; one that has been sent or steered elsewhere since stays there."""

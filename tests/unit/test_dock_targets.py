@@ -253,3 +253,24 @@ def test_dock_that_cannot_go_back_to_make_room_stays_where_it_is() -> None:
     assert [dock.stage for dock in outputs.docks] == [Stage.PRE_APPROACH] * 2
     assert not any("gives way" in said for _, said in tank.said)
     assert min(np.linalg.norm(past[3][:3] - past[4][:3]) for past in tank.past) > 0.35
+
+
+@pytest.mark.slow
+def test_target_that_was_sent_elsewhere_is_on_no_way_to_the_place_where_it_was_to_meet() -> None:
+    tank = placed((1.0, 0.0), (1.0, 2.4), (2.0, 0.75))
+    tank.run(1.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    tank.run(3.0, send(0, 1.0, 0.0))
+    outputs = tank.run(3.0, send(2, 1.0, 0.75))
+    assert len(outputs.docks) == 1 and not any("ended" in said for _, said in tank.said)
+
+
+@pytest.mark.slow
+def test_target_that_has_come_and_is_pushed_a_little_beside_a_third_body_still_has_come() -> None:
+    tank = placed((1.0, 0.0), (1.0, 1.4), (1.6, 0.535))
+    tank.run(7.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    tank.run(5.0, send(2, 1.25, 0.535))
+    (dock,) = tank.pipeline.formation.docking._docks
+    tank.states[0][19] = -4.0
+    tank.run(0.5)
+    assert np.linalg.norm(tank.states[0][:3] - dock.sequence.meets_at_w) > 0.006
+    assert not any("comes to meet it" in said for _, said in tank.said)
