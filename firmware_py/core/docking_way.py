@@ -7,10 +7,11 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_sequence import DockPlan, module_in, pose_of
-from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, to_matrix
+from firmware_py.core.rotations import V, conjugate, difference, exp, multiply, normalise, rotate, to_matrix
 from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Docking
 
@@ -42,9 +43,18 @@ class Way(NamedTuple):
     def at(self, shares: Sequence[float]) -> np.ndarray:
         """(k, m, 3) centres of its modules, world, m, after each of k shares of the way."""
         turn = difference(self.q_end, self.q_begin)
-        turned = np.array([to_matrix(multiply(self.q_begin, exp(share * turn))) for share in shares])
+        turned = _turned(self.q_begin, turn, np.array(shares))
         centres = self.p_begin + np.outer(shares, self.p_end - self.p_begin)
         return np.asarray(centres[:, None] + self.body.r_bm @ turned.transpose(0, 2, 1))
+
+
+@njit(f"float64[:,:,::1]({V},{V},{V})", cache=True)
+def _turned(q, turn, shares):  # type: ignore[no-untyped-def]
+    """(k, 3, 3) body to world of an attitude (4,) that has turned by each of k shares of a rotation vector (3,)."""
+    out = np.empty((shares.size, 3, 3))
+    for i in range(shares.size):
+        out[i] = to_matrix(multiply(q, exp(shares[i] * turn)))
+    return out
 
 
 def way_of_active(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, gap_m: float) -> Way:
