@@ -7,7 +7,6 @@ holds a cube of EDGE^3 modules and prints the duration of a tick, how far it str
 
 from __future__ import annotations
 
-import gc
 import json
 from collections import deque
 from pathlib import Path
@@ -30,6 +29,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare.assembly import assemble
+from firmware_py.runtime.realtime import quiet_garbage
 
 PERIOD_NS = 10_000_000
 PERIOD_S = 1e-9 * PERIOD_NS
@@ -129,9 +129,8 @@ class Hold:
         """The farthest that it was from its set-point."""
         self.run(SETTLE_TICKS)
         self.strayed_m = 0.0
-        gc.collect()
-        gc.freeze()  # as the vehicle's process does before its first tick
 
+    @quiet_garbage()
     def run(self, ticks: int) -> float:
         """Mean duration of pipeline.step, us. Raises RuntimeError when the body disarms, or leaves a healthy thruster out."""
         took_ns = 0
