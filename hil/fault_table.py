@@ -113,7 +113,7 @@ ROWS = (
     ),
     Row(
         "pushed, tags absent", "lets go of the place", _fault("push", 40.0), also=(_fault("tag_absent"),), ends=_to("ALT_HOLD", *PLACED),
-        within_s=3.0, says="pushed as by a current", says_in=PLACED,
+        within_s=3.0, says="pushed out of sight", says_in=PLACED,
     ),
     Row("camera off by 5 mm", "as before; 20 mm", _fault("camera_bias", 0.005), error_m=0.020),
     Row("battery low", "warns; 30 mm", _fault("battery_sag", 1.8), error_m=0.030, says="battery low"),

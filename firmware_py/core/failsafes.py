@@ -79,7 +79,7 @@ TABLE = (
     Row("estimator", "sensors and model disagree: {:.1f} of the expected", "nis_ratio", modes=PLACED),
     Row("rejected", "{:.0%} of the tags refused", "rejected_share", modes=PLACED),
     Row("tag_lost", "no tag for {:.1f} s", "tag_age_s", modes=PLACED),
-    Row("pushed", "pushed as by a current of {:.1f} m/s, and no tag tells where to", "unseen_push_m_s", modes=FREE),
+    Row("pushed", "pushed out of sight as by a current of {:.1f} m/s", "unseen_push_m_s", modes=FREE),
     Row("tag_late", "no tag for {:.1f} s", "tag_age_s", modes=MOVING),
     Row("depth_lost", "no pressure for {:.1f} s", "depth_age_s"),
     Row("imu_lost", "no IMU for {:.1f} s", "imu_age_s"),

@@ -14,6 +14,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
+from firmware_py.core.rotations import rotate
 from firmware_py.core.topology import in_both
 from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request
 from firmware_py.description.failsafe_parameters import Fence
@@ -337,7 +338,7 @@ class HealthMonitor:
         self._error_rate = keep * self._error_rate + errors / MEAN_S
         missed = max(0, round(dt_s * 1e9 / self._period_ns) - 1)
         self._missed_rate = keep * self._missed_rate + missed / MEAN_S
-        current_m_s = _current_m_s(math.hypot(*estimate.force_w[:2].tolist()), *self._drag)
+        current_m_s = _current_m_s(*_pushed(estimate), *self._drag)
         self._push_m2_s2 += (1.0 - keep) * (current_m_s**2 - self._push_m2_s2)
         refused, self._rejected = estimate.rejected - self._rejected, estimate.rejected
         before_ns, self._tag_ns = self._tag_ns, inputs.time_ns - estimate.tag_age_ns
@@ -354,10 +355,22 @@ def _age_s(at_ns: int | None, now_ns: int) -> float:
     return math.nan if at_ns is None else (now_ns - at_ns) * 1e-9
 
 
-def _current_m_s(push_n: float, squared: float, linear: float) -> float:
-    """Speed at which water whose drag is `squared` v^2 + `linear` v, N, pushes so hard; 0 where it never pushes."""
-    slope = linear + math.sqrt(linear**2 + 4.0 * squared * push_n)
-    return 2.0 * push_n / slope if slope > 0.0 else 0.0
+def _pushed(estimate: Estimate) -> tuple[float, float]:
+    """How hard the body is pushed sideways, N, and its speed that way over ground, m/s."""
+    (north_n, east_n, _), v_w = estimate.force_w.tolist(), rotate(estimate.q_wb, estimate.nu[:3].copy())
+    push_n = math.hypot(north_n, east_n)
+    return push_n, (north_n * v_w[0] + east_n * v_w[1]) / push_n if push_n > 0.0 else 0.0
+
+
+def _current_m_s(push_n: float, speed_m_s: float, squared: float, linear: float) -> float:
+    """Speed of the current that pushes so hard upon a body that goes with it at `speed_m_s`; 0 without drag.
+
+    Args:
+        squared, linear: N s^2/m^2 and N s/m: the drag at v through the water is `squared` v |v| + `linear` v.
+    """
+    drag_n = (squared * abs(speed_m_s) + linear) * speed_m_s - push_n
+    slope = linear + math.sqrt(linear**2 + 4.0 * squared * abs(drag_n))
+    return speed_m_s - 2.0 * drag_n / slope if slope > 0.0 else 0.0
 
 
 def _older(times_ns: list[int], oldest_ns: int) -> tuple[int, ...]:

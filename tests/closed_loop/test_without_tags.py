@@ -196,7 +196,7 @@ def test_blind_robot_that_a_wall_stops_lets_go_of_the_place_that_it_cannot_reach
     flight = Flight(Traveller(14.0, north_m=1.4), blind_s=(6.0, 1e6), size_m=1.6)
     touches_s = next(t for t, truth in enumerate(flight.truth) if truth.p_wb[0] > 0.68) / 100
     assert "ARMED POSHOLD -> ARMED ALT_HOLD" in flight.words
-    assert any(words.startswith("fail-safe on: pushed as by") for words in flight.words)
+    assert any(words.startswith("fail-safe on: pushed out of sight") for words in flight.words)
     assert {record.mode for _, record in flight.between(6.0, touches_s)} == {Mode.POSHOLD}
     after = flight.between(touches_s + 2.0, 14.0)
     assert {record.mode for _, record in after} == {Mode.ALT_HOLD}

@@ -206,7 +206,7 @@ WORDS = {
     "estimator": "sensors and model disagree: 5.0 of the expected",
     "rejected": "80% of the tags refused",
     "tag_lost": "no tag for 8.0 s",
-    "pushed": "pushed as by a current of 0.5 m/s, and no tag tells where to",
+    "pushed": "pushed out of sight as by a current of 0.5 m/s",
     "tag_late": "no tag for 1.0 s",
     "depth_lost": "no pressure for 1.0 s",
     "imu_lost": "no IMU for 0.5 s",

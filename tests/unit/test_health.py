@@ -378,6 +378,17 @@ def test_push_upon_a_body_whose_drag_is_linear_too_is_no_more_current_than_there
     assert ear.wait(9.0, force_w=np.array([push_n, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
 
 
+@pytest.mark.parametrize("speed_m_s", [-0.2, 0.3, 0.9])
+def test_push_upon_a_body_under_way_is_no_more_current_than_there_is(speed_m_s: float) -> None:
+    """Against 0.4 m/s a traveller at 0.2 m/s feels twice what one that rests does."""
+    ear, current_m_s = Ear(), 0.4
+    through_m_s = speed_m_s - current_m_s
+    push_n = BODY.drag.mean * (speed_m_s * abs(speed_m_s) - through_m_s * abs(through_m_s))
+    ear.hear()
+    heard = ear.wait(9.0, force_w=np.array([0.0, -push_n, 0.0]), nu=np.array([0.1, -speed_m_s, 0.0, 0.0, 0.0, 0.0]))
+    assert heard.push_m_s == pytest.approx(current_m_s, rel=1e-3)
+
+
 def test_push_upon_a_body_without_drag_is_no_current() -> None:
     ear = Ear(dataclasses.replace(BODY, drag=dataclasses.replace(BODY.drag, nodes=0.0 * BODY.drag.nodes)))
     assert ear.wait(9.0, force_w=np.array([5.0, 0.0, 0.0])).push_m_s == 0.0
