@@ -30,7 +30,7 @@ from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
 DEGREE = 5
 LEAST_SLOPE = 1e-3
-"""Of the force, share of its mean slope: no curve stands still."""
+"""Share of its mean slope: no curve stands still."""
 LEAST_POINTS = 6
 """On either side, beyond the deadband."""
 COLUMNS = ("command", "force_n")
@@ -40,8 +40,8 @@ MOST = 1e6
 VOLTAGE = limits_of(ThrusterCurve, "voltage_v")
 
 
-def rising_polynomial(x: np.ndarray, y: np.ndarray, end: float) -> np.ndarray:
-    """(5,) c of c[0] x + ... + c[4] x^5, the least-squares fit to (k,) points that rises all over 0..end.
+def rising_polynomial(x: np.ndarray, y: np.ndarray, end: float, least: float) -> np.ndarray:
+    """(5,) c of c[0] x + ... + c[4] x^5, the least-squares fit to (k,) points that rises all over 0..end, by no less than `least` / end.
 
     Its slope is a sum of Bernstein polynomials of degree 4 with coefficients above zero, found by non-negative least squares
     (Lawson and Hanson 1974); a slope that needs a negative coefficient though it never falls is approximated.
@@ -51,9 +51,8 @@ def rising_polynomial(x: np.ndarray, y: np.ndarray, end: float) -> np.ndarray:
         for k in range(DEGREE - i):
             basis[i, i + k] = math.comb(4, i) * math.comb(4 - i, k) * (-1.0) ** k / (i + k + 1)
     powers = (x[:, None] / end) ** np.arange(1, DEGREE + 1)
-    floor = LEAST_SLOPE * float(np.max(y))
-    shares, _ = nnls(powers @ basis.T, y - floor * powers @ basis.sum(axis=0))
-    return np.asarray((shares + floor) @ basis / end ** np.arange(1, DEGREE + 1))
+    shares, _ = nnls(powers @ basis.T, y - least * powers @ basis.sum(axis=0))
+    return np.asarray((shares + least) @ basis / end ** np.arange(1, DEGREE + 1))
 
 
 def read_points(path: Path) -> dict[str, np.ndarray]:
@@ -116,7 +115,7 @@ def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: flo
                 "needed, and none against it"
             )
         x, y = np.abs(u[works]), np.abs(force[works])
-        changed[side] = rising_polynomial(x, y, 1.0)
+        changed[side] = rising_polynomial(x, y, 1.0, LEAST_SLOPE * float(y.max()))
         powers = np.arange(1, DEGREE + 1)
         left.append(x[:, None] ** powers @ changed[side] - y)
         idle = np.abs(u[(sign * u >= 0.0) & ~works])
@@ -124,7 +123,7 @@ def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: flo
         edges.append(float(between**powers @ changed[side]) if idle.size else 0.0)
         if "power_w" in points:
             power = _propeller_power(points, works, voltage_v, idle_power(points, zero_n) or 0.0, side)
-            changed[f"power_{side}"] = rising_polynomial(y, power, float(np.sum(changed[side])))
+            changed[f"power_{side}"] = rising_polynomial(y, power, float(np.sum(changed[side])), LEAST_SLOPE * float(power.max()))
     curve = dataclasses.replace(
         like, voltage_v=voltage_v, deadband_n=float(np.mean(edges)), **{name: frozen_array(c) for name, c in changed.items()}
     )

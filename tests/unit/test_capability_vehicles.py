@@ -2,23 +2,24 @@
 
 import csv
 import dataclasses
+import importlib
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from firmware_py.core.thruster import polynomial
 from firmware_py.description.schema import DescriptionError, frozen_array
 from firmware_py.description.vehicle import Payload, load_vehicle
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
-from firmware_py.prepare.capability.curves import fit_thruster, rising_polynomial
 from firmware_py.prepare.capability.layout import of_modules, of_vehicle
 from firmware_py.prepare.lattice import MATRICES
 from tests.unit.capability_layouts import DATA, FLU_TO_FRD, LINE, ROOT, SQUARE, published
 
+rising_polynomial = importlib.import_module("fit_thruster").rising_polynomial
 KILOGRAM_FORCE = 9.80665
 """N."""
+POWERS = np.arange(1, 6)
 
 
 def rows_in_frd(name: str) -> np.ndarray:
@@ -79,44 +80,45 @@ def t200() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (pulse - 1500.0) / 400.0, force * KILOGRAM_FORCE, power
 
 
+def t200_side(sign: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Size of the commands on that side, with force along it and power."""
+    command, force, power = t200()
+    side = sign * command >= 0.0
+    return sign * command[side], sign * force[side], power[side]
+
+
 @pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy"])
 def test_vehicle_file_carries_the_fit_of_the_measured_thruster(name: str) -> None:
-    curve, fit = load_vehicle(name).curve, fit_thruster(*t200())
-    for part in ("forward", "reverse", "power_forward", "power_reverse"):
-        assert getattr(curve, part) == pytest.approx(getattr(fit, part).coefficients, rel=1e-6)
-    assert curve.deadband_n == pytest.approx(fit.deadband_n, abs=1e-3)
+    curve = load_vehicle(name).curve
+    for side, sign in (("forward", 1.0), ("reverse", -1.0)):
+        command, force, power = t200_side(sign)
+        assert getattr(curve, side) == pytest.approx(rising_polynomial(command, force, 1.0, 0.5), rel=1e-6)
+        assert getattr(curve, f"power_{side}") == pytest.approx(rising_polynomial(force, power, force.max(), 0.0), rel=1e-6)
+    force = np.abs(t200()[1])
+    assert curve.deadband_n == pytest.approx(force[force > 0.0].min(), abs=1e-3)
 
 
-def test_measured_thruster_is_fitted_closely_and_rises_everywhere() -> None:
-    fit = fit_thruster(*t200())
-    assert (fit.forward.rms, fit.reverse.rms) == pytest.approx((0.236, 0.201), abs=1e-3)
-    assert max(fit.forward.largest, fit.reverse.largest) < 0.8
-    assert max(fit.power_forward.rms, fit.power_reverse.rms) < 1.6
-    u = np.linspace(0.0, 1.0, 2001)
-    for part in (fit.forward, fit.reverse):
-        force = [polynomial(part.coefficients, x) for x in u]
-        assert np.all(np.diff(force) > 0.0)
-    for part, full in ((fit.power_forward, 51.5), (fit.power_reverse, 40.2)):
-        assert np.all(np.diff([polynomial(part.coefficients, full * x) for x in u]) > 0.0)
+@pytest.mark.parametrize(("side", "sign", "rms_n"), [("forward", 1.0, 0.236), ("reverse", -1.0, 0.201)])
+def test_measured_thruster_is_fitted_closely_and_rises_everywhere(side: str, sign: float, rms_n: float) -> None:
+    command, force, power = t200_side(sign)
+    curve = load_vehicle("bluerov2").curve
+    of_command, of_force = getattr(curve, side), getattr(curve, f"power_{side}")
+    off_n, off_w = command[:, None] ** POWERS @ of_command - force, force[:, None] ** POWERS @ of_force - power
+    assert np.sqrt(np.mean(off_n**2)) == pytest.approx(rms_n, abs=1e-3)
+    assert np.abs(off_n).max() < 0.8
+    assert np.sqrt(np.mean(off_w**2)) < 1.6
+    for part, full in ((of_command, 1.0), (of_force, force.max())):
+        assert np.all(np.diff(np.linspace(0.0, full, 2001)[:, None] ** POWERS @ part) > 0.0)
 
 
 def test_plain_least_squares_would_not_rise_near_zero_command() -> None:
-    command, force, _ = t200()
-    ahead = command >= 0.0
-    powers = command[ahead][:, None] ** np.arange(1, 6)
-    plain = np.linalg.lstsq(powers, force[ahead], rcond=None)[0]
+    command, force, _ = t200_side(1.0)
+    powers = command[:, None] ** POWERS
+    plain = np.linalg.lstsq(powers, force, rcond=None)[0]
     assert plain[0] < 0.0
-    bounded = rising_polynomial(command[ahead], force[ahead], 0.5)
-    assert bounded.rms == pytest.approx(float(np.sqrt(np.mean((powers @ plain - force[ahead]) ** 2))), abs=0.07)
-
-
-def test_fit_returns_a_rising_polynomial_as_it_is() -> None:
-    x = np.linspace(0.0, 1.0, 50)
-    wanted = np.array([1.0, 2.0, 0.5, 0.1, 0.3])
-    fit = rising_polynomial(x, (x[:, None] ** np.arange(1, 6)) @ wanted)
-    assert fit.coefficients == pytest.approx(wanted, abs=1e-9)
-    with pytest.raises(ValueError, match="within 0 to 1"):
-        rising_polynomial(x + 0.5, x)
+    bounded = rising_polynomial(command, force, 1.0, 0.5)
+    plain_n, bounded_n = (float(np.sqrt(np.mean((powers @ c - force) ** 2))) for c in (plain, bounded))
+    assert bounded_n == pytest.approx(plain_n, abs=0.07)
 
 
 def test_layout_of_docked_modules_is_that_of_the_assembled_body() -> None:
