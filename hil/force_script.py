@@ -44,7 +44,7 @@ class ForceScript(Orders):
         manual = time_ns >= self._task.begin_ns - MANUAL_BEFORE_S * 1e9
         if manual and tick % max(1, round(STICKS_EVERY_S * rate)) == 0:
             moved = 0.0 if time_ns < self._task.begin_ns else stick_at(1e-9 * (time_ns - self._task.begin_ns), self._task.stick)
-            sticks = Sticks((moved, 0.0, 0.0), (0.0, 0.0, 0.0))
+            sticks = Sticks((moved, 0.0, 0.0))
             for body in self._leaders:
                 asked.append(Request(Action.STICKS, body, sticks))
                 if body not in self._manual:

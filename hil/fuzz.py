@@ -18,7 +18,6 @@ from hil.nodes import make_nodes
 from hil.plant.draw import stream
 from hil.scenario import MODES, load_scenario, make_world
 
-NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 STOPPING = 0.0002
 """Share of the frames with ids of ESTOP and SYNC: they stop the robot, so they are few."""
 LOWEST_OTHER_ID = 0x040
@@ -122,7 +121,7 @@ def _asked(tick: int) -> list[Request]:
     asked = [Request(Action.CLEAR_ESTOP)] if tick % CLEAR_EVERY == 0 else []
     if tick % ARM_EVERY == 0:
         mode = Mode[MODES[tick // ARM_EVERY % len(MODES)]]
-        asked += [Request(Action.STICKS, 0, NEUTRAL), Request(Action.SET_MODE, 0, mode), Request(Action.ARM, 0, True)]
+        asked += [Request(Action.STICKS, 0, Sticks()), Request(Action.SET_MODE, 0, mode), Request(Action.ARM, 0, True)]
     return asked
 
 

@@ -18,7 +18,6 @@ from hil.scenario import Scenario
 STREAM_EVERY_S = 0.1
 """Sticks and set-points."""
 PILOTED = (Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD)
-STICKS = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 RADIUS_M, TURN_S = 0.25, 15.0
 """Circle of AUTO and of GUIDED's set-points, and the time of one round."""
 
@@ -57,7 +56,7 @@ class ModeScript(Orders):
 
     def _stream(self, t_s: float) -> list[Request]:
         if self._mode in PILOTED:
-            return [Request(Action.STICKS, 0, STICKS)]
+            return [Request(Action.STICKS, 0, Sticks())]
         return [Request(Action.SET_POINT, 0, self._point(t_s))] if self._mode == Mode.GUIDED else []
 
     def _point(self, t_s: float) -> Setpoint:

@@ -163,9 +163,8 @@ class InputCollector:
         module.leak = bool(leak)
 
     def _take_status(self, index: int, module: ModuleInputs, row: Row) -> None:
-        tick, _, errors, state = row[VALUES : VALUES + 4]
+        tick, _, _, state = row[VALUES : VALUES + 4]
         self._status_ticks[index] = int(tick)
-        module.mcu_errors |= int(errors)
         if module.mcu_state != MCU_ESTOP:  # of two statuses in one tick the later does not hide that an e-stop held it
             module.mcu_state = int(state)
         self.unmet.discard(index)

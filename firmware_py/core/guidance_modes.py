@@ -20,7 +20,6 @@ from firmware_py.core.transitions import Effect
 from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 
-NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 ZERO, DOWN = np.zeros(3), np.array([0.0, 0.0, 1.0])
 STILL_S = 0.1
 """Between two ticks: after more, the microcontrollers have ended all thrust (DESIGN), and the set-point goes on from the body."""
@@ -74,7 +73,7 @@ class Guidance:
         self._upright = self._lost = self._led = False
         self._point: tuple[int, Setpoint] | None = None
         self._docking: Setpoint | Wish | None = None
-        self._sticks, self._sticks_ns = NEUTRAL, 0
+        self._sticks, self._sticks_ns = Sticks(), 0
         self._time_ns: int | None = None
         self._offset, self._offset_ns = np.zeros(6), 0
         self._wrench = np.zeros(6)
@@ -289,7 +288,7 @@ class Guidance:
     def _read_sticks(self, time_ns: int) -> Sticks:
         """The sticks, neutral when they are old or hardly moved."""
         if time_ns - self._sticks_ns > self._p.stick_timeout_s * 1e9:
-            return NEUTRAL
+            return Sticks()
         dead = self._p.stick_dead
         force, moment = ((0.0 if abs(v) <= dead else v for v in group) for group in self._sticks)
         return Sticks(tuple(force), tuple(moment))  # type: ignore[arg-type]

@@ -84,7 +84,6 @@ class ModuleInputs:
     cabin_pressure_pa: float | None = None
     leak: bool | None = None
     mcu_state: int | None = None
-    mcu_errors: int = 0
     answered: bool = False
     """Its MCU_STATUS of this tick is in."""
     heard: bool = False
@@ -148,8 +147,8 @@ class Action(IntEnum):
 class Sticks(NamedTuple):
     """Pilot input, each -1 to 1, body FRD: forward, right, down; roll, pitch, yaw."""
 
-    force: tuple[float, float, float]
-    moment: tuple[float, float, float]
+    force: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    moment: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class DockRequest(NamedTuple):

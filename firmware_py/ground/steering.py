@@ -101,7 +101,7 @@ class Steering:
         """`dock` is what the buttons `dock` and `undock` ask for; `may_steer`: whose sticks are taken, by system and component."""
         self._system, self._parameters, self._dock = system, parameters, dock
         self._pilots = Pilots(system, may_steer, lambda: parameters().steering.stick_timeout_s)
-        self._sticks = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self._sticks = Sticks()
         self._overrides: dict[Sender, list[_Override]] = {}
         self._turn = Turn(system, "set-points", lambda: parameters().ground.setpoint_fresh_s)
         self._setpoint_ns: int | None = None

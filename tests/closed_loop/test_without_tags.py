@@ -17,8 +17,6 @@ from hil.plant.fault_spec import Fault
 from hil.plant.world import BodyTruth
 from hil.scenario import load_scenario
 
-NEUTRAL = Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-
 
 class Pilot:
     """Takes a mode, arms in it as soon as that is granted, and may steer ahead for a while and then ask for another mode."""
@@ -29,7 +27,7 @@ class Pilot:
     ) -> None:  # fmt: skip
         self.ticks = round(100 * duration_s)
         self._modes = {50: mode} if then is None else {50: mode, round(100 * then[0]): then[1]}
-        self._ahead, self._stick, self._armed = ahead_s, NEUTRAL._replace(force=(stick, 0.0, 0.0)), False
+        self._ahead, self._stick, self._armed = ahead_s, Sticks((stick, 0.0, 0.0)), False
         self._until_s = until_s
 
     def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
@@ -37,7 +35,7 @@ class Pilot:
         self._armed = self._armed or (last is not None and last.records[0].state == State.ARMED)
         asked = [Request(Action.GROUND_ALIVE)]
         if t < self._until_s:
-            asked.append(Request(Action.STICKS, 0, self._stick if self._ahead[0] <= t < self._ahead[1] else NEUTRAL))
+            asked.append(Request(Action.STICKS, 0, self._stick if self._ahead[0] <= t < self._ahead[1] else Sticks()))
         if tick in self._modes:
             asked.append(Request(Action.SET_MODE, 0, self._modes[tick]))
         if tick % 50 == 10 and not self._armed:

@@ -23,7 +23,7 @@ def test_pilot_of_the_target_feels_no_blow_when_another_docks_to_it() -> None:
         state[:7] = [1.0, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
     tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
-    sticks = Request(Action.STICKS, 0, Sticks((0.2, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    sticks = Request(Action.STICKS, 0, Sticks((0.2, 0.0, 0.0)))
     tank.run(0.03, sticks, Request(Action.SET_MODE, 0, Mode.ALT_HOLD), Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     (dock,) = tank.pipeline.formation.docking._docks
     dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just come
@@ -94,7 +94,7 @@ def test_target_that_comes_goes_back_when_the_dock_is_called_off() -> None:
 
 
 ELSEWHERE = Request(Action.HOLD, 0, rest_at(np.array([1.0, -0.5, 0.8]), np.array([1.0, 0.0, 0.0, 0.0])))
-LEFTWARDS = Request(Action.STICKS, 0, Sticks((0.0, -1.0, 0.0), (0.0, 0.0, 0.0)))
+LEFTWARDS = Request(Action.STICKS, 0, Sticks((0.0, -1.0, 0.0)))
 
 
 @pytest.mark.slow

@@ -183,7 +183,7 @@ def test_robot_that_was_flown_away_from_a_dock_is_not_flung_back_when_it_is_told
     outputs = tank.run(0.05, Request(Action.SET_MODE, 1, Mode.POSHOLD))
     assert outputs.docks == [] and tank.when("dock of module 1 ended")
     for _ in range(18):
-        tank.run(0.1, Request(Action.STICKS, 1, Sticks((-1.0, 1.0, 0.0), (0.0, 0.0, 0.0))))
+        tank.run(0.1, Request(Action.STICKS, 1, Sticks((-1.0, 1.0, 0.0))))
     first = len(tank.outputs)
     outputs = tank.run(1.5, WANTED)
     places = np.array([outputs.records[1].setpoint.p_wb for outputs in tank.outputs[first - 1 :]])

@@ -58,7 +58,7 @@ def test_robot_that_is_pushed_off_its_place_comes_back_to_it() -> None:
 @pytest.mark.parametrize("mode", [Mode.POSHOLD, Mode.ALT_HOLD])
 @pytest.mark.parametrize(
     ("roll", "given", "tilt"),
-    [(2.6, None, 0.0), (0.62, None, 0.0), (0.58, None, 0.58), (2.6, Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)), 2.6)],
+    [(2.6, None, 0.0), (0.62, None, 0.0), (0.58, None, 0.58), (2.6, Sticks(moment=(0.0, 0.0, 0.1)), 2.6)],
     ids=["upside down", "steep", "tilted", "a pilot turns it"],
 )
 def test_steep_robot_that_a_failsafe_makes_hold_turns_upright_where_it_is(

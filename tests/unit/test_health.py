@@ -188,7 +188,7 @@ def test_wet_sensor_that_flickers_is_a_leak_all_the_time() -> None:
 def test_body_that_takes_over_knows_what_its_modules_said_and_when_people_were_heard() -> None:
     """The module that was number 3 of the fleet, alone; and the pair again."""
     whole = Ear()
-    sticks = Request(Action.STICKS, 0, Sticks((0.5, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    sticks = Request(Action.STICKS, 0, Sticks((0.5, 0.0, 0.0)))
     whole.dropped = 1000
     said = {"voltage_v": 11.4, "cabin_temperature_c": 44.0, "pressure_pa": 1.2e5, "esc": [EscFeedback(6, (0.0, 0.0), (0.0, 0.0), (0, 0))]}
     whole.hear(here(cabin_pressure_pa=90e3), here(cabin_pressure_pa=100e3), Request(Action.GROUND_ALIVE, 0), sticks)

@@ -38,7 +38,7 @@ def test_every_measurement_of_a_module_arrives_in_its_unit():
     assert module.docks == [(0, (70, -71, 0), (1, 2, 0)), (3, (0, 0, -8192), (0, 0, 3))]
     (esc,) = module.esc
     assert (esc.first, esc.rpm, esc.current_a, esc.status) == (2, (2000, -1500), (1.5, 0.5), (0, 3))
-    assert (module.mcu_state, module.mcu_errors) == (2, 4)
+    assert module.mcu_state == 2
 
 
 def test_inputs_start_empty_after_each_tick():
@@ -77,12 +77,11 @@ def test_failed_supply_measurement_says_nothing():
     assert robot.faults == {"sensor": 1}
 
 
-def test_errors_of_two_status_frames_add_up():
+def test_later_of_two_statuses_in_a_tick_counts():
     robot = Robot()
-    robot.say("MCU_STATUS", (0, 1, 0b01, 2))
-    robot.say("MCU_STATUS", (1, 1, 0b10, 3))
-    (module,) = robot.tick(1).modules
-    assert (module.mcu_errors, module.mcu_state) == (0b11, 3)
+    robot.say("MCU_STATUS", (0, 1, 0, 2))
+    robot.say("MCU_STATUS", (1, 1, 0, 3))
+    assert robot.tick(1).modules[0].mcu_state == 3
 
 
 def test_requests_and_time_enter_the_inputs_as_given():

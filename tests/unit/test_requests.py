@@ -55,8 +55,8 @@ UNSOUND: list[tuple[Action, Any]] = [
     (Action.TRACK, type("Endless", (), {"sample": lambda self, t: HERE})()),
     *[(Action.SET_MODE, x) for x in (3, None, "AUTO", Mode.DOCK)],
     *[(Action.STICKS, x) for x in (
-        None, (1, 2), (0.0,) * 6, Sticks((1.01, 0.0, 0.0), (0.0,) * 3), Sticks((0.0,) * 3, (0.0, -1.01, 0.0)),
-        Sticks((0.0,) * 3, (NAN, 0.0, 0.0)), Sticks((0.0, 0.0), (0.0,) * 3), Sticks(("a", "b", "c"), (0.0,) * 3), Sticks(None, None),
+        None, (1, 2), (0.0,) * 6, Sticks((1.01, 0.0, 0.0)), Sticks(moment=(0.0, -1.01, 0.0)),
+        Sticks(moment=(NAN, 0.0, 0.0)), Sticks((0.0, 0.0)), Sticks(("a", "b", "c")), Sticks(None, None),
     )],
     *[(Action.SET_PARAMETER, x) for x in (None, "control.lead_s", ("control.lead_s",), (1, 2), ("control.lead_s", None), (["a"], 1.0))],
     *[(action, x) for action in (Action.DOCK, Action.UNDOCK) for x in (
@@ -69,7 +69,7 @@ SOUND_ONES: list[tuple[Action, Any]] = [
     (Action.ARM, None), (Action.ARM, True), (Action.ARM, False), (Action.DISARM, object()), (Action.ESTOP, NAN), (Action.CLEAR_ESTOP, 1),
     (Action.GROUND_ALIVE, "?"), (Action.HOLD, None), (Action.HOLD, HERE), (Action.TRACK, Path()), (Action.TRACK, Hold(HERE, 3.0)),
     (Action.TRACK, Path(duration_s=0.0)),
-    (Action.STICKS, STICKS), (Action.STICKS, Sticks((1.0, -1.0, 0), (0.0,) * 3)), (Action.SET_MODE, Mode.AUTO),
+    (Action.STICKS, STICKS), (Action.STICKS, Sticks((1.0, -1.0, 0))), (Action.SET_MODE, Mode.AUTO),
     (Action.SET_POINT, HERE), (Action.SET_POINT, spoilt(p_wb=ZERO * NAN)),
     (Action.SET_POINT, spoilt(q_wb=LEVEL * NAN, v_w=np.array([NAN, 0.0, 0.1]))), (Action.SET_PARAMETER, ("control.lead_s", 0.1)),
     (Action.MOTOR_TEST, (7, -0.1, 2)), (Action.HOLD, spoilt(q_wb=LEVEL * 1.0009)), (Action.HOLD, spoilt(p_wb=np.full(3, 1e6))),
