@@ -138,8 +138,8 @@ def _make(
     return Harmonic(table, head, float(duration_s), float(end_phase), float(ramp_share))
 
 
-def _sine(axis: int, amplitude: float, frequency: float, angle: float) -> list[float]:
-    return [axis, amplitude, frequency, angle - 0.5 * math.pi]
+def _sine(axis: int, amplitude: float, frequency: float) -> list[float]:
+    return [axis, amplitude, frequency, -0.5 * math.pi]
 
 
 def spiral(
@@ -148,10 +148,9 @@ def spiral(
     climb_m: float,
     turns: float,
     duration_s: float,
-    start_angle_rad: float = 0.0,
     attitude: Vector = LEVEL,
 ) -> Harmonic:
-    """The paper's cylindrical spiral, clockwise seen from above, holding its attitude.
+    """The paper's cylindrical spiral, clockwise seen from above, starting in the north and holding its attitude.
 
     Args:
         centre: (3,) centre of the lowest turn, world NED, m.
@@ -159,34 +158,17 @@ def spiral(
         climb_m: rise from start to end (up, so z falls by it).
         turns: number of turns.
         duration_s: rest to rest.
-        start_angle_rad: where on the circle it starts, from north towards east.
         attitude: (4,) q_wb held all the way.
     """
     end = 2.0 * math.pi * turns
-    terms = [[0, radius_m, 1.0, start_angle_rad], _sine(1, radius_m, 1.0, start_angle_rad)]
+    terms = [[0, radius_m, 1.0, 0.0], _sine(1, radius_m, 1.0)]
     slope = [0.0, 0.0, -climb_m / end]
     return _make(terms, centre, duration_s, end, slope=slope, first=attitude)
 
 
-def circle(
-    centre: Vector,
-    radius_m: float,
-    turns: float,
-    duration_s: float,
-    start_angle_rad: float = 0.0,
-    attitude: Vector = LEVEL,
-    face_along: bool = False,
-) -> Harmonic:
-    """A level circle, clockwise seen from above; arguments as `spiral`.
-
-    `face_along` turns with the path: the attitude is then that in the frame whose x axis points along the path.
-    """
-    terms = [[0, radius_m, 1.0, start_angle_rad], _sine(1, radius_m, 1.0, start_angle_rad)]
-    end = 2.0 * math.pi * turns
-    if not face_along:
-        return _make(terms, centre, duration_s, end, first=attitude)
-    ahead = rotations.from_euler(0.0, 0.0, start_angle_rad + 0.5 * math.pi)
-    return _make(terms, centre, duration_s, end, first=ahead, turning=(1.0, 0.0), last=attitude)
+def circle(centre: Vector, radius_m: float, turns: float, duration_s: float) -> Harmonic:
+    """A level circle: a spiral that does not climb."""
+    return spiral(centre, radius_m, 0.0, turns, duration_s)
 
 
 def moebius(
@@ -195,13 +177,12 @@ def moebius(
     radius_m: float = 1.0,
     half_width_m: float = 0.3,
     laps: float = 2.0,
-    attitude: Vector = LEVEL,
     ramp_share: float = LONGEST_RAMP,
 ) -> Harmonic:
     """Along the rim of a Moebius strip; the body turns with the strip and rolls by 180 deg a lap.
 
-    Point at angle u: r = (R + h cos(u/2)) e_r + h sin(u/2) e_z; body axes (at attitude LEVEL) x = e_u along the centre
-    circle, y = -(cos(u/2) e_r + sin(u/2) e_z) across the strip towards the centre circle, z its normal, down at u = 0.
+    Point at angle u: r = (R + h cos(u/2)) e_r + h sin(u/2) e_z; body axes x = e_u along the centre circle,
+    y = -(cos(u/2) e_r + sin(u/2) e_z) across the strip towards it, z its normal, down at u = 0.
 
     Args:
         centre: (3,) world NED, m.
@@ -209,16 +190,15 @@ def moebius(
         radius_m: of the centre circle, R.
         half_width_m: of the strip, h; 0 follows the centre circle.
         laps: two close it.
-        attitude: (4,) body in the strip's frame.
         ramp_share: see `progress`.
     """
     h = half_width_m
-    terms = [[0, radius_m, 1.0, 0.0], _sine(1, radius_m, 1.0, 0.0)]
-    terms += [[0, 0.5 * h, 1.5, 0.0], [0, 0.5 * h, 0.5, 0.0], _sine(1, 0.5 * h, 1.5, 0.0), _sine(1, 0.5 * h, 0.5, 0.0)]
-    terms += [_sine(2, h, 0.5, 0.0)]
+    terms = [[0, radius_m, 1.0, 0.0], _sine(1, radius_m, 1.0)]
+    terms += [[0, 0.5 * h, 1.5, 0.0], [0, 0.5 * h, 0.5, 0.0], _sine(1, 0.5 * h, 1.5), _sine(1, 0.5 * h, 0.5)]
+    terms += [_sine(2, h, 0.5)]
     first = rotations.from_euler(0.0, 0.0, 0.5 * math.pi)
     end = 2.0 * math.pi * laps
-    return _make(terms, centre, duration_s, end, ramp_share, first=first, turning=(1.0, -0.5), last=attitude)
+    return _make(terms, centre, duration_s, end, ramp_share, first=first, turning=(1.0, -0.5))
 
 
 def lissajous(
@@ -226,21 +206,20 @@ def lissajous(
     amplitude_m: Vector,
     frequency: Vector,
     duration_s: float,
-    angle_rad: Vector = (0.0, 0.0, 0.0),
     turns: float = 1.0,
     attitude: Vector = LEVEL,
     turning: tuple[float, float] = (0.0, 0.0),
 ) -> Harmonic:
-    """p_k = centre_k + amplitude_k sin(frequency_k u + angle_k), u from 0 to 2 pi turns: closed where they are whole.
+    """p_k = centre_k + amplitude_k sin(frequency_k u), u from 0 to 2 pi turns: closed where they are whole.
 
     Args:
-        centre, amplitude_m, frequency, angle_rad: (3,) per world axis.
+        centre, amplitude_m, frequency: (3,) per world axis.
         duration_s: rest to rest.
         turns: of the phase u.
         attitude: (4,) q_wb at the start.
         turning: yaw and then roll, rad per rad of u, about world-down and the body's x axis.
     """
-    terms = [_sine(k, float(amplitude_m[k]), float(frequency[k]), float(angle_rad[k])) for k in range(3)]
+    terms = [_sine(k, float(amplitude_m[k]), float(frequency[k])) for k in range(3)]
     end = 2.0 * math.pi * turns
     return _make(terms, centre, duration_s, end, turning=turning, last=attitude)
 
