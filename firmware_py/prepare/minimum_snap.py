@@ -13,7 +13,7 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
-from firmware_py.prepare.piecewise import CHANNELS, Piecewise
+from firmware_py.prepare.piecewise import Piecewise
 from firmware_py.prepare.snap_limits import InfeasibleError, Limits, crests, planes, solve_limited, worst
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
 from firmware_py.prepare.snap_thrust import divide, sag, usage
@@ -223,7 +223,7 @@ class _Request:
         knots = Knots.at_rest(value)
         knots.fixed[:] |= self.position.fixed
         knots.derivative[:, :, :3] = self.position.derivative
-        return divide_time(knots, total, np.ones(CHANNELS))
+        return divide_time(knots, total)
 
     def try_stretch(self, base: np.ndarray, factor: float) -> Piecewise | None:
         """The trajectory at `factor` times the durations, or None where it breaks something that longer ones may mend."""

@@ -15,9 +15,6 @@ from numba import njit
 from firmware_py.core.setpoint import as_setpoint
 from firmware_py.core.types import Setpoint
 
-CHANNELS = 7
-"""x, y, z, then the four of the quaternion before it is normalised."""
-
 _DEGREE = 9
 _CLOSE = 0.1
 """Share of its length by which the quaternion changes from point to point at most, where points are close enough to tell how fast it
@@ -110,7 +107,8 @@ class Piecewise:
     """Polynomial pieces in time; a `Trajectory`.
 
     Attributes:
-        coefficients: (k, 10, 7) of 1, u, ..., u^9 in the share u of each piece's duration.
+        coefficients: (k, 10, 7) of 1, u, ..., u^9 in the share u of each piece's duration; for x, y, z, then the four of the quaternion
+            before it is normalised.
         breaks: (k + 1,) s, rising from 0.
         method: how it was found: "closed form" or "osqp".
         stretch: factor by which the asked durations were lengthened.

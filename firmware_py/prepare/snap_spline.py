@@ -187,16 +187,14 @@ def solve(system: System, knots: Knots) -> np.ndarray:
     return np.asarray(given + step.reshape(n, _UNKNOWN, channels))
 
 
-def divide_time(knots: Knots, total_s: float, weights: np.ndarray) -> np.ndarray:
+def divide_time(knots: Knots, total_s: float) -> np.ndarray:
     """(n - 1,) durations of sum `total_s` with the least snap.
 
     Args:
         knots: waypoints and what is given there.
         total_s: s.
-        weights: (c,) factor of each channel's cost.
     """
-    scaled = Knots(knots.value * np.sqrt(weights), knots.fixed, knots.derivative * np.sqrt(weights))
-    distance = np.linalg.norm(np.diff(scaled.value, axis=0), axis=1)
+    distance = np.linalg.norm(np.diff(knots.value, axis=0), axis=1)
     if distance.max() == 0.0:
         return np.full(len(distance), total_s / len(distance))
     start = np.log(np.maximum(distance, distance.max() / _SHORTER))
@@ -205,11 +203,11 @@ def divide_time(knots: Knots, total_s: float, weights: np.ndarray) -> np.ndarray
         share = np.exp(z - z.max())
         share /= share.sum()
         system = System.of(total_s * share)
-        unknown = solve(system, scaled)
-        cost = system.cost(scaled.value, unknown)
+        unknown = solve(system, knots)
+        cost = system.cost(knots.value, unknown)
         if not cost > 0.0:
             return _TOO_STIFF, np.zeros_like(z)
-        by_share = total_s * system.cost_by_duration(scaled.value, unknown) / cost
+        by_share = total_s * system.cost_by_duration(knots.value, unknown) / cost
         return float(np.log(cost)), share * (by_share - share @ by_share)
 
     bounds = [(start.max() - np.log(_SHORTER), start.max() + np.log(_LONGER))] * len(start)
