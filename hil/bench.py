@@ -40,18 +40,14 @@ SCRIPTS: dict[str, Callable[[Scenario, Fleet], Orders]] = {"dock": DockScript, "
 
 @dataclass(slots=True)
 class Bench:
-    """One scenario on one bus, ready to fly."""
+    """Firmware and plant on one bus, ready to fly."""
 
-    scenario: Scenario
-    seed: int
-    fleet: Fleet
     firmware: Firmware
     nodes: Nodes
     script: Orders
     firmware_port: Port
     plant_port: Port
     faults: Faults
-    parameters: Parameters
     patience_looks: int = PATIENCE_LOOKS
     """Looks at a socket before a frame counts as lost by the bus."""
     is_dead: bool = False
@@ -65,12 +61,12 @@ class Bench:
 
         Raises DescriptionError where somebody else answers as one of the simulated modules.
         """
-        lockstep = Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks)
+        lockstep, fleet = Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks), self.firmware.fleet
         sent: list[BusFrame] = []
         outputs: Outputs | None = None
         began = time.perf_counter()
         for tick in range(1, self.script.ticks + 1):
-            time_ns = tick * self.fleet.period_ns
+            time_ns = tick * fleet.period_ns
             if self.faults.process_killed(time_ns):
                 self._step_plant(tick, sent, truth)
                 lockstep, outputs, sent = self._without_firmware(observers), None, []
@@ -81,7 +77,7 @@ class Bench:
             outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), answers)
             if self.script.is_over(time_ns):
                 break
-            if progress is not None and tick % self.fleet.rate_hz == 0:
+            if progress is not None and tick % fleet.rate_hz == 0:
                 progress(time_ns * 1e-9)
         return time.perf_counter() - began
 
@@ -102,7 +98,7 @@ class Bench:
     def _step_plant(self, tick: int, sent: Sequence[BusFrame], truth: TruthRecorder | None) -> list[BusFrame]:
         """The plant's half of a tick: it hears what was sent, moves on by a period and answers; returns the answers."""
         heard = [frame for _, frame in drain([self.plant_port], sent, self.patience_looks)]
-        if tick <= self.fleet.rate_hz:  # later this one was the first
+        if tick <= self.firmware.fleet.rate_hz:  # later this one was the first
             self.nodes.refuse_others(heard, self.plant_port.address)
         answers = send([self.plant_port], [(0, frame) for frame in self.nodes.step(heard)])
         if truth is not None:
@@ -113,7 +109,7 @@ class Bench:
         """After a tick in which the firmware's process is dead; returns the one that will be started in its place."""
         self.firmware_port.receive()
         if not self.is_dead:
-            self.is_dead, self.firmware = True, compose(self.fleet, self.parameters)
+            self.is_dead, self.firmware = True, compose(self.firmware.fleet, self.firmware.parameters)
         return Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks)
 
 
@@ -140,7 +136,7 @@ def open_bench(
     nodes = make_nodes(world, firmware.codec, scenario)
     faults = nodes.faults = Faults(nodes, scenario.fault)
     ports = [stack.enter_context(open_port(bus)) for _ in range(2)]
-    return Bench(scenario, seed, fleet, firmware, nodes, script_of(scenario, fleet), ports[0], ports[1], faults, parameters)
+    return Bench(firmware, nodes, script_of(scenario, fleet), ports[0], ports[1], faults)
 
 
 def fly_scenario(

@@ -40,7 +40,7 @@ def fly(scenario: Scenario, bus: str, folder: Path, stranger: Port | None = None
         bench = open_bench(stack, scenario, 0, Parameters(), bus)
         recorder = Recorder(folder)
         stack.callback(recorder.close)
-        bench.fly([recording(recorder, bench.fleet.rate_hz), disturb])
+        bench.fly([recording(recorder, bench.firmware.fleet.rate_hz), disturb])
     return {name: (folder / name).read_bytes() for name in (CAN_LOG, SIGNAL_LOG)}
 
 

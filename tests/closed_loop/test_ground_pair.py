@@ -59,7 +59,7 @@ def flight() -> tuple[Pilot, np.ndarray, np.ndarray]:
     places, attitudes = [], []
     with ExitStack() as stack:
         bench = open_bench(stack, load_scenario("mobius-2"), 0, Parameters())
-        station = GroundStation(GroundConfig(), bench.fleet, Parameters())
+        station = GroundStation(GroundConfig(), bench.firmware.fleet, Parameters())
         pilot = Pilot(station)
         bench.script = pilot
 

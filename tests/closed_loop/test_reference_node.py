@@ -54,12 +54,12 @@ def fly(bench: Bench) -> tuple[list[Any], float]:
 
 @pytest.mark.slow
 def test_hover_with_the_c_node_is_the_hover_with_the_plants_own_frame_for_frame(library: CDLL) -> None:
-    flights = []
+    flights, scenario = [], shortened("hover", 6.0)
     for is_c in (False, True):
         with ExitStack() as stack:
-            bench = open_bench(stack, shortened("hover", 6.0), 0, Parameters())
+            bench = open_bench(stack, scenario, 0, Parameters())
             if is_c:
-                bench.nodes = CNodes(bench.nodes, bench.scenario, library, RATE_HZ)  # type: ignore[assignment]
+                bench.nodes = CNodes(bench.nodes, scenario, library, RATE_HZ)  # type: ignore[assignment]
             flights.append(fly(bench))
     (python, _), (c, speed) = flights
     assert c == python

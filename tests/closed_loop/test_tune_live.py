@@ -114,7 +114,7 @@ class Robot:
 
     def _fly(self) -> None:
         self.tick += 1
-        bench, time_ns, asked = self._bench, self.tick * self._bench.fleet.period_ns, self._side.requests()
+        bench, time_ns, asked = self._bench, self.tick * self._bench.firmware.fleet.period_ns, self._side.requests()
         self._sent += self._lockstep.start_tick(self.tick, time_ns)
         heard = drain([bench.plant_port], self._sent)
         answers = send([bench.plant_port], [(0, frame) for frame in bench.nodes.step([frame for _, frame in heard])])

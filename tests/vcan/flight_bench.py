@@ -45,7 +45,7 @@ def record(bench: Bench, folder: Path, observers: Sequence[Observer] = ()) -> li
     folder.mkdir(parents=True, exist_ok=True)
     recorder = Recorder(folder)
     try:
-        bench.fly([recording(recorder, bench.fleet.rate_hz), *observers])
+        bench.fly([recording(recorder, bench.firmware.fleet.rate_hz), *observers])
     finally:
         recorder.close()
     return (folder / "can.log").read_text().splitlines()
