@@ -10,20 +10,19 @@ from rich.table import Table
 from rich.text import Text
 
 from hil.fault_campaign import Cell
-from hil.fault_table import ROWS
 
 
-def print_faults(cells: Sequence[Cell], console: Console | None = None) -> None:
+def print_faults(cells: Sequence[Cell]) -> None:
     """The matrix of faults and modes: what happened, and what was promised; then every promise that was broken."""
-    console = console or Console()
+    console = Console()
     modes = list(dict.fromkeys(cell.mode for cell in cells))
-    promises = {row.name: row.promise for row in ROWS}
+    promises = {cell.fault: cell.promise for cell in cells}
     table = Table(title="faults: what happened in each mode", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in ("fault", "promised", *modes):
         table.add_column(column)
-    for name in dict.fromkeys(cell.fault for cell in cells):
+    for name, promise in promises.items():
         row = [Text(cell.happened, style="bold red" if cell.broken else "green") for cell in cells if cell.fault == name]
-        table.add_row(name, promises[name], *row)
+        table.add_row(name, promise, *row)
     console.print(table)
     broken = [cell for cell in cells if cell.broken]
     for cell in broken:

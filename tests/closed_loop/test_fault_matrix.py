@@ -66,7 +66,7 @@ def test_promise_of_less_error_than_there_is_is_broken() -> None:
 
 
 def test_campaign_writes_every_cell_with_its_promise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hil.fault_campaign, "fly_cell", lambda row, mode, seed: Cell(row.name, mode, "as before", ()))
+    monkeypatch.setattr(hil.fault_campaign, "fly_cell", lambda row, mode, seed: Cell(row.name, mode, "as before", (), row.promise))
     cells = run_fault_campaign(partial(ThreadPoolExecutor, 1), tmp_path)
     entries = json.loads((tmp_path / "faults.json").read_text())
     assert len(cells) == len(entries) == len(ROWS) * len(MODES)
@@ -77,7 +77,8 @@ def test_campaign_writes_every_cell_with_its_promise(tmp_path: Path, monkeypatch
 
 
 def test_matrix_names_what_was_broken(capsys: pytest.CaptureFixture[str]) -> None:
-    print_faults([Cell("leak", "AUTO", "as before", ()), Cell("leak", "POSHOLD", "AUTO 1.00 s", ("ended in AUTO, not SURFACE",))])
+    kept, broken = ("as before", ()), ("AUTO 1.00 s", ("ended in AUTO, not SURFACE",))
+    print_faults([Cell("leak", mode, *what, "surfaces") for mode, what in (("AUTO", kept), ("POSHOLD", broken))])
     said = capsys.readouterr().out
     assert "FAILED: leak, POSHOLD: ended in AUTO, not SURFACE" in said
     assert "1 of 2 cells kept their promise" in said
