@@ -33,11 +33,11 @@ PUSH_LEVER_M = 0.03
 
 
 class Wire:
-    """What happens to the frames of one direction of one link."""
+    """What happens to the frames of one direction."""
 
-    def __init__(self, seed: int, direction: str, link: int = 0) -> None:
+    def __init__(self, seed: int, direction: str) -> None:
         self._direction = direction
-        self._rng = stream(seed, "faults", 2 * link + DIRECTIONS.index(direction))
+        self._rng = stream(seed, "faults", DIRECTIONS.index(direction))
         self._late: deque[tuple[int, Frame]] = deque()
         self._changes: dict[str, Callable[[list[Frame]], list[Frame]]] = {
             "frame_loss": lambda copies: [],
@@ -89,16 +89,16 @@ class Wire:
 class Faults:
     """All faults of one run, on one bus."""
 
-    def __init__(self, nodes: Nodes, faults: Sequence[Fault] = (), link: int = 0) -> None:
+    def __init__(self, nodes: Nodes, faults: Sequence[Fault] = ()) -> None:
         self._nodes, self._world = nodes, nodes.world
         self._faults = list(faults)
         self._on: list[Fault] = []
         seed = self._world.seed
-        self._to_plant, self._from_plant = Wire(seed, "to_plant", link), Wire(seed, "from_plant", link)
-        self._tags = stream(seed, "faults", 1024 + link)
+        self._to_plant, self._from_plant = Wire(seed, "to_plant"), Wire(seed, "from_plant")
+        self._tags = stream(seed, "faults", 1024)
         axis = self._tags.standard_normal(3)
         self._bias_axis = axis / np.linalg.norm(axis)
-        hand = stream(seed, "push", link).standard_normal((2, 3))
+        hand = stream(seed, "push").standard_normal((2, 3))
         self._hand, self._grip = hand / np.linalg.norm(hand, axis=1, keepdims=True)
         self._breaks: dict[str, Callable[[Fault, Mcu], None]] = {
             **dict.fromkeys(THRUSTER_KINDS, self._break_thrusters),

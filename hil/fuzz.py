@@ -21,6 +21,7 @@ from hil.scenario import MODES, load_scenario, make_world
 STOPPING = 0.0002
 """Share of the frames with ids of ESTOP and SYNC: they stop the robot, so they are few."""
 LOWEST_OTHER_ID = 0x040
+A_TICK = 100
 ARM_EVERY, CLEAR_EVERY = 20, 30
 """Ticks: a pilot is there, who takes another mode, arms it by force and clears the e-stop again and again."""
 
@@ -90,8 +91,8 @@ class Fuzzed:
     ticks: int = 0
 
 
-def fuzz_flight(frames: int, seed: int = 0, a_tick: int = 100) -> Fuzzed:
-    """Flies a hover into which so many fuzzed frames come, `a_tick` in every tick. What the firmware raises comes through."""
+def fuzz_flight(frames: int, seed: int = 0) -> Fuzzed:
+    """Flies a hover into which so many fuzzed frames come, A_TICK in every tick. What the firmware raises comes through."""
     scenario = load_scenario("hover")
     fleet = fleet_of(scenario, "virtual:fuzz", 100)
     codec = Codec.load()
@@ -106,7 +107,7 @@ def fuzz_flight(frames: int, seed: int = 0, a_tick: int = 100) -> Fuzzed:
         tick, time_ns = result.ticks, result.ticks * fleet.period_ns
         sync = [frame for _, frame in firmware.sync(tick, time_ns)]
         real = nodes.step([*sent, *sync])
-        taken = [*real, *fuzzer.frames(a_tick, real)]
+        taken = [*real, *fuzzer.frames(A_TICK, real)]
         _, outputs, out = firmware.step(tick, time_ns, [(0, frame) for frame in taken], _asked(tick))
         sent = [frame for _, frame in out]
         result.frames += len(taken)

@@ -77,11 +77,11 @@ class ThrusterFlight(NamedTuple):
     ends_in: str
 
 
-def spiral_with(broken: Sequence[int], kind: str = "thruster_dead", value: float = 0.0, seed: int = 0) -> ThrusterFlight:
+def spiral_with(broken: Sequence[int], kind: str = "thruster_dead", seed: int = 0) -> ThrusterFlight:
     """Flies the spiral; `broken` thrusters break at once in the middle of it."""
     base = load_scenario("spiral")
     at_s = base.task.settle_s + BREAKS_AFTER_S
-    faults = tuple(Fault(kind=kind, at_s=at_s, index=index, value=value) for index in broken)
+    faults = tuple(Fault(kind=kind, at_s=at_s, index=index) for index in broken)
     whole = flown(dataclasses.replace(base, fault=faults), seed)
     flight, wanted = in_task(base, whole)
     off, turn = errors(flight, wanted)
@@ -156,12 +156,12 @@ def spiral_through_loss(seed: int, share: float = 0.3) -> float:
     return float(flight_metrics(flight, wanted=wanted)["position_rmse_m"])
 
 
-def command_outlives_frames_ms(seed: int = 0) -> float:
+def command_outlives_frames_ms() -> float:
     """How long an MCU's command outlives the last frame that it accepted, when all frames are lost in flight, ms."""
     scenario = timed("hover", 4.0, 2.0, Fault(kind="frame_loss", at_s=5.0, value=1.0))
     longest = 0.0
     with ExitStack() as stack:
-        bench = open_bench(stack, scenario, seed, Parameters(), "virtual:lost")
+        bench = open_bench(stack, scenario, 0, Parameters(), "virtual:lost")
         mcu = next(iter(bench.nodes.mcus.values()))
 
         class Watch:
