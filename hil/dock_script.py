@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,8 +20,6 @@ from hil.script import refuse_outside
 
 NOBODY = -1
 """Index of a module that a step is not about."""
-SPEED_M_S = 0.05
-"""Mean speed at which a body goes to the start of a path."""
 AFTERWARDS_NS = 3_000_000_000
 """The run goes on so long after the last step: what was joined or parted must stay so."""
 
@@ -125,13 +124,16 @@ def _bodies_of(last: Outputs, modules: int) -> dict[int, set[int]]:
     return {record.body: {m for m in range(modules) if body_of[m] == body_of[record.body]} for record in last.records}
 
 
+@dataclass(slots=True)
 class _Running:
     """A step under way."""
 
-    def __init__(self, step: Step, end_ns: int, module: int, target: int) -> None:
-        self.step, self.end_ns, self.module, self.target = step, end_ns, module, target
-        self.docking = False
-        """In the tick before."""
+    step: Step
+    end_ns: int
+    module: int
+    target: int
+    docking: bool = False
+    """In the tick before."""
 
 
 def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> Trajectory:

@@ -124,7 +124,7 @@ def judge_logs(
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
     always = [Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"])), *_armed_at_all(scenario, whole, folder)]
-    result = judge(scenario.name, seed, metrics, [*scenario.checks, *always], told(whole.events, start_of(whole)))
+    result = judge(scenario.name, seed, metrics, [*scenario.check, *always], told(whole.events, start_of(whole)))
     return result if result.passed else result._replace(unseen=unseen(scenario, whole))
 
 
@@ -145,7 +145,7 @@ def unseen(scenario: Scenario, whole: Flight) -> str:
 
 def _armed_at_all(scenario: Scenario, whole: Flight, folder: Path) -> list[Limit]:
     """That the robot was armed at all, where the scenario says nothing of it; of a dock one of its bodies, in the `whole` flight."""
-    if any(check.metric == "armed_share" for check in scenario.checks):
+    if any(check.metric == "armed_share" for check in scenario.check):
         return []
     if scenario.task.kind == "dock":
         if np.isin(whole.firmware["state"], list(ARMED)).any():

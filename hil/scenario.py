@@ -14,6 +14,7 @@ from firmware_py.core import rotations
 from firmware_py.description.fleet import check_cell, overlaps
 from firmware_py.description.schema import DescriptionError, Source, build, frozen_array, meant, quantity, read_text, read_toml
 from firmware_py.description.vehicle import FACE_NAMES, find_vehicles, load_vehicle
+from hil.checks import UNBOUNDED
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
@@ -167,8 +168,8 @@ class Check:
     """A metric that a run must keep within bounds."""
 
     metric: str = quantity(help="name of the metric in result.json")
-    low: float = quantity(-1e9, help="smallest value that passes")
-    high: float = quantity(1e9, help="largest value that passes")
+    low: float = quantity(-UNBOUNDED, help="smallest value that passes")
+    high: float = quantity(UNBOUNDED, help="largest value that passes")
     ideal: bool = quantity(True, help="checked with ideal sensors too, which are better than the estimator believes")
 
 
@@ -225,11 +226,6 @@ class Scenario:
     def duration_s(self) -> float:
         """Length of the run."""
         return self.task.settle_s + self.task.duration_s
-
-    @property
-    def checks(self) -> tuple[Check, ...]:
-        """What the run must keep."""
-        return self.check
 
     def for_seed(self, seed: int) -> Scenario:
         """The same with what each seed has of its own written out: the modules of a polycube."""

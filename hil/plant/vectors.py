@@ -12,8 +12,6 @@ F1, F2, F3 = F8[::1], F8[:, ::1], F8[:, :, ::1]
 I1 = I8[::1]
 V3 = types.UniTuple(F8, 3)
 M3 = types.UniTuple(V3, 3)
-MASS = types.UniTuple(M3, 4)
-"""A (6, 6) matrix of masses by its blocks: force by linear, force by angular, moment by linear, moment by angular acceleration."""
 
 
 def compiled(signature: Any, makes_arrays: bool = False, **options: bool) -> Callable[[Callable[..., Any]], Any]:
@@ -121,7 +119,7 @@ def block(array, b, i, j):
 
 @callee
 def mass_of(array, b):
-    """Matrix number b of masses by its blocks."""
+    """Matrix number b of masses by its blocks: force by linear, force by angular, moment by linear, moment by angular acceleration."""
     return (block(array, b, 0, 0), block(array, b, 0, 3), block(array, b, 3, 0), block(array, b, 3, 3))
 
 

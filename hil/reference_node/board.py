@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 
-from firmware_py.bus.codec import Codec
 from hil.nodes import SLOW, Mcu, Nodes
 from hil.scenario import Scenario
 
@@ -79,9 +78,9 @@ def place(readings: Readings, name: str, values: Sequence[float]) -> None:
 
 def take_boards(nodes: Nodes, scenario: Scenario, rate_hz: int) -> dict[int, Board]:
     """The boards of the modules of `nodes`, by number; the plant's own MCUs go."""
-    codec, tick_ns = Codec.load(), NS_PER_S // rate_hz
+    tick_ns = NS_PER_S // rate_hz
     boards = {
-        number: Board(codec, number, mcu.module, nodes.world, scenario.sensors, tick_ns)
+        number: Board(nodes.codec, number, mcu.module, nodes.world, scenario.sensors, tick_ns)
         for number, mcu in nodes.mcus.items()
     }
     nodes.mcus = {}
