@@ -25,7 +25,6 @@ ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ("firmware_py", "hil", "can_dbc", "pyproject.toml", "LICENSE")
 GLIBC_VERSIONS = (28, 27, 26, 24, 17)
 """manylinux_2_N tags to accept, newest first; Ubuntu 22.04 of JetPack 6 has glibc 2.35, Debian 12 2.36."""
-ALIASES = {17: "manylinux2014"}
 
 
 class PayloadError(Exception):
@@ -132,7 +131,7 @@ def requirements_of(name: str) -> Iterator[str]:
 def platforms(machine: str) -> list[str]:
     """Platform tags that a wheel may have."""
     tags = [f"manylinux_2_{n}_{machine}" for n in GLIBC_VERSIONS]
-    return tags + [f"{alias}_{machine}" for alias in ALIASES.values()] + [f"linux_{machine}"]
+    return [*tags, f"manylinux2014_{machine}", f"linux_{machine}"]  # 2014: another name of 2_17
 
 
 def fetch(lock: str, house: Path, machine: str, python: str, offline: bool) -> None:
