@@ -39,6 +39,14 @@ def positive(text: str) -> float:
     return value
 
 
+def cells_in(text: str) -> list[tuple[int, int, int]]:
+    """Reads lattice cells such as "0,0,0 1,0,0", at least one. Raises ValueError."""
+    cells = [(int(x), int(y), int(z)) for x, y, z in (word.split(",") for word in text.replace(";", " ").split())]
+    if not cells:
+        raise ValueError
+    return cells
+
+
 def run_command(app: typer.Typer, name: str) -> int:
     """Runs the tool called `name`; its exit status. Wrong arguments, and a DescriptionError, give one line on stderr and status 2."""
     try:

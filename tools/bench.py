@@ -6,7 +6,6 @@ how many times better than the peer; what has no peer has none.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import struct
@@ -198,7 +197,7 @@ def print_entries(entries: Sequence[Entry]) -> None:
 
 def main() -> None:
     """Measures everything; takes no arguments."""
-    Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    Parser(description=__doc__).parse_args()
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":  # read when numpy is imported: start again with it
         os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     print(f"bench: {(batch_entries.__doc__ or '').splitlines()[0]}", file=sys.stderr, flush=True)

@@ -12,7 +12,6 @@ it feels, and the accelerometer feels the same.
 
 from __future__ import annotations
 
-import argparse
 import math
 from typing import NamedTuple
 
@@ -127,15 +126,15 @@ def without_tags(axis: Model, covariance: np.ndarray, seconds: float) -> tuple[l
     return gains, covariance
 
 
-def largest_errors(axis: Model, covariance: np.ndarray, seconds: float, hovers: int = HOVERS, seed: int = 0) -> np.ndarray:
-    """(hovers,) the largest horizontal error of each in so long without tags, m: what the filter errs, drawn by its own statistics.
+def largest_errors(axis: Model, covariance: np.ndarray, seconds: float) -> np.ndarray:
+    """(HOVERS,) the largest horizontal error of each in so long without tags, m: what the filter errs, drawn by its own statistics.
 
     Args:
         covariance: (11, 11) when the last tag came, of each of both axes.
     """
-    rng = np.random.default_rng(seed)
-    errors = rng.multivariate_normal(np.zeros(STATES), covariance, (2, hovers), method="eigh")
-    spread, largest = np.sqrt(axis.noise), np.zeros(hovers)
+    rng = np.random.default_rng(0)
+    errors = rng.multivariate_normal(np.zeros(STATES), covariance, (2, HOVERS), method="eigh")
+    spread, largest = np.sqrt(axis.noise), np.zeros(HOVERS)
     for gains in without_tags(axis, covariance, seconds)[0]:
         errors = errors @ axis.step.T + spread * rng.standard_normal(errors.shape)
         for k, (row, variance) in zip(gains, axis.inertial, strict=True):
@@ -156,7 +155,7 @@ def floor(imu: Imu | None = None, unforeseen_n_m: float = UNFORESEEN_N_M) -> tup
 
 def main() -> None:
     """Prints the floors; takes no arguments."""
-    Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    Parser(description=__doc__).parse_args()
     for name, imu in (("the simulated IMU", None), ("an ICM-20602", ICM_20602)):
         for unforeseen_n_m in (UNFORESEEN_N_M, 1e-4, EXACT_N_M):
             median, most = floor(imu, unforeseen_n_m)

@@ -18,7 +18,7 @@ from command_line import run_tool
 
 import numpy as np
 import typer
-from argument_types import make_room, run_command
+from argument_types import cells_in, make_room, run_command
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -66,12 +66,10 @@ app = typer.Typer(add_completion=False)
 def parse_cells(text: str) -> list[Cell]:
     """Cells out of "0,0,0 1,0,0". Raises DescriptionError."""
     try:
-        cells = [tuple(int(c) for c in word.split(",")) for word in text.replace(";", " ").split()]
+        return cells_in(text)
     except ValueError:
-        cells = []
-    if not cells or any(len(c) != 3 for c in cells):
-        raise DescriptionError(f"cells {text!r}: write whole numbers x,y,z with spaces between modules, as 0,0,0 1,0,0")
-    return [(c[0], c[1], c[2]) for c in cells]
+        what = "write whole numbers x,y,z with spaces between modules, as 0,0,0 1,0,0"
+        raise DescriptionError(f"cells {text!r}: {what}") from None
 
 
 def shapes_of(text: str) -> dict[str, list[Cell]]:

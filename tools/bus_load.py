@@ -9,14 +9,13 @@ Exit status: 0 within the limits, 1 beyond one, 2 cannot run.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from copy import deepcopy
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from command_line import Parser, in_words, run_tool
+from command_line import Parser, refuse, run_tool
 
 import cantools.database
 
@@ -96,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given.dbc is not None:
             write_dbcs(given.dbc, looked_at)
     except (DescriptionError, ValueError, OSError) as error:
-        return refuse(in_words(error))
+        return refuse("bus_load", error)
     codec, allowed = Codec.load(), True
     print(f"{'bus':28s} modules    Hz  mean %  fullest tick %")
     for name, numbers, rate in looked_at:
@@ -116,12 +115,6 @@ def write_dbcs(folder: Path, looked_at: Sequence[tuple[str, list[int], int]]) ->
         path = folder / f"modcube_bus{index}.dbc"
         path.write_text(expanded_dbc(numbers), encoding="utf-8")
         print(f"wrote {path}")
-
-
-def refuse(text: str) -> int:
-    """One line on stderr."""
-    print(f"bus_load: {text}", file=sys.stderr)
-    return 2
 
 
 if __name__ == "__main__":

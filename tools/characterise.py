@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
@@ -18,12 +17,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from command_line import Parser, run_tool, worker_pool
+from command_line import Parser, refuse, run_tool, worker_pool
 
 import characterise_blas  # noqa: F401
 import characterise_table as table
 import numpy as np
-from argument_types import check_results, folder_for_results, positive, whole
+from argument_types import cells_in, check_results, folder_for_results, positive, whole
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -31,6 +30,7 @@ from rich.table import Table
 from firmware_py.description.fleet import load_fleet
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.prepare.assembly import described, groups_of
 from firmware_py.prepare.capability.layout import AXES, UNITS, Layout, of_modules, of_rows, of_vehicle
 from firmware_py.prepare.capability.summary import DIRECTIONS, Capability, characterise
 
@@ -50,19 +50,21 @@ LEAST_DIRECTIONS, MOST_DIRECTIONS = 121, 100_000
 """Harmonics of degree ten have 121 coefficients."""
 
 
-def main() -> None:
-    """Command line; bad input is one line and exit status 2."""
+def main() -> int:
+    """The command line."""
+    given = arguments()
     try:
-        run(arguments())
+        with folder_for_results(given.out):
+            run(given)
     except DescriptionError as error:
-        print(f"characterise: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+        return refuse("characterise", error)
+    return 0
 
 
 def arguments() -> argparse.Namespace:
     """What is asked for."""
     assert __doc__ is not None
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__)
     parser.add_argument("vehicle", nargs="*", help="vehicle names or .toml files")
     parser.add_argument(
         "--assembly", metavar="SHAPE", help="AxBxC modules, cells such as '0,0,0 1,0,0', or a fleet file"
@@ -92,11 +94,6 @@ def arguments() -> argparse.Namespace:
 
 def run(given: argparse.Namespace) -> None:
     """Does what is asked for. Raises DescriptionError."""
-    with folder_for_results(given.out):
-        _run(given)
-
-
-def _run(given: argparse.Namespace) -> None:
     if given.out:
         stem = "choice" if given.choose is not None else "table1" if given.table1 else "capability"
         key = "rank_by" if given.choose is not None else "vehicles"
@@ -140,37 +137,26 @@ def _by_name(layouts: Sequence[Layout]) -> dict[str, Layout]:
 
 def _fleet(path: Path) -> list[Layout]:
     fleet = load_fleet(path)
-    bodies: dict[object, list[int]] = {}
-    for index, member in enumerate(fleet.module):
-        bodies.setdefault(member.body if member.body >= 0 else (index,), []).append(index)
-    layouts = []
-    for indices in bodies.values():
-        members = [fleet.module[i] for i in indices]
-        cells = np.rint([m.cell for m in members]).astype(int)
-        vehicles = [load_vehicle(m.vehicle) for m in members]
-        name = f"{path.stem} body {indices[0]}"
-        layouts.append(of_modules(cells.tolist(), [m.rotation for m in members], vehicles, fleet.pitch_m, name))
-    return layouts
+    vehicles = {m.vehicle: load_vehicle(m.vehicle) for m in fleet.module}
+    groups = groups_of(fleet)
+    return [of_modules(*described(fleet, members, vehicles), fleet.pitch_m, f"{path.stem} body {members[0]}") for members in groups]
 
 
 def _cells(shape: str) -> list[tuple[int, int, int]]:
     """Cells of `2x2x1` or of `0,0,0 1,0,0`."""
-    wrong = (
-        f"--assembly {shape!r}: needs AxBxC, cells such as '0,0,0 1,0,0', or a fleet file (.toml); 64 modules at most"
-    )
     try:
         if "," in shape:
-            found = [tuple(int(c) for c in cell.split(",")) for cell in shape.replace(";", " ").split()]
+            found = cells_in(shape)
         else:
             a, b, c = (int(edge) for edge in shape.split("x"))
-            if min(a, b, c) < 1 or a * b * c > LARGEST_BOX:
-                raise ValueError
-            found = [(x, y, z) for x in range(a) for y in range(b) for z in range(c)]
+            fits = min(a, b, c) >= 1 and a * b * c <= LARGEST_BOX
+            found = [(x, y, z) for x in range(a) for y in range(b) for z in range(c)] if fits else []
     except ValueError:
-        raise DescriptionError(wrong) from None
-    if not 1 <= len(found) <= LARGEST_BOX or any(len(cell) != 3 for cell in found):
-        raise DescriptionError(wrong)
-    return [(cell[0], cell[1], cell[2]) for cell in found]
+        found = []
+    if not 1 <= len(found) <= LARGEST_BOX:
+        what = "needs AxBxC, cells such as '0,0,0 1,0,0', or a fleet file (.toml)"
+        raise DescriptionError(f"--assembly {shape!r}: {what}; {LARGEST_BOX} modules at most")
+    return found
 
 
 def _all(layouts: dict[str, Layout], settings: dict[str, Any], jobs: int) -> dict[str, Capability]:

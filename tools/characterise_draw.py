@@ -17,12 +17,11 @@ from matplotlib.colors import to_rgba
 from matplotlib.patches import Rectangle
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from firmware_py.prepare.capability.layout import UNITS
+from firmware_py.prepare.capability.layout import AXES, FRAMES, UNITS
 from firmware_py.prepare.capability.summary import Capability
 
 _SURFACE = {"power": "#d98324", "wrench": "#2f6f9f"}
 _DECLARED, _ELLIPSOID = "#7a5195", "#2f9e44"
-_AXES = {"force": ("surge", "sway", "heave"), "torque": ("roll", "pitch", "yaw")}
 _CELL_INCHES = (2.9, 2.9)
 _VIOLIN_INCHES = 1.9
 _LINE_INCHES, _LETTERS_PER_INCH = 0.125, 19.0
@@ -86,12 +85,12 @@ def _solid(axes: Any, picture: Picture, limit: float) -> None:
             )
     axes.set(xlim=(-limit, limit), ylim=(limit, -limit), zlim=(limit, -limit))  # FRD: z down, y then the other way
     axes.set_box_aspect((1, 1, 1))
-    for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), _AXES[picture.frame], strict=True):
+    for axis, component in zip((axes.xaxis, axes.yaxis, axes.zaxis), FRAMES[picture.frame], strict=True):
         axis.set_ticks([-_tick(limit), 0.0, _tick(limit)])
         axis.label.set_fontsize(8)
         axis.set_tick_params(labelsize=7, pad=-2)
         axis.labelpad = -6
-        axis.set_label_text(f"{name}, {picture.unit}")
+        axis.set_label_text(f"{AXES[component]}, {picture.unit}")
 
 
 def _tick(limit: float) -> float:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from characterise_surfaces import SPACES, Picture, pictures
 
-from firmware_py.prepare.capability.layout import UNITS
+from firmware_py.prepare.capability.layout import AXES, FRAMES, UNITS
 from firmware_py.prepare.capability.summary import Capability
 
 _DIGITS = 4
@@ -32,7 +32,7 @@ def write_report(path: Path, found: Mapping[str, Capability], titles: Mapping[st
         rows.append(
             {
                 "title": next(iter(parts.values())).title,
-                "axes": ["surge", "sway", "heave"] if key[1] == "force" else ["roll", "pitch", "yaw"],
+                "axes": [AXES[component] for component in FRAMES[key[1]]],
                 "limit": max(part.limit for part in parts.values()) or 1.0,  # where all are degenerate
                 "kind": key[0],
                 "unit": "W" if key[0] == "power" else UNITS[key[1]],

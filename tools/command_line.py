@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 REASONS = {errno.EEXIST: "is a file; a folder is needed"}
 """In place of the system's words, where these do not say what would be right."""
@@ -25,17 +25,22 @@ INTERRUPTED = 130
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one line; exit status 2."""
+    """Says what is wrong with the arguments in one line; exit status 2. Its description is shown as it is written."""
+
+    def __init__(self, **how: Any) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **how)
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog.removesuffix('.py')}: {message}; see --help\n")
 
 
-def in_words(error: Exception) -> str:
-    """What is wrong, in one line; of a file that the system refuses, its name first."""
+def refuse(tool: str, error: Exception) -> int:
+    """Says what is wrong, in one line; of a file that the system refuses, its name first. The exit status of a tool that cannot run."""
+    words = str(error)
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {REASONS.get(error.errno or 0, error.strerror)}"
-    return str(error)
+        words = f"{error.filename}: {REASONS.get(error.errno or 0, error.strerror)}"
+    print(f"{tool}: {words}", file=sys.stderr)
+    return 2
 
 
 def _end_at_once(number: int, frame: FrameType | None) -> NoReturn:

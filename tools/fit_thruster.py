@@ -10,15 +10,13 @@ for --curve of tools/identify.py; what was not measured (power, lag, speed) is -
 
 from __future__ import annotations
 
-import argparse
 import csv
 import dataclasses
 import math
-import sys
 import tomllib
 from pathlib import Path
 
-from command_line import Parser, in_words, run_tool
+from command_line import Parser, refuse, run_tool
 
 import numpy as np
 from argument_types import make_room
@@ -180,7 +178,7 @@ def check_out(path: Path) -> None:
 
 def main() -> int:
     """The command line."""
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__)
     parser.add_argument("csv", type=Path, help="the measurement")
     parser.add_argument("--voltage", type=float, help="V of the curve; else the vehicle's")
     parser.add_argument("--zero", type=float, default=0.05, metavar="N", help="size of a force that counts as none")
@@ -196,8 +194,7 @@ def main() -> int:
         check_out(given.out)
         given.out.write_text(text, encoding="utf-8")
     except (DescriptionError, OSError) as error:
-        print(f"fit_thruster: {in_words(error)}", file=sys.stderr)
-        return 2
+        return refuse("fit_thruster", error)
     print(f"{given.out}: {np.sum(curve.forward):.3g} N forward, {np.sum(curve.reverse):.3g} N reverse at {curve.voltage_v:g} V;", end=" ")
     print(f"deadband {curve.deadband_n:.2g} N; residual {left_n:.2g} N RMS")
     if "power_w" in points:

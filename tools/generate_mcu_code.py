@@ -11,14 +11,13 @@ Exit status: 0, or 2 when it cannot write.
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
 
-from command_line import Parser, in_words, run_tool
+from command_line import Parser, refuse, run_tool
 
 import cantools.database
 from cantools.database.can import c_source
@@ -144,8 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (folder / name).write_text(text, encoding="utf-8")
             print(f"wrote {folder / name}")
     except OSError as error:
-        print(f"generate_mcu_code: {in_words(error)}", file=sys.stderr)
-        return 2
+        return refuse("generate_mcu_code", error)
     return 0
 
 

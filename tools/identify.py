@@ -20,7 +20,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from command_line import Parser, in_words, run_tool
+from command_line import Parser, refuse, run_tool
 
 from argument_types import check_results, folder_for_results
 from identify_excitation import MOTIONS, SPACE_M, check_space, excitation
@@ -189,7 +189,7 @@ def leave(given: argparse.Namespace, result: Fit, recording: Recording, curve: T
 
 def main() -> int:
     """The command line."""
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__)
     parser.add_argument("logs", nargs="*", metavar="LOG", help="folders of flights of one vehicle, one module alone")
     parser.add_argument("--curve", type=Path, metavar="FILE", help="curve of one thruster, from tools/fit_thruster.py")
     parser.add_argument("--thruster", type=int, help="which thruster that was, 1 the first (default)")
@@ -203,8 +203,7 @@ def main() -> int:
     try:
         return identify(parser.parse_args())
     except (DescriptionError, OSError) as error:
-        print(f"identify: {in_words(error)}", file=sys.stderr)
-        return 2
+        return refuse("identify", error)
 
 
 if __name__ == "__main__":

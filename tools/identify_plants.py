@@ -7,14 +7,12 @@ The load cell: 41 forces of thruster 1 with 0.02 N of noise, through a scale tha
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from command_line import Parser, in_words, run_tool, worker_pool
+from command_line import Parser, refuse, run_tool, worker_pool
 
 import numpy as np
 from argument_types import check_results, folder_for_results, positive, whole
@@ -113,7 +111,7 @@ def examine_all(seeds: Sequence[int], jobs: int, folder: Path, duration_s: float
 
 def main() -> int:
     """The command line."""
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__)
     parser.add_argument("--plants", type=whole(1), default=10, help="number of seeds")
     parser.add_argument("--seed", type=whole(0), default=0, help="first seed")
     parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
@@ -125,8 +123,7 @@ def main() -> int:
             check_results(given.out, "covers", "plants.json")
             found = examine_all(range(given.seed, given.seed + given.plants), given.jobs, given.out, given.seconds)
     except (DescriptionError, OSError) as error:
-        print(f"identify_plants: {in_words(error)}", file=sys.stderr)
-        return 2
+        return refuse("identify_plants", error)
     print(json.dumps(found, indent=2))
     return 0 if max(found[kind] for kind in (MASS, DRAG, GAIN)) <= 0.1 and found["covered"] >= 0.85 and not found["stated"] else 1
 

@@ -32,7 +32,6 @@ from hil.plant.sensors import Sensors
 from hil.plant.spec import CALM, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
 
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 BODIES: dict[int, list[tuple[int, int, int]]] = {
     1: [(0, 0, 0)],
     2: [(0, 0, 0), (1, 0, 0)],

@@ -10,7 +10,6 @@ named and does not count. In DIR: margins.json and margins.png, the Bode plot.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import sys
@@ -18,11 +17,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from command_line import Parser, in_words, run_tool, worker_pool
+from command_line import Parser, refuse, run_tool, worker_pool
 
 import numpy as np
 from argument_types import check_results, folder_for_results, whole
-from loop_response import AXES, BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure, read_off
+from loop_response import BODIES, NOMINAL, Margins, Response, Scale, corners, margins, measure, read_off
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -31,6 +30,7 @@ from firmware_py.description.parameters import CONTROLLERS, Parameters, load_par
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M
+from firmware_py.prepare.capability.layout import AXES
 from firmware_py.prepare.joints import Placement, check_joints
 
 BARS = {"nominal": (8.0, 40.0), "worst": (6.0, 35.0)}
@@ -178,7 +178,7 @@ def leave(out: Path, found: Found) -> int:
 
 def main() -> int:
     """The command line."""
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__)
     parser.add_argument("--modules", type=int, nargs="+", choices=list(BODIES), default=list(BODIES), help="sizes of body")
     parser.add_argument("--controller", default="modcube", help=f"{', '.join(CONTROLLERS)}, or a file of parameters")
     parser.add_argument("--vehicle", default="modcube", help="vehicle of every module")
@@ -192,8 +192,7 @@ def main() -> int:
             check_results(given.out, "crossover_rad_s", "margins.json", "margins.png")
             return leave(given.out, measured(given.modules, chosen, given.vehicle, given.jobs))
     except (DescriptionError, OSError) as error:
-        print(f"margins: {in_words(error)}", file=sys.stderr)
-        return 2
+        return refuse("margins", error)
 
 
 if __name__ == "__main__":

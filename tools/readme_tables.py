@@ -8,7 +8,6 @@ group of its table has not been measured.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import sys
@@ -16,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from command_line import Parser, in_words, run_tool
+from command_line import Parser, refuse, run_tool
 
 RowName = tuple[str, str, str]
 """Command, what `the same` means, and name: `rows_by_name`."""
@@ -159,7 +158,7 @@ def read_source(path: Path) -> Entries:
 
 def main() -> int:
     """The command line."""
-    Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    Parser(description=__doc__).parse_args()
     if missing := [page for page in PAGES if not page.is_file()]:
         print(f"readme: no {missing[0]} in {Path.cwd()}; run this in the root of the project", file=sys.stderr)
         return 2
@@ -169,8 +168,7 @@ def main() -> int:
         print(f"readme: {error} is no kind of table, or no column of its file; there are {', '.join(TABLES)}", file=sys.stderr)
         return 2
     except (ValueError, OSError) as error:
-        print(f"readme: {in_words(error)}", file=sys.stderr)
-        return 2
+        return refuse("readme", error)
     return 0
 
 

@@ -21,7 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from command_line import INTERRUPTED, Parser, in_words, run_tool
+from command_line import INTERRUPTED, Parser, refuse, run_tool
 
 from argument_types import check_results, folder_for_results, positive, whole
 from tune_objective import Objective, detuned, load_objective, with_values
@@ -114,7 +114,7 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
 
 def arguments() -> argparse.Namespace:
     """What the command line says."""
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(description=__doc__)
     parser.add_argument("objective", type=Path, help="objective file, such as tools/objectives/spiral.toml")
     parser.add_argument("--trials", type=whole(1), default=40, help="trials in all, earlier ones in the same folder counted")
     parser.add_argument("--minutes", type=positive, default=float("inf"), help="no trial is begun after so long")
@@ -156,8 +156,7 @@ def main() -> int:
         with folder_for_results(given.out):
             return begin(objective, start, given)
     except (DescriptionError, OSError) as error:
-        print(f"tune_gains: {in_words(error)}", file=sys.stderr)
-        return 2
+        return refuse("tune_gains", error)
     except BrokenExecutor:
         print(f"tune_gains: a worker died; the same command with --out {given.out} goes on where it was", file=sys.stderr)
         return 2

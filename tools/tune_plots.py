@@ -11,11 +11,12 @@ from command_line import worker_pool
 
 import numpy as np
 import optuna
-from loop_response import AXES, PERIOD_NS, STEP_TICKS, Response, margins, measure, step_responses
+from loop_response import PERIOD_NS, STEP_TICKS, Response, margins, measure, step_responses
 from margins import bode
 from tune_objective import Objective
 
 from firmware_py.description.parameters import Parameters
+from firmware_py.prepare.capability.layout import AXES
 
 SHOWN = (0, 2, 3, 5)
 """Axes of the plots: surge (sway is its like), heave, roll (pitch is its like), yaw."""

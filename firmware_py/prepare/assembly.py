@@ -70,7 +70,7 @@ def assemble_vehicle(vehicle: Vehicle, cache: DragCache | None = None) -> Body:
 def assemble_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> list[Body]:
     """The bodies that the fleet starts as, in the order of their leaders; `vehicles` by the name in the fleet file."""
     check_fleet(fleet, vehicles)
-    return [assemble(*_described(fleet, members, vehicles), members, fleet.pitch_m) for members in _groups(fleet)]
+    return [assemble(*described(fleet, members, vehicles), members, fleet.pitch_m) for members in groups_of(fleet)]
 
 
 def check_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> None:
@@ -78,11 +78,11 @@ def check_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> None:
     for name, vehicle in vehicles.items():
         if len(vehicle.thruster) > CHANNELS:
             raise DescriptionError(f"vehicle {name}: {len(vehicle.thruster)} thrusters; a module's frames carry {CHANNELS}")
-    for members in _groups(fleet):
-        check_joints(place(*_described(fleet, members, vehicles)), [fleet.label(i) for i in members], fleet.pitch_m)
+    for members in groups_of(fleet):
+        check_joints(place(*described(fleet, members, vehicles)), [fleet.label(i) for i in members], fleet.pitch_m)
 
 
-def _groups(fleet: Fleet) -> list[list[int]]:
+def groups_of(fleet: Fleet) -> list[list[int]]:
     """Fleet indices of the modules of each body."""
     groups: dict[object, list[int]] = {}
     for index, module in enumerate(fleet.module):
@@ -90,7 +90,7 @@ def _groups(fleet: Fleet) -> list[list[int]]:
     return list(groups.values())
 
 
-def _described(
+def described(
     fleet: Fleet, members: Sequence[int], vehicles: Mapping[str, Vehicle]
 ) -> tuple[np.ndarray, list[int], list[Vehicle]]:
     """Cells, rotations and vehicles of a body's modules."""

@@ -9,6 +9,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from command_line import run_tool
+
 import characterise_choose
 import numpy as np
 import pytest
@@ -177,11 +179,10 @@ def test_power_of_a_held_wrench_is_that_of_its_forces() -> None:
 @pytest.fixture
 def characterise(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """characterise(*arguments): what the tool prints."""
-    monkeypatch.syspath_prepend(ROOT / "tools")
 
     def run(*arguments: str) -> str:
         monkeypatch.setattr(sys, "argv", ["characterise.py", *arguments])
-        importlib.import_module("characterise").main()
+        assert importlib.import_module("characterise").main() == 0
         return capsys.readouterr().out
 
     return run
@@ -205,10 +206,9 @@ def characterise(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
 def test_wrong_command_line_is_answered_in_one_line(
     arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.syspath_prepend(ROOT / "tools")
     monkeypatch.setattr(sys, "argv", ["characterise.py", *arguments])
     with pytest.raises(SystemExit) as stopped:
-        importlib.import_module("characterise").main()
+        run_tool(importlib.import_module("characterise").main)
     shown = capsys.readouterr()
     assert stopped.value.code == 2
     assert shown.out == "" and shown.err.count("\n") == 1, shown.err
@@ -233,11 +233,8 @@ def test_two_vehicles_of_one_name_are_not_one_column(
 ) -> None:
     copy = tmp_path / "lighter.toml"
     copy.write_text((ROOT / "firmware_py" / "vehicles" / "modcube.toml").read_text().replace("dry_kg = 2.6", "dry_kg = 2.5"))
-    monkeypatch.syspath_prepend(ROOT / "tools")
     monkeypatch.setattr(sys, "argv", ["characterise.py", "modcube", str(copy)])
-    with pytest.raises(SystemExit) as stopped:
-        importlib.import_module("characterise").main()
-    assert stopped.value.code == 2
+    assert importlib.import_module("characterise").main() == 2
     assert capsys.readouterr().err == "characterise: 2 vehicles have the name 'modcube'; give each file another `name`\n"
 
 
@@ -245,7 +242,6 @@ def test_space_that_rounding_left_of_none_is_called_degenerate_and_has_no_ticks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three thrusters that pass the centre of mass by a tenth of a nanometre: all force, no torque."""
-    monkeypatch.syspath_prepend(ROOT / "tools")
     drawing = importlib.import_module("characterise_draw")
     drawn: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure))
@@ -262,7 +258,6 @@ def test_space_that_rounding_left_of_none_is_called_degenerate_and_has_no_ticks(
 def test_figure_counts_thrusters_from_one_and_its_legend_has_the_colours_that_are_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(ROOT / "tools")
     drawing = importlib.import_module("characterise_draw")
     drawn: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure))

@@ -1,18 +1,17 @@
 """The measured open loop against what it says of the closed one, and margins of loops that are known."""
 
 import importlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from loop_response import AXES, LINES, Loop, Response, Scale, body_of, controlled, corners, lines, margins, measure
+from loop_response import LINES, Loop, Response, Scale, body_of, controlled, corners, lines, margins, measure
 from matplotlib import pyplot
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
+from firmware_py.prepare.capability.layout import AXES
 
-ROOT = Path(__file__).resolve().parents[2]
 SURGE = 0
 
 
@@ -50,9 +49,8 @@ def test_axis_that_no_thruster_pushes_is_not_controlled() -> None:
     assert controlled(body_of(1, "bluerov2_heavy")).all() and controlled(body_of(2, "modcube")).all()
 
 
-def judged(monkeypatch: pytest.MonkeyPatch, pitch: Response) -> list[dict[str, Any]]:
+def judged(pitch: Response) -> list[dict[str, Any]]:
     """What tools/margins.py says of good loops and that one, nominal and worst."""
-    monkeypatch.syspath_prepend(ROOT / "tools")
     tool = importlib.import_module("margins")
     loops = [pitch if name == "pitch" else ideal(2.0, 0.2) for name in AXES]
     rows: list[dict[str, Any]] = tool.rows({1: {tool.NOMINAL: loops}})
@@ -60,23 +58,20 @@ def judged(monkeypatch: pytest.MonkeyPatch, pitch: Response) -> list[dict[str, A
     return rows
 
 
-def test_axis_that_is_not_controlled_is_named_and_left_out_of_the_verdict(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_axis_that_is_not_controlled_is_named_and_left_out_of_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
     silent = Response(np.geomspace(0.3, 30.0, 20), np.zeros(20, complex), controlled=False)
-    assert all(row["passed"] for row in judged(monkeypatch, silent))
+    assert all(row["passed"] for row in judged(silent))
     line = next(line for line in capsys.readouterr().out.splitlines() if "pitch" in line)
     assert "not controlled" in line and "inf" not in line
 
 
-def test_controlled_axis_that_never_reaches_0_db_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = judged(monkeypatch, ideal(1e-3, 0.01))
+def test_controlled_axis_that_never_reaches_0_db_fails(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = judged(ideal(1e-3, 0.01))
     assert [row["axis"] for row in rows if not row["passed"]] == ["pitch", "pitch"]
     assert "FAILED: no crossover" in capsys.readouterr().out
 
 
-def test_picture_marks_crossover_and_margins_where_they_are_read_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(ROOT / "tools")
+def test_picture_marks_crossover_and_margins_where_they_are_read_off() -> None:
     mark = importlib.import_module("margins").mark
     figure, (gain, phase) = pyplot.subplots(2, 1)
     mark(gain, phase, ideal(2.0, 0.2), "surge", "black")
