@@ -26,7 +26,7 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
 from hil.bench import open_bench
 from hil.scenario import load_scenario
-from tests.clients.bench_process import ROOT, free_port
+from tests.clients.bench_process import free_port
 from tests.unit.campaigns import Inline
 
 os.environ["MAVLINK20"] = "1"
@@ -156,7 +156,6 @@ class PlugError(Exception):
 @pytest.fixture
 def live(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The module tune_live; it waits less."""
-    monkeypatch.syspath_prepend(ROOT / "tools")
     import tune_live
     import tune_vehicle
 

@@ -1,4 +1,6 @@
-"""Fixtures of the tests of the ground side; a file that has a world of its own keeps it."""
+"""Fixtures of several files: the ground side's world, which a file that has one of its own keeps, and what the command line refuses."""
+
+from collections.abc import Callable
 
 import pytest
 
@@ -13,3 +15,20 @@ def world() -> World:
 @pytest.fixture
 def client(world: World) -> Client:
     return world.client()
+
+
+@pytest.fixture
+def refusal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """refusal(*arguments): the one line with which `modcube` refuses them."""
+    from firmware_py.cli import main  # most files do without it
+
+    def run(*arguments: str) -> str:
+        monkeypatch.setattr("sys.argv", ["modcube", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 2
+        error = capsys.readouterr().err
+        assert error.endswith("\n") and len(error.splitlines()) == 1, error
+        return error.strip()
+
+    return run

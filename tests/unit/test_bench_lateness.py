@@ -1,10 +1,6 @@
 """The bench's drift: what a loop would show whose ticks start later and later, for either reason."""
 
-import sys
-from collections.abc import Iterator
-from pathlib import Path
-from types import ModuleType
-
+import bench_lateness as bench
 import numpy as np
 import pytest
 
@@ -15,34 +11,24 @@ BINS = len(LATENESS_EDGES_NS) + 1
 EARLY, LATER = 20, 25
 
 
-@pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "tools"))
-    import bench_lateness
-
-    yield bench_lateness
-    for name in ("bench_lateness", "bench_entry"):
-        sys.modules.pop(name, None)
-
-
 def counts(late: np.ndarray) -> np.ndarray:
     """(k, BINS) ticks so far, every half second, whose lateness is in bin late[k]."""
     return np.cumsum(50 * np.eye(BINS, dtype=np.int64)[late], axis=0)
 
 
-def test_loop_that_keeps_its_grid_does_not_drift(bench: ModuleType) -> None:
+def test_loop_that_keeps_its_grid_does_not_drift() -> None:
     deadlines = [5 + k * PERIOD_NS for k in range(100 * SECONDS)]
     assert bench.drift_ns(counts(np.full(2 * SECONDS, EARLY)), deadlines, PERIOD_NS) == 0.0
 
 
-def test_ticks_that_start_later_after_their_deadlines_drift(bench: ModuleType) -> None:
+def test_ticks_that_start_later_after_their_deadlines_drift() -> None:
     deadlines = [5 + k * PERIOD_NS for k in range(100 * SECONDS)]
     late = np.where(np.arange(2 * SECONDS) < SECONDS, EARLY, LATER)
     expected = LATENESS_EDGES_NS[LATER] - LATENESS_EDGES_NS[EARLY]
     assert bench.drift_ns(counts(late), deadlines, PERIOD_NS) == expected
 
 
-def test_deadlines_that_leave_their_grid_drift(bench: ModuleType) -> None:
+def test_deadlines_that_leave_their_grid_drift() -> None:
     deadlines = [5 + k * (PERIOD_NS + 100) for k in range(100 * SECONDS)]
     drift = bench.drift_ns(counts(np.full(2 * SECONDS, EARLY)), deadlines, PERIOD_NS)
     assert drift == pytest.approx(100 * 100 * SECONDS, rel=0.06)

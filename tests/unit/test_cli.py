@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -23,7 +24,6 @@ from firmware_py.runtime.guarded_file import GuardedFile
 from hil.scenario import scenario_names
 from hil.trial_file import TrialFile
 from hil.truth_log import TruthRecorder
-from tests.unit.command_line import refusal
 
 SPIRAL = (Path(hil.bench.__file__).parent / "scenarios" / "spiral.toml").read_text(encoding="utf-8")
 
@@ -46,14 +46,9 @@ SPIRAL = (Path(hil.bench.__file__).parent / "scenarios" / "spiral.toml").read_te
     ],
 )
 def test_what_does_not_exist_is_refused_with_what_there_is(
-    arguments: list[str],
-    wrong: str,
-    right: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: list[str], wrong: str, right: str, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:
-    line = refusal([*arguments, "--out", str(tmp_path)], monkeypatch, capsys)
+    line = refusal(*arguments, "--out", str(tmp_path))
     assert wrong in line
     assert right in line
 
@@ -74,10 +69,8 @@ def test_what_does_not_exist_is_refused_with_what_there_is(
         (["run", "--bus", "virtual:cli", "--live-port", "9000"], "--live-port", "give --live with"),
     ],
 )
-def test_wrong_arguments_are_refused_in_one_line(
-    arguments: list[str], wrong: str, right: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = refusal(arguments, monkeypatch, capsys)
+def test_wrong_arguments_are_refused_in_one_line(arguments: list[str], wrong: str, right: str, refusal: Callable[..., str]) -> None:
+    line = refusal(*arguments)
     assert line.startswith("modcube")
     assert wrong in line
     assert right in line
@@ -98,18 +91,12 @@ def test_wrong_arguments_are_refused_in_one_line(
     ],
 )
 def test_wrong_scenario_file_is_refused_with_line_and_permitted_range(
-    old: str,
-    new: str,
-    wrong: str,
-    right: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    old: str, new: str, wrong: str, right: str, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:
     assert old in SPIRAL
     path = tmp_path / "spiral.toml"
     path.write_text(SPIRAL.replace(old, new), encoding="utf-8")
-    line = refusal(["hil", "run", str(path), "--out", str(tmp_path)], monkeypatch, capsys)
+    line = refusal("hil", "run", str(path), "--out", str(tmp_path))
     assert f"{path}:" in line
     assert wrong in line
     assert right in line
@@ -124,36 +111,26 @@ def test_wrong_scenario_file_is_refused_with_line_and_permitted_range(
     ],
 )
 def test_wrong_parameter_file_is_refused_with_line_and_permitted_range(
-    text: str,
-    wrong: str,
-    right: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    text: str, wrong: str, right: str, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:
     path = tmp_path / "gains.toml"
     path.write_text(text, encoding="utf-8")
-    arguments = ["hil", "run", "hover", "--controller", str(path), "--out", str(tmp_path)]
-    line = refusal(arguments, monkeypatch, capsys)
+    line = refusal("hil", "run", "hover", "--controller", str(path), "--out", str(tmp_path))
     assert f"{path}:2: " in line
     assert wrong in line
     assert right in line
 
 
-def test_folder_that_cannot_be_made_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_folder_that_cannot_be_made_is_refused(tmp_path: Path, refusal: Callable[..., str]) -> None:
     file = tmp_path / "taken"
     file.touch()
-    assert str(file) in refusal(["hil", "run", "hover", "--out", str(file / "run")], monkeypatch, capsys)
+    assert str(file) in refusal("hil", "run", "hover", "--out", str(file / "run"))
 
 
-def test_folder_that_is_a_file_is_refused_with_what_is_needed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_folder_that_is_a_file_is_refused_with_what_is_needed(tmp_path: Path, refusal: Callable[..., str]) -> None:
     file = tmp_path / "README.md"
     file.touch()
-    line = refusal(["hil", "run", "hover", "--out", str(file)], monkeypatch, capsys)
+    line = refusal("hil", "run", "hover", "--out", str(file))
     assert line == f"modcube: {file}: is a file; a folder is needed"
 
 
@@ -167,21 +144,21 @@ def find_the_disk_full(*_: object) -> None:
     [("run", TruthRecorder, "record_world"), ("run", GuardedFile, "_append"), ("campaign", TrialFile, "_write")],
 )
 def test_full_disk_ends_the_bench_in_one_line_with_the_folder(
-    command: str, writer: type, write: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, writer: type, write: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Callable[..., str]
 ) -> None:
     """The firmware's own log fails in silence, for a vehicle flies on without it; a bench has no use for such a flight."""
     if writer is GuardedFile:
         monkeypatch.setattr(hil.bench.Bench, "fly", lambda *_: 1.0)
     monkeypatch.setattr(writer, write, find_the_disk_full)
-    line = refusal(["hil", command, "hover", "--out", str(tmp_path)], monkeypatch, capsys)
+    line = refusal("hil", command, "hover", "--out", str(tmp_path))
     assert line == f"modcube: {tmp_path}: No space left on device"
 
 
 def test_full_disk_is_told_in_one_line_where_nobody_knows_the_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Callable[..., str]
 ) -> None:
     monkeypatch.setattr(hil.campaign, "run_campaign", find_the_disk_full)
-    line = refusal(["hil", "campaign", "hover", "--out", str(tmp_path)], monkeypatch, capsys)
+    line = refusal("hil", "campaign", "hover", "--out", str(tmp_path))
     assert line == "modcube: No space left on device"
 
 
@@ -219,57 +196,51 @@ def test_installed_command_is_the_one_that_bears_an_interrupt() -> None:
     assert project["scripts"] == {"modcube": f"{main_from_the_start.__module__}:main"}
 
 
-def test_list_names_every_scenario_with_one_line_of_help(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("sys.argv", ["modcube", "hil", "list"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    lines = capsys.readouterr().out.splitlines()
-    assert ended.value.code == 0
+def test_list_names_every_scenario_with_one_line_of_help(printed: Callable[..., str]) -> None:
+    lines = printed("hil", "list").splitlines()
     assert [line.split()[0] for line in lines] == scenario_names()
     assert all(len(line.split()) > 3 for line in lines)
 
 
-def printed(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    monkeypatch.setattr("sys.argv", ["modcube", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 0
-    return capsys.readouterr().out
+@pytest.fixture
+def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """printed(*arguments): what `modcube` prints when asked so."""
+
+    def run(*arguments: str) -> str:
+        monkeypatch.setattr("sys.argv", ["modcube", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 0
+        return capsys.readouterr().out
+
+    return run
 
 
-def test_printed_parameters_are_a_file_of_parameters(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_printed_parameters_are_a_file_of_parameters(tmp_path: Path, printed: Callable[..., str]) -> None:
     mine = tmp_path / "mine.toml"
     mine.write_text("[control]\nlead_s = 0.1\n")
     whole = tmp_path / "whole.toml"
-    whole.write_text(printed(["parameters", "--parameters", str(mine)], monkeypatch, capsys))
+    whole.write_text(printed("parameters", "--parameters", str(mine)))
     assert load_parameters(whole) == load_parameters(mine) == Parameters().replace("control.lead_s", 0.1)
 
 
-def test_printed_parameters_say_what_each_is_and_may_be(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = printed(["parameters"], monkeypatch, capsys).splitlines()
+def test_printed_parameters_say_what_each_is_and_may_be(printed: Callable[..., str]) -> None:
+    lines = printed("parameters").splitlines()
     for name, limits in registry():
         told = [line for line in lines if line.startswith(f"{name.partition('.')[2]} = ") and limits.help in line]
         assert len(told) == 1 and f"; {describe(limits)}" in told[0] and limits.mavlink in told[0]
 
 
 @pytest.mark.parametrize("name", vehicle_names())
-def test_printed_vehicle_is_the_vehicle(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_printed_vehicle_is_the_vehicle(name: str, tmp_path: Path, printed: Callable[..., str]) -> None:
     mine = tmp_path / "mine.toml"
-    mine.write_text(printed(["vehicle", name], monkeypatch, capsys))
-    assert printed(["vehicle", str(mine)], monkeypatch, capsys) == mine.read_text()
+    mine.write_text(printed("vehicle", name))
+    assert printed("vehicle", str(mine)) == mine.read_text()
     assert to_toml(load_vehicle(str(mine))) == to_toml(load_vehicle(name))
 
 
-def test_printed_vehicle_takes_tables_of_a_kind_that_it_had_none_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = printed(["vehicle", "modcube"], monkeypatch, capsys)
+def test_printed_vehicle_takes_tables_of_a_kind_that_it_had_none_of(tmp_path: Path, printed: Callable[..., str]) -> None:
+    text = printed("vehicle", "modcube")
     assert "# [[payload]]: none; keys: name, dry_kg, entrained_kg, size_m, position_m\n" in text
     mine = tmp_path / "mine.toml"
     arm = '[[payload]]\nname = "arm"\ndry_kg = 0.5\nsize_m = [0.1, 0.02, 0.02]\nposition_m = [0.15, 0, 0]\n'
@@ -277,13 +248,13 @@ def test_printed_vehicle_takes_tables_of_a_kind_that_it_had_none_of(
     assert [payload.name for payload in load_vehicle(str(mine)).payload] == ["arm"]
 
 
-def test_vehicles_are_printed_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert printed(["vehicle"], monkeypatch, capsys).split() == vehicle_names()
+def test_vehicles_are_printed_by_name(printed: Callable[..., str]) -> None:
+    assert printed("vehicle").split() == vehicle_names()
 
 
-def test_groups_of_parameters_are_printed_alone(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(tomllib.loads(printed(["parameters", "fence", "control"], monkeypatch, capsys))) == ["control", "fence"]
-    line = refusal(["parameters", "fences"], monkeypatch, capsys)
+def test_groups_of_parameters_are_printed_alone(refusal: Callable[..., str], printed: Callable[..., str]) -> None:
+    assert list(tomllib.loads(printed("parameters", "fence", "control"))) == ["control", "fence"]
+    line = refusal("parameters", "fences")
     assert "group 'fences'" in line and "did you mean fence? there are control, " in line
 
 

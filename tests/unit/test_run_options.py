@@ -1,11 +1,11 @@
 """`modcube run` takes no option that it would not use: each is refused in one line, with status 2, before anything is started."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from firmware_py.cli import fleet_of
-from tests.unit.command_line import refusal
 
 FLEET = 'buses = ["virtual:options"]\n[[module]]\nnumber = 7\n'
 
@@ -18,25 +18,19 @@ def fleet(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("command", ["run", "doctor"])
-def test_bus_beside_a_fleet_file_is_refused(
-    command: str, fleet: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = refusal([command, "--fleet", str(fleet), "--bus", "socketcan:can7"], monkeypatch, capsys)
+def test_bus_beside_a_fleet_file_is_refused(command: str, fleet: Path, refusal: Callable[..., str]) -> None:
+    line = refusal(command, "--fleet", str(fleet), "--bus", "socketcan:can7")
     assert line == f"modcube: --bus beside --fleet: buses, vehicles and rate_hz stand in {fleet}; give one or the other"
 
 
-def test_rate_and_vehicle_beside_a_fleet_file_are_refused_even_at_their_defaults(
-    fleet: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = refusal(["run", "--fleet", str(fleet), "--rate", "100", "--vehicle", "modcube"], monkeypatch, capsys)
+def test_rate_and_vehicle_beside_a_fleet_file_are_refused_even_at_their_defaults(fleet: Path, refusal: Callable[..., str]) -> None:
+    line = refusal("run", "--fleet", str(fleet), "--rate", "100", "--vehicle", "modcube")
     assert line.startswith("modcube: --vehicle, --rate beside --fleet: ")
 
 
-def test_fleet_file_without_buses_is_refused(
-    fleet: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fleet_file_without_buses_is_refused(fleet: Path, refusal: Callable[..., str]) -> None:
     fleet.write_text(FLEET.partition("\n")[2])
-    assert f"{fleet}:1: buses: missing key" in refusal(["run", "--fleet", str(fleet)], monkeypatch, capsys)
+    assert f"{fleet}:1: buses: missing key" in refusal("run", "--fleet", str(fleet))
 
 
 @pytest.mark.parametrize(
@@ -48,18 +42,14 @@ def test_fleet_file_without_buses_is_refused(
         (["--ground", "udpin:127.0.0.1:0", "--identity", "px4"], "identity 'px4' is unknown; there are generic, ardusub"),
     ],
 )
-def test_options_of_the_ground_side_that_cannot_count_are_refused(
-    arguments: list[str], words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert words in refusal(["run", "--bus", "virtual:options", *arguments], monkeypatch, capsys)
+def test_options_of_the_ground_side_that_cannot_count_are_refused(arguments: list[str], words: str, refusal: Callable[..., str]) -> None:
+    assert words in refusal("run", "--bus", "virtual:options", *arguments)
 
 
-def test_dock_button_of_a_module_that_the_fleet_lacks_is_refused(
-    fleet: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_dock_button_of_a_module_that_the_fleet_lacks_is_refused(fleet: Path, refusal: Callable[..., str]) -> None:
     file = fleet.with_name("ground.toml")
     file.write_text('links = ["udpin:127.0.0.1:0"]\ndock_button = [0, 0, 60, 1]\n')
-    line = refusal(["run", "--fleet", str(fleet), "--ground-file", str(file)], monkeypatch, capsys)
+    line = refusal("run", "--fleet", str(fleet), "--ground-file", str(file))
     assert line.startswith(f"modcube: {file}:2: dock_button: module 0 to module 60; ")
 
 

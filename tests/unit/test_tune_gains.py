@@ -39,7 +39,6 @@ START = Parameters().replace(BANDWIDTH, 7.5).replace(DAMPING, 1.0)
 @pytest.fixture
 def tools(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
     """The modules tune_objective and tune_search; a flight takes no time and knows the best gains: 2 rad/s and 1."""
-    monkeypatch.syspath_prepend(ROOT / "tools")
     import tune_objective
     import tune_search
 
