@@ -14,19 +14,18 @@ from typing import Any
 import pytest
 
 from firmware_py.app.firmware import BusFrame
-from firmware_py.bus.codec import Codec, Frame
+from firmware_py.bus.codec import Frame
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from hil.bench import Bench, open_bench
-from hil.nodes import Nodes, make_nodes
+from hil.nodes import make_nodes
 from hil.reference_node import CNodes, load_library
 from hil.scenario import make_world
 from tests.closed_loop.flights import shortened
+from tests.unit.mcu_frames import ARMED, CODEC, DISARMED, PUSHES, REST, dock, magnets, sync, thrust
 
 FOLDER = Path(__file__).resolve().parents[2] / "hil" / "reference_node"
 RATE_HZ, PERIOD_NS = 100, 10_000_000
-NUMBER = 1
-CODEC = Codec.load()
 pytestmark = pytest.mark.skipif(
     shutil.which("gcc") is None or shutil.which("make") is None, reason="gcc is missing (make setup-system)"
 )
@@ -75,15 +74,6 @@ def nodes(library: CDLL) -> CNodes:
     return CNodes(make_nodes(world, CODEC, scenario), scenario, library, RATE_HZ)
 
 
-def command(share: float, counter: int, mode: int = 1) -> list[Frame]:
-    values = (share, share, share, share, mode)
-    return [CODEC.message(f"THRUSTER_CMD_{half}").encode(NUMBER, values, counter) for half in "AB"]
-
-
-def sync(tick: int) -> Frame:
-    return CODEC.message("SYNC").encode(0, (tick,))
-
-
 def status(frames: Sequence[Frame]) -> tuple[int, int, int]:
     """Tick, errors and state of the last frame of a tick."""
     tick, _, errors, state = CODEC.message("MCU_STATUS").decode(frames[-1].data)
@@ -91,11 +81,11 @@ def status(frames: Sequence[Frame]) -> tuple[int, int, int]:
 
 
 def applied(nodes: CNodes) -> list[float]:
-    return nodes.c_nodes[NUMBER].board._applied
+    return nodes.c_nodes[1].board._applied
 
 
 def test_node_applies_a_command_with_the_next_sync_and_says_that_it_is_armed(nodes: CNodes) -> None:
-    nodes.step([sync(1), *command(0.5, 1)])
+    nodes.step([sync(1), *thrust(0.5, ARMED, 1)])
     assert not any(applied(nodes))
     answers = nodes.step([sync(2)])
     assert applied(nodes) == [0.5] * 8
@@ -103,7 +93,7 @@ def test_node_applies_a_command_with_the_next_sync_and_says_that_it_is_armed(nod
 
 
 def test_node_commands_zero_after_100_ms_of_silence_without_any_sync(nodes: CNodes) -> None:
-    nodes.step([*command(0.5, 1), sync(1)])
+    nodes.step([*thrust(0.5, ARMED, 1), sync(1)])
     for _ in range(10):
         nodes.step([])
         assert any(applied(nodes))
@@ -113,34 +103,22 @@ def test_node_commands_zero_after_100_ms_of_silence_without_any_sync(nodes: CNod
 
 
 def test_half_of_the_thrusters_times_out_by_itself(nodes: CNodes) -> None:
-    nodes.step([*command(0.5, 1), sync(1)])
+    nodes.step([*thrust(0.5, ARMED, 1), sync(1)])
     for counter in range(2, 14):
-        nodes.step([command(0.5, counter)[1]])
+        nodes.step([thrust(0.5, ARMED, counter)[1]])
     assert applied(nodes) == [0.0] * 4 + [0.5] * 4
 
 
 def test_estop_ends_thrust_at_once_and_only_a_disarmed_command_after_200_ms_of_none_releases_it(nodes: CNodes) -> None:
-    nodes.step([*command(0.5, 1), sync(1)])
+    nodes.step([*thrust(0.5, ARMED, 1), sync(1)])
     nodes.step([Frame(0x01E, b"whatever")])
     assert not any(applied(nodes))
-    assert status(nodes.step([*command(0.0, 2, mode=0), sync(2)]))[2] == 4
+    assert status(nodes.step([*thrust(0.0, DISARMED, 2), sync(2)]))[2] == 4
     for counter in range(3, 25):
-        nodes.step(command(0.5, counter & 15))
+        nodes.step(thrust(0.5, ARMED, counter & 15))
     assert status(nodes.step([sync(30)]))[2] == 4
-    nodes.step(command(0.0, 14, mode=0))
+    nodes.step(thrust(0.0, DISARMED, 14))
     assert status(nodes.step([sync(31)]))[2] == 1
-
-
-PUSHES, REST = (1, 0, 2, 0, 0, 2), (1, 0, 0, 0, 0, 0)
-
-
-def dock(relays: Sequence[int], counter: int) -> Frame:
-    return CODEC.message("DOCK_CMD").encode(NUMBER, relays, counter)
-
-
-def magnets(nodes: CNodes | Nodes) -> tuple[int, ...]:
-    """The relays of the module, in the world."""
-    return tuple(nodes.world.docks.relays[0].tolist())
 
 
 def test_magnet_that_pushes_goes_off_after_2_s_without_dock_cmd_and_one_that_pulls_stays(nodes: CNodes) -> None:
@@ -159,7 +137,7 @@ def test_estop_ends_pushing_at_once_and_until_it_is_released(nodes: CNodes) -> N
     for counter in range(2, 32):
         nodes.step([dock(PUSHES, counter)])
         assert magnets(nodes) == REST
-    nodes.step([*command(0.0, 1, mode=0), dock(PUSHES, 32)])
+    nodes.step([*thrust(0.0, DISARMED, 1), dock(PUSHES, 32)])
     assert magnets(nodes) == PUSHES
 
 
@@ -167,7 +145,7 @@ def test_c_node_switches_its_magnets_as_the_plants_own_does_frame_for_frame(node
     """Frames come, stay away, and come again around the 2 s and an e-stop."""
     scenario = shortened("hover", 1.0)
     own = make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, scenario)
-    stop, release = [Frame(0x000, b"")], command(0.0, 2, mode=0)
+    stop, release = [Frame(0x000, b"")], thrust(0.0, DISARMED, 2)
     script = {1: [dock(PUSHES, 1)], 203: [dock(PUSHES, 2)], 300: stop, 310: [dock(PUSHES, 3)], 330: release, 340: [dock(PUSHES, 4)]}
     pushed = []
     for tick in range(1, 560):
@@ -179,7 +157,7 @@ def test_c_node_switches_its_magnets_as_the_plants_own_does_frame_for_frame(node
 
 
 def test_node_reports_bad_frames_once_in_its_next_status(nodes: CNodes) -> None:
-    good = command(0.5, 1)
+    good = thrust(0.5, ARMED, 1)
     torn = Frame(good[0].id, good[0].data[:-1] + bytes([good[0].data[-1] ^ 1]))
     short = Frame(good[1].id, good[1].data[:5])
     answers = nodes.step([*good, torn, short, good[0], sync(1)])

@@ -6,15 +6,15 @@ import itertools
 import numpy as np
 import pytest
 
-from firmware_py.bus.codec import Codec, Frame, Receiver
+from firmware_py.bus.codec import Frame, Receiver
 from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults, Wire
 from hil.nodes import Nodes, make_nodes
 from hil.plant.fault_spec import Fault
 from hil.scenario import load_scenario, make_world
+from tests.unit.mcu_frames import ARMED, CODEC, sync, thrust
 
 PERIOD_NS = 10_000_000
-CODEC = Codec.load()
 FRAMES = [Frame(0x100 + i, bytes([i] * 6)) for i in range(20)]
 
 
@@ -28,8 +28,7 @@ def nodes_with(*faults: Fault, scenario: str = "hover") -> Nodes:
 def fly(nodes: Nodes, ticks: int, u: float = 0.5, first: int = 1) -> list[Frame]:
     out: list[Frame] = []
     for k in range(first, first + ticks):
-        commands = [CODEC.message(f"THRUSTER_CMD_{half}").encode(1, [u, u, u, u, 1], k) for half in "AB"]
-        out += nodes.step([CODEC.message("SYNC").encode(0, [k]), *commands])
+        out += nodes.step([sync(k), *thrust(u, ARMED, k)])
     return out
 
 
@@ -158,8 +157,7 @@ def test_magnet_that_hangs_is_not_moved_by_another_fault() -> None:
 def test_fault_of_one_module_leaves_the_other_whole() -> None:
     nodes = nodes_with(Fault(kind="imu_frozen", module=2), Fault(kind="thruster_dead", module=1), scenario="dock")
     for tick in range(1, 50):
-        commands = [CODEC.message(f"THRUSTER_CMD_{h}").encode(n, [0.5] * 4 + [1], tick) for n in (1, 2) for h in "AB"]
-        nodes.step([CODEC.message("SYNC").encode(0, [tick]), *commands])
+        nodes.step([sync(tick), *thrust(0.5, ARMED, tick), *thrust(0.5, ARMED, tick, number=2)])
     assert [mcu.frozen for mcu in nodes.mcus.values()] == [False, True]
     assert not nodes.world.truth(0).force_n.any() and nodes.world.truth(1).force_n.all()
 

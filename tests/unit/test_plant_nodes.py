@@ -2,20 +2,18 @@
 
 import collections
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
-from firmware_py.bus.codec import Codec, Frame, Received, Receiver, unpack_quaternion
+from firmware_py.bus.codec import Frame, Received, Receiver, unpack_quaternion
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
 from hil.nodes import Nodes, make_nodes
 from hil.scenario import Scenario, load_scenario, make_world, scenario_names
+from tests.unit.mcu_frames import ARMED, CODEC, DISARMED, PUSHES, REST, dock, magnets, sync, thrust
 
 PERIOD_NS = 10_000_000
-CODEC = Codec.load()
-ARMED, DISARMED = 1, 0
 
 
 def calm(name: str = "hover") -> Scenario:
@@ -25,14 +23,6 @@ def calm(name: str = "hover") -> Scenario:
 def nodes_of(scenario: Scenario, seed: int = 0, period_ns: int = PERIOD_NS) -> Nodes:
     world = make_world(scenario, seed, period_ns)
     return make_nodes(world, CODEC, scenario)
-
-
-def sync(tick: int) -> Frame:
-    return CODEC.message("SYNC").encode(0, [tick])
-
-
-def thrust(u: float, mode: int, counter: int, halves: str = "AB", number: int = 1) -> list[Frame]:
-    return [CODEC.message(f"THRUSTER_CMD_{half}").encode(number, [u, u, u, u, mode], counter) for half in halves]
 
 
 def decode(frames: list[Frame], receiver: Receiver | None = None) -> list[Received]:
@@ -258,24 +248,11 @@ def test_estop_is_released_by_a_disarmed_command_200_ms_later_and_by_nothing_els
 def test_relays_are_echoed() -> None:
     nodes = nodes_of(calm())
     frames: list[Frame] = []
-    nodes.step([CODEC.message("DOCK_CMD").encode(1, [1, 0, 2, 0, 0, 1], 5)])
+    nodes.step([dock((1, 0, 2, 0, 0, 1), 5)])
     for tick in range(1, 9):
         frames += nodes.step([sync(tick)])
     assert named(frames, "DOCK_CURRENT_ABC").values[3:] == (1, 0, 2)
     assert named(frames, "DOCK_CURRENT_DEF").values[3:] == (0, 0, 1)
-
-
-PUSHES, REST = (1, 0, 2, 0, 0, 2), (1, 0, 0, 0, 0, 0)
-"""Face A pulls throughout: a joint may hang on it."""
-
-
-def dock(relays: Sequence[int], counter: int) -> Frame:
-    return CODEC.message("DOCK_CMD").encode(1, relays, counter)
-
-
-def magnets(nodes: Nodes) -> tuple[int, ...]:
-    """The relays of the one module, in the world."""
-    return tuple(nodes.world.docks.relays[0].tolist())
 
 
 def test_magnet_that_pushes_goes_off_after_2_s_without_dock_cmd_and_one_that_pulls_stays() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.bus.codec import Codec, Frame
+from firmware_py.bus.codec import Frame
 from firmware_py.bus.port import PortError, open_port
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
@@ -17,9 +17,9 @@ from hil.plant.fault_spec import Fault
 from hil.plant_process import PlantProcess
 from hil.reference_node.plant import SocketPlant
 from hil.scenario import load_scenario, make_world
+from tests.unit.mcu_frames import CODEC, DISARMED, dock, sync, thrust
 
 PERIOD_NS = 10_000_000
-CODEC = Codec.load()
 
 
 class Sent:
@@ -37,8 +37,7 @@ class Sent:
 
 def tick_of(k: int) -> list[Frame]:
     """What the firmware sends in a tick: the frames come one by one."""
-    halves = [CODEC.message(f"THRUSTER_CMD_{half}").encode(1, [0.0] * 4 + [0], k) for half in "AB"]
-    return [CODEC.message("SYNC").encode(0, [k]), *halves, CODEC.message("DOCK_CMD").encode(1, [0] * 6, k)]
+    return [sync(k), *thrust(0.0, DISARMED, k), dock([0] * 6, k)]
 
 
 @pytest.mark.parametrize(
