@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -149,13 +150,7 @@ class Objective:
 
     def start(self, parameters: Parameters) -> dict[str, float]:
         """Where the search begins: the values in `parameters`, moved within the bounds."""
-        return {s.parameter: min(max(value_of(parameters, s.parameter), s.low), s.high) for s in self.search}
-
-
-def value_of(parameters: Parameters, dotted: str) -> float:
-    """The value of `group.field`."""
-    group, _, name = dotted.partition(".")
-    return float(getattr(getattr(parameters, group), name))
+        return {s.parameter: min(max(float(attrgetter(s.parameter)(parameters)), s.low), s.high) for s in self.search}
 
 
 def with_values(parameters: Parameters, values: Mapping[str, float]) -> Parameters:
@@ -168,7 +163,7 @@ def with_values(parameters: Parameters, values: Mapping[str, float]) -> Paramete
 def detuned(objective: Objective, parameters: Parameters, factor: float, seed: int) -> Parameters:
     """A copy in which everything that is searched is off by a random factor, log-uniform from 1/factor to factor, within its bounds."""
     factors = factor ** np.random.default_rng(seed).uniform(-1.0, 1.0, len(objective.search))
-    off = [(s, value_of(parameters, s.parameter) * float(f)) for s, f in zip(objective.search, factors, strict=True)]
+    off = [(s, attrgetter(s.parameter)(parameters) * float(f)) for s, f in zip(objective.search, factors, strict=True)]
     return with_values(parameters, {s.parameter: min(max(value, s.low), s.high) for s, value in off})
 
 

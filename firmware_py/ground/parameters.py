@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +43,7 @@ class ParameterStore:
 
     def get(self, name: str) -> float:
         """The value of a MAVLink name. Raises KeyError."""
-        group, _, field = self.names[name][0].partition(".")
-        return float(getattr(getattr(self.values, group), field))
+        return float(attrgetter(self.names[name][0])(self.values))
 
     def set(self, name: str, value: float) -> tuple[str, float]:
         """Change one and store all that differ from the start; returns its name in the registry and the value as kept.
@@ -53,8 +53,7 @@ class ParameterStore:
             OSError: it cannot be stored; the old value stays.
         """
         dotted, _ = self.names[name]
-        group, _, field = dotted.partition(".")
-        kind = type(getattr(getattr(self.values, group), field))
+        kind = type(attrgetter(dotted)(self.values))
         kept = kind(value) if kind is not int else round(value)
         changed = self.values.replace(dotted, kept)
         if self._path is not None:

@@ -1,8 +1,8 @@
 """Every permitted set of parameters survives being written and read; every other value is refused."""
 
+from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,16 +16,11 @@ REGISTRY = dict(registry())
 NUMBERS = sorted(name for name, limits in REGISTRY.items() if not limits.choices)
 
 
-def value_of(parameters: Parameters, name: str) -> Any:
-    group, _, field = name.partition(".")
-    return getattr(getattr(parameters, group), field)
-
-
 def permitted(name: str) -> st.SearchStrategy[float | str]:
     limits = REGISTRY[name]
     if limits.choices:
         return st.sampled_from(limits.choices)
-    if isinstance(value_of(Parameters(), name), int):
+    if isinstance(attrgetter(name)(Parameters()), int):
         return st.integers(int(limits.low), int(limits.high))
     return st.floats(limits.low, limits.high)
 
@@ -54,9 +49,9 @@ def test_number_is_taken_if_and_only_if_it_is_in_range(name: str, value: float) 
     try:
         taken = Parameters().replace(name, value)
     except DescriptionError as refused:
-        is_whole = isinstance(value_of(Parameters(), name), int)
+        is_whole = isinstance(attrgetter(name)(Parameters()), int)
         assert not limits.low <= value <= limits.high or (is_whole and not float(value).is_integer())
         assert name in str(refused) and "permitted" in str(refused)
     else:
         assert limits.low <= value <= limits.high
-        assert value_of(taken, name) == value
+        assert attrgetter(name)(taken) == value

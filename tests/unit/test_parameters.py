@@ -2,6 +2,7 @@
 
 import math
 import re
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +15,20 @@ from firmware_py.description.toml_text import to_toml
 REGISTRY = dict(registry())
 
 
-def value_of(parameters: Parameters, name: str) -> Any:
-    group, _, field = name.partition(".")
-    return getattr(getattr(parameters, group), field)
-
-
 @pytest.mark.parametrize(("name", "limits"), REGISTRY.items(), ids=REGISTRY.keys())
 def test_every_tunable_is_bounded_and_explained(name: str, limits: Limits) -> None:
     assert limits.help
     if limits.choices:
-        assert value_of(Parameters(), name) in limits.choices
+        assert attrgetter(name)(Parameters()) in limits.choices
     else:
         assert math.isfinite(limits.low) and limits.low < limits.high < math.inf
-        assert limits.low <= value_of(Parameters(), name) <= limits.high
+        assert limits.low <= attrgetter(name)(Parameters()) <= limits.high
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_every_shipped_set_is_within_its_bounds(name: str) -> None:
     for key, limits in REGISTRY.items():
-        value = value_of(CONTROLLERS[name], key)
+        value = attrgetter(key)(CONTROLLERS[name])
         assert value in limits.choices if limits.choices else limits.low <= value <= limits.high
 
 
@@ -60,7 +56,7 @@ def test_word_is_replaced_by_a_permitted_word() -> None:
 def test_bound_of_every_tunable_is_permitted_and_beyond_is_not(name: str) -> None:
     limits = REGISTRY[name]
     for bound, beyond in ((limits.low, -math.inf), (limits.high, math.inf)):
-        assert value_of(Parameters().replace(name, bound), name) == bound
+        assert attrgetter(name)(Parameters().replace(name, bound)) == bound
         for wrong in (math.nextafter(bound, beyond), beyond, math.nan):
             with pytest.raises(DescriptionError, match=rf"parameter {name}: .* is out of range; permitted: "):
                 Parameters().replace(name, wrong)
@@ -69,9 +65,9 @@ def test_bound_of_every_tunable_is_permitted_and_beyond_is_not(name: str) -> Non
 def test_whole_number_becomes_what_the_tunable_is() -> None:
     """An int where a float was makes compiled functions of the tick refuse their arguments, in flight."""
     for name in ("control.attitude_bandwidth", "docking.current_threshold_ma", "failsafes.leak_action"):
-        kind = type(value_of(Parameters(), name))
+        kind = type(attrgetter(name)(Parameters()))
         for value in (2, 2.0):
-            assert type(value_of(Parameters().replace(name, value), name)) is kind
+            assert type(attrgetter(name)(Parameters().replace(name, value))) is kind
 
 
 @pytest.mark.parametrize("wrong", ["fast", 3, ""])
