@@ -101,12 +101,6 @@ class Guest:
         words = ["ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=60", "-p", str(self.port), *self.options]
         return subprocess.run([*words, "robot@127.0.0.1", script], capture_output=True, text=True, check=check)
 
-    def copy_in(self, folder: Path, place: str) -> None:
-        """A folder's content into a folder there."""
-        tar = subprocess.run(["tar", "-C", folder, "-c", "."], capture_output=True, check=True).stdout
-        words = ["ssh", "-o", "BatchMode=yes", "-p", str(self.port), *self.options, "robot@127.0.0.1"]
-        subprocess.run([*words, f"mkdir -p {place} && tar -C {place} -x"], input=tar, check=True)
-
     def flash_words(self, python: str, checkout: Path, *more: str) -> Sequence[Any]:
         """The command line of flash.py for this machine."""
         patience = ("ConnectTimeout=120", "ServerAliveInterval=60")

@@ -1,9 +1,14 @@
-"""Fixtures of several files: the ground side's world, which a file that has one of its own keeps, and what the command line refuses."""
+"""Fixtures of several files: the ground side's world, which a file that has one of its own keeps, a lone module, and what the
+command line refuses.
+"""
 
 from collections.abc import Callable
 
 import pytest
 
+from firmware_py.core.body import Body
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.ground_world import Client, World
 
 
@@ -15,6 +20,12 @@ def world() -> World:
 @pytest.fixture
 def client(world: World) -> Client:
     return world.client()
+
+
+@pytest.fixture(scope="session")
+def body() -> Body:
+    """That of one module; a file that has others asks for its own."""
+    return assemble_vehicle(load_vehicle("modcube"))
 
 
 @pytest.fixture

@@ -16,12 +16,6 @@ from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.estimated_robot import DELAY_TICKS, NOTHING, P_WB, PERIOD, Q_WB, P, Robot, assert_rests, holding, sensors, tag, world
 
-
-@pytest.fixture(scope="module")
-def body() -> Body:
-    return assemble_vehicle(load_vehicle("modcube"))
-
-
 # ---------------------------------------------------------------- from nothing to a pose
 
 

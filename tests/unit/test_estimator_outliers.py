@@ -9,14 +9,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.estimator import READY_AFTER, RESET_AFTER
 from firmware_py.core.rotations import exp, multiply
 from firmware_py.core.types import Estimate
-from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.estimated_robot import DELAY_TICKS, P_WB, PERIOD, Q_WB, Robot, assert_rests, sensors, tag
-
-
-@pytest.fixture(scope="module")
-def body() -> Body:
-    return assemble_vehicle(load_vehicle("modcube"))
 
 
 def test_tag_that_jumps_is_refused_and_moves_nothing(body: Body) -> None:

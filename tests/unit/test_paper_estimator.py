@@ -10,32 +10,17 @@ from firmware_py.core.body import Body
 from firmware_py.core.estimator import READY_AFTER, RESET_AFTER
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.propagation import ERRORS
-from firmware_py.core.rotations import difference, exp, from_euler, multiply
+from firmware_py.core.rotations import difference, exp, multiply
 from firmware_py.core.topology import PARTED_SIGMA, part_of
-from firmware_py.core.types import BodyPose, Estimate, Measured
+from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.parameters import Estimation
-from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.assembly import assemble_vehicle
+from tests.unit.estimated_robot import NOTHING, P_WB, PERIOD, Q_WB, tag, world
 
-PERIOD = 10_000_000
-P_WB = np.array([1.0, -0.5, 0.8])
-Q_WB = from_euler(0.2, -0.4, 1.0)
-R_WB = Rotation.from_quat(Q_WB[[1, 2, 3, 0]])
-LEVER = np.array([0.0, 0.0, -0.105])
 PAPER = replace(Estimation(), kind="paper")
 
 
-@pytest.fixture(scope="module")
-def body() -> Body:
-    return assemble_vehicle(load_vehicle("modcube"))
-
-
 def seen(capture_ns: int, p_wb: np.ndarray = P_WB, q_wb: np.ndarray = Q_WB) -> Measured:
-    turn = Rotation.from_quat(q_wb[[1, 2, 3, 0]])
-    return Measured(None, None, None, [BodyPose(capture_ns, p_wb + turn.apply(LEVER), LEVER, q_wb, 1)])
-
-
-NOTHING = Measured(None, None, None, [])
+    return NOTHING._replace(tags=[tag(capture_ns, p_wb, q_wb)])
 
 
 def run(body: Body, velocity_w: np.ndarray, ticks: int) -> tuple[Estimate, np.ndarray]:
@@ -51,7 +36,7 @@ def test_paper_estimator_follows_a_steady_run(body: Body) -> None:
     velocity_w = np.array([0.1, -0.2, 0.05])
     estimate, p = run(body, velocity_w, 1000)
     np.testing.assert_allclose(estimate.p_wb, p, atol=1e-4)
-    np.testing.assert_allclose(R_WB.apply(estimate.nu[:3]), velocity_w, atol=1e-3)
+    np.testing.assert_allclose(world(Q_WB).apply(estimate.nu[:3]), velocity_w, atol=1e-3)
     assert estimate.ready
 
 

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from firmware_py.core import rotations
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.schema import DescriptionError, frozen_array
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
 from firmware_py.prepare import lattice as controllers_lattice
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.projected_area import areas_and_centroids, box
@@ -17,13 +17,11 @@ from hil.plant import shelter
 from hil.plant.draw import skew, stream
 from hil.plant.lattice import QUATERNIONS, is_connected, place
 from hil.plant.polycube import grow
-from hil.plant.spec import CALM, Tank, WorldSpec
+from hil.plant.spec import CALM, WorldSpec
 from hil.plant.world import STEP_NS, Start, World
 from hil.scenario import Scenario, load_scenario, make_world
+from tests.unit.plant_docks import OCEAN, PERIOD_NS, VEHICLE
 
-PERIOD_NS = 10_000_000
-OCEAN = Tank(kind="box", size_m=np.array([900.0, 900.0, 900.0]))
-VEHICLE = load_vehicle("modcube")
 UNEVEN = dataclasses.replace(
     VEHICLE,
     inertial=dataclasses.replace(

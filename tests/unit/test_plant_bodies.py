@@ -13,10 +13,8 @@ from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.plant import drag
 from hil.plant.spec import CALM, Tank, WorldSpec
 from hil.plant.world import Start, World
+from tests.unit.plant_docks import LEVEL, OCEAN, PERIOD_NS
 
-PERIOD_NS = 10_000_000
-LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
-OCEAN = Tank(kind="box", size_m=np.array([900.0, 900.0, 900.0]))
 UNEVEN = np.array([3.0, 9.0, 6.0, 0.01, 0.03, 0.02])
 
 

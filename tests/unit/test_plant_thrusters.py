@@ -15,10 +15,8 @@ from hil.plant.spec import CALM, Tank, WorldSpec
 from hil.plant.water import Gusts
 from hil.plant.world import Start, World
 from hil.scenario import load_scenario, make_world
+from tests.unit.plant_docks import LEVEL, OCEAN, PERIOD_NS
 
-PERIOD_NS = 10_000_000
-LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
-OCEAN = Tank(kind="box", size_m=np.array([900.0, 900.0, 900.0]))
 CURVE = load_vehicle("modcube").curve
 
 
