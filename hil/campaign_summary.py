@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 from typing import Any
@@ -29,15 +30,12 @@ def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
     """The content of campaign.json. Success has Wilson's interval, a median that of its order statistics."""
     succeeded = sum(bool(trial["passed"]) for trial in trials)
     interval = scipy.stats.binomtest(succeeded, len(trials)).proportion_ci(CONFIDENCE, method="wilson")
-    outcomes: dict[str, int] = {}
-    for trial in trials:
-        outcomes[trial["outcome"]] = outcomes.get(trial["outcome"], 0) + 1
     worst = sorted(trials, key=_goodness)[:WORST]
     return {
         "scenario": scenario,
         "trials": len(trials),
         "succeeded": succeeded,
-        "outcomes": outcomes,
+        "outcomes": dict(Counter(trial["outcome"] for trial in trials)),
         "confidence_interval": [interval.low, interval.high],
         "metrics": {name: _spread(_known(trials, "metrics", name)) for name in _names(trials, "metrics")},
         "sensitivities": sensitivities(trials),

@@ -5,6 +5,7 @@ Runs before a body is needed (start, or when docking is requested); the tick onl
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -34,7 +35,6 @@ def assemble(
     modules: Sequence[int] | None = None,
     pitch_m: float = PITCH_M,
     cache: DragCache | None = None,
-    name: str = "",
 ) -> Body:
     """One rigid body out of docked modules.
 
@@ -47,7 +47,6 @@ def assemble(
         modules: (m,) fleet indices; 0, 1, ... when left out.
         pitch_m: lattice pitch.
         cache: kept drag outlines.
-        name: for people; made of the vehicle names when left out.
 
     Raises:
         DescriptionError: too many modules, two in one cell, a probe that meets no drogue, or no joint that leads to a
@@ -59,12 +58,12 @@ def assemble(
         raise DescriptionError(f"a body has 1 to {MOST_MODULES} modules with cell, rotation and vehicle, not {count}")
     placements = place(cells, rotation, vehicles)
     check_joints(placements, modules, pitch_m)
-    return _body(placements, modules, pitch_m, cache, name or _name(placements))
+    return _body(placements, modules, pitch_m, cache)
 
 
-def assemble_vehicle(vehicle: Vehicle, cache: DragCache | None = None) -> Body:
+def assemble_vehicle(vehicle: Vehicle) -> Body:
     """The body that one module is on its own."""
-    return assemble([(0, 0, 0)], [0], [vehicle], cache=cache, name=vehicle.name)
+    return assemble([(0, 0, 0)], [0], [vehicle])
 
 
 def assemble_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> list[Body]:
@@ -108,22 +107,18 @@ def place(
 
 
 def _name(placements: Sequence[Placement]) -> str:
-    counts: dict[str, int] = {}
-    for placement in placements:
-        counts[placement.vehicle.name] = counts.get(placement.vehicle.name, 0) + 1
+    counts = Counter(placement.vehicle.name for placement in placements)
     return " + ".join(n if c == 1 else f"{c} x {n}" for n, c in counts.items())
 
 
-def _body(
-    placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: float, cache: DragCache | None, name: str
-) -> Body:
+def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: float, cache: DragCache | None) -> Body:
     balance = Balance.of(placements, pitch_m)
     r_bm = balance.r_bm
     q_bm = np.array([QUATERNIONS[p.rotation] for p in placements])
     mass = _mass_matrix(balance, placements)
     tags = [(k, tag) for k, p in enumerate(placements) for tag in p.vehicle.tag]
     return Body(
-        name=name,
+        name=_name(placements),
         modules=modules,
         cells=np.array([p.cell for p in placements], dtype=np.int64),
         faces=tuple(p.vehicle.faces for p in placements),

@@ -261,7 +261,7 @@ def test_kept_table_equals_the_one_built(modcube: Vehicle, cache: DragCache) -> 
 def test_coefficients_and_masses_do_not_make_new_entries(modcube: Vehicle, cache: DragCache) -> None:
     other = dataclasses.replace(modcube, drag=dataclasses.replace(modcube.drag, cd_face=0.9))
     for vehicle in (modcube, other):
-        assemble_vehicle(vehicle, cache=cache)
+        assemble([(0, 0, 0)], [0], [vehicle], cache=cache)
     assert len(list(cache.folder.iterdir())) == 1
 
 
@@ -286,7 +286,7 @@ def test_damaged_or_older_file_is_rebuilt_never_believed(damage: str, modcube: V
 def test_body_is_built_without_a_folder_that_can_be_written(modcube: Vehicle, tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
-    body = assemble_vehicle(modcube, cache=DragCache(blocked / "drag"))
+    body = assemble([(0, 0, 0)], [0], [modcube], cache=DragCache(blocked / "drag"))
     np.testing.assert_array_equal(body.drag.nodes, assemble_vehicle(modcube).drag.nodes)
 
 
