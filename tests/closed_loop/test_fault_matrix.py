@@ -77,8 +77,8 @@ def test_campaign_writes_every_cell_with_its_promise(tmp_path: Path, monkeypatch
 
 
 def test_matrix_names_what_was_broken(capsys: pytest.CaptureFixture[str]) -> None:
-    kept, broken = ("as before", ()), ("AUTO 1.00 s", ("ended in AUTO, not SURFACE",))
-    print_faults([Cell("leak", mode, *what, "surfaces") for mode, what in (("AUTO", kept), ("POSHOLD", broken))])
+    kept = Cell("leak", "AUTO", "as before", (), "surfaces")
+    print_faults([kept, Cell("leak", "POSHOLD", "AUTO 1.00 s", ("ended in AUTO, not SURFACE",), "surfaces")])
     said = capsys.readouterr().out
     assert "FAILED: leak, POSHOLD: ended in AUTO, not SURFACE" in said
     assert "1 of 2 cells kept their promise" in said

@@ -40,7 +40,7 @@ def test_heavy_bluerov_flies_the_same_spiral_a_hand_from_the_walls(fly: Fly, see
 
 def test_scenario_says_what_the_issue_asks_of_the_spiral() -> None:
     scenario = load_scenario("spiral")
-    limits = {check.metric: check.high for check in scenario.checks}
+    limits = {check.metric: check.high for check in scenario.check}
     assert limits["position_rmse_m"] <= WORST_SEED_LIMIT_M
     assert limits["attitude_rmse_rad"] <= ATTITUDE_LIMIT_RAD
     assert scenario.tank.size_m.tolist() == [1.3, 1.2, 0.76]
