@@ -14,9 +14,9 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Part, Prepared
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
-from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan
+from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan, module_in
 from firmware_py.core.docking_traffic import Traffic, thirds_of
-from firmware_py.core.docking_way import obstacle, to_one_place
+from firmware_py.core.docking_way import WAY_SLACK, first_met, obstacle, to_one_place, way_of_piece
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
@@ -360,12 +360,21 @@ class DockingStage:
             self._end(whole, decisions)
             return
         self.relays.switch(RELAY_OFF, *plan.opens)
-        estimate = estimates[whole][1]
-        away_w = rotate(estimate.q_wb, plan.axis_b) * self._p.standoff_m
-        stays, leaves = undock.chains
-        decisions.parts.append(Part(whole, stays, leaves, away_w))
+        decisions.parts.append(self._part(undock, whole, estimates))
         self._undocks.remove(undock)
         self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
+
+    def _part(self, undock: Undock, whole: int, estimates: Estimated) -> Part:
+        """The one that leaves glides away; where that would bring it to a third body, the other goes the other way; else neither does."""
+        (body, at), plan, (stays, leaves) = estimates[whole], undock.plan, undock.chains
+        thirds = thirds_of(estimates, whole) if at.placed else []
+        (near_m, _), (far_m, _) = (module_in(body, module) for module in (plan.opens[0].target_module, plan.opens[0].module))
+        pitch_m = float(np.linalg.norm(far_m - near_m))
+        away_w = rotate(at.q_wb, plan.axis_b) * self._p.standoff_m
+        for piece, rest, goes, by_w in ((plan.leaves, stays, leaves, away_w), (plan.stays, leaves, stays, -away_w)):
+            if first_met(way_of_piece(piece, body, at, by_w, pitch_m), thirds, WAY_SLACK * self._p.standoff_m) is None:
+                return Part(whole, rest, goes, by_w)
+        return Part(whole, stays, leaves, np.zeros(3))
 
     def _call_off(self, undock: Undock) -> None:
         """Ends an undock before its end: magnets pull again where there still is a joint, and let go where another has undone it."""

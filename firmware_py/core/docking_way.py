@@ -74,6 +74,16 @@ def way_of_target(plan: DockPlan, active: Way, target: Body, target_at: Estimate
     return Way(target, target_at.p_wb, target_at.q_wb, target_at.p_wb + met_w, target_at.q_wb, active.pitch_m)
 
 
+def way_of_piece(piece: Body, whole: Body, at: Estimate, by_w: np.ndarray, pitch_m: float) -> Way:
+    """Of a piece of a body, by so much (3,), world, m, from where the body holds it."""
+    module = piece.modules[0]
+    p_w, q_w = pose_of(at, *module_in(whole, module))
+    r_b, q_b = module_in(piece, module)
+    q_wb = normalise(multiply(q_w, conjugate(q_b)))
+    p_wb = p_w - rotate(q_wb, r_b)
+    return Way(piece, p_wb, q_wb, p_wb + by_w, q_wb, pitch_m)
+
+
 def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near: Sequence[int] = BOTH_ENDS) -> int | None:
     """Module of the other body that a way comes nearest to, and too near; None: none.
 

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from firmware_py.core.docking_decisions import Decisions, Join
+from firmware_py.core.rotations import rotate
+from firmware_py.core.transitions import State
 from firmware_py.core.types import RELAY_PUSH, Action, DockRequest, Mode, ModuleInputs, Request
 from firmware_py.core.undocking import IN_PLACE, PULLED
 from firmware_py.description.parameters import Parameters
-from tests.unit.tanks import RING, Docked
+from firmware_py.prepare.assembly import PITCH_M
+from tests.unit.tanks import RING, Docked, world
 
 
 @pytest.mark.parametrize("stop", ["e-stop", "DISARM", "mode"])
@@ -44,6 +47,26 @@ def test_undock_under_way_goes_on_when_what_is_asked_for_meanwhile_is_refused(bo
     tank.run(2.0, Request(Action.UNDOCK if refused.target_module < 3 else Action.DOCK, body, refused))
     assert tank.when("dock refused")
     assert tank.shape == [(0, 1), (2,), (3,)]
+
+
+@pytest.mark.parametrize(("ahead", "behind", "glides"), [(False, False, 1), (True, False, 0), (False, True, 1), (True, True, None)])
+def test_what_is_undocked_glides_to_no_third_body(ahead: bool, behind: bool, glides: int | None) -> None:
+    """A chain of three was taken apart: the middle one, sent away from the last, went to stand against the first, and they pressed."""
+    tank = Docked([(0, 0, 0), (1, 0, 0)] * 3, each=2)
+    standoff_m = Parameters().docking.standoff_m
+    along_w = world(tank.states[0]).apply([2.0 * PITCH_M + standoff_m, 0.0, 0.0])
+    for n, is_there, way in (1, ahead, 1.0), (2, behind, -1.0):
+        tank.states[n][:3] = tank.states[0][:3] + way * (along_w if is_there else 3.0 * along_w)
+    tank.run(0.5)
+    records = tank.run(1.0, *(Request(Action.ARM, body.index) for body in tank.bodies)).records
+    assert [record.state for record in records] == [State.ARMED] * 3
+    half_w = rotate(records[0].setpoint.q_wb, np.array([0.5 * PITCH_M, 0.0, 0.0]))
+    held = [records[0].setpoint.p_wb - half_w, records[0].setpoint.p_wb + half_w]
+    tank.run(4.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    assert tank.shape == [(0,), (1,), (2, 3), (4, 5)]
+    holds = [chain.guidance._held().p_wb for chain in tank.pipeline.formation.chains[:2]]
+    gone_m = np.linalg.norm(np.array(holds) - held, axis=1)
+    assert gone_m == pytest.approx([standoff_m * (module == glides) for module in (0, 1)], abs=0.01)
 
 
 @pytest.mark.slow
