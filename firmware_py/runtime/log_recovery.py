@@ -1,6 +1,6 @@
 """Mends a log that kill -9 or a pulled plug has torn, or that is damaged: keeps the whole ticks before it, and closes both files.
 
-What was torn stays beside it, as `NAME.torn`.
+What was torn stays beside it, as `NAME.torn`, and where that is taken, as `NAME.torn2`, ....
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import fcntl
 import os
 import shutil
 from collections.abc import Callable
+from itertools import chain, count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,21 +36,27 @@ def recover(folder: Path) -> Recovery:
     """Mends the log in `folder`. Raises LogError where no tick of it is whole or its flight goes on, and OSError."""
     log = FlightLog(folder)
     _refuse_in_flight(folder)
-    count, last_ns = 0, 0
+    ticks, last_ns = 0, 0
     for logged in log.ticks():
-        count, last_ns = count + 1, logged.time_ns
+        ticks, last_ns = ticks + 1, logged.time_ns
     if not log.torn:
-        return Recovery(count, "")
-    if not count:
+        return Recovery(ticks, "")
+    if not ticks:
         raise LogError(f"{folder}: no tick of the log is whole")
     mended = {name: folder / f"{name}.mended" for name in (CAN_LOG, SIGNAL_LOG)}
     _cut_frames(folder / CAN_LOG, mended[CAN_LOG], candump_stamp(last_ns))
     rewrite(folder / SIGNAL_LOG, mended[SIGNAL_LOG], lambda topic, message: message.log_time <= last_ns)
     for name, path in mended.items():
         shutil.copystat(folder / name, path)  # by its time `app.last_flight` knows how long ago the flight was
-        os.replace(folder / name, folder / f"{name}{TORN}")
+        os.replace(folder / name, _free_name(folder / f"{name}{TORN}"))
         os.replace(path, folder / name)
-    return Recovery(count, log.torn)
+    return Recovery(ticks, log.torn)
+
+
+def _free_name(path: Path) -> Path:
+    """`path`, or with the first number behind it where nothing is yet: what an earlier mend set aside is the only whole copy."""
+    numbered = (path.with_name(f"{path.name}{number}") for number in count(2))
+    return next(each for each in chain([path], numbered) if not each.exists())
 
 
 def _refuse_in_flight(folder: Path) -> None:

@@ -99,6 +99,15 @@ def test_torn_log_is_read_up_to_the_tear_and_mended(log: Path, seed: int) -> Non
     assert recover(log) == (len(ticks), "")
 
 
+def test_log_that_is_torn_again_keeps_what_the_first_mend_set_aside(log: Path) -> None:
+    aside = {}
+    for share, behind in ((0.9, ".torn"), (0.8, ".torn2"), (0.7, ".torn3")):
+        tear(log / CAN_LOG, share)
+        aside |= {f"{name}{behind}": (log / name).read_bytes() for name in (CAN_LOG, SIGNAL_LOG)}
+        assert recover(log).torn
+    assert {path.name: path.read_bytes() for path in log.glob("*.torn*")} == aside
+
+
 @pytest.mark.parametrize("fill", [b"\0", b"\xff", b"\n", b"\r", b"7"])
 @pytest.mark.parametrize("begin", [100_000, 100_017])
 def test_can_log_with_a_spoilt_block_is_read_up_to_it_and_mended(log: Path, fill: bytes, begin: int) -> None:
