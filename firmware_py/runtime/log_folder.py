@@ -31,7 +31,7 @@ def log_folders(out: Path) -> list[Path]:
 
 def _numbers(out: Path) -> list[int]:
     """Of the logs under `out`, whose own is the first."""
-    if not out.exists():
+    if not out.is_dir():
         return []
     names = [path.name for path in out.iterdir()]
     numbers = [int(name) for name in names if len(name) >= _DIGITS and name.isdecimal()]

@@ -127,10 +127,11 @@ def test_folder_that_cannot_be_made_is_refused(tmp_path: Path, refusal: Callable
     assert str(file) in refusal("hil", "run", "hover", "--out", str(file / "run"))
 
 
-def test_folder_that_is_a_file_is_refused_with_what_is_needed(tmp_path: Path, refusal: Callable[..., str]) -> None:
+@pytest.mark.parametrize("command", [["hil", "run", "hover"], ["run", "--bus", "virtual:out-is-a-file"]], ids=["hil run", "run"])
+def test_folder_that_is_a_file_is_refused_with_what_is_needed(command: list[str], tmp_path: Path, refusal: Callable[..., str]) -> None:
     file = tmp_path / "README.md"
     file.touch()
-    line = refusal("hil", "run", "hover", "--out", str(file))
+    line = refusal(*command, "--out", str(file))
     assert line == f"modcube: {file}: is a file; a folder is needed"
 
 
