@@ -267,8 +267,14 @@ def open_link(address: str) -> Link:
             number = _number(address, port, _LAST_PORT, f"{kind}:HOST:PORT, as {kind}:{LOOPBACK}:14550, and behind it at most one +trusted")
             return TcpLink(host or LOOPBACK, number) if kind == "tcpin" else UdpLink(host or LOOPBACK, number, kind == "udpin")
     except (OSError, ValueError, OverflowError) as error:
-        raise LinkError(f"link {address}: cannot be opened: {error}") from None
+        raise LinkError(f"link {address}: cannot be opened: {_reason(error)}") from None
     raise LinkError(f"link {address}: unknown; there are udpin:, udpout:, tcpin:HOST:PORT and /dev/NAME,BAUD")
+
+
+def _reason(error: Exception) -> str:
+    """In the system's words alone. Those of the resolver of names have numbers below 0, and their words in the error."""
+    number = getattr(error, "errno", None) or 0
+    return os.strerror(number) if number > 0 else getattr(error, "strerror", None) or str(error)
 
 
 def _number(address: str, text: str, most: int, right: str) -> int:
