@@ -26,10 +26,16 @@ def firmware_of(configuration: Mapping[str, Any], source: str, worker: Worker | 
     missing = [key for key in ("fleet", "parameters", "vehicles") if key not in configuration]
     if missing:
         raise DescriptionError(f"{source}: its configuration has no {', '.join(missing)}; this version's logs have them")
+    return compose(*_described(configuration, source), worker)
+
+
+def _described(configuration: Mapping[str, Any], source: str) -> tuple[Fleet, Parameters, dict[str, Vehicle]]:
     text = Source(source, "")
-    fleet: Fleet = build(Fleet, configuration["fleet"], text, ("fleet",))
-    parameters: Parameters = build(Parameters, configuration["parameters"], text, ("parameters",))
-    vehicles: dict[str, Vehicle] = {
-        name: build(Vehicle, table, text, ("vehicles", name)) for name, table in configuration["vehicles"].items()
-    }
-    return compose(fleet, parameters, vehicles, worker)
+    try:
+        fleet: Fleet = build(Fleet, configuration["fleet"], text, ("fleet",))
+        parameters: Parameters = build(Parameters, configuration["parameters"], text, ("parameters",))
+        vehicles = {name: build(Vehicle, table, text, ("vehicles", name)) for name, table in configuration["vehicles"].items()}
+    except DescriptionError as error:
+        what = str(error).removeprefix(f"{source}:1: ")  # a log has no lines to go to
+        raise DescriptionError(f"{source}: its configuration is of another version of modcube: {what}") from None
+    return fleet, parameters, vehicles

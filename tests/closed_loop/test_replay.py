@@ -136,6 +136,13 @@ def test_log_that_does_not_say_what_flew_is_refused(tmp_path: Path) -> None:
         replay(tmp_path)
 
 
+def test_log_of_another_version_is_refused_as_one_and_names_no_line(tmp_path: Path) -> None:
+    Recorder(tmp_path, {"fleet": {"buses": ["virtual:x"], "spin": 1}, "parameters": {}, "vehicles": {}}).close()
+    with pytest.raises(DescriptionError) as error:
+        replay(tmp_path)
+    assert str(error.value).startswith(f"{tmp_path}: its configuration is of another version of modcube: fleet.spin: unknown key; ")
+
+
 def test_logs_of_two_flights_are_not_taken_for_one(log: Path) -> None:
     lines = (log / CAN_LOG).read_text().splitlines(True)
     (log / CAN_LOG).write_text("".join(lines[100:]))
