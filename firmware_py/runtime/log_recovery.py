@@ -9,7 +9,7 @@ import fcntl
 import os
 import shutil
 from collections.abc import Callable
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,8 +55,8 @@ def recover(folder: Path) -> Recovery:
 
 def _free_name(path: Path) -> Path:
     """`path`, or with the first number behind it where nothing is yet: what an earlier mend set aside is the only whole copy."""
-    numbered = (path.with_name(f"{path.name}{number}") for number in count(2))
-    return next(each for each in chain([path], numbered) if not each.exists())
+    names = (path.with_name(f"{path.name}{number if number > 1 else ''}") for number in count(1))
+    return next(each for each in names if not each.exists())
 
 
 def _refuse_in_flight(folder: Path) -> None:
