@@ -77,11 +77,6 @@ def _pose_consistent(q: Question) -> str:
     return ""
 
 
-def _still(q: Question) -> str:
-    permitted, rate = q.parameters.supervision.arm_rate_rad_s, q.health.rate_rad_s
-    return "" if rate <= permitted else f"turns at {rate:.1f} rad/s, {permitted:.1f} permitted"
-
-
 def _sticks(q: Question) -> str:
     steering, age_s = q.parameters.steering, q.health.pilot_age_s
     if age_s <= steering.stick_timeout_s and q.health.stick > steering.stick_dead:
@@ -137,7 +132,6 @@ CHECKS = (
     Check("pose fresh", _pose_fresh, True),
     Check("pose sure", _pose_sure, True),
     Check("pose consistent", _pose_consistent, True),
-    Check("body does not tumble", _still, True),
     Check("battery and cabin known", _readings, True),
     Check("modules fit", _fit, True),
     Check("every ESC answers", _escs, True),

@@ -106,8 +106,6 @@ class Health(NamedTuple):
     """Modules of each joint that is open though it should hold."""
     push_m_s: float = 0.0
     """Speed of the current that would push the body sideways as hard as is believed, root of the mean square of a second."""
-    rate_rad_s: float = 0.0
-    """At which the body turns."""
 
     @property
     def unseen_push_m_s(self) -> float:
@@ -270,7 +268,6 @@ class HealthMonitor:
             battery_age_s=(now - min(self._read_ns["battery"])) * 1e-9,
             cabin_age_s=(now - min(self._read_ns["cabin"])) * 1e-9,
             push_m_s=math.sqrt(self._push_m2_s2),
-            rate_rad_s=math.hypot(*estimate.nu[3:].tolist()),
         )
         return self.now
 

@@ -169,9 +169,6 @@ class Supervision:
     arm_sigma_m: float = quantity(
         0.05, unit="m", low=1e-3, high=10, help="largest position sigma to arm with", mavlink="ARM_SIGMA"
     )
-    arm_rate_rad_s: float = quantity(
-        1.0, unit="rad/s", low=0.05, high=100, help="fastest turning to arm with; a current may carry it at any speed", mavlink="ARM_RATE"
-    )
     answer_ms: float = quantity(
         200.0,
         unit="ms",

@@ -17,7 +17,7 @@ from firmware_py.description.parameters import Parameters
 from hil.bench import Bench, open_bench
 from hil.fuzz import fuzz_flight
 from hil.plant.fault_spec import Fault
-from hil.safety import ICM_20602, command_outlives_frames_ms, fly_to_estop, hover_blind, spiral_through_loss, spiral_with
+from hil.safety import ICM_20602, command_outlives_frames_ms, flown, fly_to_estop, hover_blind, spiral_through_loss, spiral_with, timed
 from hil.scenario import load_scenario
 
 TICK_MS = 10.0
@@ -61,6 +61,14 @@ def test_pair_without_which_yaw_is_lost_keeps_the_place_and_surfaces() -> None:
 def test_healthy_spiral_blames_no_thruster() -> None:
     flight = spiral_with([], seed=7)
     assert (flight.blamed, flight.ends_in) == ((), "AUTO")
+
+
+@pytest.mark.slow
+def test_module_that_turns_over_while_nobody_drives_it_is_armed_and_comes_to_rest() -> None:
+    """This one does not float upright: to wait until it is still would be to wait until it shows no tag."""
+    turning = np.linalg.norm(flown(timed("hover-blind", 3.0, 2.0), 41).firmware["nu"][:, 3:], axis=1)
+    assert turning[:110].max() > 1.0
+    assert turning[-50:].max() < 0.1
 
 
 @pytest.mark.slow

@@ -414,7 +414,3 @@ def test_push_is_known_to_a_body_that_two_have_become() -> None:
     joined.time_ns = ear.time_ns
     joined.monitor.take_over([ear.monitor, other.monitor])
     assert joined.hear(force_w=np.array([8.0, 0.0, 0.0])).push_m_s == pytest.approx(math.sqrt(8.0 / BODY.drag.mean), rel=1e-3)
-
-
-def test_rate_of_turning_is_that_about_all_axes_and_speed_is_none() -> None:
-    assert Ear().hear(nu=np.array([5.0, 5.0, 5.0, 0.3, -0.4, 1.2])).rate_rad_s == pytest.approx(1.3)
