@@ -14,9 +14,9 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Part, Prepared
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
-from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan, module_in
+from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan
 from firmware_py.core.docking_traffic import Traffic, thirds_of
-from firmware_py.core.docking_way import WAY_SLACK, first_met, obstacle, to_one_place, way_of_piece
+from firmware_py.core.docking_way import first_met, obstacle, to_one_place, way_of_piece
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
@@ -368,11 +368,9 @@ class DockingStage:
         """The one that leaves glides away; where that would bring it to a third body, the other goes the other way; else neither does."""
         (body, at), plan, (stays, leaves) = estimates[whole], undock.plan, undock.chains
         thirds = thirds_of(estimates, whole) if at.placed else []
-        (near_m, _), (far_m, _) = (module_in(body, module) for module in (plan.opens[0].target_module, plan.opens[0].module))
-        pitch_m = float(np.linalg.norm(far_m - near_m))
         away_w = rotate(at.q_wb, plan.axis_b) * self._p.standoff_m
         for piece, rest, goes, by_w in ((plan.leaves, stays, leaves, away_w), (plan.stays, leaves, stays, -away_w)):
-            if first_met(way_of_piece(piece, body, at, by_w, pitch_m), thirds, WAY_SLACK * self._p.standoff_m) is None:
+            if first_met(way_of_piece(plan, piece, body, at, by_w), thirds, self._p) is None:
                 return Part(whole, rest, goes, by_w)
         return Part(whole, stays, leaves, np.zeros(3))
 

@@ -40,12 +40,12 @@ class Traffic:
 
     def blocked(self, sequence: DockingSequence, active: int, target: int) -> str:
         """Why a target that comes to meet the active body can come no farther; empty: it can, or it does not come."""
-        thirds, to_w, plan = thirds_of(self._estimates, active, target), sequence.meets_at_w, sequence.plan
-        if not thirds or to_w is None or target not in self._coming:
+        to_w, plan = sequence.meets_at_w, sequence.plan
+        if to_w is None or target not in self._coming:
             return ""
         body, at = self._estimates[target]
         way = Way(body, at.p_wb, at.q_wb, to_w, at.q_wb, plan.pitch_m)
-        met = first_met(way, thirds, WAY_SLACK * self._p.standoff_m)
+        met = first_met(way, thirds_of(self._estimates, active, target), self._p)
         return "" if met is None else f"module {met} is where module {plan.request.target_module} comes to meet it"
 
     def wait(self, sequence: DockingSequence, active: int, target: int, began: Wish) -> Wait | None:
@@ -57,10 +57,10 @@ class Traffic:
         thirds = thirds_of(self._estimates, active, target)
         if not thirds or sequence.stage not in AHEAD:
             return None
-        gap_m, slack_m = (self._p.standoff_m * share for share in AHEAD[sequence.stage])
+        gap, slack = AHEAD[sequence.stage]
         body, target_at = self._estimates[target]
-        way = way_of_active(sequence.plan, *self._estimates[active], body, sequence.met(target_at), gap_m)
-        met = first_met(way, thirds, slack_m)
+        way = way_of_active(sequence.plan, *self._estimates[active], body, sequence.met(target_at), gap * self._p.standoff_m)
+        met = first_met(way, thirds, self._p, slack)
         if met is None:
             return None
         makes_room = not self._awaited.isdisjoint(way.body.modules) and self._is_free(way, began, thirds)
@@ -70,7 +70,7 @@ class Traffic:
     def _is_free(self, way: Way, to: Wish, thirds: Sequence[tuple[Body, Estimate]]) -> bool:
         """Whether the body may go there from where it is."""
         assert to.p_wb is not None and to.q_wb is not None
-        return first_met(way._replace(p_end=to.p_wb, q_end=to.q_wb), thirds, WAY_SLACK * self._p.standoff_m) is None
+        return first_met(way._replace(p_end=to.p_wb, q_end=to.q_wb), thirds, self._p) is None
 
 
 def thirds_of(estimates: Estimated, *pair: int) -> list[tuple[Body, Estimate]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import Body
-from firmware_py.core.docking_sequence import DockPlan, module_in, pose_of
+from firmware_py.core.docking_sequence import DockPlan, UndockPlan, module_in, pose_of
 from firmware_py.core.rotations import V, conjugate, difference, exp, multiply, normalise, rotate, to_matrix
 from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Docking
@@ -74,9 +74,10 @@ def way_of_target(plan: DockPlan, active: Way, target: Body, target_at: Estimate
     return Way(target, target_at.p_wb, target_at.q_wb, target_at.p_wb + met_w, target_at.q_wb, active.pitch_m)
 
 
-def way_of_piece(piece: Body, whole: Body, at: Estimate, by_w: np.ndarray, pitch_m: float) -> Way:
-    """Of a piece of a body, by so much (3,), world, m, from where the body holds it."""
-    module = piece.modules[0]
+def way_of_piece(plan: UndockPlan, piece: Body, whole: Body, at: Estimate, by_w: np.ndarray) -> Way:
+    """Of a piece of a body that is undocked, by so much (3,), world, m, from where the body holds it."""
+    module, opens = piece.modules[0], plan.opens[0]
+    pitch_m = float(np.linalg.norm(module_in(whole, opens.module)[0] - module_in(whole, opens.target_module)[0]))
     p_w, q_w = pose_of(at, *module_in(whole, module))
     r_b, q_b = module_in(piece, module)
     q_wb = normalise(multiply(q_w, conjugate(q_b)))
@@ -102,9 +103,13 @@ def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near
     return other.modules[int(np.where(touching, least, np.inf).min(axis=0).argmin())] if touching.any() else None
 
 
-def first_met(way: Way, thirds: Sequence[tuple[Body, Estimate]], slack_m: float) -> int | None:
-    """A module of bodies that have nothing to do with the dock which is where a way leads, as far as is known; None: none."""
-    passes = (nearest_pass(way, body, at, slack_m, BEGINNING) for body, at in thirds if at.placed)
+def first_met(way: Way, thirds: Sequence[tuple[Body, Estimate]], p: Docking, slack: float = WAY_SLACK) -> int | None:
+    """A module of bodies that have nothing to do with the dock which is where a way leads, as far as is known; None: none.
+
+    Args:
+        slack: share of the stand-off, see WAY_SLACK.
+    """
+    passes = (nearest_pass(way, body, at, slack * p.standoff_m, BEGINNING) for body, at in thirds if at.placed)
     return next((module for module in passes if module is not None), None)
 
 
@@ -125,13 +130,13 @@ def obstacle(
     """
     if not (active[1].placed and target[1].placed):
         return ""
-    staged, slack_m = p.approach == "staged", WAY_SLACK * p.standoff_m
+    staged = p.approach == "staged"
     way = way_of_active(plan, *active, *target, p.standoff_m if staged else 0.0)
-    met = nearest_pass(way, *target, slack_m) if staged else None
-    met = first_met(way, thirds, slack_m) if met is None else met
+    met = nearest_pass(way, *target, WAY_SLACK * p.standoff_m) if staged else None
+    met = first_met(way, thirds, p) if met is None else met
     if met is not None:
         return f"on its way it would come too near to module {met}: bring it before that face first"
-    met = first_met(way_of_target(plan, way, *target), thirds, slack_m) if comes else None
+    met = first_met(way_of_target(plan, way, *target), thirds, p) if comes else None
     return "" if met is None else f"module {plan.request.target_module}, which is to meet it, would come too near to module {met}"
 
 

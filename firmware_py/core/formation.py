@@ -46,7 +46,7 @@ class Formation:
             return
         bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.chains}
         waiting, holding = (self._armed_in(mode) if inputs.prepared else [] for mode in (Mode.DOCK, Mode.POSHOLD))
-        coming = [chain.body.index for chain in self.chains if chain.guidance.comes]
+        coming = [c.body.index for c in self.chains if c.guidance.comes] if self.docking.under_way else []
         decisions = self.docking.step(inputs, bodies, waiting, holding, coming, self._resting())
         self._miss_partners(outputs, [parted.whole for parted in decisions.parts])
         outputs.docks += self.docking.records

@@ -183,7 +183,7 @@ def test_dock_says_of_each_module_once_that_it_waits_though_two_are_as_near() ->
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     met = cycle([2, 3])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("firmware_py.core.docking_traffic.first_met", lambda way, thirds, slack_m: next(met))
+        patch.setattr("firmware_py.core.docking_traffic.first_met", lambda *_: next(met))
         tank.run(0.2)
     assert [said for _, said in tank.said if "waits" in said] == [f"dock of module 1 waits: module {m} is on its way" for m in (2, 3)]
 
