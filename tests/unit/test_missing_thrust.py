@@ -124,6 +124,26 @@ def test_motion_of_a_body_whose_water_is_heavier_along_one_axis_than_along_anoth
     np.testing.assert_allclose(b.mass @ np.r_[felt, turning], tau + modelled, atol=1e-9)
 
 
+def test_a_thruster_is_not_blamed_for_a_wall_that_the_robot_leans_on() -> None:
+    """Three hundred places on its hull where something solid pushes and rubs, and thrusters that push back: six were blamed before what
+    one thruster leaves unexplained had to be noise."""
+    rng, thrusters, blamed = np.random.default_rng(8), BODY.thrusters, 0
+    for _ in range(300):
+        watch = MissingThrust(BODY, Faults(), TICK_NS)
+        watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.05
+        watch._blocks[:, FORCES:-2] = PUSH
+        axis, half = rng.integers(3), 0.105
+        place, push = rng.uniform(-half, half, 3), rng.normal(0.0, 0.3, 3)
+        place[axis], push[axis] = half, -1.0
+        push *= rng.uniform(2.0, 10.0) / np.linalg.norm(push)
+        wrench = np.r_[push, np.cross(place, push)]
+        watch._blocks[-RECENT:, :6] = wrench + 0.5 * watch._healthy[0] * rng.normal(size=6)
+        watch._blocks[-RECENT:, 6:12] = -wrench
+        watch._blocks[-RECENT:, FORCES:-2] -= thrusters.pinv @ wrench
+        blamed += watch._explain(np.ones(8, bool)) >= 0
+    assert blamed == 0
+
+
 @pytest.mark.parametrize("coriolis", [0.0, 1.0, 10.0])
 def test_a_thruster_is_not_blamed_for_a_change_that_is_small_beside_the_coriolis_wrench(coriolis: float) -> None:
     """Masses are known to a tenth, the speed through water that drifts to less: so is what both do on a fast curve."""
