@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import astuple, dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
 from firmware_py.core.rotations import rotate
-from firmware_py.core.topology import in_both
 from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
@@ -135,41 +135,50 @@ class Health(NamedTuple):
         return len(self.dead) > 0
 
 
+@dataclass(slots=True)
+class _Latest:
+    """What a new body goes on with from those before it: of every figure the largest, which is the latest or the worst."""
+
+    time_ns: int = NEVER_NS
+    """Of the last tick."""
+    imu_ns: int = NEVER_NS
+    depth_ns: int = NEVER_NS
+    depth_heard: bool = False
+    foreign_sync_ns: int = NEVER_NS
+    foreign_command_ns: int = NEVER_NS
+    ground_ns: int = NEVER_NS
+    pilot_ns: int = NEVER_NS
+    stick: float = 0.0
+    dropped_frames: int = 0
+    error_rate: float = 0.0
+    missed_rate: float = 0.0
+    push_m2_s2: float = 0.0
+
+
 class HealthMonitor:
     """Keeps the ages and means of one body."""
 
     def __init__(self, body: Body, parameters: Parameters, period_ns: int) -> None:
-        count = len(body.modules)
-        self._modules = body.modules
         self._period_ns = period_ns
-        self._nominal_v = body.nominal_v.tolist()
-        self._thruster_at = by_channel(body)
+        self._nominal_v = dict(zip(body.modules, body.nominal_v.tolist(), strict=True))
+        self._drag = body.drag.mean, float(body.drag.linear[:3].mean())
+        self._thruster_at = dict(zip(body.modules, by_channel(body), strict=True))
         self._esc_ns = [NEVER_NS] * body.thrusters.module.size
-        self._heard_ns = [0] * count
-        self._answered_ns = [NEVER_NS] * count
+        never = dict.fromkeys(body.modules, NEVER_NS)
+        self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(5))
+        self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(3))
+        self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa = (dict[int, float]() for _ in range(4))
+        self._told: tuple[dict[int, Any], ...] = (
+            self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._unfit, self._leak, self._wet,
+            self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
+        )  # fmt: skip
+        """By fleet index: what each module of the body has told last, and when."""
         self._stopped_ns: dict[int, int] = {}
         """By fleet index, when a module said last that an e-stop holds it; without those that have said since that none does."""
-        self._unfit = [False] * count
-        self._leak, self._wet, self._wet_ns = [False] * count, [False] * count, [NEVER_NS] * count
-        self._voltage_share: dict[int, float] = {}
-        self._cabin_c: dict[int, float] = {}
-        self._cabin_start_pa: dict[int, float] = {}
-        self._cabin_change_pa: dict[int, float] = {}
-        self._readings = (self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa)
-        self._read_ns = {name: [NEVER_NS] * count for name in ("battery", "cabin")}
-        self._foreign_sync_ns = self._foreign_command_ns = NEVER_NS
-        self._depth_ns = self._imu_ns = 0
-        self._depth_heard = False
-        self._ground_ns: int | None = None
-        self._pilot_ns: int | None = None
-        self._stick = 0.0
+        self._latest = _Latest()
         self._nis_ratio, self._rejected_share = 1.0, 0.0
         self._rejected, self._tag_ns = 0, NEVER_NS
         self._pictures_ns = (NEVER_NS, NEVER_NS)
-        self._errors, self._error_rate = 0, 0.0
-        self._time_ns: int | None = None
-        self._missed_rate = 0.0
-        self._drag, self._push_m2_s2 = (body.drag.mean, float(body.drag.linear[:3].mean())), 0.0
         self.now: Health
         self.imu_heard = True
         """Whether an IMU that is to be believed was heard in this tick; set by whoever watches them."""
@@ -191,72 +200,65 @@ class HealthMonitor:
         """Goes on from the bodies that this one is made of, or was part of: what each module said last, and when people were heard."""
         for other in before:
             self._stopped_ns |= other._stopped_ns
-            for i, j in in_both(self._modules, other._modules):
-                self._heard_ns[i], self._answered_ns[i] = other._heard_ns[j], other._answered_ns[j]
-                self._unfit[i] = other._unfit[j]
-                self._leak[i], self._wet[i], self._wet_ns[i] = other._leak[j], other._wet[j], other._wet_ns[j]
-                for name, times_ns in self._read_ns.items():
-                    times_ns[i] = other._read_ns[name][j]
-                for mine, theirs in zip(self._readings, other._readings, strict=True):
-                    if j in theirs:
-                        mine[i] = theirs[j]
-                for channel, thruster in self._thruster_at[i].items():
-                    self._esc_ns[thruster] = other._esc_ns[other._thruster_at[j][channel]]
-        self._depth_ns, self._imu_ns = max(other._depth_ns for other in before), max(other._imu_ns for other in before)
-        self._depth_heard = any(other._depth_heard for other in before)
-        self._foreign_sync_ns = max(other._foreign_sync_ns for other in before)
-        self._foreign_command_ns = max(other._foreign_command_ns for other in before)
-        self._time_ns = max((other._time_ns for other in before if other._time_ns is not None), default=None)
-        self._ground_ns = max((other._ground_ns for other in before if other._ground_ns is not None), default=None)
-        self._pilot_ns = max((other._pilot_ns for other in before if other._pilot_ns is not None), default=None)
-        self._stick = max(other._stick for other in before)
-        self._errors, self._error_rate = max((other._errors, other._error_rate) for other in before)
-        self._missed_rate = max(other._missed_rate for other in before)
-        self._push_m2_s2 = max(other._push_m2_s2 for other in before)
+            for mine, theirs in zip(self._told, other._told, strict=True):
+                mine |= {module: told for module, told in theirs.items() if module in self._thruster_at}
+            for module, thrusters in self._thruster_at.items():
+                for channel, thruster in other._thruster_at.get(module, {}).items():
+                    self._esc_ns[thrusters[channel]] = other._esc_ns[thruster]
+        self._latest = _Latest(*map(max, zip(*(astuple(other._latest) for other in before), strict=True)))
 
     def step(self, inputs: Inputs, estimate: Estimate, requests: list[Request], faults: ThrusterFaults) -> Health:
         """The figures of this tick; `now` keeps them."""
-        now = inputs.time_ns
-        if self._time_ns is None:  # silence counts from here
-            self._heard_ns, self._depth_ns, self._imu_ns, self._time_ns = [now] * len(self._modules), now, now, now
-        dt_s = (now - self._time_ns) * 1e-9
-        self._listen([inputs.modules[m] for m in self._modules], now)
+        now, latest = inputs.time_ns, self._latest
+        if latest.time_ns == NEVER_NS:  # silence counts from here
+            latest.time_ns = latest.depth_ns = latest.imu_ns = now
+            self._heard_ns.update(dict.fromkeys(self._heard_ns, now))
+        self._listen(inputs.modules, now)
         self._hear_stops(inputs.modules, now)
         if self.imu_heard:
-            self._imu_ns = now
+            latest.imu_ns = now
         if self.pressure_heard:
-            self._depth_ns, self._depth_heard = now, True
-        self._foreign_sync_ns = now if inputs.foreign_sync else self._foreign_sync_ns
-        self._foreign_command_ns = now if inputs.foreign_command else self._foreign_command_ns
+            latest.depth_ns, latest.depth_heard = now, True
+        if inputs.foreign_sync:
+            latest.foreign_sync_ns = now
+        if inputs.foreign_command:
+            latest.foreign_command_ns = now
         self._people(requests, now)
-        self._rates(inputs, estimate, dt_s)
-        self._time_ns = now
-        self.now = Health(
+        self._rates(inputs, estimate, (now - latest.time_ns) * 1e-9)
+        self._judge_tags(estimate, now)
+        latest.time_ns = now
+        self.now = self._figures(estimate, faults)
+        return self.now
+
+    def _figures(self, estimate: Estimate, faults: ThrusterFaults) -> Health:
+        """All that is known at the end of the tick."""
+        now, latest = self._latest.time_ns, self._latest
+        return Health(
             time_ns=now,
             ready=estimate.ready,
             tag_age_s=estimate.tag_age_ns * 1e-9,
             sigma_m=max(estimate.sigma_p.tolist()),
             nis_ratio=self._nis_ratio,
             rejected_share=self._rejected_share,
-            depth_age_s=(now - self._depth_ns) * 1e-9,
-            depth_heard=self._depth_heard,
-            imu_age_s=(now - self._imu_ns) * 1e-9,
+            depth_age_s=(now - latest.depth_ns) * 1e-9,
+            depth_heard=latest.depth_heard,
+            imu_age_s=(now - latest.imu_ns) * 1e-9,
             voltage_share=min(self._voltage_share.values(), default=math.nan),
-            leak=any(self._leak),
+            leak=any(self._leak.values()),
             cabin_c=max(self._cabin_c.values(), default=math.nan),
             cabin_change_pa=max(self._cabin_change_pa.values(), default=math.nan),
-            stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._modules or now - at <= self._answer_ns]),
-            silent=tuple([self._modules[i] for i in _older(self._answered_ns, now - self._answer_ns)]),
-            silent_s=(now - min(self._heard_ns)) * 1e-9,
-            bus_silent_s=(now - max(self._heard_ns)) * 1e-9,
+            stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._heard_ns or now - at <= self._answer_ns]),
+            silent=tuple([m for m, at in self._answered_ns.items() if now - at > self._answer_ns]),
+            silent_s=(now - min(self._heard_ns.values())) * 1e-9,
+            bus_silent_s=(now - max(self._heard_ns.values())) * 1e-9,
             esc_missing=_older(self._esc_ns, now - self._esc_fresh_ns),
-            frame_errors_per_s=self._error_rate,
-            missed_ticks_per_s=self._missed_rate,
-            foreign_sync=now - self._foreign_sync_ns <= FOREIGN_NS,
-            foreign_command=now - self._foreign_command_ns <= FOREIGN_NS,
-            ground_age_s=_age_s(self._ground_ns, now),
-            pilot_age_s=_age_s(self._pilot_ns, now),
-            stick=self._stick,
+            frame_errors_per_s=latest.error_rate,
+            missed_ticks_per_s=latest.missed_rate,
+            foreign_sync=now - latest.foreign_sync_ns <= FOREIGN_NS,
+            foreign_command=now - latest.foreign_command_ns <= FOREIGN_NS,
+            ground_age_s=_age_s(latest.ground_ns, now),
+            pilot_age_s=_age_s(latest.pilot_ns, now),
+            stick=latest.stick,
             outside_m=outside(estimate.p_wb, self._fence) if estimate.placed else math.nan,
             dead=faults.dead,
             lost_axes=faults.lost_axes,
@@ -264,15 +266,15 @@ class HealthMonitor:
             topology=self.topology,
             open_joints=self.open_joints,
             tag_gap_s=self._tag_gap_s(now),
-            unfit=tuple([m for m, unfit in zip(self._modules, self._unfit, strict=True) if unfit]),
-            battery_age_s=(now - min(self._read_ns["battery"])) * 1e-9,
-            cabin_age_s=(now - min(self._read_ns["cabin"])) * 1e-9,
-            push_m_s=math.sqrt(self._push_m2_s2),
+            unfit=tuple([m for m, unfit in self._unfit.items() if unfit]),
+            battery_age_s=(now - min(self._battery_ns.values())) * 1e-9,
+            cabin_age_s=(now - min(self._cabin_ns.values())) * 1e-9,
+            push_m_s=math.sqrt(latest.push_m2_s2),
         )
-        return self.now
 
-    def _listen(self, modules: list[ModuleInputs], now: int) -> None:
-        for index, module in enumerate(modules):
+    def _listen(self, modules: Sequence[ModuleInputs], now: int) -> None:
+        for index in self._heard_ns:
+            module = modules[index]
             if module.answered:
                 self._heard_ns[index] = self._answered_ns[index] = now
             elif module.heard:
@@ -287,12 +289,12 @@ class HealthMonitor:
                 self._leak[index] = module.leak or now - self._wet_ns[index] < DRY_NS
                 self._wet[index] = module.leak
             if module.voltage_v is not None and math.isfinite(module.voltage_v):
-                self._read_ns["battery"][index] = now
+                self._battery_ns[index] = now
                 share = module.voltage_v / self._nominal_v[index]
                 before = self._voltage_share.get(index, share)
                 self._voltage_share[index] = before + VOLTAGE_SHARE * (share - before)
             if module.cabin_temperature_c is not None and math.isfinite(module.cabin_temperature_c):
-                self._read_ns["cabin"][index] = now
+                self._cabin_ns[index] = now
                 self._cabin_c[index] = module.cabin_temperature_c
             if module.cabin_pressure_pa is not None and math.isfinite(module.cabin_pressure_pa):
                 start = self._cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
@@ -323,22 +325,25 @@ class HealthMonitor:
     def _people(self, requests: list[Request], now: int) -> None:
         for request in requests:
             if request.action == Action.GROUND_ALIVE:
-                self._ground_ns = now
+                self._latest.ground_ns = now
             elif request.action == Action.STICKS:
-                self._pilot_ns = now
-                self._stick = max(abs(value) for group in request.argument for value in group)
+                self._latest.pilot_ns = now
+                self._latest.stick = max(abs(value) for group in request.argument for value in group)
 
     def _rates(self, inputs: Inputs, estimate: Estimate, dt_s: float) -> None:
-        keep = math.exp(-dt_s / MEAN_S)
-        errors = inputs.dropped_frames - self._errors
-        self._errors = inputs.dropped_frames
-        self._error_rate = keep * self._error_rate + errors / MEAN_S
+        """Means of the last second: bad frames, missed ticks, and the push of the water."""
+        latest, keep = self._latest, math.exp(-dt_s / MEAN_S)
+        errors, latest.dropped_frames = inputs.dropped_frames - latest.dropped_frames, inputs.dropped_frames
+        latest.error_rate = keep * latest.error_rate + errors / MEAN_S
         missed = max(0, round(dt_s * 1e9 / self._period_ns) - 1)
-        self._missed_rate = keep * self._missed_rate + missed / MEAN_S
+        latest.missed_rate = keep * latest.missed_rate + missed / MEAN_S
         current_m_s = _current_m_s(*_pushed(estimate), *self._drag)
-        self._push_m2_s2 += (1.0 - keep) * (current_m_s**2 - self._push_m2_s2)
+        latest.push_m2_s2 += (1.0 - keep) * (current_m_s**2 - latest.push_m2_s2)
+
+    def _judge_tags(self, estimate: Estimate, now: int) -> None:
+        """Means over the tags of about a second: their squared innovations, and the share that was refused."""
         refused, self._rejected = estimate.rejected - self._rejected, estimate.rejected
-        before_ns, self._tag_ns = self._tag_ns, inputs.time_ns - estimate.tag_age_ns
+        before_ns, self._tag_ns = self._tag_ns, now - estimate.tag_age_ns
         taken = estimate.ready and refused == 0 and self._tag_ns > before_ns  # the paper's estimator tells of no innovations
         if estimate.nis_dof:
             self._nis_ratio += TAG_SHARE * (estimate.nis / estimate.nis_dof - self._nis_ratio)
@@ -348,8 +353,8 @@ class HealthMonitor:
             self._rejected_share += TAG_SHARE * (1.0 - self._rejected_share)
 
 
-def _age_s(at_ns: int | None, now_ns: int) -> float:
-    return math.nan if at_ns is None else (now_ns - at_ns) * 1e-9
+def _age_s(at_ns: int, now_ns: int) -> float:
+    return math.nan if at_ns == NEVER_NS else (now_ns - at_ns) * 1e-9
 
 
 def _pushed(estimate: Estimate) -> tuple[float, float]:

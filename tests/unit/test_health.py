@@ -91,9 +91,9 @@ def test_module_that_starts_or_has_a_fault_is_unfit_until_it_says_otherwise() ->
     assert ear.hear().unfit == ()
     assert ear.hear(here(mcu_state=1), here(mcu_state=5)).unfit == (3,)
     assert ear.hear(here(mcu_state=0), here()).unfit == (1, 3), "one that says nothing is as it was"
-    whole = HealthMonitor(BODY, Parameters(), TICK_NS)
-    whole.take_over([ear.monitor])
-    assert whole._unfit == [True, True]
+    whole = Ear()
+    whole.monitor.take_over([ear.monitor])
+    assert whole.hear().unfit == (1, 3)
     for state in (1, 2, 3, 4):
         assert ear.hear(here(mcu_state=state), here(mcu_state=state)).unfit == ()
 
@@ -320,9 +320,9 @@ def test_depth_is_known_from_the_first_that_is_heard() -> None:
     ear = Ear()
     assert not ear.hear(here()).depth_heard
     assert ear.hear(here(pressure_pa=1.1e5)).depth_heard and ear.hear(here()).depth_heard
-    whole = HealthMonitor(BODY, Parameters(), TICK_NS)
-    whole.take_over([HealthMonitor(BODY, Parameters(), TICK_NS), ear.monitor])
-    assert whole._depth_heard
+    whole = Ear()
+    whole.monitor.take_over([HealthMonitor(BODY, Parameters(), TICK_NS), ear.monitor])
+    assert whole.hear().depth_heard
 
 
 def test_imu_is_as_old_as_its_last_sample_that_was_believed() -> None:
