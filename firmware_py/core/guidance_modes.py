@@ -206,7 +206,7 @@ class Guidance:
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):
             self._glider.put(self._docking)
             return self._docking, ahead_of(self._docking, self._lead_s)
-        wish = self._wish(time_ns, estimate, health)
+        wish = self._wish(time_ns)
         led, self._led = self._led, self.mode == Mode.GUIDED or bool(wish.v_w.any() or wish.w_b.any())
         if self._led:  # by what somebody asks for, and the body may be held
             self._glider.put(on_leash(self._glider.at, estimate))
@@ -238,7 +238,7 @@ class Guidance:
                 self._start_ns = time_ns
         return self._start_ns is not None
 
-    def _wish(self, time_ns: int, estimate: Estimate, health: Health) -> Wish:
+    def _wish(self, time_ns: int) -> Wish:
         """Where the glider goes in this mode."""
         p, at = self._p, self._glider.at
         if self.mode == Mode.AUTO and self._trajectory is not None:

@@ -82,7 +82,7 @@ class Port:
         try:
             self._link.send(bus, frame)
         except Exception as error:  # python-can lets OSError, SerialException and its own through, by back end
-            self._failed("send", bus, error)
+            self._failed("send", error)
             return False
         return True
 
@@ -171,7 +171,7 @@ class Port:
                 else:
                     self.faults["foreign"] += 1
         except Exception as error:  # as in send; also what a back end makes of garbage
-            self._failed("receive", bus, error)
+            self._failed("receive", error)
         if not frames:
             self._look_after(bus)
         return frames
@@ -195,7 +195,7 @@ class Port:
         elif self._bus is not None and not self._link.is_same():
             self._let_go()
 
-    def _failed(self, direction: str, bus: Any, error: Exception) -> None:
+    def _failed(self, direction: str, error: Exception) -> None:
         number = error_number(error)
         if number in _GONE:
             self.faults["gone"] += 1
