@@ -15,7 +15,6 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.rotations import V
-from firmware_py.core.topology import in_both
 from firmware_py.core.types import ModuleInputs
 
 REPEATS = 10
@@ -36,67 +35,69 @@ class SensorWatch:
     """Watches the sensors of one body's modules.
 
     Attributes:
-        frozen: of each module, whether its IMU is not to be believed now.
         imu_heard, pressure_heard: whether any IMU, any pressure sensor that is to be believed gave a sample in this tick.
     """
 
     def __init__(self, modules: Sequence[int]) -> None:
-        self._modules = tuple(modules)
-        self._last: list[tuple[bytes, np.ndarray]] = [(b"", np.zeros(0))] * len(self._modules)
-        self._repeats = [0] * len(self._modules)
-        self._pressures = [(math.nan, 0)] * len(self._modules)
-        """The last one, and how often it has been repeated."""
-        self._traces: list[dict[str, Trace]] = [{} for _ in self._modules]
-        self.frozen = [False] * len(self._modules)
+        self._watches = {module: _ModuleWatch() for module in modules}
         self.imu_heard = self.pressure_heard = False
 
     def take_over(self, before: Sequence[SensorWatch]) -> None:
         """Goes on from the bodies that this one is made of, or was part of."""
         for other in before:
-            for i, j in in_both(self._modules, other._modules):
-                self._last[i], self._repeats[i], self.frozen[i] = other._last[j], other._repeats[j], other.frozen[j]
-                self._pressures[i] = other._pressures[j]
-                self._traces[i] = dict(other._traces[j])
+            self._watches |= {module: watch for module, watch in other._watches.items() if module in self._watches}
 
     def step(self, modules: Sequence[ModuleInputs]) -> Sequence[ModuleInputs]:
         """The inputs of the fleet, by fleet index, less what is not to be believed."""
         believed = list(modules)
         self.imu_heard = self.pressure_heard = False
-        for i, index in enumerate(self._modules):
-            module = modules[index]
-            if module.gyro is not None and module.accel is not None:
-                self.frozen[i] = self._repeats_itself(i, module.gyro, module.accel)
-            gone: dict[str, Any] = {name: None for name in LEAPS if self._leaps(i, name, getattr(module, name))}
-            if self.frozen[i]:
-                gone |= FROZEN
-            if module.pressure_pa is not None and self._pressure_repeats_itself(i, module.pressure_pa):
-                gone["pressure_pa"] = None
-            if gone:
-                believed[index] = dataclasses.replace(module, **gone)
-            self.imu_heard = self.imu_heard or (believed[index].gyro is not None and believed[index].accel is not None)
-            self.pressure_heard = self.pressure_heard or believed[index].pressure_pa is not None
+        for index, watch in self._watches.items():
+            module = believed[index] = watch.step(modules[index])
+            self.imu_heard = self.imu_heard or (module.gyro is not None and module.accel is not None)
+            self.pressure_heard = self.pressure_heard or module.pressure_pa is not None
         return believed
 
-    def _repeats_itself(self, i: int, gyro: np.ndarray, accel: np.ndarray) -> bool:
-        rate, (last_rate, last_accel) = gyro.tobytes(), self._last[i]
-        repeats = rate == last_rate and accel.tobytes() == last_accel.tobytes()
-        self._repeats[i] = self._repeats[i] + 1 if repeats else 0
-        self._last[i] = rate, accel
-        return self._repeats[i] >= REPEATS
 
-    def _pressure_repeats_itself(self, i: int, pressure_pa: float) -> bool:
-        last_pa, repeats = self._pressures[i]
-        self._pressures[i] = pressure_pa, repeats + 1 if pressure_pa == last_pa else 0
-        return self._pressures[i][1] >= DEPTH_REPEATS
+class _ModuleWatch:
+    """Watches the sensors of one module, whichever body it is in."""
 
-    def _leaps(self, i: int, name: str, reading: np.ndarray | float | None) -> bool:
+    def __init__(self) -> None:
+        self._last_rate, self._last_accel = b"", np.zeros(0)
+        self._repeats = 0
+        """How often the last sample of the IMU has been repeated; stays as it is while none comes."""
+        self._last_pa, self._pressure_repeats = math.nan, 0
+        self._traces: dict[str, Trace] = {}
+
+    def step(self, module: ModuleInputs) -> ModuleInputs:
+        """What the module said, less what is not to be believed."""
+        if module.gyro is not None and module.accel is not None:
+            self._take_imu(module.gyro, module.accel)
+        gone: dict[str, Any] = {name: None for name in LEAPS if self._leaps(name, getattr(module, name))}
+        if self._repeats >= REPEATS:
+            gone |= FROZEN
+        if module.pressure_pa is not None and self._pressure_repeats_itself(module.pressure_pa):
+            gone["pressure_pa"] = None
+        return dataclasses.replace(module, **gone) if gone else module
+
+    def _take_imu(self, gyro: np.ndarray, accel: np.ndarray) -> None:
+        rate = gyro.tobytes()
+        repeats = rate == self._last_rate and accel.tobytes() == self._last_accel.tobytes()
+        self._repeats = self._repeats + 1 if repeats else 0
+        self._last_rate, self._last_accel = rate, accel
+
+    def _pressure_repeats_itself(self, pressure_pa: float) -> bool:
+        self._pressure_repeats = self._pressure_repeats + 1 if pressure_pa == self._last_pa else 0
+        self._last_pa = pressure_pa
+        return self._pressure_repeats >= DEPTH_REPEATS
+
+    def _leaps(self, name: str, reading: np.ndarray | float | None) -> bool:
         """Whether a reading is far from the one that was believed last, and from the one after that as well."""
         if reading is None:
             return False
         sample = reading if isinstance(reading, np.ndarray) else np.array([reading])
-        sound, odd = self._traces[i].get(name, (sample, NOTHING))
+        sound, odd = self._traces.get(name, (sample, NOTHING))
         is_odd = not (is_near(sample, sound, LEAPS[name]) or is_near(sample, odd, LEAPS[name]))
-        self._traces[i][name] = (sound, sample) if is_odd else (sample, NOTHING)
+        self._traces[name] = (sound, sample) if is_odd else (sample, NOTHING)
         return is_odd
 
 
