@@ -63,7 +63,7 @@ def read_recording(folder: Path) -> Recording:
     if len(firmware.fleet.module) > 1:
         raise LogError(f"{folder}: {len(firmware.fleet.module)} modules flew; a vehicle file is fitted to a log of one module alone")
     body, count = firmware.pipeline.bodies[0], len(firmware.vehicles[0].thruster)
-    measurements, collector, commands = Measurements(body), firmware.collector, _Commands(count)
+    measurements, collector, commands = Measurements(body, firmware.fleet.period_ns), firmware.collector, _Commands(count)
     times: list[int] = []
     heard: list[ModuleInputs] = []
     told: list[tuple[bool, np.ndarray]] = []

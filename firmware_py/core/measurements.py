@@ -45,16 +45,15 @@ Seen = list[tuple[TagObservation, int]]
 class Measurements:
     """Fuses what the modules of one body say. Holds geometry, and the angular acceleration."""
 
-    def __init__(self, body: Body, period_ns: int = 0) -> None:
-        """`period_ns`: a tick; 0: unknown, and angular acceleration stays in the specific force of IMUs off the centre of mass."""
+    def __init__(self, body: Body, period_ns: int) -> None:
         self._modules = body.modules
         self._rotations = np.stack([to_matrix(np.ascontiguousarray(q)) for q in body.q_bm], axis=1)
         self._mean_of_all = self._rotations.reshape(3, -1) / len(body.modules)
         self._r_bi, self._mean_r_bi = body.r_bi, body.r_bi.mean(axis=0)
         self._centred = bool(np.abs(self._mean_r_bi).max() < CENTRED_M)
         self._share = 1.0 - math.exp(-period_ns * 1e-9 / ALPHA_S)
-        self._per_s = 1e9 / period_ns if period_ns else 0.0
-        self._gain = self._share * self._per_s
+        per_s = 1e9 / period_ns
+        self._gain = self._share * per_s
         count = len(body.modules)
         self._apart = np.kron(np.ones((count, 1)), -self._mean_of_all)
         """(3 count, 3 count) readings of all modules -> how each differs from their mean, body frame."""
@@ -63,11 +62,11 @@ class Measurements:
         self._gyro_offsets = SensorOffsets(count, 3, GYRO_BIASES, period_ns)
         self._accel_offsets = SensorOffsets(count, 3, ACCEL_BIASES, period_ns)
         self._depth_offsets = SensorOffsets(count, 1, DEPTH_BIASES, period_ns)
-        self._turn = max(1, TURN_NS // max(1, period_ns))
+        self._turn = max(1, TURN_NS // period_ns)
         self._depths_m, self._depth_age = np.zeros(count), np.full(count, self._turn)
         """Last depth of each sensor, and ticks with a depth since then."""
         self._no_swing = np.zeros(3 * count)
-        self._swing_of = self._per_s * -np.vstack([skew(r) for r in self._r_bi - self._mean_r_bi])
+        self._swing_of = per_s * -np.vstack([skew(r) for r in self._r_bi - self._mean_r_bi])
         """(3 count, 3) change of the rate within a tick -> by how much it lets each IMU differ from their mean."""
         self._is_still = False
         self._last_gyro: np.ndarray | None = None

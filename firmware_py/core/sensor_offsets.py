@@ -18,7 +18,7 @@ class SensorOffsets:
     def __init__(self, modules: int, numbers: int, most: float, period_ns: int) -> None:
         """For readings of so many numbers each. `most`: no two biases differ by more. `period_ns`: between two readings."""
         self._most = most
-        self._longest = max(1, round(REMEMBERED_S * 1e9 / max(1, period_ns)))
+        self._longest = max(1, round(REMEMBERED_S * 1e9 / period_ns))
         self._count = 0
         self._offsets = np.zeros((modules, numbers))
 

@@ -36,9 +36,9 @@ def body() -> Body:
     return assemble(CELLS, ROTATIONS, [load_vehicle("modcube")] * 3, FLEET_INDEX)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def measurements(body: Body) -> Measurements:
-    return Measurements(body)
+    return Measurements(body, PERIOD)
 
 
 def silent() -> list[ModuleInputs]:
@@ -358,7 +358,7 @@ def test_body_that_swings_at_once_takes_no_angular_acceleration_for_a_bias(body:
 def test_depth_is_told_by_the_density_that_drags() -> None:
     cube = load_vehicle("modcube")
     lone = assemble([(0, 0, 0)], [0], [cube], [0])
-    depth = Measurements(lone).fuse([ModuleInputs(pressure_pa=111_325.0)], Q_WB).depth_m
+    depth = Measurements(lone, PERIOD).fuse([ModuleInputs(pressure_pa=111_325.0)], Q_WB).depth_m
     drag = -drag_wrench(lone.drag.nodes, np.zeros(3), np.zeros(6), np.array([1.0, 0, 0, 0, 0, 0]))[0]
     assert depth is not None
     assert 10_000.0 / (9.80665 * depth) == pytest.approx(2.0 * drag / (cube.drag.cd_face * 0.21**2), rel=1e-9)
@@ -371,7 +371,7 @@ def test_nothing_heard_is_nothing_measured(measurements: Measurements) -> None:
 
 
 def test_other_modules_of_the_fleet_are_not_listened_to() -> None:
-    lone = Measurements(assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [1]))
+    lone = Measurements(assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [1]), PERIOD)
     modules = silent()
     modules[0].gyro = modules[2].gyro = np.ones(3)
     assert lone.fuse(modules, Q_WB).gyro is None

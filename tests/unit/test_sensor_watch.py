@@ -11,7 +11,7 @@ from firmware_py.core.sensor_watch import LEAPS, REPEATS, SensorWatch
 from firmware_py.core.types import Action, Mode, ModuleInputs, Request
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
-from tests.unit.tanks import Tank, single
+from tests.unit.tanks import PERIOD, Tank, single
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 PAIR = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
@@ -123,7 +123,7 @@ def test_body_that_takes_over_knows_which_imu_is_frozen_and_what_was_believed_of
 
 def test_frozen_imu_is_left_out_of_the_mean() -> None:
     """The other stands 0.105 m off the centre of mass, and feels 0.21 m/s^2 of a turn at 1 rad/s about each axis."""
-    watch, fuse = SensorWatch(PAIR.modules), Measurements(PAIR).fuse
+    watch, fuse = SensorWatch(PAIR.modules), Measurements(PAIR, PERIOD).fuse
     both = fuse(watch.step([sample(1.0, 4.0), sample(3.0, 8.0)]), LEVEL)
     for n in range(REPEATS + 1):
         first = fuse(watch.step([sample(1.0, 4.0 + 1e-9 * (n % 2)), sample(3.0, 8.0)]), LEVEL)
