@@ -18,13 +18,14 @@ from firmware_py.description.parameters import Docking
 WAY_SAMPLES = 65
 """Places on a way that are looked at, where the bodies are near each other."""
 WAY_SLACK = 0.25
-"""Share of the stand-off by which cubes that would clear each other level may come nearer than where that is not to be helped."""
+"""Share of the stand-off by which a way may lead nearer to another body than its ends are, as long as level cubes still pass each other."""
 WAY_NOISE_M = 0.005
-"""Nearer by so little is not nearer."""
+"""Of the estimates: a way that leads nearer by less than this leads no nearer."""
 SQUARE_DIAGONAL, CUBE_DIAGONAL = 2.0**0.5, 3.0**0.5
 """Centres of two cubes of edge 1 that are so far apart do not touch: level cubes side by side; and however they are turned."""
 BOTH_ENDS, BEGINNING = (0, -1), (0,)
-"""Where on a way its body is as near to the other as it has to be: who docks begins where it is, and ends before the target."""
+"""Ends of a way at which nearness is no fault of the way. A body that docks begins where it happens to be, and has to end close to its
+target; to a third body it has to be close at its beginning alone."""
 
 
 class Way(NamedTuple):
@@ -86,10 +87,10 @@ def way_of_piece(plan: UndockPlan, piece: Body, whole: Body, at: Estimate, by_w:
 
 
 def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near: Sequence[int] = BOTH_ENDS) -> int | None:
-    """Module of the other body that a way comes nearest to, and too near; None: none.
+    """Module of the other body that a way comes nearest to, of those that it comes too near; None: none.
 
-    Too near is nearer than at the ends `near`, and near enough for level cubes to touch; or for cubes in any attitude, and nearer by
-    `slack_m`.
+    Too near is nearer than at the ends `near`, and either so near that even level cubes may touch; or so near that turned cubes may, and
+    nearer than at those ends by more than `slack_m`.
     """
     apart_m = CUBE_DIAGONAL * way.pitch_m + sum(float(np.linalg.norm(body.r_bm, axis=1).max()) for body in (way.body, other))
     shares = _near_part(way.p_begin - other_at.p_wb, way.p_end - way.p_begin, apart_m)

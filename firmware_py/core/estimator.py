@@ -49,13 +49,15 @@ NORTH_DENSITY = 1e-4
 """Of the noise of the heading before the first tag, rad^2 s: it says where north is, and so is known. What the filter else took for
 knowledge of it was noise: a bump turned the belief by a third of a circle."""
 KEPT, MOVING, GYROS = np.r_[10:19, 21:25, 26:29], slice(6, 9), slice(12, 15)
-"""Of the state: rates, biases, vertical force, moment and righting, which say the same whatever the heading. Of the error: velocity; gyro
-biases, of which it is as sure as before, or the next bump, that no model knows, would be taken for a bias."""
+"""What is kept when a body that was adrift is placed anew. KEPT, of the state: rates, biases, vertical force, moment and righting, which
+do not depend on the heading. Of the error: MOVING is the velocity, which becomes unsure; GYROS are the gyro biases, which stay as sure as
+they were: with a larger variance the filter would take the next bump, which no model knows, for a bias."""
 WAY_S = 0.01
 """For which `accel_under_way` tells what a sample errs. A wrong mass errs alike in all samples of that time: more of them tell no more."""
 LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[22:25, 26:29], np.r_[21:24, 25:28], 5.0
-"""Of the state, and of its error: moment and righting. A lost place does not spoil them as far as a filter that begins could believe them;
-what is farther off may be why tags were refused. Biases and vertical force take up what was refused meanwhile."""
+"""Where moment and righting stand in the state and in its error, and within how many initial sigmas they are kept when the filter begins
+anew because it refused too many tags. A place that was wrong has not spoilt them; but a value that a fresh filter would not believe may be
+the very reason why tags were refused. Biases and vertical force are not kept: while tags are refused they take up all that does not fit."""
 SPEED_SIGMA = 0.5
 """Of one that was adrift, when tags come, m/s: what a module swims at half stick."""
 FELT_LIMIT_NS = 2_000_000_000

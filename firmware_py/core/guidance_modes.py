@@ -91,8 +91,8 @@ class Guidance:
         self._glider.retune(p.bandwidth, p.speed_m_s, p.rate_rad_s)
 
     def look(self, estimate: Estimate, health: Health) -> None:
-        """To be called before the decisions of a tick: where a body begins to stand by gravity alone, or tags tell it at last where the
-        world begins and where its north is, what was wanted in the old world is forgotten.
+        """To be called before the decisions of a tick. Forgets what was wanted when place and heading take on another meaning: when the
+        body begins to stand by gravity alone, and when tags then tell it where it is and where north is.
         """
         before, self._upright = self._upright, health.ready and not health.placed
         if self._upright != before:

@@ -109,8 +109,8 @@ class Health(NamedTuple):
 
     @property
     def unseen_push_m_s(self) -> float:
-        """The same while no tag tells what it does to the body, else none. A wall or a hand pushes as no model foresees: believed speed and
-        disturbance then run away together, as the accelerometer cannot tell one from the other.
+        """`push_m_s` while no tag is seen, else 0. Without tags the estimator cannot tell a push that it did not foresee (a wall, a hand)
+        from a speed: to the accelerometer both are the same, and both estimates run away together.
         """
         return self.push_m_s if self.tag_age_s > UNSEEN_S else 0.0
 

@@ -88,10 +88,12 @@ class Measurements:
         return Measured(gyro, self._accel([m.accel for m in mine], gyro), self._depth(mine, q_wb), self._poses(mine, q_wb))
 
     def _mean(self, readings: list[np.ndarray | None], offsets: SensorOffsets, swing: np.ndarray | None) -> np.ndarray | None:
-        """Mean over all modules, body frame; where not all were heard, what it would be by the offsets of those that were.
+        """Mean over all modules, (3,) in the body frame. Where some were not heard: what the mean of all would be, by the offsets learnt.
 
         Args:
-            swing: (3 count,) what of their differences from the mean is no offset; None where nobody knows, and none is learnt.
+            readings: of each module (3,), its own frame; None: not heard.
+            swing: (3 count,) by how much the readings differ from their mean because of the body's motion: what is left are offsets, and
+                these are learnt. None: not known, and nothing is learnt.
         """
         heard = [value for value in readings if value is not None]
         if not heard:
@@ -116,15 +118,18 @@ class Measurements:
         return np.asarray(accel - cross(self._alpha, lever) - cross(gyro, cross(gyro, lever)))
 
     def _swing(self, gyro: np.ndarray | None) -> np.ndarray | None:
-        """(3 count,) by how much the IMUs of a body that is nearly still differ by its angular acceleration; None of any other. Of the
-        last tick alone: what noise and lag that has is gone from the mean of many, in which the gyro's differences cancel.
+        """(3 count,) by how much the accelerometers differ from their mean because the body's rate changes, m/s^2; None unless the body is
+        nearly still, for else its rate counts too.
+
+        Taken from the gyro's change in the last tick, unsmoothed: its noise is large, but cancels in the mean over many ticks by which
+        offsets are learnt, and it does not lag.
         """
         if not self._is_still or gyro is None or self._last_gyro is None:
             return None
         return np.asarray(self._swing_of @ (gyro - self._last_gyro))
 
     def _follow(self, gyro: np.ndarray | None) -> None:
-        """Angular acceleration by the gyro's differences, averaged; from zero after a tick without."""
+        """Keeps the angular acceleration, rad/s^2: the gyro's change from tick to tick, smoothed; from zero after a tick without gyro."""
         if gyro is None or self._last_gyro is None:
             self._alpha = np.zeros(3)
         else:
@@ -148,8 +153,8 @@ class Measurements:
         return depth_m
 
     def _depth_offset(self, which: list[bool], each_m: np.ndarray) -> float:
-        """By how much the mean of the sensors that were heard in this tick is off that of all, m, where some are silent. Healthy ones come
-        in turns, a few ticks apart, and the estimator has learnt what they tell on the mean.
+        """What is to be taken off the mean of the sensors that were heard in this tick, m: where some have fallen silent, by how much it is
+        off the mean of all. 0 while none has: healthy ones come in turns, a few ticks apart, and the estimator learns their mean's bias.
 
         Args:
             which: of each module of the body, whether its sensor was heard. each_m: (heard,) what those tell of the centre of mass.

@@ -1,7 +1,7 @@
-"""How the sensors of each module differ from the mean of the body's: so that the mean does not jump when some of them fall silent.
+"""How the sensors of each module differ from the mean of the body's, so that the mean does not jump when some of them fall silent.
 
-Each has a bias of its own. The estimator learns that of the mean, slowly; what is left of the mean brings another one, and a robot that
-takes it for a push leans and drifts until it has learnt that too.
+Every sensor has a bias of its own. The estimator slowly learns the bias of their mean. When some fall silent, the mean of the others has
+another bias: the robot would take the jump for a push, and lean and drift until it has learnt the new one.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ class SensorOffsets:
         self._offsets = np.zeros((modules, numbers))
 
     def learn(self, differences: np.ndarray) -> None:
-        """(modules, numbers) how each reading differs from the mean of all, in the body's axes, in one tick. Where a sensor tells of more
-        than a bias, it has failed, and nothing is learnt from any.
+        """Takes what one tick tells: (modules, numbers), by how much each reading differs from the mean of all, in the body's axes.
+
+        A difference that is larger than any bias shows a sensor that has failed; it spoils the mean, so nothing is learnt from that tick.
         """
         if float(np.abs(differences).max()) > self._most:
             return

@@ -130,9 +130,13 @@ def _biases(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
 
 
 def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body, shock: Sequence[float]) -> np.ndarray:
-    """(28, 28) covariance of the new body in state x: that of the old, uncorrelated, larger by the shock, disturbance by mass.
+    """(28, 28) covariance of the new body in state x: the variances of the old one, larger by the shock, the disturbance's by mass.
 
-    How the moment that acts shares out between disturbance and righting is known no more; what acts is.
+    Correlations are dropped but for one. How the moment that acts is made up of disturbance and righting is not known of the new body, and
+    righting begins with its own sigma; but their sum, the moment that acts, is known as well as before, by inertia.
+
+    Args:
+        shock: sigma to be added to position m, attitude rad, velocity m/s, rate rad/s.
     """
     variance = old.covariance.diagonal().copy()
     variance[18:21] *= (after.rigid_mass_kg / before.rigid_mass_kg) ** 2
