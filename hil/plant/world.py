@@ -146,14 +146,16 @@ class World(DockedBodies):
         alone = [Place(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) for _ in vehicles]
         self._seat(groups or [(m,) for m in range(len(vehicles))], places or alone)
         for b, members in enumerate(self.bodies):
-            start, q_bm = starts[members[0]], self._modules.quaternion[members[0]]
-            q_wm = rotations.normalise(np.array(start.q_wm, dtype=np.float64))
-            self._body_arrays.state[b, 3:7] = rotations.normalise(rotations.multiply(q_wm, rotations.conjugate(q_bm)))
-            lever = rotations.rotate(self._body_arrays.state[b, 3:7].copy(), self._modules.position[members[0]].copy())
-            self._body_arrays.state[b, :3] = start.p_wm - lever
+            self._put(b, members[0], starts[members[0]])
         self.docks.energise(joints_between(self._modules, self.docks.faces.kind))
         self._power_magnets()
         self._step(0)
+
+    def _put(self, body: int, leader: int, start: Start) -> None:
+        """Puts a body where its leader starts."""
+        x, q_wm = self._body_arrays.state[body], rotations.normalise(np.array(start.q_wm, dtype=np.float64))
+        x[3:7] = rotations.normalise(rotations.multiply(q_wm, rotations.conjugate(self._modules.quaternion[leader])))
+        x[:3] = start.p_wm - rotations.rotate(x[3:7].copy(), self._modules.position[leader].copy())
 
     def set_command(self, module: int, u: Sequence[float] | np.ndarray) -> None:
         """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call."""
