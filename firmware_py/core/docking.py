@@ -38,7 +38,7 @@ from firmware_py.description.parameters import Docking
 
 CHANGED = "the bodies are others than those that it was planned for"
 NO_LONGER = "its body is no longer in DOCK"
-HOLDS = "its body is not in DOCK, and the joint may still hold"
+HOLDS = "its body is not in DOCK, and modules {} and {} may still hold each other"
 ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
@@ -212,7 +212,8 @@ class DockingStage:
             return CHANGED
         if isinstance(plan, UndockPlan):
             whole = _body_of(plan.opens[0].module, estimates)
-            return HOLDS if self._holds(plan) and whole not in waiting else ""
+            holds = next(iter(self._still_closed(plan)), None)
+            return "" if holds is None or whole in waiting else HOLDS.format(*sorted(modules_of(holds)))
         mine, others = (_body_of(module, estimates) for module in (plan.request.module, plan.request.target_module))
         if mine not in waiting:
             return NO_LONGER
@@ -251,13 +252,13 @@ class DockingStage:
             decisions.returning.append(dock.target)
 
     def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
-        self._undocks.append(Undock.begun(plan, chains, time_ns, self._holds(plan), self._p, self._joints))
+        self._undocks.append(Undock.begun(plan, chains, time_ns, bool(self._still_closed(plan)), self._p, self._joints))
         self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
 
-    def _holds(self, plan: UndockPlan) -> bool:
-        """Whether magnets have to push it open: not all that is seen says that it is."""
+    def _still_closed(self, plan: UndockPlan) -> list[DockRequest]:
+        """Joints that magnets have to push open: not all that is seen says that they are."""
         apart = [modules_of(joint) for joint in self.open_joints(APART)]
-        return any(modules_of(joint) not in apart for joint in plan.opens)
+        return [joint for joint in plan.opens if modules_of(joint) not in apart]
 
     def _begin_dock(
         self,

@@ -145,8 +145,18 @@ def test_disarmed_body_whose_joint_pictures_show_closed_is_not_undocked() -> Non
     tank.weak.add(1)
     tank.run(2.0)
     tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
-    assert tank.when(f"undock refused: {HOLDS}") and tank.shape == [(0, 1)]
+    assert tank.when(f"undock refused: {HOLDS.format(0, 1)}") and tank.shape == [(0, 1)]
     assert {max(states) for states in tank.pipeline.formation.docking.relays.states} == {RELAY_PULL}
+
+
+def test_disarmed_ring_says_which_modules_keep_the_one_that_is_to_leave_from_leaving() -> None:
+    """Module 1 has come off both its neighbours; 3 is asked to leave, and leaves alone, by both of its joints."""
+    tank = Docked(RING)
+    tank.run(0.5)
+    tank.lose(1)
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(3, 3, 1, 2)))
+    assert tank.when(f"undock refused: {HOLDS.format(2, 3)}") and tank.shape == [(0, 1, 2, 3)]
 
 
 def test_fail_safe_that_is_switched_off_parts_nothing() -> None:
