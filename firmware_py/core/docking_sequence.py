@@ -157,7 +157,7 @@ class DockingSequence:
         errors = self.errors(active, target)
         dt = (time_ns - self._last_ns) * 1e-9
         self._last_ns = time_ns
-        self._decide(time_ns, active, target, errors, status)
+        self._decide(time_ns, active, target, errors, status, waits is not None)
         speed = self._speed(errors, waits is not None)
         self._gap_m = float(np.clip(self._gap_m + speed * dt, -self._p.push_m, self._farthest_m))
         setpoint = self._setpoint(self.met(target), speed, waits)
@@ -208,7 +208,7 @@ class DockingSequence:
 
     # ------------------------------------------------------------ what comes next
 
-    def _decide(self, time_ns: int, active: Estimate, target: Estimate, errors: Errors, status: PairStatus) -> None:
+    def _decide(self, time_ns: int, active: Estimate, target: Estimate, errors: Errors, status: PairStatus, waits: bool) -> None:
         if self.stage in ENDED:
             return
         if status.docked and TABLE[self.stage].relay == RELAY_PULL:  # while they push, faces that are still near are no dock
@@ -220,7 +220,7 @@ class DockingSequence:
             return
         row = TABLE[self.stage]
         if row.limit_s and time_ns - self._entered_ns > getattr(self._p, row.limit_s) * 1e9:
-            self._time_out(time_ns, status)
+            self._time_out(time_ns, status, waits)
         elif self._is_done(time_ns, errors, status):
             self._enter(row.on_done, time_ns)
 
@@ -247,8 +247,9 @@ class DockingSequence:
             self._good_since_ns = time_ns
         return time_ns - self._good_since_ns >= seconds * 1e9
 
-    def _time_out(self, time_ns: int, status: PairStatus) -> None:
-        if TABLE[self.stage].on_timeout == Stage.RELEASE:
+    def _time_out(self, time_ns: int, status: PairStatus, waits: bool) -> None:
+        following = Stage.ABORTED if waits else TABLE[self.stage].on_timeout  # who waits has touched nothing that could have jammed
+        if following == Stage.RELEASE:
             only = "current alone" if status.current else "position alone" if status.position else "neither condition"
             unseen = f", pictures of both are too few or older than {self._p.pose_fresh_ms:.0f} ms (DOCK_POSE_AGE)"
             self.reason = f"jam: {only} after {self.stage.name}{unseen if math.isnan(status.position_error_m) else ''}"
@@ -257,8 +258,8 @@ class DockingSequence:
                 self._enter(Stage.FAILED, time_ns)
                 return
         elif self.stage != Stage.RELEASE:
-            self.reason = f"{self.stage.name} took longer than {self._p.timeout_s:.0f} s"
-        self._enter(TABLE[self.stage].on_timeout, time_ns)
+            self.reason = f"{self.stage.name} took longer than {self._p.timeout_s:.0f} s{', waiting for another body' if waits else ''}"
+        self._enter(following, time_ns)
 
     def _enter(self, stage: Stage, time_ns: int) -> None:
         if stage == Stage.RELEASE:

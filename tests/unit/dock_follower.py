@@ -6,6 +6,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
 from firmware_py.core.docking_sequence import DockingSequence, Stage, Steering
 from firmware_py.core.rotations import from_euler, multiply, rotate, to_matrix
+from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRequest, Estimate
 from firmware_py.description.parameters import Docking
 from firmware_py.description.vehicle import FACE_NORMALS, load_vehicle
@@ -51,9 +52,9 @@ class Follower:
         self.at = estimate(self.face + 0.5 * self.outward)._replace(q_wb=TILTED)
         self.tick = 0
 
-    def step(self, status: PairStatus = NEITHER) -> Steering:
+    def step(self, status: PairStatus = NEITHER, waits: Wish | None = None) -> Steering:
         self.tick += 1
-        steering = self.sequence.step(self.tick * TICK_NS, self.at, self.there, status)
+        steering = self.sequence.step(self.tick * TICK_NS, self.at, self.there, status, waits)
         self.at = self.at._replace(p_wb=steering.active.p_wb, q_wb=steering.active.q_wb)
         return steering
 

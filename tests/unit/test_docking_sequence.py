@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.core.docking_sequence import DockingSequence, Stage
 from firmware_py.core.rotations import conjugate, difference, from_euler, multiply, rotate, rotate_back, to_matrix
-from firmware_py.core.setpoint import Wish
+from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest
 from firmware_py.description.parameters import PAPER, Docking
 from firmware_py.description.vehicle import FACE_NORMALS, load_vehicle
@@ -176,6 +176,16 @@ def test_jam_that_a_camera_too_slow_makes_is_told_by_the_parameter_that_helps() 
     assert dock.sequence.reason == (
         "jam: current alone after VERIFY, pictures of both are too few or older than 300 ms (DOCK_POSE_AGE), 1 try"
     )
+
+
+def test_approach_that_waits_to_the_end_of_its_time_is_no_jam_and_is_over() -> None:
+    """It was: magnets pushed at whatever stood there, and all was tried anew."""
+    dock = Follower(Docking(timeout_s=20.0))
+    dock.until(Stage.APPROACH)
+    while dock.sequence.stage == Stage.APPROACH:
+        dock.step(waits=REST)
+    assert dock.sequence.stage == Stage.ABORTED and dock.step().relay == RELAY_OFF
+    assert dock.sequence.reason == "APPROACH took longer than 20 s, waiting for another body"
 
 
 def test_approach_slows_down_to_the_speed_of_contact() -> None:
