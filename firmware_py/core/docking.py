@@ -6,7 +6,7 @@ Works on the estimates of this tick; the pipeline carries out the joins and part
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Part,
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan
-from firmware_py.core.docking_traffic import Traffic, thirds_of
+from firmware_py.core.docking_traffic import Dock, Traffic, thirds_of
 from firmware_py.core.docking_way import first_met, obstacle, to_one_place, way_of_piece
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
@@ -45,20 +45,6 @@ LED = "the body that it is to go to is on its way to it: end that dock first"
 TAKEN = "another dock is to bring a module to the same place: end that dock first"
 
 
-class _Dock(NamedTuple):
-    """A dock under way."""
-
-    sequence: DockingSequence
-    detector: PairDetector
-    active: int
-    target: int
-    prepared: Prepared
-    began: Wish
-    """Where the active body was: there it gives way to others."""
-    said: set[str]
-    """What has been said of its waiting."""
-
-
 class DockingStage:
     """All docks and joints of the fleet."""
 
@@ -66,7 +52,7 @@ class DockingStage:
         self._p = parameters
         self._tags = tags
         self.relays = MagnetRelays(modules)
-        self._docks: list[_Dock] = []
+        self._docks: list[Dock] = []
         self._undocks: list[Undock] = []
         self._expected: dict[int, DockRequest] = {}
         """By body: the newest dock or undock that waits for its plan."""
@@ -165,7 +151,7 @@ class DockingStage:
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)
         self._joints.step(inputs.time_ns, inputs.modules, poses, resting)
-        traffic = Traffic(estimates, coming, self._p)
+        traffic = Traffic(self._docks, estimates, coming, self._p)
         for dock in list(self._docks):
             self._steer(dock, inputs, estimates, poses, traffic, decisions)
         for undock in list(self._undocks):
@@ -239,12 +225,12 @@ class DockingStage:
             found.append(body)
         return found
 
-    def _drop(self, dock: _Dock) -> None:
+    def _drop(self, dock: Dock) -> None:
         """It is no longer under way, and its magnets let go."""
         self._docks.remove(dock)
         self.relays.switch(RELAY_OFF, *dock.sequence.plan.closes)
 
-    def _give_up(self, dock: _Dock, reason: str, decisions: Decisions) -> None:
+    def _give_up(self, dock: Dock, reason: str, decisions: Decisions) -> None:
         """Ends a dock before its end; a target that was coming goes back to where it held."""
         self._drop(dock)
         self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: {reason}")
@@ -275,21 +261,21 @@ class DockingStage:
         pair = FacePair(request.target_module, request.target_face, request.module, request.face, plan.place_t, plan.q_ta)
         at = estimates[active][1]
         began = REST._replace(p_wb=at.p_wb.copy(), q_wb=at.q_wb.copy())
-        self._docks.append(_Dock(sequence, PairDetector(pair, self._p), active, target, prepared, began, set()))
+        self._docks.append(Dock(sequence, PairDetector(pair, self._p), active, target, prepared, began, set()))
         self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
 
     # ------------------------------------------------------------ each tick
 
     def _steer(
         self,
-        dock: _Dock,
+        dock: Dock,
         inputs: Inputs,
         estimates: Estimated,
         poses: ModulePoses,
         traffic: Traffic,
         decisions: Decisions,
     ) -> None:
-        if blocked := traffic.blocked(dock.sequence, dock.active, dock.target):
+        if blocked := traffic.blocked(dock):
             self._give_up(dock, blocked, decisions)
             self._end(dock.active, decisions)
             return
@@ -319,9 +305,9 @@ class DockingStage:
         if steering.meets is not None:
             decisions.meets[dock.target] = steering.meets
 
-    def _wish(self, dock: _Dock, traffic: Traffic) -> Wish | None:
+    def _wish(self, dock: Dock, traffic: Traffic) -> Wish | None:
         """What the active body glides by while a third body is on its way; what it then does is said once."""
-        wait = traffic.wait(dock.sequence, dock.active, dock.target, dock.began)
+        wait = traffic.wait(dock)
         if wait is None:
             return None
         if wait.words not in dock.said:
@@ -335,7 +321,7 @@ class DockingStage:
         if active not in self._expected and active not in parting:
             decisions.ended.append(active)
 
-    def _join(self, dock: _Dock, decisions: Decisions) -> None:
+    def _join(self, dock: Dock, decisions: Decisions) -> None:
         """One join a tick and body: a dock that comes second finds its bodies gone, and `forget` ends it."""
         if decisions.joining.isdisjoint((dock.active, dock.target)):
             decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))

@@ -142,6 +142,8 @@ class DockingSequence:
         self._under_way = False
         self.meets_at_w: np.ndarray | None = None
         """(3,) where the target's centre of mass was told to come, world, m; None: it was told nothing."""
+        self.makes_room = False
+        """Told so in the last tick."""
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
@@ -152,12 +154,17 @@ class DockingSequence:
         self._turn = 0.0
 
     def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus, waits: Wish | None = None) -> Steering:
-        """Moves the sequence on by one tick. `waits`: somebody is on its way; until it is before the face, it glides by this instead."""
+        """Moves the sequence on by one tick. `waits`: somebody is on its way; until it is before the face, it glides by this instead, and
+        where this leads to a place, to make room, it goes back from before the face too.
+        """
         meets = None if self._under_way else self._set_off(active, target)
         errors = self.errors(active, target)
         dt = (time_ns - self._last_ns) * 1e-9
         self._last_ns = time_ns
         self._decide(time_ns, active, target, errors, status, waits is not None)
+        self.makes_room = waits is not None and waits.p_wb is not None
+        if self.makes_room and self.stage == Stage.APPROACH and self._p.approach == "staged":
+            self._enter(Stage.PRE_APPROACH, time_ns)
         speed = self._speed(errors, waits is not None)
         self._gap_m = float(np.clip(self._gap_m + speed * dt, -self._p.push_m, self._farthest_m))
         setpoint = self._setpoint(self.met(target), speed, waits)
@@ -275,6 +282,8 @@ class DockingSequence:
         """Rate of the wanted gap, m/s."""
         p = self._p
         if self.stage == Stage.APPROACH:
+            if self.makes_room and self._gap_m < self._farthest_m:
+                return RETREAT_M_S
             astray = errors.lateral_m > CONE * p.align_m or errors.angle_rad > CONE * p.align_rad
             if waits or (astray and p.approach == "staged"):
                 return 0.0

@@ -240,19 +240,45 @@ def test_later_of_two_docks_that_are_on_each_other_s_ways_makes_room() -> None:
     tank.run(0.1, *(Request(Action.DOCK, request.module, request) for request in wanted))
     outputs = tank.run(12.0)
     assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] * 2
-    assert sum("gives way" in said for _, said in tank.said) == 1 and tank.when("dock of module 3 gives way to one that began before it")
+    assert sum("gives way" in said for _, said in tank.said) == 1 and tank.when("dock of module 3 gives way to another")
     assert min(np.linalg.norm(past[1][:3] - past[3][:3]) for past in tank.past) > 0.35
 
 
 @pytest.mark.slow
-def test_dock_that_cannot_go_back_to_make_room_stays_where_it_is() -> None:
+def test_dock_that_cannot_go_back_to_make_room_is_given_way_to_by_the_other() -> None:
     tank = placed((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0), (2.2, 1.6))
     wanted = DockRequest(1, 3, 0, 2), DockRequest(3, 1, 2, 0)
     tank.run(0.1, *(Request(Action.DOCK, request.module, request) for request in wanted))
-    outputs = tank.run(6.0, send(4, 1.9, 1.0))
-    assert [dock.stage for dock in outputs.docks] == [Stage.PRE_APPROACH] * 2
-    assert not any("gives way" in said for _, said in tank.said)
-    assert min(np.linalg.norm(past[3][:3] - past[4][:3]) for past in tank.past) > 0.35
+    tank.run(6.0, send(4, 1.9, 1.0))
+    outputs = tank.run(9.0)
+    assert [Stage.APPROACH <= dock.stage <= Stage.VERIFY for dock in outputs.docks] == [True] * 2
+    assert [said for _, said in tank.said if "gives way" in said] == ["dock of module 1 gives way to another"]
+    assert min(np.linalg.norm(past[3][:3] - past[n][:3]) for past in tank.past for n in (1, 4)) > 0.35
+
+
+@pytest.mark.slow
+def test_earlier_of_two_docks_makes_room_where_the_later_one_s_room_is_on_its_way() -> None:
+    """Its target is sent elsewhere, and its new way leads through the place from where the other came."""
+    tank = placed((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0), parameters=Parameters().replace("docking.timeout_s", 30.0))
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    tank.run(1.0, Request(Action.DOCK, 3, DockRequest(3, 1, 2, 0)))
+    while not any("gives way" in said for _, said in tank.said):
+        tank.run(0.01)
+    tank.run(0.1, send(0, 2.5, 0.3))
+    outputs = tank.run(17.0)
+    assert tank.when("dock of module 1 gives way to another")
+    assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] * 2
+    assert min(np.linalg.norm(past[1][:3] - past[3][:3]) for past in tank.past) > 0.35
+
+
+@pytest.mark.slow
+def test_dock_to_a_target_that_comes_to_meet_another_waits_until_it_is_there() -> None:
+    """It went before the face, which was then in the way that the target came, and so ended the other's dock."""
+    tank = placed((1.0, 0.0), (2.4, 1.4), (1.75, -0.3))
+    tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    outputs = tank.run(10.0, Request(Action.DOCK, 2, DockRequest(2, 1, 0, 0)))
+    assert len(outputs.docks) == 2 and not any("ended" in said for _, said in tank.said)
+    assert tank.when("dock of module 2 waits: module 0 is on its way")
 
 
 @pytest.mark.slow

@@ -188,6 +188,28 @@ def test_approach_that_waits_to_the_end_of_its_time_is_no_jam_and_is_over() -> N
     assert dock.sequence.reason == "APPROACH took longer than 20 s, waiting for another body"
 
 
+def test_approach_that_is_to_make_room_goes_back_and_begins_anew() -> None:
+    dock = Follower()
+    dock.until(Stage.APPROACH)
+    for _ in range(100):
+        dock.step()
+    room = REST._replace(p_wb=dock.at.p_wb + 0.5 * dock.outward, q_wb=dock.at.q_wb)
+    steering = dock.step(waits=room)
+    assert dock.sequence.stage == Stage.PRE_APPROACH and steering.active is room and steering.relay == RELAY_OFF
+    dock.until(Stage.PUSH)
+
+
+def test_straight_approach_that_is_to_make_room_goes_back_on_its_line_as_far_as_it_came() -> None:
+    dock, came = Follower(Docking(approach="straight")), list[np.ndarray]()
+    for _ in range(300):
+        came.append(dock.step().active.p_wb)
+    room = REST._replace(p_wb=came[0], q_wb=dock.at.q_wb)
+    for _ in range(1500):
+        steering = dock.step(waits=room)
+    assert dock.sequence.stage == Stage.APPROACH and not steering.active.v_w.any()
+    np.testing.assert_allclose(dock.at.p_wb, came[0], atol=0.001)
+
+
 def test_approach_slows_down_to_the_speed_of_contact() -> None:
     dock, speeds = Follower(), {}
     dock.until(Stage.APPROACH)
