@@ -98,14 +98,14 @@ class DockingStage:
         """Whether any dock or undock is."""
         return bool(self._docks or self._undocks)
 
-    def forget(self, bodies: Collection[int]) -> list[int]:
-        """Ends every dock that one of these takes part in, bodies that there are no more; returns the active ones."""
+    def forget(self, bodies: Collection[int]) -> Decisions:
+        """Ends every dock that one of these takes part in, bodies that there are no more; a target that was coming goes back."""
         self._expected = {body: request for body, request in self._expected.items() if body not in bodies}
-        ended = [dock for dock in self._docks if dock.active in bodies or dock.target in bodies]
-        for dock in ended:
-            self._drop(dock)
-            self._say(WARNING, f"dock ended: {CHANGED}")
-        return [dock.active for dock in ended]
+        decisions = Decisions()
+        for dock in [each for each in self._docks if each.active in bodies or each.target in bodies]:
+            self._give_up(dock, CHANGED, decisions)
+            self._end(dock.active, decisions)
+        return decisions
 
     def expect(self, body: int, requests: Sequence[DockRequest]) -> None:
         """Plans of these have been asked for, in this order."""

@@ -142,9 +142,7 @@ class Formation:
             estimates[chain.body.index] = estimate
         kept = [chain for chain in self.chains if chain not in before]
         self.chains = sorted([*kept, *after], key=lambda chain: chain.body.index)
-        ended = self.docking.forget([chain.body.index for chain in before])
-        for chain in kept:
-            chain.dock_over = chain.dock_over or chain.body.index in ended
+        self._steer(self.docking.forget([chain.body.index for chain in before]))
         self._watch_joints()
 
     def _watch_joints(self) -> None:

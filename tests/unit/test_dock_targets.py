@@ -5,7 +5,7 @@ from itertools import cycle
 import numpy as np
 import pytest
 
-from firmware_py.core.docking import LED, NO_LONGER, SURFACES
+from firmware_py.core.docking import CHANGED, LED, NO_LONGER, SURFACES
 from firmware_py.core.docking_sequence import Stage
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.setpoint import rest_at
@@ -91,6 +91,20 @@ def test_target_that_comes_goes_back_when_the_dock_is_called_off() -> None:
     goal = tank.pipeline.formation.chains[0].guidance._goal
     assert goal is not None and goal.p_wb is not None
     np.testing.assert_allclose(goal.p_wb, held, atol=0.02)
+
+
+@pytest.mark.slow
+def test_target_that_comes_goes_back_when_the_body_that_it_comes_to_meet_is_taken_apart() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0)] * 2, each=2)
+    for state, east in zip(tank.states, (0.0, 2.4), strict=True):
+        state[:7] = [1.0, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 2))
+    held = tank.pipeline.formation.chains[0].guidance._held().p_wb.copy()
+    tank.run(0.5, Request(Action.DOCK, 2, DockRequest(2, 3, 1, 2, 0, True)))
+    tank.run(2.0, Request(Action.UNDOCK, 2, DockRequest(3, 3, 2, 2)))
+    assert tank.shape == [(0, 1), (2,), (3,)] and tank.when(f"dock of module 2 ended: {CHANGED}")
+    np.testing.assert_allclose(tank.pipeline.formation.chains[0].guidance._held().p_wb, held, atol=0.02)
 
 
 ELSEWHERE = Request(Action.HOLD, 0, rest_at(np.array([1.0, -0.5, 0.8]), np.array([1.0, 0.0, 0.0, 0.0])))

@@ -56,7 +56,7 @@ def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
     assert tank.shape == [(0, 1), (2,)]
     assert tank.pipeline.formation.docking.relays.states == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
-    assert tank.when(f"dock ended: {CHANGED}")
+    assert tank.when(f"dock of module 2 ended: {CHANGED}")
 
 
 @pytest.mark.slow
@@ -239,6 +239,20 @@ def test_dock_in_whose_place_another_was_asked_for_before_it_was_planned_never_b
     assert {(dock.module_a, dock.module_b) for each in tank.outputs[first:] for dock in each.docks} == {(2, 1)}
     assert tank.pipeline.formation.chains[0].guidance._goal is None, "nor does its target come"
     assert outputs.records[1].mode == Mode.DOCK and tank.when("dock refused: another was asked for")
+
+
+@pytest.mark.slow
+def test_dock_whose_plan_is_still_awaited_when_the_target_of_the_one_before_is_taken_apart_begins_all_the_same() -> None:
+    tank = Docked([(0, 0, 0), (0, 1, 0)] * 3, each=2, delay=50)
+    for state, north, east in zip(tank.states, (1.0, 1.0, 3.0), (0.0, 2.4, 2.4), strict=True):
+        state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, body) for body in (0, 2, 4)))
+    tank.run(1.0, Request(Action.DOCK, 2, DockRequest(2, 3, 1, 2)))
+    tank.run(1.2, Request(Action.UNDOCK, 0, DockRequest(1, 3, 0, 2)))
+    outputs = tank.run(1.0, Request(Action.DOCK, 2, DockRequest(3, 0, 5, 1)))
+    assert tank.shape == [(0,), (1,), (2, 3), (4, 5)] and tank.when(f"dock of module 2 ended: {CHANGED}")
+    assert [(dock.module_a, dock.module_b) for dock in outputs.docks] == [(5, 3)] and outputs.records[2].mode == Mode.DOCK
 
 
 def test_refused_dock_does_not_end_the_one_that_was_asked_for_after_it() -> None:
