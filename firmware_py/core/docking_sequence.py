@@ -157,7 +157,8 @@ class DockingSequence:
         """Moves the sequence on by one tick. `waits`: somebody is on its way; until it is before the face, it glides by this instead, and
         where this leads to a place, to make room, it goes back from before the face too.
         """
-        meets = None if self._under_way else self._set_off(active, target)
+        delays = waits is not None and self._p.approach == "straight"  # its line is drawn once: to where the target will be
+        meets = None if self._under_way or delays else self._set_off(active, target)
         errors = self.errors(active, target)
         dt = (time_ns - self._last_ns) * 1e-9
         self._last_ns = time_ns

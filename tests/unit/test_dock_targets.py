@@ -296,6 +296,20 @@ def test_dock_to_a_target_that_comes_to_meet_another_waits_until_it_is_there() -
 
 
 @pytest.mark.slow
+def test_straight_line_to_a_target_that_comes_to_meet_another_is_drawn_once_it_is_there() -> None:
+    """It was drawn at once, to where the target was never to be again."""
+    tank = placed((1.0, 0.0), (2.4, 1.4), (1.75, -0.3), parameters=Parameters().replace("docking.approach", "straight"))
+    tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    tank.run(0.1, Request(Action.DOCK, 2, DockRequest(2, 1, 0, 0)))
+    first, second = (dock.sequence for dock in tank.pipeline.formation.docking._docks)
+    assert first.stage == Stage.APPROACH and second.stage == Stage.PRE_APPROACH
+    while second.stage == Stage.PRE_APPROACH:
+        tank.run(0.01)
+    there = second.met(tank.outputs[-1].records[0].estimate).p_wb
+    np.testing.assert_allclose(there, first.meets_at_w, atol=0.01)
+
+
+@pytest.mark.slow
 def test_target_that_was_sent_elsewhere_is_on_no_way_to_the_place_where_it_was_to_meet() -> None:
     tank = placed((1.0, 0.0), (1.0, 2.4), (2.0, 0.75))
     tank.run(1.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
