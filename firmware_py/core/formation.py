@@ -58,6 +58,19 @@ class Formation:
             self._part(parted, inputs.time_ns, estimates)
         outputs.events += self.docking.events
 
+    def asked(self, chain: BodyPipeline, granted: Sequence[DockRequest]) -> list[DockRequest | PartRequest]:
+        """What is to be prepared for docks and undocks of a body that were granted in this tick."""
+        if not chain.supervisor.armed:
+            return [self._parting(chain, request) for request in granted]
+        self.docking.expect(chain.body.index, granted)
+        return [*granted]
+
+    def _parting(self, chain: BodyPipeline, request: DockRequest) -> DockRequest | PartRequest:
+        """The undock of a disarmed body, which no magnet pushes open: it is parted where it has come apart, whichever side was named."""
+        apart = [joint for joint in self.docking.open_joints(APART) if joint.module in chain.body.modules]
+        named = [joint for joint in apart if modules_of(joint) == modules_of(request)]
+        return PartRequest((*named, *(joint for joint in apart if joint not in named))) if named else request
+
     def leave(self, chain: BodyPipeline, outputs: Outputs) -> None:
         """Docks and undocks go on in the mode DOCK alone: a body that leaves it lets go at once."""
         supervisor = chain.supervisor

@@ -231,8 +231,7 @@ class Pipeline:
             self._retune(requests, outputs)
         for chain in formation.chains:
             granted = chain.decide(inputs, estimates[chain.body.index], requests)
-            outputs.preparations += granted
-            docking.expect(chain.body.index, granted)
+            outputs.preparations += formation.asked(chain, granted)
             outputs.events += [event._replace(body=chain.body.index) for event in chain.supervisor.events]
             outputs.estop = outputs.estop or chain.supervisor.raises_estop
             if docking.under_way:

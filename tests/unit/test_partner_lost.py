@@ -149,14 +149,36 @@ def test_disarmed_body_whose_joint_pictures_show_closed_is_not_undocked() -> Non
     assert {max(states) for states in tank.pipeline.formation.docking.relays.states} == {RELAY_PULL}
 
 
-def test_disarmed_ring_says_which_modules_keep_the_one_that_is_to_leave_from_leaving() -> None:
-    """Module 1 has come off both its neighbours; 3 is asked to leave, and leaves alone, by both of its joints."""
+@pytest.mark.parametrize(("module", "target"), [(1, 3), (3, 1)])
+def test_disarmed_ring_is_parted_where_it_has_come_apart_whichever_side_is_named(module: int, target: int) -> None:
+    """Module 1 has come off both its neighbours: 3 was to leave by the joint that still holds it too, and was refused."""
     tank = Docked(RING)
     tank.run(0.5)
     tank.lose(1)
     tank.run(2.0)
-    tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(3, 3, 1, 2)))
-    assert tank.when(f"undock refused: {HOLDS.format(2, 3)}") and tank.shape == [(0, 1, 2, 3)]
+    faces = {1: 2, 3: 3}
+    tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(module, faces[module], target, faces[target])))
+    assert tank.shape == [(0, 2, 3), (1,)]
+
+
+@pytest.mark.parametrize("asked", [DockRequest(1, 1, 0, 0), DockRequest(2, 0, 3, 1)], ids=str)
+def test_disarmed_ring_that_has_come_apart_into_halves_is_undocked_into_them(asked: DockRequest) -> None:
+    """Each corner was to leave alone, by both its joints, of which one holds: only forced arming parted the halves."""
+    tank = Docked(RING)
+    tank.run(0.5)
+    hear = tank._hear
+
+    def hear_no_current_between_the_halves(tick: int) -> list[ModuleInputs]:
+        modules = hear(tick)
+        for module in modules:
+            module.docks = [DockFeedback(first, (0.0, 0.0, ma[2]) if first == 0 else ma, relays) for first, ma, relays in module.docks]
+        return modules
+
+    tank._hear, tank.hidden = hear_no_current_between_the_halves, {1, 3}  # type: ignore[method-assign]
+    tank.run(2.0)
+    outputs = tank.run(0.5, Request(Action.UNDOCK, 0, asked))
+    assert tank.shape == [(0, 2), (1, 3)] and [record.state for record in outputs.records] == [State.DISARMED] * 2
+    assert [sum(states) for states in tank.pipeline.formation.docking.relays.states] == [1] * 4, "the halves hold"
 
 
 def test_fail_safe_that_is_switched_off_parts_nothing() -> None:
