@@ -107,13 +107,16 @@ class Framer:
         return _Header(layout.size, length, flags, system, component, low | high << 16)
 
     def _definition(self, header: _Header) -> Definition | None:
-        """Of the message; None when this can be no frame: nothing more of it is waited for, a stop may stand behind one byte of noise."""
+        """Of the message; None when this can be no frame: nothing more of it is waited for, a stop may stand behind one byte of noise.
+
+        Only in MAVLink 2 a message may have grown. None of MAVLink 1 is 253 bytes long: that is the first byte of the next frame.
+        """
         definition = self._dialect.by_number.get(header.number)
         if header.flags & ~_SIGNED:
             self.counts["flags"] += 1
         elif definition is None:
             self.counts["unknown"] += 1
-        elif header.size == _HEADER_1.size and header.length > definition.struct.size:  # only in MAVLink 2 a message may have grown
+        elif header.size == _HEADER_1.size and (header.length > definition.struct.size or header.length == _MAGIC_2):
             self.counts["length"] += 1
         else:
             return definition

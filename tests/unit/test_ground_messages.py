@@ -275,6 +275,11 @@ def test_every_definition_has_pymavlinks_layout() -> None:
         )
 
 
+def test_no_message_of_the_old_protocol_is_as_long_as_the_first_byte_of_the_new_one_says() -> None:
+    """A length of 253 is therefore no length: the Framer goes on behind it."""
+    assert 0xFD not in {d.struct.size for d in load_dialect().by_number.values() if d.number < 256}
+
+
 def test_refusals_and_failsafes_reach_the_client_as_text(world: World, client: Client) -> None:
     world.robot.refuse[Action.ARM] = "pose is 700 ms old, 500 permitted, and some more that makes it long"
     assert ask(world, client, 400, 1) == mavlink.MAV_RESULT_DENIED

@@ -17,8 +17,10 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.types import Action, Event
 from firmware_py.ground.link import Links
+from firmware_py.ground.signing import Signing
 from firmware_py.ground.telemetry import DEFAULT_HZ
 from firmware_py.ground.wire import checksum
+from tests.unit.ground_attack import KEY, NOW
 from tests.unit.ground_sides import PATIENCE_S, free_port, heartbeat, pump, received, side_on
 from tests.unit.ground_world import Robot, World
 
@@ -60,6 +62,17 @@ def test_stop_behind_noise_that_looks_like_the_start_of_a_frame_is_heard_at_once
     assert world.station.take(client.channel, noise + stop, world.time_ns, datagram=False)
     world.run(1)
     assert [request.action for request in world.robot.asked] == [Action.ESTOP]
+
+
+@pytest.mark.parametrize("signing", [Signing(), Signing(key=KEY, timestamp=NOW)])
+def test_stop_behind_a_byte_of_the_old_protocol_is_heard_at_once_whatever_its_number(signing: Signing) -> None:
+    """At 3 of 256 it was taken for the beginning of the longest messages that there are."""
+    station = World(signing=signing).station
+    client = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+    client.signing.secret_key, client.signing.timestamp, client.signing.sign_outgoing = KEY, NOW, signing.key is not None
+    for client.seq in range(256):
+        stop = mavlink.MAVLink_command_long_message(1, 1, 31012, 0, *[0] * 7).pack(client)
+        assert station.take(0, b"\xfe" + bytes(stop), 0, datagram=False), client.seq
 
 
 def test_frame_of_the_old_protocol_is_no_longer_than_its_message_and_one_of_the_new_may_have_grown() -> None:
