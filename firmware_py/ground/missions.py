@@ -15,7 +15,7 @@ from firmware_py.ground.system import Arrival, Handler, System
 
 MOST_ITEMS = 500
 _MISSION = 0
-_ACCEPTED, _ERROR, _UNSUPPORTED, _NO_SPACE, _INVALID_SEQUENCE, _DENIED, _CANCELLED = 0, 1, 3, 4, 13, 14, 15
+_ACCEPTED, _UNSUPPORTED, _NO_SPACE, _INVALID_SEQUENCE, _DENIED, _CANCELLED = 0, 3, 4, 13, 14, 15
 _ASK_AGAIN_NS, _MOST_ASKED = 250_000_000, 20
 _ASKED_ALIKE = 4
 """Times that an item is asked for in one form, before the other has its turn. DroneKit hears the old one alone; others answer it in degrees
