@@ -1,13 +1,28 @@
-"""Commands about messages: which are streamed how often, and which are wanted once."""
+"""What clients ask about messages: which are streamed how often, and which are wanted once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import chain
 
 from firmware_py.ground.command import ACCEPTED, DENIED, UNSUPPORTED, Answer, Command
-from firmware_py.ground.system import NS_PER_S, Arrival, System
+from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
 from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS
+
+_STOP, _START = 0, 1
+_GROUPS: Mapping[int, tuple[str, ...]] = {
+    1: ("SCALED_PRESSURE", "SCALED_PRESSURE2"),  # RAW_SENSORS
+    2: ("SYS_STATUS", "MISSION_CURRENT", "GPS_RAW_INT", "NAMED_VALUE_FLOAT"),  # EXTENDED_STATUS
+    3: ("SERVO_OUTPUT_RAW",),  # RC_CHANNELS
+    6: ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED"),  # POSITION
+    10: ("ATTITUDE",),  # EXTRA1
+    11: ("VFR_HUD",),  # EXTRA2
+    12: ("SYSTEM_TIME", "BATTERY_STATUS"),  # EXTRA3
+}
+"""MAV_DATA_STREAM: what ArduSub counts among each, of what there is here."""
+_ALL = 0
+_NAMES_OF = {_ALL: tuple(chain.from_iterable(_GROUPS.values())), **_GROUPS}
 
 
 class MessageRequests:
@@ -26,6 +41,19 @@ class MessageRequests:
             512: self._request_message,
             520: lambda c: self._request(c, "AUTOPILOT_VERSION"),
         }
+
+    def handlers(self) -> dict[str, Handler]:
+        """By message name."""
+        return {"REQUEST_DATA_STREAM": self._set_group}
+
+    def _set_group(self, arrival: Arrival) -> None:
+        """The old way, of QGroundControl, MAVProxy and many scripts with an ArduSub: it has no answer."""
+        m, rates = arrival.message, self._system.channels[arrival.channel]
+        if m["start_stop"] not in (_STOP, _START):
+            return
+        hz = m["req_message_rate"] * m["start_stop"]
+        for name in _NAMES_OF.get(m["req_stream_id"], ()):
+            rates.set(name, round(NS_PER_S / hz) if hz else 0, arrival.time_ns)
 
     def _set_interval(self, command: Command) -> Answer:
         name = self._name(command.get(1))

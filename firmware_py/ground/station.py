@@ -39,8 +39,10 @@ _MAY_STOP = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE", "MANUAL_CONTROL")
 """They go to services that know what stops."""
 _STEERS_ONE = ("RC_CHANNELS_OVERRIDE", "SET_POSITION_TARGET_LOCAL_NED", "SET_ATTITUDE_TARGET")
 """For all, they are for the one body that there is: several would be steered to one place. DroneKit sends everything to all."""
-_OF_NO_BODY = ("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END")
-"""Logs are the process's: who fetches one goes on with the same system when its body docks."""
+_OF_NO_BODY = ("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END", "REQUEST_DATA_STREAM")
+"""Logs are the process's: who fetches one goes on with the same system when its body docks. Rates are the link's: some clients
+ask for them again and again.
+"""
 _NEVER_SIGNED = ("RADIO_STATUS",)
 """Taken from everybody, also with a key."""
 _TARGETS = frozenset({"target_system", "target"})
@@ -73,13 +75,14 @@ class Services:
             "AUTOPILOT_VERSION": self.presence.autopilot_version,
             "AVAILABLE_MODES": self.presence.available_modes,
         }
-        self.commands = CommandService(system, self.flight, self.steering, MessageRequests(system, extra))
-        parts = (self.commands, self.parameters, self.missions, self.steering, self.presence, self.logs)
+        messages = MessageRequests(system, extra)
+        self.commands = CommandService(system, self.flight, self.steering, messages)
+        parts = (self.commands, messages, self.parameters, self.missions, self.steering, self.presence, self.logs)
         self._handlers = {name: handler for part in parts for name, handler in part.handlers().items()}
 
     def take(self, arrival: Arrival, addressed: bool) -> None:
-        """A message for this system, `addressed`, or for all. A system whose body is gone hears what may stop it, and who wants logs; the
-        rest it refuses.
+        """A message for this system, `addressed`, or for all. A system whose body is gone hears what may stop it, and who wants logs
+        or other rates; the rest it refuses.
         """
         name = arrival.message.name
         handler = self._handlers.get(name)

@@ -329,6 +329,43 @@ def test_message_interval_sets_the_rate_of_this_link_alone(world: World, client:
     assert client.last("MESSAGE_INTERVAL").interval_us == -1
 
 
+def test_group_of_messages_streams_as_an_ardusubs_client_asks_on_its_link_alone(world: World, client: Client) -> None:
+    """REQUEST_DATA_STREAM, by which QGroundControl, MAVProxy (`set streamrate`) and scripts set rates."""
+    other = world.client(254)
+
+    def streamed(group: int, hz: int, start: int = 1) -> list[int]:
+        client.send("REQUEST_DATA_STREAM", 1, 1, group, hz, start)
+        world.run(1)
+        client.clear()
+        other.clear()
+        world.run(100)
+        assert len(other.all("ATTITUDE")) == 10 and client.all("HEARTBEAT")
+        return [len(client.all(name)) for name in ("ATTITUDE", "VFR_HUD", "SYS_STATUS", "SERVO_OUTPUT_RAW")]
+
+    assert streamed(mavlink.MAV_DATA_STREAM_EXTRA1, 50) == [50, 4, 2, 2]
+    assert streamed(mavlink.MAV_DATA_STREAM_EXTRA1, 20, start=2) == [50, 4, 2, 2], "neither starts nor stops"
+    assert streamed(mavlink.MAV_DATA_STREAM_ALL, 5) == [5, 5, 5, 5]
+    assert streamed(mavlink.MAV_DATA_STREAM_ALL, 65535) == [100, 100, 100, 100], "once in a tick"
+    assert streamed(mavlink.MAV_DATA_STREAM_EXTRA2, 5, start=0) == [100, 0, 100, 100]
+    assert streamed(mavlink.MAV_DATA_STREAM_RAW_CONTROLLER, 5) == [100, 0, 100, 100], "there is nothing of it here"
+    assert streamed(mavlink.MAV_DATA_STREAM_ALL, 0) == [0, 0, 0, 0]
+
+
+def test_rates_that_are_asked_of_a_docked_body_again_and_again_are_no_warning_and_count_once_it_is_undocked() -> None:
+    world = World(modules=2)
+    client, apart = world.client(), world.robot.bodies
+    world.robot.dock()
+    world.run(1)
+    client.clear()
+    client.send("REQUEST_DATA_STREAM", 2, 1, mavlink.MAV_DATA_STREAM_ALL, 1, 1)
+    world.run(10)
+    assert not client.texts
+    world.robot.bodies = apart
+    client.clear()
+    world.run(200)
+    assert sum(m.get_srcSystem() == 2 for m in client.all("ATTITUDE")) in (2, 3)
+
+
 def test_heartbeat_cannot_be_switched_off(world: World, client: Client) -> None:
     assert ask(world, client, 511, mavlink.MAVLINK_MSG_ID_HEARTBEAT, -1) == mavlink.MAV_RESULT_DENIED
 
