@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -82,6 +82,8 @@ class _Flight:
     """Legs under way."""
 
     legs: tuple[Leg, ...]
+    terms: tuple[Any, ...]
+    """All that its plan is made of, but where it begins."""
     arrivals_s: tuple[float, ...] = ()
     taken: int = 0
     """System.taken when it began, and while it is followed, as of the last tick."""
@@ -295,12 +297,32 @@ class MissionFlight:
         if self._plan_at_tick is None or s.picture.ticks < self._plan_at_tick or self._flight is None or not self._flight.holds:
             return
         self._plan_at_tick = None
-        at, ground, cruise = s.record.setpoint, self._parameters().ground, self._cruise
+        at, ground = s.record.setpoint, self._parameters().ground
         self._serial += 1
-        legs = tuple(leg._replace(speed_m_s=cruise) if math.isnan(leg.speed_m_s) else leg for leg in self._flight.legs)
+        self._flight.terms = self._terms(self._flight.legs)
         self.jobs.append(
-            PlanJob(s.body, self._serial, at.p_wb, at.q_wb, legs, ground.mission_acceleration, ground.mission_corridor_m)
-        )
+            PlanJob(
+                s.body, self._serial, at.p_wb, at.q_wb, self._with_speeds(self._flight.legs), ground.mission_acceleration,
+                ground.mission_corridor_m,
+            )
+        )  # fmt: skip
+
+    def _with_speeds(self, legs: Sequence[Leg]) -> tuple[Leg, ...]:
+        cruise = self._cruise
+        return tuple(leg._replace(speed_m_s=cruise) if math.isnan(leg.speed_m_s) else leg for leg in legs)
+
+    def _terms(self, legs: Sequence[Leg]) -> tuple[Any, ...]:
+        ground = self._parameters().ground
+        places = (None if leg.p_wb is None else tuple(leg.p_wb) for leg in legs)
+        rest = (leg._replace(p_wb=None) for leg in self._with_speeds(legs))
+        return ground.mission_acceleration, ground.mission_corridor_m, *places, *rest
+
+    def _flies_already(self, legs: Sequence[Leg]) -> bool:
+        """Whether just these are under way, and none of them is reached: who asks again did not hear the answer."""
+        flight = self._flight
+        if flight is None or flight.replaced or flight.reached or flight.taken != self._system.taken:
+            return False
+        return flight.terms == self._terms(legs)
 
     def _advance(self, flight: _Flight, time_ns: int) -> None:
         assert flight.started_ns is not None
@@ -324,10 +346,12 @@ class MissionFlight:
             self._system.broadcast("MISSION_ITEM_REACHED", {"seq": self._repeat.pop(0)[0]})
 
     def _begin(self, legs: Sequence[Leg]) -> None:
+        if self._flies_already(legs):
+            return
         s = self._system.subject
         self._serial += 1  # a plan that is still being made is no longer wanted
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
-        self._flight = _Flight(tuple(legs), taken=self._system.taken, members=s.picture.members(s.body))
+        self._flight = _Flight(tuple(legs), self._terms(legs), taken=self._system.taken, members=s.picture.members(s.body))
         self._plan_at_tick, self._hold_by_tick = s.picture.ticks + _SETTLE_TICKS, s.picture.ticks + _HOLD_TICKS
 
     def _end(self, state: int) -> None:

@@ -206,6 +206,54 @@ def test_start_that_comes_again_behind_a_mode_that_is_refused_does_not_begin_the
     assert world.station.jobs() == [] and world.robot.mode[0] == Mode.AUTO
 
 
+@pytest.mark.parametrize("by_message", [False, True])
+@pytest.mark.parametrize("flown_ticks", [0, 10, 500])
+def test_jump_that_comes_again_because_its_answer_was_lost_flies_on(
+    world: World, client: Client, by_message: bool, flown_ticks: int
+) -> None:
+    """It stopped, and was planned anew for each repetition, from the place to which it had come."""
+
+    def jump() -> None:
+        client.send(*(("MISSION_SET_CURRENT", 1, 1, 1) if by_message else ("COMMAND_LONG", 1, 1, 224, 0, 1, *[0] * 6)))
+        world.run(10)
+
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    jump()
+    jump()
+    (job,) = world.station.jobs()
+    world.station.planned(0, Plan(job.serial, Path(), (10.0, 20.0)))
+    world.run(3 + flown_ticks)
+    jump()
+    assert world.station.jobs() == [] and world.robot.mode[0] == Mode.AUTO
+    assert client.last("MISSION_CURRENT").seq == 1
+    world.run(1000)
+    jump()
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [1, 2], "once the item is reached it is gone back to"
+
+
+def test_jump_to_the_item_that_is_flown_to_takes_up_another_speed(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    client.command(178, 1, 0.3)
+    client.command(224, -1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.speed_m_s for leg in job.legs] == [pytest.approx(0.3)] * 3
+
+
+def test_jump_behind_what_takes_the_body_for_something_else_is_flown(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    client.command(176, 1, 1)
+    client.command(224, 0)
+    client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [0, 1, 2]
+
+
 def test_start_that_comes_again_while_its_mission_is_planned_is_waited_for_once(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     client.command(400, 1)

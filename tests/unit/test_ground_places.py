@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from firmware_py.core.types import Mode
 from firmware_py.ground.geodesy import Origin
-from tests.unit.ground_missions import PLACES, fly, item, upload
-from tests.unit.ground_requests import NAN
+from firmware_py.ground.mission_flight import Plan, PlanJob
+from tests.unit.ground_missions import PLACES, Path, fly, item, upload
+from tests.unit.ground_requests import NAN, ask
 from tests.unit.ground_world import Client, World
 
 
@@ -46,6 +48,28 @@ def test_reposition_is_as_fast_as_it_asks_for(world: World, client: Client, aske
     world.run(10)
     (job,) = world.station.jobs()
     assert job.legs[0].speed_m_s == pytest.approx(flown)
+
+
+def test_reposition_that_comes_again_because_its_answer_was_lost_flies_on(world: World, client: Client) -> None:
+    """It stopped, and was planned anew for each repetition."""
+
+    def go(yaw: float = NAN, x: int = 302084010) -> list[PlanJob]:
+        client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, yaw, x, 1201614000, -0.4)
+        world.run(10)
+        return world.station.jobs()
+
+    ask(world, client, 400, 1)
+    (job,) = go()
+    assert go() == [], "its plan is waited for once"
+    world.station.planned(0, Plan(job.serial, Path(), (10.0,)))
+    world.run(300)
+    assert go() == [] and world.robot.mode[0] == Mode.AUTO
+    assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+    ask(world, client, 178, 1, 0.3)
+    for another in ({}, {"x": 302084020}, {"yaw": 1.0}):
+        assert len(go(**another)) == 1, "another speed, place or heading"
+    ask(world, client, 193, 0)
+    assert len(go(yaw=1.0)) == 1, "it was paused"
 
 
 @pytest.mark.parametrize("speed", [1e-6, 50.0])
