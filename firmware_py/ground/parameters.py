@@ -46,17 +46,19 @@ class ParameterStore:
         return float(attrgetter(self.names[name][0])(self.values))
 
     def set(self, name: str, value: float) -> tuple[str, float]:
-        """Change one and store all that differ from the start; returns its name in the registry and the value as kept.
+        """Change one and store all that differ from the start, where it is no longer as it was; returns its name in the registry and the
+        value as kept.
 
         Raises:
             DescriptionError: out of range.
             OSError: it cannot be stored; the old value stays.
         """
         dotted, _ = self.names[name]
-        kind = type(attrgetter(dotted)(self.values))
+        before = attrgetter(dotted)(self.values)
+        kind = type(before)
         kept = kind(value) if kind is not int else round(value)
         changed = self.values.replace(dotted, kept)
-        if self._path is not None:
+        if self._path is not None and kept != before:
             write_atomically(self._path, differences_toml(changed, self._started).encode())
         self.values = changed
         return dotted, kept
@@ -111,8 +113,8 @@ class ParameterService:
             self._system.say(WARNING, f"{stays}: {error.filename}: {error.strerror}" if isinstance(error, OSError) else wrong)
             self._system.send(arrival.channel, "PARAM_VALUE", self._value(name))
             return
+        self._system.ask(Action.SET_PARAMETER, (dotted, kept))  # it is for every body
         for system in self._everybody():
-            system.ask(Action.SET_PARAMETER, (dotted, kept))
             system.broadcast("PARAM_VALUE", self._value(name))
 
     def _value(self, name: str) -> dict[str, float | str]:

@@ -64,6 +64,14 @@ def test_parameter_that_is_set_on_one_body_is_told_by_all_for_it_is_theirs_too()
     assert [(v.get_srcSystem(), v.param_value) for v in client.all("PARAM_VALUE")] == [(1, 2.75), (2, 2.75)]
 
 
+def test_value_that_a_parameter_has_already_is_echoed_and_not_stored_again(world: World, client: Client, tmp_path: Path) -> None:
+    """What a client sends again because the echo was lost waits for no disk."""
+    assert put(world, client, "POS_BW", 2.75) == 2.75
+    (tmp_path / "parameters.toml").unlink()
+    assert put(world, client, "POS_BW", 2.75) == 2.75
+    assert not list(tmp_path.iterdir())
+
+
 def test_out_of_range_is_refused_in_words_and_the_old_value_echoed(world: World, client: Client) -> None:
     assert put(world, client, "POS_BW", 1000.0) == SHIPPED
     assert "parameter POS_BW: 1000.0 is out of range; permitted: 0.1 to 10 rad/s" in client.texts

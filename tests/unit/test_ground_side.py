@@ -95,6 +95,19 @@ def test_stop_is_handed_over_however_much_else_is_asked() -> None:
         assert Action.ESTOP in asked and len(asked) == 257
 
 
+def test_parameters_that_come_at_once_all_reach_the_flight_of_a_fleet() -> None:
+    """Each was asked for once for each body: of a hundred with four bodies 36 were echoed, and told to all, and never flown by."""
+    client = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+    with closing(side_on("udpin:127.0.0.1:0", modules=4)) as side:
+        pump(side, robot := Robot(4), 2)
+        wanted = dict(list(side.station.store.names.items())[:100])
+        for name in wanted:
+            value = side.station.store.get(name)
+            side.station.take(0, bytes(mavlink.MAVLink_param_set_message(1, 1, name.encode(), value, 9).pack(client)), 0)
+        asked = pump(side, robot)
+    assert [request.argument[0] for request in asked] == [dotted for dotted, _ in wanted.values()]
+
+
 def test_new_key_is_stored_at_once_for_the_robot_may_be_restarted_next(tmp_path: Path) -> None:
     firmware = firmware_of(bodies=Robot().bodies)
     config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",), store=str(tmp_path))
