@@ -60,9 +60,11 @@ class Pilots:
     """
 
     def __init__(self, system: System, may_steer: Callable[[int, int], bool], timeout_s: Callable[[], float]) -> None:
-        self._may_steer = may_steer
+        self._system, self._may_steer = system, may_steer
         self._turn = Turn(system, "sticks", timeout_s)
         self._pressed: dict[Sender, int] = {}
+        self._never: set[Sender] = set()
+        """Who was told that its sticks are not taken."""
 
     def are_silent(self, time_ns: int) -> bool:
         """Whether nobody has the sticks."""
@@ -70,7 +72,13 @@ class Pilots:
 
     def steers(self, arrival: Arrival) -> bool:
         """Whether a sender of sticks has them, now that it was heard."""
-        return self._may_steer(*sender_of(arrival)) and self._turn.is_of(arrival)
+        sender = sender_of(arrival)
+        if self._may_steer(*sender):
+            return self._turn.is_of(arrival)
+        if sender not in self._never:
+            self._never.add(sender)
+            self._system.say(NOTICE, f"sticks of {sender[0]}/{sender[1]} are not taken: it is not the watched ground station")
+        return False
 
     def freshly_pressed(self, arrival: Arrival, buttons: int) -> int:
         """The buttons that the sender did not hold in its message before."""

@@ -49,6 +49,17 @@ def test_sticks_of_another_than_the_watched_station_are_never_taken() -> None:
     assert not world.robot.asked
 
 
+def test_station_whose_sticks_are_never_taken_is_told_so_once() -> None:
+    """It moved its sticks, nothing moved, and nobody said why."""
+    world = World(config=GroundConfig(watch_system=255))
+    other = world.client(77)
+    for _ in range(100):
+        other.send("MANUAL_CONTROL", 1, 1000, 0, 500, 0, ARM_BUTTON)
+        other.send("RC_CHANNELS_OVERRIDE", 1, 1, *[1600] * 8)
+        world.run(10)
+    assert other.texts == "sticks of 77/190 are not taken: it is not the watched ground station"
+
+
 def test_sticks_pass_to_another_only_after_the_timeout() -> None:
     world = World()
     pilot, other = world.client(255), world.client(77)
