@@ -30,6 +30,9 @@ SET_CURRENT, MOTOR_TEST = 224, 209
 _NEEDED = {ARM: 1, TERMINATE: 1, SET_CURRENT: 1, MOTOR_TEST: 3, DOCK: 4, UNDOCK: 4}
 """How many of its first parameters a command must name: what is none of them would be taken for 0, which disarms or clears an e-stop."""
 
+_PWM = 1100, 1900
+"""Ends of a motor test's throttle as a pulse, us. In % they are the identity's."""
+
 
 @dataclass(frozen=True, slots=True)
 class Pending:
@@ -117,8 +120,8 @@ class CommandService:
         handler = self._table.get(command.number)
         if not self._system.body_is_known and not _stops(command):
             answer: Answer = self._refuse(command)
-        elif not all(map(math.isfinite, command.parameters[: _NEEDED.get(command.number, 0)])):
-            answer = DENIED
+        elif missing := [n for n in range(1, _NEEDED.get(command.number, 0) + 1) if not math.isfinite(command.parameters[n - 1])]:
+            answer = self._unless(f"its parameter {missing[0]} is no number", f"command {command.number}", DENIED)
         else:
             answer = UNSUPPORTED if handler is None else handler(command)
         if answer is not None:
@@ -199,12 +202,14 @@ class CommandService:
         return self._unless(self._missions.jump(int(command.get(1))), "mission", DENIED)
 
     def _change_speed(self, command: Command) -> Answer:
-        return ACCEPTED if command.get(1) not in ONE_WAY_SPEEDS and self._missions.set_speed(command.get(2)) else DENIED
+        if command.get(1) in ONE_WAY_SPEEDS:
+            return self._unless("there is none of climbing or descending alone", "speed", DENIED)
+        return self._unless(self._missions.set_speed(command.get(2)), "speed", DENIED)
 
     def _reposition(self, command: Command) -> Answer:
         latitude, longitude, altitude = command.parameters[4:7]
         if not all(map(math.isfinite, (latitude, longitude, altitude))):
-            return DENIED
+            return self._unless("it names no place on the earth", "reposition", DENIED)
         if self._system.is_one_of_several(command.arrival):
             return self._unless("it is for all, and there are several bodies", "reposition", DENIED)
         reason = self._missions.go_to(latitude, longitude, altitude, command.parameters[3], command.get(1))
@@ -233,10 +238,13 @@ class CommandService:
 
     def _dock(self, command: Command, action: Action) -> Answer:
         module, face, target, target_face, turns = (int(command.get(i)) for i in range(1, 6))
-        known = len(self._system.subject.picture.modules)
-        faces_fit = face in range(FACES) and target_face in range(FACES) and turns in range(QUARTERS)
-        if module not in range(known) or target not in range(known) or module == target or not faces_fit:
-            return DENIED
+        last = len(self._system.subject.picture.modules) - 1
+        reason = _outside(
+            ("module", module, 0, last), ("face", face, 0, FACES - 1), ("target module", target, 0, last),
+            ("target face", target_face, 0, FACES - 1), ("quarter turns", turns, 0, QUARTERS - 1),
+        )  # fmt: skip
+        if reason or module == target:
+            return self._unless(reason or f"module {module} and itself", action.name.lower(), DENIED)
         request = DockRequest(module, face, target, target_face, turns, command.get(6) >= 0.5)
         s = self._system.subject
         parts = action == Action.UNDOCK and s.picture.leader(module) == s.picture.leader(target)
@@ -248,15 +256,16 @@ class CommandService:
         return self._ask(command, action, request, is_done)
 
     def _motor_test(self, command: Command) -> Answer:
-        """Motor, throttle type (0: %, 1: PWM 1100 to 1900), throttle, seconds; motors and % count from where the identity's do."""
-        count, identity = CHANNELS * len(self._system.subject.modules), self._system.subject.identity
-        thruster, kind, throttle = int(command.get(1)) - identity.first_motor, int(command.get(2)), command.get(3)
-        rest = identity.rest_percent
-        share = {0: (throttle - rest) / (100 - rest), 1: (throttle - 1500) / 400}.get(kind)
-        if thruster not in range(count) or share is None or not -1 <= share <= 1:
-            return DENIED
+        """Motor, throttle type (0: %, 1: PWM), throttle, seconds; motors and % count from where the identity's do."""
+        s, identity = self._system.subject, self._system.subject.identity
+        motor, kind, throttle = int(command.get(1)), int(command.get(2)), command.get(3)
+        low, high = _PWM if kind == 1 else (2 * identity.rest_percent - 100, 100)
+        first, last = identity.first_motor, identity.first_motor + CHANNELS * len(s.modules) - 1
+        reason = _outside(("motor", motor, first, last), ("throttle type", kind, 0, 1), ("throttle", throttle, low, high))
+        if reason:
+            return self._unless(reason, "motor test", DENIED)
+        thruster, share = motor - first, (2 * throttle - low - high) / (high - low)
         seconds = min(max(command.get(4, 1.0), 0.0), 10.0)
-        s = self._system.subject
         is_turning = lambda: s.picture.mode(s.body) == Mode.MOTOR_DETECT and s.armed  # noqa: E731
         return self._ask(command, Action.MOTOR_TEST, (thruster, share, seconds), is_turning)
 
@@ -264,6 +273,11 @@ class CommandService:
 def _names_mode(command: Command) -> bool:
     """Whether the number beside MAV_MODE_FLAG is one: without its flag it is to be ignored, and flags alone choose no mode here."""
     return bool(int(command.get(1)) & CUSTOM_MODE_ENABLED)
+
+
+def _outside(*wanted: tuple[str, float, float, float]) -> str:
+    """The first that is beyond its ends, in words; each is a name, a value, and the lowest and highest that there are."""
+    return next((f"{name} {value:g}; it needs {low:g} to {high:g}" for name, value, low, high in wanted if not low <= value <= high), "")
 
 
 def _stops(command: Command) -> bool:

@@ -204,13 +204,13 @@ class MissionFlight:
         p.current, p.state, self._left = index, PAUSED, ()
         return ""
 
-    def set_speed(self, speed_m_s: float) -> bool:
-        """Speed of what is planned from now on; -1: as before, -2: as the parameter says."""
+    def set_speed(self, speed_m_s: float) -> str:
+        """Speed of what is planned from now on; -1: as before, -2: as the parameter says. Returns why not, or nothing."""
         wanted = {SPEED_STAYS: self._speed, SPEED_DEFAULT: None}.get(speed_m_s, speed_m_s)
         if wanted is not None and not SLOWEST <= wanted <= FASTEST:
-            return False
+            return _no_speed(wanted)
         self._speed = wanted
-        return True
+        return ""
 
     def go_to(self, latitude_deg: float, longitude_deg: float, altitude_m: float, yaw: float, speed_m_s: float) -> str:
         """Fly to one place inside the fence; a speed of 0 or less is that of missions. Returns why not, or nothing."""
@@ -222,7 +222,7 @@ class MissionFlight:
         if result:
             return reason
         if speed_m_s > 0 and not SLOWEST <= speed_m_s <= FASTEST:
-            return f"a speed of {speed_m_s:g} m/s; it needs {SLOWEST:g} to {FASTEST:g}"
+            return _no_speed(speed_m_s)
         if s.progress.state == ACTIVE:
             self._end(PAUSED)
         turned = yaw if math.isfinite(yaw) else None
@@ -387,3 +387,7 @@ class MissionFlight:
             if item.command == LOITER_UNLIMITED:
                 break
         return tuple(legs)
+
+
+def _no_speed(speed_m_s: float) -> str:
+    return f"a speed of {speed_m_s:g} m/s; it needs {SLOWEST:g} to {FASTEST:g}"

@@ -61,6 +61,27 @@ def test_speed_of_climbing_or_descending_alone_is_denied(world: World, client: C
     assert ask(world, client, 178, kind, 1.5) == mavlink.MAV_RESULT_DENIED
 
 
+@pytest.mark.parametrize(
+    ("number", "parameters", "why"),
+    [
+        (178, (1, 5.0), "speed refused: a speed of 5 m/s; it needs 0.01 to 2"),
+        (178, (2, 1.0), "speed refused: there is none of climbing or descending alone"),
+        (209, (9, 0, 20, 1), "motor test refused: motor 9; it needs 1 to 8"),
+        (209, (1, 0, 120, 1), "motor test refused: throttle 120; it needs -100 to 100"),
+        (209, (1, 1, 1000, 1), "motor test refused: throttle 1000; it needs 1100 to 1900"),
+        (209, (1, 2, 0, 1), "motor test refused: throttle type 2; it needs 0 to 1"),
+        (209, (1, 0, NAN, 1), "command 209 refused: its parameter 3 is no number"),
+        (31010, (0, 0, 1, 1), "dock refused: target module 1; it needs 0 to 0"),
+        (31011, (0, 0, 0, 1), "undock refused: module 0 and itself"),
+    ],
+)
+def test_command_that_makes_no_sense_is_denied_in_words(
+    world: World, client: Client, number: int, parameters: tuple[float, ...], why: str
+) -> None:
+    assert ask(world, client, number, *parameters) == mavlink.MAV_RESULT_DENIED
+    assert client.texts == why and not world.robot.asked
+
+
 @pytest.mark.parametrize("number", [20, 21])
 def test_return_and_land_both_surface(world: World, client: Client, number: int) -> None:
     assert ask(world, client, number) == mavlink.MAV_RESULT_ACCEPTED
