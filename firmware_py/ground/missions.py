@@ -21,6 +21,7 @@ _ASKED_ALIKE = 4
 """Times that an item is asked for in one form, before the other has its turn. DroneKit hears the old one alone; others answer it in degrees
 of 32 bits, which tell a place to a metre, or refuse it.
 """
+_FLIES = "it flies, and is not changed in part"
 _AT_ONCE = (2, 3)
 """What stands for `current` in an item of no mission: ArduPilot's way to go to a place or to an altitude at once."""
 
@@ -101,8 +102,8 @@ class MissionService:
         if count > MOST_ITEMS:
             self._acknowledge(arrival, _NO_SPACE, kind)
             return
-        if self._denies(arrival):
-            self._acknowledge(arrival, _DENIED, kind)
+        if reason := self._against(arrival):
+            self._deny(arrival, kind, reason)
             return
         if count == 0:
             self._upload = self._ended = None
@@ -118,18 +119,21 @@ class MissionService:
         known = self._flight.items
         if kind != _MISSION or not 0 <= first <= last < len(known):
             self._acknowledge(arrival, _UNSUPPORTED if kind != _MISSION else _INVALID_SEQUENCE, kind)
-        elif self._flight.flies or self._denies(arrival):
-            self._acknowledge(arrival, _DENIED, kind)
+        elif reason := _FLIES if self._flight.flies else self._against(arrival):
+            self._deny(arrival, kind, reason)
         else:
             self._upload = _Upload(arrival, last + 1, kind, list(known[:first]), known[last + 1 :], in_part=True)
             self._ask(self._upload, arrival.time_ns)
 
-    def _denies(self, arrival: Arrival) -> bool:
-        """Whether no mission may come from there now: another client brings one, or it is for all and would fly several to one place."""
+    def _against(self, arrival: Arrival) -> str:
+        """Why no mission may come from there now, or nothing."""
         if self._system.is_one_of_several(arrival):
-            self._system.say(WARNING, "mission refused: it is for all, and there are several bodies")
-            return True
-        return self._upload is not None and not _same(self._upload.arrival, arrival)
+            return "it is for all, and there are several bodies"  # they would fly to one place
+        return "another station is sending one" if self._upload is not None and not _same(self._upload.arrival, arrival) else ""
+
+    def _deny(self, arrival: Arrival, kind: int, reason: str) -> None:
+        self._system.say(WARNING, f"mission refused: {reason}")
+        self._acknowledge(arrival, _DENIED, kind)
 
     def _ask(self, upload: _Upload, time_ns: int) -> None:
         upload.asked, upload.asked_ns = upload.asked + 1, time_ns
@@ -162,6 +166,7 @@ class MissionService:
             self._ask(upload, arrival.time_ns)
             return
         if upload.in_part and self._flight.flies:  # it was started meanwhile
+            self._system.say(WARNING, f"mission refused: {_FLIES}")
             self._end(arrival, _DENIED, upload.kind)
             return
         (self._flight.amend if upload.in_part else self._flight.replace)((*upload.items, *upload.rest))

@@ -77,6 +77,15 @@ def test_items_of_two_stations_of_one_number_do_not_mix(world: World, client: Cl
     assert {i.x for i in world.station.services[1].flight.items} == {PLACES[1][0]}
 
 
+def test_station_that_sends_a_mission_while_another_one_does_is_denied_in_words(world: World, client: Client) -> None:
+    other = world.client(254)
+    for station in (client, other):
+        station.send("MISSION_COUNT", 1, 1, 2, 0)
+    world.run(1)
+    assert [ack.type for ack in other.all("MISSION_ACK")] == [mavlink.MAV_MISSION_DENIED] and not client.all("MISSION_ACK")
+    assert other.texts == "mission refused: another station is sending one"
+
+
 @pytest.mark.parametrize("current", [2, 3])
 @pytest.mark.parametrize("name", ["MISSION_ITEM", "MISSION_ITEM_INT"])
 def test_item_that_is_a_place_to_go_to_at_once_is_refused_and_told_of(world: World, client: Client, name: str, current: int) -> None:
@@ -148,6 +157,7 @@ def test_mission_that_flies_is_not_written_over_in_part_and_a_paused_one_goes_on
     client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 2, 0)
     world.run(2)
     assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_DENIED
+    assert "mission refused: it flies, and is not changed in part" in client.texts
     client.command(193, 0)
     world.run(120)
     client.send("MISSION_WRITE_PARTIAL_LIST", 1, 1, 2, 2, 0)
@@ -186,4 +196,5 @@ def test_part_of_a_mission_that_was_started_meanwhile_is_not_written_over(world:
     client.send("MISSION_ITEM_INT", *item(2, PLACES[0]), 0)
     world.run(2)
     assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_DENIED
+    assert "mission refused: it flies, and is not changed in part" in client.texts
     assert world.station.services[1].flight.items == before
