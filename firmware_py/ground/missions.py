@@ -141,13 +141,9 @@ class MissionService:
         self._system.send(upload.arrival.channel, "MISSION_REQUEST" if upload.in_old_form else "MISSION_REQUEST_INT", values)
 
     def _item(self, arrival: Arrival) -> None:
-        upload, ended = self._upload, self._ended
-        if upload is None and ended is not None and _is_again(arrival, ended.item):
-            self._acknowledge(arrival, ended.result, arrival.message["mission_type"])  # the answer to it was lost
-        elif upload is None and arrival.message["current"] in _AT_ONCE:
-            self._system.say(WARNING, "a place is gone to at once by DO_REPOSITION, as COMMAND_INT")
-            self._acknowledge(arrival, _UNSUPPORTED, arrival.message["mission_type"])
+        upload = self._upload
         if upload is None or not _brings(arrival, upload):
+            self._item_of_none(arrival)
             return
         sequence = arrival.message["seq"]
         if sequence != len(upload.items):
@@ -171,6 +167,15 @@ class MissionService:
             return
         (self._flight.amend if upload.in_part else self._flight.replace)((*upload.items, *upload.rest))
         self._end(arrival, _ACCEPTED, upload.kind)
+
+    def _item_of_none(self, arrival: Arrival) -> None:
+        """It is of no transfer that goes on: the last one of its sender's, whose answer was lost, or a place to go to at once."""
+        kind = arrival.message["mission_type"]
+        if self._ended is not None and _is_again(arrival, self._ended.item):
+            self._acknowledge(arrival, self._ended.result, kind)
+        elif arrival.message["current"] in _AT_ONCE:
+            self._system.say(WARNING, "a place is gone to at once by DO_REPOSITION, as COMMAND_INT")
+            self._acknowledge(arrival, _UNSUPPORTED, kind)
 
     def _end(self, arrival: Arrival, result: int, kind: int) -> None:
         self._upload, self._ended = None, _Ended(arrival, result)

@@ -77,6 +77,21 @@ def test_items_of_two_stations_of_one_number_do_not_mix(world: World, client: Cl
     assert {i.x for i in world.station.services[1].flight.items} == {PLACES[1][0]}
 
 
+def test_last_item_that_comes_again_is_answered_again_while_another_station_sends_a_mission(world: World, client: Client) -> None:
+    """Its mission was taken, the answer was lost, and it was told of nothing."""
+    other = world.client(254)
+    assert upload(world, client, [item(0, PLACES[0])]) == mavlink.MAV_MISSION_ACCEPTED
+    other.send("MISSION_COUNT", 1, 1, 2, 0)
+    client.clear()
+    client.send("MISSION_ITEM_INT", *item(0, PLACES[0]), 0)
+    world.run(2)
+    assert [ack.type for ack in client.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED] and not other.all("MISSION_ACK")
+    for sequence in (0, 1):
+        other.send("MISSION_ITEM_INT", *item(sequence, PLACES[1]), 0)
+    world.run(2)
+    assert [ack.type for ack in other.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED]
+
+
 def test_station_that_sends_a_mission_while_another_one_does_is_denied_in_words(world: World, client: Client) -> None:
     other = world.client(254)
     for station in (client, other):
