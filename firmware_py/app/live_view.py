@@ -6,6 +6,7 @@ and only while somebody looks at it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 
 import foxglove
@@ -91,7 +92,7 @@ class LiveView:
                 name="modcube", host=host, port=port, context=self.context, server_listener=self._watchers
             )
         except RuntimeError as error:
-            raise LiveViewError(f"live view on {host}:{port}: {error}") from None
+            raise LiveViewError(f"live view on {host}:{port}: {_in_words(error)}") from None
         self.address = f"ws://{host}:{self._server.port}"
 
     @property
@@ -128,6 +129,11 @@ class LiveView:
             self._scene.log(scene_of(shown, gone, of_module, time_ns), log_time=time_ns)
 
         return observe
+
+
+def _in_words(error: RuntimeError) -> str:
+    """The system's words alone, without who told of them, and their number."""
+    return re.sub(r" \(os error \d+\)$", "", str(error)).rpartition(": ")[2]
 
 
 def stamp(time_ns: int) -> Timestamp:
