@@ -34,6 +34,11 @@ class Rates:
             self.intervals_ns[name] = interval_ns
             self._next_ns[name] = now_ns
 
+    def hurry(self, name: str, now_ns: int) -> None:
+        """Send `name` now, and from then on as often as before."""
+        if name in self._next_ns:
+            self._next_ns[name] = now_ns
+
     def due(self, now_ns: int, among: Container[str]) -> list[str]:
         """What is to be sent now; what was missed is not made up. What is not `among` these waits for the next call."""
         names = [name for name, next_ns in self._next_ns.items() if next_ns <= now_ns and name in among]

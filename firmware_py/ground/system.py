@@ -57,6 +57,8 @@ class System:
     taken: int = 0
     """How often somebody asked the body for something else than what it does."""
     _text_number: int = 0
+    _pulse: Any = None
+    """What the last HEARTBEAT said."""
     _refused_ns: int = -_SELDOM_NS
 
     @property
@@ -120,7 +122,14 @@ class System:
             self.broadcast("STATUSTEXT", {"severity": severity, "text": piece, "id": number, "chunk_seq": i})
 
     def stream(self, time_ns: int) -> None:
-        """Send what is due on every channel; each message is made once. A slow link gets fewer of all kinds, and every heartbeat."""
+        """Send what is due on every channel; each message is made once. A slow link gets fewer of all kinds, and every heartbeat.
+
+        A heartbeat that says something new is due at once.
+        """
+        before, self._pulse = self._pulse, STREAMS["HEARTBEAT"](self.subject)
+        if self._pulse != before:
+            for rates in self.channels.values():
+                rates.hurry("HEARTBEAT", time_ns)
         made: dict[str, list[bytes]] = {}
         for channel, rates in self.channels.items():
             for name in rates.due(time_ns, NEVER_WAITS if channel in self.busy else STREAMS):

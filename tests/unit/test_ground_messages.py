@@ -194,6 +194,22 @@ def test_system_status_tells_of_health_and_of_readiness_to_arm(world: World, cli
     assert not client.last("SYS_STATUS").onboard_control_sensors_health & (vision | prearm)
 
 
+def test_heartbeat_tells_at_once_of_another_mode_of_arming_and_of_an_emergency_stop(world: World, client: Client) -> None:
+    """A pilot saw each up to a second later. ArduSub sends one more too."""
+    world.run(130)
+    for number, *parameters in ((400, 1), (176, 1, 1), (31012,)):
+        client.clear()
+        client.command(number, *parameters)
+        world.run(2)
+        told = [(m.base_mode, m.custom_mode, m.system_status) for m in client.all("HEARTBEAT")]
+        assert len(told) == 1, "once"
+        world.run(50)
+    assert told[0][2] == mavlink.MAV_STATE_EMERGENCY
+    client.clear()
+    world.run(300)
+    assert len(client.all("HEARTBEAT")) == 3
+
+
 def test_heartbeat_is_critical_while_a_fail_safe_flies(world: World, client: Client) -> None:
     world.robot.level = Level.SURFACE
     world.run(100)
