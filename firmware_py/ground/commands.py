@@ -30,6 +30,8 @@ SET_CURRENT, MOTOR_TEST = 224, 209
 _NEEDED = {ARM: 1, TERMINATE: 1, SET_CURRENT: 1, MOTOR_TEST: 3, DOCK: 4, UNDOCK: 4}
 """How many of its first parameters a command must name: what is none of them would be taken for 0, which disarms or clears an e-stop."""
 
+_LEFT_OUT = 2**31 - 1
+"""What COMMAND_INT has for an x or y that is none."""
 _PWM = 1100, 1900
 """Ends of a motor test's throttle as a pulse, us. In % they are the identity's."""
 
@@ -105,10 +107,11 @@ class CommandService:
             self._run(command)
 
     def _int(self, arrival: Arrival) -> None:
-        """Only a place is in 1e-7 deg and has a frame; in other commands x and y are the parameters 5 and 6."""
+        """Only a place is in 1e-7 deg and has a frame; in other commands x and y are the parameters 5 and 6, or left out."""
         m = arrival.message
-        five, six, seven = self._place(m) if m["command"] == REPOSITION else (m["x"], m["y"], m["z"])
-        self._run(Command(m["command"], (*(m[f"param{i}"] for i in range(1, 5)), five, six, seven), arrival))
+        plain = (*(math.nan if m[name] == _LEFT_OUT else m[name] for name in ("x", "y")), m["z"])
+        last = self._place(m) if m["command"] == REPOSITION else plain
+        self._run(Command(m["command"], (*(m[f"param{i}"] for i in range(1, 5)), *last), arrival))
 
     def _place(self, m: Message) -> tuple[float, float, float]:
         """Latitude and longitude, deg, and altitude above the sea, m; NaN where the message has no place."""

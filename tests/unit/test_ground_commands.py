@@ -281,6 +281,15 @@ def test_parameters_of_a_command_without_a_place_are_plain_in_command_int() -> N
     assert world.robot.asked[-1].argument == DockRequest(0, 0, 1, 1, 2, True)
 
 
+def test_parameters_that_a_command_int_leaves_out_are_none() -> None:
+    """INT32_MAX stands where there is no number (MAVLink, COMMAND_INT): both bodies moved, which nobody had asked for."""
+    world = World(modules=2)
+    client = world.client()
+    client.send("COMMAND_INT", 1, 1, 0, 31010, 0, 0, 0, 0, 1, 1, 2**31 - 1, 2**31 - 1, NAN)
+    world.run(2)
+    assert world.robot.asked[-1].argument == DockRequest(0, 0, 1, 1)
+
+
 @pytest.mark.parametrize("text", ["x" * length for length in (1, 49, 50, 51, 99, 100, 150)])
 def test_client_knows_where_a_text_ends(world: World, client: Client, text: str) -> None:
     """MAVLink: the last chunk of a text is one that is not full."""
