@@ -50,6 +50,8 @@ _TARGETS = frozenset({"target_system", "target"})
 _NEVER_FORWARDED = ("SETUP_SIGNING", *_NEVER_SIGNED)
 _STREAM_NS = 1_000_000_000
 """What comes again within this time streams."""
+_TORN_NS = 500_000_000
+"""A frame of which nothing more comes for so long is torn; radios that take turns pause for less within one."""
 
 
 class _Heard(NamedTuple):
@@ -126,6 +128,8 @@ class GroundStation:
         self._busy: set[int] = set()
         self._frames: list[Outgoing] = []
         self._framers: dict[int, Framer] = {}
+        self._last_bytes: dict[int, tuple[int, bool]] = {}
+        """When bytes came last on each stream that is not silent, and whether its link may set the key."""
         self._routes: dict[Sender, _Heard] = {}
         origin = Origin(fleet.latitude_deg, fleet.longitude_deg, fleet.altitude_m)
         self.services: dict[int, Services] = {}
@@ -145,6 +149,7 @@ class GroundStation:
                     services.commands.hear(event)
                     services.flight.hear(event)
         self._tell()
+        self._take_torn(outputs.time_ns)
         for services in self.services.values():
             services.step(outputs.time_ns)
 
@@ -169,21 +174,30 @@ class GroundStation:
     def leave(self, channel: int) -> None:
         """A channel is gone."""
         self._framers.pop(channel, None)
+        self._last_bytes.pop(channel, None)
         self._routes = {sender: heard for sender, heard in self._routes.items() if heard.channel != channel}
         for services in self.services.values():
             services.system.remove_channel(channel)
 
     def take(self, channel: int, data: bytes, time_ns: int, datagram: bool = True, trusted: bool = False) -> bool:
         """Bytes that came on a channel; whether a frame in them was believed. Never raises on what is in them."""
-        framer = self._framers.get(channel)
-        if framer is None:
-            framer = self._framers[channel] = Framer(self._dialect, self.signing, self.counts)
-        packets = framer.feed(data)
+        if channel not in self._framers:
+            self._framers[channel] = Framer(self._dialect, self.signing, self.counts)
+        if not datagram:
+            self._last_bytes[channel] = time_ns, trusted
+        return self._feed(channel, data, not datagram, time_ns, trusted)
+
+    def _feed(self, channel: int, data: bytes, goes_on: bool, time_ns: int, trusted: bool) -> bool:
+        packets = self._framers[channel].feed(data, goes_on)
         for packet in packets:
             self._take_packet(packet, channel, time_ns, trusted)
-        if datagram:
-            framer.end()
         return any(packet.message.name not in _NEVER_SIGNED for packet in packets)
+
+    def _take_torn(self, time_ns: int) -> None:
+        """What a stream has begun and does not go on with: a stop may stand behind it."""
+        silent = [channel for channel, (heard_ns, _) in self._last_bytes.items() if time_ns - heard_ns > _TORN_NS]
+        for channel in silent:
+            self._feed(channel, b"", False, time_ns, self._last_bytes.pop(channel)[1])
 
     def planned(self, body: int, plan: Plan) -> None:
         """The plan of a job came back."""

@@ -59,24 +59,22 @@ class Framer:
         self.counts = counts
         """Frames by what became of them: good, checksum, unknown, flags, length, refused; bytes of no frame: garbage."""
 
-    def feed(self, data: bytes) -> list[Packet]:
-        """The believed messages that `data` completes."""
+    def feed(self, data: bytes, goes_on: bool = True) -> list[Packet]:
+        """The believed messages that `data` completes. Where it does not go on, what is begun is no frame, and may hold one."""
         self._buffer += data
         packets: list[Packet] = []
         at = false = 0
         while false < _MOST_FALSE and (start := self._next_magic(at)) is not None:
             self.counts["garbage"] += start - at
             at = start
-            header = self._header(at)
-            definition = None if header is None else self._definition(header)
-            if header is None or (definition is not None and len(self._buffer) - at < header.frame_size):
+            packet, is_short = self._cut(at)
+            if is_short and goes_on:
                 break
-            packet = None if definition is None else self._frame(header, definition, bytes(self._buffer[at : at + header.frame_size]))
             if packet is None:
                 at += 1  # what looked like a frame may hold a real one
                 false += 1
                 continue
-            at += header.frame_size
+            at += len(packet.raw)
             if packet.message.name:
                 packets.append(packet)
         else:
@@ -85,10 +83,15 @@ class Framer:
         del self._buffer[:at]
         return packets
 
-    def end(self) -> None:
-        """A datagram is over: a frame never goes on in the next."""
-        self.counts["garbage"] += len(self._buffer)
-        self._buffer.clear()
+    def _cut(self, at: int) -> tuple[Packet | None, bool]:
+        """The frame at `at`, if it is one, and whether more would have to come to tell."""
+        header = self._header(at)
+        definition = None if header is None else self._definition(header)
+        if header is None or definition is None:
+            return None, header is None
+        raw = bytes(self._buffer[at : at + header.frame_size])
+        is_short = len(raw) < header.frame_size
+        return None if is_short else self._frame(header, definition, raw), is_short
 
     def _next_magic(self, at: int) -> int | None:
         found = _MAGIC.search(self._buffer, at)
@@ -131,12 +134,12 @@ class Framer:
         signature = raw[end + _CRC.size :]
         if not self._signing.believes(raw[: end + _CRC.size], signature, header.number, header.system, header.component):
             self.counts["refused"] += 1
-            return _REFUSED
+            return Packet(_NOT_BELIEVED, raw)
         self.counts["good"] += 1
         return Packet(Message(definition.name, definition.decode(raw[header.size : end]), header.system, header.component), raw)
 
 
-_REFUSED = Packet(Message("", {}), b"")
+_NOT_BELIEVED = Message("", {})
 
 
 def checksum(covered: bytes, crc_extra: int) -> int:

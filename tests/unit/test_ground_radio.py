@@ -75,6 +75,41 @@ def test_stop_behind_a_byte_of_the_old_protocol_is_heard_at_once_whatever_its_nu
         assert station.take(0, b"\xfe" + bytes(stop), 0, datagram=False), client.seq
 
 
+TORN = bytes(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251).pack(mavlink.MAVLink(None, 255, 190)))[:20]
+"""The beginning of a frame of 260 bytes."""
+
+
+def test_stop_behind_a_torn_frame_is_heard_once_nothing_more_comes_of_it() -> None:
+    """It waited for the rest: with a heartbeat a second for ten seconds."""
+    world = World()
+    client = world.client()
+    stop = client.pack("COMMAND_LONG", 1, 1, 31012, 0, *[0] * 7)
+    world.station.take(client.channel, TORN + stop, world.time_ns, datagram=False)
+    world.run(52)
+    assert [request.action for request in world.robot.asked] == [Action.ESTOP]
+
+
+def test_stop_behind_a_torn_frame_in_one_datagram_is_heard_at_once() -> None:
+    """As bridges from a radio to a network send it: it was thrown away with what it stood behind."""
+    world = World()
+    client = world.client()
+    stop = client.pack("COMMAND_LONG", 1, 1, 31012, 0, *[0] * 7)
+    assert world.station.take(client.channel, TORN + stop + TORN, world.time_ns)
+    world.run(1)
+    assert [request.action for request in world.robot.asked] == [Action.ESTOP]
+    assert not any(world.station.take(client.channel, half, world.time_ns) for half in (stop[:20], stop[20:])), "a datagram is whole"
+
+
+def test_frame_that_comes_in_parts_is_put_together_while_they_follow_each_other() -> None:
+    world = World()
+    client = world.client()
+    stop = client.pack("COMMAND_LONG", 1, 1, 31012, 0, *[0] * 7)
+    for part in (stop[:1], stop[1:15], stop[15:]):
+        world.station.take(client.channel, part, world.time_ns, datagram=False)
+        world.run(40)
+    assert [request.action for request in world.robot.asked] == [Action.ESTOP]
+
+
 def test_frame_of_the_old_protocol_is_no_longer_than_its_message_and_one_of_the_new_may_have_grown() -> None:
     station = World().station
     heartbeat_1 = b"\xfe\x0a\x00\xff\xbe\x00" + bytes(8)  # ten bytes, where there are nine
