@@ -44,6 +44,8 @@ _BUTTON_ACTIONS = {
     "arm": Action.ARM, "disarm": Action.DISARM, "estop": Action.ESTOP, "clear_estop": Action.CLEAR_ESTOP,
     "dock": Action.DOCK, "undock": Action.UNDOCK,
 }  # fmt: skip
+_STOPS_LAST = tuple(sorted(enumerate(BUTTONS), key=lambda button: _BUTTON_ACTIONS.get(button[1]) in STOPPING))
+"""The buttons as they are done when several are pressed at once: what stops has the last word."""
 
 
 class _Override(NamedTuple):
@@ -150,7 +152,7 @@ class Steering:
         )
         fresh = self._pilots.freshly_pressed(arrival, m["buttons"] | m["buttons2"] << 16)
         steers = m["target"] == self._system.outbox.system and self._steer(Sticks(force, moment), arrival)
-        for number, name in enumerate(BUTTONS):
+        for number, name in _STOPS_LAST:
             if fresh >> number & 1 and (steers or _BUTTON_ACTIONS.get(name) in STOPPING):
                 self._do(name)
 

@@ -122,6 +122,14 @@ def test_estop_and_disarm_buttons_are_taken_from_everybody(watched: int) -> None
     assert sticks(world) == [1.0] * 3 and buttons(world) == [Action.DISARM, Action.ESTOP]
 
 
+@pytest.mark.parametrize(("together", "last"), [(DISARM_BUTTON | ARM_BUTTON, Action.DISARM), (ESTOP_BUTTON | 1 << 8, Action.ESTOP)])
+def test_of_buttons_that_are_pressed_together_what_stops_counts(world: World, client: Client, together: int, last: Action) -> None:
+    """Disarm and arm armed the robot, and an e-stop was cleared before any module had heard of it."""
+    client.send("MANUAL_CONTROL", 1, 0, 0, 500, 0, together)
+    world.run(1)
+    assert len(buttons(world)) == 2 and buttons(world)[-1] == last
+
+
 @pytest.mark.parametrize("raw", [0, 65535])
 def test_override_of_no_channel_is_nothing(world: World, client: Client, raw: int) -> None:
     other = world.client(77)
