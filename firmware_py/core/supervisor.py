@@ -110,7 +110,7 @@ class Supervisor:
             trigger = Trigger.FORCED_ARM
         decision = self._try(trigger, request.argument, health)
         if decision is not None and trigger in (Trigger.ESTOP, Trigger.CLEAR_ESTOP):
-            if self.raises_estop and trigger == Trigger.CLEAR_ESTOP:  # until now the modules have heard ours
+            if self.raises_estop or trigger == Trigger.ESTOP:  # the modules hear ours, until now or from now on
                 self._estop_ns = health.time_ns
             self.raises_estop = trigger == Trigger.ESTOP
         return decision

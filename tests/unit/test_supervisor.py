@@ -137,8 +137,17 @@ def test_requested_e_stop_is_raised_on_the_bus_until_it_is_cleared() -> None:
     for action in (Action.ARM, Action.DISARM, Action.HOLD, Action.SET_MODE):
         ask(supervisor, action, Mode.AUTO if action == Action.SET_MODE else None)
         assert supervisor.raises_estop and supervisor.state == State.ESTOP
-    ask(supervisor, Action.CLEAR_ESTOP)
+    ask(supervisor, Action.CLEAR_ESTOP, None, at(GOOD, 0.2))
     assert not supervisor.raises_estop and supervisor.state == State.DISARMED
+
+
+def test_requested_e_stop_outlives_a_clear_of_the_same_tick() -> None:
+    """Two people press at once, or a radio brings both in one burst: one who asks for an e-stop gets it, and the modules hear of it."""
+    supervisor = supervisor_in()
+    decisions = supervisor.step(False, GOOD, [Request(Action.ESTOP), Request(Action.CLEAR_ESTOP)])
+    assert [decision.trigger for decision in decisions] == [Trigger.ESTOP] and supervisor.raises_estop
+    assert texts(supervisor)[-1] == "CLEAR_ESTOP refused: the e-stop is still raised"
+    assert ask(supervisor, Action.CLEAR_ESTOP, None, at(GOOD, 0.2)) and not supervisor.raises_estop
 
 
 def test_robot_that_raised_an_e_stop_itself_is_armed_once_its_modules_have_let_go() -> None:
@@ -201,8 +210,8 @@ def test_e_stop_that_only_a_module_has_heard_is_latched_after_another_was_cleare
 def test_modules_that_hear_an_e_stop_of_the_robots_own_when_it_is_cleared_do_not_raise_it_again() -> None:
     supervisor = supervisor_in()
     supervisor.step(False, GOOD, [Request(Action.ESTOP)])
-    supervisor.step(False, at(GOOD, 0.01), [Request(Action.CLEAR_ESTOP)])
-    for health in (at(GOOD, 0.02), at(GOOD._replace(stopped=(0,)), 0.03), at(GOOD._replace(stopped=(0,)), 0.22), at(GOOD, 0.23)):
+    supervisor.step(False, at(GOOD, 0.2), [Request(Action.CLEAR_ESTOP)])
+    for health in (at(GOOD, 0.21), at(GOOD._replace(stopped=(0,)), 0.22), at(GOOD._replace(stopped=(0,)), 0.41), at(GOOD, 0.42)):
         assert supervisor.step(False, health, []) == [] and supervisor.state == State.DISARMED
 
 
