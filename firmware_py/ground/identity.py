@@ -36,6 +36,7 @@ class Identity:
         numbers: custom mode of each mode; the first is what is reported.
         pairs: the second and third parameter of DO_SET_MODE are a main and a sub mode, as PX4 has it.
         mission_has_home: item 0 of a mission is the home position and is not flown, as ArduPilot has it.
+        waypoints_turn: a place in a mission may have a heading. ArduSub takes none, and its clients write 0, which is north.
         first_log: number of the oldest log. QGroundControl counts from 1 for ArduPilot alone.
         first_motor: of a motor test. ArduSub's, and who tests them, count from 0.
         rest_percent: the throttle of a motor test at which the motor stands. ArduSub's reaches from 0, full reverse, to 100 %.
@@ -46,6 +47,7 @@ class Identity:
     numbers: Mapping[Mode, tuple[int, ...]]
     pairs: bool
     mission_has_home: bool
+    waypoints_turn: bool
     first_log: int
     first_motor: int
     rest_percent: float
@@ -92,6 +94,7 @@ GENERIC = Identity(
     },
     pairs=True,
     mission_has_home=False,
+    waypoints_turn=True,
     first_log=0,
     first_motor=1,
     rest_percent=0.0,
@@ -103,6 +106,7 @@ ARDUSUB = Identity(
     numbers={mode: (int(mode),) for mode in Mode},
     pairs=False,
     mission_has_home=True,
+    waypoints_turn=False,
     first_log=1,
     first_motor=0,
     rest_percent=50.0,

@@ -370,7 +370,7 @@ class MissionFlight:
         return self._parameters().ground.mission_speed_m_s if self._speed is None else self._speed
 
     def _legs(self, first: int) -> tuple[Leg, ...]:
-        origin, speed = self._system.subject.origin, math.nan
+        origin, turns, speed = self._system.subject.origin, self._system.subject.identity.waypoints_turn, math.nan
         legs: list[Leg] = []
         speeds = [item for item in self.items[:first] if item.speed_m_s is not None]  # one that was passed goes on to count
         for item in (*speeds, *flight_order(self.items, first)):
@@ -380,7 +380,7 @@ class MissionFlight:
                 speed = item.speed_m_s if item.speed_m_s > 0 else math.nan
             place = item.place(origin)
             if place is not None:
-                legs.append(Leg(item.sequence, place, item.yaw, item.hold_s, speed))
+                legs.append(Leg(item.sequence, place, item.yaw if turns else None, item.hold_s, speed))
             elif item.delay_s > 0:
                 last = legs.pop() if legs else Leg(item.sequence, None, None, 0.0, speed)
                 legs.append(last._replace(hold_s=last.hold_s + item.delay_s))

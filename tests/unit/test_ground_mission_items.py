@@ -137,6 +137,20 @@ def test_ardupilots_missions_begin_with_home_which_is_not_flown() -> None:
     assert [leg.sequence for leg in job.legs] == [1, 2]
 
 
+@pytest.mark.parametrize(("identity", "yaw"), [("generic", 0.0), ("ardusub", None)])
+def test_fourth_parameter_of_a_waypoint_turns_the_robot_but_for_clients_of_an_ardusub(identity: str, yaw: float | None) -> None:
+    """QGroundControl writes 0 there for an ArduPilot, which turns by none."""
+    world = World(config=GroundConfig(identity=identity))
+    client = world.client()
+    upload(world, client, [item(i, place, p=(0, 0, 0, 0)) for i, place in enumerate(PLACES)])
+    client.command(400, 1)
+    world.run(3)
+    client.command(300, 0, 0)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert {leg.yaw for leg in job.legs} == {yaw}
+
+
 def test_jump_to_home_flies_to_no_home_that_may_lie_outside_the_fence() -> None:
     world = World(config=GroundConfig(identity="ardusub"))
     client = world.client()
