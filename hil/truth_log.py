@@ -5,7 +5,6 @@ The plant writes with another library than the firmware (mcap here, foxglove the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from firmware_py.description.signals import Layout, Row, Signal
 
 if TYPE_CHECKING:
-    from hil.plant.world import World
+    from hil.plant.world import BodyTruth, Truth, World
 
 TRUTH_LOG = "truth.mcap"
 WRITER = "modcube"
@@ -116,12 +115,9 @@ class TruthRecorder:
     def record_world(self, tick: int, world: World) -> None:
         """Truth of everything at the moment of SYNC `tick`."""
         for module in range(len(world.vehicles)):
-            t = world.truth(module)
-            power = t.voltage_v * t.current_a
-            self.record(tick, t.time_ns, module, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w, power)
+            self.record(tick, module, world.truth(module))
         for body in range(len(world.bodies)):
-            b = world.body_truth(body)
-            self.record_body(tick, b.time_ns, b.modules, b.p_wb, b.q_wb, b.v_w, b.w_b, world.load(body))
+            self.record_body(tick, world.body_truth(body), world.load(body))
         if self._docks is not None:
             docks, (channel, row) = world.docks, self._docks
             jams = sum(contact.jammed for contact in docks.contacts)
@@ -129,55 +125,25 @@ class TruthRecorder:
             values = (tick, world.time_ns, *counts, docks.gap_m, docks.lateral_m, docks.current_ma().ravel())
             self._add(channel, world.time_ns, row, values)
 
-    def record_body(
-        self,
-        tick: int,
-        time_ns: int,
-        modules: Sequence[int],
-        p_wb: np.ndarray,
-        q_wb: np.ndarray,
-        v_w: np.ndarray,
-        w_b: np.ndarray,
-        load: np.ndarray | None = None,
-    ) -> None:
-        """Truth of the body that `modules` make up, its leader first, at the moment of SYNC `tick`.
+    def record(self, tick: int, module: int, truth: Truth) -> None:
+        """Truth of `module` at the moment of SYNC `tick`; the power is all that its supply gives, electronics and magnets included."""
+        channel, row = self._modules[module]
+        t, power_w = truth, truth.voltage_v * truth.current_a
+        self._add(channel, t.time_ns, row, (tick, t.time_ns, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w, power_w))
+
+    def record_body(self, tick: int, truth: BodyTruth, load: np.ndarray) -> None:
+        """Truth of a body at the moment of SYNC `tick`; its channel has the number of its leader.
 
         Args:
-            p_wb, q_wb: (3,) m nominal centre of mass and (4,) body frame in the world.
-            v_w: (3,) velocity of that point, world, m/s. w_b: (3,) angular rate, body frame, rad/s.
-            load: (6,) what an ideal load cell reads of a clamped body about its leader's hull centre, body frame.
+            load: (6,) what an ideal load cell reads of a clamped body about its leader's hull centre, body frame, N and N m.
         """
-        leader = modules[0]
+        leader, b = truth.modules[0], truth
         if leader not in self._bodies:
             channel = self._writer.register_channel(f"/plant/body{leader}", "protobuf", self._body_schema)
             self._bodies[leader] = (channel, self._body_layout.row())
         channel, row = self._bodies[leader]
-        member = [float(module in modules) for module in range(len(self._modules))]
-        self._add(channel, time_ns, row, (tick, time_ns, member, p_wb, q_wb, v_w, w_b, np.zeros(6) if load is None else load))
-
-    def record(
-        self,
-        tick: int,
-        time_ns: int,
-        module: int,
-        p_wm: np.ndarray,
-        q_wm: np.ndarray,
-        v_w: np.ndarray,
-        w_b: np.ndarray,
-        force_n: np.ndarray,
-        water_w: np.ndarray,
-        power_w: float = 0.0,
-    ) -> None:
-        """Truth of `module` at the moment of SYNC `tick`.
-
-        Args:
-            p_wm, q_wm: (3,) m and (4,) module frame (hull centre) in the world.
-            v_w: (3,) velocity of the module's origin, world, m/s. w_b: (3,) angular rate, module frame, rad/s.
-            force_n: (n,) force that each thruster gives, N. water_w: (3,) velocity of the undisturbed water there, m/s.
-            power_w: that its supply gives, electronics and magnets included, W.
-        """
-        channel, row = self._modules[module]
-        self._add(channel, time_ns, row, (tick, time_ns, p_wm, q_wm, v_w, w_b, force_n, water_w, power_w))
+        member = [float(module in b.modules) for module in range(len(self._modules))]
+        self._add(channel, b.time_ns, row, (tick, b.time_ns, member, b.p_wb, b.q_wb, b.v_w, b.w_b, load))
 
     def _add(self, channel: int, time_ns: int, row: Row, values: tuple[Any, ...]) -> None:
         self._waiting.append((channel, time_ns, row, values))

@@ -7,6 +7,7 @@ import numpy as np
 from firmware_py.core.rotations import exp, multiply, rotate
 from firmware_py.core.types import BodyRecord, Estimate, Event, Inputs, Outputs, Setpoint, Thrust
 from firmware_py.runtime.recorder import Recorder
+from hil.plant.world import BodyTruth, Truth
 from hil.truth_log import TruthRecorder
 
 PERIOD_NS = 10_000_000
@@ -65,9 +66,10 @@ def write_flight(
             speed = (spiral(at + 0.005, duration_s) - spiral(at - 0.005, duration_s)) / 0.01
             p_wm = wanted + np.array(offset_m) + error[tick]
             q_wm = exp(np.array(tilt_rad) + tilt[tick])
-            truth.record(tick, time_ns, 0, p_wm, q_wm, speed, np.zeros(3), thrust[tick], np.array([0.04, 0.03, 0.0]), POWER_W)
-            truth.record_body(tick, time_ns, (0,), p_wm, q_wm, speed, np.zeros(3))
             zero = np.zeros(3)
+            water = np.array([0.04, 0.03, 0.0])
+            truth.record(tick, 0, Truth(time_ns, p_wm, q_wm, speed, zero, zero, thrust[tick], water, 1.0, POWER_W))
+            truth.record_body(tick, BodyTruth(time_ns, (0,), p_wm, q_wm, speed, zero), np.zeros(6))
             tagged = tick % 2 == 0
             estimate = Estimate(
                 p_wm + doubt[tick], multiply(q_wm, exp(turn[tick])), np.r_[speed, zero],
@@ -105,9 +107,9 @@ def write_pair(
             away_m = 1e-4 * max(0, joined_from - tick, tick - parted_from)
             leader, other = p_wb - rotate(q, lever), p_wb + rotate(q, (1.0 + away_m / 0.105) * lever)
             for m, p_wm in enumerate((leader, other)):
-                truth.record(tick, time_ns, m, p_wm, q, zero, zero, np.full(8, 2.0 + m), zero, POWER_W)
+                truth.record(tick, m, Truth(time_ns, p_wm, q, zero, zero, zero, np.full(8, 2.0 + m), zero, 1.0, POWER_W))
             for members, at in (((0, 1), p_wb),) if joined else (((0,), leader), ((1,), other)):
-                truth.record_body(tick, time_ns, members, at, q, zero, zero)
+                truth.record_body(tick, BodyTruth(time_ns, members, at, q, zero, zero), np.zeros(6))
             steered = p_wb if count > 8 else leader
             estimate = Estimate(steered, q, np.zeros(6), zero, zero, np.full(3, 1e-3), np.full(3, 2e-3), 0, np.nan, 0, 0, True)
             setpoint = Setpoint(steered - np.array(offset_m), multiply(q, exp(np.full(3, 0.01))), zero, zero, zero, zero)

@@ -25,6 +25,7 @@ from firmware_py.core.types import (
 )
 from firmware_py.description.signals import Layout, Signal, read_signals
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, GuardedFile, Recorder
+from hil.plant.world import BodyTruth, Truth
 from hil.signals import read_flight
 from hil.truth_log import TruthRecorder
 
@@ -199,9 +200,9 @@ def test_flight_joins_firmware_and_plant_by_tick(tmp_path: Path) -> None:
     zero = np.zeros(3)
     with TruthRecorder(tmp_path, (8,)) as truth:
         for tick in range(3, 90):
-            q = np.array([1.0, 0.0, 0.0, 0.0])
-            truth.record(tick, tick * PERIOD_NS, 0, np.full(3, float(tick)), q, zero, zero, np.zeros(8), zero)
-            truth.record_body(tick, tick * PERIOD_NS, (0,), np.full(3, float(tick)), q, zero, zero)
+            time_ns, place, q = tick * PERIOD_NS, np.full(3, float(tick)), np.array([1.0, 0.0, 0.0, 0.0])
+            truth.record(tick, 0, Truth(time_ns, place, q, zero, zero, zero, np.zeros(8), zero, 0.0, 0.0))
+            truth.record_body(tick, BodyTruth(time_ns, (0,), place, q, zero, zero), np.zeros(6))
     flight = read_flight(tmp_path)
     assert flight.firmware["tick"].tolist() == flight.truth["tick"].tolist() == list(range(3, 90))
     np.testing.assert_array_equal(np.sort(flight.lost_ns), PERIOD_NS * np.r_[0:3, 90:100])
