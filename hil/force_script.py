@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Mode, Outputs, Request, Sticks
 from firmware_py.description.fleet import Fleet
-from hil.orders import Orders, is_time_to_arm
+from hil.orders import Orders, is_due, is_time_to_arm
 from hil.scenario import Scenario
 from hil.scenario_rules import ARM_FROM_S
 
@@ -37,12 +37,11 @@ class ForceScript(Orders):
         """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
         if last is None or time_ns < ARM_FROM_S * 1e9:
             return []
-        tick, rate = time_ns // self._fleet.period_ns, self._fleet.rate_hz
         asked: list[Request] = []
         if is_time_to_arm(time_ns, self._fleet):
             asked += [Request(Action.ARM, r.body) for r in last.records if r.state not in ARMED]
         manual = time_ns >= self._task.begin_ns - MANUAL_BEFORE_S * 1e9
-        if manual and tick % max(1, round(STICKS_EVERY_S * rate)) == 0:
+        if manual and is_due(time_ns, self._fleet, STICKS_EVERY_S):
             moved = 0.0 if time_ns < self._task.begin_ns else stick_at(1e-9 * (time_ns - self._task.begin_ns), self._task.stick)
             sticks = Sticks((moved, 0.0, 0.0))
             for body in self._leaders:

@@ -12,7 +12,7 @@ from firmware_py.core.transitions import ARMED
 from firmware_py.core.types import Action, Mode, Outputs, Request, Setpoint, Sticks
 from firmware_py.description.fleet import Fleet
 from firmware_py.prepare import paths
-from hil.orders import Orders, is_time_to_arm
+from hil.orders import Orders, is_due, is_time_to_arm
 from hil.scenario import Scenario
 
 STREAM_EVERY_S = 0.1
@@ -42,7 +42,7 @@ class ModeScript(Orders):
             return []
         asked = [] if self._begun else self._begin()
         self._begun = True
-        if time_ns // self._fleet.period_ns % max(1, round(STREAM_EVERY_S * self._fleet.rate_hz)) == 0:
+        if is_due(time_ns, self._fleet, STREAM_EVERY_S):
             asked += self._stream(1e-9 * (time_ns - self._task.begin_ns)) if time_ns < self._task.pilot_until_s * 1e9 else []
             asked += [Request(Action.GROUND_ALIVE)] if time_ns < self._task.ground_until_s * 1e9 else []
         return asked

@@ -30,4 +30,9 @@ class Orders(Protocol):
 
 def is_time_to_arm(time_ns: int, fleet: Fleet) -> bool:
     """Whether to arm is asked for in the tick at `time_ns`."""
-    return time_ns >= ARM_FROM_S * 1e9 and time_ns // fleet.period_ns % round(ARM_EVERY_S * fleet.rate_hz) == 0
+    return time_ns >= ARM_FROM_S * 1e9 and is_due(time_ns, fleet, ARM_EVERY_S)
+
+
+def is_due(time_ns: int, fleet: Fleet, every_s: float) -> bool:
+    """Whether what comes every so often, no oftener than the slowest fleet's ticks (20 ms), comes in the tick at `time_ns`."""
+    return time_ns // fleet.period_ns % round(every_s * fleet.rate_hz) == 0
