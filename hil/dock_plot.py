@@ -9,7 +9,7 @@ import numpy as np
 
 from firmware_py.description.signals import Columns, read_signals
 from hil.plots import STYLE
-from hil.signals import SIGNAL_LOG
+from hil.signals import SIGNAL_LOG, rows_of
 from hil.truth_log import TRUTH_LOG
 
 THRESHOLD_MA = 70.0
@@ -59,9 +59,8 @@ def docking(docks: Columns, truth: Columns, start_ns: int) -> Any:
     from matplotlib import pyplot
 
     pair = (docks["module_b"] == docks["module_b"][0]) & (docks["module_a"] == docks["module_a"][0])
-    rows = {name: column[pair] for name, column in docks.items()}
-    again = np.flatnonzero(np.diff(rows["time_ns"]) > PAUSE_NS)  # the same two, undocked and docked once more
-    rows = {name: column[: again[0] + 1] if again.size else column for name, column in rows.items()}
+    again = np.flatnonzero(np.diff(docks["time_ns"][pair]) > PAUSE_NS)  # the same two, undocked and docked once more
+    rows = rows_of(docks, np.flatnonzero(pair)[: again[0] + 1 if again.size else None])
     time_s = 1e-9 * (rows["time_ns"] - start_ns)
     figure, (currents, gap, conditions) = pyplot.subplots(
         3, 1, figsize=(9.0, 7.0), sharex=True, layout="constrained", height_ratios=(2, 2, 1.2)

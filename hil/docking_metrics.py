@@ -14,9 +14,11 @@ from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS
 from hil.dock_plot import STAGES
 from hil.metrics import OUTCOMES
 from hil.scenario import Scenario, Step
-from hil.signals import SIGNAL_LOG
+from hil.signals import SIGNAL_LOG, by_number, rows_of
 from hil.truth_log import TRUTH_LOG
 
+BELIEVED, TRUE = "/firmware/body", "/plant/body"
+"""Channels of the bodies, before the number of the leader: as the firmware takes them to be, and as they are."""
 DOCKED, JAMMED, UNSTABLE, REFUSED, GAVE_UP = range(len(OUTCOMES))
 DECLARED = STAGES.index("docked")
 """Stage of a dock in the tick in which the firmware takes two bodies for one."""
@@ -69,8 +71,8 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
 
 def _together(truths: Mapping[str, Columns], ticks: np.ndarray) -> np.ndarray:
     """(k, m, m) whether two modules share a body in each of these ticks."""
-    bodies = [columns for name, columns in truths.items() if name.startswith("/plant/body")]
-    count = bodies[0]["member"].shape[1]
+    bodies = by_number(truths, TRUE).values()
+    count = next(iter(bodies))["member"].shape[1]
     found = np.zeros((len(ticks), count, count), dtype=bool)
     for columns in bodies:
         inside = columns["member"] > 0.0
@@ -128,17 +130,14 @@ def is_as_asked(scenario: Scenario, truths: Mapping[str, Columns]) -> bool:
 
 def _bodies(channels: Mapping[str, Columns], prefix: str, ticks: np.ndarray) -> np.ndarray:
     """(k,) number of bodies in each of the ticks."""
-    count = np.zeros(len(ticks), dtype=np.int64)
-    for name, columns in channels.items():
-        if name.startswith(prefix):
-            count += np.isin(ticks, columns["tick"])
-    return count
+    there = (np.isin(ticks, columns["tick"]) for columns in by_number(channels, prefix).values())
+    return sum(there, np.zeros(len(ticks), dtype=np.int64))
 
 
 def _false_declarations(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> int:
     """By those that hang together, and by how many bodies there are, which knows of joins that no dock declared."""
     ticks = truths["/plant/docks"]["tick"]
-    believed, real = _bodies(signals, "/firmware/body", ticks), _bodies(truths, "/plant/body", ticks)
+    believed, real = _bodies(signals, BELIEVED, ticks), _bodies(truths, TRUE, ticks)
     joined = np.diff(believed, prepend=believed[:1]) < 0
     too_few = int((joined & (believed > 0) & (believed < real)).sum())
     docks = signals.get("/firmware/docks")
@@ -162,8 +161,8 @@ def _failure(docks: Columns, signals: Mapping[str, Columns]) -> int:
 def _off_attitude(signals: Mapping[str, Columns]) -> float:
     """Largest angle between set-point and estimate that any body, its pose known, keeps up for a while, rad."""
     worst = 0.0
-    for name, columns in signals.items():
-        if name.startswith("/firmware/body") and len(columns["tick"]) >= KEPT_UP_TICKS:
+    for columns in by_number(signals, BELIEVED).values():
+        if len(columns["tick"]) >= KEPT_UP_TICKS:
             cosine = np.abs(np.sum(columns["q_wb"] * columns["setpoint_q_wb"], axis=1))
             angle = np.where(columns["ready"], 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0)), 0.0)
             worst = max(worst, float(np.lib.stride_tricks.sliding_window_view(angle, KEPT_UP_TICKS).min(axis=1).max()))
@@ -172,8 +171,7 @@ def _off_attitude(signals: Mapping[str, Columns]) -> float:
 
 def _join_jump_n(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> float:
     """Over all joins that docks declared; a joined body has the target's thrusters first, then the active one's. NaN without any."""
-    bodies = {int(name.removeprefix("/firmware/body")): c for name, c in signals.items() if name.startswith("/firmware/body")}
-    docks, worst = signals.get("/firmware/docks"), math.nan
+    bodies, docks, worst = by_number(signals, BELIEVED), signals.get("/firmware/docks"), math.nan
     if docks is None:
         return worst
     declared = docks["stage"] == DECLARED
@@ -196,10 +194,9 @@ def _members(truths: Mapping[str, Columns], leader: int, tick: int, thrusters: i
 
 def _body_with(truths: Mapping[str, Columns], module: int) -> Columns:
     """The true body that has a module, tick by tick: it bears the number of its lowest one, and the firmware's that of its leader."""
-    rows = [(columns, columns["member"][:, module] > 0.0) for name, columns in truths.items() if name.startswith("/plant/body")]
-    found = {name: np.concatenate([columns[name][inside] for columns, inside in rows]) for name in ("tick", "member", "p_wb")}
-    order = np.argsort(found["tick"])
-    return {name: column[order] for name, column in found.items()}
+    parts = [rows_of(columns, columns["member"][:, module] > 0.0) for columns in by_number(truths, TRUE).values()]
+    found = {name: np.concatenate([part[name] for part in parts]) for name in ("tick", "member", "p_wb")}
+    return rows_of(found, np.argsort(found["tick"]))
 
 
 def _thrusters(truths: Mapping[str, Columns], true: Columns) -> np.ndarray:
@@ -213,10 +210,8 @@ def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]
     NaN without any.
     """
     squares = [np.zeros(0)]
-    for name, believed in signals.items():
-        if not name.startswith("/firmware/body"):
-            continue
-        true = _body_with(truths, int(name.removeprefix("/firmware/body")))
+    for leader, believed in by_number(signals, BELIEVED).items():
+        true = _body_with(truths, leader)
         _, mine, theirs = np.intersect1d(true["tick"], believed["tick"], return_indices=True)
         forces = np.isfinite(believed["commanded_n"][theirs]).sum(axis=1)
         members = (true["member"][mine] > 0.0).sum(axis=1)

@@ -32,7 +32,7 @@ from hil.replaceable import check_replaceable, is_json_with, made
 from hil.report import REPORT_FILE, Scene, write_report
 from hil.scenario import Scenario
 from hil.script import Script
-from hil.signals import SIGNAL_LOG, Flight, period_of, read_flight
+from hil.signals import SIGNAL_LOG, Flight, by_number, period_of, read_flight
 from hil.truth_log import TRUTH_LOG, is_truth_log
 
 LEFT_BEHIND = (RESULT_FILE, REPORT_FILE, DOCK_PLOT, *(f"{name}.png" for name in PLOTS))
@@ -150,8 +150,8 @@ def _armed_at_all(scenario: Scenario, whole: Flight, folder: Path) -> list[Limit
     if scenario.task.kind == "dock":
         if np.isin(whole.firmware["state"], list(ARMED)).any():
             return []  # the others' logs need not be read
-        bodies = (columns["state"] for name, columns in read_signals(folder / SIGNAL_LOG).items() if name.startswith("/firmware/body"))
-        if any(np.isin(state, list(ARMED)).any() for state in bodies):
+        bodies = by_number(read_signals(folder / SIGNAL_LOG), "/firmware/body").values()
+        if any(np.isin(columns["state"], list(ARMED)).any() for columns in bodies):
             return []
     return [Limit("armed_share", low=ARMED_AT_ALL)]
 

@@ -61,11 +61,19 @@ class Flight:
         """The ticks with start <= time <= end."""
         time_ns = self.firmware["time_ns"]
         keep = (time_ns >= start_ns) & (time_ns <= end_ns)
-        pick = {name: column[keep] for name, column in self.firmware.items()}
-        truth = {name: column[keep] for name, column in self.truth.items()}
-        modules = tuple({name: column[keep] for name, column in module.items()} for module in self.modules)
+        modules = tuple(rows_of(module, keep) for module in self.modules)
         lost_ns = self.lost_ns[(self.lost_ns >= start_ns) & (self.lost_ns <= end_ns)]
-        return Flight(pick, truth, self.events, self.ticks, lost_ns, modules)
+        return Flight(rows_of(self.firmware, keep), rows_of(self.truth, keep), self.events, self.ticks, lost_ns, modules)
+
+
+def rows_of(columns: Columns, which: np.ndarray) -> Columns:
+    """The same columns of some rows: a mask (k,), or their indices in the order that is wanted."""
+    return {name: column[which] for name, column in columns.items()}
+
+
+def by_number(channels: Mapping[str, Columns], prefix: str) -> dict[int, Columns]:
+    """The channels `prefix`0, `prefix`1, ... of a log by their number: of a module, or of a body's leader."""
+    return {int(name.removeprefix(prefix)): columns for name, columns in channels.items() if name.startswith(prefix)}
 
 
 def read_flight(folder: Path) -> Flight:
@@ -83,8 +91,7 @@ def read_flight(folder: Path) -> Flight:
     if not len(mine):
         raise ValueError(f"{folder}: the two logs share no tick")
     nothing: Columns = {name: np.zeros(0, np.int64) for name in ("tick", "severity", "log_time")} | {"text": np.zeros(0, str)}
-    believed = {name: column[mine] for name, column in firmware.items()}
-    true = {name: column[theirs] for name, column in truth.items()}
+    believed, true = rows_of(firmware, mine), rows_of(truth, theirs)
     _tell_of_same_body(believed, true, thrusters)
     ticks = signals["/firmware/ticks"]
     untold = np.concatenate([np.setdiff1d(firmware["tick"], truth["tick"]), np.setdiff1d(truth["tick"], ticks["tick"])])
@@ -100,16 +107,15 @@ def period_of(ticks: Columns) -> int:
 
 def _fleet(truths: Mapping[str, Columns], ticks: np.ndarray) -> tuple[Columns, ...]:
     """Pose, forces and power of every module at these ticks, in the order of the fleet."""
-    count = sum(name.startswith("/plant/module") for name in truths)
-    modules = [truths[f"/plant/module{m}"] for m in range(count)]
-    return tuple({name: _at(module, ticks, name) for name in ("p_wm", "q_wm", "force_n", "power_w")} for module in modules)
+    modules = sorted(by_number(truths, "/plant/module").items())
+    return tuple({name: _at(module, ticks, name) for name in ("p_wm", "q_wm", "force_n", "power_w")} for _, module in modules)
 
 
 def _joined(truths: Mapping[str, Columns]) -> Columns:
     """The truth of module 0 with that of the body it leads, over the ticks of both."""
     module, body = truths["/plant/module0"], truths["/plant/body0"]
     _, mine, theirs = np.intersect1d(module["tick"], body["tick"], return_indices=True)
-    joined = {name: column[mine] for name, column in module.items()}
+    joined = rows_of(module, mine)
     joined |= {name: body[name][theirs] for name in ("member", "p_wb", "q_wb")}
     joined |= {"v_wb": body["v_w"][theirs], "w_bb": body["w_b"][theirs]}
     members = np.flatnonzero(joined["member"].any(axis=0))
