@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from multiprocessing.context import ForkContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event as ProcessEvent
@@ -16,9 +17,9 @@ from typing import Any, Literal, NamedTuple
 
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import recording_times
-from firmware_py.app.firmware import compose
+from firmware_py.app.firmware import Firmware, compose
 from firmware_py.app.observers import Observer, recording, recording_buses
-from firmware_py.app.realtime import open_loop
+from firmware_py.app.realtime import RealTimeLoop, open_loop
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Outputs, Request
 from firmware_py.description.parameters import Parameters
@@ -28,6 +29,7 @@ from firmware_py.runtime.interrupts import held_back, out_of_reach
 from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, read_libraries, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from hil.bench import fleet_of, script_of
+from hil.orders import Orders
 from hil.plant_process import CHUNK_NS, PlantProcess, check_served
 from hil.scenario import Scenario, make_world
 from hil.workers import end_with_parent
@@ -105,25 +107,16 @@ def fly_in_real_time(
     make_world(scenario, seed, CHUNK_NS)  # told of here, before there are two processes to tell of it: a world that cannot be,
     open_port(bus).close()  # a bus that cannot be opened,
     fleet = fleet_of(scenario, bus, rate_hz)
-    script = script_of(scenario, fleet)  # a path that cannot be flown
+    orders = _Started(script_of(scenario, fleet))  # a path that cannot be flown
     read_libraries()
     with ExitStack() as stack:
-        plant, handshake = stack.enter_context(_started(start_method, serve, scenario, seed, bus, rate_hz, out))
+        plant, handshake = stack.enter_context(_plant(start_method, serve, scenario, seed, bus, rate_hz, out))
         firmware = compose(fleet, parameters)
-        while not handshake.ready.wait(timeout=1.0):
-            if not plant.is_alive():
-                raise RuntimeError("the plant's process ended before it was ready")
+        _wait_until_ready(plant, handshake)
         check = stack.enter_context(held_back())
         if before_logs is not None:
             before_logs()
-        recorder = Recorder(out, configuration_of(firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz), queued=True)
-        stack.callback(recorder.close)
-        for body in firmware.pipeline.bodies:
-            recorder.expect(body.index, body.thrusters.f_max.size)
-        start_ns = 0
-
-        def requests(time_ns: int, last: Outputs | None) -> Sequence[Request]:
-            return script.requests(time_ns - start_ns, last)
+        recorder = _recorder(stack, out, firmware, scenario.name, seed, rate_hz)
 
         def stop_at_end(tick: int, outputs: Outputs) -> bool:
             if tick % rate_hz == 0:
@@ -131,10 +124,10 @@ def fly_in_real_time(
                     raise DescriptionError("the plant's process has ended, and the flight with it")
                 if progress is not None:
                     progress(tick / rate_hz)
-            return tick >= script.ticks or script.is_over(outputs.time_ns - start_ns)
+            return orders.are_over(tick, outputs.time_ns)
 
         refused = stack.enter_context(real_time())
-        loop = open_loop(stack, firmware, requests)
+        loop = open_loop(stack, firmware, orders.requests)
         times = recording_times(recorder, loop.rate_keeper, rate_hz)
         buses = recording_buses(recorder, loop.ports, rate_hz)
         loop.observers = [recording(recorder, rate_hz), times, buses, lambda *_: check(), *observers]
@@ -142,17 +135,54 @@ def fly_in_real_time(
         stack.enter_context(quiet_garbage())
         handshake.begin.set()
         loop.listen()
-        start_ns = loop.clock.now_ns()
-        loop.rate_keeper.start(start_ns + fleet.period_ns)
+        orders.start_ns = loop.clock.now_ns()
+        loop.rate_keeper.start(orders.start_ns + fleet.period_ns)
         loop.run(stop_at_end)
+    return _flown(loop, rate_hz, refused)
+
+
+@dataclass(slots=True)
+class _Started:
+    """The orders of a run that begins at `start_ns` of the firmware's clock."""
+
+    script: Orders
+    start_ns: int = 0
+
+    def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
+        """As `Orders.requests`, at a time of the firmware's clock."""
+        return self.script.requests(time_ns - self.start_ns, last)
+
+    def are_over(self, tick: int, time_ns: int) -> bool:
+        """Whether the run ends with this tick, at a time of the firmware's clock."""
+        return tick >= self.script.ticks or self.script.is_over(time_ns - self.start_ns)
+
+
+def _wait_until_ready(plant: BaseProcess, handshake: Handshake) -> None:
+    """Raises RuntimeError where the plant's process ends instead."""
+    while not handshake.ready.wait(timeout=1.0):
+        if not plant.is_alive():
+            raise RuntimeError("the plant's process ended before it was ready")
+
+
+def _recorder(stack: ExitStack, out: Path, firmware: Firmware, scenario: str, seed: int, rate_hz: int) -> Recorder:
+    """One that is closed with `stack`, writes in a thread of its own, and opens the bodies' channels before the first tick."""
+    recorder = Recorder(out, configuration_of(firmware, scenario=scenario, seed=seed, rate_hz=rate_hz), queued=True)
+    stack.callback(recorder.close)
+    for body in firmware.pipeline.bodies:
+        recorder.expect(body.index, body.thrusters.f_max.size)
+    return recorder
+
+
+def _flown(loop: RealTimeLoop, rate_hz: int, refused: list[str]) -> RealTimeFlight:
+    """What came of a loop that has ended."""
     keeper, late = loop.rate_keeper, loop.rate_keeper.lateness
-    flown = loop.last.tick if loop.last is not None else 0
+    ticks = loop.last.tick if loop.last is not None else 0
     lateness_ns = {"p50": late.quantile_ns(0.5), "p99": late.quantile_ns(0.99), "worst": late.worst_ns}
-    return RealTimeFlight(flown / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness_ns, refused)
+    return RealTimeFlight(ticks / rate_hz, keeper.overruns + keeper.skipped, loop.unanswered, lateness_ns, refused)
 
 
 @contextmanager
-def _started(start_method: str, serve: Callable[..., None], *arguments: Any) -> Iterator[tuple[BaseProcess, Handshake]]:
+def _plant(start_method: str, serve: Callable[..., None], *arguments: Any) -> Iterator[tuple[BaseProcess, Handshake]]:
     """The plant's process, which serves inside. Raises RuntimeError at the end where it failed."""
     spawn, fork = multiprocessing.get_context("spawn"), multiprocessing.get_context("fork")
     context: SpawnContext | ForkContext = fork if start_method == "fork" else spawn
