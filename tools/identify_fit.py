@@ -79,12 +79,8 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
     vehicle = flights[0].vehicle
     mine = unknowns(len(vehicle.thruster))
     shared, count = places(mine), sum(u.size for u in mine)
-    parts, own, gusts = list(mine), [], []
-    for flight in flights:
-        nuisances = [*NUISANCES, Unknown("gust", 3 * flight.knots.shape[1], math.inf)]
-        own.append(places(nuisances, sum(u.size for u in parts)))
-        gusts.append(np.kron(gust_precision(flight.knots.shape[1]), np.eye(3)))
-        parts += nuisances
+    parts, own = _with_nuisances(mine, flights)
+    gusts = [np.kron(gust_precision(flight.knots.shape[1]), np.eye(3)) for flight in flights]
     width = np.concatenate([np.full(u.size, u.width) for u in parts])
     step = np.concatenate([np.full(u.size, u.step) for u in parts])
     first = np.zeros(len(width))
@@ -106,17 +102,31 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
         x = x + move
         noise = sum(np.einsum("np,pq,nq->n", each, inverse, each, optimize=True).reshape(-1, 6).sum(axis=0) for each in flat)
         noise = noise * sigma**2 / len(residual)
-        spread = [x[at["gust"]] @ p @ x[at["gust"]] + np.sum(p * inverse[at["gust"], at["gust"]]) for at, p in zip(own, gusts, strict=True)]
-        gust = math.sqrt(sum(spread) / sum(len(p) for p in gusts))
+        gust = _gust_m_s(x, inverse, [at["gust"] for at in own], gusts)
         if np.all(np.abs(move) < STILL * np.sqrt(np.diag(inverse))):
             break
-    share, meat = 0.0, prior.copy()
-    for flight, (left, slopes) in zip(flights, rows, strict=True):
-        lags = max(1, round(MEMORY_S / float(np.median(np.diff(flight.time_s)))))
-        meat += _long_run(np.einsum("nki,nk->ni", slopes, left / sigma**2), lags)
-        share = max(share, lags / len(left) / len(flights))
-    covariance = (inverse @ meat @ inverse)[:count, :count]
-    return Fit(x[:count], shared, covariance, critical_value(min(share, 1.0)), sigma, gust, reference is not None or has_weight)
+    lags = [max(1, round(MEMORY_S / float(np.median(np.diff(flight.time_s))))) for flight in flights]
+    scores = [np.einsum("nki,nk->ni", slopes, left / sigma**2) for left, slopes in rows]
+    covariance = inverse @ sum(map(_long_run, scores, lags), prior) @ inverse
+    share = max(lag / len(each) / len(flights) for lag, each in zip(lags, scores, strict=True))
+    critical = critical_value(min(share, 1.0))
+    return Fit(x[:count], shared, covariance[:count, :count], critical, sigma, gust, reference is not None or has_weight)
+
+
+def _with_nuisances(mine: Sequence[Unknown], flights: Sequence[Equations]) -> tuple[list[Unknown], list[dict[str, slice]]]:
+    """All unknowns, the vehicle's and then each flight's own, and where each flight's stand among them, by name."""
+    parts, own = list(mine), []
+    for flight in flights:
+        nuisances = [*NUISANCES, Unknown("gust", 3 * flight.knots.shape[1], math.inf)]
+        own.append(places(nuisances, sum(u.size for u in parts)))
+        parts += nuisances
+    return parts, own
+
+
+def _gust_m_s(x: np.ndarray, inverse: np.ndarray, where: Sequence[slice], precisions: Sequence[np.ndarray]) -> float:
+    """Standard deviation of the gusts of all flights: of what was found, and of how far that may be off (`inverse`: covariance)."""
+    squares = [x[at] @ p @ x[at] + np.sum(p * inverse[at, at]) for at, p in zip(where, precisions, strict=True)]
+    return math.sqrt(sum(squares) / sum(map(len, precisions)))
 
 
 def critical_value(share: float) -> float:
