@@ -145,7 +145,7 @@ class Equations:
         felt = self._seen(filled(recording.accel) + GRAVITY * down - moved)
         self.measured = np.hstack([felt, _slope(motion.w_b, recording.period_s)[self._rows - HALF_WINDOW]])
         self._command = recording.command
-        self._static = np.column_stack([_force(curve, u) for u in recording.command.T])
+        self._static = np.column_stack([curve_force(curve, u) for u in recording.command.T])
         self._scale = np.square(recording.voltage_v / curve.voltage_v)
         self._nodes = _drag_nodes(vehicle)
         self._loaded = _share(self.time_s, weight)
@@ -250,8 +250,8 @@ def _slope(series: np.ndarray, period_s: float) -> np.ndarray:
     return np.column_stack([np.convolve(c, -j / (j @ j) / period_s, "valid") for c in series.T])
 
 
-def _force(curve: ThrusterCurve, u: np.ndarray) -> np.ndarray:
-    """(n,) force of the curve over commands, without its deadband."""
+def curve_force(curve: ThrusterCurve, u: np.ndarray) -> np.ndarray:
+    """(n,) force of the curve over commands (n,) from -1 to 1, without its deadband, N."""
     powers = np.arange(1, 6)
     sides = [np.maximum(s * u, 0.0)[:, None] ** powers @ c for s, c in ((1.0, curve.forward), (-1.0, curve.reverse))]
     return np.asarray(sides[0] - sides[1])

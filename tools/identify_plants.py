@@ -20,7 +20,7 @@ from fit_thruster import fit_curve
 from identify_excitation import MOTIONS, excitation
 from identify_fit import Reference, fit
 from identify_log import read_recording
-from identify_model import Equations
+from identify_model import Equations, curve_force
 from identify_motion import smooth
 from identify_quantities import findings
 
@@ -41,8 +41,7 @@ def load_cell(draw: ModuleDraw, curve: ThrusterCurve, seed: int) -> dict[str, np
     """The columns of tools/fit_thruster.py for thruster 1 of a plant, measured with a scale that is a little off."""
     rng = np.random.default_rng([seed, 9])
     u = np.linspace(-1.0, 1.0, CELL_POINTS)
-    powers = np.arange(1, 6)
-    force = np.abs(u)[:, None] ** powers @ curve.forward * (u > 0.0) - np.abs(u)[:, None] ** powers @ curve.reverse * (u < 0.0)
+    force = curve_force(curve, u)
     force[np.abs(force) < draw.deadband_n[0]] = 0.0
     read = draw.gain[0] * force * (1.0 + ACCURACY * rng.uniform(-1.0, 1.0))
     return {"command": u, "force_n": read + CELL_NOISE_N * rng.standard_normal(len(u)) * (force != 0.0)}
