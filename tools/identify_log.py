@@ -8,10 +8,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from firmware_py.app.configuration import firmware_of
+from firmware_py.app.firmware import Firmware
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.core.body import Body
 from firmware_py.core.measurements import Measurements
@@ -62,16 +64,40 @@ def read_recording(folder: Path) -> Recording:
     firmware = firmware_of(log.configuration, str(folder))
     if len(firmware.fleet.module) > 1:
         raise LogError(f"{folder}: {len(firmware.fleet.module)} modules flew; a vehicle file is fitted to a log of one module alone")
-    body, count = firmware.pipeline.bodies[0], len(firmware.vehicles[0].thruster)
-    measurements, collector, commands = Measurements(body, firmware.fleet.period_ns), firmware.collector, _Commands(count)
-    times: list[int] = []
-    heard: list[ModuleInputs] = []
-    told: list[tuple[bool, np.ndarray]] = []
-    poses: list[BodyPose] = []
+    heard = _heard(log, firmware)
+    period_s = 1.0 / firmware.fleet.rate_hz
+    if len(heard.time_ns) * period_s < LEAST_S:
+        raise LogError(f"{folder}: {len(heard.time_ns) * period_s:.1f} s of flight; at least {LEAST_S:.0f} s are needed")
+    if len(heard.poses) < 2:
+        raise LogError(f"{folder}: no tag was seen; without poses nothing can be identified")
+    vehicle, modules = firmware.vehicles[0], heard.modules
+    return Recording(
+        str(folder), firmware.fleet.module[0].vehicle, vehicle, firmware.pipeline.bodies[0], firmware.parameters.estimation, period_s,
+        np.array(heard.time_ns),
+        _rows([m.gyro for m in modules], 3), _rows([m.accel for m in modules], 3),
+        _delayed(np.array(heard.command)), _delayed(np.array(heard.armed)),
+        _voltage([m.voltage_v for m in modules], vehicle.supply.voltage_v), heard.poses,
+    )  # fmt: skip
+
+
+class _Heard(NamedTuple):
+    """What a log says, tick by tick; of tags every picture."""
+
+    time_ns: list[int]
+    modules: list[ModuleInputs]
+    armed: list[bool]
+    command: list[np.ndarray]
+    poses: list[BodyPose]
+
+
+def _heard(log: FlightLog, firmware: Firmware) -> _Heard:
+    """Feeds the frames of a log of one module to the firmware that wrote it. Raises LogError where ticks are missing."""
+    heard, commands = _Heard([], [], [], [], []), _Commands(len(firmware.vehicles[0].thruster))
+    measurements, collector = Measurements(firmware.pipeline.bodies[0], firmware.fleet.period_ns), firmware.collector
     q_near, before = np.array([1.0, 0.0, 0.0, 0.0]), None
     for logged in log.ticks():
         if before is not None and logged.tick != before + 1:
-            raise LogError(f"{folder}: ticks {before + 1} to {logged.tick - 1} are missing; give a log without a gap")
+            raise LogError(f"{log.folder}: ticks {before + 1} to {logged.tick - 1} are missing; give a log without a gap")
         before = logged.tick
         collector.sync_sent(logged.tick, logged.time_ns)
         for bus in range(len(firmware.fleet.buses)):
@@ -79,22 +105,13 @@ def read_recording(folder: Path) -> Recording:
         inputs = collector.collect(logged.tick, logged.time_ns)
         seen = measurements.fuse(inputs.modules, q_near).tags
         q_near = seen[-1].q_wb if seen else q_near
-        poses += seen
-        times.append(logged.time_ns)
-        heard.append(inputs.modules[0])
-        told.append(commands.of(logged.sent))
-    period_s = 1.0 / firmware.fleet.rate_hz
-    if len(times) * period_s < LEAST_S:
-        raise LogError(f"{folder}: {len(times) * period_s:.1f} s of flight; at least {LEAST_S:.0f} s are needed")
-    if len(poses) < 2:
-        raise LogError(f"{folder}: no tag was seen; without poses nothing can be identified")
-    armed, command = (np.array(column) for column in zip(*told, strict=True))
-    return Recording(
-        str(folder), firmware.fleet.module[0].vehicle, firmware.vehicles[0], body, firmware.parameters.estimation, period_s,
-        np.array(times),
-        _rows([m.gyro for m in heard], 3), _rows([m.accel for m in heard], 3), _delayed(command), _delayed(armed),
-        _voltage([m.voltage_v for m in heard], firmware.vehicles[0].supply.voltage_v), poses,
-    )  # fmt: skip
+        armed, command = commands.of(logged.sent)
+        heard.time_ns.append(logged.time_ns)
+        heard.modules.append(inputs.modules[0])
+        heard.armed.append(armed)
+        heard.command.append(command)
+        heard.poses.extend(seen)
+    return heard
 
 
 class _Commands:
