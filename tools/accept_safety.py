@@ -32,7 +32,6 @@ from hil.random_operator import fly_with_random_operator
 from hil.safety import (
     ICM_20602,
     Imu,
-    ThrusterFlight,
     command_outlives_frames_ms,
     fly_to_estop,
     hover_blind,
@@ -65,14 +64,6 @@ def _all(work: Callable[[Any], Any], inputs: Iterable[Any]) -> list[Any]:
         return list(pool.map(work, inputs))
 
 
-def _lying(thruster: int) -> ThrusterFlight:
-    return spiral_with([thruster], "thruster_fake_rpm")
-
-
-def _healthy(seed: int) -> ThrusterFlight:
-    return spiral_with([], seed=seed)
-
-
 def _shaken(seed: int, scenario: Path) -> float:
     with TemporaryDirectory(dir=scenario.parent) as folder:
         flown = fly_and_judge(load_scenario(str(scenario)), seed, Parameters(), Path(folder), f"virtual:shaken-{seed}")
@@ -82,13 +73,12 @@ def _shaken(seed: int, scenario: Path) -> float:
 def thrusters_out(folder: Path) -> Values:
     """Every thruster dead, every pair dead, every thruster lying, and healthy flights, all on the spiral; and healthy ones shaken hard."""
     matrix = assemble_vehicle(load_vehicle("modcube")).thrusters.matrix
-    count = matrix.shape[1]
-    pairs = list(itertools.combinations(range(count), 2))
+    alone, pairs = (list(itertools.combinations(range(matrix.shape[1]), broken)) for broken in (1, 2))
     whole = {pair: bool(np.linalg.matrix_rank(np.delete(matrix, pair, axis=1)) == 6) for pair in pairs}
-    singles = _all(spiral_with, ([thruster] for thruster in range(count)))
+    singles, liars = _all(spiral_with, alone), _all(functools.partial(spiral_with, kind="thruster_fake_rpm"), alone)
+    healthy = _all(functools.partial(spiral_with, (), "thruster_dead"), HEALTHY)
     found = dict(zip(pairs, _all(spiral_with, pairs), strict=True))
     flown_on, given_up = ([found[pair] for pair in pairs if whole[pair] == is_whole] for is_whole in (True, False))
-    liars, healthy = _all(_lying, range(count)), _all(_healthy, HEALTHY)
     every = [*singles, *found.values(), *liars, *healthy]
     shake = folder / "shake.toml"
     shake.write_text(excitation(list(MOTIONS), "modcube"), encoding="utf-8")
