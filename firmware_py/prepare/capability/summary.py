@@ -108,9 +108,7 @@ def characterise(
         if programs:
             say(f"{frame}: {count} linear programs")
             differ = max(differ, _difference(layout, frame, directions, reach[frame]["physical"].radius))
-    declared: dict[str, dict[str, Reach]] = {}
-    if layout.passive:
-        declared = {frame: _all_normalisations(rest, frame, directions, harmonics) for frame in FRAMES}
+    declared = {frame: _all_normalisations(rest, frame, directions, harmonics) for frame in FRAMES if layout.passive}
     return Capability(
         layout=layout,
         rank=layout.rank,
@@ -191,45 +189,6 @@ def _notes(layout: Layout) -> tuple[str, ...]:
 
 def to_plain(result: Capability) -> dict[str, Any]:
     """Figures alone, for JSON; units in the names."""
-
-    def number(value: float) -> float | None:
-        return float(value) if math.isfinite(value) else None
-
-    def shape(part: Shape | None) -> dict[str, Any] | None:
-        if part is None:
-            return None
-        return {
-            "dirichlet_energy": number(part.dirichlet),
-            "dirichlet_scale_free": number(part.dirichlet_scale_free),
-            "willmore_energy": number(part.willmore),
-            "willmore_refused": part.refused,
-            "total_curvature": number(part.total_curvature),
-            "fit_misfit_share": number(part.misfit),
-        }
-
-    def reach(part: Reach) -> dict[str, Any]:
-        return {
-            "degenerate": part.degenerate,
-            "max_inscribed_ellipsoid_volume": number(part.volume),
-            "ellipsoid": None
-            if part.ellipsoid is None
-            else {"shape": part.ellipsoid.shape.tolist(), "centre": part.ellipsoid.centre.tolist()},
-            "worst_direction": number(part.worst),
-            "facets": 0 if part.section is None else len(part.section.offsets),
-            "surface": shape(part.shape),
-        }
-
-    def power(frame: str) -> dict[str, Any]:
-        space = result.power[frame]
-        return {
-            "wrench_size": space.size,
-            "mean_power_w": number(float(np.mean(space.power_w))),
-            "largest_residual": number(space.residual),
-            "share_over_limits": space.over_limit,
-            "thrust_variance_n2": space.variance,
-            "surface": shape(result.power_shape[frame]),
-        }
-
     return {
         "name": result.layout.name,
         "thrusters": result.layout.count,
@@ -239,8 +198,51 @@ def to_plain(result: Capability) -> dict[str, Any]:
         "assumption": result.layout.assumption,
         "directions": len(result.directions),
         "axes_positive_negative": result.axes.tolist(),
-        "programs_differ": number(result.programs_differ),
-        "wrench": {f: {how: reach(r) for how, r in by.items()} for f, by in result.reach.items()},
-        "wrench_passive_declared": {f: {how: reach(r) for how, r in by.items()} for f, by in result.declared.items()},
-        "power": {frame: power(frame) for frame in FRAMES},
+        "programs_differ": _number(result.programs_differ),
+        "wrench": _plain_reaches(result.reach),
+        "wrench_passive_declared": _plain_reaches(result.declared),
+        "power": {frame: _plain_power(result.power[frame], result.power_shape[frame]) for frame in FRAMES},
+    }
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN and no infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _plain_reaches(reaches: dict[str, dict[str, Reach]]) -> dict[str, Any]:
+    return {frame: {how: _plain_reach(reach) for how, reach in by.items()} for frame, by in reaches.items()}
+
+
+def _plain_reach(reach: Reach) -> dict[str, Any]:
+    ellipsoid = reach.ellipsoid
+    return {
+        "degenerate": reach.degenerate,
+        "max_inscribed_ellipsoid_volume": _number(reach.volume),
+        "ellipsoid": ellipsoid and {"shape": ellipsoid.shape.tolist(), "centre": ellipsoid.centre.tolist()},
+        "worst_direction": _number(reach.worst),
+        "facets": len(reach.section.offsets) if reach.section else 0,
+        "surface": reach.shape and _plain_shape(reach.shape),
+    }
+
+
+def _plain_power(space: PowerSpace, shape: Shape) -> dict[str, Any]:
+    return {
+        "wrench_size": space.size,
+        "mean_power_w": _number(float(np.mean(space.power_w))),
+        "largest_residual": _number(space.residual),
+        "share_over_limits": space.over_limit,
+        "thrust_variance_n2": space.variance,
+        "surface": _plain_shape(shape),
+    }
+
+
+def _plain_shape(shape: Shape) -> dict[str, Any]:
+    return {
+        "dirichlet_energy": _number(shape.dirichlet),
+        "dirichlet_scale_free": _number(shape.dirichlet_scale_free),
+        "willmore_energy": _number(shape.willmore),
+        "willmore_refused": shape.refused,
+        "total_curvature": _number(shape.total_curvature),
+        "fit_misfit_share": _number(shape.misfit),
     }
