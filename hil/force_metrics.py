@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from firmware_py.description.signals import Columns, read_signals
+from hil.metrics import rms
 from hil.signals import SIGNAL_LOG
 from hil.truth_log import TRUTH_LOG
 
@@ -49,7 +50,7 @@ def force_metrics(scenario: Scenario, folder: Path, begin_ns: int) -> dict[str, 
             firmware, truth = signals[f"/firmware/body{leader}"], truths[f"/plant/body{leader}"]
             wanted, measured = _forces(firmware, truth, start_ns, start_ns + half_ns)
             name = NAMES.get(count, str(count))
-            rmse[name] = float(np.sqrt(np.mean(np.square(measured - wanted)))) / count
+            rmse[name] = rms(measured - wanted) / count
             metrics[f"force_rmse_{name}_{phase}_n"] = rmse[name]
             metrics |= {f"force_fit{k}_{name}_{phase}": c for k, c in enumerate(_fit(wanted / count, measured / count))}
         metrics[f"force_difference_{phase}"] = abs(rmse["two"] - rmse["one"]) / rmse["one"] if rmse["one"] > 0.0 else math.nan

@@ -165,26 +165,9 @@ def flight_metrics(
     firmware = flight.firmware
     if not len(firmware["tick"]):
         return dict.fromkeys((name for name in SHOWN if name not in DOCKING), math.nan)
-    error, angle = errors(flight, wanted)
-    estimate_error = firmware["p_wb"] - flight.p_wb
-    estimate_angle = rotation_vectors(flight.q_wb, firmware["q_wb"])
     time_s = flight.time_s
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-    metrics = {
-        "position_rmse_m": _rms(error),
-        "position_max_m": float(error.max()),
-        "attitude_rmse_rad": _rms(angle),
-        "attitude_max_rad": float(angle.max()),
-        "estimate_position_rmse_m": _rms(np.linalg.norm(estimate_error, axis=1)),
-        "estimate_attitude_rmse_rad": _rms(np.linalg.norm(estimate_angle, axis=1)),
-        "nis_mean": nis_mean(firmware["nis"], firmware["nis_dof"]),
-    }
-    inside = np.abs(np.hstack([estimate_error, estimate_angle])) <= 3.0 * np.hstack(
-        [firmware["sigma_p"], firmware["sigma_q"]]
-    )
-    metrics |= {f"sigma3_share_{axis}": float(share) for axis, share in zip(AXES, inside.mean(axis=0), strict=True)}
-    return metrics | {
-        "sigma3_share": float(inside.mean(axis=0).min()),
+    return _tracking(flight, wanted) | _estimation(flight) | {
         "thrust_rms_n": float(np.sqrt(np.nanmean(np.square(firmware["commanded_n"])))),
         "thrust_rate_rms_n_s": rate_rms(firmware["commanded_n"], period_s),
         "supply_power_w": float(np.sum([module["power_w"] for module in flight.modules], axis=0).mean()),
@@ -196,7 +179,38 @@ def flight_metrics(
         "ticks": float(len(time_s)),
         "unmatched_ticks": float(len(flight.lost_ns)),
         "deadline_misses": float(deadline_misses),
+    }  # fmt: skip
+
+
+def _tracking(flight: Flight, wanted: Poses | None) -> dict[str, float]:
+    """How far the truth is from where it is wanted."""
+    error, angle = errors(flight, wanted)
+    return {
+        "position_rmse_m": rms(error),
+        "position_max_m": float(error.max()),
+        "attitude_rmse_rad": rms(angle),
+        "attitude_max_rad": float(angle.max()),
     }
+
+
+def _estimation(flight: Flight) -> dict[str, float]:
+    """How far the estimate is from the truth, and whether that is as far as the filter believes."""
+    firmware = flight.firmware
+    off_m, off_rad = firmware["p_wb"] - flight.p_wb, rotation_vectors(flight.q_wb, firmware["q_wb"])
+    within = np.abs(np.hstack([off_m, off_rad])) <= 3.0 * np.hstack([firmware["sigma_p"], firmware["sigma_q"]])
+    shares = within.mean(axis=0).tolist()
+    return {
+        "estimate_position_rmse_m": rms(np.linalg.norm(off_m, axis=1)),
+        "estimate_attitude_rmse_rad": rms(np.linalg.norm(off_rad, axis=1)),
+        "nis_mean": nis_mean(firmware["nis"], firmware["nis_dof"]),
+        **{f"sigma3_share_{axis}": share for axis, share in zip(AXES, shares, strict=True)},
+        "sigma3_share": min(shares),
+    }
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square of all values."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def rate_rms(values: np.ndarray, period_s: float) -> float:
@@ -235,7 +249,3 @@ def nis_mean(nis: np.ndarray, dof: np.ndarray) -> float:
     """
     used = (dof > 0) & np.isfinite(nis)
     return float(nis[used].sum() / dof[used].sum()) if used.any() else float("nan")
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

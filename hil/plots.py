@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.metrics import errors, nis_mean, refused, rotation_vectors
+from hil.metrics import errors, nis_mean, refused, rms, rotation_vectors
 from hil.signals import Flight
 
 TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
@@ -100,9 +100,9 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
     error_m, angle_rad = errors(flight)
     for row, (values, unit, what) in enumerate(((1e3 * error_m, "mm", "Position"), (np.degrees(angle_rad), "deg", "Attitude"))):
         axes = figure.add_subplot(grid[row, 1])
-        rms = float(np.sqrt(np.mean(values[inside] ** 2)))
+        rmse = rms(values[inside])
         axes.plot(time_s, _once_placed(flight, values), color=TRUTH, linewidth=1.0)
-        axes.axhline(rms, color=REFERENCE, linestyle="--", linewidth=1.2, label=f"RMSE {rms:.2f} {unit}")
+        axes.axhline(rmse, color=REFERENCE, linestyle="--", linewidth=1.2, label=f"RMSE {rmse:.2f} {unit}")
         if row == 0 and paper_rmse_mm is not None:
             paper = f"paper's robot, real tank: RMSE {paper_rmse_mm:g} mm"
             axes.axhline(paper_rmse_mm, color=AXIS_COLOURS[0], linestyle=":", linewidth=1.4, label=paper)

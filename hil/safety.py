@@ -24,7 +24,7 @@ from firmware_py.description.parameters import Parameters
 from hil.bench import fly_scenario, open_bench
 from hil.fault_table import ALONE
 from hil.flight import wanted_in
-from hil.metrics import Poses, errors, flight_metrics
+from hil.metrics import Poses, errors, flight_metrics, rms
 from hil.orders import Orders
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
@@ -93,7 +93,7 @@ def spiral_with(broken: Sequence[int], kind: str = "thruster_dead", seed: int = 
     }
     after = whole.between(round(at_s * 1e9), base.task.end_ns)
     return ThrusterFlight(
-        float(np.sqrt(np.mean(off[kept] ** 2))), float(off[kept].max()), float(np.degrees(turn[kept].max())),
+        rms(off[kept]), float(off[kept].max()), float(np.degrees(turn[kept].max())),
         tuple(_found_after(after, index, left_out) for index in broken), tuple(sorted(set(left_out) - set(broken))),
         Mode(int(flight.firmware["mode"][-1])).name,
     )  # fmt: skip
@@ -143,7 +143,7 @@ def hover_blind(seed: int, imu: Imu | None = None) -> BlindFlight:
     flight, wanted = in_task(scenario, flown(scenario, seed, parameters))
     off = np.linalg.norm((flight.p_wb - wanted.p_wb)[:, :2], axis=1)
     wrong = (flight.firmware["p_wb"] - flight.p_wb)[-1, :2] / flight.firmware["sigma_p"][-1, :2]
-    return BlindFlight(float(off.max()), float(np.sqrt(np.mean(off**2))), (float(wrong[0]), float(wrong[1])))
+    return BlindFlight(float(off.max()), rms(off), (float(wrong[0]), float(wrong[1])))
 
 
 # ---------------------------------------------------------------- frames

@@ -16,6 +16,7 @@ from firmware_py.prepare import alpha, drag_table
 from firmware_py.prepare.capability.sphere import fibonacci
 from firmware_py.prepare.joints import Placement
 from firmware_py.prepare.projected_area import Solid, areas_and_centroids, box, plane_basis
+from hil.metrics import rms
 
 DIRECTIONS = 1000
 """Directions of the paper's drag table, and look-ups in one repetition."""
@@ -65,7 +66,7 @@ def drag_entries() -> list[Entry]:
     _look_up_all(*look_up)
     _nearest_all(*nearest)
     truth = exact(velocities[:, :3])
-    errors = [100.0 * _rms(np.linalg.norm(each[:, :3], axis=1) / truth - 1.0) for each in (ours, theirs)]
+    errors = [100.0 * rms(np.linalg.norm(each[:, :3], axis=1) / truth - 1.0) for each in (ours, theirs)]
     peer = "nearest of 1000 directions"
     name, exact_s = "drag table of one module", build(areas_and_centroids)
     builds = compare(name, "s", exact_s, {"alpha shapes of 1000 points": build(alpha.lattice_method)})
@@ -96,7 +97,3 @@ def _alphashape_package(solids: Sequence[Solid], directions: np.ndarray) -> tupl
     ]
     centroids = [np.array([shape.centroid.x, shape.centroid.y]) @ basis for shape, basis in shapes]
     return np.array([shape.area for shape, _ in shapes]), np.array(centroids)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
