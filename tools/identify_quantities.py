@@ -52,27 +52,17 @@ def absolute(fit: Fit, vehicle: Vehicle) -> list[Quantity]:
     at = fit.places
     mass, inertia, drag, arm = (at[name].start for name in ("mass", "inertia", "drag", "arm"))
     rotational = assemble_vehicle(vehicle).drag.rotational
-    found = [
-        Quantity(f"total mass along {a}", "kg", lambda x, i=mass + i: float(np.exp(x[i])), f"along {a}") for i, a in enumerate(AXES)
-    ]
-    found += [
-        Quantity(f"total inertia about {a}", "kg m^2", lambda x, i=inertia + i: float(np.exp(x[i])), "turning")
-        for i, a in enumerate(AXES)
-    ]
-    found += [Quantity(f"drag coefficient, {side}", "", lambda x, i=drag + i: float(x[i]), f"fast {side}") for i, side in enumerate(SIDES)]
+    found = [Quantity(f"total mass along {a}", "kg", _exponential(mass + i), f"along {a}") for i, a in enumerate(AXES)]
+    found += [Quantity(f"total inertia about {a}", "kg m^2", _exponential(inertia + i), "turning") for i, a in enumerate(AXES)]
+    found += [Quantity(f"drag coefficient, {side}", "", _number(drag + i), f"fast {side}") for i, side in enumerate(SIDES)]
     if rotational.all():
         cd = vehicle.drag.rotational_cd
         found.append(Quantity("rotational_cd", "", lambda x: cd * float(np.mean(x[at["rotational"]] / rotational))))
-    found += [
-        Quantity(f"righting moment, {a}", "N m", lambda x, i=arm + i: float(x[i]), "turning", _length(at["arm"]))
-        for i, a in enumerate(AXES)
-    ]
-    found.append(Quantity("weight less buoyancy", "N", lambda x: float(x[at["weight"]][0])))
+    found += [Quantity(f"righting moment, {a}", "N m", _number(arm + i), "turning", _length(at["arm"])) for i, a in enumerate(AXES)]
+    found.append(Quantity("weight less buoyancy", "N", _number(at["weight"].start)))
     found.append(Quantity("deadband, mean", "N", lambda x: float(np.mean(x[at["deadband"]]))))
-    return found + [
-        Quantity(f"gain of thruster {k + 1}", "", lambda x, i=i: float(x[i]), "turning")
-        for k, i in enumerate(range(at["gain"].start, at["gain"].stop))
-    ]
+    gains = range(at["gain"].start, at["gain"].stop)
+    return found + [Quantity(f"gain of thruster {k + 1}", "", _number(i), "turning") for k, i in enumerate(gains)]
 
 
 def ratios(fit: Fit) -> list[Quantity]:
@@ -83,19 +73,16 @@ def ratios(fit: Fit) -> list[Quantity]:
     def per_mass(name: str, i: int) -> Callable[[np.ndarray], float]:
         return lambda x: float(x[at[name]][i] / np.exp(x[mass]))
 
+    def exponential_per_mass(name: str, i: int) -> Callable[[np.ndarray], float]:
+        return lambda x: float(np.exp(x[at[name]][i] - x[mass]))
+
     found = [
-        Quantity(
-            f"total mass along {AXES[i]} over that along x", "", lambda x, i=i: float(np.exp(x[mass + i] - x[mass])), f"along {AXES[i]}"
-        )
-        for i in (1, 2)
-    ]  # fmt: skip
+        Quantity(f"total mass along {AXES[i]} over that along x", "", exponential_per_mass("mass", i), f"along {AXES[i]}") for i in (1, 2)
+    ]
     found += [
-        Quantity(
-            f"total inertia about {a} over total mass along x", "m^2",
-            lambda x, i=at["inertia"].start + i: float(np.exp(x[i] - x[mass])), "turning",
-        )
+        Quantity(f"total inertia about {a} over total mass along x", "m^2", exponential_per_mass("inertia", i), "turning")
         for i, a in enumerate(AXES)
-    ]  # fmt: skip
+    ]
     found += [
         Quantity(f"drag coefficient, {side}, over total mass along x", "1/kg", per_mass("drag", i), f"fast {side}")
         for i, side in enumerate(SIDES)
@@ -110,7 +97,7 @@ def ratios(fit: Fit) -> list[Quantity]:
         for k in range(gains.stop - gains.start)
     ]
     found.append(Quantity("force in reverse over that forwards, against the curve's", "", lambda x: 1.0 + float(x[at["shape"]][0])))
-    return [*found, Quantity("thruster lag", "s", lambda x: float(x[at["lag"]][0]), "along x")]
+    return [*found, Quantity("thruster lag", "s", _number(at["lag"].start), "along x")]
 
 
 def findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
@@ -169,6 +156,16 @@ def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) 
         force_max_n=min(vehicle.force_max_n, float(np.sum(curve.forward))),
         force_min_n=max(vehicle.force_min_n, -float(np.sum(curve.reverse))),
     )  # fmt: skip
+
+
+def _number(i: int) -> Callable[[np.ndarray], float]:
+    """One of the unknowns."""
+    return lambda x: float(x[i])
+
+
+def _exponential(i: int) -> Callable[[np.ndarray], float]:
+    """One that is searched by its logarithm."""
+    return lambda x: float(np.exp(x[i]))
 
 
 def _length(at: slice) -> Callable[[np.ndarray], float]:
