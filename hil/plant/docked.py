@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,17 @@ from hil.plant.lattice import QUATERNIONS, Place, nearest
 from hil.plant.spec import WorldSpec
 from hil.plant.thrusters import Thrusters
 from hil.plant.water import Water
+
+
+class _FixedPoint(NamedTuple):
+    """What stays where it is when two bodies become one: their common centre of mass, or a module that a load cell holds."""
+
+    p_w: np.ndarray
+    """(3,) there, world, m."""
+    share: float
+    """Of the turn by which the two are off the lattice, what the first body makes of it; the second makes the rest."""
+    anchor: int | None = None
+    """The module; None: the centre of mass."""
 
 
 class DockedBodies(ABC):
@@ -81,24 +93,17 @@ class DockedBodies(ABC):
         seats = seats_after_join(self.places, self._modules, joint, kept, self.bodies[b], q_ab)
         lattice = QUATERNIONS[nearest(q_ab)].copy()
         off = rotations.log(rotations.multiply(q_ab, rotations.conjugate(lattice)))
-        masses = old.rigid[[a, b], 0, 0]
-        share = masses[1] / masses.sum()
-        stays_w = np.average([self._to_world(k, centre_of(old, k)) for k in (a, b)], axis=0, weights=masses)
-        held = next((k for k in (a, b) if old.clamped[k]), None)
-        if held is not None:
-            anchor = self.bodies[held][0]
-            share, stays_w = float(held == b), self._to_world(held, self.places[anchor].position)
-        groups = [g for k, g in enumerate(self.bodies) if k not in (a, b)]
-        groups = sorted([*groups, tuple(sorted((*self.bodies[a], *self.bodies[b])))])
+        fixed = self._fixed_point(a, b)
+        whole = tuple(sorted((*self.bodies[a], *self.bodies[b])))
+        groups = sorted([*(g for k, g in enumerate(self.bodies) if k not in (a, b)), whole])
         states = {g[0]: old.state[k].copy() for k, g in enumerate(self.bodies)}
-        leader = min(self.bodies[a][0], self.bodies[b][0])
         self._seat(groups, seats)
         self._restore(states)
-        new = groups.index(next(g for g in groups if g[0] == leader))
+        new = groups.index(whole)
         x = self._body_arrays.state[new]
-        x[3:7] = rotations.normalise(rotations.multiply(q_a, rotations.exp(off * share)))
-        stays = centre_of(self._body_arrays, new) if held is None else self.places[anchor].position
-        x[:3] = stays_w - rotations.rotate(x[3:7].copy(), stays)
+        x[3:7] = rotations.normalise(rotations.multiply(q_a, rotations.exp(off * fixed.share)))
+        at = centre_of(self._body_arrays, new) if fixed.anchor is None else self.places[fixed.anchor].position
+        x[:3] = fixed.p_w - rotations.rotate(x[3:7].copy(), at)
         motion_of(self._body_arrays, new, total[a] + total[b], self._flow())
         if self._body_arrays.clamped[new]:
             x[7:13] = 0.0
@@ -107,6 +112,16 @@ class DockedBodies(ABC):
             if met not in known:
                 self.docks.joined(met)
         self._step(0)
+
+    def _fixed_point(self, a: int, b: int) -> _FixedPoint:
+        """That of the bodies a and b, which are about to be one."""
+        old = self._body_arrays
+        if (held := next((k for k in (a, b) if old.clamped[k]), None)) is not None:
+            anchor = self.bodies[held][0]
+            return _FixedPoint(self._to_world(held, self.places[anchor].position), float(held == b), anchor)
+        masses = old.rigid[[a, b], 0, 0]
+        centre_w = np.average([self._to_world(k, centre_of(old, k)) for k in (a, b)], axis=0, weights=masses)
+        return _FixedPoint(centre_w, masses[1] / masses.sum())
 
     def part(self, joint: Joint) -> None:
         """Opens a joint; what no other joint holds becomes a body of its own, moving as it did."""
