@@ -13,6 +13,7 @@ import copy
 import importlib.abc
 import importlib.machinery
 import importlib.util
+import itertools
 import os
 import signal
 import sys
@@ -73,25 +74,14 @@ def mutants(source: str) -> Iterator[Mutant]:
     """All mutants of a module's text, in the order of its lines."""
     tree = ast.parse(source)
     skipped = {id(node) for node in _annotations(tree)}
-    count = sum(1 for _ in ast.walk(tree))
-    for index in range(count):
-        node = _at(tree, index)
+    for index, node in enumerate(ast.walk(tree)):
         if id(node) in skipped:
             continue
-        for change in range(len(_changes(node))):
+        for number in range(len(_changes(node))):
             other = copy.deepcopy(tree)
-            target = _at(other, index)
-            what = _changes(target)[change]
-            before = ast.unparse(node)
-            what[1]()
-            yield Mutant(getattr(node, "lineno", 0), f"{what[0]}: {before.splitlines()[0][:70]}", ast.fix_missing_locations(other))
-
-
-def _at(tree: ast.Module, index: int) -> ast.AST:
-    for number, node in enumerate(ast.walk(tree)):
-        if number == index:
-            return node
-    raise IndexError(index)
+            words, change = _changes(next(itertools.islice(ast.walk(other), index, None)))[number]
+            change()
+            yield Mutant(getattr(node, "lineno", 0), f"{words}: {ast.unparse(node).splitlines()[0][:70]}", ast.fix_missing_locations(other))
 
 
 def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
@@ -264,29 +254,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.path.insert(0, str(ROOT))
     for heavy in HEAVY:
         importlib.import_module(heavy)
-    names = [name for name in TARGETS if not options.module or name.rpartition(".")[2] in options.module]
-    loaded = [name for name in TARGETS if name in sys.modules]
-    if loaded:
+    if loaded := [name for name in TARGETS if name in sys.modules]:
         print(f"cannot mutate what is loaded already: {', '.join(loaded)}", file=sys.stderr)
         return 2
+    names = [name for name in TARGETS if not options.module or name.rpartition(".")[2] in options.module]
+    return list_mutants(names) if options.list else run_mutants(names, options.jobs)
+
+
+def source_of(name: str) -> str:
+    """The text of a module."""
+    return (ROOT / (name.replace(".", "/") + ".py")).read_text()
+
+
+def list_mutants(names: Sequence[str]) -> int:
+    """Says what would be tried; the exit status."""
+    for name in names:
+        print("\n".join(f"{name}:{m.line}: {m.what}" for m in mutants(source_of(name))))
+    return 0
+
+
+def run_mutants(names: Sequence[str], jobs: int) -> int:
+    """Runs all mutants of these modules; the exit status."""
     total = alive = 0
     for name in names:
-        source = (ROOT / (name.replace(".", "/") + ".py")).read_text()
-        todo = list(mutants(source))
-        if options.list:
-            print("\n".join(f"{name}:{m.line}: {m.what}" for m in todo))
-            continue
-        began = time.monotonic()
+        source = source_of(name)
+        todo, began = list(mutants(source)), time.monotonic()
         # served as its mutants are: what cannot even be imported so would count as killed
         _, status = os.waitpid(start(name, ast.parse(source), quiet=False), 0)
         if os.waitstatus_to_exitcode(status) != 0:
             print(f"{name}: its tests fail without any mutant", file=sys.stderr)
             return 2
-        survivors = run(name, todo, options.jobs)
+        survivors = run(name, todo, jobs)
         total, alive = total + len(todo), alive + len(survivors)
         print(f"{name}: {len(todo) - len(survivors)} killed, {len(survivors)} survived, {time.monotonic() - began:.0f} s", flush=True)
-    if not options.list:
-        print(f"mutants: {total - alive} killed, {alive} survived")
+    print(f"mutants: {total - alive} killed, {alive} survived")
     return 1 if alive else 0
 
 
