@@ -9,8 +9,9 @@ import numpy as np
 from bench_entry import Entry, compare, each_us
 from numba import njit
 
+from firmware_py.core.body import DragTable
 from firmware_py.core.drag_lookup import add_drag
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import Vehicle, load_vehicle
 from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare import alpha, drag_table
 from firmware_py.prepare.capability.sphere import fibonacci
@@ -44,19 +45,20 @@ def _nearest_all(directions, coefficients, velocities, out):  # type: ignore[no-
 def drag_entries() -> list[Entry]:
     """Looking drag up, its error, and building its table."""
     vehicle = load_vehicle("modcube")
+    return [*_look_up_entries(vehicle), *_build_entries(vehicle)]
+
+
+def _look_up_entries(vehicle: Vehicle) -> list[Entry]:
+    """Looking drag up in the table of a lone module, and among the paper's 1000 directions; against the exact drag, both."""
     placements = [Placement(vehicle, (0, 0, 0), 0)]
     solids = [box(np.array(vehicle.hull.size_m))]
-    pitch_m = float(vehicle.hull.size_m[0])
 
     def exact(directions: np.ndarray) -> np.ndarray:
         """Drag per squared speed along (n, 3) directions, N s^2/m^2."""
         area = areas_and_centroids(solids, directions)[0]
         return np.asarray(0.5 * WATER_DENSITY * drag_table.coefficient(placements, directions) * area)
 
-    def build(method: drag_table.Outlines) -> Callable[[], float]:
-        return lambda: each_us(lambda: drag_table.build(placements, np.zeros(3), pitch_m, method=method), 1)() * 1e-6
-
-    table = drag_table.build(placements, np.zeros(3), pitch_m)
+    table = _table(vehicle, areas_and_centroids)
     drawn = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
     velocities = np.hstack([drawn / np.linalg.norm(drawn, axis=1, keepdims=True), np.zeros((DIRECTIONS, 3))])
     grid = fibonacci(DIRECTIONS)
@@ -68,18 +70,29 @@ def drag_entries() -> list[Entry]:
     truth = exact(velocities[:, :3])
     errors = [100.0 * rms(np.linalg.norm(each[:, :3], axis=1) / truth - 1.0) for each in (ours, theirs)]
     peer = "nearest of 1000 directions"
-    name, exact_s = "drag table of one module", build(areas_and_centroids)
-    builds = compare(name, "s", exact_s, {"alpha shapes of 1000 points": build(alpha.lattice_method)})
-    if importlib.util.find_spec("alphashape") is not None:  # it takes minutes: once
-        builds += compare(name, "s", exact_s, {"the alphashape package": build(_alphashape_package)}, repetitions=1)
+    peers = {peer: _per_direction(lambda: _nearest_all(*nearest))}
     return [
-        *compare(
-            "drag look-up, compiled", "us", _per_direction(lambda: _look_up_all(*look_up)),
-            {peer: _per_direction(lambda: _nearest_all(*nearest))},
-        ),
+        *compare("drag look-up, compiled", "us", _per_direction(lambda: _look_up_all(*look_up)), peers),
         Entry("drag look-up, error", errors[0], "% rms", peer, errors[1], errors[1] / errors[0]),
-        *builds,
-    ]  # fmt: skip
+    ]
+
+
+def _build_entries(vehicle: Vehicle) -> list[Entry]:
+    """Building the table of a lone module, beside two ways by alpha shapes."""
+
+    def build(method: drag_table.Outlines) -> Callable[[], float]:
+        return lambda: each_us(lambda: _table(vehicle, method), 1)() * 1e-6
+
+    name, exact_s = "drag table of one module", build(areas_and_centroids)
+    entries = compare(name, "s", exact_s, {"alpha shapes of 1000 points": build(alpha.lattice_method)})
+    if importlib.util.find_spec("alphashape") is not None:  # it takes minutes: once
+        entries += compare(name, "s", exact_s, {"the alphashape package": build(_alphashape_package)}, repetitions=1)
+    return entries
+
+
+def _table(vehicle: Vehicle, method: drag_table.Outlines) -> DragTable:
+    """That of a lone module, its outlines found by `method`."""
+    return drag_table.build([Placement(vehicle, (0, 0, 0), 0)], np.zeros(3), float(vehicle.hull.size_m[0]), method=method)
 
 
 def _per_direction(function: Callable[[], object]) -> Callable[[], float]:
@@ -92,8 +105,6 @@ def _alphashape_package(solids: Sequence[Solid], directions: np.ndarray) -> tupl
     import alphashape
 
     cloud = alpha.lattice_points(solids)
-    shapes = [
-        (alphashape.alphashape(cloud.points @ basis.T, 1.0 / cloud.radius), basis) for basis in plane_basis(directions)
-    ]
+    shapes = [(alphashape.alphashape(cloud.points @ basis.T, 1.0 / cloud.radius), basis) for basis in plane_basis(directions)]
     centroids = [np.array([shape.centroid.x, shape.centroid.y]) @ basis for shape, basis in shapes]
     return np.array([shape.area for shape, _ in shapes]), np.array(centroids)
