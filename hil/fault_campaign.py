@@ -75,12 +75,9 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Vehicle) -> Cell:
     wanted = row.ends.get(mode, mode)
     changes = [i for i in range(1, len(names)) if names[i] != names[i - 1]]
     reached_s = float(time_s[changes[-1]]) if changes else 0.0
-    events = zip(flight.events["text"], flight.events["log_time"] * 1e-9 - AT_S, strict=True)
-    told = [(str(text), float(at_s)) for text, at_s in events if at_s >= 0.0]
+    told = _told(flight)
     said_s = [at_s for text, at_s in told if row.says and row.says in text]
     error_m, angle_deg = worst_errors(after, names)
-    commanded = after.firmware["commanded_n"]
-    still = np.array([name in ("DISARMED", "ESTOP") for name in names])
     blamed = {f"thruster {found[1]}" for text, _ in told for found in BLAMED.finditer(text)} - ({NUMBER} if row.leaves_out else set())
     broken = {
         f"was in {names[0]} when it began": names[0] != mode,
@@ -91,14 +88,28 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Vehicle) -> Cell:
         f"{angle_deg:.0f} deg off": angle_deg > row.angle_deg,
         f"did not say {row.says!r}": bool(row.says) and mode in row.says_in and not said_s,
         f"blamed {', '.join(sorted(blamed))}": bool(blamed) or (not row.leaves_out and any("left out" in text for text, _ in told)),
-        "a command was no number": not np.isfinite(commanded).all(),
-        "a command was beyond its limits": bool((commanded > vehicle.force_max_n).any() or (commanded < vehicle.force_min_n).any()),
-        "a thruster turned while stopped": bool(commanded[still].any()),
+        **_wrong_commands(after.firmware["commanded_n"], names, vehicle),
     }
     happened = f"{names[-1]} {reached_s:.2f} s" if changes else "as before"
     happened += f", said {said_s[0]:.1f} s" if said_s and not changes else ""
     happened += f", {error_m * 1e3:.0f} mm" if np.isfinite(error_m) else ""
     return Cell(row.name, mode, happened, tuple(words for words, is_so in broken.items() if is_so), row.promise)
+
+
+def _told(flight: Flight) -> list[tuple[str, float]]:
+    """What the firmware said from the fault on, and how long after it, s."""
+    events = zip(flight.events["text"], flight.events["log_time"] * 1e-9 - AT_S, strict=True)
+    return [(str(text), float(at_s)) for text, at_s in events if at_s >= 0.0]
+
+
+def _wrong_commands(commanded: np.ndarray, names: Sequence[str], vehicle: Vehicle) -> dict[str, bool]:
+    """What no thruster's command may be, whatever breaks, and whether it was; commanded: (k, t) N, in the states `names`."""
+    still = np.array([name in ("DISARMED", "ESTOP") for name in names])
+    return {
+        "a command was no number": not np.isfinite(commanded).all(),
+        "a command was beyond its limits": bool((commanded > vehicle.force_max_n).any() or (commanded < vehicle.force_min_n).any()),
+        "a thruster turned while stopped": bool(commanded[still].any()),
+    }
 
 
 def worst_errors(flight: Flight, names: Sequence[str]) -> tuple[float, float]:
