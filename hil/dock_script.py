@@ -112,7 +112,7 @@ class DockScript(Orders):
         return self._number(running.module) == self._number(running.target)
 
     def _number(self, module: int) -> int:
-        """Of the body that a module is of."""
+        """Number of the body that holds a module; NOBODY where none does."""
         return next((number for number, modules in self._bodies.items() if module in modules), NOBODY)
 
 
@@ -133,7 +133,7 @@ class _Running:
     module: int
     target: int
     docking: bool = False
-    """In the tick before."""
+    """Whether its body was in the mode DOCK in the tick before."""
 
 
 def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> Trajectory:

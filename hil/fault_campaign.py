@@ -48,7 +48,7 @@ class Cell(NamedTuple):
     broken: tuple[str, ...]
     """Promises that were not kept; empty: all were."""
     promise: str
-    """Of the fault, in words."""
+    """What the robot promises about the fault, in words."""
 
 
 def scenario_of(row: Row, mode: str) -> Scenario:

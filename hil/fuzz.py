@@ -82,9 +82,9 @@ class Fuzzed:
     frames: int = 0
     """Fuzzed and real ones, all that the firmware took."""
     accepted: int = 0
-    """By a receiver that listens in; `frames` less all that the firmware dropped."""
+    """Frames that a receiver beside the firmware found good: as many as `frames` less those that the firmware dropped."""
     dropped: dict[str, int] = field(default_factory=dict)
-    """By kind."""
+    """Frames that the firmware dropped, by what was wrong with them."""
     beyond: int = 0
     """Commands that were no number or beyond their limits."""
     armed_ticks: int = 0

@@ -133,7 +133,7 @@ def rotation_vectors(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class Poses(NamedTuple):
-    """Of one body, tick by tick."""
+    """Where a body is in k ticks, or is wanted to be: its centre of mass and its attitude in the world."""
 
     p_wb: np.ndarray
     """(k, 3) m."""

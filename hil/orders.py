@@ -17,7 +17,7 @@ class Orders(Protocol):
     """The orders of one run."""
 
     ticks: int
-    """Of the run, at the most."""
+    """How long the run takes at the most; `is_over` may end it before."""
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
         """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""

@@ -219,7 +219,7 @@ def _fault(rng: np.random.Generator, duration_s: float) -> Fault:
 
 
 def _seen(bench: Bench, operator: RandomOperator, outputs: Outputs, before: Mapping[int, int]) -> dict[int, Seen]:
-    """By module."""
+    """What the rules look at after a tick, by module; `before`: the state of each module's body in the tick before."""
     bodies, told_ago = bench.firmware.pipeline.bodies, {action: outputs.tick - tick for action, tick in operator.asked.items()}
     records = {record.body: record for record in outputs.records}
     seen = {}

@@ -145,7 +145,7 @@ def _in_start(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:
-    """Of modules that are not there."""
+    """Steps, faults and cameras that name a module that is not there."""
     numbers = module_numbers(scenario)
     mentions: list[tuple[tuple[str | int, ...], int]] = []
     for i, step in enumerate(scenario.step):

@@ -35,7 +35,7 @@ class DetectorBench:
         self._ticks = [[[f for at, f in frames if at == bus] for bus in range(2)] for frames in map(self._frames_of, range(TICKS))]
         self._table = tag_table([self._body])
         self.frames = sum(len(frames) for tick in self._ticks for frames in tick) / TICKS
-        """Of a tick, on the mean."""
+        """How many come in a tick, on the mean."""
 
     def tick_us(self) -> float:
         """Raw frames to Inputs, and on to the state of the twelve joints, a tick. Raises RuntimeError when one is not found docked."""

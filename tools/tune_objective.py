@@ -78,7 +78,7 @@ class Stability:
     per_deg: float = quantity(low=1e-3, high=180, help="so many degrees too little cost 1")
 
     def cost(self, gain_db: float, phase_deg: float) -> float:
-        """Of the least margins of all axes."""
+        """What margins cost; given are the least gain margin and the least phase margin of all axes."""
         return max(0.0, self.gain_db - gain_db) / self.per_db + max(0.0, self.phase_deg - phase_deg) / self.per_deg
 
 
@@ -136,7 +136,7 @@ class Objective:
 
     @property
     def vehicle(self) -> str:
-        """Whose margins and plots: that of the first flight."""
+        """The vehicle whose margins are measured and drawn: that of the first flight."""
         return self.flight[0].flown().module[0].vehicle
 
     def shortfall(self, parameters: Parameters) -> float:

@@ -197,7 +197,7 @@ class Balance:
 
     @staticmethod
     def of(placements: Sequence[Placement], pitch_m: float) -> Balance:
-        """That of placed modules."""
+        """Where these modules balance, each at its cell of a lattice of this pitch."""
         origins = pitch_m * np.array([p.cell for p in placements], dtype=float)
         lumps = [lump for p, origin in zip(placements, origins, strict=True) for lump in _lumps(p, origin)]
         mass_kg = sum(lump.mass for lump in lumps)

@@ -62,7 +62,7 @@ class LimitsTable:
                 raise DescriptionError(f"{name} needs 3 numbers, not {len(values)}", name)
 
     def limits(self) -> Limits:
-        """As minimum_snap takes them."""
+        """The limits as minimum_snap.plan takes them; None where the file leaves a quantity free."""
         return Limits(
             self.velocity_m_s if len(self.velocity_m_s) else None,
             self.acceleration_m_s2 if len(self.acceleration_m_s2) else None,

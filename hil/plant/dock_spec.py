@@ -49,6 +49,6 @@ class JamRule:
     shallowest: float = quantity(0.3, low=0, high=1, help="a jam stops the probe at this share of its length at least (synthetic)")
 
     def probability(self, lateral_m: float, speed_m_s: float, tilt_deg: float) -> float:
-        """Of a jam at a contact with these errors."""
+        """How likely a probe jams that meets its funnel with these errors, 0 to 1."""
         inside = lateral_m <= self.lateral_m and speed_m_s <= self.speed_m_s and tilt_deg <= self.tilt_deg
         return self.probability_inside if inside else self.probability_outside
