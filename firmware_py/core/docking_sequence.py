@@ -229,7 +229,7 @@ class DockingSequence:
         row = TABLE[self.stage]
         if row.limit_s and time_ns - self._entered_ns > getattr(self._p, row.limit_s) * 1e9:
             self._time_out(time_ns, status, waits)
-        elif self._is_done(time_ns, errors, status):
+        elif not waits and self._is_done(time_ns, errors, status):  # who waits is on its way, though it may pass the end of it
             self._enter(row.on_done, time_ns)
 
     def _is_done(self, time_ns: int, errors: Errors, status: PairStatus) -> bool:

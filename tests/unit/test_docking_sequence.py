@@ -199,6 +199,19 @@ def test_approach_that_is_to_make_room_goes_back_and_begins_anew() -> None:
     dock.until(Stage.PUSH)
 
 
+@pytest.mark.parametrize("approach", ["staged", "straight"])
+def test_who_waits_or_makes_room_at_its_stand_off_does_not_go_on_from_there(approach: str) -> None:
+    """It aligned, which nobody is waited with: it came before the face, made room anew, and so on for ever; or drew its line too early."""
+    ready, dock = Follower(), Follower(Docking(approach=approach))
+    ready.until(Stage.APPROACH)
+    dock.at = ready.at
+    for wish in (REST, REST._replace(p_wb=dock.at.p_wb + 0.5 * dock.outward, q_wb=dock.at.q_wb)):
+        steering = dock.step(waits=wish)
+        dock.at = ready.at
+        assert dock.sequence.stage == Stage.PRE_APPROACH and steering.active is wish
+    dock.until(Stage.PUSH)
+
+
 def test_straight_approach_that_is_to_make_room_goes_back_on_its_line_as_far_as_it_came() -> None:
     dock, came = Follower(Docking(approach="straight")), list[np.ndarray]()
     for _ in range(300):
