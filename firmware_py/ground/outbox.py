@@ -10,6 +10,9 @@ from firmware_py.ground.identity import COMPONENT_AUTOPILOT
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.wire import Encoder
 
+_HURRY_NS = 100_000_000
+"""Between two of what is hurried."""
+
 
 class Outgoing(NamedTuple):
     """A frame for one channel."""
@@ -24,6 +27,7 @@ class Rates:
     def __init__(self, intervals_ns: Mapping[str, int], now_ns: int) -> None:
         self.intervals_ns = dict(intervals_ns)
         self._next_ns = dict.fromkeys(intervals_ns, now_ns)
+        self._sent_ns: dict[str, int] = {}
 
     def set(self, name: str, interval_ns: int, now_ns: int) -> None:
         """Send `name` every `interval_ns`; 0 ends it."""
@@ -35,9 +39,10 @@ class Rates:
             self._next_ns[name] = now_ns
 
     def hurry(self, name: str, now_ns: int) -> None:
-        """Send `name` now, and from then on as often as before."""
+        """Send `name` now, or as soon after the last one as may be, and from then on as often as before."""
         if name in self._next_ns:
-            self._next_ns[name] = now_ns
+            soonest_ns = self._sent_ns.get(name, now_ns - _HURRY_NS) + _HURRY_NS
+            self._next_ns[name] = min(self._next_ns[name], max(now_ns, soonest_ns))
 
     def due(self, now_ns: int, among: Container[str]) -> list[str]:
         """What is to be sent now; what was missed is not made up. What is not `among` these waits for the next call."""
@@ -45,6 +50,7 @@ class Rates:
         for name in names:
             interval = self.intervals_ns[name]
             self._next_ns[name] += interval * ((now_ns - self._next_ns[name]) // interval + 1)
+            self._sent_ns[name] = now_ns
         return names
 
 

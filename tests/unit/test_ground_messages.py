@@ -15,7 +15,7 @@ from firmware_py.core.failsafes import Level
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.rotations import rotate
 from firmware_py.core.transitions import State
-from firmware_py.core.types import NEVER_AGE_NS, Action
+from firmware_py.core.types import NEVER_AGE_NS, Action, Mode
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.ground.dialect import load_dialect
@@ -208,6 +208,19 @@ def test_heartbeat_tells_at_once_of_another_mode_of_arming_and_of_an_emergency_s
     client.clear()
     world.run(300)
     assert len(client.all("HEARTBEAT")) == 3
+
+
+def test_heartbeat_of_what_changes_in_every_tick_leaves_room_on_a_radio(world: World, client: Client) -> None:
+    """Two stations that fight about the mode filled it: a heartbeat waits for nothing else, and a hundred went out in a second."""
+    client.clear()
+    for tick in range(200):
+        world.robot.mode[0] = (Mode.POSHOLD, Mode.MANUAL)[tick % 2]
+        world.run(1)
+    assert 18 <= len(client.all("HEARTBEAT")) <= 20
+    world.robot.mode[0] = Mode.STABILIZE
+    world.run(11)
+    modes = [m.custom_mode for m in client.all("HEARTBEAT")]
+    assert modes[-1] not in modes[:-1], "the last is told soon"
 
 
 def test_heartbeat_is_critical_while_a_fail_safe_flies(world: World, client: Client) -> None:
