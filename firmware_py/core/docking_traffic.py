@@ -92,7 +92,7 @@ class Traffic:
         sequence = dock.sequence
         if not thirds or sequence.stage not in AHEAD:
             return None
-        gap, slack = AHEAD[sequence.stage]
+        gap, slack = AHEAD[Stage.APPROACH if self._p.approach == "straight" else sequence.stage]
         body, target_at = self._estimates[dock.target]
         way = way_of_active(sequence.plan, *self._estimates[dock.active], body, sequence.met(target_at), gap * self._p.standoff_m)
         comes = dock.target in self._coming and sequence.meets_at_w is None

@@ -9,6 +9,7 @@ from firmware_py.core.docking_sequence import DockingSequence, Stage
 from firmware_py.core.docking_traffic import Dock, Traffic
 from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import DockRequest
+from firmware_py.description.parameters import Docking
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.docking import plan_dock
@@ -78,3 +79,13 @@ def test_room_is_made_until_it_is_there_and_not_begun_by_one_that_is_on_no_way_i
     assert waits((AWAY, BACK), Stage.PRE_APPROACH) == (REST, None)
     passer, before = waits((AWAY, BACK), Stage.PRE_APPROACH, makes_room=True)
     assert passer is REST and is_at(before, BACK)
+
+
+@pytest.mark.parametrize("approach", ["staged", "straight"])
+def test_straight_approach_does_not_wait_for_who_is_beside_a_stand_off_that_it_does_not_go_to(approach: str) -> None:
+    """It waited there before it had set off, until its time was over."""
+    mine = dock(DockRequest(1, 3, 0, 2), BACK, Stage.PRE_APPROACH)
+    places = [(0.0, 0.0), (-0.8, 0.3), (0.25, 0.5)]
+    estimates = {m: (BODIES[m], estimate(np.array([*place, 0.0]))) for m, place in enumerate(places)}
+    waits = Traffic([mine], estimates, [], Docking(approach=approach)).wait(mine)
+    assert (waits is None) == (approach == "straight")
