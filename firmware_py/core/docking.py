@@ -238,7 +238,8 @@ class DockingStage:
             decisions.returning.append(dock.target)
 
     def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
-        if any(undock.plan.opens == plan.opens for undock in self._undocks):
+        opens = set(map(modules_of, plan.opens))
+        if any(set(map(modules_of, undock.plan.opens)) == opens for undock in self._undocks):
             return
         self._undocks.append(Undock.begun(plan, chains, time_ns, bool(self._still_closed(plan)), self._p, self._joints))
         self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")

@@ -227,12 +227,13 @@ def test_ring_with_one_open_joint_is_still_one_body_and_asks_once() -> None:
     assert sum("also held together" in text for _, text in tank.said) == 1
 
 
-def test_undock_that_is_asked_for_twice_parts_once() -> None:
+@pytest.mark.parametrize("again", [DockRequest(1, 1, 0, 0), DockRequest(0, 0, 1, 1)], ids=["alike", "from the other side"])
+def test_undock_that_is_asked_for_twice_parts_once(again: DockRequest) -> None:
     """A client whose answer was lost asks again: it was told that its undock began anew, and after it was done that it had ended."""
     tank = Docked(RING[:2])
     tank.fly()
-    for _ in range(2):
-        tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    for request in (DockRequest(1, 1, 0, 0), again):
+        tank.run(0.1, Request(Action.UNDOCK, 0, request))
     tank.run(2.5)
     assert tank.shape == [(0,), (1,)]
     assert [text for _, text in tank.said if "undock" in text] == ["undocking module 1 from 0", "module 1 is undocked from 0"]
