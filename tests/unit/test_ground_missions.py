@@ -243,6 +243,18 @@ def test_jump_to_the_item_that_is_flown_to_takes_up_another_speed(world: World, 
     assert [leg.speed_m_s for leg in job.legs] == [pytest.approx(0.3)] * 3
 
 
+def test_jump_after_the_same_mission_was_sent_anew_flies_the_new_one(world: World, client: Client) -> None:
+    """Of the old one nobody is told what is reached, nor that it is complete."""
+    mission = [item(i, place) for i, place in enumerate(PLACES)]
+    upload(world, client, mission)
+    fly(world, client)
+    upload(world, client, mission)
+    client.command(224, 0)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == [0, 1, 2]
+
+
 def test_jump_behind_what_takes_the_body_for_something_else_is_flown(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)

@@ -68,6 +68,11 @@ def test_reposition_that_comes_again_because_its_answer_was_lost_flies_on(world:
     ask(world, client, 178, 1, 0.3)
     for another in ({}, {"x": 302084020}, {"yaw": 1.0}):
         assert len(go(**another)) == 1, "another speed, place or heading"
+    for name in (b"MIS_ACCEL", b"MIS_CORRIDOR"):
+        client.send("PARAM_SET", 1, 1, name, 0.2, 9)
+        assert len(go(yaw=1.0)) == 1, name
+    client.command(176, 1, 1)
+    assert len(go(yaw=1.0)) == 1, "another mode was asked for just before"
     ask(world, client, 193, 0)
     assert len(go(yaw=1.0)) == 1, "it was paused"
 

@@ -100,6 +100,24 @@ def test_stop_behind_a_torn_frame_in_one_datagram_is_heard_at_once() -> None:
     assert not any(world.station.take(client.channel, half, world.time_ns) for half in (stop[:20], stop[20:])), "a datagram is whole"
 
 
+def test_torn_frame_of_a_link_that_is_gone_is_forgotten() -> None:
+    world = World()
+    client = world.client()
+    world.station.take(client.channel, TORN, world.time_ns, datagram=False)
+    world.station.leave(client.channel)
+    world.run(60)
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+def test_key_behind_a_torn_frame_is_taken_from_a_trusted_link_alone(trusted: bool) -> None:
+    world = World()
+    client = world.client()
+    setup = client.pack("SETUP_SIGNING", 1, 1, list(KEY), NOW)
+    world.station.take(client.channel, TORN + setup, world.time_ns, datagram=False, trusted=trusted)
+    world.run(52)
+    assert (world.station.signing.key == KEY) == trusted
+
+
 def test_frame_that_comes_in_parts_is_put_together_while_they_follow_each_other() -> None:
     world = World()
     client = world.client()
