@@ -167,6 +167,18 @@ def test_cabin_pressure_counts_from_its_first_reading() -> None:
     ear = Ear()
     ear.hear(here(cabin_pressure_pa=80e3), here(cabin_pressure_pa=100e3))
     assert ear.hear(here(cabin_pressure_pa=81e3), here(cabin_pressure_pa=93e3)).cabin_change_pa == 7e3
+    whole = Ear()
+    whole.monitor.take_over([ear.monitor])
+    assert whole.hear(here(), here(cabin_pressure_pa=90e3)).cabin_change_pa == 10e3, "also of a body that is made of others"
+
+
+def test_cabin_that_was_wet_twice_is_not_dry_at_once_for_a_body_that_is_made_of_others() -> None:
+    ear, whole = Ear(), Ear()
+    for _ in range(2):
+        ear.hear(here(leak=True), here())
+    whole.monitor.take_over([ear.monitor])
+    whole.time_ns = ear.time_ns
+    assert whole.hear(here(leak=False), here()).leak
 
 
 def test_leak_of_any_module_counts_until_it_says_dry() -> None:
