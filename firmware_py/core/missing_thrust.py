@@ -38,9 +38,9 @@ by this times the slope of the drag. That acts at the body's middle and makes no
 MODEL_SHARE = 0.12
 """What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too. Of the Coriolis wrench it is this
 share and that by which the water's drift changes the speed."""
-LEFT = 5.0
-"""Squared sigmas that a thruster may leave unexplained: one for each of the five axes that its loss says nothing of. A wall, a hand or
-a rope pushes nearly as some thruster would, but seldom so exactly."""
+LEFT = 9.2
+"""Squared sigmas that a thruster may leave unexplained: of the five axes that its loss says nothing of, noise leaves less nine times in
+ten (chi-squared). A wall, a hand or a rope pushes nearly as some thruster would, but seldom so exactly."""
 RUNNER_UP = 0.5
 """What it leaves unexplained must be less than this share of what the next best leaves."""
 SIGNIFICANT = 20.0

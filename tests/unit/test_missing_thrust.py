@@ -144,6 +144,18 @@ def test_a_thruster_is_not_blamed_for_a_wall_that_the_robot_leans_on() -> None:
     assert blamed == 0
 
 
+def test_a_thruster_that_lies_is_told_from_noise_of_the_size_that_is_foreseen() -> None:
+    rng, found = np.random.default_rng(9), 0
+    for trial in range(200):
+        watch = MissingThrust(BODY, Faults(), TICK_NS)
+        watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.05
+        lost = -3.0 * BODY.thrusters.matrix[:, trial % 8]
+        watch._blocks[-RECENT:, :6] = lost + watch._healthy[0] * rng.normal(size=6)
+        watch._blocks[-RECENT:, FORCES + trial % 8] = 3.0
+        found += watch._explain(np.ones(8, bool)) == trial % 8
+    assert found >= 170, "nine of ten"
+
+
 @pytest.mark.parametrize("coriolis", [0.0, 1.0, 10.0])
 def test_a_thruster_is_not_blamed_for_a_change_that_is_small_beside_the_coriolis_wrench(coriolis: float) -> None:
     """Masses are known to a tenth, the speed through water that drifts to less: so is what both do on a fast curve."""
