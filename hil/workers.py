@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import socket
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, get_context, parent_process
+from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import Any
 
@@ -21,8 +24,46 @@ Pool = Callable[[], AbstractContextManager[Executor]]
 
 
 def processes(jobs: int) -> Pool:
-    """So many processes of this machine, which end with this one, however it ends."""
-    return lambda: ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=end_with_parent)
+    """So many processes of this machine, which end with this one, however it ends, and whose temporary files go with them.
+
+    Ctrl-C, which a terminal sends to them too, they leave to this one, which ends them with what they do.
+    """
+
+    @contextmanager
+    def use() -> Iterator[Executor]:
+        others = active_children()
+        with (
+            TemporaryDirectory() as scratch,
+            ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=begin, initargs=(scratch,)) as pool,
+        ):
+            try:
+                _start(pool, jobs)
+                yield pool
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                for child in active_children():
+                    if child not in others:
+                        child.terminate()
+                        child.join()
+                raise
+
+    return use
+
+
+def _start(pool: Executor, jobs: int) -> None:
+    """Starts all processes now, with Ctrl-C blocked, which they inherit: they would print tracebacks."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        for _ in range(jobs):
+            pool.submit(os.getpid)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def begin(scratch: str) -> None:
+    """In a child, before its first call: its temporary files go to the folder `scratch`."""
+    end_with_parent()
+    tempfile.tempdir = scratch
 
 
 def end_with_parent() -> None:

@@ -13,8 +13,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from statistics import median
 
-from command_line import worker_pool
-
 import identify_plants
 import near_miss
 
@@ -102,7 +100,7 @@ def passed_by(folder: Path) -> Values:
     """Ten thousand near misses seen by the docking detector through real frames."""
     chunks = [range(first, first + CHUNK) for first in range(0, PASSES, CHUNK)]
     total: dict[str, int] = {}
-    with worker_pool(JOBS) as pool:
+    with processes(JOBS)() as pool:
         for found in pool.map(near_miss.count, chunks):
             total = {key: total.get(key, 0) + value for key, value in found.items()}
     (folder / "passes.json").write_text(json.dumps(total, indent=2) + "\n", encoding="utf-8")

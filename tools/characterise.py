@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from command_line import Parser, refuse, run_tool, worker_pool
+from command_line import Parser, refuse, run_tool
 
 import characterise_blas  # noqa: F401
 import characterise_table as table
@@ -33,6 +33,7 @@ from firmware_py.description.vehicle import Vehicle, load_vehicle
 from firmware_py.prepare.assembly import described, groups_of
 from firmware_py.prepare.capability.layout import AXES, UNITS, Layout, of_modules, of_rows, of_vehicle
 from firmware_py.prepare.capability.summary import DIRECTIONS, Capability, characterise
+from hil.workers import processes
 
 DATA = Path(__file__).with_name("data")
 ENDINGS = ("json", "csv", "png", "html")
@@ -178,7 +179,7 @@ def _all(layouts: dict[str, Layout], settings: dict[str, Any], jobs: int) -> dic
             for name, layout in layouts.items():
                 done(name, work(layout, progress=partial(_describe, bar, mark, name)))
         else:
-            with worker_pool(min(jobs, len(layouts))) as pool:
+            with processes(min(jobs, len(layouts)))() as pool:
                 largest_first = sorted(layouts, key=lambda n: -layouts[n].count)
                 waiting = {pool.submit(work, layouts[name]): name for name in largest_first}
                 for future in as_completed(waiting):

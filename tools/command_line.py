@@ -1,4 +1,4 @@
-"""For the tools: how a command line ends: what is wrong in one line, and Ctrl-C without a word, in its processes too.
+"""For the tools: how a command line ends: what is wrong in one line, and Ctrl-C without a word.
 
 A tool imports this before all that takes long to import: from here on Ctrl-C ends it without a word.
 """
@@ -10,10 +10,7 @@ import errno
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from multiprocessing import active_children, get_context
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -65,22 +62,3 @@ def run_tool(main: Callable[[], int | None]) -> NoReturn:
         sys.exit(main())
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-
-
-@contextmanager
-def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """So many processes. Ctrl-C, which a terminal sends to them too, they leave to the tool, which ends them with what they do."""
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by all that is started here
-        try:
-            for _ in range(jobs):
-                pool.submit(os.getpid)  # starts a process
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        try:
-            yield pool
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for child in active_children():
-                child.terminate()
-            raise

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from command_line import Parser, refuse, run_tool, worker_pool
+from command_line import Parser, refuse, run_tool
 
 import numpy as np
 from argument_types import check_results, folder_for_results, positive, whole
@@ -31,6 +31,7 @@ from hil.bench import fly_scenario
 from hil.flight import check_folder
 from hil.plant.draw import ModuleDraw, draw_module
 from hil.scenario import load_scenario
+from hil.workers import processes
 
 ACCURACY = 0.02
 CELL_POINTS, CELL_NOISE_N = 41, 0.02
@@ -102,7 +103,7 @@ def summary(plants: Sequence[dict]) -> dict[str, float]:  # type: ignore[type-ar
 def examine_all(seeds: Sequence[int], jobs: int, folder: Path, duration_s: float = 170.0) -> dict[str, float]:
     """Examines all plants in so many processes; plants.json is left in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    with worker_pool(jobs) as pool:
+    with processes(jobs)() as pool:
         plants = list(pool.map(partial(examine, folder=folder, duration_s=duration_s), seeds))
     (folder / "plants.json").write_text(json.dumps(plants, indent=2) + "\n", encoding="utf-8")
     return summary(plants)

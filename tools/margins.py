@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from command_line import Parser, refuse, run_tool, worker_pool
+from command_line import Parser, refuse, run_tool
 
 import numpy as np
 from argument_types import check_results, folder_for_results, whole
@@ -32,6 +32,7 @@ from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M
 from firmware_py.prepare.capability.layout import AXES
 from firmware_py.prepare.joints import Placement, check_joints
+from hil.workers import processes
 
 BARS = {"nominal": (8.0, 40.0), "worst": (6.0, 35.0)}
 """Least gain margin, dB, and phase margin, deg."""
@@ -46,7 +47,7 @@ def measured(modules: Sequence[int], parameters: Parameters, vehicle: str, jobs:
     """The responses of every body in the nominal world and in the eight corners."""
     cases = [(n, scale) for n in modules for scale in (NOMINAL, *corners(SPREAD))]
     found: Found = {n: {} for n in modules}
-    with worker_pool(jobs) as pool:
+    with processes(jobs)() as pool:
         futures = [pool.submit(measure, n, parameters, scale, vehicle) for n, scale in cases]
         for done, ((n, scale), future) in enumerate(zip(cases, futures, strict=True), 1):
             found[n][scale] = future.result()

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from command_line import worker_pool
-
 import numpy as np
 import optuna
 from loop_response import PERIOD_NS, STEP_TICKS, Response, margins, measure, step_responses
@@ -17,6 +15,7 @@ from tune_objective import Objective
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.prepare.capability.layout import AXES
+from hil.workers import processes
 
 SHOWN = (0, 2, 3, 5)
 """Axes of the plots: surge (sway is its like), heave, roll (pitch is its like), yaw."""
@@ -32,7 +31,7 @@ def draw(out: Path, objective: Objective, study: optuna.Study, sets: Mapping[str
     import matplotlib
 
     matplotlib.use("Agg")
-    with worker_pool(JOBS) as pool:
+    with processes(JOBS)() as pool:
         loops = {name: pool.submit(measure, 1, p, vehicle=vehicle) for name, p in sets.items() if name != "start"}
         steps = {name: pool.submit(step_responses, p, SHOWN, vehicle) for name, p in sets.items()}
         draw_bode(out / "bode.png", {name: job.result() for name, job in loops.items()})

@@ -162,3 +162,39 @@ def test_workers_end_with_the_process_that_began_them() -> None:
         parent.kill()
         assert select.select([worker], [], [], 20.0)[0], "it goes on alone"
         os.close(worker)
+
+
+PROGRAM = """
+import os, signal, tempfile, time
+from hil.workers import processes
+
+
+def fly() -> None:
+    with tempfile.TemporaryDirectory():
+        {in_flight}
+        time.sleep(60.0)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell runs in the background ignores it
+    try:
+        with processes(2)() as pool:
+            [pool.submit(fly) for _ in range(9)][0].result()
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+else:
+    {at_import}
+"""
+PRESS = "os.killpg(0, signal.SIGINT)"
+
+
+@pytest.mark.parametrize("moment", ["at_import", "in_flight"])
+def test_workers_that_a_terminal_interrupts_end_at_once_without_a_word_and_leave_no_file(moment: str, tmp_path: Path) -> None:
+    """It tells all of them."""
+    (tmp_path / "tmp").mkdir()
+    (tmp_path / "program.py").write_text(PROGRAM.format(**{"at_import": "pass", "in_flight": "pass", moment: PRESS}), encoding="utf-8")
+    places = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(tmp_path / "tmp")}
+    command = [sys.executable, str(tmp_path / "program.py")]
+    ended = subprocess.run(command, env=places, start_new_session=True, capture_output=True, text=True, timeout=50)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
+    assert not list((tmp_path / "tmp").iterdir())

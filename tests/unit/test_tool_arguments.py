@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import os
 import runpy
 import subprocess
 import sys
@@ -28,7 +27,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
     def run_it(tool: str, *arguments: str) -> int:
         monkeypatch.setattr("sys.argv", [tool, *arguments])
         module = importlib.import_module(tool)
-        for name in ("batch_entries", "worker_pool", "processes"):
+        for name in ("batch_entries", "processes"):
             monkeypatch.setattr(module, name, begins, raising=False)
         try:
             return int(module.main() or 0)
@@ -84,36 +83,6 @@ def test_wrong_arguments_are_refused(
     line = capsys.readouterr().err
     assert refusal in line
     assert line.count("\n") == 1
-
-
-PROGRAM = """
-import os, signal, time
-from command_line import run_tool, worker_pool
-
-
-def main() -> None:
-    with worker_pool(2) as pool:
-        for _ in range({waited_for}):
-            pool.submit(os.getpid).result()
-        busy = [pool.submit(time.sleep, 60.0) for _ in range(9)]
-        os.killpg(0, signal.SIGINT)
-        busy[0].result()
-
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell runs in the background ignores it
-    run_tool(main)
-"""
-
-
-@pytest.mark.parametrize("waited_for", [0, 2])
-def test_interrupt_ends_a_tool_and_its_processes_without_a_word(tmp_path: Path, waited_for: int) -> None:
-    """Of a terminal, which sends it to all of them: while the processes start, and while they work."""
-    (tmp_path / "program.py").write_text(PROGRAM.format(waited_for=waited_for), encoding="utf-8")
-    command = [sys.executable, str(tmp_path / "program.py")]
-    paths = {**os.environ, "PYTHONPATH": str(TOOLS)}
-    ended = subprocess.run(command, env=paths, start_new_session=True, capture_output=True, text=True, timeout=50)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
 
 
 IMPORTED = """

@@ -321,7 +321,7 @@ def test_plots_of_a_search_are_of_the_vehicle_that_it_flies(
 
     monkeypatch.setattr(loop_response, "Loop", Still)
     monkeypatch.setattr(tune_plots, "measure", measured)
-    monkeypatch.setattr(tune_plots, "worker_pool", lambda jobs: Inline())
+    monkeypatch.setattr(tune_plots, "processes", lambda jobs: Inline)
     study = optuna.create_study()
     study.add_trial(optuna.trial.create_trial(value=2.0))
     sets = dict.fromkeys(("start", "shipped", "tuned"), Parameters())
