@@ -43,14 +43,23 @@ def recover(folder: Path) -> Recovery:
         return Recovery(ticks, "")
     if not ticks:
         raise LogError(f"{folder}: no tick of the log is whole")
-    mended = {name: folder / f"{name}.mended" for name in (CAN_LOG, SIGNAL_LOG)}
+    mended = {name: folder / f"{name}.mended" for name in (SIGNAL_LOG, CAN_LOG)}  # a can.log that goes on is mended to the same ticks
     _cut_frames(folder / CAN_LOG, mended[CAN_LOG], candump_stamp(last_ns))
     rewrite(folder / SIGNAL_LOG, mended[SIGNAL_LOG], lambda topic, message: message.log_time <= last_ns)
     for name, path in mended.items():
         shutil.copystat(folder / name, path)  # by its time `app.last_flight` knows how long ago the flight was
-        os.replace(folder / name, _free_name(folder / f"{name}{TORN}"))
+        _set_aside(folder / name)
         os.replace(path, folder / name)
     return Recovery(ticks, log.torn)
+
+
+def _set_aside(path: Path) -> None:
+    """Gives a file a second name; the first stays, so that a mend that is killed leaves no log without one of its files."""
+    aside = _free_name(path.with_name(f"{path.name}{TORN}"))
+    try:
+        os.link(path, aside)
+    except OSError:  # a disk without links, as a memory stick
+        shutil.copy2(path, aside)
 
 
 def _free_name(path: Path) -> Path:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import tracemalloc
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +99,17 @@ def test_torn_log_is_read_up_to_the_tear_and_mended(log: Path, seed: int) -> Non
     assert recover(log) == (len(ticks), "")
 
 
+def test_log_on_a_disk_without_links_is_mended_too(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(source: Path, target: Path) -> None:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    tear(log / CAN_LOG, 0.9)
+    torn = (log / CAN_LOG).read_bytes()
+    monkeypatch.setattr(os, "link", refused)
+    assert recover(log).torn and not replay(log).torn
+    assert (log / f"{CAN_LOG}.torn").read_bytes() == torn
+
+
 def test_log_that_is_torn_again_keeps_what_the_first_mend_set_aside(log: Path) -> None:
     aside = {}
     for share, behind in ((0.9, ".torn"), (0.8, ".torn2"), (0.7, ".torn3")):
@@ -106,6 +117,30 @@ def test_log_that_is_torn_again_keeps_what_the_first_mend_set_aside(log: Path) -
         aside |= {f"{name}{behind}": (log / name).read_bytes() for name in (CAN_LOG, SIGNAL_LOG)}
         assert recover(log).torn
     assert {path.name: path.read_bytes() for path in log.glob("*.torn*")} == aside
+
+
+@pytest.mark.parametrize("renames", range(2))
+@pytest.mark.parametrize("torn", [(CAN_LOG,), (SIGNAL_LOG,), (CAN_LOG, SIGNAL_LOG)], ids="+".join)
+def test_mend_that_is_killed_between_two_renames_loses_nothing(
+    torn: tuple[str, ...], renames: int, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in torn:
+        tear(log / name, 0.9)
+    ticks, before = ticks_of(log), {(log / name).read_bytes() for name in (CAN_LOG, SIGNAL_LOG)}
+    replace, left = os.replace, iter(range(renames))
+
+    def killed(source: Path, target: Path) -> None:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    with monkeypatch.context() as patched, suppress(KeyboardInterrupt):
+        patched.setattr(os, "replace", killed)
+        recover(log)
+    recover(log)
+    mended = replay(log)
+    assert (mended.first, mended.ticks, mended.torn) == (None, len(ticks), "")
+    assert before <= {path.read_bytes() for path in log.iterdir()}
 
 
 @pytest.mark.parametrize("fill", [b"\0", b"\xff", b"\n", b"\r", b"7"])
