@@ -151,7 +151,7 @@ def _dask_client(address: str) -> Any:
         from distributed import Client
 
         return Client(address, timeout=10, set_as_default=False)
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, UnicodeError) as error:  # the last: a name that no host can have
         raise DescriptionError(f"no dask scheduler at {address}: {error}; start one with `dask scheduler`") from None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import termios
@@ -198,6 +199,10 @@ class SerialLink:
             return serial.Serial(self._device, self._baud, timeout=0, write_timeout=0)
         except termios.error as error:  # pulled out meanwhile: no OSError, and pyserial lets it through
             raise OSError(*error.args) from None
+        except serial.SerialException as error:
+            if isinstance(error.__context__, termios.error):  # of which it keeps neither number nor words apart
+                raise OSError(*error.__context__.args) from None
+            raise
 
     def _is_plugged(self) -> bool:
         """Whether the device is open; opens it when it is there again."""
@@ -265,7 +270,8 @@ def open_link(address: str) -> Link:
         host, _, port = rest.rpartition(":")
         if kind in ("udpin", "udpout", "tcpin"):
             number = _number(address, port, _LAST_PORT, f"{kind}:HOST:PORT, as {kind}:{LOOPBACK}:14550, and behind it at most one +trusted")
-            return TcpLink(host or LOOPBACK, number) if kind == "tcpin" else UdpLink(host or LOOPBACK, number, kind == "udpin")
+            host = _host(address, host or LOOPBACK)
+            return TcpLink(host, number) if kind == "tcpin" else UdpLink(host, number, kind == "udpin")
     except (OSError, ValueError, OverflowError) as error:
         raise LinkError(f"link {address}: cannot be opened: {_reason(error)}") from None
     raise LinkError(f"link {address}: unknown; there are udpin:, udpout:, tcpin:HOST:PORT and /dev/NAME,BAUD")
@@ -274,7 +280,18 @@ def open_link(address: str) -> Link:
 def _reason(error: Exception) -> str:
     """In the system's words alone. Those of the resolver of names have numbers below 0, and their words in the error."""
     number = getattr(error, "errno", None) or 0
+    if number == errno.ENOTTY:
+        return "is no serial device"
     return os.strerror(number) if number > 0 else getattr(error, "strerror", None) or str(error)
+
+
+def _host(address: str, text: str) -> str:
+    """A host's name or number. Raises LinkError for what can be none."""
+    try:
+        text.encode("idna")
+    except UnicodeError:
+        raise LinkError(f"link {address}: {text!r} is no name of a host") from None
+    return text
 
 
 def _number(address: str, text: str, most: int, right: str) -> int:

@@ -139,6 +139,20 @@ def test_an_address_that_cannot_be_opened_is_refused_in_one_line(address: str) -
 
 
 @pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("/dev/null", "cannot be opened: is no serial device"),
+        (f"udpout:{64 * 'a'}:14550", f"'{64 * 'a'}' is no name of a host"),
+        ("tcpin:x..y:14550", "'x..y' is no name of a host"),
+    ],
+)
+def test_what_can_be_no_host_and_no_radio_is_refused_in_words(address: str, words: str) -> None:
+    with pytest.raises(LinkError) as error:
+        open_link(address)
+    assert str(error.value) == f"link {address}: {words}"
+
+
+@pytest.mark.parametrize(
     ("address", "right"),
     [
         ("udpin:127.0.0.1:14550+trusted,1", "it needs udpin:HOST:PORT"),

@@ -188,6 +188,7 @@ class TestSlcan(PortSuite):
         ("socketcan:can77", "no such interface"),
         ("socketcan:", "no such interface"),
         ("slcan:/dev/no-such-device", "serial device"),
+        ("slcan:/dev/null", "slcan:/dev/null: Inappropriate ioctl for device; it takes a serial device"),
     ],
 )
 def test_wrong_address_is_refused_with_one_line_that_says_what_is_right(address, says):

@@ -155,7 +155,11 @@ def test_workers_that_are_kept_serve_every_campaign_until_one_dies(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("address", "words"), [("nonsense", "is no address; it needs tcp://HOST:PORT"), ("tcp://127.0.0.1:1", "no dask scheduler at tcp")]
+    ("address", "words"), [
+        ("nonsense", "is no address; it needs tcp://HOST:PORT"),
+        ("tcp://127.0.0.1:1", "no dask scheduler at tcp"),
+        (f"tcp://{64 * 'a'}:1", "no dask scheduler at tcp"),
+    ],
 )
 def test_cluster_that_is_not_there_is_said_in_one_line(address: str, words: str) -> None:
     with pytest.raises(DescriptionError, match=words):

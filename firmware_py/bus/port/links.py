@@ -262,6 +262,8 @@ class SlcanLink(Link):
         """Raises BlockingIOError where another has it, before anything is sent to it."""
         lock = os.open(self.address, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
+            if not os.isatty(lock):
+                raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(lock)
