@@ -32,6 +32,9 @@ _Module = TypeVar("_Module", bound=Any)
 FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Faces A..F of the bus, in order; also the tag ids of tags that sit on a face."""
 
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+"""In the order in which six numbers stand."""
+
 FACE_NORMALS = frozen_array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 """(6, 3) outward normals of the faces, module frame."""
 
@@ -55,7 +58,7 @@ class Inertial:
         unit="kg m^2", low=-1e4, high=1e4, shape=(3, 3), help="dry and entrained, about the centre of mass"
     )
     added: np.ndarray = quantity(
-        [0, 0, 0, 0, 0, 0], unit="kg, kg m^2", low=0, high=1e4, shape=(6,), help="diagonal added mass and inertia"
+        [0, 0, 0, 0, 0, 0], unit="kg, kg m^2", low=0, high=1e4, shape=(6,), help=f"diagonal added mass and inertia: {', '.join(AXES)}"
     )
     righting_arm_m: float = quantity(
         0.0, unit="m", low=-0.5, high=0.5, help="centre of buoyancy above the centre of mass, entrained water included in both"
@@ -95,7 +98,7 @@ class Drag:
     cd_edge: float = quantity(unit="", low=0.0, high=5.0, help="drag coefficient of flow onto an edge")
     rotational_cd: float = quantity(1.1, low=0.0, high=10.0, help="coefficient of the rotational damping integral")
     linear: np.ndarray = quantity(
-        [0, 0, 0, 0, 0, 0], unit="N s/m, N m s", low=0, high=1e4, shape=(6,), help="linear damping, diagonal"
+        [0, 0, 0, 0, 0, 0], unit="N s/m, N m s", low=0, high=1e4, shape=(6,), help=f"linear damping, diagonal: {', '.join(AXES)}"
     )
     quadratic: np.ndarray = quantity(
         [],
@@ -103,7 +106,7 @@ class Drag:
         low=0,
         high=1e5,
         shape=(-1,),
-        help="published quadratic damping of the six axes, in place of areas",
+        help=f"published quadratic damping, in place of areas: {', '.join(AXES)}",
     )
 
 
@@ -189,9 +192,7 @@ class Vehicle:
     faces: str = quantity("PDPDPD", help="one letter a face, A to F: P probe, D drogue, - none")
     force_max_n: float = quantity(unit="N", low=0.1, high=1e4, help="forward limit of each thruster")
     force_min_n: float = quantity(unit="N", low=-1e4, high=-0.1, help="reverse limit of each thruster")
-    passive_dof: tuple[str, ...] = quantity(
-        (), choices=("surge", "sway", "heave", "roll", "pitch", "yaw"), help="degrees of freedom left to buoyancy"
-    )
+    passive_dof: tuple[str, ...] = quantity((), choices=AXES, help="degrees of freedom left to buoyancy")
     depth_rating_m: float = quantity(50.0, unit="m", low=0.1, high=11000, help="deepest permitted")
 
     def __post_init__(self) -> None:
@@ -279,7 +280,7 @@ def _check_drag(drag: Drag, source: Source) -> None:
     The drag table's coefficient is linear in the cubic harmonic from cd_face to cd_corner, so those two tell of every direction.
     """
     if drag.quadratic.size not in (0, 6):
-        what = f"has {drag.quadratic.size} numbers; it needs six, surge, sway, heave, roll, pitch and yaw, or none: leave it out"
+        what = f"has {drag.quadratic.size} numbers; it needs six, {', '.join(AXES)}, or none: leave it out"
         raise source.error(("drag", "quadratic"), what)
     if not drag.quadratic.size and 0.0 < drag.cd_face >= 4.0 * drag.cd_edge:
         what = f"{drag.cd_edge:g} is too small for drag.cd_face, {drag.cd_face:g}: along a space diagonal the coefficient, "

@@ -10,11 +10,13 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from firmware_py.description.schema import DescriptionError
+from firmware_py.description.schema import DescriptionError, limits_of
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import (
     FACE_NAMES,
     FACE_NORMALS,
+    Drag,
+    Inertial,
     Vehicle,
     load_vehicle,
     vehicle_names,
@@ -292,3 +294,8 @@ def test_vehicle_whose_texts_have_lines_and_whose_hull_is_a_mesh_is_printed_as_a
     Path("to/odd.toml").write_text(to_toml(load_vehicle("from/odd.toml")), encoding="utf-8")
     again = load_vehicle("to/odd.toml")
     assert (again.assumption, again.hull.mesh) == (assumption, str(tmp_path / "from" / "hull.stl"))
+
+
+def test_file_of_a_vehicle_says_in_which_order_six_figures_stand() -> None:
+    six = [limits_of(cls, name) for cls, name in ((Inertial, "added"), (Drag, "linear"), (Drag, "quadratic"))]
+    assert all(limits.help.endswith(": surge, sway, heave, roll, pitch, yaw") for limits in six)
