@@ -52,6 +52,7 @@ FAREWELL_TICKS = 10
 ARM_EVERY_S = 1.0
 """How often arming is tried again with `--hold`, once the pose is known."""
 FORGETFUL = "warning: --hold without --out: an e-stop in this run will not be known at the next start"
+UNTAGGED = "warning: module {} carries no [[tag]]: no camera places it, so --hold never arms it; a pilot has attitude and depth alone"
 MISUSED = (FileExistsError, NotADirectoryError, PermissionError)
 """A folder for logs that is none, or not ours: whoever starts the vehicle is told. What else a disk may fail in, it flies without."""
 STOPPED_BY = frozenset({Action.DISARM, Action.ESTOP})
@@ -152,6 +153,9 @@ def run_vehicle(
         operator = Operator(fleet.rate_hz, to_arm(before, firmware, hold, teller.say), math.inf if hold else REARM_S, teller.say)
         if hold and out is None:
             teller.say(FORGETFUL)
+        for body in firmware.pipeline.bodies:
+            if not body.tag_ids.size:
+                teller.say(UNTAGGED.format(" and ".join(map(fleet.label, body.modules))))
         logged = stack.enter_context(ExitStack())  # ends when the log and the note of an e-stop are closed
         note = _open_note(stack, out) if out is not None else None  # before the log: of two that start at once one has the folder
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}

@@ -61,6 +61,13 @@ def test_vehicle_that_is_told_to_ignore_the_end_of_its_terminal_does() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.parametrize(("name", "told"), [("girona500", 1), ("modcube", 0)])
+def test_robot_that_carries_no_tag_is_told_so_at_its_start(name: str, told: int, tmp_path: Path) -> None:
+    """By a camera it is never seen; it would wait for its place for ever."""
+    said = fly(tmp_path, fleet=single(name, bus_of(tmp_path)), hold=True)
+    assert sum(line.startswith("warning: module 1 carries no [[tag]]: ") for line in said) == told
+
+
 def test_vehicle_says_that_a_bus_takes_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(link: VirtualLink, bus: Any, frame: Frame) -> None:
         raise OSError(errno.ENOBUFS, "No buffer space available")
