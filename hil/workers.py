@@ -23,6 +23,18 @@ Pool = Callable[[], AbstractContextManager[Executor]]
 """What begins and ends the workers."""
 
 
+class Processes(ProcessPoolExecutor):
+    """Starts each process with Ctrl-C blocked, which it inherits: it would print a traceback."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Begins one call, for which a process is started where none is idle."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return super().submit(fn, *args, **kwargs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def processes(jobs: int) -> Pool:
     """So many processes of this machine, which end with this one, however it ends, and whose temporary files go with them.
 
@@ -34,10 +46,9 @@ def processes(jobs: int) -> Pool:
         others = active_children()
         with (
             TemporaryDirectory() as scratch,
-            ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=begin, initargs=(scratch,)) as pool,
+            Processes(jobs, mp_context=get_context("spawn"), initializer=begin, initargs=(scratch,)) as pool,
         ):
             try:
-                _start(pool, jobs)
                 yield pool
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
@@ -48,16 +59,6 @@ def processes(jobs: int) -> Pool:
                 raise
 
     return use
-
-
-def _start(pool: Executor, jobs: int) -> None:
-    """Starts all processes now, with Ctrl-C blocked, which they inherit: they would print tracebacks."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        for _ in range(jobs):
-            pool.submit(os.getpid)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def begin(scratch: str) -> None:

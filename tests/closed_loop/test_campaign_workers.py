@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing import active_children
 from pathlib import Path
 from typing import IO
 
@@ -162,6 +163,13 @@ def test_workers_end_with_the_process_that_began_them() -> None:
         parent.kill()
         assert select.select([worker], [], [], 20.0)[0], "it goes on alone"
         os.close(worker)
+
+
+def test_no_more_processes_are_started_than_there_is_work_for() -> None:
+    before = len(active_children())
+    with processes(99)() as pool:
+        pool.submit(os.getpid).result()
+        assert len(active_children()) == before + 1
 
 
 PROGRAM = """
