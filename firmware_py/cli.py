@@ -23,6 +23,7 @@ from firmware_py.description.vehicle import load_vehicle, vehicle_names
 from firmware_py.ground.config import GroundConfig, check_store, load_ground
 from firmware_py.ground.identity import IDENTITIES
 from firmware_py.runtime import disk
+from firmware_py.runtime.folders import folder_of
 from firmware_py.runtime.interrupts import ended_at_once
 
 CANNOT_RUN = 2
@@ -34,6 +35,7 @@ BUS, VEHICLE, RATE_HZ = "socketcan:can0", "modcube", 100
 _STDERR = 2
 LIVE_HOST, LIVE_PORT = "127.0.0.1", 8765
 """Where the live view listens, where the command line does not say."""
+Log = Annotated[Path, typer.Argument(parser=folder_of, help="folder that a run left: can.log and signals.mcap")]
 
 app = typer.Typer(
     help="Controller of a self-reconfigurable underwater robot.", no_args_is_help=True, pretty_exceptions_enable=False
@@ -56,7 +58,9 @@ def run(
     parameters: Annotated[Path | None, typer.Option(help="file of parameters")] = None,
     rate_hz: Annotated[int | None, typer.Option("--rate", min=50, max=400, help="ticks a second", show_default=f"{RATE_HZ}")] = None,
     hold: Annotated[bool, typer.Option("--hold", help="arm as soon as the vehicle may, and hold the place")] = False,
-    out: Annotated[Path | None, typer.Option(help="folder for the logs; where it holds one, 0002, 0003, ... in it")] = None,
+    out: Annotated[
+        Path | None, typer.Option(parser=folder_of, metavar="DIR", help="folder for the logs; where it holds one, 0002, 0003, ... in it")
+    ] = None,
     ground: Annotated[
         list[str] | None, typer.Option(help="link to ground stations: udpout:, udpin:, tcpin:HOST:PORT, /dev/NAME,BAUD")
     ] = None,
@@ -140,7 +144,7 @@ def doctor(
         str | None, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE", show_default=BUS)
     ] = None,
     fleet: Annotated[Path | None, typer.Option(help="fleet file, not beside --bus; without it module 1")] = None,
-    out: Annotated[Path, typer.Option(help="folder for logs")] = Path(),
+    out: Annotated[Path, typer.Option(parser=folder_of, metavar="DIR", help="folder for logs")] = Path(),
     warm: Annotated[bool, typer.Option("--warm", help="only compile what a tick calls, into the cache")] = False,
 ) -> None:
     """Say whether this machine and its buses are fit to fly."""
@@ -178,7 +182,7 @@ def vehicle(
 
 @app.command()
 def replay(
-    log: Annotated[Path, typer.Argument(help="folder that a run left: can.log and signals.mcap")],
+    log: Log,
     tolerance: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="share by which numbers may differ: for logs of another machine; 0: every byte")
     ] = 0.0,
@@ -190,7 +194,9 @@ def replay(
 
 
 @app.command("clear-estop")
-def clear_estop(out: Annotated[Path, typer.Argument(help="folder for the logs, as `modcube run --out` has it")]) -> None:
+def clear_estop(
+    out: Annotated[Path, typer.Argument(parser=folder_of, help="folder for the logs, as `modcube run --out` has it")],
+) -> None:
     """Clear the e-stop in which the last flight ended, where no ground station does: the next start may arm by itself again.
 
     For a person at the vehicle, who sees that it may move; no script and no service should.
@@ -203,7 +209,7 @@ def clear_estop(out: Annotated[Path, typer.Argument(help="folder for the logs, a
 
 
 @log_app.command()
-def recover(log: Annotated[Path, typer.Argument(help="folder that a run left: can.log and signals.mcap")]) -> None:
+def recover(log: Log) -> None:
     """Mend a log that is torn (kill -9, a pulled plug) or damaged: whole ticks before that stay; what it was is kept as NAME.torn."""
     from firmware_py.runtime.log_recovery import recover as mend
 

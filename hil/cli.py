@@ -12,6 +12,7 @@ import typer
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError, meant
+from firmware_py.runtime.folders import folder_of
 from firmware_py.runtime.interrupts import ended_at_once, interrupted_once
 from firmware_py.runtime.recorder import CAN_LOG
 from hil.bench import DEFAULT_BUS
@@ -29,13 +30,6 @@ ScenarioName = Annotated[str, typer.Argument(help="name of a scenario (`modcube 
 Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, paper_sequence, or a file of parameters")]
 Vehicle = Annotated[str, typer.Option(help="vehicle in place of the scenario's")]
 Sensors = Annotated[str, typer.Option(help="real, or ideal: no noise, no delay")]
-
-
-def folder_of(text: str) -> Path:
-    """The folder called `text`; nothing, as an unset variable of a shell gives, is none."""
-    if not text:
-        raise typer.BadParameter("'' is no folder; give one, or . for this one")
-    return Path(text)
 
 
 def parameters_of(controller: str) -> Parameters:

@@ -77,6 +77,14 @@ def test_wrong_arguments_are_refused_in_one_line(arguments: list[str], wrong: st
 
 
 @pytest.mark.parametrize(
+    "arguments", [["run", "--bus", "token:ring", "--out"], ["doctor", "--out"], ["replay"], ["clear-estop"], ["log", "recover"]]
+)
+def test_folder_without_a_name_is_refused(arguments: list[str], tmp_path: Path, refusal: Callable[..., str]) -> None:
+    """As an unset variable of a shell gives it; it is not the working directory."""
+    assert "'' is no folder; give one, or . for this one" in refusal(*arguments, "")
+
+
+@pytest.mark.parametrize(
     ("old", "new", "wrong", "right"),
     [
         ("radius_m = 0.30", "radius_m = 0.30\nspeed_m_s = 1.0", "speed_m_s: unknown key", "duration_s, "),
