@@ -17,7 +17,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.patches import Rectangle
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from firmware_py.prepare.capability.layout import AXES, FRAMES, UNITS
+from firmware_py.description.vehicle import AXES
+from firmware_py.prepare.capability.layout import FRAMES, UNITS
 from firmware_py.prepare.capability.summary import Capability
 
 _SURFACE = {"power": "#d98324", "wrench": "#2f6f9f"}

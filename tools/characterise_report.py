@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from characterise_surfaces import SPACES, Picture, pictures
 
-from firmware_py.prepare.capability.layout import AXES, FRAMES, UNITS
+from firmware_py.description.vehicle import AXES
+from firmware_py.prepare.capability.layout import FRAMES, UNITS
 from firmware_py.prepare.capability.summary import Capability
 
 _DIGITS = 4

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware_py.prepare.capability.layout import AXES, UNITS
+from firmware_py.description.vehicle import AXES
+from firmware_py.prepare.capability.layout import UNITS
 from firmware_py.prepare.capability.power import electrical_power
 from firmware_py.prepare.capability.sphere import grid
 from firmware_py.prepare.capability.summary import Capability, Reach

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.prepare.capability.layout import AXES, FRAMES, NORMALISATIONS, UNITS
+from firmware_py.description.vehicle import AXES
+from firmware_py.prepare.capability.layout import FRAMES, NORMALISATIONS, UNITS
 from firmware_py.prepare.capability.summary import Capability, Reach, to_plain
 
 DEGENERATE = "degenerate"

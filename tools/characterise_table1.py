@@ -10,9 +10,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import AXES, load_vehicle
 from firmware_py.prepare.assembly import PITCH_M
-from firmware_py.prepare.capability.layout import AXES, FRAMES, NORMALISATIONS, UNITS
+from firmware_py.prepare.capability.layout import FRAMES, NORMALISATIONS, UNITS
 from firmware_py.prepare.capability.summary import Capability, Reach
 
 _COLOURS = {table.AGREES: "green", table.DIFFERS: "yellow", table.INCONSISTENT: "red", table.NOTHING: "dim"}

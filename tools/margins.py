@@ -28,9 +28,8 @@ from rich.table import Table
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import AXES, load_vehicle
 from firmware_py.prepare.assembly import PITCH_M
-from firmware_py.prepare.capability.layout import AXES
 from firmware_py.prepare.joints import Placement, check_joints
 from hil.workers import processes
 

@@ -14,7 +14,7 @@ from margins import bode
 from tune_objective import Objective
 
 from firmware_py.description.parameters import Parameters
-from firmware_py.prepare.capability.layout import AXES
+from firmware_py.description.vehicle import AXES
 from hil.workers import processes
 
 SHOWN = (0, 2, 3, 5)

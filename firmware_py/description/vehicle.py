@@ -33,7 +33,7 @@ FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Faces A..F of the bus, in order; also the tag ids of tags that sit on a face."""
 
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
-"""In the order in which six numbers stand."""
+"""Degrees of freedom, in the order of a wrench and of any six numbers here."""
 
 FACE_NORMALS = frozen_array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 """(6, 3) outward normals of the faces, module frame."""

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import AXES, load_vehicle
 from firmware_py.prepare.capability import summary
 from firmware_py.prepare.capability.ellipsoid import largest_inscribed
-from firmware_py.prepare.capability.layout import AXES, FRAMES, Layout, of_modules, of_rows, of_vehicle
+from firmware_py.prepare.capability.layout import FRAMES, Layout, of_modules, of_rows, of_vehicle
 from firmware_py.prepare.capability.polycubes import polycubes, poses
 from firmware_py.prepare.capability.programs import ProgramSpace, reach_by_programs
 from firmware_py.prepare.capability.sphere import fibonacci

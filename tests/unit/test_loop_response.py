@@ -10,7 +10,7 @@ from matplotlib import pyplot
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.prepare.capability.layout import AXES
+from firmware_py.description.vehicle import AXES
 
 SURGE = 0
 

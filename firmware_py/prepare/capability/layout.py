@@ -13,12 +13,9 @@ import numpy as np
 
 from firmware_py.core.body import ThrusterSet
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle import AXES, Vehicle
 from firmware_py.prepare.assembly import PITCH_M, Balance, place, thruster_set
 from firmware_py.prepare.joints import check_joints
-
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
-"""Degrees of freedom, in the order of a wrench."""
 
 FRAMES = {"force": (0, 1, 2), "torque": (3, 4, 5)}
 """Which components of a wrench each frame looks at, the others held at zero."""

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from firmware_py.description.vehicle import AXES
 from firmware_py.prepare.capability.ellipsoid import Ellipsoid, largest_inscribed
 from firmware_py.prepare.capability.facets import subsets
-from firmware_py.prepare.capability.layout import AXES, FRAMES, Layout
+from firmware_py.prepare.capability.layout import FRAMES, Layout
 from firmware_py.prepare.capability.morphology import Harmonics, Shape
 from firmware_py.prepare.capability.power import PowerSpace, power_space
 from firmware_py.prepare.capability.programs import ProgramSpace, reach_by_programs
