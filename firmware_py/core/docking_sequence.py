@@ -147,7 +147,8 @@ class DockingSequence:
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
-        self._entered_ns = time_ns
+        self._entered_ns, self._waited_ns = time_ns, 0
+        """When the stage began, and how much of it was spent waiting for others: that may be as long again, and is no jam."""
         self._good_since_ns: int | None = None
         self._gap_m = self._farthest_m
         self._last_ns = time_ns
@@ -160,14 +161,15 @@ class DockingSequence:
         delays = waits is not None and self._p.approach == "straight"  # its line is drawn once: to where the target will be
         meets = None if self._under_way or delays else self._set_off(active, target)
         errors = self.errors(active, target)
-        dt = (time_ns - self._last_ns) * 1e-9
-        self._last_ns = time_ns
+        passed_ns, self._last_ns = time_ns - self._last_ns, time_ns
+        if waits is not None:
+            self._waited_ns += passed_ns
         self._decide(time_ns, active, target, errors, status, waits is not None)
         self.makes_room = waits is not None and waits.p_wb is not None
         if self.makes_room and self.stage == Stage.APPROACH and self._p.approach == "staged":
             self._enter(Stage.PRE_APPROACH, time_ns)
         speed = self._speed(errors, waits is not None)
-        self._gap_m = float(np.clip(self._gap_m + speed * dt, -self._p.push_m, self._farthest_m))
+        self._gap_m = float(np.clip(self._gap_m + speed * (passed_ns * 1e-9), -self._p.push_m, self._farthest_m))
         setpoint = self._setpoint(self.met(target), speed, waits)
         is_apart = self._gap_m >= self._p.standoff_m
         return Steering(setpoint, TABLE[self.stage].relay, is_apart, None if self.stage in ENDED else meets)
@@ -211,7 +213,7 @@ class DockingSequence:
             self._gap_m = float(np.linalg.norm(off))
             self._line_t = off / self._gap_m if self._gap_m > 0.0 else self.plan.axis_t
             self._farthest_m = max(self._gap_m, self._p.standoff_m)
-            self._enter(Stage.APPROACH, self._entered_ns)
+            self._enter(Stage.APPROACH, self._entered_ns + self._waited_ns)
         return meets
 
     # ------------------------------------------------------------ what comes next
@@ -227,8 +229,10 @@ class DockingSequence:
             self.abort(time_ns, f"relative sigma {sigma * 1e3:.1f} mm, {self._p.sigma_m * 1e3:.1f} permitted")
             return
         row = TABLE[self.stage]
-        if row.limit_s and time_ns - self._entered_ns > getattr(self._p, row.limit_s) * 1e9:
-            self._time_out(time_ns, status, waits)
+        if self._waited_ns > self._p.timeout_s * 1e9:
+            self.abort(time_ns, f"{self._too_long}, waiting for another body")
+        elif row.limit_s and time_ns - self._entered_ns - self._waited_ns > getattr(self._p, row.limit_s) * 1e9:
+            self._time_out(time_ns, status)
         elif not waits and self._is_done(time_ns, errors, status):  # who waits is on its way, though it may pass the end of it
             self._enter(row.on_done, time_ns)
 
@@ -255,9 +259,12 @@ class DockingSequence:
             self._good_since_ns = time_ns
         return time_ns - self._good_since_ns >= seconds * 1e9
 
-    def _time_out(self, time_ns: int, status: PairStatus, waits: bool) -> None:
-        following = Stage.ABORTED if waits else TABLE[self.stage].on_timeout  # who waits has touched nothing that could have jammed
-        if following == Stage.RELEASE:
+    @property
+    def _too_long(self) -> str:
+        return f"{self.stage.name} took longer than {self._p.timeout_s:.0f} s"
+
+    def _time_out(self, time_ns: int, status: PairStatus) -> None:
+        if TABLE[self.stage].on_timeout == Stage.RELEASE:
             only = "current alone" if status.current else "position alone" if status.position else "neither condition"
             unseen = f", pictures of both are too few or older than {self._p.pose_fresh_ms:.0f} ms (DOCK_POSE_AGE)"
             self.reason = f"jam: {only} after {self.stage.name}{unseen if math.isnan(status.position_error_m) else ''}"
@@ -266,15 +273,15 @@ class DockingSequence:
                 self._enter(Stage.FAILED, time_ns)
                 return
         elif self.stage != Stage.RELEASE:
-            self.reason = f"{self.stage.name} took longer than {self._p.timeout_s:.0f} s{', waiting for another body' if waits else ''}"
-        self._enter(following, time_ns)
+            self.reason = self._too_long
+        self._enter(TABLE[self.stage].on_timeout, time_ns)
 
     def _enter(self, stage: Stage, time_ns: int) -> None:
         if stage == Stage.RELEASE:
             self.tries += 1
             self._turn = TURN_RAD if self.tries % 2 == 0 else -TURN_RAD
         self.stage = stage
-        self._entered_ns = time_ns
+        self._entered_ns, self._waited_ns = time_ns, 0
         self._good_since_ns = None
 
     # ------------------------------------------------------------ where to be

@@ -188,6 +188,20 @@ def test_approach_that_waits_to_the_end_of_its_time_is_no_jam_and_is_over() -> N
     assert dock.sequence.reason == "APPROACH took longer than 20 s, waiting for another body"
 
 
+@pytest.mark.parametrize(("approach", "waiting"), [("staged", Stage.APPROACH), ("straight", Stage.PRE_APPROACH)])
+def test_time_that_an_approach_waited_is_not_taken_from_what_it_has_to_dock(approach: str, waiting: Stage) -> None:
+    """One that waited 19 of 20 s was called a jam before it was there, and let go with magnets that push."""
+    dock = Follower(Docking(timeout_s=20.0, approach=approach))
+    while dock.sequence.stage != waiting:
+        dock.step()
+    at = dock.at
+    for _ in range(1900):
+        dock.step(waits=REST)
+        dock.at = at
+    dock.until(Stage.PUSH)
+    assert dock.sequence.tries == 1
+
+
 def test_approach_that_is_to_make_room_goes_back_and_begins_anew() -> None:
     dock = Follower()
     dock.until(Stage.APPROACH)
