@@ -38,6 +38,8 @@ by this times the slope of the drag. That acts at the body's middle and makes no
 MODEL_SHARE = 0.12
 """What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too. Of the Coriolis wrench it is this
 share and that by which the water's drift changes the speed."""
+EXPLAINED = 0.8
+"""Share of the change (squared, in sigmas) that one thruster must explain."""
 LEFT = 9.2
 """Squared sigmas that a thruster may leave unexplained: of the five axes that its loss says nothing of, noise leaves less nine times in
 ten (chi-squared). A wall, a hand or a rope pushes nearly as some thruster would, but seldom so exactly."""
@@ -271,5 +273,5 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, flow, lie_share):
             best, least, second = t, left, least
         else:
             second = min(second, left)
-    sure = total - least >= SIGNIFICANT and least <= LEFT
+    sure = total - least >= SIGNIFICANT and least <= min(LEFT, (1.0 - EXPLAINED) * total)
     return best if sure and least <= RUNNER_UP * second else -1
