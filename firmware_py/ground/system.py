@@ -18,6 +18,10 @@ _SELDOM_NS = 5 * NS_PER_S
 """Between two texts about what streams in."""
 NEVER_WAITS = ("HEARTBEAT", "STATUSTEXT")
 """Without the one clients lose the vehicle; the other is said once."""
+_AT_ONCE = ("HEARTBEAT", "MISSION_CURRENT")
+"""What is told as soon as it changes. A pilot sees arming, modes and stops in the one; a client that has sent a mission knows by the other
+that it is there, and where it begins.
+"""
 STOPPING = frozenset({Action.ESTOP, Action.DISARM})
 """What reaches a module whichever body it is part of."""
 STEERING = STOPPING | {Action.SET_MODE, Action.HOLD, Action.DOCK, Action.UNDOCK, Action.MOTOR_TEST}
@@ -57,8 +61,8 @@ class System:
     taken: int = 0
     """How often somebody asked the body for something else than what it does."""
     _text_number: int = 0
-    _pulse: Any = None
-    """What the last HEARTBEAT said."""
+    _said: dict[str, Any] = field(default_factory=dict)
+    """What the last of each of `_AT_ONCE` said."""
     _refused_ns: int = -_SELDOM_NS
 
     @property
@@ -124,12 +128,13 @@ class System:
     def stream(self, time_ns: int) -> None:
         """Send what is due on every channel; each message is made once. A slow link gets fewer of all kinds, and every heartbeat.
 
-        A heartbeat that says something new is due at once.
+        Of `_AT_ONCE` one that says something new is due at once.
         """
-        before, self._pulse = self._pulse, STREAMS["HEARTBEAT"](self.subject)
-        if self._pulse != before:
-            for rates in self.channels.values():
-                rates.hurry("HEARTBEAT", time_ns)
+        for name in _AT_ONCE:
+            before, self._said[name] = self._said.get(name), STREAMS[name](self.subject)
+            if self._said[name] != before:
+                for rates in self.channels.values():
+                    rates.hurry(name, time_ns)
         made: dict[str, list[bytes]] = {}
         for channel, rates in self.channels.items():
             for name in rates.due(time_ns, NEVER_WAITS if channel in self.busy else STREAMS):

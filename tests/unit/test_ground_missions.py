@@ -30,6 +30,18 @@ def test_mission_starts_by_mode_holds_first_and_tracks_the_plan(world: World, cl
     assert "mission complete" in client.texts
 
 
+def test_mission_that_came_and_one_that_begins_are_told_at_once(world: World, client: Client) -> None:
+    """A client that armed and started it within the second saw no item of it."""
+    world.run(150)
+    client.clear()
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    world.run(2)
+    (told,) = client.all("MISSION_CURRENT")
+    assert (told.seq, told.total, told.mission_state) == (0, 3, mavlink.MISSION_STATE_NOT_STARTED)
+    fly(world, client)
+    assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_ACTIVE
+
+
 def test_pause_and_resume_go_on_at_the_same_item(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)
