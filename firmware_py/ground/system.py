@@ -139,6 +139,6 @@ class System:
         for channel, rates in self.channels.items():
             for name in rates.due(time_ns, NEVER_WAITS if channel in self.busy else STREAMS):
                 if name not in made:
-                    made[name] = [self.outbox.payload(name, values) for values in STREAMS[name](self.subject)]
+                    made[name] = [self.outbox.payload(name, values) for values in self._said.get(name) or STREAMS[name](self.subject)]
                 for payload in made[name]:
                     self.outbox.send_payload(channel, name, payload)

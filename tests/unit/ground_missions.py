@@ -46,11 +46,11 @@ def upload(world: World, client: Client, items: list[tuple[float, ...]], kind: i
     raise AssertionError("no acknowledgement")
 
 
-def begin(world: World, client: Client) -> PlanJob:
-    """Arm, start by mode: what is to be planned."""
+def begin(world: World, client: Client, *start: float) -> PlanJob:
+    """Arm, start by the command `start`, or by mode: what is to be planned."""
     client.command(400, 1)
     world.run(3)
-    client.command(176, 1, 4, 4)
+    client.command(*(start or (176, 1, 4, 4)))
     world.run(10)
     (job,) = world.station.jobs()
     return job

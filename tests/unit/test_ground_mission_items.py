@@ -7,7 +7,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.app.mission_plan import plan_mission
 from firmware_py.ground.config import GroundConfig
-from tests.unit.ground_missions import PLACES, fly, item, upload
+from tests.unit.ground_missions import PLACES, begin, fly, item, upload
 from tests.unit.ground_requests import NAN
 from tests.unit.ground_world import Client, World
 
@@ -129,12 +129,7 @@ def test_ardupilots_missions_begin_with_home_which_is_not_flown() -> None:
     world = World(config=GroundConfig(identity="ardusub"))
     client = world.client()
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
-    client.command(400, 1)
-    world.run(3)
-    client.command(300, 0, 0)
-    world.run(10)
-    (job,) = world.station.jobs()
-    assert [leg.sequence for leg in job.legs] == [1, 2]
+    assert [leg.sequence for leg in begin(world, client, 300, 0, 0).legs] == [1, 2]
 
 
 @pytest.mark.parametrize(("identity", "yaw"), [("generic", 0.0), ("ardusub", None)])
@@ -143,12 +138,7 @@ def test_fourth_parameter_of_a_waypoint_turns_the_robot_but_for_clients_of_an_ar
     world = World(config=GroundConfig(identity=identity))
     client = world.client()
     upload(world, client, [item(i, place, p=(0, 0, 0, 0)) for i, place in enumerate(PLACES)])
-    client.command(400, 1)
-    world.run(3)
-    client.command(300, 0, 0)
-    world.run(10)
-    (job,) = world.station.jobs()
-    assert {leg.yaw for leg in job.legs} == {yaw}
+    assert {leg.yaw for leg in begin(world, client, 300, 0, 0).legs} == {yaw}
 
 
 def test_jump_to_home_flies_to_no_home_that_may_lie_outside_the_fence() -> None:
@@ -157,9 +147,4 @@ def test_jump_to_home_flies_to_no_home_that_may_lie_outside_the_fence() -> None:
     home = item(0, (302184000, 1201614000, 100.0), frame=0)  # a kilometre away
     jump = item(2, (0, 0, 0), command=177, frame=2, p=(0, 1, 0, 0))
     assert upload(world, client, [home, item(1, PLACES[0]), jump, item(3, PLACES[1])]) == mavlink.MAV_MISSION_ACCEPTED
-    client.command(400, 1)
-    world.run(3)
-    client.command(300, 0, 0)
-    world.run(10)
-    (job,) = world.station.jobs()
-    assert [leg.sequence for leg in job.legs] == [1, 1, 3]
+    assert [leg.sequence for leg in begin(world, client, 300, 0, 0).legs] == [1, 1, 3]
