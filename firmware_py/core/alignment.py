@@ -1,7 +1,7 @@
-"""How the estimator begins without a tag: upright by gravity, heading and place unknown, until the first tags give those.
+"""Start of the estimator without a tag: levelled by gravity, with heading and position unknown until the first tags give them.
 
-What inertial navigation calls coarse alignment (Groves 2013, Principles of GNSS, Inertial and Multisensor Navigation, 5.6): at rest the
-accelerometer shows which way is down. By that alone a robot is stabilised, holds its depth and surfaces.
+This is the coarse alignment of inertial navigation (Groves 2013, Principles of GNSS, Inertial and Multisensor Navigation, 5.6): at rest
+the accelerometer shows which way is down. That alone is enough to stabilise a robot, hold its depth and surface.
 """
 
 from __future__ import annotations
@@ -16,19 +16,22 @@ from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
 from firmware_py.core.types import BodyPose
 
 AT_REST_M_S2 = 0.05 * GRAVITY
-"""Mean specific force and gravity differ by less in size where nothing pushes up or down. What pushes across tilts the beginning, by ten
-degrees for 1.7 m/s^2; the filter, whose model knows the thrusters, rights it within seconds."""
+"""Largest difference in magnitude between mean specific force and gravity for a body at rest: nothing pushes it up or down. A sideways
+acceleration passes this check and tilts the initial attitude, by ten degrees for 1.7 m/s^2; the filter, whose model includes the
+thrusters, corrects that within seconds."""
 AT_REST_RAD_S = 0.5
-"""Half of the time over which the mean is taken, 0.1 s, then turns a body by three degrees."""
+"""Largest mean angular rate for a body at rest: in half of the averaging window, 0.1 s, it turns the body by three degrees."""
 SAME_RAD, SAME_M, SAME_M_S, SAME_S = 0.1, 0.1, 1.0, 1.0
-"""Tags that differ by less in heading, place, rad and m, and time, s, tell the same; a body that is said to stand still may move so
-fast, m/s. Ten times a tag's noise in attitude; a flipped one is off by twice the angle at which it is seen."""
+"""Two tag poses agree if they differ by no more than this in heading (rad), position (m) and time (s). The position limit grows by
+SAME_M_S (m/s) with the time between them, because a body that is assumed to stand still may move that fast. The heading limit is ten times
+a tag's attitude noise; a flipped tag is off by twice the angle at which it is seen."""
 
 
 def upright(gyros: np.ndarray, accels: np.ndarray) -> np.ndarray | None:
-    """Attitude (4,) with heading 0 by the mean of (k, 3) specific forces, m/s^2; None where gravity cannot be told from the rest.
+    """Returns the attitude (4,), heading 0, from the mean of (k, 3) specific forces, m/s^2; None where gravity cannot be isolated.
 
-    Half of them must have come (NaN: did not), and by those and the (k, 3) angular rates, rad/s, the body must be about at rest.
+    At least half of the samples of both kinds must be present (NaN marks a missing one), and by the specific forces and the (k, 3) angular
+    rates, rad/s, the body must be about at rest.
     """
     felt, turned = accels[~np.isnan(accels[:, 0])], gyros[~np.isnan(gyros[:, 0])]
     if min(len(felt), len(turned)) < max(1, len(accels) // 2):
@@ -41,21 +44,23 @@ def upright(gyros: np.ndarray, accels: np.ndarray) -> np.ndarray | None:
 
 
 class FirstSight:
-    """Tags before the place is known: counts those that agree with gravity and with the one before."""
+    """Screens tag poses before the position is known: counts the run of those that agree with gravity and with the one before."""
 
     def __init__(self) -> None:
         self.count = 0
         self._heading, self._offset, self._capture_ns = math.nan, np.full(3, math.nan), 0
 
     def agrees(self, pose: BodyPose, p_wb: np.ndarray, q_wb: np.ndarray) -> bool:
-        """Whether `pose` has the same way down as q_wb (4,), or else is flipped or not where the vehicle file says; notes where it would
-        move the body that is believed at p_wb (3,), m.
+        """Whether `pose` agrees with q_wb (4,) on which way is down; if not, the tag is flipped or not mounted where the vehicle file says.
+
+        For a pose that agrees, updates `count`: compares the heading and position change that it implies for the body at p_wb (3,), m, with
+        those of the pose before.
         """
         w, x, y, z = multiply(pose.q_wb, conjugate(q_wb)).tolist()
         if 2.0 * math.asin(min(1.0, math.hypot(x, y))) > FLIP_RAD:
             return False
         heading, offset = 2.0 * math.atan2(z, w), pose.p_wt - rotate(pose.q_wb, pose.lever_b) - p_wb
-        turned = abs(math.remainder(heading - self._heading, 2.0 * math.pi))  # NaN at first, which is the same as nothing
+        turned = abs(math.remainder(heading - self._heading, 2.0 * math.pi))  # NaN at first, which agrees with nothing
         gap_s = (pose.capture_ns - self._capture_ns) * 1e-9
         near = float(np.linalg.norm(offset - self._offset)) <= SAME_M + SAME_M_S * gap_s
         same = turned <= SAME_RAD and near and gap_s <= SAME_S

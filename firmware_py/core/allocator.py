@@ -1,10 +1,10 @@
 """Stage 7 of a tick: from a wrench to the force of each thruster (paper, Eq. 5), within limits.
 
-Where the pseudo-inverse (plus the preload) stays within limits it is the answer. Otherwise a box-constrained
-least-squares problem (box_program) keeps the directions of force and moment, and gives way first in the force beyond what holds a
-place, then in that and the moment, whichever costs the less; and so does a body whose supplies cannot feed the answer. A robot that
-lacks moment leans into its righting moment and stays where it is, instead of keeping level and drifting away.
-Mode `least_power` moves an answer within limits to where the thrusters draw the least.
+The pseudo-inverse (plus the preload) is the answer where it stays within limits. Otherwise a box-constrained least-squares problem
+(box_program) keeps the directions of force and moment and reduces their size: first the force beyond what holds a position, then the
+holding force and the moment, whichever costs less. A body whose supplies cannot feed the answer gives way in the same order. A robot that
+lacks moment therefore leans into its righting moment and stays where it is, instead of keeping level and drifting away.
+Mode `least_power` then moves an answer that is within limits to where the thrusters draw the least power.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from firmware_py.core.types import Room, Thrust
 from firmware_py.description.parameters import Allocation
 
 HOLD = 0.05
-"""Share of what all thrusters together could push that counts as much as the moment: of a module 4 N, against buoyancy, current and the
-drag of a slow path."""
+"""Holding force, which has the same priority as the moment, as a share of what all thrusters together could push. For a module it is 4 N,
+enough against buoyancy, current and the drag of a slow path."""
 PRIORITIES = np.array([1e2, 1e2, 1.0])
-"""What a lost share of the holding force, of the moment and of the rest of the force costs."""
+"""Relative cost of a lost share of the holding force, of the moment and of the rest of the force."""
 SHARE_WEIGHT = 1e3
 """Cost of losing the rest of the force, against all thrusters at their limits: high enough that feasible force is not given away."""
 BEYOND = 2.0
 """A wrench above this many times what all thrusters together could give is scaled down first, so that the problem stays well scaled."""
 HALVINGS = 8
-"""Bisections of the share that the supplies can feed: it is found to 0.4 %."""
+"""Bisection steps for the share that the supplies can feed; they find it to 0.4 %."""
 TINY = 1e-9
-"""Force or moment, N and N m, below which there is none."""
+"""Force or moment, N and N m, below which it counts as zero."""
 LEFT = 1e-3
-"""Largest difference from the directions of force and moment, N and N m, that is taken; a hundred thousand times what is usual."""
+"""Largest accepted residual of the directions of force and moment, N and N m; a hundred thousand times the usual one."""
 
 
 @njit(f"float64({V},{V},{V})", cache=True)
 def busiest(force, f_min, f_max):  # type: ignore[no-untyped-def]
-    """Share of its range that the busiest thruster gives."""
+    """Returns the share of its range that the busiest thruster uses."""
     most = 0.0
     for i in range(force.shape[0]):
         most = max(most, force[i] / (f_max[i] if force[i] > 0.0 else f_min[i]))
@@ -49,29 +49,29 @@ def busiest(force, f_min, f_max):  # type: ignore[no-untyped-def]
 
 @njit(f"boolean({V},{V},{V})", cache=True)
 def are_within(force, f_min, f_max):  # type: ignore[no-untyped-def]
-    """Whether every force is within its limits; one that is not a number is not."""
+    """Whether every force is within its limits; a NaN is not."""
     return bool(np.all((force >= f_min) & (force <= f_max)))
 
 
 @njit(f"boolean({V},{M},{M},int64[::1],{V})", cache=True)
 def are_fed(force, power_forward, power_reverse, module, supply):  # type: ignore[no-untyped-def]
-    """Whether the (m,) supplies, W, are enough for the forces; a power that is not a number is no reason against."""
+    """Whether the (m,) supplies, W, are enough for the forces; a power that is NaN counts as fed."""
     return not np.any(module_power(force, power_forward, power_reverse, module, supply.size) > supply)
 
 
 def _sizes(wrench: np.ndarray) -> np.ndarray:
-    """(2,) of force and moment."""
+    """(2,) magnitudes of force and moment."""
     return np.asarray(np.linalg.norm(wrench.reshape(2, 3), axis=1))
 
 
 def _kept(made: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
-    """Shares of force and moment; of one that nobody wants, all."""
+    """Returns the shares of force and moment that are kept; 1 for one that was not asked for."""
     force, moment = (float(m / w) if w > TINY else 1.0 for m, w in zip(_sizes(made), _sizes(wanted), strict=True))
     return force, moment
 
 
 class Allocator:
-    """Allocates for one body, within its thrusters' nominal limits until `confine` tells others."""
+    """Allocates for one body, within its thrusters' nominal limits until `confine` sets others."""
 
     def __init__(self, body: Body, parameters: Allocation) -> None:
         self.parameters = parameters
@@ -88,11 +88,11 @@ class Allocator:
         self._set(np.ones(n, dtype=bool), body.thrusters.pinv)
 
     def set_alive(self, alive: np.ndarray) -> None:
-        """(n,) bool: thrusters that may be used from now on."""
-        self._set(alive, np.linalg.pinv(self._thrusters.matrix * alive) * alive[:, None])  # no rounding for those that may not be used
+        """Sets the thrusters that may be used from now on, (n,) bool."""
+        self._set(alive, np.linalg.pinv(self._thrusters.matrix * alive) * alive[:, None])  # exact zeros for unusable thrusters
 
     def confine(self, room: Room) -> None:
-        """Keeps within `room` from now on."""
+        """Limits the forces to `room` from now on."""
         if room is not self._room:
             self._room = room
             self._set_limits()
@@ -116,14 +116,16 @@ class Allocator:
             self._cheaper.confine(self._f_min, self._f_max)
 
     def step(self, wrench: np.ndarray) -> Thrust:
-        """The thruster forces for a wanted (6,) wrench, body frame."""
+        """Returns the thruster forces for a wanted (6,) wrench, body frame."""
         thrust = self._within(wrench)
         if self._cheaper and thrust.scale == (1.0, 1.0):
             thrust = self._thrust(self._cheaper.step(thrust.force_n), thrust.scale)
         return thrust if self._clip_only or self._is_fed(thrust) else self._fed(wrench, thrust)
 
     def _fed(self, wrench: np.ndarray, unfed: Thrust) -> Thrust:
-        """What the supplies can feed; where that is not even the preload, `unfed`, of which the limiter takes each module's share."""
+        """Returns the forces that the supplies can feed. Where they cannot feed even the preload, returns `unfed`, which the limiter then
+        scales down module by module.
+        """
         holding, moment, rest = self._parts(wrench)
         for part, beside in ((rest, holding + moment), (holding + moment, np.zeros(6))):
             if not part.any():
@@ -134,19 +136,22 @@ class Allocator:
         return unfed
 
     def _parts(self, wrench: np.ndarray) -> np.ndarray:
-        """(3, 6) wrenches that make up `wrench`: the force that holds, the moment, the rest of the force."""
+        """Splits `wrench` into (3, 6): holding force, moment, rest of the force."""
         held = min(1.0, HOLD * self._most[0] / max(_sizes(wrench)[0], TINY))
         parts = np.zeros((3, 6))
         parts[0, :3], parts[1, 3:], parts[2, :3] = held * wrench[:3], wrench[3:], (1.0 - held) * wrench[:3]
         return parts
 
     def _is_fed(self, thrust: Thrust) -> bool:
-        """Whether every module's supply is enough; for forces that are no numbers the limiter has the last word."""
+        """Whether every module's supply is enough. Forces that are NaN pass; the limiter handles them."""
         t = self._thrusters
         return bool(are_fed(thrust.force_n, t.power_forward, t.power_reverse, t.module, self._room.supply_w))
 
     def _largest_share(self, wrench: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, Thrust]:
-        """The largest share of a wrench that is fed beside another, both together, and the forces; where none is, of the other alone."""
+        """Finds the largest share of `wrench` that the supplies can feed together with all of `beside`.
+
+        Returns that sum of the two and its forces; `beside` alone where no share can be fed.
+        """
         share, step, found = 0.0, 1.0, self._within(beside)
         for _ in range(HALVINGS):
             step *= 0.5
@@ -156,7 +161,7 @@ class Allocator:
         return beside + share * wrench, found
 
     def _within(self, wrench: np.ndarray) -> Thrust:
-        """The forces within the thrusters' limits."""
+        """Returns forces within the thrusters' limits."""
         force = self._preload + self._pinv.dot(wrench)
         if are_within(force, self._f_min, self._f_max):
             return self._thrust(force, (1.0, 1.0))
@@ -168,7 +173,7 @@ class Allocator:
         return Thrust(force, self._matrix.dot(force), kept, 1.0 - busiest(force, self._room.low_n, self._room.high_n))
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
-        """min |f - f_preload|^2 + sum_i w_i (1 - s_i)^2 so that J f = sum_i s_i W_i, f within limits, 0 <= s_i <= 1; W the parts."""
+        """min |f - f_preload|^2 + sum_i w_i (1 - s_i)^2 subject to J f = sum_i s_i W_i, f within limits, 0 <= s_i <= 1; W: `_parts`."""
         parts = self._parts(wrench)
         down = np.array([self._down(part) for part in parts])
         self._rows[-3:] = -parts * down[:, None]
@@ -179,11 +184,11 @@ class Allocator:
         return self._thrust(x[:-3].copy(), _kept((x[-3:] * down) @ parts, wrench))
 
     def _down(self, wrench: np.ndarray) -> float:
-        """What scales a wrench down that is beyond all bounds."""
+        """Factor, at most 1, that scales down a wrench above BEYOND times what the thrusters could give."""
         return float(np.min(BEYOND * self._most / np.maximum(_sizes(wrench), TINY), initial=1.0))
 
     def _common_share(self, wrench: np.ndarray) -> float:
-        """Largest share of the pseudo-inverse's answer that is within limits."""
+        """Returns the largest share of the pseudo-inverse's answer that is within limits."""
         force = self._pinv @ wrench
         limit = np.where(force > 0, self._f_max, -self._f_min)
         return float(1.0 / max(1.0, np.max(np.abs(force) / np.maximum(limit, 1e-9))))

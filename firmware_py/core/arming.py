@@ -1,4 +1,4 @@
-"""Arming checks as a table, each with its reason in words; and what each mode needs. The supervisor asks, nobody else.
+"""Table of arming checks, each with its reason in words, and the check of what each mode needs. Only the supervisor uses them.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from firmware_py.description.parameters import Parameters, invalid
 
 
 class Question(NamedTuple):
-    """All that a check may look at."""
+    """Inputs of an arming check."""
 
     health: Health
     mode: Mode
-    """The mode that is to be armed in."""
+    """Mode that the body would be armed in."""
     parameters: Parameters
     failsafes: Failsafes
     estop_age_ms: float
@@ -30,13 +30,15 @@ class Check(NamedTuple):
 
     name: str
     reason: Callable[[Question], str | list[str]]
-    """Why it fails, in words; empty when it holds."""
+    """Returns why the check fails, in words; empty when it passes."""
     may_be_skipped: bool
-    """Forced arming passes over it."""
+    """Whether forced arming skips the check."""
 
 
 def _estop(q: Question) -> str:
-    """Raised, or still holding a module: one lets go when it hears, some time after the last frame, that it is disarmed."""
+    """Fails while an e-stop is raised or still holds a module. A module releases once it hears, some time after the last ESTOP frame, that
+    it is disarmed.
+    """
     if q.estop_age_ms < q.parameters.supervision.estop_quiet_ms:
         return "e-stop raised"
     return f"an e-stop holds module {', '.join(map(str, q.health.stopped))}" if q.health.stopped else ""
@@ -55,7 +57,7 @@ def _needs(q: Question) -> list[str]:
 
 
 def _has_pose(q: Question) -> bool:
-    """Whether the mode asks for a pose, and there is one to judge; else `_needs` says that there is none."""
+    """Whether the mode needs a pose and has one that can be judged; `_needs` reports a missing pose."""
     return Need.POSITION in MODES[q.mode].needs and not missing(q.mode, q.health, q.parameters)
 
 
@@ -143,7 +145,7 @@ CHECKS = (
 
 
 def against_arming(question: Question, forced: bool) -> list[str]:
-    """Why the body may not be armed, in words; empty when it may."""
+    """Returns the reasons against arming, in words; empty when the body may be armed."""
     reasons: list[str] = []
     for check in CHECKS:
         found = [] if forced and check.may_be_skipped else check.reason(question)
@@ -152,12 +154,12 @@ def against_arming(question: Question, forced: bool) -> list[str]:
 
 
 def _seldom(health: Health) -> str:
-    """In words that tags do come, too far apart to tell a place that is not known."""
+    """Returns words to add when tags do come, but too far apart to find an unknown position; else empty."""
     return f": tags come {health.tag_gap_s:.2f} s apart, {SAME_S:.2f} s permitted to tell a place" if health.tag_gap_s > SAME_S else ""
 
 
 def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:
-    """What `mode` needs and does not have, in words."""
+    """Returns what `mode` needs and does not have, in words."""
     limits, needs = parameters.failsafes, MODES[mode].needs
     reasons = []
     if (Need.ATTITUDE in needs and not health.ready) or (Need.POSITION in needs and not health.placed):
@@ -167,6 +169,6 @@ def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:
     depth_age_s = min(health.depth_age_s if health.depth_heard else NEVER_S, health.tag_age_s)
     if Need.DEPTH in needs and depth_age_s > limits.depth_unknown_limit:
         reasons.append("depth unknown")
-    if Need.PILOT in needs and health.pilot_age_s > limits.pilot_lost_limit:  # one who was never heard is no cause: sticks are neutral
+    if Need.PILOT in needs and health.pilot_age_s > limits.pilot_lost_limit:  # NaN, a pilot never heard, passes: sticks are neutral
         reasons.append("pilot input lost")
     return reasons

@@ -1,4 +1,4 @@
-"""The arrays of one docked shape: what estimator, controller and allocator need to know of a body. Frozen.
+"""Frozen arrays of one docked shape: what estimator, controller and allocator need to know of a body.
 
 Built by `prepare.assembly` from vehicle files; a merge or split swaps one Body for another.
 """
@@ -10,19 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 
 RANK_TOLERANCE = 1e-6
-"""Singular values of what thrusters make that are below this share of the largest count as zero."""
+"""Singular values of a thruster matrix below this share of the largest count as zero."""
 CRUISE_M_S = 0.2
-"""Speed of a robot under way, by which a change of the water's own speed is turned into a change of drag."""
+"""Nominal speed of a robot under way, used to convert a change of the water's speed into a change of drag."""
 BUOYANCY_SIGMA_N, ARM_SIGMA_M, TRIM_SIGMA_M = 0.5, 0.003, 0.002
-"""Buoyancy of a module, its righting arm (times its weight with the entrained water a moment) and its trim along each axis (times its
-dry weight) may be off by this much: felt when the body tilts. One sigma of what the bench draws: 5 and 3 mm to either side."""
+"""Sigma of a module's buoyancy, of its righting arm (a moment when multiplied by the weight with entrained water) and of its trim along
+each axis (multiplied by the dry weight); the errors show when the body tilts. Arm and trim: one sigma of the bench's draw of 5 and 3 mm
+to either side."""
 Plant = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Mass, its inverse, righting, drag nodes, rotational and linear damping, as core.propagation.PLANT has their types."""
+"""Mass, its inverse, righting, drag nodes, rotational and linear damping; core.propagation.PLANT has their types."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThrusterSet:
-    """n thrusters of a body, in module order, eight to a module where the vehicle has eight.
+    """The n thrusters of a body, in module order; eight per module where the vehicle has eight.
 
     Attributes:
         matrix: (6, n) wrench of unit forces: [direction; position x direction] about the centre of mass.
@@ -30,7 +31,7 @@ class ThrusterSet:
         f_min, f_max: (n,) N.
         forward, reverse: (n, 5) force polynomials; power_forward, power_reverse: (n, 5) power polynomials (W over |N|).
         deadband_n, lag_s, voltage_v, rpm_at_full: (n,).
-        module: (n,) index within the body of the module that it belongs to; channel: (n,) its number there.
+        module: (n,) index, within the body, of each thruster's module; channel: (n,) its number within that module.
     """
 
     matrix: np.ndarray
@@ -66,12 +67,12 @@ class DragTable:
 
     @property
     def mean(self) -> float:
-        """Force per squared speed, mean of all directions, N s^2/m^2."""
+        """Force per squared speed, mean over all nodes, N s^2/m^2."""
         return float(self.nodes[..., 0].mean())
 
     @property
     def cruise_slope(self) -> float:
-        """What a change of the water's speed does to the force on a robot under way, mean of all directions, N s/m: dF/dv = 2 c v."""
+        """Change of drag per change of the water's speed for a robot under way, mean over all nodes, N s/m: dF/dv = 2 c v."""
         return 2.0 * CRUISE_M_S * self.mean
 
 
@@ -86,14 +87,14 @@ class Body:
         mass: (6, 6) rigid, entrained and added mass about the centre of mass; mass_inv: its inverse.
         rigid_mass_kg: dry and entrained mass.
         righting: (3,) sum of weight, entrained water included, times (centre of buoyancy - centre of mass), body frame, N m.
-        righting_sigma: (3,) how far that may be off, as arm, trim and buoyancy of each module are.
-        thrusters, drag: see there.
+        righting_sigma: (3,) its standard deviation, from arm, trim and buoyancy of each module.
+        thrusters, drag: see ThrusterSet and DragTable.
         tag_ids: (t,) ids; tag_module: (t,) index within the body; r_bt: (t, 3); q_bt: (t, 4) tag frame to body frame.
         tag_module and r_bt follow the order of tag_ids.
-        supply_power_w: (m,) what each module's supply gives to its thrusters and magnets.
-        reach_m: no point of its hulls is farther from the centre of mass, m.
-        cells: (m, 3) lattice cells; name: for people.
-        faces: of each module, what its six faces are, a letter each, as in the vehicle file (P probe, D drogue).
+        supply_power_w: (m,) power that each module's supply can give to its thrusters and magnets.
+        reach_m: largest distance of any point of its hulls from the centre of mass, m.
+        cells: (m, 3) lattice cells; name: for display.
+        faces: per module the kinds of its six faces, a letter each, as in the vehicle file (P probe, D drogue).
     """
 
     name: str
@@ -119,16 +120,16 @@ class Body:
 
     @property
     def index(self) -> int:
-        """The body's number: that of its leader, its first module."""
+        """Number of the body: the fleet index of its leader, which is its first module."""
         return self.modules[0]
 
     @property
     def nominal_v(self) -> np.ndarray:
-        """(m,) supply of each module for which its thrusters' curves stand."""
+        """(m,) supply voltage of each module at which its thrusters' curves hold."""
         t = self.thrusters
         return np.array([t.voltage_v[t.module == m][0] for m in range(len(self.modules))])
 
     @property
     def plant(self) -> Plant:
-        """What the process model takes of it."""
+        """Arrays of the body that the process model uses."""
         return self.mass, self.mass_inv, self.righting, self.drag.nodes, self.drag.rotational, self.drag.linear

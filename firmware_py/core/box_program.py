@@ -1,11 +1,11 @@
-"""The point nearest to a goal within a box on which six sums vanish: what the allocator asks when thrusters saturate.
+"""Box-constrained least squares with six equality constraints, which the allocator solves when thrusters saturate.
 
-    min 1/2 sum_i w_i (x_i - g_i)^2   so that   sum_i a_i x_i = 0 (6,)   and   l <= x <= u
+    min 1/2 sum_i w_i (x_i - g_i)^2   subject to   sum_i a_i x_i = 0 (6,)   and   l <= x <= u
 
-Solved in its dual, which has six unknowns y however many thrusters there are: x_i(y) = clip(g_i + a_i y / w_i) minimises the
-Lagrangian, and sum_i a_i x_i(y) is the gradient of a convex, piecewise quadratic function of y. Newton's steps with exact
+Solved in its dual, which has six unknowns y for any number of thrusters: x_i(y) = clip(g_i + a_i y / w_i) minimises the
+Lagrangian, and sum_i a_i x_i(y) is the gradient of a convex, piecewise quadratic function of y. Newton steps with exact
 line searches end in its lowest piece (Li and Swetits, A new algorithm for solving strictly convex quadratic programs,
-SIAM J. Optim. 7, 1997). Work and memory are bounded; nothing is kept from call to call.
+SIAM J. Optim. 7, 1997). Work and memory are bounded; no state is kept between calls.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from numba import njit
 from firmware_py.core.rotations import M, V
 
 RESIDUAL = 1e-8
-"""Of the sums, at which the point is good enough."""
+"""Largest sum, in magnitude, at which the point counts as a solution."""
 MOST_STEPS = 60
-"""Of Newton; 8 to 13 are usual, 37 the most of 4000 draws."""
+"""Limit of Newton steps; 8 to 13 are usual, and 37 was the most in 4000 draws."""
 MOST_TRIALS = 60
-"""Of one line search; 25 are usual."""
+"""Limit of iterations of one line search; 25 are usual."""
 EXACT = 1e-9
-"""Share of its first slope at which a line search ends."""
+"""A line search ends where the slope has fallen to this share of its first value."""
 RIDGE = 1e-13
-"""Added to the curvature, as a share of its trace without the box: it is singular where all thrusters of a direction are at limits."""
+"""Regularisation of the curvature, as a share of its trace without the box: the curvature is singular where all thrusters of a direction
+are at their limits."""
 
 
 @njit(f"float64({M},{V},{V},{V},{V},{V},{V},{M})", cache=True)
@@ -46,7 +47,7 @@ def _look(rows, weights, free, low, high, x, gradient, curvature):  # type: igno
 
 @njit(cache=True)
 def _newton(curvature, ridge, gradient, step):  # type: ignore[no-untyped-def]
-    """Writes -(curvature + ridge)^-1 gradient into `step` by Cholesky's factors, which take the place of the curvature's lower half."""
+    """Writes -(curvature + ridge)^-1 gradient into `step`. The Cholesky factor overwrites the lower half of `curvature`."""
     for k in range(6):
         for j in range(k + 1):
             for m in range(j):
@@ -65,7 +66,7 @@ def _newton(curvature, ridge, gradient, step):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _lowest(weights, free, slope, low, high):  # type: ignore[no-untyped-def]
-    """How many times `slope` leads from `free` to the lowest point of that line; there the derivative, which only rises, is zero."""
+    """Returns the step length along `slope` from `free` to the minimum of the line: the zero of the derivative, which only rises."""
     first, shortest, longest, length = 0.0, 0.0, math.inf, 1.0
     for i in range(free.size):
         first += weights[i] * slope[i] * min(max(free[i], low[i]), high[i])
@@ -90,7 +91,7 @@ def _lowest(weights, free, slope, low, high):  # type: ignore[no-untyped-def]
 
 @njit(f"float64({M},{V},{V},{V},{V},{V})", cache=True)
 def nearest(rows, weights, goal, low, high, x):  # type: ignore[no-untyped-def]
-    """Writes the point (n,) into `x`; returns the largest of the six sums that is left, `RESIDUAL` or less when it is found.
+    """Writes the solution (n,) into `x`; returns the largest remaining sum of the six, at most `RESIDUAL` when a solution is found.
 
     Args:
         rows: (n, 6) a_i. weights, goal, low, high: (n,) w, g, l, u; weights > 0, and x = 0 within the box.

@@ -22,7 +22,7 @@ SETPOINT = f"{V},{V},{V},{V},{V},{V}"
 
 
 class Controller:
-    """Pure: no state. All gains are worked out at construction."""
+    """Stateless control law. All gains are computed at construction."""
 
     def __init__(self, body: Body, parameters: Control) -> None:
         p = parameters
@@ -34,12 +34,12 @@ class Controller:
         self._law = np.array([float(p.law == "model"), p.drag_feedforward, p.disturbance_feedforward])
 
     def step(self, now: Setpoint, ahead: Setpoint, estimate: Estimate) -> np.ndarray:
-        """The wanted wrench, (6,), body frame.
+        """Returns the wanted wrench, (6,), body frame.
 
         Args:
             now: set-point of this tick, for the errors.
-            ahead: set-point a thruster lag later, for the feed-forward.
-            estimate: of this tick.
+            ahead: set-point `lead_s` (thruster lag and bus delay) later, for the feed-forward.
+            estimate: estimate of this tick.
         """
         e = estimate
         return np.asarray(
@@ -68,7 +68,7 @@ def _wrench(  # type: ignore[no-untyped-def]
     error[3:] = difference(q0, q)
     ahead = _body_velocity(q1, v1, w1, q)
     rate = kp * error + kd * (_body_velocity(q0, v0, w0, q) - nu)
-    # w x v is taken off because the Coriolis term holds it
+    # w x v is subtracted because the Coriolis term contains it
     rate[:3] += rotate_back(q, a1) - cross(ahead[3:], ahead[:3])
     rate[3:] += rotate_back(q, rotate(q1, alpha1))
     modelled = ahead if law[0] > 0.5 else nu

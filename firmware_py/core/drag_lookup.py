@@ -1,6 +1,6 @@
-"""Drag of a body out of its table, each tick and in every prediction: bilinear over the six sides of a cube.
+"""Drag of a body from its table, for every tick and prediction: bilinear interpolation on the six sides of a cube map.
 
-Side k is that of description.vehicle.FACE_NAMES (+x, -x, +y, -y, +z, -z). On the side of axis a the grid runs over
+Side k is the face k of description.vehicle.FACE_NAMES (+x, -x, +y, -y, +z, -z). On the side of axis a the grid runs over
 u = d[(a + 1) % 3] / |d[a]| and v = d[(a + 2) % 3] / |d[a]|, both from -1 to 1, nodes on the rims included.
 """
 
@@ -15,7 +15,7 @@ from firmware_py.core.rotations import V
 
 NODES = "float64[:,:,:,::1]"
 STILL = 1e-12
-"""m/s; below it there is no direction, and no drag."""
+"""Speed, m/s, at or below which direction and drag are zero."""
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -47,7 +47,7 @@ def _interpolate(nodes, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def look_up(nodes, direction):  # type: ignore[no-untyped-def]
-    """Coefficient and centre of pressure for flow along one direction.
+    """Returns coefficient and centre of pressure for flow along one direction.
 
     Args:
         nodes: (6, n, n, 4) of core.body.DragTable.
@@ -61,7 +61,7 @@ def look_up(nodes, direction):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def add_drag(nodes, rotational, linear, nu, out):  # type: ignore[no-untyped-def]
-    """Add the wrench of the water on the body to `out` (6,). Arguments as `drag_wrench`; allocates nothing."""
+    """Adds the wrench of the water on the body to `out` (6,). Arguments as `drag_wrench`; allocates nothing."""
     k, rx, ry, rz = _interpolate(nodes, nu[0], nu[1], nu[2])
     c = -k * math.sqrt(nu[0] * nu[0] + nu[1] * nu[1] + nu[2] * nu[2])
     fx, fy, fz = c * nu[0], c * nu[1], c * nu[2]
@@ -78,8 +78,8 @@ def add_drag(nodes, rotational, linear, nu, out):  # type: ignore[no-untyped-def
 def drag_wrench(nodes, rotational, linear, nu):  # type: ignore[no-untyped-def]
     """Wrench of the water on the body about its centre of mass, body frame, (6,) N and N m.
 
-    F = -c(d) |v| v, the paper's -1/2 rho Cd A |v| v with c = 1/2 rho Cd A out of the table; the moment is r_cp x F (the
-    paper's Algorithm 1 has no lever arm; see its errata) less rotational |w| w; linear damping acts on all six.
+    F = -c(d) |v| v, the paper's -1/2 rho Cd A |v| v with c = 1/2 rho Cd A from the table; the moment is r_cp x F (the
+    paper's Algorithm 1 has no lever arm; see its errata) minus rotational |w| w; linear damping acts on all six.
 
     Args:
         nodes, rotational, linear: core.body.DragTable.
@@ -91,7 +91,7 @@ def drag_wrench(nodes, rotational, linear, nu):  # type: ignore[no-untyped-def]
 
 
 def node_directions(n: int) -> np.ndarray:
-    """(6, n, n, 3) unit vectors of the nodes of a cube-map with n nodes along each rim."""
+    """(6, n, n, 3) unit vectors to the nodes of a cube map with n nodes along each edge."""
     grid = np.linspace(-1.0, 1.0, n)
     u, v = np.meshgrid(grid, grid, indexing="ij")
     directions = np.empty((6, n, n, 3))

@@ -1,14 +1,15 @@
-"""Stage 2 of a tick: an error-state Kalman filter of pose, velocity, sensor biases, one lumped disturbance, and what turns a body upright.
+"""Stage 2 of a tick: an error-state Kalman filter of pose, velocity, sensor biases, one lumped disturbance, and the righting vector.
 
-The filter stands at its anchor: the time of the newest tag picture, or half a second ago when none came. Everything is fused once, in the
-order in which it happened; from the anchor the state is carried to now through the stored thruster wrenches and gyro readings. While no
-tag comes, what would be half a second old is not waited for: a head runs on ahead of the anchor, and the state is carried from there.
+The filter state is kept at the anchor: the capture time of the newest tag picture, or half a second ago when none came. Each measurement is
+fused once, in the order of its time; from the anchor the state is carried to now through the stored thruster wrenches and gyro readings.
+While no tag comes, measurements are not held back for half a second: a second belief, the head, runs ahead of the anchor, and the state is
+carried from there.
 
-Until the first tags come it stands upright by gravity (`alignment`): attitude but for the heading, and depth. Without any for long it is
-adrift: it makes up that it stands still, and believes only tags that tell the same ten times.
+Until the first tags come, the estimate is levelled by gravity (`alignment`): attitude except for the heading, and depth. After a long time
+without tags the body is adrift: the filter assumes zero velocity over ground, and accepts tags again only once ten of them agree.
 
-The body moves by the model of `propagation`, and the accelerometer measures what that model left out (`observation.fuse_inertial`): so the
-velocity follows the robot and not the command, which is worth 15 degrees of phase (docs/estimator.md).
+The process model is that of `propagation`; the accelerometer measures what that model leaves out (`observation.fuse_inertial`). The
+velocity estimate therefore follows the robot rather than the command, which gains 15 degrees of phase (docs/estimator.md).
 """
 
 from __future__ import annotations
@@ -30,46 +31,50 @@ from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
 
 READY_AFTER = 10
-"""Tag observations to accept before the pose is believed."""
+"""Tag observations to accept before the pose counts as valid."""
 UNKNOWN_SIGMA = np.full(6, 1e3)
-"""Of the pose before the first tag, m and rad."""
+"""Sigma of the pose before the first tag, m and rad."""
 UPRIGHT_AFTER_S = 1.0
-"""Without a tag, until gravity has to do: its mean over the last `FELT_NS`."""
+"""Time without a tag after which the attitude is taken from gravity: the mean specific force of the last `FELT_NS`."""
 FELT_NS = 200_000_000
 BLIND_NS = 250_000_000
-"""Without a tag, until the head leaves the anchor: fifteen pictures. Without a depth, until none tells."""
+"""Time without a tag, fifteen pictures, after which the head leaves the anchor; also the time without a depth reading after which depth
+counts as unmeasured."""
 CATCH_UP = 4
-"""Samples that the head takes in a tick at most: it is with the present after half a second."""
+"""Most samples that the head processes in a tick; it has caught up with the present after half a second."""
 ADRIFT_NS = 10_000_000_000
-"""Without a tag, until nobody knows how the body moves over ground. What pushes it and what the water takes of its speed are the same to
-the accelerometer: the speed that is believed would grow, to 15 m/s within a minute of half stick, and spoil the tilt."""
+"""Time without a tag after which the velocity over ground counts as unknown. The accelerometer cannot tell a disturbance force from drag:
+the velocity estimate would grow, to 15 m/s within a minute of half stick, and spoil the tilt."""
 STILL_DENSITY = 0.0003
-"""Of the noise of the speed that is made up then, m^2/s: 0.17 m/s in a tick at 100 Hz."""
+"""Noise density of the zero-velocity pseudo-measurement that is fused while adrift, m^2/s: 0.17 m/s in a tick at 100 Hz."""
 NORTH_DENSITY = 1e-4
-"""Of the noise of the heading before the first tag, rad^2 s: it says where north is, and so is known. What the filter else took for
-knowledge of it was noise: a bump turned the belief by a third of a circle."""
+"""Noise density of the heading pseudo-measurement before the first tag, rad^2 s. Until then the believed heading defines north, so it is
+known by definition. Without this the filter fitted the heading to noise: a bump turned the estimate by a third of a circle."""
 KEPT, MOVING, GYROS = np.r_[10:19, 21:25, 26:29], slice(6, 9), slice(12, 15)
-"""What is kept when a body that was adrift is placed anew. KEPT, of the state: rates, biases, vertical force, moment and righting, which
-do not depend on the heading. Of the error: MOVING is the velocity, which becomes unsure; GYROS are the gyro biases, which stay as sure as
-they were: with a larger variance the filter would take the next bump, which no model knows, for a bias."""
+"""Entries that matter when tags relocate a body that was adrift. KEPT (state): angular rates, biases, vertical force, moment and righting
+vector, which do not depend on the heading, survive. MOVING (error): velocity, whose covariance is set from `SPEED_SIGMA`. GYROS (error):
+gyro biases, whose covariance stays: with a larger variance the filter would take the next unmodelled bump for a bias."""
 WAY_S = 0.01
-"""For which `accel_under_way` tells what a sample errs. A wrong mass errs alike in all samples of that time: more of them tell no more."""
+"""Sample period for which `accel_under_way` gives the error of one sample. A wrong mass causes the same error in all samples within that
+time, so that more samples carry no more information."""
 LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[22:25, 26:29], np.r_[21:24, 25:28], 5.0
-"""Where moment and righting stand in the state and in its error, and within how many initial sigmas they are kept when the filter begins
-anew because it refused too many tags. A place that was wrong has not spoilt them; but a value that a fresh filter would not believe may be
-the very reason why tags were refused. Biases and vertical force are not kept: while tags are refused they take up all that does not fit."""
+"""Indices of moment and righting vector in the state and in the error, and the limit in initial sigmas within which they are kept when the
+filter restarts because it refused too many tags. A wrong position does not spoil them; but a value outside the limit may be the very reason
+why tags were refused. Biases and vertical force are not kept: while tags are refused, they absorb whatever does not fit."""
 SPEED_SIGMA = 0.5
-"""Of one that was adrift, when tags come, m/s: what a module swims at half stick."""
+"""Sigma of the velocity of a body that was adrift, when tags relocate it, m/s: the speed of a module at half stick."""
 FELT_LIMIT_NS = 2_000_000_000
-"""Without an accelerometer, until one that is adrift does not know its attitude either: four times what the fail-safe `imu_lost` waits."""
+"""Time without an accelerometer after which a body that is adrift loses its attitude too: four times the delay of the fail-safe
+`imu_lost`."""
 RESET_AFTER = 30
-"""Observations refused one after the other (half a second) until the filter believes them and not itself."""
+"""Consecutive refused observations (half a second) after which the filter restarts from the tag."""
 INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
-"""Of position m, attitude rad, velocity m/s, rate rad/s, gyro bias, accelerometer bias, disturbance over mass, over inertia, depth bias."""
+"""Initial sigma of position m, attitude rad, velocity m/s, rate rad/s, gyro bias, accelerometer bias, disturbance force over mass,
+disturbance moment over inertia, depth bias."""
 
 
 class Belief(NamedTuple):
-    """State (32,) and covariance (28, 28) at a time, as core.propagation orders them."""
+    """State (32,) and covariance (28, 28) at a time, in the order of core.propagation."""
 
     x: np.ndarray
     covariance: np.ndarray
@@ -77,7 +82,7 @@ class Belief(NamedTuple):
 
 
 class Estimator:
-    """One body's estimator. Same inputs, same outputs; time comes in."""
+    """Estimator of one body. Deterministic: time is an input, and the same inputs give the same outputs."""
 
     def __init__(self, body: Body, parameters: Estimation, period_ns: int) -> None:
         self._body = body
@@ -97,7 +102,7 @@ class Estimator:
         self._nis_dof = 0
 
     def retune(self, parameters: Estimation) -> None:
-        """Takes other noise figures from the next tick on; the estimate stays."""
+        """Applies new noise parameters from the next tick on; the estimate stays."""
         p = self._p = parameters
         self._density = self._process_noise()
         drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
@@ -111,20 +116,20 @@ class Estimator:
 
     @property
     def q_wb(self) -> np.ndarray:
-        """(4,) latest attitude."""
+        """Latest attitude, (4,)."""
         return np.asarray(self._now[3:7])
 
     def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:
-        """The estimate at `time_ns`.
+        """Returns the estimate at `time_ns`.
 
         Args:
             time_ns: time of this tick.
-            measured: fused sensors.
+            measured: fused measurements of all sensors.
             tau: (6,) mean thruster wrench since the previous tick, body frame.
         """
         self._nis, self._nis_dof = math.nan, 0
         if self._history.newest >= 0 and time_ns - self._history.newest_ns > WINDOW_NS:
-            self._accepted = self._waited = 0  # the process stood still: what is remembered joins on to nothing
+            self._accepted = self._waited = 0  # the process was suspended: the history does not reach back to the anchor
         self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
         self._felt_ns = time_ns if measured.accel is not None else self._felt_ns
         self._depth_ns = time_ns if measured.depth_m is not None else self._depth_ns
@@ -132,7 +137,7 @@ class Estimator:
             self._take(pose)
         if self._is_lost(time_ns):
             self._forget()
-            self._waited = round(UPRIGHT_AFTER_S / self._dt)  # it has done so already
+            self._waited = round(UPRIGHT_AFTER_S / self._dt)  # no second wait: gravity is used at once
         if not self._accepted:
             self._wait(time_ns)
         if self._accepted:
@@ -144,11 +149,11 @@ class Estimator:
 
     @property
     def motion(self) -> Motion:
-        """State and covariance now, for a body that joins or parts."""
+        """Current state, and covariance of the head, for a body that docks or undocks."""
         return Motion(self._now.copy(), self._head.covariance.copy(), self._accepted, self._last_tag_ns)
 
     def restart(self, time_ns: int, motion: Motion) -> Estimate:
-        """Goes on from `motion` at `time_ns`, as after a dock; returns the estimate of the same tick."""
+        """Restarts from `motion` at `time_ns`, as after a dock; returns the estimate of the same tick."""
         self._history.push(time_ns, np.zeros(6), None, None, None)
         self._anchor = self._head = Belief(motion.x.copy(), motion.covariance.copy(), time_ns)
         self._now = self._anchor.x
@@ -188,7 +193,7 @@ class Estimator:
         self._now = x
 
     def _wait(self, time_ns: int) -> None:
-        """For a tag; after a second without any the body stands upright by gravity, where and as it was last believed to head."""
+        """Waits for a tag; after a second without any, starts levelled by gravity, at the last believed position and heading."""
         self._waited += 1
         if self._waited * self._dt <= UPRIGHT_AFTER_S:
             return
@@ -204,23 +209,23 @@ class Estimator:
 
     @property
     def _has_north(self) -> bool:
-        """Whether a tag has told the heading."""
+        """Whether a tag has ever given the heading."""
         return self._last_tag_ns != NEVER_NS
 
     @property
     def _is_adrift(self) -> bool:
-        """Whether tags have told nothing for long, or never."""
+        """Whether no tag was accepted for longer than `ADRIFT_NS`, or ever."""
         return self._history.newest_ns - self._last_tag_ns > ADRIFT_NS
 
     def _is_lost(self, time_ns: int) -> bool:
-        """Whether what is believed rests on too little: a few tags that no more came after, or nothing but a gyro for long."""
+        """Whether the estimate rests on too little: on a few tags after which no more came, or for long on nothing but a gyro."""
         few = self._accepted < READY_AFTER and time_ns - self._taken_ns > UPRIGHT_AFTER_S * 1e9
         borne_out_ns = max(self._felt_ns, self._last_tag_ns + ADRIFT_NS)
         return self._accepted > 0 and (few or time_ns - borne_out_ns > FELT_LIMIT_NS)
 
     def _stilled(self, at: Belief) -> Belief:
-        """It is made up that the body stands still over ground, more or less (ADRIFT_NS); ArduPilot's EKF3 does the like without aiding.
-        Up and down only where no depth tells.
+        """Fuses a zero velocity over ground, with noise, as a pseudo-measurement (see ADRIFT_NS); ArduPilot's EKF3 does likewise without
+        aiding. Includes the vertical velocity only while depth is unmeasured. Before the first tag, fuses the believed heading too.
         """
         axes = 2 if self._history.newest_ns - self._depth_ns < BLIND_NS else 3
         north = math.inf if self._has_north else NORTH_DENSITY / self._dt
@@ -228,7 +233,7 @@ class Estimator:
         return Belief(x, covariance, at.time_ns)
 
     def _place(self, pose: BodyPose) -> None:
-        """The first tags for long say where the body is; what it knows of its turning and its sensors stays."""
+        """Relocates a body that was adrift once enough tags agree (`FirstSight`); the state entries KEPT stay."""
         if not self._first_sight.agrees(pose, self._anchor.x[:3], self._anchor.x[3:7]):
             self._refuse(pose)
             return
@@ -238,11 +243,11 @@ class Estimator:
             self._start(pose)
             self._anchor.x[KEPT], self._accepted = before.x[KEPT], READY_AFTER
             self._anchor.covariance[MOVING, MOVING] = SPEED_SIGMA**2 * np.eye(3)
-            if had_north:  # one that made its heading up is too sure of them
+            if had_north:  # before the first tag the assumed heading makes their variance too small
                 self._anchor.covariance[GYROS, GYROS] = before.covariance[GYROS, GYROS]
 
     def _advanced(self, start: Belief, to_ns: int) -> Belief:
-        """The filter at `to_ns`, the inertial and depth measurements on the way fused."""
+        """Returns the belief advanced to `to_ns`, with the inertial and depth measurements on the way fused."""
         if to_ns <= start.time_ns:
             return start
         index = self._history.first_after(start.time_ns)
@@ -283,7 +288,7 @@ class Estimator:
     # ------------------------------------------------------------ from the anchor to now
 
     def _lead(self, time_ns: int) -> None:
-        """Moves the head: it is the anchor while tags come, and else runs on to the sample before the newest."""
+        """Moves the head: equal to the anchor while tags come; otherwise it runs ahead, up to one period before now."""
         if time_ns - self._taken_ns < BLIND_NS:
             self._head = self._anchor
             return
@@ -292,7 +297,7 @@ class Estimator:
         self._head = self._advanced(start, min(time_ns - period_ns, start.time_ns + CATCH_UP * period_ns))
 
     def _carry(self, time_ns: int) -> tuple[np.ndarray, bool]:
-        """Brings the state to `time_ns`; returns sigma (6,) of its pose, and whether all of that is sound."""
+        """Carries the state from the head to `time_ns`; returns sigma (6,) of its pose, and whether state and sigma are sound."""
         head = self._head
         index = self._history.first_after(head.time_ns)
         taus, gyros, _ = self._history.since(index)
@@ -301,14 +306,14 @@ class Estimator:
         self._now, sigma, sound = observation.carried(
             head.x, head.covariance, taus, gyros, self._dt, until_first, self._density, lag, rate_variance, *self._plant
         )
-        if self._is_adrift:  # its place is made up, and before the first tag the heading
+        if self._is_adrift:  # the horizontal position is a guess, and before the first tag the heading is too
             sigma[:2] = UNKNOWN_SIGMA[:2]
         if not self._has_north:
             sigma[3:] += UNKNOWN_SIGMA[3:] * np.abs(to_matrix(self._now[3:7])[2])
         return sigma, sound
 
     def _forget(self) -> None:
-        """Nothing is known: the filter begins anew with the next tag, or upright where it was."""
+        """Drops the estimate: the filter restarts from the next tag, or levelled by gravity at the last believed position."""
         self._accepted = self._waited = 0
         sound = observation.are_finite(self._now[:3], self._now[3:7])
         self._now = np.r_[self._now[:7] if sound else np.eye(1, 7, 3)[0], np.zeros(STATES - 7)]
@@ -316,7 +321,7 @@ class Estimator:
 
     def _estimate(self, time_ns: int) -> Estimate:
         sigma, sound = self._carry(time_ns) if self._accepted else (UNKNOWN_SIGMA, True)
-        if not sound:  # sensors have lied
+        if not sound:  # a sensor gave false readings
             self._forget()
             sigma = UNKNOWN_SIGMA
         x = self._now.copy()
@@ -336,7 +341,7 @@ class Estimator:
         )
 
     def _process_noise(self) -> np.ndarray:
-        """(28,) spectral density of the process noise of a body at rest, per second."""
+        """Spectral density (28,) of the process noise of a body at rest, per second."""
         p = self._p
         inertia = np.diag(self._body.mass)
         density = np.zeros(ERRORS)

@@ -1,6 +1,6 @@
-"""Fail-safes as a table: what is measured, in which modes it counts, and the words for it; limits, delays and actions are parameters.
+"""Table of fail-safes: the figure watched, the modes in which it counts, and its text; limits, delays and actions are parameters.
 
-The first row is the gravest. `Failsafes` keeps the time of each row; the supervisor acts on what it reports.
+The first row is the gravest. `Failsafes` keeps the timers of each row; the supervisor acts on what it reports.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from firmware_py.description.failsafe_parameters import Failsafes as FailsafePar
 
 
 class Level(IntEnum):
-    """What a fail-safe does, milder first; each is done in the best way that is possible."""
+    """Action of a fail-safe, mildest first; the supervisor falls back to the best variant that is possible."""
 
     NONE = 0
     WARN = 1
     HOLD = 2
-    """Hold the place; without position, depth and attitude; without depth, surface."""
+    """Hold the position; without a position, hold depth and attitude; without a depth, surface."""
     DEPTH = 3
     """Hold depth and attitude."""
     SURFACE = 4
@@ -30,12 +30,12 @@ class Level(IntEnum):
 
 
 ANY = frozenset(Mode)
-"""The vehicle itself is at fault: counts in every mode, and disarmed too."""
+"""All modes, for faults of the vehicle itself: such a row counts in every mode, and while disarmed too."""
 PLACED = frozenset(row.mode for row in MODE_TABLE if Need.POSITION in row.needs)
-"""Modes that hold or follow a place."""
+"""Modes that hold or follow a position."""
 MOVING = PLACED - {Mode.POSHOLD}
 FREE = PLACED - {Mode.DOCK}
-"""Those in which nothing but the water should push."""
+"""Position modes in which nothing but the water should push the body."""
 PILOTED = frozenset(row.mode for row in MODE_TABLE if row.by_pilot)
 
 PERMITTED = {
@@ -46,22 +46,22 @@ PERMITTED = {
     Level.SURFACE: PILOTED | {Mode.SURFACE},
     Level.DISARM: frozenset[Mode](),
 }
-"""Modes that may be entered while the cause of a fail-safe of that level lasts. A pilot may always take over."""
+"""Modes that may be entered while the cause of a fail-safe of that level lasts. Below DISARM a pilot may always take over."""
 
 
 class Row(NamedTuple):
-    """One fail-safe. Its parameters are `name`_limit (unless its figure is yes or no), _delay_s, _action and _latched."""
+    """One fail-safe. Its parameters are `name`_limit (none for a yes/no figure), _delay_s, _action and _latched."""
 
     name: str
     words: str
-    """For people; `{}` takes the value."""
+    """Text for people; `{}` takes the value."""
     figure: str
-    """Of Health; of yes or no and of numbers without a limit, what is above zero is bad."""
+    """Name of the field of Health to watch. Without a limit parameter any value above zero is bad; True counts as 1."""
     below: bool = False
-    """Low values are bad."""
+    """Whether values below the limit, not above it, are bad."""
     modes: frozenset[Mode] = ANY
     forced_modes: frozenset[Mode] = frozenset()
-    """Modes in which it counts besides, where a fail-safe and no person chose them."""
+    """Further modes, in which it counts only if a fail-safe and not a person chose them."""
 
 
 TABLE = (
@@ -94,59 +94,59 @@ TABLE = (
     Row("battery_low", "battery low: {:.0%} of its voltage", "voltage_share", below=True),
 )
 FIGURES = attrgetter(*(row.figure for row in TABLE))
-"""What each row looks at, of the health of a tick."""
+"""Returns the figure of every row, from the health of a tick."""
 
 
 class Alarm(NamedTuple):
-    """A fail-safe that has just begun, begun anew or ended."""
+    """Report of a fail-safe that has just begun, recurred or ended."""
 
     name: str
     words: str
     level: Level
     begins: bool
     again: bool = False
-    """Its cause has come back before it ended."""
+    """Whether its cause came back before it had ended."""
 
 
 class Watch:
-    """One row and its time."""
+    """One row with its timers."""
 
     def __init__(self, row: Row, parameters: FailsafeParameters) -> None:
         self.row = row
         self._since_ns: int | None = None
         self._gone_ns: int | None = None
         self._told_ns: int | None = None
-        """`_since_ns` at the last report. A cause that went and came back has another one, and is reported again."""
+        """`_since_ns` at the last report. A cause that went and came back has a new `_since_ns`, and is reported again."""
         self.active, self.level = False, Level.NONE
         self.began = ""
-        """Its words when it last began."""
+        """Its text when it last began."""
         self.retune(parameters)
 
     def retune(self, parameters: FailsafeParameters) -> None:
-        """Takes other limits; its time goes on. Another action is acted on anew."""
+        """Applies new limits and keeps the timers. A changed action is reported, and so carried out, again."""
         name, before = self.row.name, self.level
         self.limit: float = getattr(parameters, f"{name}_limit", 0.0)
         self.level = Level(getattr(parameters, f"{name}_action"))
         self.latched = bool(getattr(parameters, f"{name}_latched"))
         self._told_ns = self._told_ns if self.level == before else None
-        self.active = self.active and self.level != Level.NONE  # else it is not looked at any more, and begins anew when it is again
+        self.active = self.active and self.level != Level.NONE  # NONE is not watched; it begins afresh when watched again
         self._delay_ns = round(getattr(parameters, f"{name}_delay_s") * 1e9)
         self._clear_ns = round(parameters.clear_s * 1e9)
 
     def take_over(self, before: Sequence[Watch]) -> None:
-        """Goes on from the watches of the same row of the bodies before: on where one was, its cause as old as the oldest."""
+        """Inherits from the watches of the same row in the bodies before: active if any was, with the age of the oldest cause."""
         on = [watch for watch in before if watch.active]
         self.active, self.began = bool(on), next((watch.began for watch in on), "")
         self._since_ns = min((watch._since_ns for watch in before if watch._since_ns is not None), default=None)
         self._told_ns = self._since_ns if on and all(watch._told_ns == watch._since_ns for watch in on) else None
 
     def beyond(self, health: Health) -> bool:
-        """Whether its cause holds now, whatever the mode. A NaN is no cause."""
+        """Whether the figure is beyond its limit now, in any mode. A NaN is not."""
         value = getattr(health, self.row.figure)
         return bool(value < self.limit if self.row.below else value > self.limit)
 
     def counts(self, mode: Mode, forced: bool, armed: bool) -> bool:
-        """Whether it counts now."""
+        """Whether the row is watched in this mode and state."""
         if self.level == Level.NONE:
             return False
         if not armed:
@@ -154,21 +154,21 @@ class Watch:
         return mode in self.row.modes or (forced and mode in self.row.forced_modes)
 
     def words(self, health: Health) -> str:
-        """How it is, for people."""
+        """Returns its text with the present value."""
         value, words = getattr(health, self.row.figure), self.row.words
         return words.replace(" for {:.1f} s", "") if value >= NEVER_S else words.format(value)
 
     def ending(self, health: Health, mode: Mode, armed: bool) -> str:
-        """How it is when it ends: a cause that lasts is not over, but counts no more."""
+        """Returns its text when it ends; says so where the cause persists but no longer counts in this mode or while disarmed."""
         no_more = f", which does not count {f'in {mode.name}' if armed else 'while disarmed'}" if self.beyond(health) else ""
         return self.words(health) + no_more
 
     def reason(self, health: Health) -> str:
-        """What is wrong, for people; what was wrong when it began, where its cause is gone."""
+        """Returns what is wrong, for people; the text from when it began if its cause is gone."""
         return self.words(health) if self.beyond(health) else self.began
 
     def step(self, now: int, cause: bool, armed: bool) -> bool:
-        """Moves its time on; whether it has begun or ended in this tick, or its cause has come back to stay."""
+        """Advances the timers; returns whether it began or ended in this tick, or its cause came back for as long as the delay."""
         if cause:
             self._gone_ns = None
             if self._since_ns is None:
@@ -193,20 +193,20 @@ class Failsafes:
         self._all = [Watch(row, parameters) for row in TABLE]
 
     def retune(self, parameters: FailsafeParameters) -> None:
-        """Takes other limits and actions; what is on stays on."""
+        """Applies new limits and actions. Active fail-safes stay active, except where the action is NONE now."""
         for watch in self._all:
             watch.retune(parameters)
 
     def take_over(self, before: Sequence[Failsafes]) -> None:
-        """Goes on from those of the bodies that this one is made of, or was part of."""
+        """Inherits from the fail-safes of the bodies that this one is made of, or was part of."""
         for i, watch in enumerate(self._all):
             watch.take_over([other._all[i] for other in before])
 
     def step(self, health: Health, mode: Mode, forced: bool, armed: bool) -> list[Alarm]:
-        """Those that begin, come back or end in this tick, gravest row first.
+        """Returns the fail-safes that begin, recur or end in this tick, gravest row first.
 
         Args:
-            forced: a fail-safe and no person chose `mode`.
+            forced: whether a fail-safe and not a person chose `mode`.
         """
         alarms = []
         for watch, value in zip(self._all, FIGURES(health), strict=True):
@@ -223,19 +223,19 @@ class Failsafes:
 
     @property
     def level(self) -> Level:
-        """What the gravest of those that are on asks for."""
+        """Strongest action of all active fail-safes."""
         return max((watch.level for watch in self._all if watch.active), default=Level.NONE)
 
     def is_on(self, name: str) -> bool:
-        """Whether the row of that name is on."""
+        """Whether the row of that name is active."""
         return any(watch.active for watch in self._all if watch.row.name == name)
 
     def active(self, health: Health) -> list[str]:
-        """Those that are on and more than a warning, in words."""
+        """Returns the active fail-safes above a warning, in words."""
         return [watch.reason(health) for watch in self._all if watch.active and watch.level > Level.WARN]
 
     def against(self, mode: Mode, health: Health, but: Container[str] = ()) -> list[str]:
-        """Why `mode` must not be entered now, in words; empty when it may. Rows named in `but` are no reason."""
+        """Returns the reasons against entering `mode` now, in words; empty when it may be entered. Rows named in `but` are ignored."""
         return [
             watch.reason(health)
             for watch in self._all

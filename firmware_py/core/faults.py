@@ -1,7 +1,7 @@
-"""Which thrusters are dead or lie: by what their ESCs report, by the motion that is missing, and by a module that falls silent. Between
-estimate and supervisor.
+"""Detection of dead and lying thrusters: from ESC reports, from missing motion, and from modules that fall silent. Runs between estimator
+and supervisor.
 
-What is found stays out until the body is disarmed; those of a silent module until it is heard again.
+A thruster that was found faulty stays excluded until the body is disarmed; those of a silent module until it is heard again.
 """
 
 from __future__ import annotations
@@ -25,46 +25,49 @@ ESC_DOWN = (1, 3)
 """EscStatus FAULT and SILENT."""
 WHY = ("has an ESC that failed", "stands still", "does not obey")
 DOWN, STANDS, DISOBEYS = range(len(WHY))
-"""What the feedback of an ESC may show often enough in a row, the gravest first."""
+"""Faults that enough ESC feedbacks in a row may show, gravest first."""
 NEITHER = (-1, -1)
-"""Thrusters of a feedback that the vehicle does not have."""
+"""Thruster indices for a feedback of ESCs that the vehicle does not have."""
 LEAST_LEVER = 0.1
-"""Moment in a lost axis (a unit vector) with which force is kept: with less, a newton costs 10 N m and more; 1e16 where it is rounding."""
+"""Smallest moment part of a lost axis (a unit vector) that is traded for force: below it, keeping a newton costs more than 10 N m; 1e16
+where the moment part is rounding."""
 FAST_SHARE = 2.0
-"""A propeller that turns at more than this share of the believed speed does not obey."""
+"""A propeller does not obey if it turns faster than this multiple of its believed speed plus `FAST_MARGIN`."""
 FAST_MARGIN = 0.25
-"""Share of full speed that it must be off besides: below, deadband and lag explain it."""
+"""Margin for a speed that is too high or of the wrong sign, as a share of full speed: deadband and lag explain smaller deviations."""
 CLEAR = 4.0
-"""A propeller that stands still again where this many times the least force is believed counts twice: it is not about to start."""
+"""A repeated standstill counts twice where the believed force is at least this many times the least judged force: the propeller is not
+just about to start."""
 SILENT_NS = 500_000_000
-"""After so much silence, when the fail-safe `module_silent` acts too, the thrusters of a module are left out, if the others can make every
-wrench without: where it hears nothing either they have stood still since 100 ms (DESIGN's bus), and where it hears they then do so too."""
+"""Silence after which a module's thrusters are excluded, if the others can make every wrench without them; the fail-safe `module_silent`
+acts then too. A module that hears nothing either has stopped its thrusters after 100 ms (DESIGN's bus); one that still hears stops them
+because of the exclusion."""
 TELLS = 0.3
-"""Weight of one feedback in what an ESC tells of its thruster's force. Ten come in a second (DESIGN's bus), so that 0.3 s are remembered:
-less than the half second of motion that core.missing_thrust judges."""
+"""Weight of one ESC feedback in the running share of force that a thruster reports. Ten come per second (DESIGN's bus), which gives a
+memory of 0.3 s: less than the half second of motion that core.missing_thrust judges."""
 
 
 class ThrusterFaults(NamedTuple):
-    """What is known of a body's thrusters."""
+    """Fault state of a body's thrusters."""
 
     alive: np.ndarray
-    """(n,) bool: may be used."""
+    """(n,) bool: thrusters that may be used."""
     dead: tuple[int, ...]
-    """Those that were found dead or lying."""
+    """Indices of thrusters found dead or lying."""
     lost_axes: int
-    """Rank that is missing because of them."""
+    """Rank lost from the thruster matrix because of unusable thrusters."""
     keep: np.ndarray
-    """(6, 6) takes from a wrench what the thrusters left cannot make."""
+    """(6, 6) matrix that removes from a wrench what the usable thrusters cannot make."""
 
 
 def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """(6, 6) gives up moment for what cannot be made, so that the force stays; only then force.
+    """Returns the (6, 6) matrix that makes a wrench feasible: it gives up moment first, so that the force stays, and force only then.
 
     Args:
         made, lost: (6, r) and (6, 6 - r) orthonormal bases of the wrenches that can be made, and of the rest.
     """
     if not lost.size:
-        return np.eye(6)  # without rounding
+        return np.eye(6)  # exact
     turned, levers, axes = np.linalg.svd(lost[3:], full_matrices=False)
     long = levers > LEAST_LEVER
     give_up = np.eye(6)
@@ -73,7 +76,7 @@ def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:
 
 
 def by_channel(body: Body) -> list[dict[int, int]]:
-    """Per module: number of a thruster in the module -> its index in the body."""
+    """Maps, per module, the number of a thruster in the module to its index in the body."""
     t = body.thrusters
     found: list[dict[int, int]] = [{} for _ in body.modules]
     for i, (module, channel) in enumerate(zip(t.module.tolist(), t.channel.tolist(), strict=True)):
@@ -96,28 +99,28 @@ class FaultDetector:
         self.retune(parameters)
         n = t.f_max.size
         self._obeys = np.ones(n, dtype=bool)
-        """Those that nothing was found about."""
+        """Thrusters without a fault of their own."""
         self._silent_after = max(1, SILENT_NS // period_ns)
         self._silence = [0] * len(body.modules)
-        """Ticks that each module has been silent, counted down again while one that is left out is heard."""
+        """Ticks that each module has been silent; counts down again while an excluded module is heard."""
         self._mute: list[int] = []
         self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
         self._heard, self._share = np.zeros((n, 2)), np.ones(n)
         self.words: list[str] = []
-        """What was found in this tick, for people."""
+        """Messages of this tick, for people."""
         self.changed = False
         """Whether `now` changed in this tick."""
         self.now = self._judge(self._obeys)
 
     def retune(self, parameters: Faults) -> None:
-        """Takes other limits from this tick on; what is known stays."""
+        """Applies new limits from this tick on; known faults stay."""
         self._limits = parameters.force_n, parameters.dead_share
         self._needed = np.array([parameters.dead_count, parameters.dead_count, parameters.stray_count])
         self._motion.parameters = parameters
 
     def take_over(self, before: Sequence[FaultDetector]) -> None:
-        """Goes on from the bodies that this one is made of, or was part of: what is left out stays out."""
+        """Inherits from the bodies that this one is made of, or was part of: excluded thrusters stay excluded."""
         for other in before:
             for i, j in in_both(self._modules, other._modules):
                 self._silence[i] = other._silence[j]
@@ -127,7 +130,7 @@ class FaultDetector:
         self.now = self._left()
 
     def reset(self) -> None:
-        """All thrusters are trusted again."""
+        """Trusts all thrusters again."""
         self._counts[:] = 0
         self._motion.reset()
         self.changed = not self.now.alive.all()
@@ -144,14 +147,14 @@ class FaultDetector:
         armed: bool,
         free: bool,
     ) -> ThrusterFaults:
-        """What is known after this tick.
+        """Returns the fault state after this tick.
 
         Args:
             modules: inputs of the whole fleet, by fleet index.
-            measured, estimate: of this tick.
-            force_n, mean_n: (n,) forces that the thrusters are believed to give now, and on the mean since the last tick, N.
-            armed: while disarmed nothing is looked for but propellers that turn all the same.
-            free: no magnet pulls at another body or pushes anything away; while one does, the motion says nothing of thrusters.
+            measured, estimate: measurements and estimate of this tick.
+            force_n, mean_n: (n,) believed forces of the thrusters now, and their mean since the last tick, N.
+            armed: while disarmed, only propellers that turn although they should not are looked for.
+            free: no magnet pulls at another body or pushes anything away; while one does, the motion says nothing about thrusters.
         """
         self.words, self.changed = [], False
         found = self._motion.step(measured, estimate, mean_n * self._share, self.now.alive, armed, free)
@@ -163,7 +166,7 @@ class FaultDetector:
         return self.now
 
     def _miss(self, modules: list[ModuleInputs], armed: bool) -> None:
-        """Leaves out the thrusters of modules that have fallen silent, and takes them back once those are heard again for as long."""
+        """Excludes the thrusters of modules that have fallen silent; re-admits them once the module has been heard for as long again."""
         before = self._mute
         for i, module in enumerate(modules):
             if not module.heard:
@@ -183,7 +186,7 @@ class FaultDetector:
             self.words.append(f"thrusters of silent module {silent} are left out" if less else "thrusters of every module are used again")
 
     def _left(self) -> ThrusterFaults:
-        """What may be used: all that obey, less those of silent modules where the others do without."""
+        """Returns the fault state: all thrusters that obey, without those of silent modules where the others have the same rank."""
         obeying = self._judge(self._obeys)
         if not self._mute:
             return obeying
@@ -191,7 +194,7 @@ class FaultDetector:
         return heard._replace(dead=obeying.dead) if heard.lost_axes == obeying.lost_axes else obeying
 
     def _hear(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
-        """Every ESC's feedback against what its thruster is believed to give."""
+        """Compares every ESC's feedback with the believed force of its thruster."""
         heard: list[float] = []
         for module, pairs in zip(modules, self._pairs, strict=True):
             for esc in module.esc:
@@ -207,7 +210,7 @@ class FaultDetector:
                     self._lose(i, WHY[kind])
 
     def _hear_at_rest(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
-        """Tells of a propeller that turns though nobody may turn it: somebody may be about to reach for it."""
+        """Warns of a propeller that turns while disarmed: somebody may be about to reach for it."""
         for module, thruster_at in zip(modules, self._thruster_at, strict=True):
             for esc in module.esc:
                 for channel, rpm in enumerate(esc.rpm, esc.first):
@@ -215,14 +218,14 @@ class FaultDetector:
                         self._watch_at_rest(thruster_at[channel], rpm, force_n)
 
     def _watch_at_rest(self, i: int, rpm: float, force_n: np.ndarray) -> None:
-        """One feedback. After a flight a propeller runs down, as is believed of its force."""
+        """Judges one feedback while disarmed. The limit follows the believed force, as a propeller runs down after a flight."""
         most = FAST_SHARE * abs(self.believed_rpm(i, force_n[i])) + FAST_MARGIN * self._believed[1][i]
         self._counts[i, DISOBEYS] = self._counts[i, DISOBEYS] + 1 if abs(rpm) > most else 0
         if self._counts[i, DISOBEYS] == self._needed[DISOBEYS]:
             self.words.append(f"thruster {i + 1} turns though it was told to stand still")
 
     def believed_rpm(self, i: int, force_n: float) -> float:
-        """Speed of thruster `i` at a force, 1/min."""
+        """Returns the speed of thruster `i` at a force, 1/min."""
         full_n, rpm_at_full = self._believed
         return float(believed_rpm(force_n, full_n[i], rpm_at_full[i]))
 
@@ -234,7 +237,7 @@ class FaultDetector:
 
     def _judge(self, usable: np.ndarray) -> ThrusterFaults:
         alive = usable.copy()
-        u, values, _ = np.linalg.svd(self._t.matrix * alive, full_matrices=alive.size < 6)  # all six axes, however few thrusters
+        u, values, _ = np.linalg.svd(self._t.matrix * alive, full_matrices=alive.size < 6)  # u is (6, 6) even with fewer thrusters
         rank = int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1e-12)))
         dead = tuple(int(i) for i in np.flatnonzero(~alive))
         return ThrusterFaults(alive, dead, self._rank - rank, _keep(u[:, :rank], u[:, rank:]))
@@ -242,22 +245,22 @@ class FaultDetector:
 
 @njit(f"float64(float64,{V},float64)", cache=True)
 def believed_rpm(force_n, full_n, rpm_at_full):  # type: ignore[no-untyped-def]
-    """Speed of a thruster at a force, 1/min: thrust goes with the square of the speed. full_n: (2,) full force forward, reverse."""
+    """Returns the speed of a thruster at a force, 1/min; thrust grows with its square. full_n: (2,) full force forward, reverse."""
     return math.copysign(rpm_at_full * math.sqrt(abs(force_n) / full_n[0 if force_n > 0.0 else 1]), force_n)
 
 
 @njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},float64,float64,int64[::1],int64[:,::1],{M},{V})", cache=True)
 def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts, heard, share):  # type: ignore[no-untyped-def]
-    """Counts what each feedback shows, and notes how much force it tells of; whether a fault was shown often enough by a thruster.
+    """Updates fault counts and force shares from ESC feedback; returns whether any thruster has shown a fault often enough.
 
     Args:
-        feedback: (k, 3, 2) of two thrusters each their indices (-1: there is none), speeds 1/min and EscStatus.
-        force_n, alive, full_n, rpm_at_full: of all thrusters; force believed, may be used, full forces (n, 2), full speed.
-        least_n: force from which a speed is judged, N; dead_share: as the parameter.
+        feedback: (k, 3, 2) per frame the indices (-1: none), speeds 1/min and EscStatus of its two thrusters.
+        force_n, alive, full_n, rpm_at_full: per thruster believed force, whether usable, full forces (n, 2), full speed.
+        least_n: smallest believed force at which a standstill is judged, N; dead_share: the parameter.
         needed: (3,) feedbacks in a row that suffice for DOWN, STANDS, DISOBEYS.
-        counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS; of STANDS a clear one after another counts twice.
-        heard: (n, 2) means of what the speed tells of the force times what is believed of it, and of that squared, any unit.
-        share: (n,) of the believed force that the speeds tell of, 0 to 1: a weak thruster does not lie when its ESC says so.
+        counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS; a clear STANDS after another one counts twice.
+        heard: (n, 2) running means of reported times believed force, and of believed force squared, any unit.
+        share: (n,) share of the believed force that the speeds report, 0 to 1: a thruster whose ESC reports it as weak is not a liar.
     """
     found = False
     for k in range(feedback.shape[0]):

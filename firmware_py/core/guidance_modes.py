@@ -1,6 +1,7 @@
-"""Stage 5 of a tick: what each mode makes of set-points, trajectories and sticks; and what it keeps of the controller's wrench.
+"""Stage 5 of a tick: turns set-points, trajectories and sticks into the set-point of each mode, and mixes the controller's wrench with the
+sticks.
 
-No change of mode jumps: set-points go on from where they are, and the wrench moves over within `blend_s`.
+Mode changes are free of jumps: the set-point continues from where it is, and the wrench is blended over within `blend_s`.
 """
 
 from __future__ import annotations
@@ -22,15 +23,17 @@ from firmware_py.description.parameters import Parameters
 
 ZERO, DOWN = np.zeros(3), np.array([0.0, 0.0, 1.0])
 STILL_S = 0.1
-"""Between two ticks: after more, the microcontrollers have ended all thrust (DESIGN), and the set-point goes on from the body."""
+"""Longest gap between two ticks. After a longer one the microcontrollers have stopped all thrust (DESIGN), and the set-point restarts from
+the body."""
 NEAR_M, NEAR_RAD = 0.2, 0.35
-"""A set-point no farther from the body is gone on from; otherwise the body itself is."""
+"""Largest distance, in m and rad, between set-point and body at which the set-point continues from where it is; otherwise it restarts from
+the body."""
 COME_M = 0.005
-"""A set-point so near to where the body is to meet another has come there."""
+"""Distance from the meeting point within which the set-point of a body that moves to meet another counts as arrived."""
 
 
 class Keep(IntEnum):
-    """What of the controller's force or moment is kept; the rest is the sticks'."""
+    """Part of the controller's force or moment that is used; the rest comes from the sticks."""
 
     NOTHING = 0
     VERTICAL = 1
@@ -39,7 +42,7 @@ class Keep(IntEnum):
 
 
 class Steering(NamedTuple):
-    """How a mode steers."""
+    """Parts of the controller's force and moment that a mode uses."""
 
     force: Keep
     moment: Keep
@@ -59,7 +62,7 @@ STEERING = {
 
 
 class Guidance:
-    """Keeps what was asked for, and makes each tick's set-point of it."""
+    """Stores what was requested, and makes the set-point of each tick from it."""
 
     def __init__(self, body: Body, parameters: Parameters) -> None:
         self._body = body
@@ -69,7 +72,7 @@ class Guidance:
         self._start_ns: int | None = None
         self._goal: Wish | None = None
         self._met: tuple[Wish, Wish | None] | None = None
-        """Where it held before it came to meet another body, and where it was to come."""
+        """Position held before the body moved to meet another, and the one that it was sent to."""
         self._upright = self._lost = self._led = False
         self._point: tuple[int, Setpoint] | None = None
         self._docking: Setpoint | Wish | None = None
@@ -81,7 +84,7 @@ class Guidance:
         self.mode = Mode.POSHOLD
 
     def retune(self, parameters: Parameters) -> None:
-        """Takes other limits from this tick on; set-point and what was asked for stay."""
+        """Applies new limits from this tick on; set-point and requests stay."""
         p, t = parameters.steering, self._body.thrusters
         self._p, self._fence = p, parameters.fence
         self._lead_s = parameters.control.lead_s
@@ -91,18 +94,19 @@ class Guidance:
         self._glider.retune(p.bandwidth, p.speed_m_s, p.rate_rad_s)
 
     def look(self, estimate: Estimate, health: Health) -> None:
-        """To be called before the decisions of a tick. Forgets what was wanted when place and heading take on another meaning: when the
-        body begins to stand by gravity alone, and when tags then tell it where it is and where north is.
+        """Drops goals when position and heading change their meaning; to be called before the decisions of a tick.
+
+        That is when the estimate starts from gravity alone, and when tags then give position and heading.
         """
         before, self._upright = self._upright, health.ready and not health.placed
         if self._upright != before:
             self._glider.put(at_estimate(estimate))
             self._goal = self._point = None
 
-    # ------------------------------------------------------------ what is asked for
+    # ------------------------------------------------------------ requests
 
     def apply(self, decision: Decision, time_ns: int, estimate: Estimate) -> None:
-        """Does what the supervisor decided."""
+        """Carries out a decision of the supervisor."""
         effect, argument = decision.effect, decision.argument
         if effect == Effect.TAKE_STICKS:
             self._sticks, self._sticks_ns = argument, time_ns
@@ -120,20 +124,20 @@ class Guidance:
                 self._trajectory, self._start_ns = argument, None
 
     def _level(self) -> None:
-        """A body that is steeper than a hold may keep is to turn upright where it is."""
+        """Sets a goal to turn upright in place if the set-point is tilted more than a hold may keep."""
         at = self._glider.at
         if rotate(at.q_wb, DOWN)[2] < math.cos(self._p.hold_tilt_rad):
             self._goal = Wish(ZERO, ZERO, self._inside(at.p_wb), heading(at.q_wb), self._p.level_rad_s)
 
     def rest(self, estimate: Estimate) -> None:
-        """The body is disarmed: the set-point stays where it is believed to be."""
+        """Puts the set-point at rest at the estimated pose, for a body that is disarmed."""
         self._glider.put(rest_at(estimate.p_wb, estimate.q_wb))
         self._trajectory = self._goal = self._docking = None
         self._wrench, self._blend = np.zeros(6), True
 
     def take_over(self, mode: Mode, estimate: Estimate, wrench: np.ndarray, before: Guidance | None = None) -> None:
-        """Starts in `mode` where a new body is, from the wrench (6,) that its thrusters give. The body that had its number `before` leaves
-        it the sticks: whoever moves those steers on.
+        """Starts in `mode` at the pose of a new body, from the wrench (6,) that its thrusters give. `before`, the guidance of the body that
+        had its number, hands over its stick input, so that the pilot keeps control.
         """
         self._glider.put(at_estimate(estimate))
         self.mode, self._wrench, self._blend = mode, wrench, True
@@ -141,34 +145,34 @@ class Guidance:
             self._sticks, self._sticks_ns = before._sticks, before._sticks_ns
 
     def dock(self, where: Setpoint | Wish) -> None:
-        """Where the docking sequence wants the body in this tick: just there, or on its way there."""
+        """Sets where the docking sequence wants the body in this tick: at a set-point, or on its way to a goal."""
         self._docking = where
 
     def move_by(self, by_w: np.ndarray) -> None:
-        """POSHOLD's place, or the one that it is on its way to, moves by so much (3,), world, m."""
+        """Shifts POSHOLD's position, or the one that it is on its way to, by (3,) in the world, m."""
         goal = self._held()
         self._goal = goal._replace(p_wb=self._inside(goal.p_wb + by_w))
 
     def meet(self, by_w: np.ndarray) -> None:
-        """POSHOLD's place comes so much (3,), world, m, to meet another body."""
+        """Shifts POSHOLD's position by (3,) in the world, m, to meet another body."""
         before = self._held()
         self.move_by(by_w)
         self._met = before, self._goal
 
     @property
     def comes(self) -> bool:
-        """Whether it is on its way to meet another body: not yet where it was to come, and not sent or steered elsewhere since."""
+        """Whether the body is on its way to meet another: not yet at the meeting point, and not sent or steered elsewhere since."""
         if self._met is None or self._goal is not self._met[1]:
             return False
         return bool(np.linalg.norm(self._held().p_wb - self._glider.at.p_wb) > COME_M)
 
     def go_back(self) -> None:
-        """To where it held before it came to meet another body; one that has been sent or steered elsewhere since stays there."""
+        """Returns to the position held before meeting another body, unless the body has been sent or steered elsewhere since."""
         if self._met is not None and self._goal is self._met[1]:
             self._goal = self._met[0]
 
     def _held(self) -> Wish:
-        """POSHOLD's place, or the one that it is on its way to."""
+        """POSHOLD's position, or the one that it is on its way to."""
         at = self._glider.at
         return self._goal or Wish(ZERO, ZERO, at.p_wb, at.q_wb)
 
@@ -182,7 +186,7 @@ class Guidance:
         self.mode, self._blend = mode, True
 
     def _go_on(self, estimate: Estimate) -> None:
-        """From the set-point where it is near the body, or from the body itself."""
+        """Keeps the set-point where it is near the body; otherwise restarts it from the body."""
         at = self._glider.at
         gap, turn = np.linalg.norm(at.p_wb - estimate.p_wb), np.linalg.norm(difference(at.q_wb, estimate.q_wb))
         if not (gap <= NEAR_M and turn <= NEAR_RAD):
@@ -191,7 +195,7 @@ class Guidance:
     # ------------------------------------------------------------ the set-point
 
     def step(self, time_ns: int, estimate: Estimate, health: Health) -> tuple[Setpoint, Setpoint]:
-        """The set-point at `time_ns`, and the one that the thrusters' force will meet."""
+        """Returns the set-point at `time_ns`, and the one `lead_s` later, for the feed-forward."""
         dt_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) * 1e-9
         self._time_ns = time_ns
         if dt_s > STILL_S:
@@ -202,24 +206,24 @@ class Guidance:
             sampled = self._sample(self._trajectory, time_ns)
             if sampled is not None:
                 return sampled
-            self._trajectory = None  # it has a hole: the body comes to rest before it
+            self._trajectory = None  # it has a gap: the body stops before it
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):
             self._glider.put(self._docking)
             return self._docking, ahead_of(self._docking, self._lead_s)
         wish = self._wish(time_ns)
         led, self._led = self._led, self.mode == Mode.GUIDED or bool(wish.v_w.any() or wish.w_b.any())
-        if self._led:  # by what somebody asks for, and the body may be held
+        if self._led:  # by requested speeds, while something may hold the body back
             self._glider.put(on_leash(self._glider.at, estimate))
         elif led:
             self._go_on(estimate)
         now = self._glider.step(wish, dt_s)
-        lost, self._lost = self._lost, not self._placed(health)  # in the tick in which tags tell a place, the set-point still moves to it
+        lost, self._lost = self._lost, not self._placed(health)  # when tags return, the set-point follows the body for one more tick
         if STEERING[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (lost or self._lost)):
             now = self._let_go(now, estimate)
         return now, ahead_of(now, self._lead_s)
 
     def _sample(self, trajectory: Trajectory, time_ns: int) -> tuple[Setpoint, Setpoint] | None:
-        """The trajectory's set-points; None where one of them is not finite."""
+        """Returns the trajectory's set-points, now and ahead; None where one of them is not finite."""
         assert self._start_ns is not None
         t = (time_ns - self._start_ns) * 1e-9
         now, ahead = trajectory.sample(t), trajectory.sample(t + self._lead_s)
@@ -230,7 +234,7 @@ class Guidance:
         return now, ahead
 
     def _joined(self, trajectory: Trajectory, time_ns: int) -> bool:
-        """Whether the trajectory runs; it starts when the set-point is near its start."""
+        """Whether the trajectory runs; starts it when the set-point is near its start."""
         if self._start_ns is None:
             start, at = trajectory.sample(0.0), self._glider.at
             gap, turn = np.linalg.norm(start.p_wb - at.p_wb), np.linalg.norm(difference(start.q_wb, at.q_wb))
@@ -239,7 +243,7 @@ class Guidance:
         return self._start_ns is not None
 
     def _wish(self, time_ns: int) -> Wish:
-        """Where the glider goes in this mode."""
+        """Returns the glider's goal in this mode."""
         p, at = self._p, self._glider.at
         if self.mode == Mode.AUTO and self._trajectory is not None:
             start = self._trajectory.sample(0.0)
@@ -264,7 +268,7 @@ class Guidance:
         return Wish(self._held_in(at.p_wb, v_w), rate)
 
     def _guided(self, time_ns: int) -> Wish:
-        """The newest set-point, moved on by its own speed; without a successor it moves no more."""
+        """Returns the newest streamed set-point, extrapolated by its own speed; it stops after `guided_timeout_s` without a newer one."""
         if self._point is None:
             return REST
         came_ns, point = self._point
@@ -277,7 +281,7 @@ class Guidance:
         return Wish(self._held_in(self._glider.at.p_wb, v_w), w_b, self._inside(point.p_wb + moved), q_wb)
 
     def _let_go(self, setpoint: Setpoint, estimate: Estimate) -> Setpoint:
-        """The set-point drifts along with the body where position is not held: horizontally, or wholly."""
+        """Moves the set-point along with the body where position is not held: horizontally, or in all axes."""
         p_wb = estimate.p_wb.copy()
         if STEERING[self.mode].force != Keep.NOTHING:
             p_wb[2] = setpoint.p_wb[2]
@@ -286,7 +290,7 @@ class Guidance:
         return moved
 
     def _read_sticks(self, time_ns: int) -> Sticks:
-        """The sticks, neutral when they are old or hardly moved."""
+        """Returns the sticks: all neutral when stale, and each axis neutral within its deadband."""
         if time_ns - self._sticks_ns > self._p.stick_timeout_s * 1e9:
             return Sticks()
         dead = self._p.stick_dead
@@ -294,13 +298,13 @@ class Guidance:
         return Sticks(tuple(force), tuple(moment))  # type: ignore[arg-type]
 
     def _inside(self, p_wb: np.ndarray) -> np.ndarray:
-        """The place, or the nearest one inside the fence."""
+        """Returns the position, or the nearest one inside the fence."""
         f = self._fence
         low = np.array([-f.north_m, -f.east_m, f.top_m])
         return np.asarray(np.clip(p_wb, low, np.array([f.north_m, f.east_m, f.bottom_m])))
 
     def _held_in(self, p_wb: np.ndarray, v_w: np.ndarray) -> np.ndarray:
-        """The speed without what would lead out of the fence within a second, or farther out."""
+        """Returns the velocity without the components that would lead out of the fence, or farther out, within a second."""
         soon = p_wb + v_w
         return np.where(np.abs(self._inside(soon) - soon) > np.abs(self._inside(p_wb) - p_wb), 0.0, v_w)
 
@@ -310,7 +314,7 @@ class Guidance:
     # ------------------------------------------------------------ the wrench
 
     def mix(self, wrench: np.ndarray, time_ns: int, estimate: Estimate, health: Health) -> np.ndarray:
-        """What the mode makes of the controller's wrench, (6,), body frame; passes over from the last mode's within `blend_s`."""
+        """Returns the wrench of the mode from that of the controller, (6,), body frame; blends over from the last mode within `blend_s`."""
         out = self._kept(wrench, time_ns, estimate, health)
         if self._blend:
             self._offset, self._offset_ns, self._blend = self._wrench - out, time_ns, False
@@ -339,7 +343,7 @@ class Guidance:
         return np.asarray(out)
 
     def _surfacing(self, wrench: np.ndarray, estimate: Estimate, health: Health) -> np.ndarray:
-        """Up by the controller, or by a constant force where depth is unknown; sideways only where the place is known."""
+        """Wrench of SURFACE: upward by the controller, or by a constant force if depth is unknown; horizontal only if position is known."""
         if not health.ready:
             return np.asarray(np.r_[0.0, 0.0, -self._lift_n, 0.0, 0.0, 0.0])
         out = wrench.copy()

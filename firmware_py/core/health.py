@@ -1,7 +1,6 @@
-"""How a body is: one row of figures per tick, from what its modules say and what the estimator believes. Supervisor
-and fail-safes judge it.
+"""Health of a body: one row of figures per tick, from module reports and the estimate. Supervisor and fail-safes judge it.
 
-Figures that are not known yet are NaN, so that no comparison with them holds.
+Unknown figures are NaN, so that no comparison with them holds.
 """
 
 from __future__ import annotations
@@ -21,126 +20,127 @@ from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 
 NEVER_S = 1e9
-"""Age of what never came."""
+"""Ages at or above this mean that nothing ever came."""
 MEAN_S = 1.0
 """Time over which rates and shares are averaged."""
 DRY_NS = 3_000_000_000
-"""A cabin that was wet in two readings running is dry when its sensor has been for so long: water in it moves. ArduSub waits as long."""
+"""How long a leak sensor must read dry, after two wet readings in a row, until the cabin counts as dry: water in it moves about. ArduSub
+waits as long."""
 FOREIGN_NS = 1_000_000_000
-"""So long a frame of somebody else is remembered: one that sends as slowly as once a second is one stranger."""
+"""How long a foreign frame is remembered. A sender as slow as once a second still counts as present throughout."""
 TAG_SHARE = 1.0 / 60.0
-"""Weight of one tag observation in a mean of a second: tags come at 60 Hz."""
+"""Weight of one tag observation in a one-second mean: tags come at 60 Hz."""
 UNSEEN_S = 0.5
-"""Without a tag, until nobody sees what a push does to the body: longer than frames that are lost leave it alone."""
+"""Time without a tag after which the effect of a push counts as unobserved. Longer than the gaps that ordinary frame loss makes."""
 VOLTAGE_SHARE = 0.2
-"""Weight of one reading of the supply, which come at 10 Hz: a mean of half a second."""
+"""Weight of one supply voltage reading; they come at 10 Hz, which makes it a half-second mean."""
 
 
 class Health(NamedTuple):
-    """Figures of one tick. Ages in s."""
+    """Health figures of one tick. Ages in s."""
 
     time_ns: int
     ready: bool
-    """An attitude has been found."""
+    """Whether an attitude has been found."""
     tag_age_s: float
     sigma_m: float
     """Largest standard deviation of the position, m."""
     nis_ratio: float
-    """Squared innovations over their expectation, mean of a second; 1 is right."""
+    """NIS of tags over its expectation, mean of a second; ideally 1."""
     rejected_share: float
     """Share of tag observations that the gate refused, mean of a second."""
     depth_age_s: float
-    """From the start, until one is heard."""
+    """Counts from the start until a pressure reading is heard."""
     depth_heard: bool
-    """Once, or more often."""
+    """Whether a pressure reading was ever heard."""
     imu_age_s: float
-    """Since the last sample of any module's IMU that is to be believed."""
+    """Since the last sample of any module's IMU that is trusted."""
     voltage_share: float
-    """Lowest supply of a module over its nominal one; NaN before the first reading."""
+    """Lowest supply voltage of a module over its nominal one; NaN before the first reading."""
     leak: bool
     cabin_c: float
-    """Hottest cabin; NaN before the first reading."""
+    """Temperature of the hottest cabin; NaN before the first reading."""
     cabin_change_pa: float
     """Largest change of a cabin's pressure since its first reading."""
     stopped: tuple[int, ...]
-    """Fleet indices of modules that say that an e-stop holds them: those of every body, for an e-stop is meant for all."""
+    """Fleet indices of modules that report being held by an e-stop: those of every body, because an e-stop is meant for all."""
     silent: tuple[int, ...]
-    """Fleet indices of modules that did not answer of late."""
+    """Fleet indices of modules without a recent answer."""
     silent_s: float
-    """Longest silence of a module."""
+    """Longest present silence of any module."""
     bus_silent_s: float
-    """Shortest silence of a module."""
+    """Shortest present silence of any module."""
     esc_missing: tuple[int, ...]
-    """Thrusters whose ESC does not answer, or reports a fault."""
+    """Indices of thrusters whose ESC does not answer, or reports a fault."""
     frame_errors_per_s: float
     missed_ticks_per_s: float
     foreign_sync: bool
     foreign_command: bool
-    """Somebody else sent SYNC, commanded modules, in the last second."""
+    """Whether another node sent SYNC (or commanded modules) in the last second."""
     ground_age_s: float
     """NaN before a ground station was heard."""
     pilot_age_s: float
     """NaN before a pilot was heard."""
     stick: float
-    """Largest deflection of the sticks, 0 to 1."""
+    """Largest deflection of any stick axis, 0 to 1."""
     outside_m: float
     """How far the body is beyond the fence; negative inside; NaN without a pose."""
     dead: tuple[int, ...]
-    """Thrusters that count as dead or lying."""
+    """Indices of thrusters that count as dead or lying."""
     lost_axes: int
-    """Rank that is missing because of them."""
+    """Rank lost from the thruster matrix because of unusable thrusters."""
     warm: bool
-    """Every stage has run at least once."""
+    """Whether every stage has run at least once."""
     topology: str
     """Which docked partner is lost, in words; empty: none."""
     tag_gap_s: float = math.nan
-    """Between the last two pictures of tags, believed or not; NaN while none come."""
+    """Time between the last two tag pictures, accepted or not; NaN while none come."""
     battery_age_s: float = 0.0
-    """Oldest last reading of a module's supply; the figures above stay what they were."""
+    """Age of the latest supply reading, for the module where it is oldest. The figures above keep their last values meanwhile."""
     cabin_age_s: float = 0.0
-    """The same of a module's cabin, which tells of water in it too."""
+    """The same for cabin readings, whose frame carries the leak sensor too."""
     unfit: tuple[int, ...] = ()
-    """Fleet indices of modules that say that they start, or have a fault."""
+    """Fleet indices of modules that report starting up, or a fault."""
 
     open_joints: tuple[frozenset[int], ...] = ()
-    """Modules of each joint that is open though it should hold."""
+    """Modules of each joint that is open although it should hold."""
     push_m_s: float = 0.0
-    """Speed of the current that would push the body sideways as hard as is believed, root of the mean square of a second."""
+    """Speed of the current that would explain the estimated horizontal disturbance force; RMS over a second."""
 
     @property
     def unseen_push_m_s(self) -> float:
-        """`push_m_s` while no tag is seen, else 0. Without tags the estimator cannot tell a push that it did not foresee (a wall, a hand)
-        from a speed: to the accelerometer both are the same, and both estimates run away together.
+        """`push_m_s` while no tag is seen, else 0. Without tags the estimator cannot tell an unmodelled push (a wall, a hand) from a
+        velocity: both look the same to the accelerometer, and both estimates run away together.
         """
         return self.push_m_s if self.tag_age_s > UNSEEN_S else 0.0
 
     @property
     def placed(self) -> bool:
-        """Whether tags have told heading and place."""
+        """Whether tags have given heading and position."""
         return self.ready and self.tag_age_s < NEVER_S
 
     @property
     def depth_unknown_s(self) -> float:
-        """Age of what told the depth last, pressure or tag."""
+        """Age of the newest depth information, from pressure or tag."""
         return min(self.depth_age_s, self.tag_age_s)
 
     @property
     def partner_lost(self) -> bool:
-        """Whether a docked partner is."""
+        """Whether a docked partner is lost."""
         return self.topology != ""
 
     @property
     def thruster_lost(self) -> bool:
-        """Whether any is."""
+        """Whether any thruster counts as dead or lying."""
         return len(self.dead) > 0
 
 
 @dataclass(slots=True)
 class _Latest:
-    """What a new body goes on with from those before it: of every figure the largest, which is the latest or the worst."""
+    """State that a new body inherits from the bodies it was made of: the largest of each figure, which is the latest or the worst."""
 
     time_ns: int = NEVER_NS
-    """Of the last tick."""
+    """Time of the last tick."""
     imu_ns: int = NEVER_NS
     depth_ns: int = NEVER_NS
     depth_heard: bool = False
@@ -156,7 +156,7 @@ class _Latest:
 
 
 class HealthMonitor:
-    """Keeps the ages and means of one body."""
+    """Keeps the ages and running means of one body."""
 
     def __init__(self, body: Body, parameters: Parameters, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -172,32 +172,32 @@ class HealthMonitor:
             self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._unfit, self._leak, self._wet,
             self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
         )  # fmt: skip
-        """By fleet index: what each module of the body has told last, and when."""
+        """By fleet index: the last report of each module of the body, and its time."""
         self._stopped_ns: dict[int, int] = {}
-        """By fleet index, when a module said last that an e-stop holds it; without those that have said since that none does."""
+        """By fleet index: when a module last reported being held by an e-stop. A module that reports otherwise is removed."""
         self._latest = _Latest()
         self._nis_ratio, self._rejected_share = 1.0, 0.0
         self._rejected, self._tag_ns = 0, NEVER_NS
         self._pictures_ns = (NEVER_NS, NEVER_NS)
         self.now: Health
         self.imu_heard = True
-        """Whether an IMU that is to be believed was heard in this tick; set by whoever watches them."""
+        """Whether a trusted IMU was heard in this tick; set by the code that watches the sensors."""
         self.pressure_heard = False
-        """The same of a pressure sensor."""
+        """The same for a pressure sensor."""
         self.topology, self.open_joints = "", tuple[frozenset[int], ...]()
-        """Set by whoever watches the docked faces."""
+        """Set by the code that watches the docked faces."""
         self.warm = True
-        """Cleared and set by whoever compiles."""
+        """False only if a caller clears it, for as long as compiled functions are not warmed up."""
         self.retune(parameters)
 
     def retune(self, parameters: Parameters) -> None:
-        """Takes other limits from this tick on."""
+        """Applies new limits from this tick on."""
         self._fence = parameters.fence
         self._answer_ns = round(parameters.supervision.answer_ms * 1e6)
         self._esc_fresh_ns = round(parameters.supervision.esc_fresh_ms * 1e6)
 
     def take_over(self, before: Sequence[HealthMonitor]) -> None:
-        """Goes on from the bodies that this one is made of, or was part of: what each module said last, and when people were heard."""
+        """Inherits from the bodies that this one is made of, or was part of: the last reports of each module, and `_Latest`."""
         for other in before:
             self._stopped_ns |= other._stopped_ns
             for mine, theirs in zip(self._told, other._told, strict=True):
@@ -208,9 +208,9 @@ class HealthMonitor:
         self._latest = _Latest(*map(max, zip(*(astuple(other._latest) for other in before), strict=True)))
 
     def step(self, inputs: Inputs, estimate: Estimate, requests: list[Request], faults: ThrusterFaults) -> Health:
-        """The figures of this tick; `now` keeps them."""
+        """Returns the figures of this tick, and stores them in `now`."""
         now, latest = inputs.time_ns, self._latest
-        if latest.time_ns == NEVER_NS:  # silence counts from here
+        if latest.time_ns == NEVER_NS:  # first tick: silence counts from here
             latest.time_ns = latest.depth_ns = latest.imu_ns = now
             self._heard_ns.update(dict.fromkeys(self._heard_ns, now))
         self._listen(inputs.modules, now)
@@ -231,7 +231,7 @@ class HealthMonitor:
         return self.now
 
     def _figures(self, estimate: Estimate, faults: ThrusterFaults) -> Health:
-        """All that is known at the end of the tick."""
+        """Returns all figures at the end of the tick."""
         now, latest = self._latest.time_ns, self._latest
         return Health(
             time_ns=now,
@@ -303,7 +303,7 @@ class HealthMonitor:
                 self._hear_escs(self._thruster_at[index], module.esc, now)
 
     def _hear_stops(self, modules: Sequence[ModuleInputs], now: int) -> None:
-        """Of the whole fleet: an ESTOP on one bus stops the bodies on the others too, also where only a module has heard it."""
+        """Notes e-stop reports of the whole fleet: an ESTOP on one bus stops bodies on the others too, even if only a module heard it."""
         for index, module in enumerate(modules):
             if module.mcu_state == MCU_ESTOP:
                 self._stopped_ns[index] = now
@@ -311,7 +311,7 @@ class HealthMonitor:
                 self._stopped_ns.pop(index, None)
 
     def _tag_gap_s(self, now: int) -> float:
-        """Told as long as another picture is not overdue."""
+        """Returns the time between the last two tag pictures; NaN once the next one is overdue (twice that time)."""
         before_ns, last_ns = self._pictures_ns
         gap_ns = last_ns - before_ns
         return gap_ns * 1e-9 if before_ns != NEVER_NS and now - last_ns <= 2 * gap_ns else math.nan
@@ -331,7 +331,7 @@ class HealthMonitor:
                 self._latest.stick = max(abs(value) for group in request.argument for value in group)
 
     def _rates(self, inputs: Inputs, estimate: Estimate, dt_s: float) -> None:
-        """Means of the last second: bad frames, missed ticks, and the push of the water."""
+        """Updates the one-second means: bad frames, missed ticks, and the push as an equivalent current."""
         latest, keep = self._latest, math.exp(-dt_s / MEAN_S)
         errors, latest.dropped_frames = inputs.dropped_frames - latest.dropped_frames, inputs.dropped_frames
         latest.error_rate = keep * latest.error_rate + errors / MEAN_S
@@ -341,10 +341,10 @@ class HealthMonitor:
         latest.push_m2_s2 += (1.0 - keep) * (current_m_s**2 - latest.push_m2_s2)
 
     def _judge_tags(self, estimate: Estimate, now: int) -> None:
-        """Means over the tags of about a second: their squared innovations, and the share that was refused."""
+        """Updates the means over the tags of about a second: NIS ratio, and share of refused tags."""
         refused, self._rejected = estimate.rejected - self._rejected, estimate.rejected
         before_ns, self._tag_ns = self._tag_ns, now - estimate.tag_age_ns
-        taken = estimate.ready and refused == 0 and self._tag_ns > before_ns  # the paper's estimator tells of no innovations
+        taken = estimate.ready and refused == 0 and self._tag_ns > before_ns  # the paper's estimator reports no NIS
         if estimate.nis_dof:
             self._nis_ratio += TAG_SHARE * (estimate.nis / estimate.nis_dof - self._nis_ratio)
         if estimate.nis_dof or taken:
@@ -358,14 +358,14 @@ def _age_s(at_ns: int, now_ns: int) -> float:
 
 
 def _pushed(estimate: Estimate) -> tuple[float, float]:
-    """How hard the body is pushed sideways, N, and its speed that way over ground, m/s."""
+    """Returns the horizontal disturbance force, N, and the speed over ground along it, m/s."""
     (north_n, east_n, _), v_w = estimate.force_w.tolist(), rotate(estimate.q_wb, estimate.nu[:3].copy())
     push_n = math.hypot(north_n, east_n)
     return push_n, (north_n * v_w[0] + east_n * v_w[1]) / push_n if push_n > 0.0 else 0.0
 
 
 def _current_m_s(push_n: float, speed_m_s: float, squared: float, linear: float) -> float:
-    """Speed of the current that pushes so hard upon a body that goes with it at `speed_m_s`; 0 without drag.
+    """Returns the speed of the current that exerts `push_n` on a body that moves along it at `speed_m_s`; 0 without drag.
 
     Args:
         squared, linear: N s^2/m^2 and N s/m: the drag at v through the water is `squared` v |v| + `linear` v.
@@ -376,14 +376,14 @@ def _current_m_s(push_n: float, speed_m_s: float, squared: float, linear: float)
 
 
 def _older(times_ns: list[int], oldest_ns: int) -> tuple[int, ...]:
-    """Indices of the times before `oldest_ns`."""
+    """Returns the indices of the times before `oldest_ns`."""
     if min(times_ns) >= oldest_ns:
         return ()
     return tuple(i for i, time_ns in enumerate(times_ns) if time_ns < oldest_ns)
 
 
 def beyond(p_w: np.ndarray, fence: Fence) -> dict[str, float]:
-    """How far a place (3,) is beyond each side of the fence, by the side's name, m; negative: how far inside."""
+    """Returns how far a position (3,) is beyond each side of the fence, by the side's name, m; negative inside."""
     return dict(zip(("north_m", "east_m", "top_m", "bottom_m"), _beyond(p_w, fence), strict=True))
 
 
@@ -393,5 +393,5 @@ def _beyond(p_w: np.ndarray, fence: Fence) -> tuple[float, float, float, float]:
 
 
 def outside(p_w: np.ndarray, fence: Fence) -> float:
-    """How far a place (3,) is beyond the fence, m; negative: how far inside."""
+    """Returns how far a position (3,) is beyond the fence, m; negative inside."""
     return max(_beyond(p_w, fence))

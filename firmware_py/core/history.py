@@ -1,4 +1,4 @@
-"""What the estimator keeps of the last half second: per tick the thruster wrench and the inertial and depth
+"""The estimator's buffer of the last half second: per tick the thruster wrench and the inertial and depth
 measurements.
 """
 
@@ -7,11 +7,11 @@ from __future__ import annotations
 import numpy as np
 
 WINDOW_NS = 500_000_000
-"""Tag poses older than this are refused on the bus already."""
+"""Length of the buffer. The bus already refuses older tag poses."""
 
 
 class History:
-    """A ring of samples, one a tick, written twice so that the newest k are always one contiguous slice."""
+    """Ring buffer of samples, one per tick, stored twice so that the newest k are always one contiguous slice."""
 
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
@@ -26,10 +26,10 @@ class History:
     def push(
         self, time_ns: int, tau: np.ndarray, gyro: np.ndarray | None, accel: np.ndarray | None, depth_m: float | None
     ) -> None:
-        """Appends the sample of the tick at `time_ns`; ticks that were skipped are filled with the same wrench and no
-        sensors.
+        """Appends the sample of the tick at `time_ns`. Fills skipped ticks with the same wrench and no
+        measurements.
         """
-        periods = (time_ns - self.newest_ns + self.period_ns // 2) // self.period_ns  # the nearest: a tick may come off its time
+        periods = (time_ns - self.newest_ns + self.period_ns // 2) // self.period_ns  # rounded: a tick may be early or late
         missed = min(periods - 1, self.length) if self.newest >= 0 else 0
         for _ in range(missed):
             self._write(self.newest_ns + self.period_ns, tau, None, None, None)
@@ -47,16 +47,16 @@ class History:
         self._rows[both, 3] = np.nan if depth_m is None else depth_m
 
     def time_of(self, index: int) -> int:
-        """Time of sample `index`, ns."""
+        """Returns the time of sample `index`, ns, counted back from the newest at the nominal period."""
         return self.newest_ns - (self.newest - index) * self.period_ns
 
     def first_after(self, time_ns: int) -> int:
-        """Index of the first sample later than `time_ns`, or of the oldest that is kept; one beyond the newest where none is later."""
+        """Returns the index of the first stored sample later than `time_ns`; one beyond the newest if none is later."""
         later = (self.newest_ns - time_ns - 1) // self.period_ns + 1 if time_ns < self.newest_ns else 0
         return self.newest + 1 - min(later, self.length)
 
     def since(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the samples from `index` to the newest: wrenches (k, 6), gyro readings (k, 3), accelerometer and depth (k, 4)."""
+        """Returns wrenches (k, 6), gyro readings (k, 3), and accelerometer and depth (k, 4) of the samples from `index` to the newest."""
         last = self.newest % self.length + self.length + 1
         first = last - (self.newest - index + 1)
         return self._tau[first:last], self._gyro[first:last], self._rows[first:last]

@@ -1,9 +1,9 @@
-"""Least power: of all forces that make a wrench, those whose thrusters draw the least electrical power.
+"""Least-power allocation: of all thruster forces that make a wrench, those that draw the least electrical power.
 
-Stage 7 of a tick, after the wrench is known to be within limits. The forces may only move within the null space of the
-thruster matrix, so the wrench stays. No thruster changes the side that it pushes to, nor comes nearer to zero than its
-deadband, where what it does is not known; on one side power rises smoothly, and a few quadratic programs (daqp), each with
-the power's own slope and curvature, find the least. Work and memory of a tick are fixed; nothing is kept from tick to tick.
+Stage 7 of a tick, after the wrench is known to be within limits. The forces move only within the null space of the thruster matrix,
+so that the wrench stays. No thruster changes its direction, or comes closer to zero than its deadband, where its behaviour is unknown.
+Within one direction power rises smoothly, and a few quadratic programs (daqp), each with the slope and curvature of the power, find the
+minimum. Work and memory of a tick are bounded; no state is kept between ticks.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import total_power
 
 PASSES = 3
-"""Quadratic programs of a tick; power that is quadratic in the force needs one."""
+"""Quadratic programs per tick; a power curve that is quadratic in the force would need one."""
 ITERATIONS = 200
-"""Most changes of the active set in one program; a 2x2 of modules needs about 40."""
+"""Limit of active-set changes in one program; a 2x2 of modules needs about 40."""
 LEAST_BEND = 0.02
-"""Smallest curvature, W/N^2: a fitted curve may bend down somewhere, a program may not."""
+"""Smallest curvature used, W/N^2: a fitted curve may bend down somewhere, but a program must be convex."""
 SOLVED = 1
 """daqp's exit flag for optimal."""
 
@@ -40,7 +40,7 @@ def slopes(force, power_forward, power_reverse, slope, bend):  # type: ignore[no
 
 
 class LeastPower:
-    """Moves the forces of one body within its null space."""
+    """Moves the thruster forces of one body within its null space."""
 
     def __init__(self, thrusters: ThrusterSet, alive: np.ndarray) -> None:
         """`alive`: (n,) bool, thrusters that may be used."""
@@ -51,11 +51,11 @@ class LeastPower:
         self._slope, self._bend = np.zeros(alive.size), np.zeros(alive.size)
 
     def confine(self, f_min: np.ndarray, f_max: np.ndarray) -> None:
-        """Keeps within these limits (n,), N, from now on."""
+        """Sets the force limits (n,), N, from now on."""
         self._f_min, self._f_max = f_min, f_max
 
     def step(self, base: np.ndarray) -> np.ndarray:
-        """(n,) forces, N, of the same wrench and within the same limits as `base`, and of no more power."""
+        """Returns (n,) forces, N, with the wrench and limits of `base` and at most its power."""
         if not self._free.size:
             return base
         t = self._t
@@ -72,7 +72,7 @@ class LeastPower:
         return force if self.power_w(force) < self.power_w(base) else base
 
     def _program(self, force: np.ndarray, base: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, int]:
-        """min p'(f) x + 1/2 p''(f) (x - f)^2 over x = base + N z, low <= N z <= high."""
+        """Solves min p'(f) x + 1/2 p''(f) (x - f)^2 over x = base + N z, low <= N z <= high; returns x and daqp's exit flag."""
         slopes(force, self._t.power_forward, self._t.power_reverse, self._slope, self._bend)
         used, free = self._used, self._free
         bend = self._bend[used]
@@ -83,12 +83,12 @@ class LeastPower:
         return moved, flag
 
     def power_w(self, force: np.ndarray) -> float:
-        """Electrical power of all thrusters by the vehicle's curves, W."""
+        """Returns the electrical power of all thrusters by the vehicle's curves, W."""
         return float(total_power(force, self._t.power_forward, self._t.power_reverse))
 
 
 def _null_space(matrix: np.ndarray) -> np.ndarray:
-    """(n, n - rank) orthonormal directions that make no wrench."""
+    """(n, n - rank) orthonormal basis of the forces that make no wrench."""
     _, sizes, rows = np.linalg.svd(matrix)
     rank = int(np.sum(sizes > RANK_TOLERANCE * sizes.max(initial=0.0)))
     return np.ascontiguousarray(rows[rank:].T)

@@ -1,6 +1,6 @@
-"""Last stage of a tick, after everything else: per thruster force, slew and arm state, per module supply and magnets; then the command.
+"""Last stage of a tick: limits force, slew rate and arm state per thruster, and supply and magnets per module; then makes the commands.
 
-Whatever asks for a force, nothing leaves that this file has not passed.
+Every thruster force passes through this file, whatever asked for it.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, RELAY_PUSH, Roo
 from firmware_py.description.parameters import Limiter as LimiterParameters
 
 VOLTAGE_EXPONENT = 1.2
-"""Force over supply voltage at a fixed command: T200 at 16 V against 12 V, 5.25 / 3.71 kgf (t200_16v.csv, t200_12v.csv)."""
+"""Exponent of force over supply voltage at a fixed command: T200 at 16 V against 12 V, 5.25 / 3.71 kgf (t200_16v.csv, t200_12v.csv)."""
 VOLTAGE_RANGE = (0.6, 1.4)
-"""Share of the nominal voltage outside of which a reading is not believed, and counts as nominal."""
+"""Valid range of a voltage reading, as a share of the nominal voltage; a reading outside is replaced by the nominal voltage."""
 POWER_HALVINGS = 12
-"""Bisections of the share that meets the supply limit."""
+"""Bisection steps for the share of the forces that meets the supply limit."""
 EASED_STEP_N, EASED_S = 0.8, 0.2
-"""Fastest change in a tick while thrusters pass from one body's allocation to another's, and for how long."""
+"""Slew limit, N per tick, while thrusters pass from one body's allocation to another's, and how long it applies."""
 
 
 class Limiter:
-    """Limits one body's thrusters. Remembers the last forces for the slew limit."""
+    """Limits the thrusters of one body. Keeps the last forces for the slew limit."""
 
     def __init__(self, body: Body, parameters: LimiterParameters, dt_s: float) -> None:
         t = body.thrusters
@@ -44,12 +44,12 @@ class Limiter:
         self._room: Room | None = None
         self._room_for: tuple[object, ...] = ()
         self.magnets = [MagnetLimiter(parameters, dt_s) for _ in body.modules]
-        """One for each module."""
+        """One per module."""
         self.force_n = np.zeros(t.f_max.size)
         self.retune(parameters)
 
     def retune(self, parameters: LimiterParameters) -> None:
-        """Takes other limits from this tick on; forces and the magnets' accounts stay."""
+        """Applies new limits from this tick on; forces and the magnets' accounts stay."""
         t = self._t
         self._limits = (
             t.f_min * parameters.force_share, t.f_max * parameters.force_share,
@@ -61,7 +61,7 @@ class Limiter:
             magnets.retune(parameters)
 
     def room(self, voltage_v: np.ndarray) -> Room:
-        """What passes at this supply (m,), beside the magnets that are on; the same object for as long as it is the same."""
+        """Returns the limits at this supply voltage (m,), less the power of the active magnets; the same object until they change."""
         scale, magnets_w = self._voltage_scale(voltage_v), [magnets.power_w for magnets in self.magnets]
         if self._room is None or self._room_for != (self._scaled_for, magnets_w):
             low, high, full_low, full_high = self._limits
@@ -71,18 +71,18 @@ class Limiter:
         return self._room
 
     def ease(self, force_n: np.ndarray) -> None:
-        """Goes on from the forces (n,) of the bodies before, whose thrusters these were, and changes them slowly at first."""
+        """Continues from the forces (n,) that these thrusters had in the bodies before, with the lower slew limit at first."""
         self.force_n, self._eased = force_n, self._eased_ticks
 
     def step(
         self, wanted_n: np.ndarray, armed: bool, voltage_v: np.ndarray, alive: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Limited forces (n,) N and commands (n,) in -1..1.
+        """Returns limited forces (n,) N and commands (n,) in -1..1.
 
         Args:
             wanted_n: (n,) N; a value that is not finite counts as zero.
-            armed: without it every command is zero in this very tick.
-            voltage_v: (m,) measured supply of each module.
+            armed: if false, every command is zero in this very tick.
+            voltage_v: (m,) measured supply voltage of each module.
             alive: (n,) bool, thrusters that may turn; the others stop in this very tick. None: all.
         """
         if not armed:
@@ -102,7 +102,7 @@ class Limiter:
         return wanted, out
 
     def _limit_power(self, wanted: np.ndarray, module: int, supply: float) -> None:
-        """Scales the forces of one module down until its supply can give their power."""
+        """Scales down the forces of one module until its supply can provide their power."""
         index = self._of_module[module]
         force = wanted[index]
         forward, reverse = self._power[module]
@@ -114,7 +114,7 @@ class Limiter:
         wanted[index] = force * kept
 
     def _voltage_scale(self, voltage_v: np.ndarray) -> np.ndarray:
-        """(n,) force at a full command over that at the nominal voltage; 1 where the reading is not believed."""
+        """Returns (n,) force at a full command over that at the nominal voltage; 1 where the reading is invalid."""
         reading = voltage_v.tobytes()
         if reading != self._scaled_for:  # readings come at 10 Hz
             ratio = voltage_v / self._nominal_v
@@ -128,29 +128,30 @@ def limit_forces(wanted, last, alive, scale, low, high, full_low, full_high, ste
     """Writes the limited force of each thruster, N; all but `step` are (n,).
 
     Args:
-        wanted, last: force asked for, and of the tick before. alive: may turn.
+        wanted, last: wanted force, and force of the tick before. alive: may turn.
         scale: force at a full command over that at the nominal voltage.
-        low, high: limits by the parameters. full_low, full_high: what full commands give at the nominal voltage.
+        low, high: limits from the parameters. full_low, full_high: forces at full commands and nominal voltage.
         step: largest change in a tick, N.
     """
     for i in range(out.shape[0]):
         force = wanted[i] if math.isfinite(wanted[i]) else 0.0
         force = min(max(force, last[i] - step), last[i] + step)
-        # what a full command gives at this voltage: more must not be believed
+        # capped at what a full command gives at this voltage, so that the believed force is no larger
         force = min(max(force, low[i], full_low[i] * scale[i]), high[i], full_high[i] * scale[i])
         out[i] = force if alive[i] else 0.0
 
 
 def is_believed(ratio: np.ndarray) -> np.ndarray:
-    """Whether readings of a supply may be true, given as shares of its nominal voltage. A NaN may not."""
+    """Whether supply voltage readings, given as shares of the nominal voltage, are valid. A NaN is not."""
     low, high = VOLTAGE_RANGE
     return np.asarray((ratio >= low) & (ratio <= high))
 
 
 class MagnetLimiter:
-    """Keeps the docking magnets of one module from burning: each may be on for a while, and for a share of time for ever.
+    """Protects the docking magnets of one module from overheating: limits the time on at a stretch and the long-term duty cycle.
 
-    A magnet's account falls by the time that it is on, and fills at the rate of its duty. An empty one goes off until it is half full.
+    Each magnet has an account, s, that falls by the time that the magnet is on and fills at the rate of its duty. A magnet whose account is
+    empty is switched off until the account is half full.
     """
 
     def __init__(self, parameters: LimiterParameters, dt_s: float) -> None:
@@ -160,20 +161,20 @@ class MagnetLimiter:
         self.states = (RELAY_OFF,) * FACES
         """Relay states of the last tick."""
         self.power_w = 0.0
-        """What the magnets that are on take, W."""
+        """Power of the magnets that are on, W."""
         self.retune(parameters)
 
     @property
     def resting(self) -> list[int]:
-        """Faces whose magnet is off until its account is half full, whatever is wanted."""
+        """Faces whose magnet is forced off until its account is half full."""
         return [face for face, rests in enumerate(self._resting) if rests] if True in self._resting else []
 
     def retune(self, parameters: LimiterParameters) -> None:
-        """Takes other limits from this tick on; accounts stay."""
+        """Applies new limits from this tick on; accounts stay."""
         self._p, self._is_cold = parameters, False
 
     def step(self, wanted: Sequence[int]) -> tuple[int, ...]:
-        """The relay states that are permitted in this tick; a state that does not exist is off. To be called in every tick."""
+        """Returns the permitted relay states of this tick; an unknown state counts as off. To be called in every tick."""
         if self._is_cold and not any(wanted):
             return self.states
         full, duty = self._p.relay_on_s, self._p.relay_duty

@@ -1,4 +1,4 @@
-"""Stage 1 of a tick: the sensors of all modules of a body become one set of measurements in the body frame."""
+"""Stage 1 of a tick: fuses the sensors of all modules of a body into one set of measurements in the body frame."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservat
 from firmware_py.description.water import WATER_DENSITY
 
 ATMOSPHERE_PA = 101_325.0
-"""Standard atmosphere; what the weather adds is the estimator's depth bias."""
+"""Standard atmosphere; the estimator's depth bias takes up changes by the weather."""
 FLIP_RAD = 0.35
-"""Tags of one picture that disagree by more with the most that agree are flipped and left out (20 deg; noise is 0.5); so is one that tells
-of such a tilt against gravity before any was believed."""
+"""Attitude difference beyond which a tag counts as flipped and is left out (20 deg; noise is 0.5): against the largest group of agreeing
+tags in its picture, and, before any tag was accepted, against the tilt by gravity."""
 
 SECOND_HAND = 0
-"""Quality of a tag whose place was told through another one, by a camera that a module carries: the other's errors add to its own."""
+"""Quality of a tag whose pose was measured relative to another one, by a camera on a module: the other's errors add to its own."""
 SECOND_HAND_WEIGHT = 1.0 / 9.0
-"""What such a tag is worth: half a degree of the carrier over half a metre is three times a tag's own noise."""
+"""Weight of a second-hand tag: half a degree of the carrier over half a metre is three times a tag's own noise."""
 CENTRED_M = 1e-9
-"""IMUs whose mean is nearer to the centre of mass stand around it: what is left is rounding."""
+"""Distance of the mean IMU position from the centre of mass below which the IMUs count as centred: the rest is rounding."""
 ALPHA_S = 0.03
-"""Time over which the gyro's differences are averaged: over 0.3 m of lever their noise makes 0.02 m/s^2, without it 0.1 at 100 Hz."""
+"""Averaging time of the gyro's differences: at 0.3 m of lever their noise makes 0.02 m/s^2; without averaging 0.1 at 100 Hz."""
 GYRO_BIASES, ACCEL_BIASES, DEPTH_BIASES = 0.1, 1.0, 0.5
-"""By how much a sensor may be off the mean of all, rad/s, m/s^2, m: twenty sigmas and more of the bench's draw of biases. One that fails
-tells zeros or its limit: gravity off, for as long as it takes to be found."""
+"""Largest plausible deviation of a sensor from the mean of all, rad/s, m/s^2, m: twenty sigmas and more of the bench's draw of biases. A
+failed sensor reads zeros or its limit, off by gravity, until it is found."""
 TURN_NS = 100_000_000
-"""Within so long each pressure sensor is heard, five times over (DEPTH comes at 50 Hz, DESIGN's bus); who is not is silent."""
+"""Time without a reading, while others are heard, after which a pressure sensor counts as silent: five times its period (DEPTH comes at
+50 Hz, DESIGN's bus)."""
 STILL_RAD_S = 0.05
-"""Slower than that the rate makes no difference to an IMU anywhere in the body: 0.75 mm/s^2 over 0.3 m."""
+"""Angular rate below which centripetal acceleration is negligible at any IMU in the body: 0.75 mm/s^2 over 0.3 m."""
 
 
 Seen = list[tuple[TagObservation, int]]
-"""Tags of one picture, and which of the body's tags each is."""
+"""Tags of one picture, each with its index among the body's tags."""
 
 
 class Measurements:
-    """Fuses what the modules of one body say. Holds geometry, and the angular acceleration."""
+    """Fuses the sensor readings of one body's modules. Holds geometry, learnt sensor offsets, and the angular acceleration."""
 
     def __init__(self, body: Body, period_ns: int) -> None:
         self._modules = body.modules
@@ -56,7 +57,7 @@ class Measurements:
         self._gain = self._share * per_s
         count = len(body.modules)
         self._apart = np.kron(np.ones((count, 1)), -self._mean_of_all)
-        """(3 count, 3 count) readings of all modules -> how each differs from their mean, body frame."""
+        """(3 count, 3 count) matrix from the readings of all modules to the difference of each from their mean, body frame."""
         for i in range(count):
             self._apart[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += self._rotations[:, i]
         self._gyro_offsets = SensorOffsets(count, 3, GYRO_BIASES, period_ns)
@@ -64,10 +65,10 @@ class Measurements:
         self._depth_offsets = SensorOffsets(count, 1, DEPTH_BIASES, period_ns)
         self._turn = max(1, TURN_NS // period_ns)
         self._depths_m, self._depth_age = np.zeros(count), np.full(count, self._turn)
-        """Last depth of each sensor, and ticks with a depth since then."""
+        """Last depth of each sensor, and ticks with any depth reading since then."""
         self._no_swing = np.zeros(3 * count)
         self._swing_of = per_s * -np.vstack([skew(r) for r in self._r_bi - self._mean_r_bi])
-        """(3 count, 3) change of the rate within a tick -> by how much it lets each IMU differ from their mean."""
+        """(3 count, 3) matrix from the rate change within a tick to the resulting difference of each accelerometer from their mean."""
         self._is_still = False
         self._last_gyro: np.ndarray | None = None
         self._alpha = np.zeros(3)
@@ -76,11 +77,11 @@ class Measurements:
         self._q_tb = np.array([conjugate(np.ascontiguousarray(q)) for q in body.q_bt]).reshape(-1, 4)
 
     def fuse(self, modules: Sequence[ModuleInputs], q_wb: np.ndarray) -> Measured:
-        """One measurement of each kind.
+        """Returns one measurement of each kind.
 
         Args:
             modules: inputs of the whole fleet, by fleet index.
-            q_wb: (4,) latest attitude, for the height of each pressure sensor above the centre of mass.
+            q_wb: (4,) latest attitude, for the height of each pressure sensor above the centre of mass, and to break ties between tags.
         """
         mine = [modules[i] for i in self._modules]
         gyro = self._mean([m.gyro for m in mine], self._gyro_offsets, self._no_swing if self._is_still else None)
@@ -88,12 +89,12 @@ class Measurements:
         return Measured(gyro, self._accel([m.accel for m in mine], gyro), self._depth(mine, q_wb), self._poses(mine, q_wb))
 
     def _mean(self, readings: list[np.ndarray | None], offsets: SensorOffsets, swing: np.ndarray | None) -> np.ndarray | None:
-        """Mean over all modules, (3,) in the body frame. Where some were not heard: what the mean of all would be, by the offsets learnt.
+        """Returns the mean over all modules, (3,) in the body frame. Corrects it by the learnt offsets where some modules were not heard.
 
         Args:
-            readings: of each module (3,), its own frame; None: not heard.
-            swing: (3 count,) by how much the readings differ from their mean because of the body's motion: what is left are offsets, and
-                these are learnt. None: not known, and nothing is learnt.
+            readings: reading of each module (3,), in its own frame; None: not heard.
+            swing: (3 count,) difference of each reading from the mean caused by the body's motion; the rest are offsets, which are learnt.
+                None: unknown, nothing is learnt.
         """
         heard = [value for value in readings if value is not None]
         if not heard:
@@ -107,7 +108,7 @@ class Measurements:
         return np.asarray(self._mean_of_all.dot(stacked))
 
     def _accel(self, readings: list[np.ndarray | None], gyro: np.ndarray | None) -> np.ndarray | None:
-        """Mean specific force (3,) less what turning adds at the mean place of those heard, as far as a gyro tells it."""
+        """Returns the mean specific force (3,); if a gyro is heard, less the effect of rotation at the mean position of the IMUs heard."""
         swing, heard = self._swing(gyro), [value is not None for value in readings]
         accel = self._mean(readings, self._accel_offsets, swing)
         if not self._centred or len(heard) > 1:
@@ -118,18 +119,18 @@ class Measurements:
         return np.asarray(accel - cross(self._alpha, lever) - cross(gyro, cross(gyro, lever)))
 
     def _swing(self, gyro: np.ndarray | None) -> np.ndarray | None:
-        """(3 count,) by how much the accelerometers differ from their mean because the body's rate changes, m/s^2; None unless the body is
-        nearly still, for else its rate counts too.
+        """Returns (3 count,) difference of each accelerometer from their mean due to angular acceleration, m/s^2. None unless the body is
+        nearly still, because otherwise its angular rate matters too.
 
-        Taken from the gyro's change in the last tick, unsmoothed: its noise is large, but cancels in the mean over many ticks by which
-        offsets are learnt, and it does not lag.
+        Computed from the gyro's change in the last tick, unsmoothed: its noise is large, but averages out over the many ticks over which
+        offsets are learnt, and it has no lag.
         """
         if not self._is_still or gyro is None or self._last_gyro is None:
             return None
         return np.asarray(self._swing_of @ (gyro - self._last_gyro))
 
     def _follow(self, gyro: np.ndarray | None) -> None:
-        """Keeps the angular acceleration, rad/s^2: the gyro's change from tick to tick, smoothed; from zero after a tick without gyro."""
+        """Updates the angular acceleration, rad/s^2: the smoothed change of the gyro from tick to tick; zero after a tick without gyro."""
         if gyro is None or self._last_gyro is None:
             self._alpha = np.zeros(3)
         else:
@@ -137,7 +138,7 @@ class Measurements:
         self._last_gyro = gyro
 
     def _lever(self, heard: list[bool]) -> np.ndarray:
-        """(3,) mean place of the sensors that were heard, from the centre of mass, body frame."""
+        """Returns (3,) mean position of the sensors that were heard, from the centre of mass, body frame."""
         return self._mean_r_bi if all(heard) else np.asarray(self._r_bi[heard].mean(axis=0))
 
     def _depth(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> float | None:
@@ -153,11 +154,13 @@ class Measurements:
         return depth_m
 
     def _depth_offset(self, which: list[bool], each_m: np.ndarray) -> float:
-        """What is to be taken off the mean of the sensors that were heard in this tick, m: where some have fallen silent, by how much it is
-        off the mean of all. 0 while none has: healthy ones come in turns, a few ticks apart, and the estimator learns their mean's bias.
+        """Returns the correction to subtract from the mean depth of the sensors heard in this tick, m.
+
+        Where some have fallen silent, it is the offset of that mean from the mean of all. It is 0 while none has: healthy sensors take
+        turns, a few ticks apart, and the estimator learns the bias of their mean.
 
         Args:
-            which: of each module of the body, whether its sensor was heard. each_m: (heard,) what those tell of the centre of mass.
+            which: per module of the body, whether its sensor was heard. each_m: (heard,) depth of the centre of mass by each of those.
         """
         self._depth_age += 1
         self._depth_age[which], self._depths_m[which] = 0, each_m
@@ -168,7 +171,7 @@ class Measurements:
         return 0.0
 
     def _poses(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> list[BodyPose]:
-        """One pose for each picture, oldest first."""
+        """Returns one pose per picture, oldest first."""
         pictures: dict[int, Seen] = {}
         for index, module in enumerate(mine):
             for tag in module.tags:
@@ -178,7 +181,7 @@ class Measurements:
         return [self._one_pose(capture, seen, q_wb) for capture, seen in sorted(pictures.items())]
 
     def _one_pose(self, capture_ns: int, seen: Seen, q_wb: np.ndarray) -> BodyPose:
-        """Weighted mean of the tags of one picture; those that stand alone against the others are left out as flipped."""
+        """Returns the weighted mean of the tags of one picture; tags that disagree with the largest group are left out as flipped."""
         if len(seen) == 1:
             tag, k = seen[0]
             return BodyPose(capture_ns, tag.p_wt, self._levers[k], multiply(tag.q_wt, self._q_tb[k]), _weight(tag))
@@ -190,18 +193,18 @@ class Measurements:
 
 
 def _weight(tag: TagObservation) -> float:
-    """How many tags of full quality an observation is worth."""
+    """Returns the weight of an observation, in tags of full quality."""
     return SECOND_HAND_WEIGHT if tag.quality == SECOND_HAND else 1.0
 
 
 @njit(f"float64({M},{M},{M},{M},{V},{V},{V},{V},{V})", cache=True)
 def fuse_picture(p_wt, q_wt, levers, q_tb, weights, q_near, mean_p_wt, mean_lever, mean_q_wb):  # type: ignore[no-untyped-def]
-    """Writes the weighted means of the largest group of tags that agree on the attitude; of equal groups of the one nearest to `q_near`.
+    """Writes the weighted means of the largest group of tags that agree on the attitude; of equal groups, the one nearest to `q_near`.
 
     Args:
-        p_wt, q_wt: (k, 3), (k, 4) poses of the tags in the world; levers, q_tb: their places in the body, body frame to
-            tag frame; weights: (k,), positive.
-        mean_p_wt, mean_lever, mean_q_wb: are written, (3,), (3,), (4,).
+        p_wt, q_wt: (k, 3), (k, 4) poses of the tags in the world; levers, q_tb: (k, 3) their positions in the body, and (k, 4) body frame
+            to tag frame; weights: (k,), positive.
+        mean_p_wt, mean_lever, mean_q_wb: outputs, (3,), (3,), (4,).
 
     Returns the weight of the group.
     """
@@ -211,7 +214,7 @@ def fuse_picture(p_wt, q_wt, levers, q_tb, weights, q_near, mean_p_wt, mean_leve
         q_wb[i] = multiply(q_wt[i], q_tb[i])
     agreement = np.abs(q_wb @ q_wb.T) > math.cos(0.5 * FLIP_RAD)
     group = agreement[np.argmax(agreement.sum(axis=1) + 0.5 * np.abs(q_wb @ q_near))]
-    first = np.argmax(group * weights)  # the heaviest of the group: the others' turns count from it
+    first = np.argmax(group * weights)  # the heaviest of the group: rotations are averaged relative to it
     reference, weight, total, turn = q_wb[first], 0.0, 0.0, np.zeros(3)
     for i in range(count):
         if group[i]:

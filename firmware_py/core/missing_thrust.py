@@ -1,8 +1,8 @@
-"""Finds the thruster whose force is missing in the motion, whatever its ESC says. Part of `faults`.
+"""Finds a thruster whose force is missing from the motion, whatever its ESC reports. Part of `faults`.
 
-The wrench that the motion shows, less the one that was commanded and modelled, is averaged over tenths of a second. When it
-changes, and one thruster's lost force explains the change in all six components, that thruster lies. Slow changes (current,
-trim, buoyancy) are not looked at.
+The wrench residual, measured by the motion minus commanded and modelled, is averaged over blocks of a tenth of a second. If it
+changes, and the lost force of one thruster explains the change in all six components, that thruster lies. Slow changes (current,
+trim, buoyancy) are ignored.
 """
 
 from __future__ import annotations
@@ -21,46 +21,46 @@ from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 
 BLOCK_NS = 100_000_000
-"""Length of a block."""
+"""Length of an averaging block."""
 RECENT, GAP, BASE = 5, 12, 30
-"""Blocks: what is judged is the mean of the last half second; against that of three seconds that ended 1.2 s before now."""
+"""Numbers of blocks: the mean of the last half second is compared with the mean of three seconds that ended 1.2 s before now."""
 LEAST_BASE = 5
-"""Blocks that the base needs."""
+"""Whole blocks needed in the base."""
 SIGMA_FORCE_N, SIGMA_TILT, SIGMA_YAW = 0.15, 0.006, 0.010
-"""What a healthy module's half-second mean is off, N, N m of roll and pitch, N m of yaw: accelerometer tilt and noise, gains, gusts
+"""Sigma of the half-second mean of a healthy module, N, N m of roll and pitch, N m of yaw: accelerometer tilt and noise, gains, gusts
 (measured on the bench)."""
 GUST_M_S, GUST_LEVER_M = 0.0135, 0.03
-"""Change of the water's speed within seconds that counts as noise: what it does to the drag of a body under way, and how far beside the
-centre that acts. Of a module that is the 0.15 N measured above, of a BlueROV2 Heavy 0.7 N."""
+"""Change of the water's speed within seconds that counts as noise, for its effect on the drag of a body under way, and the lever arm of
+that force about the centre. For a module the force is the 0.15 N measured above, for a BlueROV2 Heavy 0.7 N."""
 DRIFT_M_S = 0.04
-"""Speed that the water is assumed to have. A body that turns or reverses meets it from another side within seconds, so its drag may be off
-by this times the slope of the drag. That acts at the body's middle and makes no moment, so moments are trusted more under way."""
+"""Assumed speed of the water. A body that turns or reverses meets it from another side within seconds, so its drag may be off by this speed
+times the slope of the drag. The force acts at the body's middle and makes no moment, so moments are trusted more under way."""
 MODEL_SHARE = 0.12
-"""What mass, drag and gain errors make of the wrench that acts: share of it that counts as noise too. Of the Coriolis wrench it is this
-share and that by which the water's drift changes the speed."""
+"""Model error as a share of the acting wrench, from mass, drag and gain errors; counts as additional noise. For the Coriolis wrench the
+share by which the water's drift changes the speed is added."""
 EXPLAINED = 0.8
 """Share of the change (squared, in sigmas) that one thruster must explain."""
 LEFT = 9.2
-"""Squared sigmas that a thruster may leave unexplained: of the five axes that its loss says nothing of, noise leaves less nine times in
-ten (chi-squared). A wall, a hand or a rope pushes nearly as some thruster would, but seldom so exactly."""
+"""Squared sigmas that a thruster may leave unexplained: the 90 % quantile of chi-squared noise in the five axes that its loss does not
+determine. A wall, a hand or a rope pushes nearly as some thruster would, but seldom so exactly."""
 RUNNER_UP = 0.5
-"""What it leaves unexplained must be less than this share of what the next best leaves."""
+"""Largest residual of the best thruster as a share of that of the next best."""
 SIGNIFICANT = 20.0
-"""Squared sigmas that it must explain."""
+"""Squared sigmas that a thruster must explain."""
 CROSS_SHARE = 1.0 / 9.0
-"""Of a body's reach, squared: what the mean square distance of its hull from a turning axis is, L^2 / 12 for a cube of edge L. A body
-that turns under way meets the water faster on one side than on the other; the drag's slope times this brakes the turn, and no model of
-the firmware has it. Of a module that makes 0.20 N m by m/s and rad/s; tools/identify.py finds 0.14 to 0.21."""
+"""Mean square distance of the hull from a rotation axis, as a share of the body's squared reach: L^2 / 12 for a cube of edge L. A body
+that turns under way meets the water faster on one side than on the other; the drag's slope times this brakes the turn, which no model of
+the firmware includes. For a module that makes 0.20 N m per m/s and rad/s; tools/identify.py finds 0.14 to 0.21."""
 CORIOLIS, CROSSED, MUNK, FORCES = 15, 21, 24, 27
-"""Columns of a block where these begin: Coriolis wrench, speed across times rate, products of speeds, forces; two more follow."""
+"""First columns of a block's Coriolis wrench, speed across times rate, products of speeds, and forces; two more columns follow those."""
 FRESH_NS = 500_000_000
-"""Age of the newest tag from which on nothing is judged: without tags a robot that tumbles knows its tilt and speed too badly."""
+"""Age of the newest tag at which judging stops: without tags, tilt and speed of a tumbling robot are known too poorly."""
 MOST = 2.6
-"""A thruster cannot lose more than this many times its force: 2 is reversed."""
+"""Largest loss of a thruster as a multiple of its force; 2 means reversed."""
 
 
 class MissingThrust:
-    """Watches one body's motion."""
+    """Watches the motion of one body for missing thrust."""
 
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
@@ -78,23 +78,23 @@ class MissingThrust:
             np.repeat([DRIFT_M_S * body.drag.cruise_slope / CRUISE_M_S, 0.0], 3),
             np.repeat([CROSS_SHARE * body.reach_m**2 * body.drag.cruise_slope / CRUISE_M_S, MODEL_SHARE * float(body.mass[0, 0])], 3),
         )  # fmt: skip
-        """What `explain` takes as sigma, tilt, doubt, drift and flow."""
+        """Arguments sigma, tilt, doubt, drift and flow of `explain`."""
         self._period_s = period_ns * 1e-9
         self.forget()
 
     def reset(self) -> None:
-        """Suspicion is dropped; what the disarmed body did stays as the base."""
+        """Drops any suspicion; keeps the blocks, so that the motion of the disarmed body serves as the base."""
         self._suspect, self._count = -1, 0
 
     def forget(self) -> None:
-        """What was seen no longer counts, because the body has changed."""
+        """Drops all blocks and any suspicion, because the usable thrusters have changed."""
         self._blocks = np.full((GAP + BASE, FORCES + self._columns.shape[0] + 2), np.nan)
         self._suspect, self._count = -1, 0
         self._start_block(None)
 
     def _start_block(self, gyro: np.ndarray | None) -> None:
         self._seen: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]] = []
-        """Of each tick of the block speed, attitude, forces and what was felt."""
+        """Velocity, attitude, forces and specific force of each tick of the block."""
         self._first = self._last = gyro
         self._first_n = self._last_n = 0
         self._free = True
@@ -102,7 +102,7 @@ class MissingThrust:
     def step(
         self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool, free: bool
     ) -> int | None:
-        """The thruster that lies, once it is sure.
+        """Returns the thruster that lies, once it is certain; else None.
 
         Args:
             force_n: (n,) believed mean forces since the last tick, N.
@@ -130,17 +130,17 @@ class MissingThrust:
             self._last, self._last_n = measured.gyro, len(self._seen)
 
     def _close(self, estimate: Estimate) -> bool:
-        """Ends the block; whether it is whole."""
+        """Ends the block and stores it; returns whether it is whole, that is, can be judged."""
         n, accels, speed = len(self._seen), 0, 0.0
         felt, model, coriolis, flow, forces = np.zeros(3), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(self._columns.shape[0])
-        for nu, q_wb, force_n, accel in self._seen:  # together, by code that the processor then has at hand
+        for nu, q_wb, force_n, accel in self._seen:  # in one batch, while the code is in the processor's cache
             speed += add_tick(nu, q_wb, force_n, *self._plant, model, coriolis, flow, forces)
             if accel is not None:
                 accels += 1
                 add_motion(accel, q_wb, felt)
         span = (self._last_n - self._first_n) * self._period_s
         known = accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
-        alone = estimate.p_wb[2] > self._body.reach_m  # at the surface pushes what no model here knows
+        alone = estimate.p_wb[2] > self._body.reach_m  # forces at the surface are not modelled here
         whole = known and alone and self._free and estimate.tag_age_ns < FRESH_NS
         rest, acted = np.full(6, np.nan), self._columns.T @ (forces / n)
         if whole and self._last is not None and self._first is not None:
@@ -153,7 +153,7 @@ class MissingThrust:
         return whole
 
     def _decide(self, alive: np.ndarray) -> int | None:
-        """Judges the change; returns a thruster that was suspected often enough in a row."""
+        """Judges the change; returns a thruster that was suspected in enough blocks in a row."""
         best = self._explain(alive)
         if best < 0 or best != self._suspect:
             self._suspect, self._count = best, int(best >= 0)
@@ -162,7 +162,7 @@ class MissingThrust:
         return best if self._count >= self.parameters.lie_count else None
 
     def _explain(self, alive: np.ndarray) -> int:
-        """The one thruster that explains the change, or -1."""
+        """Returns the one thruster that explains the change, or -1."""
         return int(explain(self._blocks, self._columns, alive, *self._healthy, self.parameters.lie_share))
 
 
@@ -171,22 +171,22 @@ DOWN = np.array([0.0, 0.0, GRAVITY])
 
 @njit(f"void({V},{NODES},{V},{V},{V},{V},{V})", cache=True)
 def add_model(righting, nodes, rotational, linear, nu, q_wb, out):  # type: ignore[no-untyped-def]
-    """Adds to `out` (6,) what drag and buoyancy do to the body."""
+    """Adds the wrench of drag and buoyancy to `out` (6,)."""
     add_drag(nodes, rotational, linear, nu, out)
     add_restoring(righting, q_wb, out)
 
 
 @njit(f"void({M},{V},{V})", cache=True)
 def add_coriolis(mass, nu, out):  # type: ignore[no-untyped-def]
-    """Adds to `out` (6,) what Coriolis forces do to the body, against an acceleration as it is felt: dv/dt + w x v."""
+    """Adds the Coriolis wrench to `out` (6,), relative to the acceleration that an accelerometer measures: dv/dt + w x v."""
     take_coriolis(mass, nu, out)
     out += np.ascontiguousarray(mass[:, :3]) @ cross(nu[3:], nu[:3])
 
 
 @njit(f"void({V},{V})", cache=True)
 def add_flow(nu, out):  # type: ignore[no-untyped-def]
-    """Adds to `out` (6,) for each axis the speed across it times the rate about it, m/s rad/s, and the product of the other two speeds,
-    m^2/s^2: a body whose masses along those differ by 1 kg from what is believed turns by that many N m more (Munk)."""
+    """Adds to `out` (6,) for each axis the speed across it times the rate about it, m/s rad/s, and the product of the other two velocities,
+    m^2/s^2: the additional (Munk) moment, N m, per kg of error in the difference of the masses along those two axes."""
     across = abs(nu[0]) + abs(nu[1]) + abs(nu[2])
     for i in range(3):
         out[i] += (across - abs(nu[i])) * nu[3 + i]
@@ -195,7 +195,7 @@ def add_flow(nu, out):  # type: ignore[no-untyped-def]
 
 @njit(f"void({V},{V},{V})", cache=True)
 def add_motion(accel, q_wb, out):  # type: ignore[no-untyped-def]
-    """Adds to `out` (3,) the acceleration of a body that feels `accel` (3,), m/s^2."""
+    """Adds to `out` (3,) the acceleration of a body that measures the specific force `accel` (3,), m/s^2."""
     down = turned_back(q_wb, 0.0, 0.0, GRAVITY)
     for i in range(3):
         out[i] += accel[i] + down[i]
@@ -203,7 +203,7 @@ def add_motion(accel, q_wb, out):  # type: ignore[no-untyped-def]
 
 @njit(f"float64({V},{V},{V},{M},{V},{NODES},{V},{V},{V},{V},{V},{V})", cache=True)
 def add_tick(nu, q_wb, force_n, mass, righting, nodes, rotational, linear, model, coriolis, flow, forces):  # type: ignore[no-untyped-def]
-    """Adds one tick to the sums of a block, the last four, and returns the speed, m/s."""
+    """Adds one tick to the sums of a block (the last four arguments) and returns the speed, m/s."""
     add_model(righting, nodes, rotational, linear, nu, q_wb, model)
     add_coriolis(mass, nu, coriolis)
     add_flow(nu, flow)
@@ -213,7 +213,7 @@ def add_tick(nu, q_wb, force_n, mass, righting, nodes, rotational, linear, model
 
 @njit(cache=True)
 def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
-    """Mean (w,) of those of the blocks (k, w) that are whole, and how many there are; others have NaN for a wrench."""
+    """Returns the mean (w,) over the whole blocks of (k, w), and their number; the wrench of the others is NaN."""
     total, count = np.zeros(blocks.shape[1]), 0
     for k in range(blocks.shape[0]):
         if not math.isnan(blocks[k, 0]):
@@ -224,17 +224,16 @@ def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
 
 @njit(f"int64({M},{M},boolean[::1],{V},{V},{V},{V},{V},float64)", cache=True)
 def explain(blocks, columns, alive, sigma, tilt, doubt, drift, flow, lie_share):  # type: ignore[no-untyped-def]
-    """The one thruster that explains the change of the latest blocks against the oldest, or -1.
+    """Returns the one thruster that explains the change of the latest blocks against the oldest, or -1.
 
     Args:
-        blocks: (GAP + BASE, FORCES + n + 2) wrench missing 0:6, wrench that acted 6:12, down in the body 12:15, Coriolis wrench
-            15:21, what `add_flow` adds 21:27, forces, sigma of the tilt, speed.
-        columns: (n, 6) wrench of unit force. alive: (n,) who may be suspected.
-        sigma, doubt, drift: (6,) what a healthy body's change may be: noise and model; by each radian of doubt about the tilt; by each
-            m/s that it made.
-        flow: (6,) moment by each unit by which what `add_flow` adds changed.
-        tilt: (4,) how far net buoyancy, N, and weight times the lever of buoyancy, N m, along each axis may be off.
-        lie_share: least share of its force that a liar has lost.
+        blocks: (GAP + BASE, FORCES + n + 2) residual wrench 0:6, thruster wrench 6:12, down in the body 12:15, Coriolis wrench
+            15:21, output of `add_flow` 21:27, forces, sigma of the tilt, speed.
+        columns: (n, 6) wrench of unit force. alive: (n,) thrusters that may be suspected.
+        sigma, doubt, drift: (6,) sigma of a healthy body's change: of noise; per radian of sigma of the tilt; per m/s of speed.
+        flow: (6,) sigma of the moment per unit of change in the output of `add_flow`.
+        tilt: (4,) sigma of net buoyancy, N, and of weight times the lever of buoyancy along each axis, N m.
+        lie_share: smallest share of its force that a liar has lost.
     """
     n = columns.shape[0]
     old, base = _mean_of_whole(blocks[:BASE])
@@ -260,7 +259,7 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, flow, lie_share):
     best, least, second = -1, total, total
     for t in range(n):
         left = total
-        for force in (new[FORCES + t], change[FORCES + t]):  # lost since, or lost all along
+        for force in (new[FORCES + t], change[FORCES + t]):  # lost since the base, or lost all along
             size, fit = 0.0, 0.0
             for i in range(6):
                 phi = -columns[t, i] * force / unsure[i]

@@ -1,8 +1,8 @@
-"""Turns one thruster, or one after the other (MOTOR_DETECT), past controller and allocator; the limiter still has the
-last word.
+"""Motor test: turns one thruster, or all one after the other (MOTOR_DETECT), bypassing controller and allocator; the limiter still
+applies.
 
-MOTOR_DETECT turns each forward, twice as long in reverse, and forward again, all with the same force: what that does to place and
-attitude of a free robot is undone at its end, and both directions are seen.
+MOTOR_DETECT turns each thruster forward, twice as long in reverse, and forward again, all with the same force. This shows both
+directions, and undoes its own effect on position and attitude of a free robot.
 """
 
 from __future__ import annotations
@@ -13,27 +13,29 @@ from firmware_py.core.body import Body
 from firmware_py.description.steering_parameters import Steering
 
 PAUSE_SHARE = 0.5
-"""Pause after each thruster over the time that it turns."""
+"""Pause after each thruster, as a share of the time that it turns."""
 LONGEST_S = 10.0
-"""A test that is asked to last longer ends then."""
+"""Longest duration of a test; a longer request is cut to it."""
 
 
 class MotorTest:
-    """The forces of the running test."""
+    """Makes the forces of the running test."""
 
     def __init__(self, body: Body, parameters: Steering) -> None:
         self.parameters = parameters
         self._high, self._low = body.thrusters.f_max, body.thrusters.f_min
         self._plan: list[tuple[int, int, float]] = []
-        """Until when, ns, which thruster, with what force, N."""
+        """Steps in order: end time, ns; thruster; force, N."""
 
     @property
     def running(self) -> bool:
-        """Whether a test is on."""
+        """Whether a test is in progress."""
         return bool(self._plan)
 
     def start(self, argument: tuple[int, float, float], time_ns: int) -> None:
-        """One thruster: (index, share of full command, seconds), as `requests` lets it pass. One that the body does not have is none."""
+        """Starts a test of one thruster: (index, share of largest force, seconds), as checked by `requests`. Ignores an index that the body
+        does not have.
+        """
         self.stop()
         index, share, seconds = argument
         if index >= self._high.size:
@@ -43,7 +45,7 @@ class MotorTest:
         self._plan = [(time_ns + round(1e9 * max(0.0, min(seconds, LONGEST_S))), index, force)]
 
     def detect(self, time_ns: int) -> None:
-        """All thrusters, one after the other, each with its share of what its weaker direction can give."""
+        """Starts a test of all thrusters, one after the other, each with `test_share` of the force of its weaker direction."""
         self.stop()
         turn, pause = round(1e9 * self.parameters.test_s), round(1e9 * self.parameters.test_s * PAUSE_SHARE)
         force = self.parameters.test_share * np.minimum(self._high, -self._low)
@@ -57,11 +59,11 @@ class MotorTest:
             ]
 
     def stop(self) -> None:
-        """Ends it at once."""
+        """Ends the test at once."""
         self._plan = []
 
     def step(self, time_ns: int) -> np.ndarray:
-        """(n,) forces of this tick, N."""
+        """Returns the (n,) forces of this tick, N."""
         while self._plan and time_ns >= self._plan[0][0]:
             self._plan.pop(0)
         force = np.zeros(self._high.size)

@@ -1,7 +1,7 @@
 """The estimator's measurement models, compiled: residual, Jacobian and noise of the inertial sensors with depth, and
 of a tag.
 
-States and errors are those of `propagation`. One row for each number measured; what did not come (NaN) has no row.
+States and errors are those of `propagation`. A model has one row per measured number; a missing one (NaN) has no row.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ ANY_NIS = math.inf
 
 @njit(cache=True)
 def inertial(x, gyro, accel, depth, sigma, moved, mobility):  # type: ignore[no-untyped-def]
-    """Gyro (3,), accelerometer (3,) and depth; sigma (3,) in that order.
+    """Measurement model of gyro (3,), accelerometer (3,) and depth; sigma (3,) in that order.
 
-    The accelerometer gives the tilt and the disturbance: its model is gravity plus `moved` (3,), the acceleration that thrusters, drag
-    and disturbance give the body by the process model, body frame. mobility: (3, 3) acceleration for a force, body frame.
+    The accelerometer observes the tilt and the disturbance: its model is gravity plus `moved` (3,), the acceleration of the body by the
+    process model from thrusters, drag and disturbance, body frame. mobility: (3, 3) acceleration per force, body frame.
     """
     residual = np.empty(7)
     h = np.zeros((7, ERRORS))
@@ -56,8 +56,8 @@ def inertial(x, gyro, accel, depth, sigma, moved, mobility):  # type: ignore[no-
 
 @njit(cache=True)
 def tag(x, p_wt, lever_b, q_wb, variance):  # type: ignore[no-untyped-def]
-    """Tag centre p_wt (3,) at lever_b (3,) and attitude q_wb (4,); variance (6,) of position (world) and attitude
-    (body).
+    """Measurement model of a tag: centre p_wt (3,) at lever_b (3,) and attitude q_wb (4,); variance (6,) of position (world) and
+    attitude (body).
     """
     q = x[3:7]
     r = to_matrix(q)
@@ -73,18 +73,18 @@ def tag(x, p_wt, lever_b, q_wb, variance):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def update(x, covariance, residual, h, variance, shared, gate):  # type: ignore[no-untyped-def]
-    """Normalised innovation squared, and state and covariance after the measurement; as they were where `gate` is exceeded.
+    """Returns the normalised innovation squared, and state and covariance after the measurement; unchanged where `gate` is exceeded.
 
-    The Kalman filter's update, a row at a time: the noise of the rows is independent, so that no matrix is inverted, and the
+    The Kalman filter's update, one row at a time: the noise of the rows is independent, so that no matrix is inverted, and the
     squared innovations over their variances add up to residual^T S^-1 residual (Bierman 1977, chapter II). filterpy's
-    update gives the same (tests) in eight times the time.
+    update gives the same result (tests) in eight times the time.
 
     Args:
         x, covariance: (32,) and (28, 28).
         residual, h, variance: (m,), (m, 28), (m,) of the measurement.
-        shared: (m, 28) covariance of the noise of each row with the error: what moved the state may be what was measured. Only of
-            errors that no row sees itself (a column of zeros in h), so that the rows stay independent.
-        gate: largest normalised innovation squared that is believed. One that is not a number is not.
+        shared: (m, 28) covariance of each row's noise with the error, for a disturbance that both moves the state and is measured. Non-zero
+            only for errors that no row observes (a column of zeros in h), so that the rows stay independent.
+        gate: largest normalised innovation squared that is accepted. A NaN is not.
     """
     p = covariance.copy()
     error = np.zeros(ERRORS)
@@ -106,7 +106,7 @@ def update(x, covariance, residual, h, variance, shared, gate):  # type: ignore[
         innovation *= root
         nis += innovation**2
         for i in range(ERRORS):
-            ph[i] *= root  # so that what is taken off is symmetric to the last bit
+            ph[i] *= root  # so that the reduction of p is symmetric to the last bit
         for i in range(ERRORS):
             gain = ph[i]
             error[i] += gain * innovation
@@ -121,12 +121,12 @@ def update(x, covariance, residual, h, variance, shared, gate):  # type: ignore[
 def fuse_inertial(  # type: ignore[no-untyped-def]
     x, covariance, tau, gyro, accel, depth, elapsed, dt, density, under_way, sigma, mass, mass_inv, righting, nodes, rotational, linear
 ):  # fmt: skip
-    """State and covariance after one sample of gyro, accelerometer and depth, each NaN where it did not come.
+    """Returns state and covariance after one sample of gyro, accelerometer and depth, each NaN where missing.
 
-    The acceleration that no model foresaw (white, `density` (28,) per second) has moved the body over the `elapsed` seconds of the last
-    prediction, and the accelerometer has felt it: so the velocity follows what was felt, not what was commanded. What it says of a part
-    of its `dt` seconds counts for that part. Under way it feels more than the model tells (`under_way`, as `predict`): mass and drag are
-    not as believed.
+    The unmodelled acceleration (white, `density` (28,) per second) has moved the body over the `elapsed` seconds of the last prediction,
+    and the accelerometer has measured it: so the velocity follows the measured acceleration, not the commanded one. A sample that is
+    fused for only a part of its `dt` seconds is weighted for that part. Under way the accelerometer noise is larger (`under_way`, as in
+    `predict`), because mass and drag are uncertain.
     """
     moved = inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, linear)
     mobility = np.ascontiguousarray(mass_inv[:3, :3])
@@ -148,12 +148,12 @@ def advance(  # type: ignore[no-untyped-def]
     x, covariance, taus, gyros, others, first, count, dt, rest, density, under_way, sigma,
     mass, mass_inv, righting, nodes, rotational, linear,
 ):  # fmt: skip
-    """State and covariance moved on through stored samples, each fused at its time.
+    """Returns state and covariance advanced through stored samples, each fused at its time.
 
     Args:
-        taus: (k, 6), gyros: (k, 3), others: (k, 4) accelerometer and depth, of each tick, NaN where none came.
-        first: time to the first sample, s; count: samples to fuse; dt: between them, s; rest: what is left after the last, s.
-        density, under_way: as `predict`. sigma: (3,) as `inertial`.
+        taus: (k, 6), gyros: (k, 3), others: (k, 4) accelerometer and depth, of each tick, NaN where missing.
+        first: time to the first sample, s; count: samples to fuse; dt: time between them, s; rest: time left after the last, s.
+        density, under_way: as in `predict`. sigma: (3,) as in `inertial`.
     """
     for i in range(count):
         tau, elapsed = taus[i], first if i == 0 else dt
@@ -174,18 +174,18 @@ def advance(  # type: ignore[no-untyped-def]
 
 @njit(f"Tuple((float64,{V},{M}))({V},{M},{V},{V},{V},{V},float64,float64)", cache=True)
 def fuse_tag(x, covariance, p_wt, lever_b, q_wb, variance, tags, gate):  # type: ignore[no-untyped-def]
-    """`update` by so many tags of one picture, of which `tag` tells."""
+    """Applies `update` with the mean pose of one picture, worth `tags` tags (variance / tags)."""
     residual, h, noise = tag(x, p_wt, lever_b, q_wb, variance / tags)
     return update(x, covariance, residual, h, noise, np.zeros((6, ERRORS)), gate)
 
 
 @njit(f"{STATE}({V},{M},float64,int64,float64)", cache=True)
 def fuse_stillness(x, covariance, variance, axes, heading_variance):  # type: ignore[no-untyped-def]
-    """State (32,) and covariance (28, 28) after measurements that are made up: no speed over ground, and the heading that is believed.
+    """Returns state (32,) and covariance (28, 28) after pseudo-measurements: zero velocity over ground, and the believed heading.
 
     Args:
-        variance: of the speed, (m/s)^2; axes: 2: of the horizontal speed alone, 3: downwards too.
-        heading_variance: rad^2; infinite: nothing is said of the heading.
+        variance: variance of the zero velocity, (m/s)^2; axes: 2 for the horizontal velocity alone, 3 for the vertical one too.
+        heading_variance: rad^2; infinite leaves the heading unmeasured.
     """
     r, rows = to_matrix(x[3:7]), axes + 1
     h, residual, noise = np.zeros((rows, ERRORS)), np.zeros(rows), np.full(rows, variance)
@@ -200,11 +200,11 @@ def fuse_stillness(x, covariance, variance, axes, heading_variance):  # type: ig
 
 @njit(cache=True)
 def carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance):  # type: ignore[no-untyped-def]
-    """(6,) variance of position (world) and attitude (body) after carrying the state for `lag` seconds by gyro and
+    """Returns the (6,) variance of position (world) and attitude (body) after carrying the state for `lag` seconds by gyro and
     model.
 
     Args:
-        density: (28,) process noise, per second. rate_variance: of the carried attitude, rad^2/s.
+        density: (28,) process noise, per second. rate_variance: growth of the attitude variance, rad^2/s.
     """
     r = to_matrix(x[3:7])
     f = np.zeros((6, ERRORS))
@@ -237,7 +237,7 @@ def is_sound(x, variance):  # type: ignore[no-untyped-def]
 def carried(  # type: ignore[no-untyped-def]
     x, covariance, taus, gyros, dt, until_first, density, lag, rate_variance, mass, mass_inv, righting, nodes, rotational, linear
 ):  # fmt: skip
-    """State (32,) now, sigma (6,) of its pose, and whether both are sound. Arguments are those of `carry` and `carried_pose_variance`."""
+    """Returns state (32,) now, sigma (6,) of its pose, and whether both are sound. Arguments as `carry` and `carried_pose_variance`."""
     now = carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rotational, linear)
     variance = carried_pose_variance(x, covariance, density, mass_inv, lag, rate_variance)
     return now, np.sqrt(variance), is_sound(now, variance)

@@ -1,4 +1,4 @@
-"""The paper's estimator: a constant-velocity Kalman filter on tag poses alone. Stands in for `estimator` with `--controller paper`."""
+"""The paper's estimator: a constant-velocity Kalman filter on tag poses alone. Replaces `estimator` with `--controller paper`."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from firmware_py.description.parameters import Estimation
 PAPER_ACCEL_DENSITY = 0.05
 """Acceleration noise of the constant-velocity model, m/s^2/sqrt(Hz); synthetic, the paper gives none."""
 PAPER_ALPHA_DENSITY = 0.5
-"""Angular likewise, rad/s^2/sqrt(Hz); synthetic."""
+"""The same for angular acceleration, rad/s^2/sqrt(Hz); synthetic."""
 PAPER_FLIP_RAD = 0.5
-"""A tag that jumps further than this is a flip; any working tag tracker refuses it, and begins anew where it stays so."""
+"""Attitude jump beyond which a tag counts as flipped. Any working tag tracker refuses such a tag, and restarts if the jump persists."""
 PLACED, TURNED = (np.ix_([*range(i, i + 3), *range(i + 6, i + 9)], [*range(i, i + 3), *range(i + 6, i + 9)]) for i in (0, 3))
-"""Where position with velocity, and attitude with rate, stand in a covariance (28, 28)."""
+"""Indices of position with velocity, and of attitude with rate, in a covariance (28, 28)."""
 
 
 class TagOnlyEstimator:
-    """The paper's: a constant-velocity Kalman filter on tag poses alone, no delay made up, no disturbance. State: pose, velocity.
+    """Constant-velocity Kalman filter on tag poses alone, without delay compensation or disturbance. State: pose, velocity.
 
-    Position and attitude are filtered apart, each with the error state [pose 0:3, velocity 3:6].
+    Position and attitude are filtered separately, each with the error state [pose 0:3, velocity 3:6].
     """
 
     def __init__(self, body: Body, parameters: Estimation, period_ns: int) -> None:
-        from filterpy.kalman import predict, update  # with scipy.stats: 0.4 s and 45 MB that no other estimator needs
+        from filterpy.kalman import predict, update  # imports scipy.stats: 0.4 s and 45 MB that no other estimator needs
 
         self._predict, self._update = predict, update
         self._p = parameters
@@ -53,7 +53,7 @@ class TagOnlyEstimator:
         self._last_tag_ns = NEVER_NS
 
     def retune(self, parameters: Estimation) -> None:
-        """Takes other noise figures from the next tick on."""
+        """Applies new noise parameters from the next tick on."""
         self._p = parameters
 
     @property
@@ -63,8 +63,8 @@ class TagOnlyEstimator:
 
     @property
     def motion(self) -> Motion:
-        """State and covariance now, for a body that joins or parts. Biases and disturbance, which it does not know, are zero
-        without variance.
+        """Current state and covariance, for a body that docks or undocks. Biases and disturbance, which this filter does not estimate,
+        are zero with zero variance.
         """
         x = np.zeros(STATES)
         x[:3], x[3:7] = self._position[:3], self._q_wb
@@ -76,7 +76,7 @@ class TagOnlyEstimator:
         return Motion(x, covariance, self._accepted, self._last_tag_ns)
 
     def restart(self, time_ns: int, motion: Motion) -> Estimate:
-        """Goes on from `motion` at `time_ns`; returns the estimate of the same tick."""
+        """Restarts from `motion` at `time_ns`; returns the estimate of the same tick."""
         x = motion.x
         self._q_wb = x[3:7].copy()
         self._position = np.concatenate([x[:3], rotate(self._q_wb, x[7:10].copy())])
@@ -88,7 +88,7 @@ class TagOnlyEstimator:
         return self._estimate(time_ns)
 
     def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:
-        """The estimate at `time_ns` from the tags of `measured` alone."""
+        """Returns the estimate at `time_ns` from the tags of `measured` alone."""
         if self._accepted:
             self._position, self._p_position = self._predict(self._position, self._p_position, self._f, self._q_position)
             self._q_wb = multiply(self._q_wb, exp(self._rate_b * self._dt))
@@ -144,7 +144,7 @@ class TagOnlyEstimator:
 
 
 def _turned(covariance: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """(6, 6) covariance of position and velocity, the velocity in other axes by `turn` (3, 3)."""
+    """Returns the (6, 6) covariance of position and velocity with the velocity rotated into other axes by `turn` (3, 3)."""
     whole = np.eye(6)
     whole[3:, 3:] = turn
     return np.asarray(whole @ covariance @ whole.T)

@@ -1,9 +1,9 @@
-"""The estimator's process model, compiled: the nominal state moved over a step, and the Jacobian of its error.
+"""The estimator's process model, compiled: propagation of the nominal state over a step, and the Jacobian of its error.
 
 Nominal state x (32,): position p_wb 0:3, attitude q_wb 3:7, velocity nu 7:13 (body), gyro bias 13:16, accelerometer
-bias 16:19, disturbance force 19:22 (world, N), disturbance moment 22:25 (body, N m), depth bias 25, and what the body's righting vector
-is off, 26:29 (body, N m), as arm and trim are: once known it tells the moment at every attitude; a disturbance moment would have to follow.
-29:32 is no state of the robot: down (body) as the gains take it, on a leash (LEASH).
+bias 16:19, disturbance force 19:22 (world, N), disturbance moment 22:25 (body, N m), depth bias 25, and the error of the body's righting
+vector, 26:29 (body, N m), due to arm and trim: once known, it gives the moment at every attitude, which a disturbance moment could only
+follow. 29:32 is not a state of the robot but the down direction (body) used in the gains; it follows the attitude with a deadband (LEASH).
 Error state e (28,): the same with the attitude error as a rotation vector in the body frame: dp 0:3, dtheta 3:6, dnu
 6:12, dbg 12:15, dba 15:18, df 18:21, dm 21:24, dbz 24, dh 25:28.
 """
@@ -22,12 +22,12 @@ from firmware_py.core.rotations import M, V, cross, exp, multiply, normalise, ro
 STATES = 32
 ERRORS = 28
 LEASH = 0.02
-"""How far down may turn, rad, before the gains of the righting vector follow: one degree, five times what a robot that hovers tilts
-(3.5 mrad RMS with the noise that the filter believes in). The jitter of a robot that holds its attitude
-goes with the noise that the innovations are made of. Gains that took it for tilting found an arm in it that grew for an hour,
-surer by the minute."""
+"""Deadband, rad, within which the down direction may turn before the gains of the righting vector follow: one degree, five times the tilt
+of a hovering robot (3.5 mrad RMS with the noise that the filter assumes). The attitude jitter of a robot that holds its attitude is
+correlated with the noise in the innovations. Gains that took this jitter for tilting estimated a righting arm from it that grew for an
+hour, with ever smaller variance."""
 MOVING = 12
-"""Errors of pose and velocity, which come first; those of biases, disturbance and righting stand still in a prediction."""
+"""Number of errors of pose and velocity, which come first; those of biases, disturbance and righting are constant in a prediction."""
 PLANT = f"{M},{M},{V},{NODES},{V},{V}"
 """Types of the body's arrays: mass, mass_inv, righting, drag nodes, rotational and linear damping."""
 STATE = f"Tuple(({V},{M}))"
@@ -36,8 +36,8 @@ STATE = f"Tuple(({V},{M}))"
 
 @njit(cache=True)
 def accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, total, out):  # type: ignore[no-untyped-def]
-    """Writes to `out` (6,) dnu/dt of the body under the (6,) wrench `external` (thrusters and disturbance, body frame), and to the
-    first six of `total` the whole wrench.
+    """Writes dnu/dt of the body under the (6,) wrench `external` (thrusters and disturbance, body frame) to `out` (6,), and the total
+    wrench to the first six elements of `total`.
     """
     for i in range(6):
         total[i] = external[i]
@@ -52,7 +52,7 @@ def accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, lin
 
 @njit(cache=True)
 def acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(6,) dnu/dt of the body under the (6,) wrench `external`."""
+    """Returns (6,) dnu/dt of the body under the (6,) wrench `external`."""
     out = np.empty(6)
     accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, np.empty(6), out)
     return out
@@ -60,7 +60,7 @@ def acceleration(nu, q, external, mass, mass_inv, righting, nodes, rotational, l
 
 @njit(cache=True)
 def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(3,) acceleration of the centre of mass against the world, body frame, in state x under the thruster wrench tau
+    """Returns the (3,) acceleration of the centre of mass relative to the world, body frame, in state x under the thruster wrench tau
     (6,).
     """
     q, nu = x[3:7], x[7:13]
@@ -73,7 +73,7 @@ def inertial_acceleration(x, tau, mass, mass_inv, righting, nodes, rotational, l
 
 @njit(cache=True)
 def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, work, out):  # type: ignore[no-untyped-def]
-    """Writes to `out` (32,), which is not x, the state after dt seconds; `work`: (7, 6) for what lies between. Allocates nothing."""
+    """Writes the state after dt seconds to `out` (32,), which must not be x; `work`: (7, 6) scratch memory. Allocates nothing."""
     q, q_mid, nu, nu_mid, external, rate, believed = work[0], work[1], work[2], work[3], work[4], work[5], work[6, :3]
     half = 0.5 * dt
     q[:4] = x[3:7]
@@ -114,7 +114,7 @@ def step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, w
 
 @njit(cache=True)
 def step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(32,) state after dt seconds under the thruster wrench tau (6,), by the midpoint rule."""
+    """Returns the (32,) state after dt seconds under the thruster wrench tau (6,), by the midpoint rule."""
     out = np.empty(STATES)
     step_into(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear, np.empty((7, 6)), out)
     return out
@@ -122,9 +122,9 @@ def step(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # ty
 
 @njit(cache=True)
 def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(12, 28) moving rows of F = I + A dt + (A dt)^2 / 2 of the error over one step, A the Jacobian at x.
+    """Returns the first (12, 28) rows (pose and velocity) of F = I + A dt + (A dt)^2 / 2 of the error over one step, A the Jacobian at x.
 
-    Biases, disturbance and righting stand still: their rows of F are those of the identity.
+    Biases, disturbance and righting are constant: their rows of F are those of the identity.
     """
     q = x[3:7]
     nu = x[7:13].copy()
@@ -165,30 +165,31 @@ def transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear):
 
 @njit(cache=True)
 def squared_speeds(x):  # type: ignore[no-untyped-def]
-    """Squares of the speed, m^2/s^2, and of the rate of turning, rad^2/s^2, of state x."""
+    """Returns the squared speed, m^2/s^2, and the squared angular rate, rad^2/s^2, of state x."""
     return x[7] ** 2 + x[8] ** 2 + x[9] ** 2, x[10] ** 2 + x[11] ** 2 + x[12] ** 2
 
 
 @njit(cache=True)
 def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """State (32,) and covariance (28, 28) after dt seconds: F P F^T + Q.
+    """Returns state (32,) and covariance (28, 28) after dt seconds: F P F^T + Q.
 
-    What turned the body unforeseen has turned it for half of the step, as the gyro at its end then tells (Q of a double integrator,
-    Bar-Shalom et al. 2001, 6.2.2): without that a body that meets 0.5 rad/s^2 more than its model knows is wrong by 8 deg after a minute
-    at 100 Hz. Q is diagonal otherwise: what half a step of unforeseen acceleration moves is nothing that tags would not tell.
+    Unmodelled angular acceleration has turned the body during half of the step by the time the gyro at its end measures it: attitude and
+    rate have the Q of a double integrator (Bar-Shalom et al. 2001, 6.2.2). Without that a body that meets 0.5 rad/s^2 more than its model
+    knows is wrong by 8 deg after a minute at 100 Hz. Q is diagonal otherwise: tags correct the displacement by half a step of unmodelled
+    linear acceleration.
 
     Args:
         density: (28,) process noise of a body at rest, per second.
-        under_way: (5,) what motion adds, as what is not as believed of current, drag and mass is felt in proportion to it: to the
-            random walk of the disturbance force N/sqrt(s) for each m/s and for each rad/s; to the angular acceleration rad/s^2/sqrt(Hz)
-            for each rad/s; to the noise of the accelerometer (`observation.fuse_inertial`) m/s^2 for each m/s and for each rad/s.
+        under_way: (5,) additional noise of a moving body, because errors of current, drag and mass act in proportion to its motion: of the
+            random walk of the disturbance force N/sqrt(s) per m/s and per rad/s; of the angular acceleration rad/s^2/sqrt(Hz) per rad/s;
+            of the accelerometer (`observation.fuse_inertial`) m/s^2 per m/s and per rad/s.
     """
     f = transition(x, tau, dt, mass, mass_inv, righting, nodes, rotational, linear)
     moved = f @ covariance
     out = covariance.copy()
     out[:MOVING, :MOVING] = moved @ np.ascontiguousarray(f.T)
     for i in range(MOVING):
-        for j in range(i):  # rounding off symmetry would grow with every unstable motion, and no measurement damps it
+        for j in range(i):  # asymmetry from rounding would grow with every unstable motion, undamped by measurements
             out[i, j] = out[j, i] = 0.5 * (out[i, j] + out[j, i])
         for j in range(MOVING, ERRORS):
             out[i, j] = out[j, i] = moved[i, j]
@@ -208,12 +209,12 @@ def predict(x, covariance, tau, dt, density, under_way, mass, mass_inv, righting
 
 @njit(cache=True)
 def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rotational, linear):  # type: ignore[no-untyped-def]
-    """(32,) state moved from the anchor to now through stored inputs.
+    """Returns the (32,) state carried from the head to now through stored inputs.
 
     Args:
         taus: (k, 6) mean thruster wrench of each remaining tick; gyros: (k, 3) measured rate at its end, NaN where
-            none came.
-        dt: tick, s; until_first: what is left of the first tick, s.
+            missing.
+        dt: tick period, s; until_first: remaining part of the first tick, s.
     """
     now, after, work = x.copy(), np.empty(STATES), np.empty((7, 6))
     for i in range(taus.shape[0]):
@@ -229,7 +230,7 @@ def carry(x, taus, gyros, dt, until_first, mass, mass_inv, righting, nodes, rota
 
 @njit(cache=True)
 def inject(x, e):  # type: ignore[no-untyped-def]
-    """(32,) state with the (28,) error added."""
+    """Returns the (32,) state with the (28,) error added."""
     out = x.copy()
     out[:3] += e[:3]
     out[3:7] = normalise(multiply(x[3:7], exp(e[3:6])))

@@ -11,7 +11,7 @@ from firmware_py.core.rotations import M, V
 
 @njit(cache=True)
 def take_coriolis(mass, nu, out):  # type: ignore[no-untyped-def]
-    """Takes the (6,) wrench C(nu) nu from `out`, without an allocation: C is never made.
+    """Subtracts the (6,) wrench C(nu) nu from `out`; allocates nothing, because C is never formed.
 
     Fossen (2011), theorem 3.2, of a symmetric (6, 6) mass matrix: C = [[0, -S(M11 v + M12 w)], [-S(M11 v + M12 w), -S(M21 v + M22 w)]].
     """
@@ -34,7 +34,7 @@ def take_coriolis(mass, nu, out):  # type: ignore[no-untyped-def]
 
 @njit(f"{V}({M},{V})", cache=True)
 def coriolis_wrench(mass, nu):  # type: ignore[no-untyped-def]
-    """(6,) C(nu) nu."""
+    """Returns (6,) C(nu) nu."""
     out = np.zeros(6)
     take_coriolis(mass, nu, out)
     return -out
@@ -42,7 +42,7 @@ def coriolis_wrench(mass, nu):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def add_restoring(righting, q_wb, out):  # type: ignore[no-untyped-def]
-    """Adds the moment of buoyancy to the wrench `out` (6,): righting x (upwards, seen in the body)."""
+    """Adds the moment of buoyancy to the wrench `out` (6,): righting x (upward unit vector, body frame)."""
     w, x, y, z = q_wb[0], q_wb[1], q_wb[2], q_wb[3]
     ux, uy, uz = -2.0 * (x * z - w * y), -2.0 * (y * z + w * x), -(1.0 - 2.0 * (x * x + y * y))
     out[3] += righting[1] * uz - righting[2] * uy
@@ -52,7 +52,7 @@ def add_restoring(righting, q_wb, out):  # type: ignore[no-untyped-def]
 
 @njit(f"{V}({V},{V})", cache=True)
 def restoring_moment(righting, q_wb):  # type: ignore[no-untyped-def]
-    """(3,) moment of buoyancy about the centre of mass, body frame, N m.
+    """Returns the (3,) moment of buoyancy about the centre of mass, body frame, N m.
 
     Args:
         righting: (3,) buoyancy times centre of buoyancy from the centre of mass, body frame, N m.

@@ -1,4 +1,4 @@
-"""Rotations: quaternions scalar first, q_ab turns vectors of frame b into frame a. Compiled; used by every stage."""
+"""Rotations: quaternions are scalar first; q_ab rotates vectors from frame b into frame a. Compiled; used by every stage."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numba import njit
 
 V = "float64[::1]"
 M = "float64[:,::1]"
-"""Types of a vector and of a matrix, for the signature of a compiled function."""
+"""Numba types of a vector and of a matrix, for the signatures of compiled functions."""
 
 
 @njit(cache=True)
@@ -28,26 +28,26 @@ def _exp(x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(f"UniTuple(float64,3)({','.join(['float64'] * 7)})", cache=True)
 def _turned(w, x, y, z, a, b, c):  # type: ignore[no-untyped-def]
-    """(a, b, c) turned by the unit quaternion (w, x, y, z)."""
+    """(a, b, c) rotated by the unit quaternion (w, x, y, z)."""
     tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
     return a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx
 
 
 @njit(f"UniTuple(float64,3)({V},{','.join(['float64'] * 3)})", cache=True)
 def turned(q, a, b, c):  # type: ignore[no-untyped-def]
-    """q v q^-1 of q (4,) and v = (a, b, c), without an array."""
+    """q v q^-1 of q (4,) and v = (a, b, c), as a tuple without an array."""
     return _turned(q[0], q[1], q[2], q[3], a, b, c)
 
 
 @njit(cache=True)
 def turned_back(q, a, b, c):  # type: ignore[no-untyped-def]
-    """q^-1 v q of q (4,) and v = (a, b, c), without an array."""
+    """q^-1 v q of q (4,) and v = (a, b, c), as a tuple without an array."""
     return _turned(q[0], -q[1], -q[2], -q[3], a, b, c)
 
 
 @njit(f"void({V},{','.join(['float64'] * 3)},{V})", cache=True)
 def turn(q, a, b, c, out):  # type: ignore[no-untyped-def]
-    """Writes to `out` (4,) the attitude q turned by the rotation vector (a, b, c), rad, of its own frame."""
+    """Writes to `out` (4,) the attitude q turned by the rotation vector (a, b, c), rad, given in its own frame."""
     out[0], out[1], out[2], out[3] = _product(q[0], q[1], q[2], q[3], *_exp(a, b, c))
 
 
@@ -65,7 +65,7 @@ def conjugate(q):  # type: ignore[no-untyped-def]
 
 @njit(f"{V}({V})", cache=True)
 def normalise(q):  # type: ignore[no-untyped-def]
-    """q / |q| with a scalar part that is not negative."""
+    """q / |q|, with the sign that makes the scalar part non-negative."""
     n = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
     return q / (n if q[0] >= 0.0 else -n)
 
@@ -83,7 +83,7 @@ def to_matrix(q):  # type: ignore[no-untyped-def]
 
 @njit(f"{V}({M})", cache=True)
 def from_matrix(r):  # type: ignore[no-untyped-def]
-    """Unit quaternion of a (3, 3) rotation matrix (Shepperd's method: the largest component is found first)."""
+    """Unit quaternion of a (3, 3) rotation matrix (Shepperd's method: the largest component is computed first)."""
     trace = r[0, 0] + r[1, 1] + r[2, 2]
     squares = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
     k = np.argmax(squares)
@@ -124,7 +124,7 @@ def difference(a, b):  # type: ignore[no-untyped-def]
 
 @njit(f"{M}({V})", cache=True)
 def skew(v):  # type: ignore[no-untyped-def]
-    """(3, 3) S with S u = v x u."""
+    """(3, 3) cross-product matrix S with S u = v x u."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -156,7 +156,7 @@ def from_euler(roll: float, pitch: float, yaw: float) -> np.ndarray:
 
 
 def to_euler(q: np.ndarray) -> tuple[float, float, float]:
-    """Roll, pitch, yaw of the aerospace sequence, for people and MAVLink only; nothing controls on them."""
+    """Roll, pitch, yaw of the aerospace sequence, for display and MAVLink only; no controller uses them."""
     w, x, y, z = (float(c) for c in q)
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
@@ -164,7 +164,7 @@ def to_euler(q: np.ndarray) -> tuple[float, float, float]:
 
 
 def heading(q_wb: np.ndarray) -> np.ndarray:
-    """The level attitude (4,) that looks the way the body looks; where it looks up or down, the way that its top or bottom does."""
+    """Returns the level attitude (4,) with the body's heading; near vertical, the heading of its top (nose down) or bottom (nose up)."""
     r = np.asarray(to_matrix(q_wb))
     x = r[:, 0] if math.hypot(r[0, 0], r[1, 0]) > 0.3 else r[:, 2] * (1.0 if r[2, 0] < 0.0 else -1.0)
     return np.asarray(from_euler(0.0, 0.0, math.atan2(x[1], x[0])))
