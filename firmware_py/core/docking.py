@@ -1,6 +1,6 @@
-"""Stage 3 of a tick: all docks of the fleet. Detects, steers what is docking, and says when bodies join or part.
+"""Stage 3 of a tick: all docks of the fleet. Detects docked faces, steers docking bodies, and decides when bodies join or part.
 
-Works on the estimates of this tick; the pipeline carries out the joins and parts that it returns, within the same tick.
+Works on the estimates of this tick; the pipeline carries out the returned joins and parts within the same tick.
 """
 
 from __future__ import annotations
@@ -55,24 +55,24 @@ class DockingStage:
         self._docks: list[Dock] = []
         self._undocks: list[Undock] = []
         self._expected: dict[int, DockRequest] = {}
-        """By body: the newest dock or undock that waits for its plan."""
+        """By body: its newest dock or undock that waits for its plan."""
         self._joints = JointWatch(parameters)
         self.events: list[Event] = []
         self.records: list[DockRecord] = []
 
     def retune(self, parameters: Docking) -> None:
-        """Takes other parameters for joints, and for docks that begin from now on."""
+        """Changes the parameters of joints, and of docks that begin from now on."""
         self._p = parameters
         self._joints.retune(parameters)
 
     def watch_joints(self, joints: Sequence[Joint]) -> None:
-        """Watches these joints, all that there are in the fleet; their magnets hold, but for those of an undock under way."""
+        """Watches `joints`, all joints of the fleet, and lets their magnets pull, except for joints that are being undocked."""
         self._joints.watch(joints)
         parting = self._parting
         self.relays.switch(RELAY_PULL, *(joint.request for joint in joints if modules_of(joint.request) not in parting))
 
     def open_joints(self, least: int) -> list[DockRequest]:
-        """Joints that are `least` LOOSE or APART though they should hold, as requests that name their faces. Those that are being
+        """Joints that should hold but are at least `least` (LOOSE or APART), as requests that name their faces. Joints that are being
         undocked are left out.
         """
         parting = self._parting
@@ -85,21 +85,21 @@ class DockingStage:
 
     @property
     def joints(self) -> np.ndarray:
-        """(k,) of PAIR: what is known of every joint in this tick; a copy."""
+        """(k,) of PAIR: state of every joint in this tick; a copy."""
         return self._joints.rows
 
     @property
     def has_work(self) -> bool:
-        """Whether there is anything to watch or to steer."""
+        """Whether there is a joint to watch, or a dock or undock to steer."""
         return self.under_way or len(self._joints) > 0
 
     @property
     def under_way(self) -> bool:
-        """Whether any dock or undock is."""
+        """Whether any dock or undock is under way."""
         return bool(self._docks or self._undocks)
 
     def forget(self, bodies: Collection[int]) -> Decisions:
-        """Ends every dock that one of these takes part in, bodies that there are no more; a target that was coming goes back."""
+        """Ends every dock in which one of `bodies`, which no longer exist, takes part; a target that was coming goes back."""
         self._expected = {body: request for body, request in self._expected.items() if body not in bodies}
         decisions = Decisions()
         for dock in [each for each in self._docks if each.active in bodies or each.target in bodies]:
@@ -108,14 +108,14 @@ class DockingStage:
         return decisions
 
     def expect(self, body: int, requests: Sequence[DockRequest]) -> None:
-        """Plans of these have been asked for, in this order."""
+        """Notes that plans for `requests` of `body` were asked for, in this order."""
         self._expected.update((body, request) for request in requests)
 
     def leave(self, body: Body, surfaces: bool) -> Decisions:
-        """The body is not in the mode DOCK: its docks and undocks end at once, for nothing that they want moves it any more. One that
-        `surfaces` nobody docks to either: he would follow it up. A target that was coming goes back to where it held.
+        """Ends the docks and undocks of a body that is not in the mode DOCK at once, because they no longer steer it. If it `surfaces`,
+        docks to it end as well, else their active bodies would follow it up. A target that was coming goes back to where it held.
 
-        An open joint is parted all the same: that its modules are apart is no wish.
+        An open joint is parted in any mode, in the tick in which its plan arrives: its modules are apart already.
         """
         self.events, decisions = [], Decisions()
         for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._joints.left(each.plan.opens)]:
@@ -137,13 +137,13 @@ class DockingStage:
         coming: Collection[int],
         resting: Collection[tuple[int, int]],
     ) -> Decisions:
-        """One tick.
+        """Runs one tick.
 
         Args:
-            waiting: bodies in the mode DOCK: only these begin a dock. Looked at when a plan is there, as `holding` is.
+            waiting: bodies in the mode DOCK: only these begin a dock. Used only when a plan has arrived, as `holding` is.
             holding: bodies that hold a place which may be moved: only these come to meet another.
-            coming: those that are on their way to do so.
-            resting: modules and faces whose magnets are off whatever is wanted.
+            coming: bodies that are on their way to meet another.
+            resting: modules and faces whose magnets are forced off.
         """
         self.events, self.records = [], []
         decisions = Decisions()
@@ -190,7 +190,7 @@ class DockingStage:
             self._begin_dock(prepared, plan, time_ns, estimates, holding)
 
     def _refusal(self, prepared: Prepared, estimates: Estimated, waiting: Collection[int], holding: Collection[int]) -> str:
-        """Why a plan is not begun; empty: it is."""
+        """Reason why a plan is not begun; empty if it is."""
         plan = prepared.plan
         if plan is None:
             return prepared.refusal
@@ -213,12 +213,12 @@ class DockingStage:
         return obstacle(plan, estimates[mine], estimates[others], thirds_of(estimates, mine, others), comes, self._p)
 
     def _comes(self, plan: DockPlan, target: int, holding: Collection[int]) -> bool:
-        """Whether the target is to come half of the way."""
+        """Whether the target is to come half the way."""
         taken = any(target in (dock.active, dock.target) for dock in self._docks)
         return (plan.request.both_approach or self._p.approach == "straight") and target in holding and not taken
 
     def _leaders(self, body: int) -> list[int]:
-        """The bodies that this one is steered by: the target of its dock, the target of that one's, and so on. None is led by itself."""
+        """The bodies that steer `body`: the target of its dock, the target of that body's dock, and so on. No body leads itself."""
         targets, found = {dock.active: dock.target for dock in self._docks}, list[int]()
         while body in targets:
             body = targets[body]
@@ -226,12 +226,12 @@ class DockingStage:
         return found
 
     def _drop(self, dock: Dock) -> None:
-        """It is no longer under way, and its magnets let go."""
+        """Removes a dock from those under way and switches its magnets off."""
         self._docks.remove(dock)
         self.relays.switch(RELAY_OFF, *dock.sequence.plan.closes)
 
     def _give_up(self, dock: Dock, reason: str, decisions: Decisions) -> None:
-        """Ends a dock before its end; a target that was coming goes back to where it held."""
+        """Ends a dock early; a target that was coming goes back to where it held."""
         self._drop(dock)
         self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: {reason}")
         if dock.sequence.meets_at_w is not None:
@@ -245,7 +245,7 @@ class DockingStage:
         self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
 
     def _still_closed(self, plan: UndockPlan) -> list[DockRequest]:
-        """Joints that magnets have to push open: not all that is seen says that they are."""
+        """Joints that magnets have to push open: those not known to be APART."""
         apart = [modules_of(joint) for joint in self.open_joints(APART)]
         return [joint for joint in plan.opens if modules_of(joint) not in apart]
 
@@ -309,7 +309,7 @@ class DockingStage:
             decisions.meets[dock.target] = steering.meets
 
     def _wish(self, dock: Dock, traffic: Traffic) -> Wish | None:
-        """What the active body glides by while a third body is on its way; what it then does is said once."""
+        """What the active body glides by while a third body blocks its way, or None; each reason to wait is reported once per dock."""
         wait = traffic.wait(dock)
         if wait is None:
             return None
@@ -319,13 +319,13 @@ class DockingStage:
         return wait.wish
 
     def _end(self, active: int, decisions: Decisions) -> None:
-        """The body is done with docking, but for what it still waits for the plan of, and an undock under way."""
+        """Ends docking for the body, unless it still waits for a plan or takes part in an undock under way."""
         parting = {module for undock in self._undocks for module in (*undock.plan.stays.modules, *undock.plan.leaves.modules)}
         if active not in self._expected and active not in parting:
             decisions.ended.append(active)
 
     def _join(self, dock: Dock, decisions: Decisions) -> None:
-        """One join a tick and body: a dock that comes second finds its bodies gone, and `forget` ends it."""
+        """Joins two bodies, at most once per tick and body: a second dock finds its bodies gone, and `forget` ends it."""
         if decisions.joining.isdisjoint((dock.active, dock.target)):
             decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))
             self._docks.remove(dock)
@@ -339,7 +339,7 @@ class DockingStage:
         self.relays.switch(RELAY_PUSH, *plan.opens)
         whole = _body_of(request.module, estimates)
         changes = whole in decisions.joining or whole in [part.whole for part in decisions.parts]
-        if changes or undock.pushes(time_ns, self._joints):  # changes: the next tick has no such body, and ends this
+        if changes or undock.pushes(time_ns, self._joints):  # if it changes, the body is gone in the next tick, which ends this undock
             return
         held_by = undock.held_by(time_ns, self._joints)
         if held_by and time_ns < undock.last_ns:
@@ -355,7 +355,7 @@ class DockingStage:
         self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
 
     def _part(self, undock: Undock, whole: int, estimates: Estimated) -> Part:
-        """The one that leaves glides away; where that would bring it to a third body, the other goes the other way; else neither does."""
+        """Lets the leaving body glide away; if a third body is in its way, the staying one goes the other way; else neither moves."""
         (body, at), plan, (stays, leaves) = estimates[whole], undock.plan, undock.chains
         thirds = thirds_of(estimates, whole) if at.placed else []
         away_w = rotate(at.q_wb, plan.axis_b) * self._p.standoff_m
@@ -365,7 +365,7 @@ class DockingStage:
         return Part(whole, stays, leaves, np.zeros(3))
 
     def _call_off(self, undock: Undock) -> None:
-        """Ends an undock before its end: magnets pull again where there still is a joint, and let go where another has undone it."""
+        """Ends an undock early: magnets pull again where the joint still exists, and go off where another undock has removed it."""
         self._undocks.remove(undock)
         left = self._joints.left(undock.plan.opens)
         self.relays.switch(RELAY_OFF, *(joint for joint in undock.plan.opens if joint not in left))
@@ -376,7 +376,7 @@ class DockingStage:
 
 
 def tag_table(bodies: Sequence[Body]) -> TagTable:
-    """Tags of every module in its own frame."""
+    """Poses of the tags of every module in its module frame."""
     table: TagTable = {}
     for body in bodies:
         for k, tag in enumerate(body.tag_ids):
@@ -389,7 +389,7 @@ def tag_table(bodies: Sequence[Body]) -> TagTable:
 
 
 def _fits(plan: DockPlan | UndockPlan, estimates: Estimated) -> bool:
-    """Whether the bodies are still those that a plan is made for."""
+    """Whether the bodies are still those that the plan was made for."""
     bodies = {frozenset(body.modules) for body, _ in estimates.values()}
     if isinstance(plan, UndockPlan):
         return frozenset((*plan.stays.modules, *plan.leaves.modules)) in bodies

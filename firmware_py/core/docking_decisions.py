@@ -1,4 +1,4 @@
-"""What docking is told and what it wants, as values: the worker's answers, and the joins, parts and set-points of a tick."""
+"""Inputs and outputs of the docking stage as values: the worker's answers, and the joins, parts and set-points of a tick."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRequest, Estimate, Setpoint
 
 Estimated = Mapping[int, tuple[Body, Estimate]]
-"""The bodies of a tick, each with its estimate, by their numbers."""
+"""The bodies of a tick, each with its estimate, by number."""
 
 
 class Prepared(NamedTuple):
-    """An answer of the worker."""
+    """The worker's answer to a request."""
 
     request: DockRequest
     plan: DockPlan | UndockPlan | None
     chains: tuple[Any, ...]
-    """The pipelines of the bodies that there will be, ready to take over."""
+    """Pipelines of the resulting bodies, ready to take over."""
     refusal: str = ""
     """Why there is no plan."""
 
 
 class Join(NamedTuple):
-    """Two bodies become one, in this tick."""
+    """Two bodies become one in this tick."""
 
     target: int
-    """Numbers of the bodies."""
+    """Number of the target body; `active` likewise."""
     active: int
     chain: Any
 
 
 class Part(NamedTuple):
-    """One body becomes two, in this tick; the leaving one then glides away along `away_w` (3,), m."""
+    """One body becomes two in this tick. The body of `leaves` then glides away by `away_w` (3,), world, m; zero: it stays."""
 
     whole: int
     stays: Any
@@ -48,18 +48,18 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Decisions:
-    """What the stage wants of the pipeline; nothing at first."""
+    """Decisions of the docking stage for the pipeline to carry out; empty at first."""
 
     setpoints: dict[int, Setpoint | Wish] = field(default_factory=dict)
-    """By body: steers it in this tick."""
+    """By body: what steers it in this tick."""
     joins: list[Join] = field(default_factory=list)
     parts: list[Part] = field(default_factory=list)
     ended: list[int] = field(default_factory=list)
-    """Bodies whose dock is over without a join: they hold where they are."""
+    """Bodies whose dock ended without a join: they hold where they are."""
     meets: dict[int, np.ndarray] = field(default_factory=dict)
-    """By body: (3,) how far it comes to meet the other, world, m, from where it holds."""
+    """By body: (3,) displacement from where it holds to where it meets the other body, world, m."""
     returning: list[int] = field(default_factory=list)
-    """Bodies that came to meet one whose dock is called off."""
+    """Bodies that came to meet another whose dock was called off."""
 
     @property
     def joining(self) -> set[int]:

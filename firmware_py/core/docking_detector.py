@@ -1,9 +1,9 @@
-"""Whether two faces are docked: both conditions of the paper, on fresh measurements alone.
+"""Detects whether two faces are docked: both conditions of the paper, on fresh measurements only.
 
-Condition 1: the current of both magnets is beyond +-70 mA. Condition 2: the relative position is one lattice pitch and settled. A pose
-is taken from tags of both modules seen in one picture, never from a state that was carried on.
+Condition 1: the current of both magnets is beyond +-70 mA. Condition 2: the relative position is one lattice pitch and settled. The
+relative pose comes from tags of both modules seen in the same picture, never from a propagated state.
 
-All pairs that are watched are rows of one array, and one compiled pass a tick serves them all.
+All watched pairs are rows of one array, served by one compiled pass per tick.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from firmware_py.description.parameters import Docking
 
 
 class FacePair(NamedTuple):
-    """Two faces that may meet. Indices of modules in the fleet; where the centre of b should be in the frame of a, m, and how turned."""
+    """Two faces that may meet: fleet indices of their modules, and the pose that b should have in the frame of a."""
 
     module_a: int
     face_a: int
     module_b: int
     face_b: int
     offset_a: np.ndarray
-    """(3,)"""
+    """(3,) centre of b in the frame of a, m."""
     q_ab: np.ndarray
     """(4,) frame of b to frame of a."""
 
 
 class PairStatus(NamedTuple):
-    """What is known of one pair in this tick."""
+    """State of one pair in this tick."""
 
     current: bool
     """Condition 1 holds, debounced."""
@@ -42,16 +42,16 @@ class PairStatus(NamedTuple):
     position_error_m: float
     """Distance of the mean relative position from one pitch; NaN without fresh pictures."""
     spread_m: float
-    """Distance between the means of the two newest quarters of the pictures: what `settled` is judged by."""
+    """Distance between the means of the two newest quarters of the pictures; compared with `settled_m`."""
     docked: bool
     """Both hold."""
 
 
 class PairBank:
-    """Watches any number of pairs of faces. `rows`, (k,) of PAIR, is what is known of them in this tick."""
+    """Watches any number of pairs of faces. `rows`, (k,) of PAIR, is their state in this tick."""
 
     def __init__(self, pairs: Sequence[FacePair], parameters: Docking, before: PairBank | None = None) -> None:
-        """`before`: the bank that this one replaces; what it knows of a pair that both watch is kept."""
+        """`before`: the bank that this one replaces; pairs watched by both keep their state."""
         p = parameters
         self._limits = Limits(
             p.current_threshold_ma, p.current_hysteresis_ma, p.position_tolerance_m, p.settled_m, p.hysteresis_m, p.open_m,
@@ -81,10 +81,10 @@ class PairBank:
     def step(
         self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses, resting: Collection[tuple[int, int]] = ()
     ) -> None:
-        """Brings the rows to the tick at `time_ns`, from its inputs alone and what they were before.
+        """Advances the rows to the tick at `time_ns`, by the inputs of that tick.
 
         Args:
-            resting: modules and faces whose magnets the limiter has switched off: their currents tell nothing.
+            resting: modules and faces whose magnets the limiter has switched off: their currents carry no information.
         """
         for m in self._watched:
             for dock in modules[m].docks:
@@ -95,7 +95,7 @@ class PairBank:
         watch(self.rows, self._rings, self._heard_ma, *poses.sightings, time_ns, self._limits)
 
     def status(self, i: int) -> PairStatus:
-        """Of pair `i`."""
+        """Status of pair `i`."""
         row = self.rows[i]
         current, position = map(bool, row["holds"].tolist())
         return PairStatus(current, position, float(row["error_m"]), float(row["spread_m"]), current and position)
@@ -109,34 +109,34 @@ class PairDetector:
         self._bank = PairBank([pair], parameters)
 
     def step(self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses) -> PairStatus:
-        """The pair's status in the tick at `time_ns`."""
+        """Advances to the tick at `time_ns` and returns the pair's status."""
         self._bank.step(time_ns, modules, poses)
         return self._bank.status(0)
 
     @property
     def currents_ma(self) -> tuple[float, float]:
-        """Newest current of both faces; NaN before the first."""
+        """Newest current of each face; NaN before the first."""
         a, b = self._bank.rows[0]["current_ma"].tolist()
         return a, b
 
 
 TagTable = dict[tuple[int, int], np.ndarray]
-"""(module, tag id) -> (7,) tag centre in the module frame, m, and module frame to tag frame."""
+"""(module, tag id) -> (7,) tag centre in the module frame, m, and quaternion from module frame to tag frame."""
 
 
 class Sightings(NamedTuple):
-    """Single modules as the pictures of one tick show them, in the order of modules, then of arrival."""
+    """Poses of single modules from the pictures of one tick, ordered by module, then by arrival."""
 
     first: np.ndarray
-    """(m + 1,) where the sightings of each module of the fleet begin."""
+    """(m + 1,) index at which the sightings of each module of the fleet begin."""
     seen: np.ndarray
-    """(s, 2) module, and time of the picture, ns."""
+    """(s, 2) module, and capture time of the picture, ns."""
     poses: np.ndarray
-    """(s, 12) the module's centre in the world, and its rotation matrix row by row."""
+    """(s, 12) the module's centre in the world, m, and its rotation matrix, row by row."""
 
 
 class ModulePoses:
-    """Poses of single modules by the pictures of this tick. Made anew each tick; costs something only once it is asked."""
+    """Poses of single modules from the pictures of one tick. Created each tick; computed lazily on first use."""
 
     def __init__(self, modules: Sequence[ModuleInputs], tags: TagTable) -> None:
         self._modules = modules
@@ -145,7 +145,7 @@ class ModulePoses:
 
     @property
     def sightings(self) -> Sightings:
-        """All tags that were seen and are known."""
+        """Sightings by all observed tags that are in the table."""
         if self._sightings is None:
             self._sightings = self._gather()
         return self._sightings

@@ -1,6 +1,6 @@
 """The pairs of faces that the docking detector watches, as rows of one array, and the compiled pass over all of them.
 
-What a pair's two conditions are judged by, and when they are believed. Part of `docking_detector`.
+Evaluates the two conditions of each pair and debounces them. Part of `docking_detector`.
 """
 
 from __future__ import annotations
@@ -16,39 +16,39 @@ from firmware_py.core.rotations import multiply, to_matrix
 from firmware_py.core.types import NEVER_NS
 
 PICTURES = 32
-"""Relative positions kept of each pair: their mean tells a locked pair from one that jammed 4 mm short of it."""
+"""Relative positions kept of each pair: their mean distinguishes a locked pair from one that jammed 4 mm short of locking."""
 TURNED_TRACE = 1.0 + 2.0 * math.cos(math.radians(15.0))
-"""Of the rotation between modules as they are and as they are when docked; farther off, a tag of one of them was read flipped."""
+"""Trace of a 15 degree rotation. If the measured relative attitude is farther off the docked one, a tag was read flipped."""
 CURRENT, POSITION = 0, 1
 """The two conditions, as columns of a pair's row."""
 
 CLOSED, LOOSE, APART = 0, 1, 2
-"""A joint: nothing says that it is open; one condition says so and the other does not; all that is seen says so."""
+"""State of a joint: nothing indicates that it is open; one condition does and the other does not; all fresh measurements do."""
 
 PAIR = np.dtype(
     [
         ("module", np.int64, 2),  # fleet index of module a, of module b; sides a and b in `face` and the currents too
         ("face", np.int64, 2),
-        ("offset_a", np.float64, 3),  # where the centre of b should be in the frame of a, m
-        ("turn_a", np.float64, 9),  # attitude that b should have in the frame of a: rotation matrix, row by row
+        ("offset_a", np.float64, 3),  # desired centre of b in the frame of a, m
+        ("turn_a", np.float64, 9),  # desired attitude of b in the frame of a: rotation matrix, row by row
         ("holds", np.int64, 2),  # each condition, debounced
-        ("candidate_ns", np.int64, 2),  # since when the opposite has been seen; NEVER_NS: it is not
+        ("candidate_ns", np.int64, 2),  # since when measurements contradict `holds`; NEVER_NS: they agree
         ("current_ma", np.float64, 2),
         ("current_ns", np.int64, 2),
         ("pictures", np.int64),  # relative positions since the last gap
         ("picture_ns", np.int64),
-        ("near_ns", np.int64),  # time of the newest picture that shows them no farther off than an open joint may be
+        ("near_ns", np.int64),  # time of the newest picture whose position error is at most `open_m`
         ("error_m", np.float64),
         ("spread_m", np.float64),
         ("open", np.int64),  # CLOSED, LOOSE or APART
     ],
     align=True,
 )
-"""One pair of faces in one tick; what is not explained here, PairStatus does."""
+"""One pair of faces in one tick; see PairStatus for the fields without a comment."""
 
 
 class Limits(NamedTuple):
-    """What the conditions are judged by, from the parameters."""
+    """Limits of the two conditions, from the parameters."""
 
     threshold_ma: float
     current_hysteresis_ma: float
@@ -68,7 +68,7 @@ LIMITS = numba.typeof(Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))  # type: ig
 
 @njit(numba.void(ROW, numba.int64, numba.boolean, numba.int64, numba.int64), cache=True)
 def _see(row, which, seen, time_ns, after_ns):  # type: ignore[no-untyped-def]
-    """A condition was `seen` by a fresh measurement; believed once nothing else was seen for `after_ns`."""
+    """Debounces a condition: `seen` by a fresh measurement, it is taken over once nothing else was seen for `after_ns`."""
     if seen == (row.holds[which] != 0):
         row.candidate_ns[which] = NEVER_NS
         return
@@ -80,13 +80,13 @@ def _see(row, which, seen, time_ns, after_ns):  # type: ignore[no-untyped-def]
 
 @njit(numba.void(ROW, numba.int64), cache=True)
 def _lose(row, which):  # type: ignore[no-untyped-def]
-    """No fresh measurement supports a condition any longer."""
+    """Clears a condition that no fresh measurement supports any longer."""
     row.holds[which], row.candidate_ns[which] = 0, NEVER_NS
 
 
 @njit(cache=True)
 def _take_currents(row, heard_ma, time_ns, limits):  # type: ignore[no-untyped-def]
-    """Condition 1 by the currents of this tick; whether those known are fresh."""
+    """Updates condition 1 by the currents of this tick; returns whether the newest currents are fresh."""
     heard = False
     for side in range(2):
         value = heard_ma[row.module[side], row.face[side]]
@@ -106,7 +106,7 @@ def _take_currents(row, heard_ma, time_ns, limits):  # type: ignore[no-untyped-d
 
 @njit(cache=True)
 def _same_picture(first, seen, a, b):  # type: ignore[no-untyped-def]
-    """Sightings of modules a and b in the newest picture that shows both; -1 without one."""
+    """Indices of the sightings of modules a and b in the newest picture that shows both; -1, -1 without one."""
     for i in range(first[a + 1] - 1, first[a] - 1, -1):
         for j in range(first[b + 1] - 1, first[b] - 1, -1):
             if seen[i, 1] == seen[j, 1]:
@@ -116,7 +116,7 @@ def _same_picture(first, seen, a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _judge_ring(row, ring):  # type: ignore[no-untyped-def]
-    """Distance of the mean from the wanted position, and distance between the means of the two newest quarters."""
+    """Sets `error_m`, distance of the mean from the desired position, and `spread_m`, distance of the means of the two newest quarters."""
     n, oldest, quarter = PICTURES, row.pictures, PICTURES // 4
     off, moved = 0.0, 0.0
     for axis in range(3):
@@ -133,9 +133,9 @@ def _judge_ring(row, ring):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _as_turned(row, poses, i, j):  # type: ignore[no-untyped-def]
-    """Whether two sightings are turned against each other as the modules should be.
+    """Whether two sightings have the relative attitude that the modules have when docked.
 
-    A tag that is seen from 45 degrees and read flipped is off by a quarter turn, and so fits the lattice.
+    A tag that is seen from 45 degrees and read flipped is off by a quarter turn, which is a lattice rotation too.
     """
     trace = 0.0
     for a in range(3):
@@ -147,7 +147,7 @@ def _as_turned(row, poses, i, j):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[no-untyped-def]
-    """Condition 2 by the pictures of this tick; whether those known are fresh."""
+    """Updates condition 2 by the pictures of this tick; returns whether the newest picture is fresh."""
     i, j = _same_picture(first, seen, row.module[0], row.module[1])
     if i >= 0 and _as_turned(row, poses, i, j):
         here, off = ring[row.pictures % PICTURES], 0.0
@@ -174,11 +174,11 @@ def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[
 
 @njit(numba.void(ROW[::1], numba.float64[:, :, ::1], TABLE, FIRST, SEEN, TABLE, numba.int64, LIMITS), cache=True)
 def watch(rows, rings, heard_ma, first, seen, poses, time_ns, limits):  # type: ignore[no-untyped-def]
-    """Brings all pairs to this tick.
+    """Advances all pairs to this tick.
 
     Args:
         rows: (k,) PAIR; rings: (k, PICTURES, 3) relative positions, module b in the frame of a.
-        heard_ma: (m, 6) currents that came, per module and face, NaN where none did; forgotten afterwards.
+        heard_ma: (m, 6) currents received, per module and face, NaN where none came; reset to NaN afterwards.
         first, seen, poses: docking_detector.Sightings.
     """
     for k in range(rows.shape[0]):
@@ -198,8 +198,8 @@ def place_modules(tags, first, seen, poses):  # type: ignore[no-untyped-def]
     """Writes `first` and `poses` of docking_detector.Sightings.
 
     Args:
-        tags: (s, 14) per sighting the tag's place and attitude in the world, its place in its module, and module frame to
-            tag frame.
+        tags: (s, 14) per sighting the tag's position and attitude in the world, its position in its module, and the quaternion from
+            module frame to tag frame.
     """
     i = 0
     for module in range(first.shape[0]):

@@ -1,8 +1,8 @@
-"""Docking as a sequence of stages, a table: what each stage does, what ends it, and what comes then.
+"""Docking as a sequence of stages, a table: what each stage does, what ends it, and which stage follows.
 
-The active body is steered against the target's estimated pose, so that the target's wandering is followed. The gap is the distance
-between the two faces; lateral and angle error are those of the active module against its place before the target's face. The paper's way,
-`approach = "straight"`, begins with the approach, on a line that is drawn once; its gap is what is left of that line.
+The active body is steered relative to the target's estimated pose and so follows a target that drifts. The gap is the distance between
+the two faces; lateral and angle error are those of the active module relative to its place before the target's face. The paper's
+method, `approach = "straight"`, begins with the approach, on a line that is drawn once; its gap is the remaining length of that line.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockReques
 from firmware_py.description.parameters import Docking
 
 SLOWING_PER_S = 0.5
-"""The approach slows as this much of the gap a second."""
+"""Approach speed per remaining gap, within contact_speed_m_s and speed_m_s: the approach slows down in proportion to the gap."""
 TURN_RAD = 0.03
-"""How far the active module turns about the docking axis after a jam, to and fro."""
+"""Angle by which the active module is turned about the docking axis after a jam, in alternating directions."""
 RETREAT_M_S = 0.04
-"""Fastest growth of the gap when backing off."""
+"""Rate at which the gap grows when backing off."""
 CONE = 1.5
-"""The approach waits while the lateral error is above this many times the alignment limit, or the angle."""
+"""The approach waits while the lateral or the angle error exceeds this multiple of its alignment limit."""
 
 
 class Stage(IntEnum):
-    """Stages in the order of a dock that goes well, then the others."""
+    """Stages: first those of a successful dock, in order, then the others."""
 
     PRE_APPROACH = 0
     ALIGN = 1
@@ -49,12 +49,12 @@ class Row(NamedTuple):
     """What a stage does."""
 
     relay: int
-    """Magnets of both faces."""
+    """Relay state of the magnets of both faces."""
     limit_s: str = ""
-    """Field of `Docking` that holds the longest time; empty: none."""
+    """Name of the field of `Docking` that holds the timeout; empty: none."""
     on_timeout: Stage = Stage.ABORTED
     on_done: Stage = Stage.ABORTED
-    """What follows when it has done its work."""
+    """The stage that follows on completion."""
 
 
 TABLE = {
@@ -71,20 +71,20 @@ TABLE = {
 }
 ENDED = frozenset({Stage.DOCKED, Stage.ABORTED, Stage.FAILED})
 TURNED = frozenset({Stage.APPROACH, Stage.PUSH, Stage.VERIFY, Stage.ALIGN})
-"""Stages that use the small turn."""
+"""Stages that apply the small turn after a jam."""
 
 
 class DockPlan(NamedTuple):
-    """A dock, prepared: the geometry of the two faces and the body that they will make."""
+    """A prepared dock: the geometry of the two faces and the resulting body."""
 
     request: DockRequest
     closes: tuple[DockRequest, ...]
-    """Every joint that there will be between the two bodies: more than one where the dock closes a ring."""
+    """Every joint that the dock closes between the two bodies: more than one where it closes a ring."""
     merged: Body
     axis_t: np.ndarray
     """(3,) outward normal of the target's face, target module frame."""
     place_t: np.ndarray
-    """(3,) where the active module's centre will be, target module frame, m."""
+    """(3,) centre of the active module when docked, target module frame, m."""
     q_ta: np.ndarray
     """(4,) active module frame to target module frame when docked."""
 
@@ -95,19 +95,19 @@ class DockPlan(NamedTuple):
 
 
 class UndockPlan(NamedTuple):
-    """An undock, prepared: the two bodies that there will be."""
+    """A prepared undock: the two resulting bodies."""
 
     opens: tuple[DockRequest, ...]
-    """Every joint between the two, the one that was asked for first; `module` is the side that leaves."""
+    """Every joint between the two, the requested one first; `module` is on the side that leaves."""
     stays: Body
-    """The one with the target module."""
+    """The body with the target module."""
     leaves: Body
     axis_b: np.ndarray
-    """(3,) unit vector, the way that it leaves, frame of the whole body."""
+    """(3,) unit vector along which it leaves, frame of the whole body."""
 
 
 class Errors(NamedTuple):
-    """Where the active module is against its place."""
+    """Pose errors of the active module relative to its docked place."""
 
     gap_m: float
     lateral_m: float
@@ -115,22 +115,22 @@ class Errors(NamedTuple):
 
 
 class Steering(NamedTuple):
-    """What the sequence wants in one tick."""
+    """Outputs of the sequence in one tick."""
 
     active: Setpoint | Wish
-    """Where the active body is to be in this tick; while it is far, where it is to glide."""
+    """Set-point of the active body in this tick; while it is still far away, the wish that it glides by."""
     relay: int
     is_apart: bool
-    """As far from the target as a dock that failed leaves it."""
+    """Whether the wanted gap is back at the stand-off, where a failed dock leaves the active body."""
     meets: np.ndarray | None
-    """(3,) how far the target is to come to meet the active body, world, m; told once, in the first tick."""
+    """(3,) displacement of the target to meet the active body, world, m; given once, when the sequence sets off, else None."""
 
 
 class DockingSequence:
     """One dock of one active body to one target body."""
 
     def __init__(self, plan: DockPlan, active: Body, target: Body, parameters: Docking, time_ns: int, comes: bool) -> None:
-        """`comes`: the target is free to come half of the way."""
+        """`comes`: the target is free to come half the way."""
         self.plan = plan
         self._comes = comes
         self._p = parameters
@@ -138,27 +138,27 @@ class DockingSequence:
         self._r_t, self._q_t = module_in(target, plan.request.target_module)
         self._line_t, self._farthest_m = plan.axis_t, parameters.standoff_m
         self._fixed: Estimate | None = None
-        """Where the target is to be met, at rest, for an approach that does not look at it again."""
+        """Target estimate, at rest at the meeting place, for a straight approach, which does not look at the target again."""
         self._under_way = False
         self.meets_at_w: np.ndarray | None = None
-        """(3,) where the target's centre of mass was told to come, world, m; None: it was told nothing."""
+        """(3,) place to which the target's centre of mass was told to come, world, m; None: it was not told to come."""
         self.makes_room = False
-        """Told so in the last tick."""
+        """Whether the last tick's `waits` led to a place, to make room for other bodies."""
         self.stage = Stage.PRE_APPROACH
         self.tries = 1
         self.reason = ""
         self._entered_ns, self._waited_ns = time_ns, 0
-        """When the stage began, and how much of it was spent waiting for others: that may be as long again, and is no jam."""
+        """Start of the stage, and time in it spent waiting for other bodies: this has a limit of its own, timeout_s, and is no jam."""
         self._good_since_ns: int | None = None
         self._gap_m = self._farthest_m
         self._last_ns = time_ns
         self._turn = 0.0
 
     def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus, waits: Wish | None = None) -> Steering:
-        """Moves the sequence on by one tick. `waits`: somebody is on its way; until it is before the face, it glides by this instead, and
-        where this leads to a place, to make room, it goes back from before the face too.
+        """Advances the sequence by one tick. `waits`: given while another body blocks the way; the active body glides by it instead until
+        it stands before the target's face. If it leads to a place, to make room, the body also retreats from before the face.
         """
-        delays = waits is not None and self._p.approach == "straight"  # its line is drawn once: to where the target will be
+        delays = waits is not None and self._p.approach == "straight"  # its line is drawn once, to where the target will be
         meets = None if self._under_way or delays else self._set_off(active, target)
         errors = self.errors(active, target)
         passed_ns, self._last_ns = time_ns - self._last_ns, time_ns
@@ -175,16 +175,16 @@ class DockingSequence:
         return Steering(setpoint, TABLE[self.stage].relay, is_apart, None if self.stage in ENDED else meets)
 
     def abort(self, time_ns: int, reason: str) -> None:
-        """Ends the dock; both hold apart."""
+        """Aborts the dock; both bodies hold apart."""
         self.reason = reason
         self._enter(Stage.ABORTED, time_ns)
 
     def met(self, target: Estimate) -> Estimate:
-        """The target where it is to be met: where it is, or where a straight approach looked for it."""
+        """The target estimate to steer for: the current one, or the fixed one of a straight approach."""
         return target if self._fixed is None else self._fixed
 
     def errors(self, active: Estimate, target: Estimate) -> Errors:
-        """Errors by the two estimates."""
+        """Errors computed from the two estimates."""
         _, q_a = pose_of(active, self._r_a, self._q_a)
         _, q_t = pose_of(target, self._r_t, self._q_t)
         off = self._offset(active, target)
@@ -194,13 +194,13 @@ class DockingSequence:
         return Errors(gap, lateral, float(np.linalg.norm(angle)))
 
     def _offset(self, active: Estimate, target: Estimate) -> np.ndarray:
-        """(3,) from its place to the active module, target module frame, m."""
+        """(3,) offset of the active module from its docked place, target module frame, m."""
         p_a, _ = pose_of(active, self._r_a, self._q_a)
         p_t, q_t = pose_of(target, self._r_t, self._q_t)
         return np.asarray(rotate_back(q_t, p_a - p_t) - self.plan.place_t)
 
     def _set_off(self, active: Estimate, target: Estimate) -> np.ndarray | None:
-        """Shares the way with the target if it comes, and draws the line of a straight approach; returns how far it comes."""
+        """Shares the way with the target if it comes, and draws the line of a straight approach. Returns the target's displacement."""
         self._under_way = True
         straight = self._p.approach == "straight"
         off, (_, q_t) = self._offset(active, target), pose_of(target, self._r_t, self._q_t)
@@ -216,12 +216,12 @@ class DockingSequence:
             self._enter(Stage.APPROACH, self._entered_ns + self._waited_ns)
         return meets
 
-    # ------------------------------------------------------------ what comes next
+    # ------------------------------------------------------------ transitions
 
     def _decide(self, time_ns: int, active: Estimate, target: Estimate, errors: Errors, status: PairStatus, waits: bool) -> None:
         if self.stage in ENDED:
             return
-        if status.docked and TABLE[self.stage].relay == RELAY_PULL:  # while they push, faces that are still near are no dock
+        if status.docked and TABLE[self.stage].relay == RELAY_PULL:  # while the magnets push, faces that are still near are not docked
             self._enter(Stage.DOCKED, time_ns)
             return
         sigma = float(np.sqrt(np.max(active.sigma_p**2 + target.sigma_p**2)))
@@ -233,7 +233,7 @@ class DockingSequence:
             self.abort(time_ns, f"{self._too_long}, waiting for another body")
         elif row.limit_s and time_ns - self._entered_ns - self._waited_ns > getattr(self._p, row.limit_s) * 1e9:
             self._time_out(time_ns, status)
-        elif not waits and self._is_done(time_ns, errors, status):  # who waits is on its way, though it may pass the end of it
+        elif not waits and self._is_done(time_ns, errors, status):  # a waiting body is still on its way, even where it passes the end
             self._enter(row.on_done, time_ns)
 
     def _is_done(self, time_ns: int, errors: Errors, status: PairStatus) -> bool:
@@ -284,10 +284,10 @@ class DockingSequence:
         self._entered_ns, self._waited_ns = time_ns, 0
         self._good_since_ns = None
 
-    # ------------------------------------------------------------ where to be
+    # ------------------------------------------------------------ set-point
 
     def _speed(self, errors: Errors, waits: bool) -> float:
-        """Rate of the wanted gap, m/s."""
+        """Rate of change of the wanted gap, m/s."""
         p = self._p
         if self.stage == Stage.APPROACH:
             if self.makes_room and self._gap_m < self._farthest_m:
@@ -303,7 +303,7 @@ class DockingSequence:
         return 0.0
 
     def _setpoint(self, target: Estimate, speed: float, waits: Wish | None) -> Setpoint | Wish:
-        """The active body's centre of mass such that its module is at the wanted gap before the target's face, moving with it."""
+        """Set-point of the active body that keeps its module at the wanted gap before the target's face, moving with the target."""
         p_t, q_t = pose_of(target, self._r_t, self._q_t)
         q_module = normalise(multiply(q_t, self._q_wanted()))
         q_wb = normalise(multiply(q_module, conjugate(self._q_a)))
@@ -316,18 +316,18 @@ class DockingSequence:
         return Setpoint(p_wb, q_wb, v_w, zero, zero, zero)
 
     def _q_wanted(self) -> np.ndarray:
-        """(4,) active module to target module, turned a little about the axis after a jam."""
+        """(4,) active module frame to target module frame, turned slightly about the axis after a jam."""
         if self._turn == 0.0 or self.stage not in TURNED:
             return self.plan.q_ta
         return np.asarray(multiply(exp(self.plan.axis_t * self._turn), self.plan.q_ta))
 
 
 def module_in(body: Body, module: int) -> tuple[np.ndarray, np.ndarray]:
-    """Place (3,) of a module's centre in its body, and module frame to body frame (4,)."""
+    """Position (3,) of a module's centre in its body, m, and quaternion (4,) from module frame to body frame."""
     i = body.modules.index(module)
     return np.ascontiguousarray(body.r_bm[i]), np.ascontiguousarray(body.q_bm[i])
 
 
 def pose_of(estimate: Estimate, r_b: np.ndarray, q_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a module in the world by its body's estimate."""
+    """Pose of a module in the world from its body's estimate."""
     return estimate.p_wb + rotate(estimate.q_wb, r_b), normalise(multiply(estimate.q_wb, q_b))

@@ -1,4 +1,4 @@
-"""Right of way among the docks under way: who waits for a third body, who makes room, and whose target can come no farther."""
+"""Right of way among docks under way: which bodies wait for a third body or make room, and which targets can come no farther."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Docking
 
 AHEAD = {Stage.PRE_APPROACH: (1.0, WAY_SLACK), Stage.APPROACH: (0.0, math.inf)}
-"""Stages in which the active body is on a way: the gap that it ends at, and the slack that it leaves to others, as shares of the stand-off.
-The last piece is waited with only for those that it would touch: beside the target's face there may be others."""
+"""Stages in which the active body travels: the gap at which its way ends, and its slack (see WAY_SLACK), as shares of the stand-off.
+During the approach it waits only for bodies that it would touch, because others may stand beside the target's face."""
 
 
 class Dock(NamedTuple):
@@ -29,29 +29,29 @@ class Dock(NamedTuple):
     target: int
     prepared: Prepared
     began: Wish
-    """Where the active body was: there it gives way to others."""
+    """Pose of the active body at the start of the dock, to which it returns to give way to others."""
     said: set[str]
-    """What has been said of its waiting."""
+    """Reasons for waiting that were reported already."""
 
 
 class Wait(NamedTuple):
-    """What the active body of a dock does while somebody is on its way."""
+    """What the active body of a dock does while another body blocks its way."""
 
     wish: Wish
-    """What it glides by."""
+    """What the active body glides by."""
     words: str
 
 
 class _Course(NamedTuple):
-    """What is on the way of a dock's active body."""
+    """The way of a dock's active body, and what blocks it."""
 
     dock: Dock
     way: Way
     thirds: Sequence[tuple[Body, Estimate]]
     slack: float
-    """Share of the stand-off that it leaves to others."""
+    """Share of the stand-off, see WAY_SLACK."""
     met: int | None
-    """A module where the way leads, or of a target that has not yet come where it goes."""
+    """A module that blocks the way, or the target module while its body is still moving elsewhere; None: the way is free."""
 
 
 class Traffic:
@@ -65,12 +65,12 @@ class Traffic:
         courses = [course for dock in docks if (course := self._course(dock)) is not None]
         self._courses = {course.dock.active: course for course in courses}
         self._yielding = set[int]()
-        for k in reversed(range(len(courses))):  # the last to come is the first to make room
+        for k in reversed(range(len(courses))):  # the latest dock makes room first
             if self._yields(courses[k], courses[:k], courses[k + 1 :]):
                 self._yielding.add(courses[k].dock.active)
 
     def blocked(self, dock: Dock) -> str:
-        """Why a target that comes to meet the active body can come no farther; empty: it can, or it does not come."""
+        """Reason why a target that comes to meet the active body can come no farther; empty if it can, or does not come."""
         to_w, plan = dock.sequence.meets_at_w, dock.sequence.plan
         if to_w is None or dock.target not in self._coming:
             return ""
@@ -80,14 +80,14 @@ class Traffic:
         return "" if met is None else f"module {met} is where module {plan.request.target_module} comes to meet it"
 
     def wait(self, dock: Dock) -> Wait | None:
-        """What the active body does for a third body on its way, or for others that wait for it; None: there are none."""
+        """What the active body does about a third body that blocks its way, or others that wait for it; None: there are none."""
         if dock.active in self._yielding:
             return Wait(dock.began, "gives way to another")
         course = self._courses.get(dock.active)
         return None if course is None or course.met is None else Wait(REST, f"waits: module {course.met} is on its way")
 
     def _course(self, dock: Dock) -> _Course | None:
-        """None: it is on no way, or there is nobody else."""
+        """The course of a dock; None if its active body is not travelling, or there is no third body."""
         thirds = thirds_of(self._estimates, dock.active, dock.target)
         sequence = dock.sequence
         if not thirds or sequence.stage not in AHEAD:
@@ -100,10 +100,10 @@ class Traffic:
         return _Course(dock, way, thirds, slack, met)
 
     def _yields(self, mine: _Course, before: Sequence[_Course], after: Sequence[_Course]) -> bool:
-        """Whether the active body goes back to where it was when its dock began: while it waits itself, or until it has made room, for
-        the docks before its own that wait for it, else all would wait for ever; and for one after it that it waits for, and that cannot.
+        """Whether the active body returns to where its dock began. This breaks deadlocks: it does so while it waits itself, or until it
+        has made room, for earlier docks that wait for it, and for a later dock where each waits for the other and that one cannot yield.
 
-        Only where it is then out of their ways.
+        It yields only where the way back is free and its old place is out of their ways.
         """
         body, began = mine.way.body, mine.dock.began
         stuck = [other for other in after if mine.met in other.way.body.modules and other.dock.active not in self._yielding]
@@ -117,5 +117,5 @@ class Traffic:
 
 
 def thirds_of(estimates: Estimated, *pair: int) -> list[tuple[Body, Estimate]]:
-    """The bodies beside a pair."""
+    """All bodies except a pair."""
     return [placed for number, placed in estimates.items() if number not in pair]

@@ -1,4 +1,4 @@
-"""The straight ways that bodies go to a dock's stand-off: whether they lead too near another body, or two of them to one place."""
+"""Straight ways of bodies that dock or part: whether a way leads too near another body, or two docks lead to the same place."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Docking
 
 WAY_SAMPLES = 65
-"""Places on a way that are looked at, where the bodies are near each other."""
+"""Samples on the part of a way where the bodies are near each other."""
 WAY_SLACK = 0.25
-"""Share of the stand-off by which a way may lead nearer to another body than its ends are, as long as level cubes still pass each other."""
+"""Share of the stand-off by which a way may come nearer to another body than its ends, as long as level cubes still clear each other."""
 WAY_NOISE_M = 0.005
-"""Of the estimates: a way that leads nearer by less than this leads no nearer."""
+"""Noise of the estimates: coming nearer by less than this does not count."""
 SQUARE_DIAGONAL, CUBE_DIAGONAL = 2.0**0.5, 3.0**0.5
-"""Centres of two cubes of edge 1 that are so far apart do not touch: level cubes side by side; and however they are turned."""
+"""Distance of the centres beyond which two cubes of edge 1 cannot touch: level cubes side by side; cubes at any attitude."""
 BOTH_ENDS, BEGINNING = (0, -1), (0,)
-"""Ends of a way at which nearness is no fault of the way. A body that docks begins where it happens to be, and has to end close to its
-target; to a third body it has to be close at its beginning alone."""
+"""Ends of a way whose nearness to another body is accepted. A body that docks begins wherever it is, and must end close to its target;
+nearness to a third body is accepted at the beginning only."""
 
 
 class Way(NamedTuple):
-    """Of one body, which turns evenly as it goes."""
+    """Straight way of one body, which turns at a constant rate along it."""
 
     body: Body
     p_begin: np.ndarray
-    """(3,) of its centre of mass, world, m."""
+    """(3,) start of its centre of mass, world, m; `p_end` and `q_end` likewise."""
     q_begin: np.ndarray
     """(4,) body to world."""
     p_end: np.ndarray
@@ -42,7 +42,7 @@ class Way(NamedTuple):
     """Edge of a lattice cell."""
 
     def at(self, shares: Sequence[float]) -> np.ndarray:
-        """(k, m, 3) centres of its modules, world, m, after each of k shares of the way."""
+        """(k, m, 3) centres of its modules, world, m, at each of k shares (0 to 1) of the way."""
         turn = difference(self.q_end, self.q_begin)
         turned = _turned(self.q_begin, turn, np.array(shares))
         centres = self.p_begin + np.outer(shares, self.p_end - self.p_begin)
@@ -51,7 +51,7 @@ class Way(NamedTuple):
 
 @njit(f"float64[:,:,::1]({V},{V},{V})", cache=True)
 def _turned(q, turn, shares):  # type: ignore[no-untyped-def]
-    """(k, 3, 3) body to world of an attitude (4,) that has turned by each of k shares of a rotation vector (3,)."""
+    """(k, 3, 3) body to world, for an attitude (4,) turned by each of k shares of a rotation vector (3,)."""
     out = np.empty((shares.size, 3, 3))
     for i in range(shares.size):
         out[i] = to_matrix(multiply(q, exp(shares[i] * turn)))
@@ -59,7 +59,7 @@ def _turned(q, turn, shares):  # type: ignore[no-untyped-def]
 
 
 def way_of_active(plan: DockPlan, active: Body, at: Estimate, target: Body, target_at: Estimate, gap_m: float) -> Way:
-    """From where the active body is to a gap before the target's face."""
+    """The active body's way from where it is to a gap before the target's face."""
     r_a, q_a = module_in(active, plan.request.module)
     p_t, q_t = pose_of(target_at, *module_in(target, plan.request.target_module))
     q_end = normalise(multiply(multiply(q_t, plan.q_ta), conjugate(q_a)))
@@ -68,7 +68,7 @@ def way_of_active(plan: DockPlan, active: Body, at: Estimate, target: Body, targ
 
 
 def way_of_target(plan: DockPlan, active: Way, target: Body, target_at: Estimate) -> Way:
-    """Of a target that comes half of the way to meet the active body."""
+    """The way of a target that comes half the way to meet the active body."""
     module = active.body.modules.index(plan.request.module)
     begin, end = active.at((0.0, 1.0))[:, module]
     met_w = 0.5 * (begin - end)
@@ -76,7 +76,7 @@ def way_of_target(plan: DockPlan, active: Way, target: Body, target_at: Estimate
 
 
 def way_of_piece(plan: UndockPlan, piece: Body, whole: Body, at: Estimate, by_w: np.ndarray) -> Way:
-    """Of a piece of a body that is undocked, by so much (3,), world, m, from where the body holds it."""
+    """The way of a piece that is undocked from a body: by `by_w` (3,), world, m, from where the body holds it."""
     module, opens = piece.modules[0], plan.opens[0]
     pitch_m = float(np.linalg.norm(module_in(whole, opens.module)[0] - module_in(whole, opens.target_module)[0]))
     p_w, q_w = pose_of(at, *module_in(whole, module))
@@ -87,10 +87,10 @@ def way_of_piece(plan: UndockPlan, piece: Body, whole: Body, at: Estimate, by_w:
 
 
 def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near: Sequence[int] = BOTH_ENDS) -> int | None:
-    """Module of the other body that a way comes nearest to, of those that it comes too near; None: none.
+    """Nearest module of the other body among those that a way comes too near to; None if there is none.
 
-    Too near is nearer than at the ends `near`, and either so near that even level cubes may touch; or so near that turned cubes may, and
-    nearer than at those ends by more than `slack_m`.
+    Too near means nearer than at the ends `near` and, besides, either so near that even level cubes may touch; or so near that turned
+    cubes may touch, and nearer than at those ends by more than `slack_m`.
     """
     apart_m = CUBE_DIAGONAL * way.pitch_m + sum(float(np.linalg.norm(body.r_bm, axis=1).max()) for body in (way.body, other))
     shares = _near_part(way.p_begin - other_at.p_wb, way.p_end - way.p_begin, apart_m)
@@ -105,7 +105,7 @@ def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near
 
 
 def first_met(way: Way, thirds: Sequence[tuple[Body, Estimate]], p: Docking, slack: float = WAY_SLACK) -> int | None:
-    """A module of bodies that have nothing to do with the dock which is where a way leads, as far as is known; None: none.
+    """A module of a third body that a way comes too near to; None if there is none. Bodies whose place is unknown are left out.
 
     Args:
         slack: share of the stand-off, see WAY_SLACK.
@@ -122,9 +122,10 @@ def obstacle(
     comes: bool,
     p: Docking,
 ) -> str:
-    """Why a straight way of the two is none; empty: both are free, or nobody knows, which is for the sequence to say.
+    """Reason why a straight way of the two bodies is blocked. Empty if both ways are free, or the place of either body is unknown, which
+    the sequence judges.
 
-    The paper's own approach is drawn through the target from wherever it begins.
+    The target itself is no obstacle to the paper's straight approach, which leads through it from wherever it begins.
 
     Args:
         comes: the target comes to meet the active body.
@@ -142,7 +143,7 @@ def obstacle(
 
 
 def to_one_place(plan: DockPlan, other: DockPlan) -> bool:
-    """Whether both would bring a module to one place, beside a body that is to be part of both."""
+    """Whether both docks would bring a module to the same place, relative to a body that both include."""
     common = set(plan.merged.modules).intersection(other.merged.modules)
     if not common:
         return False
@@ -152,15 +153,15 @@ def to_one_place(plan: DockPlan, other: DockPlan) -> bool:
 
 
 def _beside(body: Body, common: Collection[int]) -> np.ndarray:
-    """(n, 3) places of those of its modules that are not `common`, in the frame of the first that is, m."""
+    """(n, 3) positions of the body's modules that are not in `common`, in the frame of the lowest-numbered one that is, m."""
     first = body.modules.index(min(common))
     places = (body.r_bm - body.r_bm[first]) @ to_matrix(np.ascontiguousarray(body.q_bm[first]))
     return np.asarray(places[[module not in common for module in body.modules]])
 
 
 def _near_part(begin: np.ndarray, way: np.ndarray, apart_m: float) -> list[float]:
-    """Shares of a way (3,) that begins at `begin` (3,) off a place: its ends, and WAY_SAMPLES of where it is nearer than `apart_m` to the
-    place; none where it never is.
+    """Shares to sample on a way (3,) that starts at `begin` (3,) relative to a place: both ends, and WAY_SAMPLES over the part nearer than
+    `apart_m` to the place; empty if there is no such part.
     """
     length2 = max(float(way @ way), 1e-12)
     middle = -float(begin @ way) / length2

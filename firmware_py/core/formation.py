@@ -1,4 +1,4 @@
-"""Which bodies there are: steers those that dock, joins and parts them within a tick, and hands over what goes on: nothing jumps."""
+"""The set of bodies: steers those that dock, joins and parts them within a tick, and hands over state so that no signal jumps."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ class Formation:
     def __init__(self, chains: list[BodyPipeline], docking: DockingStage, parameters: Parameters) -> None:
         self.chains, self.docking = chains, docking
         self.parameters = parameters
-        """Of now, for bodies that are still prepared too."""
+        """The present parameters; bodies still in preparation get them when they begin."""
         self._watch_joints()
 
     @property
     def bodies(self) -> list[Body]:
-        """In the order of their numbers."""
+        """The bodies, ordered by number."""
         return [chain.body for chain in self.chains]
 
     def retune(self, parameters: Parameters) -> None:
-        """Takes other parameters from this tick on."""
+        """Changes the parameters from this tick on."""
         self.parameters = parameters
         for chain in self.chains:
             chain.retune(parameters)
         self.docking.retune(parameters.docking)
 
     def step(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
-        """Docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
+        """Runs the docks of the whole fleet: steers those under way, joins and parts bodies within this tick."""
         if not (inputs.prepared or self.docking.has_work):
             outputs.joints = self.docking.joints
             return
@@ -59,20 +59,20 @@ class Formation:
         outputs.events += self.docking.events
 
     def asked(self, chain: BodyPipeline, granted: Sequence[DockRequest]) -> list[DockRequest | PartRequest]:
-        """What is to be prepared for docks and undocks of a body that were granted in this tick."""
+        """Preparations needed for the docks and undocks of a body that were granted in this tick."""
         if not chain.supervisor.armed:
             return [self._parting(chain, request) for request in granted]
         self.docking.expect(chain.body.index, granted)
         return [*granted]
 
     def _parting(self, chain: BodyPipeline, request: DockRequest) -> DockRequest | PartRequest:
-        """The undock of a disarmed body, which no magnet pushes open: it is parted where it has come apart, whichever side was named."""
+        """The undock of a disarmed body, which no magnet pushes open: it parts where it has come apart, whichever side was named."""
         apart = [joint for joint in self.docking.open_joints(APART) if joint.module in chain.body.modules]
         named = [joint for joint in apart if modules_of(joint) == modules_of(request)]
         return PartRequest((*named, *(joint for joint in apart if joint not in named))) if named else request
 
     def leave(self, chain: BodyPipeline, outputs: Outputs) -> None:
-        """Docks and undocks go on in the mode DOCK alone: a body that leaves it lets go at once."""
+        """Ends docks and undocks of a body at once when its mode is not DOCK."""
         supervisor = chain.supervisor
         if supervisor.mode != Mode.DOCK:
             surfaces = supervisor.armed and supervisor.mode == Mode.SURFACE
@@ -80,8 +80,8 @@ class Formation:
             outputs.events += [event._replace(body=chain.body.index) for event in self.docking.events]
 
     def _miss_partners(self, outputs: Outputs, parted: Sequence[int]) -> None:
-        """Joints that are open though nobody asked: tells the bodies, and parts those that have come apart once their fail-safe is on;
-        `parted` are so in this tick.
+        """Reports joints that are open without a request to their bodies, and asks for the parting of bodies that have come apart once
+        their `partner_lost` fail-safe is on. Bodies `parted` in this tick are left out.
         """
         loose = self.docking.open_joints(LOOSE)
         apart = self.docking.open_joints(APART) if loose else []
@@ -91,17 +91,17 @@ class Formation:
             mine = [joint for joint in loose if joint.module in chain.body.modules]
             chain.health.topology, chain.health.open_joints = _words_of(mine), tuple(map(modules_of, mine))
             gone = [joint for joint in apart if joint.module in chain.body.modules]
-            chain.parting = chain.parting if gone else []  # what closes for a moment may drop its plan: asked anew when it opens
+            chain.parting = chain.parting if gone else []  # a joint that closes briefly may drop its plan: ask again when it opens
             if gone and gone != chain.parting and chain.supervisor.armed and chain.supervisor.is_on("partner_lost"):
                 chain.parting = gone
                 outputs.preparations.append(PartRequest(tuple(gone)))
 
     def _armed_in(self, mode: Mode) -> list[int]:
-        """Numbers of the bodies that are armed in a mode."""
+        """Numbers of the bodies that are armed and in `mode`."""
         return [chain.body.index for chain in self.chains if chain.supervisor.armed and chain.supervisor.mode == mode]
 
     def _resting(self) -> list[tuple[int, int]]:
-        """Modules and faces whose magnets have used up their time."""
+        """Modules and faces whose magnets have used up their on-time."""
         return [
             (module, face)
             for chain in self.chains
@@ -137,13 +137,13 @@ class Formation:
         self._swap(before, after, estimates, found)
 
     def _begin(self, chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
-        """A body that was prepared takes over, with the parameters of now. Returns its estimate."""
+        """Lets a prepared body take over, with the present parameters. Returns its estimate."""
         if chain.parameters is not self.parameters:
             chain.retune(self.parameters)
         return take_over(chain, before, time_ns)
 
     def _chains_of(self, *bodies: int) -> list[BodyPipeline]:
-        """Of these bodies, by their numbers, in this order. No body joins or parts twice in a tick."""
+        """Pipelines of the bodies with these numbers, in this order. No body joins or parts twice in a tick."""
         return [chain for number in bodies for chain in self.chains if chain.body.index == number]
 
     def _swap(
@@ -163,7 +163,7 @@ class Formation:
 
 
 def take_over(chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
-    """`chain` goes on from the bodies that its own is made of, or was part of: motion, forces, health, arm state. Returns its estimate."""
+    """Hands motion, forces, health and arm state of the previous bodies (its parts, or the whole) to `chain`. Returns its estimate."""
     if len(before) == 1:
         motion = part_of(before[0].body, before[0].estimator.motion, chain.body)
     else:
@@ -182,7 +182,7 @@ def take_over(chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int)
 
 
 def _take_forces(chain: BodyPipeline, other: BodyPipeline) -> None:
-    """Thrusters keep the forces they have, so that no command jumps; magnets keep the time that they may still be on."""
+    """Hands over thruster forces, so that no command jumps, the remaining on-time of magnets, and supply voltages."""
     mine, theirs = chain.body, other.body
     forces = [array.copy() for array in chain.lag.forces]
     limited = chain.limiter.force_n.copy()
@@ -198,7 +198,7 @@ def _take_forces(chain: BodyPipeline, other: BodyPipeline) -> None:
 
 
 def _words_of(open_joints: Sequence[DockRequest]) -> str:
-    """The first of them, for people; empty: none is."""
+    """Text that names the first open joint and counts the others; empty if there is none."""
     if not open_joints:
         return ""
     first, more = open_joints[0], len(open_joints) - 1

@@ -1,4 +1,4 @@
-"""All joints of the fleet, and what currents and pictures tell of each of them."""
+"""All joints of the fleet, and their states by magnet currents and pictures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from firmware_py.description.parameters import Docking
 
 
 class JointWatch:
-    """Watches joints tick by tick. A request stands for the joint between its two modules, from whichever side it is told."""
+    """Watches joints tick by tick. A request identifies the joint between its two modules, from either side."""
 
     def __init__(self, parameters: Docking) -> None:
         self._p = parameters
@@ -21,47 +21,47 @@ class JointWatch:
         self._bank = PairBank([], parameters)
 
     def __len__(self) -> int:
-        """How many joints there are."""
+        """Number of joints."""
         return len(self._joints)
 
     def retune(self, parameters: Docking) -> None:
-        """Takes other parameters; what is known stays."""
+        """Changes the parameters; the joints' states are kept."""
         self._p = parameters
         self.watch(self._joints)
 
     def watch(self, joints: Sequence[Joint]) -> None:
-        """These from now on; of those that were watched before all that is known stays."""
+        """Watches `joints` from now on; joints that were watched before keep their state."""
         self._joints = joints
         self._bank = PairBank([joint.pair for joint in joints], self._p, self._bank)
 
     def step(self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses, resting: Collection[tuple[int, int]]) -> None:
-        """One tick; of `resting` modules and faces the magnets are off whatever is wanted."""
+        """Runs one tick. `resting`: modules and faces whose magnets are forced off."""
         if self._joints:
             self._bank.step(time_ns, modules, poses, resting)
 
     @property
     def rows(self) -> np.ndarray:
-        """(k,) of docking_pairs.PAIR: what is known of every joint in this tick; a copy."""
+        """(k,) of docking_pairs.PAIR: state of every joint in this tick; a copy."""
         return self._bank.rows.copy()
 
     def that_are_open(self, least: int) -> list[DockRequest]:
-        """Those that are `least` LOOSE or APART though they should hold, as requests that name their faces."""
+        """Joints that should hold but are at least `least` (LOOSE or APART), as requests that name their faces."""
         return [self._joints[k].request for k in np.flatnonzero(self._bank.rows["open"] >= least).tolist()] if self._joints else []
 
     def left(self, requests: Sequence[DockRequest]) -> list[DockRequest]:
-        """Those of the requests whose joints there still are."""
+        """The requests whose joints still exist."""
         there = [modules_of(joint.request) for joint in self._joints]
         return [request for request in requests if modules_of(request) in there]
 
     def newest_ns(self, request: DockRequest, what: str) -> int:
-        """Time of its newest picture (`picture_ns`), of the newest that shows it closed (`near_ns`), or of the staler of its two currents
-        (`current_ns`).
+        """Time of a joint's newest picture (`picture_ns`), of the newest that shows it closed (`near_ns`), or of the older of its two
+        currents (`current_ns`); NEVER_NS for an unknown joint.
         """
         row = self._row(request)
         return NEVER_NS if row is None else int(np.min(row[what]))
 
     def strong_ma(self, request: DockRequest, after_ns: int = NEVER_NS) -> np.ndarray | None:
-        """(2,) currents of its faces, mA, where both are on and came after that time."""
+        """(2,) currents of a joint's faces, mA, if both are above the threshold and newer than `after_ns`; else None."""
         row = self._row(request)
         if row is None or row["current_ns"].min() <= after_ns or not np.abs(row["current_ma"]).min() > self._p.current_threshold_ma:
             return None

@@ -1,4 +1,4 @@
-"""Joints: pairs of faces, a probe on a drogue, by which the modules of a body hold each other."""
+"""Joints: pairs of faces, a probe in a drogue, by which the modules of a body hold each other."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class Joint(NamedTuple):
 
     request: DockRequest
     offset: np.ndarray
-    """(3,) centre of its module in the frame of the target module, m."""
+    """(3,) centre of the request's module in the frame of the target module, m."""
     q_ta: np.ndarray
-    """(4,) frame of its module to frame of the target module."""
+    """(4,) frame of the request's module to frame of the target module."""
 
     @property
     def pair(self) -> FacePair:
-        """What the detector watches."""
+        """The joint as a pair of faces for the docking detector."""
         r = self.request
         return FacePair(r.target_module, r.target_face, r.module, r.face, self.offset, self.q_ta)
 
@@ -36,7 +36,7 @@ def sides(request: DockRequest) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def turned(request: DockRequest) -> DockRequest:
-    """The same joint, told from its other side."""
+    """The same joint seen from its other side."""
     return DockRequest(request.target_module, request.target_face, request.module, request.face)
 
 
@@ -46,7 +46,7 @@ def modules_of(request: DockRequest) -> frozenset[int]:
 
 
 def joints_of(body: Body) -> list[Joint]:
-    """Every joint of a body, in the order of its modules: neighbours of which one turns a probe and the other a drogue to the other."""
+    """Every joint of a body, in the order of its modules: neighbours with a probe on one of the facing sides and a drogue on the other."""
     joints: list[Joint] = []
     at = {tuple(cell): i for i, cell in enumerate(body.cells.tolist())}
     for i, cell in enumerate(body.cells):
@@ -57,13 +57,13 @@ def joints_of(body: Body) -> list[Joint]:
 
 
 def holding(body: Body, joints: Sequence[Joint]) -> list[tuple[int, ...]]:
-    """Relay states of each module of a body that hold its joints and reach for nothing else."""
+    """Relay states of each module of a body: PULL on the faces of its joints, OFF on all others."""
     held = {side for joint in joints for side in sides(joint.request)}
     return [tuple(RELAY_PULL if (m, face) in held else RELAY_OFF for face in range(FACES)) for m in body.modules]
 
 
 def _joint(body: Body, i: int, j: int) -> Joint:
-    """Between the modules i and j of the body, which are neighbours."""
+    """The joint between modules i and j of the body, which are neighbours."""
     step = (body.cells[j] - body.cells[i]).astype(np.float64)
     q_bi, q_bj = (np.ascontiguousarray(body.q_bm[k]) for k in (i, j))
     near = int(np.argmax(FACE_NORMALS @ rotate_back(q_bi, step)))

@@ -51,7 +51,7 @@ from firmware_py.description.schema import DescriptionError
 
 ESTIMATORS: dict[str, type[Estimator] | type[TagOnlyEstimator]] = {"full": Estimator, "paper": TagOnlyEstimator}
 ARMING_EVERY_NS = 100_000_000
-"""Between two times that the arming checks are asked for what a record says of them."""
+"""Period at which the arming checks are evaluated for `BodyRecord.may_arm`."""
 
 
 class BodyPipeline:
@@ -72,7 +72,7 @@ class BodyPipeline:
         self.dock_over = False
         self._asked_ns, self._may = -ARMING_EVERY_NS, False
         self.parting: list[DockRequest] = []
-        """Open joints for which a plan was last asked."""
+        """Open joints for which a plan was last requested."""
         self.controller = Controller(body, parameters.control)
         self.allocator = Allocator(body, parameters.allocation)
         self.limiter = Limiter(body, parameters.limiter, period_ns * 1e-9)
@@ -81,7 +81,7 @@ class BodyPipeline:
         self.supply = SupplyMeter(body)
 
     def retune(self, parameters: Parameters) -> None:
-        """Takes other gains, noise figures and limits from this tick on; estimate, mode, set-point and forces stay as they are."""
+        """Changes gains, noise figures and limits from this tick on; estimate, mode, set-point and forces stay as they are."""
         self.parameters = parameters
         self.estimator.retune(parameters.estimation)
         self.faults.retune(parameters.faults)
@@ -106,20 +106,20 @@ class BodyPipeline:
         return estimate
 
     def _find_faults(self, inputs: Inputs, measured: Measured, estimate: Estimate, mean_n: np.ndarray) -> None:
-        """Thrusters that are dead or lie leave the allocation at once."""
+        """Runs the fault detector; thrusters found dead or lying leave the allocation at once."""
         self.faults.step(inputs.modules, measured, estimate, self.lag.force_n, mean_n, self.supervisor.armed, self._is_free())
         if self.faults.changed:
             self.allocator.set_alive(self.faults.now.alive)
 
     def _is_free(self) -> bool:
-        """Whether no magnet pulls at another body, which then pushes back, nor pushes a module of this one away."""
+        """Whether no magnet pulls at another body, which would push back, or pushes a module of this body away."""
         return all(
             magnets.states == held or all(state in (RELAY_OFF, hold) for state, hold in zip(magnets.states, held, strict=True))
             for magnets, held in zip(self.limiter.magnets, self._holding, strict=True)
         )
 
     def decide(self, inputs: Inputs, estimate: Estimate, requests: Sequence[Request]) -> list[DockRequest]:
-        """Sound requests and fail-safes -> state and mode. Returns the docks and undocks that were granted."""
+        """Valid requests and fail-safes -> state and mode. Returns the docks and undocks that were granted."""
         mine = [r for r in requests if r.body == self.body.index or r.action in FOR_ALL]
         self.guidance.look(estimate, self.health.step(inputs, estimate, mine, self.faults.now))
         was_armed = self.supervisor.armed
@@ -137,7 +137,7 @@ class BodyPipeline:
         return [decision.argument for decision in decisions if decision.trigger in DOCKING]
 
     def _endings(self) -> list[Trigger]:
-        """What has come to its end by itself."""
+        """Triggers of activities that ended by themselves: DOCK_OVER after a dock, TEST_OVER whenever no motor test runs."""
         ended = [Trigger.DOCK_OVER] if self.dock_over else []
         self.dock_over = False
         return ended if self.motor_test.running else [*ended, Trigger.TEST_OVER]
@@ -150,7 +150,7 @@ class BodyPipeline:
             self.motor_test.detect(time_ns)
 
     def control(self, time_ns: int, estimate: Estimate) -> tuple[BodyRecord, np.ndarray]:
-        """Guide, control, allocate, limit: record of every signal, and the (n,) thruster commands."""
+        """Guide, control, allocate, limit. Returns the record of every signal, and the (n,) thruster commands."""
         health = self.health.now
         setpoint, ahead = self.guidance.step(time_ns, estimate, health)
         wrench = self.controller.step(setpoint, ahead, estimate)
@@ -167,13 +167,13 @@ class BodyPipeline:
         return record, command
 
     def _may_arm(self, time_ns: int) -> bool:
-        """Whether ARM would be granted, asked ten times a second: it takes every check, and people look at it."""
+        """Whether ARM would be granted. Evaluated ten times a second only, as it runs every check and is for display."""
         if time_ns - self._asked_ns >= ARMING_EVERY_NS:
             self._asked_ns, self._may = time_ns, self.supervisor.may_arm(self.health.now)
         return self._may and self.supervisor.state == State.DISARMED
 
     def magnets(self, wanted: Sequence[Sequence[int]], due: Collection[int]) -> dict[int, tuple[int, ...]]:
-        """Relay states that are wanted -> those that may be. Returns what is to be sent, by module: what is due, and what changed.
+        """Limits the wanted relay states. Returns the states to send, by module: those of modules that are due or whose states changed.
 
         Args:
             wanted: six states of each module of the fleet.
@@ -187,7 +187,7 @@ class BodyPipeline:
         return sent
 
     def _allocate(self, wrench: np.ndarray, time_ns: int) -> Thrust:
-        """Forces for the wrench, less what the thrusters left cannot make; or those of a motor test."""
+        """Thruster forces for the wrench, without the part that the remaining thrusters cannot make; or those of a motor test."""
         if self.supervisor.mode == Mode.MOTOR_DETECT:
             force = self.motor_test.step(time_ns)
             return Thrust(force, self.body.thrusters.matrix @ force, (1.0, 1.0))
@@ -210,15 +210,15 @@ class Pipeline:
 
     @property
     def parameters(self) -> Parameters:
-        """Of now."""
+        """The present parameters."""
         return self.formation.parameters
 
     def chain_of(self, body: Body) -> BodyPipeline:
-        """The stages of a body that is not there yet: made beside the loop, swapped in by a join or part."""
+        """Creates the stages of a future body: built outside the control loop, swapped in by a join or part."""
         return BodyPipeline(body, self.parameters, self._period_ns)
 
     def step(self, inputs: Inputs) -> Outputs:
-        """One tick."""
+        """Runs one tick."""
         outputs = Outputs(inputs.tick, inputs.time_ns, [IDLE] * self._modules, False, [], [])
         formation, docking = self.formation, self.formation.docking
         estimates = {chain.body.index: chain.measure(inputs) for chain in formation.chains}
@@ -245,7 +245,7 @@ class Pipeline:
         return outputs
 
     def _retune(self, requests: Sequence[Request], outputs: Outputs) -> None:
-        """Parameters that were set since the last tick. What a ground station's registry let through still may be refused here."""
+        """Applies parameters set since the last tick. A value that passed a ground station's registry may still be refused here."""
         wanted = dict(r.argument for r in requests if r.action == Action.SET_PARAMETER)
         if not wanted:
             return
@@ -259,11 +259,11 @@ class Pipeline:
 
 
 IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)
-"""What a module is told that belongs to no body."""
+"""Command of a module that belongs to no body."""
 
 
 def _command(chain: BodyPipeline, command: np.ndarray, relays: Mapping[int, tuple[int, ...]], outputs: Outputs) -> None:
-    """Hands each module its own thrusters and, where there are any to be sent, its relays."""
+    """Writes each module's command: its own thrusters and, where due, its relays."""
     armed, channels = chain.supervisor.armed, np.zeros((len(chain.body.modules), CHANNELS))
     channels.put(chain.slots, command)
     for module, thrusters in zip(chain.body.modules, channels, strict=True):

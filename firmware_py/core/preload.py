@@ -1,7 +1,7 @@
-"""Preload: thrusters of one module pushed against each other, without any wrench, so that small forces stay clear of
-the deadband.
+"""Preload: thrusters of one module pushing against each other, with no net wrench, so that small forces stay clear of the
+deadband.
 
-Worked out when a body is made or a thruster is lost; the allocator adds it to every answer.
+Computed when a body is made or a thruster is lost; the allocator adds it to every result.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from firmware_py.core.body import RANK_TOLERANCE, ThrusterSet
 DIRECTIONS = 720
 """Directions tried in the null space; half a degree apart where it is a plane."""
 TIE = 1e-9
-"""Directions as good as the best one but for rounding."""
+"""Relative tolerance within which directions count as equally good: rounding."""
 UNEVEN = 5.0
-"""The largest preload force of a module is at most this many times the smallest wanted one."""
+"""Limit of a module's largest preload force, as a multiple of `smallest_n`."""
 
 
 def preload(
     thrusters: ThrusterSet, alive: np.ndarray, smallest_n: float, before: tuple[np.ndarray, np.ndarray] | None = None
 ) -> np.ndarray:
-    """(n,) forces without wrench, N: every thruster that can be is at least `smallest_n` from zero, and no more than
-    needed.
+    """(n,) forces with no net wrench, N: each thruster that can be is at least `smallest_n` from zero, as far as UNEVEN permits, and no
+    force is larger than needed.
 
     Args:
         alive: (n,) bool, thrusters that may be used.
         smallest_n: wanted distance from zero; 0 gives no preload.
-        before: `alive` and answer of an earlier call; modules that have the same thrusters as then keep their forces.
+        before: `alive` and result of an earlier call; modules with the same thrusters as then keep their forces.
     """
     forces = np.zeros(thrusters.f_max.size)
     changed = np.unique(thrusters.module)
@@ -55,14 +55,14 @@ def _of_module(matrix: np.ndarray, smallest_n: float) -> np.ndarray:
     candidates = null @ _directions(null.shape[1])
     sizes = np.abs(candidates[reachable])
     evenness = sizes.min(axis=0) / sizes.max(axis=0)
-    best = int(np.argmax(evenness >= (1.0 - TIE) * evenness.max()))  # the first of those that are as good
+    best = int(np.argmax(evenness >= (1.0 - TIE) * evenness.max()))  # the first of equally good ones
     scale = min(smallest_n / max(sizes[:, best].min(), 1e-12), UNEVEN * smallest_n / sizes[:, best].max())
     return np.asarray(candidates[:, best] * scale)
 
 
 def _settled(basis: np.ndarray) -> np.ndarray:
-    """(k, d) orthonormal basis of the same space that does not depend on how the processor's LAPACK turned `basis`: Gram-Schmidt on the
-    projections of the thrusters' own axes pushing backwards, each time the first that is not much shorter than the longest.
+    """(k, d) orthonormal basis of the same space, independent of how the processor's LAPACK turned `basis`: Gram-Schmidt on the projections
+    of the thrusters' own axes pushing backwards, each time the first that is longer than half the longest.
     """
     left, found = -basis @ basis.T, []
     for _ in range(basis.shape[1]):
@@ -74,7 +74,7 @@ def _settled(basis: np.ndarray) -> np.ndarray:
 
 
 def _directions(dimension: int) -> np.ndarray:
-    """(dimension, DIRECTIONS) unit vectors: all of a plane's half-turn, a fixed draw in more dimensions."""
+    """(dimension, DIRECTIONS) unit vectors: half a turn in a plane, a seeded random draw in more dimensions, one vector on a line."""
     if dimension == 1:
         return np.ones((1, 1))
     if dimension == 2:

@@ -1,6 +1,6 @@
-"""What a request must be before anybody acts on it: a table of arguments, and whom it is for. Stands before stage 4 of a tick.
+"""Validation of requests: a table of argument checks by action, and a check of the addressed body. Runs before stage 4 of a tick.
 
-Whatever a client sends, what is unsound comes no farther than this file.
+An invalid request from any client gets no farther than this file.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from firmware_py.core.types import FACES, WARNING, Action, DockRequest, Event, M
 
 QUARTERS = 4
 FARTHEST = 1e6
-"""m, m/s, rad/s and so on: nothing that is meant is larger."""
+"""Largest magnitude of a valid number, in m, m/s, rad/s and so on."""
 UNIT = 1e-3
-"""A quaternion's length is 1 within this."""
+"""Tolerance of a quaternion's length from 1."""
 FOR_ALL = frozenset({Action.ESTOP, Action.CLEAR_ESTOP, Action.GROUND_ALIVE, Action.SET_PARAMETER})
-"""Requests that concern every body, whichever they name: ESTOP frames stop all modules."""
+"""Requests that concern every body, whichever one they name: ESTOP frames stop all modules."""
 
 
 def _anything(argument: Any) -> bool:
@@ -41,20 +41,20 @@ def _is_real(value: Any) -> bool:
 
 
 def _is_array(value: Any, size: int, may_lack: bool) -> bool:
-    """Whether it is a (size,) array as compiled functions take it, of numbers that may be meant; NaN where `may_lack`."""
+    """Whether `value` is a contiguous float64 (size,) array, as compiled functions take it, within FARTHEST; NaN passes if `may_lack`."""
     whole = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == (size,) and value.flags.c_contiguous
     return whole and bool(np.all((np.abs(value) <= FARTHEST) | (np.isnan(value) & may_lack)))
 
 
 def _is_sticks(argument: Any) -> bool:
-    """Whether it is six deflections within -1 to 1."""
+    """Whether `argument` is a Sticks of six deflections within -1 to 1."""
     if not isinstance(argument, Sticks) or not all(isinstance(group, tuple) and len(group) == 3 for group in argument):
         return False
     return all(_is_real(value) and abs(value) <= 1.0 for group in argument for value in group)
 
 
 def is_setpoint(argument: Any, may_lack: bool = False) -> bool:
-    """Whether it is a Setpoint that can be flown; with `may_lack`, NaN stands where nothing is asked for."""
+    """Whether `argument` is a valid Setpoint; with `may_lack`, NaN marks quantities that are not commanded."""
     if not isinstance(argument, Setpoint):
         return False
     p_wb, q_wb, *rest = argument
@@ -72,7 +72,7 @@ def _is_point(argument: Any) -> bool:
 
 
 def _is_trajectory(argument: Any) -> bool:
-    """Whether it can be sampled, and starts and ends where a body can be."""
+    """Whether `argument` can be sampled, and starts and ends at valid set-points."""
     duration_s: Any = getattr(argument, "duration_s", None)
     if not _is_real(duration_s) or duration_s < 0.0 or not callable(getattr(argument, "sample", None)):
         return False
@@ -118,11 +118,11 @@ SOUND: Mapping[Action, Callable[[Any], bool]] = {
     Action.MOTOR_TEST: _is_motor_test,
     Action.GROUND_ALIVE: _anything,
 }
-"""What the argument of each action must be. What stops a robot is never refused for its argument."""
+"""Argument check of each action. Actions that stop a robot are never refused for their argument."""
 
 
 def sift(requests: Sequence[Request], bodies: Mapping[int, Body]) -> tuple[list[Request], list[Event]]:
-    """The requests that make sense and reach a body, and for each of the others why not."""
+    """The valid requests that reach a body, and a warning with the reason for each of the others."""
     if not requests:
         return [], []
     reasons = [against_request(request, bodies) for request in requests]
@@ -132,10 +132,11 @@ def sift(requests: Sequence[Request], bodies: Mapping[int, Body]) -> tuple[list[
 
 
 def follow(requests: Sequence[Request], before: Sequence[Body], bodies: Mapping[int, Body]) -> list[Request]:
-    """The requests of a tick in which bodies may have joined or parted: DISARM reaches every body that has a module of the one it named.
+    """Readdresses the requests of a tick in which bodies may have joined or parted: DISARM goes to every body that has a module of the
+    body it named.
 
     Args:
-        before: at the beginning of the tick. bodies: now, by number.
+        before: the bodies at the beginning of the tick. bodies: the present ones, by number.
     """
     found: list[Request] = []
     for request in requests:
@@ -145,13 +146,13 @@ def follow(requests: Sequence[Request], before: Sequence[Body], bodies: Mapping[
 
 
 def _holders(named: int, before: Sequence[Body], bodies: Mapping[int, Body]) -> list[int]:
-    """Numbers of the bodies that hold a module of the one that has this number, or had it at the beginning of the tick."""
+    """Numbers of the bodies that include a module of a body that has the number `named`, or had it at the beginning of the tick."""
     modules = {module for body in (*before, *bodies.values()) if body.index == named for module in body.modules}
     return [number for number, body in bodies.items() if not modules.isdisjoint(body.modules)]
 
 
 def against_request(request: Request, bodies: Mapping[int, Body]) -> str:
-    """Why a request reaches nobody, in words; empty when it does. `bodies` by number."""
+    """Reason, in words, why a request is refused; empty if it is valid. `bodies`: by number."""
     if not SOUND[request.action](request.argument):
         return "its argument makes no sense"
     if request.action in FOR_ALL:
@@ -164,7 +165,7 @@ def against_request(request: Request, bodies: Mapping[int, Body]) -> str:
 
 
 def _against_faces(action: Action, dock: DockRequest, body: int, bodies: Mapping[int, Body]) -> str:
-    """Why two modules can neither meet nor part, whatever their faces are like."""
+    """Reason why two modules can neither dock nor undock, regardless of their faces; empty if they can."""
     modules = {module for each in bodies.values() for module in each.modules}
     unknown = {dock.module, dock.target_module} - modules
     if unknown:

@@ -1,7 +1,8 @@
-"""Takes away samples that are not to be believed: an IMU that repeats itself, a reading that leaps. Stands before stage 1 of a tick.
+"""Removes implausible samples: those of a frozen IMU or pressure sensor, and readings that leap. Runs before stage 1 of a tick.
 
-Noise never repeats itself for long; the body flies on by tags, depth and its model. A reading that is far from the one before is a wrong
-bit on its way unless the next one says the same: no thruster moves a body so suddenly, and a blow costs one sample.
+A live sensor's noise never repeats itself for long; without the IMU the body flies on by tags, depth and its model. A reading far from
+the one before counts as a transmission error unless the next one confirms it: no thruster moves a body so suddenly, and a real blow costs
+one sample.
 """
 
 from __future__ import annotations
@@ -18,24 +19,24 @@ from firmware_py.core.rotations import V
 from firmware_py.core.types import ModuleInputs
 
 REPEATS = 10
-"""Samples in a row that are the same in all six numbers. A quiet sensor of one count of noise does that once in a day of 100 Hz."""
+"""Repetitions of all six numbers that mark an IMU as frozen. A quiet sensor with one count of noise does that once a day at 100 Hz."""
 DEPTH_REPEATS = 100
-"""The same of a pressure, two seconds of DEPTH: the noise of a sensor that lives is tens of pascals, and its frames count single ones."""
+"""The same for pressure, two seconds of DEPTH frames: a live sensor has tens of pascals of noise, and the frames resolve single pascals."""
 LEAPS = {"gyro": 1.0, "accel": 2.0, "pressure_pa": 2000.0}
-"""From sample to sample, rad/s, m/s^2, Pa. A module's full moment, 3.2 N m of 0.088 kg m^2, turns it by 0.7 rad/s more in a tick at 50 Hz;
-its force, 40 N of 15.5 kg, comes with a lag of 80 ms: reversed, 1.2 m/s^2 in that tick. Twenty centimetres of water are 2000 Pa."""
+"""Largest plausible change between samples, rad/s, m/s^2, Pa. A module's full moment, 3.2 N m on 0.088 kg m^2, adds 0.7 rad/s in a tick at
+50 Hz; its force, 40 N on 15.5 kg, has a lag of 80 ms: reversed, 1.2 m/s^2 in that tick. Twenty centimetres of water are 2000 Pa."""
 FROZEN = {"gyro": None, "accel": None}
-"""What is left of a frozen IMU."""
+"""Replacement fields for the samples of a frozen IMU."""
 NOTHING = np.full(3, np.nan)
 Trace = tuple[np.ndarray, np.ndarray]
-"""The sample (k,) that was believed last, and the one after it that was not; NaN where there is none."""
+"""The last accepted sample (k,), and the rejected one that followed it; NaN where there is none."""
 
 
 class SensorWatch:
     """Watches the sensors of one body's modules.
 
     Attributes:
-        imu_heard, pressure_heard: whether any IMU, any pressure sensor that is to be believed gave a sample in this tick.
+        imu_heard, pressure_heard: whether any IMU, or any pressure sensor, gave a plausible sample in this tick.
     """
 
     def __init__(self, modules: Sequence[int]) -> None:
@@ -43,12 +44,12 @@ class SensorWatch:
         self.imu_heard = self.pressure_heard = False
 
     def take_over(self, before: Sequence[SensorWatch]) -> None:
-        """Goes on from the bodies that this one is made of, or was part of."""
+        """Takes over the watches of the body's modules from the previous bodies."""
         for other in before:
             self._watches |= {module: watch for module, watch in other._watches.items() if module in self._watches}
 
     def step(self, modules: Sequence[ModuleInputs]) -> Sequence[ModuleInputs]:
-        """The inputs of the fleet, by fleet index, less what is not to be believed."""
+        """The inputs of the fleet, by fleet index, without the implausible samples of this body's modules."""
         believed = list(modules)
         self.imu_heard = self.pressure_heard = False
         for index, watch in self._watches.items():
@@ -64,12 +65,12 @@ class _ModuleWatch:
     def __init__(self) -> None:
         self._last_rate, self._last_accel = b"", np.zeros(0)
         self._repeats = 0
-        """How often the last sample of the IMU has been repeated; stays as it is while none comes."""
+        """How often the last sample of the IMU has been repeated; unchanged while none comes."""
         self._last_pa, self._pressure_repeats = math.nan, 0
         self._traces: dict[str, Trace] = {}
 
     def step(self, module: ModuleInputs) -> ModuleInputs:
-        """What the module said, less what is not to be believed."""
+        """The module's inputs without implausible samples."""
         if module.gyro is not None and module.accel is not None:
             self._take_imu(module.gyro, module.accel)
         gone: dict[str, Any] = {name: None for name in LEAPS if self._leaps(name, getattr(module, name))}
@@ -91,7 +92,7 @@ class _ModuleWatch:
         return self._pressure_repeats >= DEPTH_REPEATS
 
     def _leaps(self, name: str, reading: np.ndarray | float | None) -> bool:
-        """Whether a reading is far from the one that was believed last, and from the one after that as well."""
+        """Whether a reading is far from the last accepted one, and also from a rejected one that followed it."""
         if reading is None:
             return False
         sample = reading if isinstance(reading, np.ndarray) else np.array([reading])
@@ -103,7 +104,7 @@ class _ModuleWatch:
 
 @njit(f"boolean({V},{V},float64)", cache=True)
 def is_near(a, b, reach):  # type: ignore[no-untyped-def]
-    """Whether no number of `a` (k,) is farther than `reach` from that of `b`; never where one is NaN."""
+    """Whether every number of `a` (k,) is within `reach` of that of `b`; false if any is NaN."""
     near = True
     for i in range(a.size):
         near = near and abs(a[i] - b[i]) <= reach

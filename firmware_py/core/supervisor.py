@@ -1,4 +1,4 @@
-"""Stage 4 of a tick: runs the tables of `transitions` and `failsafes` for one body and says in words what it does and refuses."""
+"""Stage 4 of a tick: runs the tables of `transitions` and `failsafes` for one body, and reports in words what it does and refuses."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ LADDER = {
     Level.SURFACE: (Trigger.FAILSAFE_SURFACE,),
     Level.DISARM: (Trigger.FAILSAFE_DISARM,),
 }
-"""What a fail-safe tries, one after the other until one is possible."""
+"""Triggers that a fail-safe tries in order until one is possible."""
 DESPITE: dict[Guard, tuple[str, ...]] = {Guard.MODE_PERMITTED: (), Guard.PARTING_PERMITTED: ("partner_lost",)}
-"""Guards that ask the fail-safes, and which of them are no reason against it."""
+"""Guards that consult the fail-safes, each with the fail-safes that it ignores."""
 MODE_LEVEL = {Mode.SURFACE: Level.SURFACE}
-"""What a mode is worth as a fail-safe, whoever chose it: a milder one does not end it."""
+"""Level that a mode provides, whoever chose it: a milder fail-safe does not replace it."""
 
 
 class Decision(NamedTuple):
-    """A transition that was made: its trigger, what guidance is to do, the mode after it, and the request's argument."""
+    """A completed transition: its trigger, what guidance is to do, the mode afterwards, and the request's argument."""
 
     trigger: Trigger
     effect: Effect
@@ -40,10 +40,10 @@ class Supervisor:
     """State and mode of one body.
 
     Attributes:
-        state, mode: now. While disarmed `mode` is the one to arm in.
-        level: what a fail-safe has done to the mode; NONE when a person chose it.
+        state, mode: the present ones. While disarmed, `mode` is the one to arm in.
+        level: level of the fail-safe that chose the mode; NONE if a person chose it.
         raises_estop: the e-stop came as a request, so the firmware itself raises ESTOP on the bus.
-        events: of this tick.
+        events: events of this tick.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -53,12 +53,12 @@ class Supervisor:
         self.mode = Mode.POSHOLD
         self.level = Level.NONE
         self._chosen = self.mode
-        """By a person, before a fail-safe acted."""
+        """The mode that a person chose, before a fail-safe acted."""
         self.raises_estop = False
         self.events: list[Event] = []
         self._estop_ns: int | None = None
         self._let_go = True
-        """Disarmed in the tick before, with no e-stop that a module could still say of that it holds it."""
+        """Whether the body was disarmed in the previous tick, with no module stopped and no recent e-stop that could still hold one."""
         self._testing = False
 
     @property
@@ -68,7 +68,7 @@ class Supervisor:
 
     @property
     def safety(self) -> Level:
-        """What its mode is worth as a fail-safe."""
+        """Fail-safe level that the present mode provides."""
         return max(self.level, MODE_LEVEL.get(self.mode, Level.NONE))
 
     def may_arm(self, health: Health) -> bool:
@@ -80,18 +80,19 @@ class Supervisor:
         return self._failsafes.is_on(failsafe)
 
     def step(self, estop: bool, health: Health, requests: list[Request], endings: Sequence[Trigger] = ()) -> list[Decision]:
-        """Runs this tick's triggers in order: e-stop, what has ended by itself, requests, fail-safes.
+        """Runs this tick's triggers in order: e-stop, activities that ended by themselves, requests, fail-safes.
 
         Args:
-            estop: an ESTOP frame came since the previous tick. A module that says it is stopped while the body is armed is as good as one;
-                and one that says so of a disarmed body when none did in the tick before: nobody has cleared that e-stop.
-            health: of this tick.
-            requests: for this body, and e-stops for all.
-            endings: TEST_OVER while no motor test runs, DOCK_OVER when a dock has ended; nothing is said where they do not apply.
+            estop: an ESTOP frame came since the previous tick. A module that reports itself stopped counts as one while the body is armed.
+                It also counts if the body was disarmed in the previous tick with no module stopped and no recent e-stop: it was
+                never cleared.
+            health: health of this tick.
+            requests: requests for this body, and e-stops for all bodies.
+            endings: TEST_OVER while no motor test runs, DOCK_OVER when a dock has ended; ignored silently where they do not apply.
         """
         self.events = []
         decisions: list[Decision | None] = []
-        if estop or (health.stopped and (self.armed or self._let_go)):  # a module has heard what the firmware has not
+        if estop or (health.stopped and (self.armed or self._let_go)):  # a module has heard an ESTOP that the firmware has not
             self._estop_ns = health.time_ns
             if not estop:
                 self._say(CRITICAL, f"e-stop: module {', '.join(map(str, health.stopped))} says that it heard one")
@@ -110,13 +111,13 @@ class Supervisor:
             trigger = Trigger.FORCED_ARM
         decision = self._try(trigger, request.argument, health)
         if decision is not None and trigger in (Trigger.ESTOP, Trigger.CLEAR_ESTOP):
-            if self.raises_estop or trigger == Trigger.ESTOP:  # the modules hear ours, until now or from now on
+            if self.raises_estop or trigger == Trigger.ESTOP:  # the modules hear our ESTOP, until now or from now on
                 self._estop_ns = health.time_ns
             self.raises_estop = trigger == Trigger.ESTOP
         return decision
 
     def _run_failsafes(self, health: Health) -> list[Decision | None]:
-        """Says what begins and ends, and does what the gravest one asks for."""
+        """Reports fail-safes that begin and end, and carries out the action of the gravest one."""
         decisions: list[Decision | None] = []
         alarms = self._failsafes.step(health, self.mode, self.level > Level.NONE, self.armed)
         if not alarms:
@@ -124,13 +125,13 @@ class Supervisor:
         begun = any(alarm.begins and alarm.level > Level.WARN for alarm in alarms)
         level = self._failsafes.level
         acts = self.armed and begun and level > self.safety
-        if level <= Level.WARN and self.mode == self._chosen:  # all that acted are over, and have left the mode as it was
+        if level <= Level.WARN and self.mode == self._chosen:  # all fail-safes that acted are over, and the mode is the chosen one
             self.level = Level.NONE
         if self.level == Level.NONE:
             self._chosen = self.mode
         for alarm in alarms:
             severity = INFORMATION if not alarm.begins else CRITICAL if alarm.level > Level.HOLD else WARNING
-            if acts or not alarm.again:  # one that comes and goes is said when it takes the robot from somebody
+            if acts or not alarm.again:  # a recurring one is reported only when it takes over control
                 self._say(severity, f"fail-safe {'on' if alarm.begins else 'over'}: {alarm.words}")
         if acts:
             for trigger in self._ladder(level, health):
@@ -142,13 +143,13 @@ class Supervisor:
         return decisions
 
     def _ladder(self, level: Level, health: Health) -> tuple[Trigger, ...]:
-        """What is tried. A body whose thrusters are tested, or that never saw a tag, may lie on a bench: no test becomes a flight."""
+        """Triggers to try. In MOTOR_DETECT, a body that a test armed, or that never saw a tag, may lie on a bench: it is disarmed."""
         if self.mode == Mode.MOTOR_DETECT and (self._testing or not health.placed):
             return LADDER[Level.DISARM]
         return LADDER[level]
 
     def _try(self, trigger: Trigger, argument: Any, health: Health) -> Decision | None:
-        """Makes the transition of the table's row, or says why not."""
+        """Makes the transition of the table's row, or reports why not."""
         row = ROWS.get((self.state, trigger))
         if row is None:
             self._say(WARNING, f"{trigger.name} refused: not possible in {self.state.name}")
@@ -162,7 +163,7 @@ class Supervisor:
         return Decision(trigger, row.effect, mode, argument)
 
     def _mode_after(self, row: Transition) -> Mode:
-        """As before; but a body that comes to rest keeps no mode that a person did not choose or cannot: it would be armed in it."""
+        """The present mode; POSHOLD if the body stops in a mode that no person chose or may choose: it would next be armed in it."""
         comes_to_rest = self.armed and row.next_state not in ARMED
         chosen = self.level == Level.NONE and not self._testing and MODES[self.mode].request
         return Mode.POSHOLD if comes_to_rest and not chosen else self.mode
@@ -179,7 +180,7 @@ class Supervisor:
         self.state, self.mode = row.next_state, mode
 
     def _reasons(self, guard: Guard, mode: Mode, health: Health, argument: Any = None) -> list[str]:
-        """Why `guard` does not hold, in words; empty when it does. Those of an undock ask for its `argument`."""
+        """Reasons, in words, why `guard` does not hold; empty if it does. Guards of an undock need its `argument`."""
         if guard in (Guard.ARMING_CHECKS, Guard.FORCED_CHECKS):
             question = Question(health, mode, self._p, self._failsafes, self._estop_age_ms(health))
             return against_arming(question, guard == Guard.FORCED_CHECKS)
@@ -191,7 +192,7 @@ class Supervisor:
         if guard in DESPITE:
             despite = DESPITE[Guard.MODE_PERMITTED if holds else guard]
             reasons = missing(mode, health, self._p) or self._failsafes.against(mode, health, despite)
-            if self._testing:  # and nobody has asked yet whether it may fly
+            if self._testing:  # a test armed the body, so the arming checks for flight have not run yet
                 reasons = reasons or self._reasons(Guard.ARMING_CHECKS, mode, health)
             return reasons
         if guard == Guard.ESTOP_QUIET and self._estop_is_fresh(health):
@@ -201,22 +202,22 @@ class Supervisor:
         return []
 
     def _applies(self, trigger: Trigger) -> bool:
-        """Whether the end of something concerns the present state."""
+        """Whether the trigger of an ended activity applies in the present state."""
         row = ROWS.get((self.state, trigger))
         return row is not None and (self._testing if row.guard == Guard.TESTING else self.mode == Mode.DOCK)
 
     def retune(self, parameters: Parameters) -> None:
-        """Takes other limits from this tick on; state and mode stay."""
+        """Changes the limits from this tick on; state and mode stay."""
         self._p = parameters
         self._failsafes.retune(parameters.failsafes)
 
     def take_over(self, before: Sequence[Supervisor]) -> None:
-        """Goes on from the bodies that this one is made of, or was part of: armed when all were, stopped when one was.
+        """Takes over from the previous bodies (its parts, or the whole): armed if all were, in e-stop if any was.
 
-        Fail-safes that were on stay on. Its mode is that of the body whose fail-safe is the gravest; where none is under one, the first
-        mode of them that needs no place; else it holds its place.
+        Fail-safes that were on stay on. The mode is that of the body under the gravest fail-safe; if there is none, the first of the
+        bodies' modes that needs no position; else POSHOLD. A body that a motor test armed counts as disarmed, and its mode is dropped.
         """
-        flown = [other for other in before if not other._testing]  # no test becomes a flight
+        flown = [other for other in before if not other._testing]  # a motor test never becomes a flight
         states = {State.DISARMED if other._testing else other.state for other in before}
         self.state = State.ESTOP if State.ESTOP in states else State.DISARMED if State.DISARMED in states else State.ARMED
         worst = max(before, key=lambda other: other.safety)
@@ -239,4 +240,4 @@ class Supervisor:
 
 
 TAKES_OVER = (Effect.ENTER_MODE, Effect.ENTER_LEVEL, Effect.HOLD_AT, Effect.FOLLOW)
-"""Effects by which a person or a fail-safe chooses how the body is steered."""
+"""Effects that set how the body is steered, by a person's or a fail-safe's choice."""

@@ -1,4 +1,4 @@
-"""The supply voltage of each module, smoothed. Read before stage 1 of a tick; the limiter asks for more command where it sags."""
+"""The smoothed supply voltage of each module. Runs before stage 1 of a tick; the limiter raises commands where the voltage sags."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from firmware_py.core.limiter import is_believed
 from firmware_py.core.types import ModuleInputs
 
 SMOOTHING = 0.5
-"""Share of a new reading (10 Hz) that is believed: settles in half a second."""
+"""Weight of a new reading (10 Hz): settles in half a second."""
 
 
 class SupplyMeter:
-    """The supplies of one body.
+    """Supply voltages of one body.
 
     Attributes:
-        voltage_v: (m,) of each module; nominal before the first reading that can be true.
+        voltage_v: (m,) of each module; nominal before the first plausible reading.
     """
 
     def __init__(self, body: Body) -> None:

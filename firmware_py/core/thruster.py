@@ -1,7 +1,6 @@
 """Thruster curves: the paper's fifth-order polynomials force(command) and power(force), supply voltage, and the lag.
 
-The controller's side: it turns wanted forces into commands (limiter) and commands into the forces that it believes in
-(estimator).
+The controller's model: it converts wanted forces into commands (limiter), and commands into believed forces (estimator).
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from firmware_py.core.body import ThrusterSet
 from firmware_py.core.rotations import M, V
 
 RESOLUTION = 2.0**-40
-"""Of a command found by `inverse`: far below the bus's 1/2048."""
+"""Tolerance of a command found by `inverse`: far below the bus's 1/2048."""
 MOST_STEPS = 60
-"""Of its search; six are usual."""
+"""Limit of the iterations of `inverse`; six are usual."""
 
 
 @njit(f"float64({V},float64)", cache=True)
 def polynomial(c, x):  # type: ignore[no-untyped-def]
-    """c[0] x + c[1] x^2 + ... without a constant term, so that no command is no force."""
+    """c[0] x + c[1] x^2 + ... without a constant term, so that a zero command gives zero force."""
     value = 0.0
     for i in range(c.shape[0] - 1, -1, -1):
         value = (value + c[i]) * x
@@ -33,7 +32,7 @@ def polynomial(c, x):  # type: ignore[no-untyped-def]
 def inverse(c, value):  # type: ignore[no-untyped-def]
     """The x in 0..1 with polynomial(c, x) = value; 0 below and 1 above the range. c must rise over 0..1.
 
-    Newton's steps from where a square law would have it, halving the interval instead wherever one would leave it.
+    Newton steps, starting from the solution of a square law; a step that would leave the bracket is replaced by a bisection.
     """
     full = polynomial(c, 1.0)
     if value <= 0.0:
@@ -60,11 +59,11 @@ def inverse(c, value):  # type: ignore[no-untyped-def]
 
 @njit(f"void({V},{V},{M},{M},{V},{V})", cache=True)
 def commands(force, scale, forward, reverse, deadband, out):  # type: ignore[no-untyped-def]
-    """(n,) command of each thruster for its wanted force.
+    """Writes the command of each thruster for its wanted force.
 
     Args:
         force: (n,) N. scale: (n,) force at this voltage over force at the curve's voltage.
-        forward, reverse: (n, 5) polynomials. deadband: (n,) N. out: (n,) is written.
+        forward, reverse: (n, 5) polynomials. deadband: (n,) N. out: (n,) commands, written.
     """
     for i in range(force.shape[0]):
         f = force[i] / scale[i]
@@ -87,7 +86,7 @@ def total_power(force, power_forward, power_reverse):  # type: ignore[no-untyped
 
 @njit(f"{V}({V},{M},{M},int64[::1],int64)", cache=True)
 def module_power(force, power_forward, power_reverse, module, count):  # type: ignore[no-untyped-def]
-    """(count,) electrical power of the thrusters of each module, W; `module` (n,) says whose a thruster is."""
+    """(count,) electrical power of the thrusters of each module, W; `module` (n,): module of each thruster."""
     out = np.zeros(count)
     for i in range(force.shape[0]):
         out[module[i]] += polynomial(power_forward[i] if force[i] > 0.0 else power_reverse[i], abs(force[i]))
@@ -96,10 +95,10 @@ def module_power(force, power_forward, power_reverse, module, count):  # type: i
 
 @njit(f"void({V},{V},{V},{V},{V})", cache=True)
 def lagged(acting, decay, lag_over_dt, force, mean):  # type: ignore[no-untyped-def]
-    """Moves `force` (n,), N, on by a tick towards `acting` (n,), N; writes to `mean` (n,) what it is on the mean of that tick, N.
+    """Advances `force` (n,), N, by a tick towards `acting` (n,), N; writes its mean over that tick, N, to `mean` (n,).
 
     Args:
-        decay: (n,) share of a difference that is left after a tick. lag_over_dt: (n,) lag over the length of a tick.
+        decay: (n,) share of a difference that remains after a tick. lag_over_dt: (n,) lag over the length of a tick.
     """
     for i in range(force.shape[0]):
         end = acting[i] + (force[i] - acting[i]) * decay[i]
@@ -108,7 +107,7 @@ def lagged(acting, decay, lag_over_dt, force, mean):  # type: ignore[no-untyped-
 
 
 class ThrusterLag:
-    """The forces that the thrusters are believed to give now: commanded forces through a first-order lag.
+    """Believed present forces of the thrusters: commanded forces through a first-order lag.
 
     The command of tick k leaves in tick k and acts from SYNC k+1 on, so one command waits in `_pending`.
     """
@@ -122,7 +121,7 @@ class ThrusterLag:
         self._pending = np.zeros(n)
 
     def step(self) -> np.ndarray:
-        """(n,) mean force of each thruster over the tick that ends now, N; moves the lag on by one tick."""
+        """Advances the lag by one tick. Returns the (n,) mean force of each thruster over the tick that ends now, N."""
         mean = np.empty_like(self.force_n)
         self.force_n = self.force_n.copy()
         lagged(self._acting, self._decay, self._lag_over_dt, self.force_n, mean)
@@ -131,13 +130,13 @@ class ThrusterLag:
 
     @property
     def forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Believed force, force aimed at now, and force aimed at next, (n,) each: all there is to remember."""
+        """Believed force, force it approaches now, and force it approaches next, (n,) each, N: the whole state."""
         return self.force_n, self._acting, self._pending
 
     def restart(self, force_n: np.ndarray, acting_n: np.ndarray, pending_n: np.ndarray) -> None:
-        """Goes on from what `forces` gave."""
+        """Restores a state that `forces` gave."""
         self.force_n, self._acting, self._pending = force_n, acting_n, pending_n
 
     def command(self, force_n: np.ndarray) -> None:
-        """The forces asked for in this tick."""
+        """Takes the forces commanded in this tick, (n,), N."""
         self._pending = force_n

@@ -1,6 +1,6 @@
-"""Which modules form which bodies, as state: what joining and parting does to motion and estimate. Nothing is built here.
+"""How joining and parting of bodies transforms estimator state and covariance. No Body is built here.
 
-The new Body comes prepared (prepare.docking). Velocities follow from momentum: what two bodies have together before, they have after.
+The new Body comes prepared (prepare.docking). Velocities of a joined body follow from conservation of momentum.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rotations import conjugate, cross, multiply, normalise, rotate, rotate_back, skew, to_matrix
 
 JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
-"""What is added to a joined body's sigma: position m, attitude rad, velocity m/s, rate rad/s. The faces' play, and the shock."""
+"""Added to a joined body's sigma: position m, attitude rad, velocity m/s, rate rad/s. Covers the play of the faces, and the shock."""
 PARTED_SIGMA = (0.07, 0.05, 0.07, 0.1)
-"""The same of a parted one: magnets push the pieces apart for as much as a second before they are flown as two (`release_s`). On the bench
-each is 70 mm and 0.05 rad away by then, at 70 mm/s and 0.1 rad/s (dock-undock-dock, seed 1)."""
+"""The same for a parted body: magnets push the pieces apart for up to a second (`release_s`) before they are flown as two. On the bench
+each has by then moved 70 mm and 0.05 rad, at 70 mm/s and 0.1 rad/s (dock-undock-dock, seed 1)."""
 BIAS_SPREAD = np.repeat([0.005, 0.05, 0.02], [3, 3, 1])
-"""(7,) how far biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, differ between modules, sigma (synthetic,
-as the bench draws them). A body knows their mean."""
+"""(7,) sigma of the biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, between modules (synthetic, as the bench draws
+them). A body estimates their mean."""
 BIASES = np.r_[12:18, 24]
-"""Where they stand in the error."""
+"""Indices of these biases in the error state."""
 LEVEL = np.array([1.0, 1.0, 0.0])
-"""Of a force in the world, what does not lift."""
+"""Mask of the horizontal part of a force in the world."""
 TURNING = np.ix_(np.r_[21:24, 25:28], np.r_[21:24, 25:28])
-"""Where disturbance moment and righting stand in a covariance (28, 28)."""
+"""Index of disturbance moment and righting in a covariance (28, 28)."""
 
 
 class Motion(NamedTuple):
@@ -36,18 +36,18 @@ class Motion(NamedTuple):
     x: np.ndarray
     covariance: np.ndarray
     accepted: int
-    """Tag observations that it rests on."""
+    """Number of tag observations accepted so far."""
     tag_ns: int
-    """Time of the newest."""
+    """Time of the newest tag observation."""
 
 
 def down_of(x: np.ndarray) -> np.ndarray:
-    """(3,) down in the axes of a body in state x."""
+    """(3,) unit vector down, in the axes of a body in state x."""
     return np.asarray(to_matrix(x[3:7].copy())[2])
 
 
 def in_both(mine: Sequence[int], theirs: Sequence[int]) -> list[tuple[int, int]]:
-    """Where each module that is in both bodies stands in the one and in the other."""
+    """Index pairs (in `mine`, in `theirs`) of the modules that are in both bodies."""
     return [(i, theirs.index(module)) for i, module in enumerate(mine) if module in theirs]
 
 
@@ -65,7 +65,7 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
         force += moved.x[19:22]
         level_b = rotate_back(x[3:7].copy(), moved.x[19:22] * LEVEL)
         moment += turn.T @ moved.x[22:25] + cross(lever_b, level_b)
-        off += turn.T @ moved.x[26:29] - lever_b * moved.x[21]  # what lifts at a lever turns the body upright
+        off += turn.T @ moved.x[26:29] - lever_b * moved.x[21]  # a vertical force at a lever has a righting moment
     x[7:13] = body.mass_inv @ momentum
     x[19:22], x[22:25], x[26:29] = force, moment, off
     modules = [len(part.modules) for part, _ in parts]
@@ -111,7 +111,7 @@ def _transport(lever_b: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _attitude(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
-    """(4,) attitude of `new` from that of `old`, by a module that both hold."""
+    """(4,) attitude of `new` from that of `old`, by a module that both contain."""
     i, j = in_both(old.modules, new.modules)[0]
     turn = multiply(np.ascontiguousarray(old.q_bm[i]), conjugate(np.ascontiguousarray(new.q_bm[j])))
     return np.asarray(normalise(multiply(x[3:7].copy(), turn)))
@@ -130,13 +130,14 @@ def _biases(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
 
 
 def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body, shock: Sequence[float]) -> np.ndarray:
-    """(28, 28) covariance of the new body in state x: the variances of the old one, larger by the shock, the disturbance's by mass.
+    """(28, 28) covariance of the new body in state x: variances of the old one, increased by the shock; that of the disturbance force is
+    scaled by mass.
 
-    Correlations are dropped but for one. How the moment that acts is made up of disturbance and righting is not known of the new body, and
-    righting begins with its own sigma; but their sum, the moment that acts, is known as well as before, by inertia.
+    All correlations but one are dropped. How the acting moment divides into disturbance and righting is unknown for the new body, and
+    righting starts with its initial sigma; but their sum, the acting moment, is known as well as before, scaled by inertia.
 
     Args:
-        shock: sigma to be added to position m, attitude rad, velocity m/s, rate rad/s.
+        shock: sigma to add to position m, attitude rad, velocity m/s, rate rad/s.
     """
     variance = old.covariance.diagonal().copy()
     variance[18:21] *= (after.rigid_mass_kg / before.rigid_mass_kg) ** 2

@@ -1,6 +1,6 @@
-"""The supervisor's rules, as data: in which state which trigger, under which guard, does what and leads where; and what each mode needs.
+"""The supervisor's rules as data: the transitions (state, trigger, guard, effect, next state), and what each mode needs.
 
-`docs/supervisor.md` is drawn from these tables.
+`docs/supervisor.md` is generated from these tables.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ class State(IntEnum):
 
 
 class Trigger(IntEnum):
-    """What makes the supervisor look into its table."""
+    """What can cause a transition."""
 
     ESTOP_FRAME = 0
-    """An ESTOP frame came from the bus, or a module says that it heard one that the firmware did not."""
+    """An ESTOP frame came from the bus, or a module reports one that the firmware did not hear."""
     ESTOP = 1
     CLEAR_ESTOP = 2
     DISARM = 3
@@ -41,7 +41,7 @@ class Trigger(IntEnum):
     TEST_OVER = 14
     """The motor test that armed the body is over."""
     DOCK_OVER = 15
-    """The docking sequence has given up."""
+    """A dock or undock ended without success."""
     FAILSAFE_HOLD = 16
     FAILSAFE_DEPTH = 17
     FAILSAFE_SURFACE = 18
@@ -49,7 +49,7 @@ class Trigger(IntEnum):
 
 
 TRIGGERS = {action: Trigger[action.name] for action in Action if action.name in Trigger.__members__}
-"""Trigger of each request; a request without one is not the supervisor's business."""
+"""Trigger of each request; the supervisor ignores requests without one."""
 
 
 DOCKING = frozenset({Trigger.DOCK, Trigger.UNDOCK})
@@ -65,11 +65,11 @@ class Guard(IntEnum):
     FORCED_CHECKS = 2
     """Those arming checks that may not be skipped, and what the chosen mode needs."""
     MODE_PERMITTED = 3
-    """The wanted mode has what it needs, and no fail-safe forbids it; of a body that a motor test has armed, every arming check too."""
+    """The wanted mode has what it needs, and no fail-safe forbids it; a body armed by a motor test must also pass every arming check."""
     MODE_NEEDS = 4
     """The wanted mode has what it needs."""
     ESTOP_QUIET = 5
-    """No ESTOP frame came of late."""
+    """No ESTOP frame came recently."""
     IN_MOTOR_DETECT = 6
     """The mode is MOTOR_DETECT."""
     TESTING = 7
@@ -77,9 +77,9 @@ class Guard(IntEnum):
     IN_DOCK = 8
     """The mode is DOCK."""
     PARTING_PERMITTED = 9
-    """As MODE_PERMITTED; but a partner that is lost may be let go: by a joint of its own that is open."""
+    """As MODE_PERMITTED, but the fail-safe of a lost partner does not forbid an undock at a joint that is open."""
     JOINT_OPEN = 10
-    """The joint is open though it should hold: a body that has come apart while disarmed could not be armed in any other way."""
+    """The joint should hold but is open: undocking it is the only way to arm a body again that has come apart while disarmed."""
 
 
 class Effect(IntEnum):
@@ -101,11 +101,11 @@ class Effect(IntEnum):
     TEST_MOTOR = 7
     """Turn the given thruster."""
     ENTER_LEVEL = 8
-    """Steer by the new mode, from where the body is, and turn upright if it is steep: cameras see its tags then."""
+    """Steer by the new mode, from where the body is, and turn upright if it is steeply tilted, so that cameras see its tags."""
 
 
 class Transition(NamedTuple):
-    """One row."""
+    """One row of the table."""
 
     state: State
     trigger: Trigger
@@ -113,7 +113,7 @@ class Transition(NamedTuple):
     effect: Effect
     next_state: State
     mode: Mode | None = None
-    """The mode afterwards; None: the one that the request names, or as before."""
+    """The mode afterwards; None: the one that the request names, or unchanged."""
 
 
 ARMED = frozenset({State.ARMED})
@@ -166,7 +166,7 @@ ROWS = {(row.state, row.trigger): row for row in TABLE}
 
 
 class Need(IntEnum):
-    """What a mode cannot do without."""
+    """What a mode requires."""
 
     ATTITUDE = 0
     DEPTH = 1

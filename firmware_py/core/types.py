@@ -1,4 +1,4 @@
-"""The values that pass between the stages of a tick. Everything else about a stage stays in its own file.
+"""Values that pass between the stages of a tick. Everything else about a stage stays in its own file.
 
 One tick: Inputs -> (Estimate, Setpoint, Wrench, Thrust per body) -> Outputs. World NED, body FRD, SI units.
 """
@@ -14,31 +14,31 @@ import numpy as np
 
 Array = np.ndarray
 CHANNELS, FACES = 8, 6
-"""Thruster commands that one module's frames carry; docking faces of a module, each with its relay."""
+"""Number of thruster commands in one module's frames; number of docking faces of a module, each with its relay."""
 RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
 """States of a docking relay, as DOCK_CMD has them."""
 MCU_ESTOP = 4
-"""State of MCU_STATUS: an e-stop holds the module."""
+"""MCU_STATUS state of a module that is held by an e-stop."""
 MCU_UNFIT = (0, 5)
-"""States of MCU_STATUS: the module starts, or has a fault of its own."""
+"""MCU_STATUS states of a module that is starting, or has a fault of its own."""
 CRITICAL, WARNING, NOTICE, INFORMATION = 2, 4, 5, 6
-"""Severities of an `Event`, as syslog and STATUSTEXT have them."""
+"""Severities of an `Event`, numbered as in syslog and STATUSTEXT."""
 NEVER_NS = -(1 << 60)
-"""Time of what has not come yet."""
+"""Time of something that has not come yet."""
 NEVER_AGE_NS = -NEVER_NS
-"""What is so old, or older, has not come yet."""
+"""An age of this or more means that nothing has come yet."""
 
 
-# ---------------------------------------------------------------- what comes in
+# ---------------------------------------------------------------- inputs
 
 
 class TagObservation(NamedTuple):
-    """One tag seen once: both TAG frames of it, paired."""
+    """One tag seen once: its two TAG frames, paired."""
 
     tag_id: int
     quality: int
     capture_ns: int
-    """Time of the picture, on the firmware's clock."""
+    """Capture time of the picture, on the firmware's clock."""
     p_wt: Array
     """(3,) tag centre in the world, m."""
     q_wt: Array
@@ -46,7 +46,7 @@ class TagObservation(NamedTuple):
 
 
 class EscFeedback(NamedTuple):
-    """Both ESCs of one feedback frame."""
+    """The two ESCs of one feedback frame."""
 
     first: int
     """Index of its first thruster in the module."""
@@ -62,12 +62,12 @@ class DockFeedback(NamedTuple):
     """Index of the first face."""
     current_ma: tuple[float, float, float]
     relay: tuple[int, int, int]
-    """States that the relays are in."""
+    """Actual states of the relays."""
 
 
 @dataclass(slots=True)
 class ModuleInputs:
-    """What one module's frames said since the previous tick; None or empty where nothing fresh came."""
+    """Contents of one module's frames since the previous tick; None or empty where nothing fresh came."""
 
     gyro: Array | None = None
     """(3,) angular rate, module frame, rad/s."""
@@ -85,36 +85,36 @@ class ModuleInputs:
     leak: bool | None = None
     mcu_state: int | None = None
     answered: bool = False
-    """Its MCU_STATUS of this tick is in."""
+    """Whether its MCU_STATUS of this tick has arrived."""
     heard: bool = False
-    """Any frame of the module came."""
+    """Whether any frame of the module came."""
 
 
 class Mode(IntEnum):
-    """How an armed body is steered; ArduSub's names and numbers where the meaning is the same."""
+    """How an armed body is steered. Names and numbers are ArduSub's where the meaning is the same."""
 
     STABILIZE = 0
-    """Sticks give force and turning rate; attitude is held."""
+    """Sticks command force and turning rate; attitude is held."""
     ALT_HOLD = 2
-    """As STABILIZE, and depth is held."""
+    """As STABILIZE, with depth held."""
     AUTO = 3
     """Follows a trajectory or mission."""
     GUIDED = 4
-    """Follows set-points that stream in."""
+    """Follows streamed set-points."""
     SURFACE = 9
-    """Rises and stays up."""
+    """Rises and stays at the surface."""
     POSHOLD = 16
     """Holds the place; sticks move it."""
     MANUAL = 19
-    """Sticks are forces and moments."""
+    """Sticks command forces and moments directly."""
     MOTOR_DETECT = 20
     """Turns one thruster after the other."""
     DOCK = 30
-    """The docking sequence steers; modcube's own number."""
+    """The docking sequence steers. The number is modcube's own."""
 
 
 class Action(IntEnum):
-    """What a person or program may ask of a body; `argument` of the Request in brackets."""
+    """What a person or program may request of a body; the Request's `argument` in brackets."""
 
     ARM = 1
     """[bool: forced]"""
@@ -133,7 +133,7 @@ class Action(IntEnum):
     SET_POINT = 9
     """GUIDED's newest set-point [Setpoint]"""
     SET_PARAMETER = 10
-    """[(name as in the registry, value)]"""
+    """[(name in the registry, value)]"""
     DOCK = 11
     """[DockRequest]"""
     UNDOCK = 12
@@ -152,7 +152,7 @@ class Sticks(NamedTuple):
 
 
 class DockRequest(NamedTuple):
-    """Which faces are to meet, or to part."""
+    """Which faces are to dock, or to undock."""
 
     module: int
     """Fleet index of the active module."""
@@ -167,10 +167,10 @@ class DockRequest(NamedTuple):
 
 
 class PartRequest(NamedTuple):
-    """What asks for a body to be flown as the pieces that it has come to."""
+    """Request to fly a body that has come apart as its pieces."""
 
     joints: tuple[DockRequest, ...]
-    """All of its joints that are open."""
+    """All open joints of the body."""
 
 
 class Request(NamedTuple):
@@ -195,11 +195,11 @@ class Inputs:
     dropped_frames: int = 0
     """Frames dropped by the codec so far, all kinds."""
     foreign_sync: bool = False
-    """A SYNC of somebody else came since the previous tick."""
+    """Another node's SYNC came since the previous tick."""
     foreign_command: bool = False
-    """A THRUSTER_CMD or DOCK_CMD of somebody else came since the previous tick."""
+    """Another node's THRUSTER_CMD or DOCK_CMD came since the previous tick."""
     prepared: list[Any] = field(default_factory=list)
-    """Results of the worker: docking.Prepared."""
+    """Results of the worker: docking_decisions.Prepared."""
 
 
 # ---------------------------------------------------------------- between the stages
@@ -211,14 +211,14 @@ class Measured(NamedTuple):
     gyro: Array | None
     """(3,) rad/s."""
     accel: Array | None
-    """(3,) specific force at the centre of mass, m/s^2; where the IMUs heard stand beside it, angular acceleration by the gyro."""
+    """(3,) specific force at the centre of mass, m/s^2; the lever arm of the IMUs heard is removed with the gyro."""
     depth_m: float | None
-    """Depth of the centre of mass by pressure, without the datum's bias."""
+    """Depth of the centre of mass from pressure, without the datum's bias."""
     tags: list[BodyPose]
 
 
 class BodyPose(NamedTuple):
-    """What one or more tags of a body, seen in one picture, say of its pose."""
+    """Pose of a body measured by one or more of its tags in one picture."""
 
     capture_ns: int
     p_wt: Array
@@ -228,11 +228,11 @@ class BodyPose(NamedTuple):
     q_wb: Array
     """(4,) attitude of the body."""
     tags: float
-    """Tags of full quality that it is worth; the noise falls with the root."""
+    """Equivalent number of tags of full quality; noise falls with its square root."""
 
 
 class Estimate(NamedTuple):
-    """What the estimator believes at the tick's time."""
+    """The estimator's state at the time of the tick."""
 
     p_wb: Array
     q_wb: Array
@@ -249,17 +249,17 @@ class Estimate(NamedTuple):
     tag_age_ns: int
     """Time since the last accepted tag observation was taken; very large before the first."""
     nis: float
-    """Normalised innovation squared of the tag updates of this tick, summed; NaN without one."""
+    """Normalised innovation squared, summed over the tag updates of this tick; NaN without one."""
     nis_dof: int
-    """Its degrees of freedom."""
+    """Degrees of freedom of `nis`."""
     rejected: int
-    """Tag observations refused by the gate so far."""
+    """Number of tag observations rejected by the gate so far."""
     ready: bool
-    """An attitude has been found: by tags, or before the first by gravity."""
+    """Whether an attitude has been found: by tags, or by gravity before the first tag."""
 
     @property
     def placed(self) -> bool:
-        """Whether tags have told heading and place."""
+        """Whether tags have fixed heading and position."""
         return self.ready and self.tag_age_ns < NEVER_AGE_NS
 
 
@@ -279,14 +279,14 @@ class Setpoint(NamedTuple):
 
 
 class Room(NamedTuple):
-    """What passes the limiter for as long as one likes: the allocation's limits."""
+    """What the limiter passes continuously: the limits of the allocation."""
 
     low_n: Array
-    """(n,) of each thruster, N, in reverse: negative."""
+    """(n,) reverse limit of each thruster, N, negative."""
     high_n: Array
-    """(n,) forward."""
+    """(n,) forward limit of each thruster, N."""
     supply_w: Array
-    """(m,) what each module's supply has for thrusters, W."""
+    """(m,) power of each module's supply that is available to thrusters, W."""
 
 
 class Thrust(NamedTuple):
@@ -295,55 +295,55 @@ class Thrust(NamedTuple):
     force_n: Array
     """(n,) force of each thruster, N."""
     achieved: Array
-    """(6,) wrench that these forces give."""
+    """(6,) wrench of these forces."""
     scale: tuple[float, float]
-    """Share of the wanted force and moment that is kept, 0 to 1, as far as the thrusters that are left can make them (faults.keep)."""
+    """Shares of the wanted force and moment that are kept, 0 to 1, relative to what the remaining thrusters can make (faults.keep)."""
     margin: float = math.nan
-    """Share of its range that the busiest thruster has left, 0 to 1; NaN while single motors are tested."""
+    """Share of its range that the most loaded thruster has left, 0 to 1; NaN while single motors are tested."""
 
 
-# ---------------------------------------------------------------- what goes out
+# ---------------------------------------------------------------- outputs
 
 
 class ModuleCommand(NamedTuple):
-    """What one module is told in this tick."""
+    """Command to one module in this tick."""
 
     armed: bool
     thrusters: Array
     """(8,) share of full command, -1 to 1."""
     relays: tuple[int, ...] | None
-    """Six wanted relay states, or None when DOCK_CMD is not due."""
+    """Six relay states to send, or None when DOCK_CMD is not due."""
 
 
 class Event(NamedTuple):
-    """Something a person may want to read."""
+    """A message for people."""
 
     severity: int
     """CRITICAL, WARNING or INFORMATION."""
     text: str
     body: int | None = None
-    """Number of the body that it is about; None: all of them, or none that there is."""
+    """Number of the body that it concerns; None: all bodies, or none that exists."""
 
 
 class BodyRecord(NamedTuple):
-    """Every internal signal of one body in one tick, as the recorder stores it."""
+    """All internal signals of one body in one tick, as the recorder stores them."""
 
     body: int
     state: int
     """core.transitions.State"""
     mode: int
-    """Mode; while disarmed the one to arm in."""
+    """Mode; while disarmed, the one to arm in."""
     estimate: Estimate
     setpoint: Setpoint
     wrench: Array
-    """(6,) wanted wrench, body."""
+    """(6,) wanted wrench, body frame."""
     thrust: Thrust
     commanded_n: Array
     """(n,) force of each thruster after the limiter."""
     may_arm: bool
-    """Disarmed, and every arming check held when they were asked last, at most 0.1 s ago."""
+    """Whether the body is disarmed and passed every arming check at the last evaluation, at most 0.1 s ago."""
     level: int
-    """failsafes.Level: what a fail-safe has made of the mode; NONE when a person chose it."""
+    """failsafes.Level of the fail-safe that chose the mode; NONE if a person chose it."""
 
 
 class DockRecord(NamedTuple):
@@ -360,10 +360,10 @@ class DockRecord(NamedTuple):
     current_holds: bool
     position_holds: bool
     gap_m: float
-    """Between the faces, by the estimates."""
+    """Gap between the faces, from the estimates."""
     lateral_m: float
     position_error_m: float
-    """Off one pitch, by fresh pictures."""
+    """Deviation of the relative position from one pitch, from fresh pictures."""
 
 
 @dataclass(slots=True)
@@ -374,13 +374,13 @@ class Outputs:
     time_ns: int
     modules: list[ModuleCommand]
     estop: bool
-    """The firmware raises ESTOP."""
+    """Whether the firmware raises ESTOP."""
     events: list[Event]
     records: list[BodyRecord]
     docks: list[DockRecord] = field(default_factory=list)
     joints: Array | None = None
-    """(k,) of docking_pairs.PAIR: all faces that hold modules of one body together."""
+    """(k,) of docking_pairs.PAIR: all joints, pairs of faces that hold modules of one body together."""
     preparations: list[DockRequest | PartRequest] = field(default_factory=list)
-    """Docks, undocks of modules of one body, and bodies that have come apart, to be prepared beside the loop; they come back in
+    """Docks, undocks and partings of bodies that have come apart, to be prepared outside the control loop; results return in
     Inputs.prepared.
     """

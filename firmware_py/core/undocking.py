@@ -1,4 +1,4 @@
-"""One undock under way: its magnets push, and then pictures, or else currents, tell whether its joints have opened."""
+"""One undock under way: its magnets push, then pictures, or else currents, show whether its joints have opened."""
 
 from __future__ import annotations
 
@@ -17,36 +17,38 @@ PULLED = "its magnets go on pulling"
 
 
 class Undock(NamedTuple):
-    """Magnets push until the body parts, which is at once where every joint is open already."""
+    """State of an undock: magnets push until the body parts, which happens at once if every joint is open already."""
 
     plan: UndockPlan
     chains: tuple[Any, ...]
     since_ns: int
     until_ns: int
     seen_ns: int
-    """By then pictures, and currents too, of the latter half of the push are there, if any still come."""
+    """Deadline by which pictures and currents from the latter half of the push have arrived, if any still come."""
     last_ns: int
-    """While a joint holds, the magnets push on, as long again: a short push shows late."""
+    """End of the extended push: while a joint still holds, magnets push for as long again, because a short push shows late."""
     before_ma: Mapping[DockRequest, np.ndarray | None]
     """Currents (2,) of the joints before the push, where both of their magnets were on."""
 
     @staticmethod
     def begun(plan: UndockPlan, chains: tuple[Any, ...], time_ns: int, holds: bool, p: Docking, joints: JointWatch) -> Undock:
-        """One that begins now; `holds`: not every joint is open."""
+        """Creates an undock that begins now; `holds`: not every joint is open."""
         push_ns, seen_ns = (round(ns) if holds else 0 for ns in (p.release_s * 1e9, 2e6 * p.pose_fresh_ms))
         last_ns = time_ns + max(2 * push_ns, seen_ns)
         before_ma = {joint: joints.strong_ma(joint) for joint in plan.opens}
         return Undock(plan, chains, time_ns, time_ns + push_ns, time_ns + seen_ns, last_ns, before_ma)
 
     def pushes(self, time_ns: int, joints: JointWatch) -> bool:
-        """Whether it is too early to ask what holds: a picture of a single joint is waited for, of several their currents."""
+        """Whether it is too early to call `held_by`: a single joint waits for a picture, several joints for their currents."""
         is_told = self._is_seen if len(self.plan.opens) == 1 else self._is_felt
         return time_ns < self.until_ns or (time_ns < self.seen_ns and not is_told(time_ns, joints))
 
     def held_by(self, time_ns: int, joints: JointWatch) -> str:
-        """What tells that a joint holds, as where a relay hangs: two bodies would fly against each other. Empty: nothing does.
+        """Evidence, in words, that a joint still holds, as with a stuck relay: parted, the two bodies would fly against each other. Empty
+        if there is none.
 
-        Of several that part at once the funnels hold back what leaves across, until thrusters draw it out: of these no picture tells.
+        Where several joints part at once, their funnels hold back a piece that leaves sideways until thrusters pull it out, so pictures
+        prove nothing: only currents count.
         """
         half_ns, joint = self._half_ns(time_ns), self.plan.opens[0]
         if len(self.plan.opens) == 1 and self._is_seen(time_ns, joints):
@@ -59,7 +61,7 @@ class Undock(NamedTuple):
         return joints.newest_ns(self.plan.opens[0], "picture_ns") > self._half_ns(time_ns)
 
     def _is_felt(self, time_ns: int, joints: JointWatch) -> bool:
-        """Whether currents of all joints that had any came in the latter half of the push."""
+        """Whether every joint with currents before the push has newer ones from its latter half."""
         felt = [joint for joint, before in self.before_ma.items() if before is not None]
         return all(joints.newest_ns(joint, "current_ns") > self._half_ns(time_ns) for joint in felt)
 

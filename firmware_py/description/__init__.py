@@ -1,1 +1,1 @@
-"""What the robot is: frozen descriptions, read once at start."""
+"""Frozen descriptions of the robot, read once at start."""

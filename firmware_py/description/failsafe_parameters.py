@@ -1,6 +1,6 @@
-"""Fail-safes as parameters: of each its limit, how long it must be beyond it, what is done, and whether it is latched.
+"""Fail-safe parameters: limit, delay, action and latching of each fail-safe; also the fence and the thruster fault limits.
 
-Part of `parameters`. core.failsafes holds the table that goes with them: what is measured, in which modes, in which order.
+Part of `parameters`. core.failsafes has the matching table: what is measured, in which modes, in which order.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ LATCHED = "1: ends by disarming only, 0: also when its cause is gone for clear_s
 
 
 def delay(default_s: float, mavlink: str) -> Any:
-    """A field: how long the cause must last."""
+    """A field for the time that the cause must last."""
     return quantity(default_s, unit="s", low=0, high=600, help="how long before it acts", mavlink=mavlink)
 
 
 def action(default: int, mavlink: str) -> Any:
-    """A field: what is then done."""
+    """A field for the action, see `ACTION`."""
     return quantity(default, low=0, high=5, help=ACTION, mavlink=mavlink)
 
 
 def latched(default: int, mavlink: str) -> Any:
-    """A field: whether it stays until the body is disarmed."""
+    """A field for whether the fail-safe stays on until the body is disarmed."""
     return quantity(default, low=0, high=1, help=LATCHED, mavlink=mavlink)
 
 
@@ -37,18 +37,18 @@ class Failsafes:
     leak_delay_s: float = delay(0.5, "FS_LEAK_S")
     leak_action: int = action(4, "FS_LEAK_ACT")
     leak_latched: int = latched(1, "FS_LEAK_LAT")
-    # every module silent: the bus is off, thrusters stand still by themselves
+    # every module silent: the bus is off, and thrusters stop by themselves
     bus_silent_limit: float = quantity(
         2.0, unit="s", low=0.1, high=60, help="no module was heard for longer", mavlink="FS_BUS_LIM"
     )
     bus_silent_delay_s: float = delay(0.0, "FS_BUS_S")
     bus_silent_action: int = action(5, "FS_BUS_ACT")
     bus_silent_latched: int = latched(0, "FS_BUS_LAT")
-    # somebody else sends SYNC
+    # another node sends SYNC
     foreign_sync_delay_s: float = delay(0.0, "FS_SYNC_S")
     foreign_sync_action: int = action(4, "FS_SYNC_ACT")
     foreign_sync_latched: int = latched(1, "FS_SYNC_LAT")
-    # somebody else sends THRUSTER_CMD or DOCK_CMD
+    # another node sends THRUSTER_CMD or DOCK_CMD
     foreign_command_delay_s: float = delay(0.0, "FS_CMD_S")
     foreign_command_action: int = action(1, "FS_CMD_ACT")
     foreign_command_latched: int = latched(0, "FS_CMD_LAT")
@@ -66,14 +66,14 @@ class Failsafes:
     cabin_hot_delay_s: float = delay(5.0, "FS_HOT_S")
     cabin_hot_action: int = action(4, "FS_HOT_ACT")
     cabin_hot_latched: int = latched(0, "FS_HOT_LAT")
-    # hull gives way
+    # the hull fails
     cabin_pressure_limit: float = quantity(
         20000.0, unit="Pa", low=100, high=200000, help="cabin pressure off its first reading by more", mavlink="FS_CABP_LIM"
     )
     cabin_pressure_delay_s: float = delay(2.0, "FS_CABP_S")
     cabin_pressure_action: int = action(4, "FS_CABP_ACT")
     cabin_pressure_latched: int = latched(1, "FS_CABP_LAT")
-    # the thrusters left cannot make every wrench
+    # the remaining thrusters cannot make every wrench
     axis_lost_delay_s: float = delay(3.0, "FS_AXIS_S")
     axis_lost_action: int = action(4, "FS_AXIS_ACT")
     axis_lost_latched: int = latched(1, "FS_AXIS_LAT")
@@ -84,8 +84,8 @@ class Failsafes:
     depth_unknown_delay_s: float = delay(0.0, "FS_DEPU_S")
     depth_unknown_action: int = action(4, "FS_DEPU_ACT")
     depth_unknown_latched: int = latched(0, "FS_DEPU_LAT")
-    # tags do not come back: what a fail-safe makes hold its depth comes up, 30 s after the last tag, or 22 s after a pilot is gone who flew
-    # without any
+    # tags do not come back: a body that a fail-safe holds at its depth surfaces, 30 s after the last tag, or 22 s after the loss of a pilot
+    # who flew without tags
     tag_gone_limit: float = quantity(
         8.0, unit="s", low=0.1, high=3600, help="no tag for longer", mavlink="FS_TAGG_LIM"
     )
@@ -105,7 +105,7 @@ class Failsafes:
     estimator_delay_s: float = delay(2.0, "FS_EST_S")
     estimator_action: int = action(3, "FS_EST_ACT")
     estimator_latched: int = latched(0, "FS_EST_LAT")
-    # tags are refused
+    # the gate rejects tags
     rejected_limit: float = quantity(
         0.8, low=0.05, high=1, help="share of tags refused by the gate, mean of a second", mavlink="FS_REJ_LIM"
     )
@@ -117,7 +117,7 @@ class Failsafes:
     tag_lost_delay_s: float = delay(0.0, "FS_TAGL_S")
     tag_lost_action: int = action(3, "FS_TAGL_ACT")
     tag_lost_latched: int = latched(0, "FS_TAGL_LAT")
-    # a wall, a hand or a rope pushes, and nobody sees where to: the believed place runs away
+    # a wall, a hand or a rope pushes while no tag is seen: the estimated position runs away
     pushed_limit: float = quantity(
         0.5, unit="m/s", low=0.05, high=10, help="without tags pushed harder than by such a current on the mean", mavlink="FS_PUSH_LIM"
     )
@@ -138,7 +138,7 @@ class Failsafes:
     depth_lost_delay_s: float = delay(0.0, "FS_DEPL_S")
     depth_lost_action: int = action(1, "FS_DEPL_ACT")
     depth_lost_latched: int = latched(0, "FS_DEPL_LAT")
-    # the IMU is silent, at fault or frozen
+    # the IMU is silent, faulty or frozen
     imu_lost_limit: float = quantity(
         0.5, unit="s", low=0.1, high=60, help="no IMU of the body gave a sample to believe for longer", mavlink="FS_IMU_LIM"
     )
@@ -182,14 +182,14 @@ class Failsafes:
     thruster_lost_delay_s: float = delay(0.0, "FS_THR_S")
     thruster_lost_action: int = action(1, "FS_THR_ACT")
     thruster_lost_latched: int = latched(1, "FS_THR_LAT")
-    # a module does not say whether it leaks: its readings come at 5 Hz, the delay is for the first of all
+    # a module does not report whether it leaks: readings come at 5 Hz; the delay allows for the first one
     cabin_unknown_limit: float = quantity(
         2.0, unit="s", low=0.5, high=60, help="no leak, temperature or pressure of a cabin for longer, to arm too", mavlink="FS_CABU_LIM"
     )
     cabin_unknown_delay_s: float = delay(1.0, "FS_CABU_S")
     cabin_unknown_action: int = action(1, "FS_CABU_ACT")
     cabin_unknown_latched: int = latched(0, "FS_CABU_LAT")
-    # a module does not say how full its battery is
+    # a module does not report its battery voltage
     battery_unknown_limit: float = quantity(
         2.0, unit="s", low=0.5, high=60, help="no voltage of a module for longer, to arm too", mavlink="FS_BATU_LIM"
     )
@@ -211,7 +211,7 @@ class Failsafes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fence:
-    """Where the body may be, world, its centre of mass. Wide open by default: a tank's own size belongs into its parameter file."""
+    """Permitted region of the body's centre of mass, world. Wide open by default: a tank's size belongs in its parameter file."""
 
     north_m: float = quantity(100.0, unit="m", low=0.1, high=100000.0, help="the farthest it may go north or south", mavlink="FENCE_NORTH")
     east_m: float = quantity(100.0, unit="m", low=0.1, high=100000.0, help="the farthest it may go east or west", mavlink="FENCE_EAST")

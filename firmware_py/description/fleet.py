@@ -1,4 +1,4 @@
-"""The fleet: which modules one firmware process controls, on which buses, and how they start out docked."""
+"""The fleet: the modules that one firmware process controls, their buses, and how they are docked at the start."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from firmware_py.description.vehicle import find_vehicles
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Module:
-    """One cube: its number on its bus, and where it sits in its body at the start."""
+    """One module: its number on its bus, and its place in its body at the start."""
 
     number: int = quantity(low=1, high=29, help="number on the bus")
     bus: int = quantity(0, low=0, high=15, help="index into `buses`")
@@ -29,19 +29,19 @@ class Module:
 
 
 def check_cell(cell: np.ndarray) -> None:
-    """Raises DescriptionError for a place (3,) between those of the lattice."""
+    """Raises DescriptionError if a cell (3,) is not made of whole numbers."""
     if not np.array_equal(cell, np.round(cell)):
         raise DescriptionError(f"cell {cell.tolist()} is between places of the lattice; it needs whole numbers", "cell")
 
 
 def overlaps(cells: Sequence[tuple[int, ...]], modules: Sequence[object]) -> Iterator[tuple[int, str]]:
-    """Of each of `cells` that another module has before it, which, and what is wrong; `modules` are what errors name them by."""
+    """Index of each cell that an earlier module occupies already, with the error text; `modules`: names of the modules in that text."""
     return ((i, f"modules {modules[cells.index(cells[i])]} and {modules[i]} overlap in cell {cells[i]}") for i in repeated(cells))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fleet:
-    """All modules of one process, in the order in which they are indexed everywhere."""
+    """All modules of one process, in fleet index order."""
 
     module: tuple[Module, ...] = quantity()
     buses: tuple[str, ...] = quantity(("virtual:modcube",), help="bus of each index")
@@ -67,17 +67,17 @@ class Fleet:
 
     @property
     def period_ns(self) -> int:
-        """Length of a tick."""
+        """Length of a tick, ns."""
         return 1_000_000_000 // self.rate_hz
 
     def label(self, index: int) -> str:
-        """How errors name a module: by its number, and by its bus where there are several."""
+        """Name of a module in error messages: its number, and its bus where there are several."""
         module = self.module[index]
         return f"{module.number}" if len(self.buses) == 1 else f"{module.number} on {self.buses[module.bus]}"
 
 
 def load_fleet(path: Path) -> Fleet:
-    """The fleet in `path`, which names its buses. Raises DescriptionError, one line."""
+    """Loads the fleet in `path`, which must name its buses. Raises DescriptionError, one line."""
     table, source = read_toml(path)
     if "buses" not in table:
         raise source.error(("buses",), 'missing key; it needs the bus of each index, such as ["socketcan:can0"]')

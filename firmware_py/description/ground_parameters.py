@@ -1,4 +1,4 @@
-"""How ground stations are listened to and how missions are flown, as parameters. Part of `parameters`."""
+"""Parameters of the ground station link and of missions. Part of `parameters`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from firmware_py.description.schema import quantity
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ground:
-    """What a client may tune of its own link."""
+    """Ground station link and missions; clients may tune these."""
 
     stick_z: int = quantity(
         0,

@@ -1,4 +1,4 @@
-"""The only registry of tunables: each with unit, range, default, help and its MAVLink name. Frozen; a change is a new
+"""The only registry of tunable parameters, each with unit, range, default, help and MAVLink name. Frozen; a change makes a new
 object.
 """
 
@@ -17,7 +17,7 @@ from firmware_py.description.steering_parameters import Steering
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
-    """PD gains as bandwidth and damping, multiplied by the body's mass matrix, so one set serves every shape."""
+    """PD gains as bandwidth and damping. The body's mass matrix multiplies them, so one set serves every shape."""
 
     law: str = quantity(
         "model", choices=("model", "paper"), help="model: desired velocity in drag and Coriolis; paper: measured"
@@ -47,7 +47,7 @@ class Control:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimation:
-    """Noise of sensors and of what the model leaves out."""
+    """Measurement noise of the sensors, and process noise for what the model leaves out."""
 
     kind: str = quantity(
         "full", choices=("full", "paper"), help="full: tag, IMU, depth, disturbance; paper: tags alone"
@@ -116,7 +116,7 @@ class Estimation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Allocation:
-    """From wrench to thrusters."""
+    """Allocation of wrenches to thrusters."""
 
     mode: str = quantity(
         "least_squares",
@@ -135,7 +135,7 @@ class Allocation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limiter:
-    """The last word on every thruster, per module."""
+    """Final limits on every thruster and docking magnet, per module."""
 
     force_share: float = quantity(
         1.0, low=0.05, high=1.0, help="share of each thruster's limit that may be used", mavlink="LIM_FORCE"
@@ -161,7 +161,7 @@ class Limiter:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Supervision:
-    """When the vehicle may arm, and when it must not go on."""
+    """Limits of arming, end of an e-stop, and re-arming after a restart."""
 
     tag_fresh_ms: float = quantity(
         500.0, unit="ms", low=10, high=60000, help="a pose older than this is stale", mavlink="TAG_FRESH_MS"
@@ -186,7 +186,7 @@ class Supervision:
     estop_quiet_ms: float = quantity(
         200.0,
         unit="ms",
-        low=200,  # what the modules wait themselves before they let go (docs/mcu.md)
+        low=200,  # the time that modules themselves wait before they release (docs/mcu.md)
         high=5000,
         help="an e-stop is over when no frame came for so long",
         mavlink="ESTOP_QUIET_MS",
@@ -198,7 +198,7 @@ class Supervision:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Docking:
-    """Detector and sequence of docking."""
+    """Docking detector and docking sequence."""
 
     current_threshold_ma: float = quantity(
         70.0, unit="mA", low=1, high=8000, help="paper: +-70 mA on the face", mavlink="DOCK_MA"
@@ -308,9 +308,7 @@ class Parameters:
     ground: Ground = quantity(Ground())
 
     def replace(self, dotted: str, value: float | str) -> Parameters:
-        """A copy with `group.field` set. Raises DescriptionError when there is no such field or the value is out of
-        range.
-        """
+        """Returns a copy with `group.field` set. Raises DescriptionError if there is no such field or the value is out of range."""
         group_name, _, name = dotted.partition(".")
         if dotted not in (known := dict(registry())):
             raise DescriptionError(f"parameter {dotted!r} is unknown; {meant(dotted, known)}`modcube parameters` prints them all")
@@ -321,7 +319,7 @@ class Parameters:
         fits = type(value) is type(getattr(group, name)) or (type(value) is int and type(getattr(group, name)) is float)
         if not (fits and limits.permits(value)):
             raise DescriptionError(f"parameter {dotted}: {value!r} is out of range; permitted: {describe(limits)}")
-        kept = type(getattr(group, name))(value)  # an int where compiled functions want a float would end the tick
+        kept = type(getattr(group, name))(value)  # an int where compiled functions expect a float would break the tick
         return dataclasses.replace(self, **{group_name: dataclasses.replace(group, **{name: kept})})
 
 
@@ -340,7 +338,7 @@ PAPER = Parameters(
     docking=Docking(approach="straight", speed_m_s=0.03, contact_speed_m_s=0.03, sigma_m=0.1, push_s=15.0, tries=1),
 )
 """The paper's controller with the authors' gains, as accelerations: position 5 and 2, attitude 2 and 1. It docks in a straight line at
-constant speed, without a second try and however unsure it is. The paper says neither how fast nor for how long it pushes: synthetic."""
+constant speed, in one try, at any uncertainty up to 0.1 m. The paper gives neither the speed nor the time of pushing: synthetic."""
 
 CONTROLLERS = {
     "modcube": Parameters(),
@@ -348,7 +346,7 @@ CONTROLLERS = {
     "paper": PAPER,
     "paper_sequence": Parameters(docking=PAPER.docking),
 }
-"""Whole sets of parameters by name. `paper_sequence`: docks as the paper does, and flies and estimates as we do."""
+"""Complete parameter sets by name. `paper_sequence` docks as the paper does, and flies and estimates as `modcube` does."""
 
 
 _TUNABLES = tuple(
@@ -356,17 +354,17 @@ _TUNABLES = tuple(
     for group in dataclasses.fields(Parameters)
     for field in dataclasses.fields(type(group.default))  # type: ignore[arg-type]
 )
-"""Group, field and limits of every tunable: worked out once, they are checked in the tick that arms."""
+"""Group, field and limits of every parameter. Computed once, because the tick that arms checks them."""
 
 
 def registry() -> Iterator[tuple[str, Limits]]:
-    """Every tunable as `group.field` with its limits, in a fixed order."""
+    """Every parameter as `group.field` with its limits, in a fixed order."""
     for group, name, limits in _TUNABLES:
         yield f"{group}.{name}", limits
 
 
 def invalid(parameters: Parameters) -> list[str]:
-    """What is out of range in a set of parameters, in words; empty when nothing is."""
+    """Reports, in words, the parameters that are out of range; empty if none is."""
     reasons = []
     for group, name, limits in _TUNABLES:
         value = getattr(getattr(parameters, group), name)
@@ -376,7 +374,7 @@ def invalid(parameters: Parameters) -> list[str]:
 
 
 def load_parameters(path: Path) -> Parameters:
-    """The parameters in `path`; what it leaves out keeps its default. Raises DescriptionError, one line."""
+    """Loads the parameters in `path`; missing ones keep their defaults. Raises DescriptionError, one line."""
     table, source = read_toml(path)
     parameters: Parameters = build(Parameters, table, source)
     return parameters

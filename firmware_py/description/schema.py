@@ -1,6 +1,6 @@
-"""TOML -> frozen dataclass: every field carries unit, range and help; anything else is refused with file, line and range.
+"""TOML -> frozen dataclass. Every field carries unit, range and help; invalid input is refused with file, line and range.
 
-Used once at start, by whoever reads a vehicle, fleet, parameter or scenario file. Nothing here runs in a tick.
+Used once at start to read vehicle, fleet, parameter and scenario files. Nothing here runs in a tick.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from typing import Any
 import numpy as np
 
 ANYTHING = "a value"
-"""What a field without unit, range and choices may hold."""
+"""Description of a field without unit, range and choices."""
 SHOWN_CHARACTERS = 60
-"""A value that is longer is cut in an error's line."""
+"""Length at which a value is cut in an error message."""
 
 
 class DescriptionError(ValueError):
-    """A description is wrong; the message is one line: where, what, and what would be right.
+    """Error in a description; the message is one line: where, what, and what would be right.
 
     Attributes:
-        keys: from the dataclass that refuses to the value that is to blame, where that is known: `build` names its line.
+        keys: path from the dataclass that refuses to the offending value, where known; `build` turns it into a line number.
     """
 
     def __init__(self, what: str, *keys: str | int) -> None:
@@ -40,13 +40,13 @@ class DescriptionError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a field may hold.
+    """Permitted values of a field.
 
     Attributes:
         unit: unit of the value, empty when it has none.
         low, high: inclusive range of every number in the field.
         help: one sentence.
-        shape: required shape of an array field, where -1 is any length.
+        shape: required shape of an array field; -1 stands for any length.
         choices: the permitted words of a text field.
         mavlink: name of the parameter on MAVLink, empty when it is not exposed.
     """
@@ -60,7 +60,7 @@ class Limits:
     mavlink: str = ""
 
     def permits(self, value: Any) -> bool:
-        """Whether a field may hold this number or word."""
+        """Whether the field may hold this number or word."""
         return bool(value in self.choices if self.choices else self.low <= value <= self.high)
 
 
@@ -75,7 +75,7 @@ def quantity(
     choices: tuple[str, ...] = (),
     mavlink: str = "",
 ) -> Any:
-    """A dataclass field with its `Limits`; arrays given as lists become read-only float64 arrays."""
+    """Creates a dataclass field with its `Limits`; a default given as a list becomes a read-only float64 array."""
     limits = Limits(unit, low, high, help, shape, choices, mavlink)
     metadata = {"limits": limits}
     if default is dataclasses.MISSING:
@@ -105,16 +105,15 @@ _KEY = re.compile(r"^\s*(?P<name>[\w.\"-]+)\s*=")
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a table came from, so that an error can name file and line."""
+    """Origin of a table, so that errors can name file and line."""
 
     path: str
     text: str
     line: int = 0
-    """Of all keys, where they do not stand in `text`; 0: they do."""
+    """Line reported for every key when the keys do not stand in `text`; 0: look them up in `text`."""
 
     def line_of(self, keys: Sequence[str | int]) -> int:
-        """1-based line of the key or table that `keys` lead to; the nearest enclosing one when it is not written out.
-        """
+        """1-based line of the key or table that `keys` lead to; if it is not written out, that of the nearest enclosing one."""
         if self.line:
             return self.line
         best_line, best_depth = 1, 0
@@ -132,33 +131,33 @@ class Source:
             else:
                 continue
             wanted = tuple(keys)
-            if path[: len(wanted)] == wanted:  # the key itself, or the first table of a list that is meant as one
+            if path[: len(wanted)] == wanted:  # the key itself, or the first table of a list that `keys` name as a whole
                 path = wanted
             if len(path) > best_depth and path == wanted[: len(path)]:
                 best_line, best_depth = number, len(path)
         return best_line
 
     def error(self, keys: Sequence[str | int], what: str, within: Sequence[str | int] = ()) -> DescriptionError:
-        """The error for `keys`: `file:line: a.b: what`; the line is that of the keys `within` them."""
+        """The error for `keys`: `file:line: a.b: what`; the line is that of the sub-key `within`."""
         name = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
         return DescriptionError(f"{self.path}:{self.line_of((*keys, *within))}: {name}{': ' if name else ''}{what}")
 
 
 def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
-    """The table in `path` and its source; a byte order mark is no part of it.
+    """The table in `path` and its source; a byte order mark is skipped.
 
     Raises:
-        DescriptionError: the file is missing or is no TOML.
+        DescriptionError: the file cannot be read or is not valid TOML.
     """
     text = read_text(path)
     return parse_toml(text, str(path)), Source(str(path), text)
 
 
 def read_text(path: Path) -> str:
-    """The text of a file, lines ended alike; a byte order mark is no part of it. Raises DescriptionError."""
+    """The text of a UTF-8 file with line endings normalised; a byte order mark is skipped. Raises DescriptionError."""
     try:
         data = path.read_bytes()
-    except (OSError, ValueError) as error:  # the latter: a name that no file can have
+    except (OSError, ValueError) as error:  # ValueError: not a possible file name
         raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     try:
         return io.StringIO(data.decode("utf-8-sig"), newline=None).read()
@@ -169,34 +168,34 @@ def read_text(path: Path) -> str:
 
 
 def parse_toml(text: str, path: str) -> dict[str, Any]:
-    """The table in the text of the file at `path`. Raises DescriptionError."""
+    """The table in `text`, the contents of the file at `path`. Raises DescriptionError."""
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError, and what Python itself refuses to read
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, and input that Python itself refuses to read
         match = re.search(r"line (\d+)", str(error))
         last = len(text.splitlines()) if "at end of document" in str(error) else 1
         raise DescriptionError(f"{path}:{match.group(1) if match else last}: not valid TOML: {str(error).splitlines()[0]}") from None
 
 
 def meant(word: str, known: Iterable[str]) -> str:
-    """A question after the one of `known` that `word` is likely to be; empty where none is like it."""
+    """A "did you mean" question for the name in `known` that is closest to `word`; empty if none is close."""
     names, small = {name.lower(): name for name in known}, word.lower()
     near = [name for name in names if name.startswith(f"{small}_")] or difflib.get_close_matches(small, names, 1)  # the unit was left out
     return f"did you mean {names[near[0]]}? " if near else ""
 
 
 def is_file_name(name: str) -> bool:
-    """Whether a file or a folder can be called that, alone and anywhere."""
+    """Whether `name` can name a file or folder: printable, without separators, neither `.` nor `..`."""
     return name not in ("", ".", "..") and name.isprintable() and not set(name) & set("/\\")
 
 
 def repeated(items: Sequence[object]) -> Iterator[int]:
-    """Indices of those that were there before."""
+    """Indices of the items that occur earlier in the sequence already."""
     return (i for i, item in enumerate(items) if item in items[:i])
 
 
 def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str | int, ...] = ()) -> Any:
-    """An instance of dataclass `cls` from `table`; refuses unknown, missing, ill-typed and out-of-range keys.
+    """Builds an instance of dataclass `cls` from `table`; refuses unknown, missing, ill-typed and out-of-range keys.
 
     Raises:
         DescriptionError: one line with file, line, key and what would be right.
@@ -220,13 +219,13 @@ def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str |
 
 
 def _helped(word: str, cls: type) -> str:
-    """A question after the one field whose help speaks of that word; empty where none does, or several do."""
+    """A "did you mean" question for the only field whose help contains `word`; empty if none or several do."""
     told = [field.name for field in dataclasses.fields(cls) if word in re.findall(r"\w+", limits_of(cls, field.name).help)]
     return f"did you mean {told[0]}? " if len(told) == 1 else ""
 
 
 def describe(limits: Limits) -> str:
-    """What a field may hold, in words."""
+    """Permitted values of a field, in words."""
     if limits.choices:
         return "one of " + ", ".join(limits.choices)
     unit = f" {limits.unit}" if limits.unit else ""
@@ -238,7 +237,7 @@ def describe(limits: Limits) -> str:
 
 
 def _needed(hint: Any, limits: Limits, name: str) -> str:
-    """What a field of that type needs, in words."""
+    """What a missing field of type `hint` needs, in words."""
     if dataclasses.is_dataclass(hint):
         return f"a table, [{name}]"
     if typing.get_origin(hint) is tuple:
@@ -287,7 +286,7 @@ def _array(limits: Limits, value: Any, source: Source, keys: tuple[str | int, ..
 
 
 def _counted(shape: tuple[int, ...]) -> str:
-    """How many numbers an array of that shape has, in words; -1 is any number of them."""
+    """Size of an array of that shape, in words; -1 stands for any length."""
     if not shape:
         return "one number alone"
     if len(shape) > 2:
@@ -303,14 +302,14 @@ def _many(count: int, thing: str) -> str:
 
 
 def _is_numeric(value: Any) -> bool:
-    """Whether a list, or lists in it, hold numbers alone; neither truth nor text."""
+    """Whether a value is a number, or a list, possibly nested, of numbers only; booleans and text are none."""
     if isinstance(value, list):
         return all(_is_numeric(item) for item in value)
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _shown(value: Any) -> str:
-    """The value as it stands in a line of words, or in TOML."""
+    """The value as TOML shows it, cut to SHOWN_CHARACTERS."""
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     if hasattr(value, "isoformat"):  # a date or a time
         text = value.isoformat()
@@ -320,11 +319,11 @@ def _shown(value: Any) -> str:
 _KINDS: Mapping[Any, tuple[str, Any]] = {
     bool: ("true or false", bool), str: ("text", str), int: ("a whole number", int), float: ("a number", int | float),
 }  # fmt: skip
-"""By a field's type: what it needs, in words, and what TOML may have there."""
+"""By a field's type: its name in error messages, and the Python types that TOML may give for it."""
 
 
 def _permitted(limits: Limits) -> str:
-    """What a field that has limits may hold, after what is wrong with it."""
+    """End of an error message: the permitted values of a field, if it has limits."""
     return f"; permitted: {describe(limits)}" if limits.choices or math.isfinite(limits.low) or math.isfinite(limits.high) else ""
 
 

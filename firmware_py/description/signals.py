@@ -1,6 +1,6 @@
-"""What is logged: the signals of a channel with unit and size, their protobuf message, and how a log is read.
+"""Logging: the signals of a channel with unit and size, their protobuf message, and readers of logs.
 
-A channel is an MCAP topic with one protobuf message per tick. Firmware and bench each declare their own with it.
+A channel is an MCAP topic with one protobuf message per tick. Firmware and bench each declare their own channels.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from mcap.stream_reader import StreamReader
 
 PACKAGE = "modcube"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-"""First and last bytes of a whole log (MCAP specification)."""
+"""First and last bytes of a complete log (MCAP specification)."""
 
 _SPOILT = (McapError, EOFError, ValueError, struct.error, OverflowError, MemoryError)
-"""What reading raises where a log is torn, or where a wrong bit makes a length of it astronomical."""
+"""Exceptions raised by reading a truncated log, or one in which a flipped bit makes a length astronomical."""
 
 Columns = dict[str, np.ndarray]
 """One array per signal of a channel, (k,) or (k, n) over its k messages, and `log_time`, (k,) int64 ns."""
@@ -38,7 +38,7 @@ _KINDS: Mapping[str, tuple[int, int, str]] = {
 
 
 class Signal(NamedTuple):
-    """One signal: `size` 0 is a scalar, else an array of that length (packed repeated doubles)."""
+    """One signal: a scalar if `size` is 0, else an array of that length (packed repeated doubles)."""
 
     name: str
     size: int = 0
@@ -49,8 +49,8 @@ class Signal(NamedTuple):
 class Layout:
     """The message of one channel. Every field is always written, at full width, so each message has the same length.
 
-    That makes a message one row of a structured array: written by filling a row whose protobuf tags stand already,
-    read by viewing the joined bytes of all messages at once.
+    A message therefore is one row of a structured array: written by filling a row that already has its protobuf tags, read by
+    viewing the joined bytes of all messages at once.
     """
 
     def __init__(self, name: str, signals: Sequence[Signal]) -> None:
@@ -63,7 +63,7 @@ class Layout:
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
-        """The row: before each value `name` its tag bytes, `name#`."""
+        """Structured dtype of a row: each value `name` is preceded by its tag bytes, `name#`."""
         fields: list[tuple[Any, ...]] = []
         for number, signal in enumerate(self.signals, 1):
             fields.append((f"{signal.name}#", "u1", (len(_prefix(number, signal)),)))
@@ -72,17 +72,17 @@ class Layout:
         return np.dtype(fields)
 
     def row(self) -> Row:
-        """A fresh row to fill."""
+        """A new row to fill."""
         return Row(self)
 
     def values(self, data: bytes) -> tuple[Any, ...]:
-        """The values of one message, in the order of `signals`. Raises ValueError where its length is that of another layout."""
+        """The values of one message, in the order of `signals`. Raises ValueError if its length is no multiple of a row's."""
         row = np.frombuffer(data, self.dtype)[0]
         return tuple(row[name] for name in self.names)
 
     @cached_property
     def schema(self) -> bytes:
-        """The serialised FileDescriptorSet of the message; units stand as trailing comments."""
+        """The serialised FileDescriptorSet of the message; units are trailing comments."""
         file = descriptor_pb2.FileDescriptorProto(name=f"{PACKAGE}/{self.name}.proto", package=PACKAGE, syntax="proto3")
         message = file.message_type.add(name=self.name)
         for number, signal in enumerate(self.signals, 1):
@@ -100,7 +100,7 @@ class Layout:
 
 
 class Row:
-    """One message that is filled again and again."""
+    """A reusable buffer for one message."""
 
     def __init__(self, layout: Layout) -> None:
         self._array = np.zeros((), layout.dtype)
@@ -109,14 +109,14 @@ class Row:
         self._views = [self._array[signal.name] for signal in layout.signals]
 
     def encode(self, values: Iterable[Any]) -> bytes:
-        """The message of `values`, one per signal, in the layout's order."""
+        """Encodes `values`, one per signal, in the layout's order."""
         for view, value in zip(self._views, values, strict=True):
             view[...] = value
         return self._array.tobytes()
 
 
 class TextLayout:
-    """A message of one text with numbers before it; for what comes seldom (events, requests)."""
+    """Message of several integers followed by one text, for infrequent data (events, requests)."""
 
     def __init__(self, name: str, numbers: Sequence[str], text: str) -> None:
         self.name = name
@@ -141,7 +141,7 @@ class TextLayout:
         return bytes(descriptor_pb2.FileDescriptorSet(file=[self._file]).SerializeToString(deterministic=True))
 
     def encode(self, *values: int | str) -> bytes:
-        """The message of the numbers and the text."""
+        """Encodes the numbers and the text."""
         message = self._class(**dict(zip(self.names, values, strict=True)))
         return bytes(message.SerializeToString(deterministic=True))
 
@@ -152,14 +152,14 @@ class TextLayout:
 
 
 class LogMessage(NamedTuple):
-    """One message of a log, as it stands there."""
+    """One message of a log, not decoded."""
 
     topic: str
     data: bytes
 
 
 def read_messages(path: Path) -> Iterator[LogMessage]:
-    """All messages of an MCAP log in their order, up to its end or to where it is torn. Raises OSError."""
+    """All messages of an MCAP log in order, up to its end or to the point of truncation. Raises OSError."""
     topics: dict[int, str] = {}
     for record in log_records(path):
         if isinstance(record, Message):
@@ -174,16 +174,16 @@ def is_closed(path: Path) -> bool:
 
 
 def read_attachment(path: Path, name: str) -> bytes | None:
-    """The attachment called `name` of an MCAP log, or None; what is behind it is not read. Raises OSError."""
+    """The attachment called `name` of an MCAP log, or None; nothing after it is read. Raises OSError."""
     with path.open("rb") as file:
         attachments = (record for record in _records_of(file) if isinstance(record, Attachment))
         return next((bytes(attachment.data) for attachment in attachments if attachment.name == name), None)
 
 
 def read_signals(path: Path) -> dict[str, Columns]:
-    """All channels of an MCAP log of protobuf messages, up to its end or to where it is torn.
+    """All channels of an MCAP log of protobuf messages, up to its end or to the point of truncation.
 
-    Messages of one channel may differ in the length of their arrays (a body that merged): short rows end in NaN.
+    Messages of one channel may differ in the length of their arrays (after bodies merge): short rows are padded with NaN.
 
     Raises:
         OSError: the file cannot be read.
@@ -208,7 +208,7 @@ def read_signals(path: Path) -> dict[str, Columns]:
 
 
 def log_records(path: Path) -> Iterator[Any]:
-    """The records of an MCAP log (mcap.records), up to its end or to where it is torn. Raises OSError."""
+    """The records of an MCAP log (mcap.records), up to its end or to the point of truncation. Raises OSError."""
     yield from _records_of(BytesIO(path.read_bytes()))
 
 
@@ -216,7 +216,7 @@ def _records_of(log: IO[bytes]) -> Iterator[Any]:
     try:
         yield from StreamReader(log, validate_crcs=True).records
     except _SPOILT:
-        return  # torn: what came before it stands
+        return  # truncated: the records before stay valid
 
 
 def _columns(schema: Schema, messages: list[bytes]) -> Columns:
@@ -238,7 +238,7 @@ def _columns(schema: Schema, messages: list[bytes]) -> Columns:
 
 
 _Part = tuple[list[int], np.ndarray, list[Signal]]
-"""Messages of one length: their places in the channel, their rows, their signals."""
+"""Messages of one length: their indices in the channel, their rows, their signals."""
 
 
 def _column(position: int, name: str, parts: list[_Part], total: int) -> np.ndarray:
@@ -270,7 +270,7 @@ def _varint(value: int) -> bytes:
 
 
 def _prefix(number: int, signal: Signal) -> bytes:
-    """Tag of a field, and its length where it is an array (Protocol Buffers, "Encoding")."""
+    """Tag of a field, followed by its length if it is an array (Protocol Buffers, "Encoding")."""
     if signal.size:
         return _varint(number << 3 | _LENGTH) + _varint(8 * signal.size)
     return _varint(number << 3 | _KINDS[signal.kind][1])

@@ -1,4 +1,4 @@
-"""How modes move the set-point, as parameters: sticks, speeds, surfacing, and how softly one mode follows another.
+"""Parameters of how modes move the set-point: sticks, speeds, surfacing, and how smoothly one mode follows another.
 Part of `parameters`.
 """
 
@@ -11,7 +11,7 @@ from firmware_py.description.schema import quantity
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steering:
-    """Sticks at their end give these; a set-point that is far away is approached with these."""
+    """Limits of the set-point's motion, reached at full stick and on the way to a distant place, and the parameters of modes."""
 
     stick_share: float = quantity(
         0.5, low=0.05, high=1, help="share of the body's force and moment at full stick", mavlink="STICK_SHARE"
@@ -37,7 +37,7 @@ class Steering:
     join_m: float = quantity(
         0.10,
         unit="m",
-        low=1e-3,  # a set-point comes no nearer than rounding lets it, and a path whose start is never met does not begin
+        low=1e-3,  # rounding limits how near a set-point comes, and a path whose start is never reached does not begin
         high=10,
         help="start of a trajectory that is farther is approached first",
         mavlink="AUTO_JOIN",
@@ -45,7 +45,7 @@ class Steering:
     join_rad: float = quantity(
         0.20, unit="rad", low=1e-3, high=3.2, help="the same for its attitude", mavlink="AUTO_JOIN_ANG"
     )
-    # Half of the 65 deg up to which the bench's cameras read a tag; at this rate a module on its head sees them within two seconds.
+    # Half of the 65 deg up to which the bench's cameras read a tag; at level_rad_s an upside-down module shows its tags within two seconds.
     hold_tilt_rad: float = quantity(
         0.6, unit="rad", low=0, high=3.2, help="a body that a fail-safe makes hold turns upright if it is steeper", mavlink="HOLD_TILT"
     )

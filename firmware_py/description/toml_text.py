@@ -1,4 +1,4 @@
-"""Dataclasses of `schema` as TOML text, each value with a comment of its own, and as what JSON can hold."""
+"""Dataclasses of `schema` as TOML text, each value with its own comment, and as plain values for JSON."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from firmware_py.description.schema import ANYTHING, Limits, describe, limits_of
 
 
 def to_plain(value: Any) -> Any:
-    """The lists, dicts and scalars of a dataclass, as JSON takes them; `build` reads them back. A field that is None is left out."""
+    """A dataclass as lists, dicts and scalars for JSON; `build` reads them back. Fields that are None are left out."""
     if dataclasses.is_dataclass(value):
         items = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value) if field.init)
         return {name: to_plain(item) for name, item in items if item is not None}
@@ -24,12 +24,12 @@ def to_plain(value: Any) -> Any:
 
 
 def unit_of(limits: Limits) -> str:
-    """The comment of a value that says no more than its unit."""
+    """Comment of a value: its unit only."""
     return limits.unit
 
 
 def explained(limits: Limits) -> str:
-    """The comment of a value that says all that is known of it."""
+    """Comment of a value: its help, permitted values and MAVLink name."""
     parts = (limits.help, describe(limits).removeprefix(ANYTHING), limits.mavlink and f"MAVLink {limits.mavlink}")
     return "; ".join(part for part in parts if part)
 
@@ -43,7 +43,7 @@ def to_toml(value: Any, comment: Callable[[Limits], str] = unit_of) -> str:
         if dataclasses.is_dataclass(item):
             tail.append(f"\n[{field.name}]\n{to_toml(item, comment)}")
         elif isinstance(item, tuple) and dataclasses.is_dataclass(of := typing.get_args(hints[field.name])[0]):
-            none = f"\n# [[{field.name}]]: none; keys: {', '.join(key.name for key in dataclasses.fields(of))}\n"  # TOML adds none to []
+            none = f"\n# [[{field.name}]]: none; keys: {', '.join(key.name for key in dataclasses.fields(of))}\n"  # TOML cannot extend []
             tail += [f"\n[[{field.name}]]\n{to_toml(each, comment)}" for each in item] or [none]
         else:
             note = comment(limits_of(type(value), field.name))
@@ -57,7 +57,7 @@ def _literal(item: Any) -> str:
     if isinstance(item, np.ndarray):
         return repr(item.tolist())
     if isinstance(item, str):
-        return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")  # as TOML escapes it, but for DEL
+        return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")  # JSON escapes as TOML does, except for DEL
     if isinstance(item, tuple):
         return f"[{', '.join(_literal(each) for each in item)}]"
     return repr(item)

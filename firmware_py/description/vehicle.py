@@ -30,10 +30,10 @@ from firmware_py.description.schema import (
 _Module = TypeVar("_Module", bound=Any)
 
 FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
-"""Faces A..F of the bus, in order; also the tag ids of tags that sit on a face."""
+"""Faces A..F of the bus, in order; the index is also the id of a tag on that face."""
 
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
-"""Degrees of freedom, in the order of a wrench and of any six numbers here."""
+"""Degrees of freedom, in the order of a wrench and of every array of six here."""
 
 FACE_NORMALS = frozen_array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 """(6, 3) outward normals of the faces, module frame."""
@@ -41,7 +41,7 @@ FACE_NORMALS = frozen_array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Hull:
-    """The outside."""
+    """The outer shape."""
 
     size_m: np.ndarray = quantity(unit="m", low=0.01, high=10.0, shape=(3,), help="edges of the box along x, y, z")
     mesh: str = quantity("", help="closed mesh (module frame, m) beside the vehicle file, in place of the box")
@@ -49,7 +49,7 @@ class Hull:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Inertial:
-    """Masses. A free-flooding module moves entrained and added water besides its own mass."""
+    """Mass properties. A free-flooding module moves entrained and added water besides its own mass."""
 
     dry_kg: float = quantity(unit="kg", low=0.01, high=5000.0, help="mass in air")
     entrained_kg: float = quantity(0.0, unit="kg", low=0.0, high=5000.0, help="water that moves with the hull")
@@ -81,7 +81,7 @@ class Inertial:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Payload:
-    """A tool or cargo carried by the module: a solid box, trimmed so that it neither sinks nor rights."""
+    """A tool or cargo carried by the module: a solid box, trimmed to be neutrally buoyant with no righting moment."""
 
     name: str = quantity(help="for people")
     dry_kg: float = quantity(unit="kg", low=0.0, high=1000.0, help="mass in air, trim included")
@@ -112,7 +112,7 @@ class Drag:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ThrusterCurve:
-    """Force and power of one thruster at `voltage_v`, as the paper's fifth-order polynomials, one per sign.
+    """Force and power of one thruster at `voltage_v`, as the paper's fifth-order polynomials, one per direction.
 
     force(u) = sum forward[i] u^(i+1) for u > 0, reverse likewise in |u|; power(f) = sum power_w[i] |f|^(i+1).
     """
@@ -134,14 +134,14 @@ class ThrusterCurve:
 
 
 def _rises(coefficients: np.ndarray, end: float) -> bool:
-    """Whether c[0] x + ... + c[4] x^5 rises all the way over 0..end."""
+    """Whether c[0] x + ... + c[4] x^5 rises throughout 0..end."""
     x = np.linspace(0.0, end, 401)
     return bool(np.all(np.diff(x[:, None] ** np.arange(1, coefficients.size + 1) @ coefficients) > 0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Thruster:
-    """Where a thruster sits and which way it pushes the vehicle at a positive command."""
+    """Position of a thruster, and the direction in which it pushes the vehicle at a positive command."""
 
     position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="propeller centre")
     direction: np.ndarray = quantity(low=-1.001, high=1.001, shape=(3,), help="unit vector of positive force")
@@ -176,7 +176,7 @@ class Supply:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Vehicle:
-    """One module: everything that the controller believes about it."""
+    """One module: everything that the controller assumes about it."""
 
     name: str = quantity(help="short name")
     source: str = quantity(help="where the figures come from")
@@ -229,16 +229,16 @@ class Vehicle:
 
 
 def vehicle_names() -> list[str]:
-    """Names of the vehicle files that the package carries."""
+    """Names of the vehicle files in the package."""
     folder = resources.files("firmware_py") / "vehicles"
     return sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml"))
 
 
 def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
-    """The vehicle called `name`, or the file at the path `name`.
+    """Loads the vehicle called `name`, or the file at the path `name`, relative to `folder` if given, when it ends in `.toml`.
 
     Raises:
-        DescriptionError: no such vehicle, or its file is wrong; one line.
+        DescriptionError: no such vehicle, or its file is invalid; one line.
     """
     if name.endswith(".toml"):
         path = Path(name) if folder is None else folder / name
@@ -253,7 +253,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     _check_body(vehicle, source)
     _check_drag(vehicle.drag, source)
     if vehicle.hull.mesh:
-        mesh = (path.parent / vehicle.hull.mesh).absolute()  # for logs, and for who prints it as a file elsewhere
+        mesh = (path.parent / vehicle.hull.mesh).absolute()  # for logs, and for printing the vehicle as a file elsewhere
         if not mesh.is_file():
             raise source.error(("hull", "mesh"), f"{mesh}: there is no such mesh")
         vehicle = dataclasses.replace(vehicle, hull=dataclasses.replace(vehicle.hull, mesh=str(mesh)))
@@ -261,7 +261,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
 
 
 def _check_body(vehicle: Vehicle, source: Source) -> None:
-    """Raises DescriptionError, which names the line, where no robot is like that, or no file can have its name."""
+    """Raises DescriptionError, which names the line, if the body is impossible, or its name cannot be a file name."""
     passive, com, half = vehicle.passive_dof, vehicle.inertial.com_m, 0.5 * vehicle.hull.size_m
     if not is_file_name(vehicle.name):
         raise source.error(("name",), f"{vehicle.name!r} cannot be the name of a file; give one without separators")
@@ -275,9 +275,9 @@ def _check_body(vehicle: Vehicle, source: Source) -> None:
 
 
 def _check_drag(drag: Drag, source: Source) -> None:
-    """Raises DescriptionError, which names the line, where the drag is none that water has.
+    """Raises DescriptionError, which names the line, if the drag is physically impossible.
 
-    The drag table's coefficient is linear in the cubic harmonic from cd_face to cd_corner, so those two tell of every direction.
+    The drag table's coefficient is linear in the cubic harmonic from cd_face to cd_corner, so checking those two covers all directions.
     """
     if drag.quadratic.size not in (0, 6):
         what = f"has {drag.quadratic.size} numbers; it needs six, {', '.join(AXES)}, or none: leave it out"
@@ -289,12 +289,12 @@ def _check_drag(drag: Drag, source: Source) -> None:
 
 
 def find_vehicles(modules: Sequence[_Module], source: Source) -> tuple[_Module, ...]:
-    """The [[module]] tables of `source` with each `vehicle` as load_vehicle takes it without a folder.
+    """The [[module]] tables of `source` with each `vehicle` resolved, as load_vehicle takes it without a folder.
 
-    A file lies beside that of `source`, or else in the working directory.
+    A vehicle file is looked up beside the file of `source`, then in the working directory.
 
     Raises:
-        DescriptionError: one is no vehicle; names its line.
+        DescriptionError: a vehicle cannot be loaded; names its line.
     """
     names: list[str] = [module.vehicle for module in modules]
     found = {name: _beside(Path(source.path).parent, name) for name in names}
@@ -307,6 +307,6 @@ def find_vehicles(modules: Sequence[_Module], source: Source) -> tuple[_Module, 
 
 
 def _beside(folder: Path, name: str) -> str:
-    """A vehicle's `name`; a file's with the folder before it, unless it lies in the working directory alone."""
+    """A vehicle's `name`; that of a file is prefixed with `folder`, unless the file exists in the working directory only."""
     path = folder / name
     return str(path) if name.endswith(".toml") and (path.exists() or not Path(name).exists()) else name
