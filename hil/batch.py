@@ -1,6 +1,6 @@
-"""Many worlds in one call, for studies that need no bus: lone modules under given commands, eight worlds at a time on every thread.
+"""Simulates many worlds in one call, for studies without a bus: single modules under given commands, eight worlds at a time per thread.
 
-The physics is the plant's own: a world that a batch has moved is to the last bit where `World.advance` would have put it.
+The physics is that of the plant; the results are bit-identical to those of `World.advance`.
 """
 
 from __future__ import annotations
@@ -23,24 +23,25 @@ from hil.plant.water import WATER
 from hil.plant.world import Arrays, World
 
 FEW = 2
-"""So many worlds are quicker one by one than in eight lanes of which most are idle."""
+"""Largest number of worlds that run faster one by one than in eight mostly idle lanes."""
 SEEN = 16
-"""Numbers of a row: hull's centre and attitude in the world 0:7, velocity (world) 7:10, rate and specific force (module) 10:16."""
+"""Columns of a row: hull centre and attitude, world, 0:7; velocity, world, 7:10; rate and specific force, module frame, 10:16."""
 
 
 def fly(worlds: Sequence[World], commands: np.ndarray, threads: int = 0) -> np.ndarray:
-    """Moves every world on by k ticks.
+    """Advances every world by k ticks.
 
     Args:
-        worlds: of one lone module each, of the same number of thrusters t, in like tanks and with ticks of one length.
-        commands: (n, k, t) share of full command, -1 to 1, that acts during each tick; or (k, t), the same for all.
-        threads: how many; 0: one a core.
+        worlds: each with a single module, all with the same number of thrusters t, the same tank, water and tick.
+        commands: (n, k, t) share of full command, -1 to 1, during each tick; or (k, t), the same for all worlds.
+        threads: number of threads; 0: one per core.
 
     Returns:
-        (n, k, 16) each module after each tick, see SEEN.
+        (n, k, 16) state of each module after each tick, see SEEN.
 
     Raises:
-        DescriptionError: worlds that cannot fly together, commands of another shape, or no ticks. No world has moved then.
+        DescriptionError: worlds that cannot run in one batch, commands of another shape, no ticks, or a negative number of threads.
+            No world has moved then.
     """
     given, count = np.asarray(commands, dtype=np.float64), len(worlds)
     _check_worlds(worlds)
@@ -62,7 +63,7 @@ def fly(worlds: Sequence[World], commands: np.ndarray, threads: int = 0) -> np.n
 
 
 def _check_worlds(worlds: Sequence[World]) -> None:
-    """Raises DescriptionError where these cannot fly together."""
+    """Raises DescriptionError when these worlds cannot run in one batch."""
     if not worlds:
         raise DescriptionError("batch: no worlds; it needs one at least")
     if len({id(world) for world in worlds}) < len(worlds):
@@ -75,7 +76,7 @@ def _check_worlds(worlds: Sequence[World]) -> None:
 
 
 def _check_commands(given: np.ndarray, worlds: int, thrusters: int) -> None:
-    """Raises DescriptionError where `given` is no commands for so many worlds of so many thrusters each."""
+    """Raises DescriptionError when the shape of `given` does not fit this number of worlds and thrusters."""
     if given.ndim not in (2, 3) or given.shape[-1] != thrusters or (given.ndim == 3 and len(given) != worlds):
         raise DescriptionError(f"batch: commands have the shape {given.shape}; (ticks, {thrusters}) or ({worlds}, ticks, {thrusters}) fit")
     if given.shape[-2] == 0:
@@ -83,7 +84,7 @@ def _check_commands(given: np.ndarray, worlds: int, thrusters: int) -> None:
 
 
 def _fly_some(parts: Sequence[Arrays], commands: np.ndarray, out: np.ndarray) -> None:
-    """At most eight worlds."""
+    """Runs at most eight worlds, in lanes or one by one."""
     if len(parts) > FEW:
         return _fly_together(parts, commands, out)
     for part, given, seen in zip(parts, commands, out, strict=True):
@@ -92,7 +93,7 @@ def _fly_some(parts: Sequence[Arrays], commands: np.ndarray, out: np.ndarray) ->
 
 @compiled(types.void(BODIES, MODULES, THRUSTERS, WATER, F2, F2, I8, F8, F3, F2, F2, F2, F2), nogil=True)
 def _fly_alone(bodies, modules, thrusters, water, gusts, external, steps, step_s, stage, thrust, seen, commands, out):
-    """One world over all ticks; its arrays are those of `plant.world.Arrays`. commands: (k, t); out: (k, 16) is written."""
+    """Runs one world over all ticks; its arrays are the fields of `plant.world.Arrays`. commands: (k, t); out: (k, 16) written."""
     for i in range(6):
         external[0, i] = 0.0
     for k in range(commands.shape[0]):
@@ -105,7 +106,7 @@ def _fly_alone(bodies, modules, thrusters, water, gusts, external, steps, step_s
 
 
 def _fly_together(parts: Sequence[Arrays], commands: np.ndarray, out: np.ndarray) -> None:
-    """Lanes that are left over fly the first world once more, and nobody looks."""
+    """Runs the worlds in lanes. Spare lanes repeat the first world, and their results are discarded."""
     lanes = [*range(len(parts)), *[0] * (LANES - len(parts))]
     memory = np.zeros(ROWS * LANES)
     for lane, i in enumerate(lanes):

@@ -1,7 +1,7 @@
-"""Everything that can break on purpose, in the plant and on its wire: by the scenario's [[fault]]s or live.
+"""Fault injection in the plant and on its wire, from the scenario's [[fault]]s or live.
 
-A fault begins, lasts and ends by the plant's clock. Every link and direction draws from a stream of its own, so that one fault more
-changes no other. The controller is never touched.
+Faults begin and end on the plant's clock. Each direction of the wire draws from its own random stream, so that an additional fault
+in one leaves the other unchanged. The controller is never modified.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from hil.plant.draw import stream
 from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, THRUSTER_KINDS, Fault
 
 NUMBER = 0x1F
-"""Bits of an id that say whose frame it is."""
+"""Mask of the module number in a CAN id."""
 LOWEST_BABBLE_ID = 0x040
-"""A babbling node takes no id of ESTOP or SYNC: those are faults of another kind."""
+"""Lowest id of a babbling node, above ESTOP and SYNC, which have fault kinds of their own."""
 ESTOP, SYNC = Frame(0x01E, b""), Frame(0x020, bytes(4))
-"""Of the e-stop box, and of somebody else who means to lead the bus."""
+"""Frames of the e-stop box, and of a second bus master."""
 ESTOP_PERIOD_NS = 50_000_000
 PUSH_LEVER_M = 0.03
-"""From the hull's centre to the point that is pushed."""
+"""Lever from the hull's centre to the point of an external push."""
 
 
 class Wire:
-    """What happens to the frames of one direction."""
+    """Faults on the frames of one direction."""
 
     def __init__(self, seed: int, direction: str) -> None:
         self._direction = direction
@@ -46,7 +46,7 @@ class Wire:
         }
 
     def pass_on(self, frames: Iterable[Frame], faults: Sequence[Fault], time_ns: int) -> list[Frame]:
-        """The frames that come out at the other end now."""
+        """Returns the frames that leave the wire now, those due after a delay first."""
         mine = [f for f in faults if f.direction in (self._direction, "both")]
         if not mine and not self._late:
             return list(frames)
@@ -60,7 +60,7 @@ class Wire:
         return out
 
     def _one(self, frame: Frame, faults: Sequence[Fault], time_ns: int) -> list[Frame]:
-        """What comes of a frame at once. Delays are the last that happens to it, whatever stands first in the list, and add up."""
+        """Returns the frames that leave at once for one frame sent. Delays add up and are applied last, whatever their order."""
         copies, late_ns = [frame], 0
         for fault in faults:
             if fault.kind == "frame_delay":
@@ -73,7 +73,7 @@ class Wire:
         return []
 
     def _corrupted(self, frame: Frame) -> Frame:
-        """One bit of the payload is wrong; a frame without one stays as it is."""
+        """Flips one random bit of the data; returns a frame without data unchanged."""
         if not frame.data:
             return frame
         data = bytearray(frame.data)
@@ -115,45 +115,45 @@ class Faults:
             "foreign_sync": lambda time_ns: [SYNC],
             "foreign_command": lambda time_ns: self._command_relays(),
         }
-        """What each says in a tick; the number that is lower wins the bus."""
+        """Frames of each foreign node in a tick, in order of CAN id: the lower id wins arbitration."""
         self._estop_due_ns = self._commands = 0
         self._dock_command = nodes.codec.message("DOCK_CMD")
         for camera in nodes.cameras:
             camera.change = self._change_tag
 
     def add(self, fault: Fault) -> None:
-        """A fault more, live. Raises DescriptionError for one that would do nothing."""
+        """Adds a fault live. Raises DescriptionError for one that would have no effect."""
         thrusters = {number: len(self._world.vehicles[mcu.module].thruster) for number, mcu in self._nodes.mcus.items()}
         for key, what in fault.mistakes(thrusters):
             raise DescriptionError(f"fault.{key}: {what}")
         self._faults.append(fault)
 
     def clear(self, kind: str = "") -> None:
-        """Ends all faults of a kind, or all."""
+        """Ends all faults of a kind; of every kind when `kind` is empty."""
         self._faults = [f for f in self._faults if kind and f.kind != kind]
         self.update(self._world.time_ns)
 
     def process_killed(self, time_ns: int) -> bool:
-        """Whether the firmware's process is dead now; the bench sees to that."""
+        """Whether the firmware's process should be dead now; the bench kills it."""
         return any(f.kind == "process_killed" and f.is_on(time_ns) for f in self._faults)
 
     def update(self, time_ns: int) -> None:
-        """Begins and ends what is due. To be called after every advance of the world."""
+        """Begins and ends faults that are due. Call after every advance of the world."""
         on = [f for f in self._faults if f.is_on(time_ns)]
         if on != self._on:
             self._on = on
             self._break_plant()
 
     def incoming(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
-        """Frames to the plant, as they arrive."""
+        """Returns the frames to the plant as they arrive."""
         return self._to_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
 
     def outgoing(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
-        """Frames from the plant, as they leave."""
+        """Returns the frames from the plant as they leave."""
         return self._from_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS and f.kind != "babble"], time_ns)
 
     def intruders(self, time_ns: int) -> list[Frame]:
-        """Frames of nodes that should not be there, and what the others answer to them."""
+        """Returns the frames of foreign nodes and the other nodes' answers to them."""
         kinds = {f.kind for f in self._on}
         frames = [frame for kind, speak in self._intruders.items() if kind in kinds for frame in speak(time_ns)]
         frames += [answer for frame in frames for answer in self._nodes.take(frame, time_ns)]
@@ -166,7 +166,7 @@ class Faults:
         return [ESTOP]
 
     def _command_relays(self) -> list[Frame]:
-        """Another controller, which wants every relay off."""
+        """Frames of a second controller that commands every relay off."""
         self._commands += 1
         return [self._dock_command.encode(number, [0] * FACES, self._commands & 15) for number in self._nodes.mcus]
 
@@ -176,9 +176,9 @@ class Faults:
         return [mcu.module for number, mcu in self._nodes.mcus.items() if fault.module in (0, number)]
 
     def _break_plant(self) -> None:
-        """What is broken depends on the faults that are on, and not on what was before: all is mended, then each breaks what it breaks.
+        """Applies the active faults from scratch, independent of history: repairs everything, then applies each fault.
 
-        Of two that break the same thing the later in the list counts; sags and hands add up.
+        Of two faults on the same part the later in the list wins; sags and pushes add up.
         """
         self._world.jet_strength = self._world.spec.jet_strength
         for number, mcu in self._nodes.mcus.items():
@@ -195,7 +195,7 @@ class Faults:
                 self._world.break_thruster(mcu.module, t, fault.kind.removeprefix("thruster_"), fault.value)
 
     def _push(self, fault: Fault, mcu: Mcu) -> None:
-        """A hand on the rim of a side's disk: it shoves and turns."""
+        """Adds an external push on a point off the hull's centre: a force and a moment."""
         self._world.push[mcu.module] += fault.value * np.concatenate([self._hand, PUSH_LEVER_M * np.cross(self._grip, self._hand)])
 
     def _hang_magnets(self, fault: Fault, mcu: Mcu) -> None:
@@ -203,9 +203,9 @@ class Faults:
             self._world.docks.hang(mcu.module, face, RELAY.index(fault.value))
 
     def _change_tag(self, sighting: Sighting, carrier: int) -> Sighting | None:
-        """What becomes of a sighting, in the world's frame, by a camera that the module `carrier` carries (-1: a fixed one).
+        """Applies the faults to a sighting, world frame, by a camera on the module `carrier` (-1: a fixed camera); None: lost.
 
-        What a fault did to the carrier's own sighting is in there already, since it was placed by that: it counts once.
+        Faults of the carrier are skipped: they are already in its own sighting, by which this one was placed, and must count only once.
         """
         for fault in self._on:
             modules = self._modules(fault)
@@ -223,10 +223,10 @@ class Faults:
 
 
 TILT_RAD = math.radians(40.0)
-"""A flipped tag is turned by twice its incidence about an axis in its plane: here that of 20 deg."""
+"""A flipped tag appears turned about an axis in its plane by twice the angle of incidence; here for an incidence of 20 deg."""
 
 
 def _flipped(sighting: Sighting) -> np.ndarray:
-    """(4,) the other pose of a planar tag seen from straight above it, tilted by `TILT_RAD`."""
+    """(4,) attitude of the ambiguous second pose of a planar tag: the sighting's, turned by `TILT_RAD` about the tag's x axis."""
     tilt = rotations.exp(np.array([TILT_RAD, 0.0, 0.0]))
     return np.asarray(rotations.normalise(rotations.multiply(sighting.q_wt, tilt)))

@@ -1,7 +1,7 @@
 """The simulated CAN nodes: the MCU of each module and the tag camera, between the frames of a bus and the world.
 
-Per tick: the world advances one period, then the frames that came are taken in order; SYNC makes an MCU apply its last
-accepted command, sample and answer, MCU_STATUS last. Nothing here knows the controller.
+Per tick, the world advances one period and the received frames are processed in order. On SYNC an MCU applies its last accepted
+command, samples its sensors and answers, MCU_STATUS last. This code is independent of the controller.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from hil.scenario import Scenario
 from hil.tag_camera import TagCamera
 
 TIMEOUT_NS = 100_000_000
-"""A half of THRUSTER_CMD that is older commands zero."""
+"""Age beyond which a half of THRUSTER_CMD is stale and its thrusters are set to zero."""
 RELEASE_NS = 200_000_000
-"""An e-stop may be released when none came for so long."""
+"""Time without an ESTOP frame after which an e-stop can be released."""
 PUSH_NS = 2_000_000_000
-"""A magnet that pushes goes off when DOCK_CMD is older; one that pulls holds a joint, and stays."""
+"""Age of the last DOCK_CMD beyond which pushing magnets switch off; pulling magnets hold a joint and stay on."""
 OFF, REVERSE = 0, 2
 """Relay states."""
 VERSION = 1
@@ -41,7 +41,7 @@ SLOW = (
     "DEPTH", "DOCK_CURRENT_ABC", "DOCK_CURRENT_DEF", "ESC_FEEDBACK_1", "ESC_FEEDBACK_2", "ESC_FEEDBACK_3",
     "ESC_FEEDBACK_4", "POWER", "ENVIRONMENT",
 )  # fmt: skip
-"""Messages that are not sent in every tick."""
+"""Messages that are sent less often than every tick, at the cycle times of the DBC."""
 
 
 class Mcu:
@@ -68,13 +68,13 @@ class Mcu:
         self._fast = [codec.message(name) for name in ("GYRO", "ACCEL", "MCU_STATUS")]
         self._slow = _schedule(codec, number, tick_ns)
         self.frozen = self.leaks = self.unread = False
-        """Faults: the IMU repeats its last sample; water in the cabin; nothing is said of battery and cabin."""
+        """Faults: the IMU repeats its last sample; water in the cabin; POWER and ENVIRONMENT are not sent."""
         self._motion: tuple[list[float], list[float]] | None = None
         self._counters = dict.fromkeys(SLOW, 0)
 
     @property
     def applied(self) -> tuple[float, ...]:
-        """Shares of full command that the thrusters have now."""
+        """Commands, share of full, that the thrusters have now."""
         return tuple(self._applied)
 
     @property
@@ -83,7 +83,7 @@ class Mcu:
         return tuple(self._accepted_ns)
 
     def heard(self, name: str, values: Sequence[float], time_ns: int) -> None:
-        """A checked message for this module."""
+        """Handles a checked message addressed to this module."""
         if name in ("THRUSTER_CMD_A", "THRUSTER_CMD_B"):
             half = 0 if name == "THRUSTER_CMD_A" else 1
             self._command[4 * half : 4 * half + 4] = values[:4]
@@ -97,14 +97,14 @@ class Mcu:
             self._switch([OFF if v == barred else int(v) for v in values[:6]])
 
     def estop(self, time_ns: int) -> None:
-        """An ESTOP frame came: thrust ends at once, without waiting for SYNC, and magnets no longer push."""
+        """Handles an ESTOP frame: thrust and pushing magnets stop at once, without waiting for SYNC."""
         self.stopped = True
         self._last_estop_ns = time_ns
         self._apply([0.0] * 8)
         self._end_push()
 
     def watch(self, time_ns: int) -> None:
-        """The MCU's own clock: each half of the command that has grown old ends, SYNC or not, and so does pushing."""
+        """Runs the MCU's timeouts, independent of SYNC: zeroes each stale half of the command, and ends a push after PUSH_NS."""
         if time_ns - self._docked_ns > PUSH_NS:
             self._end_push()
         for half, accepted in enumerate(self._accepted_ns):
@@ -114,10 +114,10 @@ class Mcu:
                     self._apply([0.0 if i // 4 == half else u for i, u in enumerate(self._applied)])
 
     def sync(self, tick: int, time_ns: int) -> list[Frame]:
-        """Applies the last accepted command, samples, answers."""
+        """Applies the last accepted command, samples the sensors and returns the answers."""
         live = [a is not None and time_ns - a <= TIMEOUT_NS for a in self._accepted_ns]
         self.timed_out = not all(live)
-        # A fresh half that says disarmed disarms both; a half that is old is zero by itself.
+        # A fresh half marked disarmed disarms both halves; a stale half is zeroed on its own.
         disarmed = any(fresh and not armed for fresh, armed in zip(live, self._armed, strict=True))
         allowed = [fresh and not disarmed and not self.stopped for fresh in live]
         self._apply([*self._command] if all(allowed) else [u if allowed[i // 4] else 0.0 for i, u in enumerate(self._command)])
@@ -188,35 +188,35 @@ class Mcu:
 
 
 class WireFaults(Protocol):
-    """What may be wrong (hil.faults)."""
+    """Interface of the fault injection (hil.faults)."""
 
     def update(self, time_ns: int) -> None:
-        """Begins and ends what is due."""
+        """Begins and ends faults that are due."""
 
     def incoming(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
-        """Frames to the plant, as they arrive."""
+        """Returns the frames to the plant as they arrive."""
 
     def outgoing(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
-        """Frames from the plant, as they leave."""
+        """Returns the frames from the plant as they leave."""
 
     def intruders(self, time_ns: int) -> list[Frame]:
-        """What nodes that should not be there put on the wire, once a tick."""
+        """Returns the frames that foreign nodes put on the wire, once per tick."""
 
 
 class NoFaults:
-    """Nothing is wrong."""
+    """Fault injection without faults."""
 
     def update(self, time_ns: int) -> None:
-        """Nothing is due."""
+        """Does nothing."""
 
     def incoming(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
-        """All of them."""
+        """Returns all frames unchanged."""
         return list(frames)
 
     outgoing = incoming
 
     def intruders(self, time_ns: int) -> list[Frame]:
-        """Nobody."""
+        """Returns no frames."""
         return []
 
 
@@ -232,7 +232,7 @@ class Nodes:
         cameras: Sequence[Camera] = (),
         tick_ns: int = 0,
     ) -> None:
-        """All nodes at rest.
+        """Creates all nodes at rest.
 
         Args:
             numbers: number on this bus -> index of the module in the world.
@@ -247,20 +247,20 @@ class Nodes:
         self._statuses = {codec.message("MCU_STATUS").id_of(number): number for number in numbers}
 
     def step(self, frames: Iterable[Frame]) -> list[Frame]:
-        """One tick of a world that has this one bus: advance a period, take the frames, return the answers."""
+        """Runs one tick of a world with this one bus: advances a period, takes the frames and returns the answers."""
         self.world.advance(self.world.period_ns)
         self.watch()
         return self.answer(frames, self.world.time_ns) + self.faults.intruders(self.world.time_ns)
 
     def refuse_others(self, frames: Iterable[Frame], address: str) -> None:
-        """Raises DescriptionError where one of the frames that came at `address` is the status of an MCU that is simulated here."""
+        """Raises DescriptionError when a frame received at `address` is the MCU_STATUS of an MCU that is simulated here."""
         for frame in frames:
             if (number := self._statuses.get(frame.id)) in self.mcus:
                 who = f"somebody else answers as module {number} on {address}"
                 raise DescriptionError(f"{who}: another plant, or the robot itself; end it, or take another --bus")
 
     def answer(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
-        """Takes frames off the wire at `time_ns` and puts the answers on it, through whatever is wrong with the wire."""
+        """Processes the frames on the wire at `time_ns` and returns the answers, both passed through the wire's faults."""
         answers: list[Frame] = []
         arrived = self.faults.incoming(frames, time_ns)
         for frame, row in zip(arrived, self.receiver.rows(arrived).tolist(), strict=True):
@@ -268,7 +268,7 @@ class Nodes:
         return self.faults.outgoing(answers, time_ns)
 
     def watch(self) -> None:
-        """What happens without any frame: faults, time-outs, pictures. To be called after every advance of the world."""
+        """Updates everything that needs no frame: faults, timeouts, pictures. Call after every advance of the world."""
         self.faults.update(self.world.time_ns)
         for camera in self.cameras:
             camera.watch()
@@ -276,11 +276,11 @@ class Nodes:
             mcu.watch(self.world.time_ns)
 
     def take(self, frame: Frame, time_ns: int) -> list[Frame]:
-        """One frame from the bus at `time_ns` on the plant's clock; returns the answers. Bad frames count and drop."""
+        """Processes one frame from the bus at `time_ns`, plant clock, and returns the answers. Bad frames are counted and dropped."""
         return self._hear(frame, self.receiver.rows((frame,)).tolist()[0], time_ns)
 
     def _hear(self, frame: Frame, row: list[float], time_ns: int) -> list[Frame]:
-        """`row`: what the receiver makes of the frame."""
+        """Processes one frame; `row`: the receiver's result for it."""
         which, number, values = int(row[MESSAGE]), row[NUMBER], row[VALUES:]
         if which < 0:
             self._blame(frame, KINDS[~which])
@@ -301,14 +301,14 @@ class Nodes:
         return []
 
     def _blame(self, frame: Frame, kind: str) -> None:
-        """The MCU that a dropped frame was meant for reports the kind of error."""
+        """Sets the error bit of a dropped frame in the status of the MCU it was addressed to."""
         mcu = self.mcus.get(frame.id & 0x1F)
         if mcu is not None:
             mcu.errors |= ERROR_BITS.get(kind, 0)
 
 
 def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[MessageCodec, int, int]]:
-    """(message, every so many ticks, in which of them): staggered by message and module."""
+    """(message, period in ticks, phase in ticks) of each slow message, staggered by message and module."""
     slow = []
     for index, name in enumerate(SLOW):
         message = codec.message(name)
@@ -318,7 +318,7 @@ def _schedule(codec: Codec, number: int, period_ns: int) -> list[tuple[MessageCo
 
 
 def make_nodes(world: World, codec: Codec, scenario: Scenario, tick_ns: int = 0) -> Nodes:
-    """The nodes of a scenario, all on one bus; `tick_ns` as in `Nodes`."""
+    """Creates the nodes of a scenario, all on one bus; `tick_ns` as in `Nodes`."""
     numbers = {module.number: index for index, module in enumerate(scenario.module)}
     cameras = [
         Camera(
@@ -330,6 +330,6 @@ def make_nodes(world: World, codec: Codec, scenario: Scenario, tick_ns: int = 0)
             index,
             scenario.index_of(pose.module) if pose.module else -1,
         )
-        for index, pose in enumerate(sorted(scenario.camera, key=lambda pose: pose.module > 0))  # carried ones take the first one's phase
+        for index, pose in enumerate(sorted(scenario.camera, key=lambda pose: pose.module > 0))  # carried cameras use the first one's phase
     ]
     return Nodes(world, codec, numbers, scenario.sensors, cameras, tick_ns)

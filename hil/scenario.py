@@ -28,7 +28,7 @@ from hil.starts import places_of, refuse_in_walls, refuse_overlap, starts_of
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModuleStart:
-    """One module: what it is and where it is put into the water."""
+    """One module: its vehicle and its initial pose."""
 
     number: int = quantity(low=1, high=29, help="number on the bus")
     vehicle: str = quantity("modcube", help="vehicle name, or a file beside the scenario's")
@@ -50,19 +50,19 @@ class ModuleStart:
 
     @property
     def start(self) -> Start:
-        """Pose at time 0 of a module alone, or of the body that it leads."""
+        """Initial pose of a lone module, or of the body that the module leads."""
         return Start(np.array(self.position_m), rotations.from_euler(*np.radians(self.euler_deg)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RandomStart:
-    """How far every body's start is off, each drawn per seed: uniform within these bounds."""
+    """Random offset of every body's initial pose, drawn per seed, uniform within these bounds."""
 
     position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=0, high=100, shape=(3,), help="along each world axis")
     yaw_deg: float = quantity(0.0, unit="deg", low=0, high=180, help="about the vertical")
 
     def shifted(self, start: Start, seed: int, leader: int) -> Start:
-        """The start of the body led by that module, in the run `seed`."""
+        """Returns the initial pose of the body led by the module with index `leader`, in the run `seed`."""
         drawn = stream(seed, "start", leader).uniform(-1.0, 1.0, 4)
         turn = rotations.from_euler(0.0, 0.0, math.radians(self.yaw_deg) * float(drawn[3]))
         return Start(start.p_wm + self.position_m * drawn[:3], rotations.multiply(turn, start.q_wm))
@@ -70,7 +70,7 @@ class RandomStart:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Step:
-    """One thing that a docking task does, after the one before is over."""
+    """One step of a docking task; begins after the previous step, or together with it (`also`)."""
 
     do: str = quantity(
         choices=("dock", "undock", "move", "moebius", "wait"),
@@ -92,17 +92,17 @@ class Step:
 
     @property
     def modules(self) -> tuple[int, ...]:
-        """Numbers of the modules that it is about: the active one, then the target of a dock or an undock."""
+        """Numbers of the modules involved: the active one, then the target of a dock or undock."""
         return {"wait": (), "move": (self.module,), "moebius": (self.module,)}.get(self.do, (self.module, self.target_module))
 
 
 MODES = ("MANUAL", "STABILIZE", "ALT_HOLD", "POSHOLD", "AUTO", "GUIDED", "SURFACE", "MOTOR_DETECT")
-"""Modes that a person may take with one body."""
+"""Modes that an operator can select for a single body."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Task:
-    """What the robot is to do."""
+    """The task of the robot."""
 
     kind: str = quantity(
         choices=("hover", "spiral", "moebius", "lissajous", "waypoints", "dock", "force", "mode"),
@@ -137,23 +137,23 @@ class Task:
 
     @property
     def begin_ns(self) -> int:
-        """When it begins, since the start of the run."""
+        """Start of the task, since the start of the run."""
         return round(self.settle_s * 1e9)
 
     @property
     def duration_ns(self) -> int:
-        """How long it takes."""
+        """Duration of the task."""
         return round(self.duration_s * 1e9)
 
     @property
     def end_ns(self) -> int:
-        """When it ends, and the run with it."""
+        """End of the task and of the run."""
         return self.begin_ns + self.duration_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Polycube:
-    """A random shape in place of the first module; each seed has its own."""
+    """A random shape in place of the first module, drawn per seed."""
 
     fewest: int = quantity(2, low=1, high=29, help="smallest number of modules")
     most: int = quantity(8, low=1, high=29, help="largest number of modules")
@@ -228,7 +228,7 @@ class Scenario:
         return self.task.settle_s + self.task.duration_s
 
     def for_seed(self, seed: int) -> Scenario:
-        """The same with what each seed has of its own written out: the modules of a polycube."""
+        """Returns the scenario of one seed, with the modules of a polycube written out."""
         if self.polycube is None:
             return self
         rng, first = stream(seed, "shape"), self.module[0]
@@ -243,26 +243,25 @@ class Scenario:
         return dataclasses.replace(self, module=modules, polycube=None)
 
     def with_ideal_sensors(self) -> Scenario:
-        """The same with perfect sensors.
+        """Returns the scenario with perfect sensors.
 
-        Quantisation by the frames stays, and half a count of noise on inertial sensors and the tags' attitude.
-
-        Checks that are none of theirs (`ideal`) are left out.
+        Quantisation by the frames remains, as does half a count of noise on IMU, depth and the tags' attitude. Checks that do not
+        apply to ideal sensors (`Check.ideal`) are left out.
         """
         check = tuple(check for check in self.check if check.ideal)
         return dataclasses.replace(self, check=check, sensors=dataclasses.replace(self.sensors, **(IDEAL | HALF_A_COUNT)))  # type: ignore[arg-type]
 
     def with_vehicle(self, vehicle: str) -> Scenario:
-        """The same with every module of the kind `vehicle`, a name or a file."""
+        """Returns the scenario with `vehicle`, a name or a file, for every module."""
         return dataclasses.replace(self, module=tuple(dataclasses.replace(m, vehicle=vehicle) for m in self.module))
 
     def with_calm_world(self) -> Scenario:
-        """The same in still water, with a robot that is what its vehicle file says."""
+        """Returns the scenario in still water, with a robot that matches its vehicle file."""
         return dataclasses.replace(self, world=dataclasses.replace(self.world, **CALM))  # type: ignore[arg-type]
 
 
 def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
-    """The world of a scenario at time 0. Raises DescriptionError."""
+    """Creates the world of a scenario at time 0. Raises DescriptionError."""
     vehicles = [load_vehicle(m.vehicle) for m in scenario.module]
     groups = scenario.groups
     bodies = [scenario.start.shifted(scenario.module[members[0]].start, seed, members[0]) for members in groups]
@@ -278,13 +277,13 @@ def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
 
 
 def scenario_names() -> list[str]:
-    """Names of the scenarios that the package carries."""
+    """Names of the scenarios that come with the package."""
     folder = resources.files("hil") / "scenarios"
     return sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml"))
 
 
 def load_scenario(name: str) -> Scenario:
-    """The scenario called `name`, or the file at the path `name`. Raises DescriptionError, one line."""
+    """Loads the scenario called `name`, or the .toml file at the path `name`. Raises DescriptionError with a one-line message."""
     if name.endswith(".toml"):
         path = Path(name)
     elif name in scenario_names():
@@ -302,7 +301,7 @@ def load_scenario(name: str) -> Scenario:
 
 
 def _with_file_text(scenario: Scenario, folder: Path, source: Source) -> Scenario:
-    """The same with the text of the file that its task names. Raises DescriptionError."""
+    """Returns the scenario with the text of the task's file read in. Raises DescriptionError."""
     if scenario.task.file_text:
         raise source.error(("task", "file_text"), "is read from `file`; give that alone")
     if not scenario.task.file:

@@ -1,4 +1,4 @@
-"""What a scenario must be beyond the range of each field, so that a mistake in its file is refused before anything flies."""
+"""Validation of scenarios beyond the range of each field, so that a mistake in a file is refused before the flight."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ if TYPE_CHECKING:
     from hil.scenario import Check, Scenario
 
 ARM_FROM_S = 1.0
-"""First attempt to arm, by whoever flies the scenario: the pose needs a few tags."""
+"""Time of the first attempt to arm in every kind of flight; the pose estimate needs a few tags before."""
 ARMED_WITHIN_S = 0.1
-"""The answer comes a tick or two later, of 20 ms at the most."""
+"""Allowance for the answer, which comes one or two ticks, of at most 20 ms, later."""
 YAWS = 37
-"""Headings that are looked at between the ends of what a seed may draw: 10 deg apart at the most."""
+"""Number of headings checked over the range that a seed may draw: at most 10 deg apart."""
 Mistake = tuple[tuple[str | int, ...], str]
-"""The keys that lead to what is wrong, and what is wrong with it."""
+"""Path of keys to the wrong entry, and the error message."""
 
 
 def mistakes(scenario: Scenario) -> Iterator[Mistake]:
-    """Everything that is wrong with a scenario as its file has it."""
+    """Yields all mistakes of a scenario as read from its file."""
     for rule in RULES:
         yield from rule(scenario)
 
 
 def metric_names(scenario: Scenario) -> list[str]:
-    """Names of the metrics that a run of it has."""
+    """Names of the metrics that a run of the scenario yields."""
     kind = scenario.task.kind
     names = [name for name in SHOWN if kind == "dock" or name not in DOCKING]
     return names + (force_names([len(members) for members in scenario.groups]) if kind == "force" else [])
 
 
 def module_numbers(scenario: Scenario) -> list[int]:
-    """Numbers of the modules that every seed has."""
+    """Numbers of the modules that exist in every seed."""
     if scenario.polycube is None:
         return [module.number for module in scenario.module]
     first = scenario.module[0].number
@@ -93,7 +93,7 @@ def _in_settling(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _in_file(scenario: Scenario) -> Iterator[Mistake]:
-    """What the file itself holds is the script's to judge, which plans the path."""
+    """Checks only whether a file is given; the script, which plans the path, checks its contents."""
     task = scenario.task
     if task.kind == "waypoints" and not task.file:
         yield ("task", "kind"), "waypoints flies a file, and there is none; give file"
@@ -117,7 +117,7 @@ def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
-    """Where bodies start and where they are sent; whether a whole path stays in the tank is the script's to judge."""
+    """Checks the start and target positions of bodies; the script checks whether whole paths stay in the tank."""
     places: list[tuple[str, int]] = [("module", members[0]) for members in scenario.groups]
     places += [("step", i) for i, step in enumerate(scenario.step) if step.do == "move"]
     for table, i in places:
@@ -131,7 +131,7 @@ def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _in_start(scenario: Scenario) -> Iterator[Mistake]:
-    """However far a seed may put a body off its place."""
+    """Checks the extremes of the random start offsets."""
     for corner in itertools.product((-1.0, 1.0), repeat=3):
         for members in scenario.groups:
             place = scenario.module[members[0]].position_m + scenario.start.position_m * corner
@@ -145,7 +145,7 @@ def _in_start(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:
-    """Steps, faults and cameras that name a module that is not there."""
+    """Checks that steps, faults and cameras refer to existing modules."""
     numbers = module_numbers(scenario)
     mentions: list[tuple[tuple[str | int, ...], int]] = []
     for i, step in enumerate(scenario.step):
@@ -159,7 +159,7 @@ def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _in_tags(scenario: Scenario) -> Iterator[Mistake]:
-    """Cameras read the tags of `tags` alone. Without a camera or tags nobody is to be seen, nor is a vehicle that carries none."""
+    """Checks that each tagged vehicle has a tag that cameras read, i.e. one of `tags`. Skipped without cameras or tags."""
     if not scenario.camera or not scenario.tags:
         return
     for i, module in enumerate(scenario.module):
@@ -170,7 +170,7 @@ def _in_tags(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _thrusters(scenario: Scenario) -> dict[int, int]:
-    """How many each module has, by its number. Raises DescriptionError where a vehicle is none."""
+    """Number of thrusters of each module, by module number. Raises DescriptionError when a vehicle cannot be loaded."""
     counts = {vehicle: len(load_vehicle(vehicle).thruster) for vehicle in {module.vehicle for module in scenario.module}}
     vehicles = itertools.cycle(module.vehicle for module in scenario.module)  # a polycube's modules are all of one kind
     return {number: counts[vehicle] for number, vehicle in zip(module_numbers(scenario), vehicles, strict=False)}
@@ -204,7 +204,7 @@ def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _out_of_reach(check: Check) -> Iterator[tuple[str, str]]:
-    """A bound beyond all that a flight can have."""
+    """Yields the bounds of a check that no flight can satisfy."""
     can = shown(check.metric)
     if check.high < can.low:
         yield "high", f"{check.high:g}, and {check.metric} is {can.low:g} or more; no value would pass"
@@ -216,4 +216,4 @@ RULES = (
     _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_tank, _in_start, _in_mentions,
     _in_tags, _in_faults, _in_checks,
 )  # fmt: skip
-"""The first that finds a mistake is heard first."""
+"""In order of priority: the first mistake found is the one reported."""

@@ -1,4 +1,4 @@
-"""Where every module of a scenario is put into the water, and whether it can be there: in the tank, and in no other's place."""
+"""Initial poses of the modules of a scenario, and checks that they are inside the tank and do not overlap."""
 
 from __future__ import annotations
 
@@ -22,19 +22,22 @@ if TYPE_CHECKING:
 PITCH_M = 0.21
 """Lattice pitch of docked modules (the paper's)."""
 CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
-"""(8, 3) of a box, in its edges."""
+"""(8, 3) corners of a box, as shares of its edges."""
 TOUCHING_M = 1e-9
-"""What rounding may put a hull into a wall that it touches."""
+"""Tolerance for a hull that touches a wall, against rounding."""
 
 
 def places_of(scenario: Scenario) -> list[Place]:
-    """Where each module sits in its body, whose frame starts at its leader's cell."""
+    """Seat of each module in its body, whose frame has its origin at the leader's cell."""
     leaders = {m: members[0] for members in scenario.groups for m in members}
     return [place(m.cell, m.rotation, PITCH_M, np.array(scenario.module[leaders[i]].cell)) for i, m in enumerate(scenario.module)]
 
 
 def starts_of(scenario: Scenario, vehicles: Sequence[Vehicle], bodies: Sequence[Start]) -> list[Start]:
-    """Pose at time 0 of each module, where its body, one of `bodies` for each of the scenario's groups, starts like this."""
+    """Pose of each module at time 0.
+
+    bodies: initial pose of each of the scenario's groups: of the centre of mass, or of the hull's centre of a lone module.
+    """
     places = places_of(scenario)
     starts = [m.start for m in scenario.module]
     for members, start in zip(scenario.groups, bodies, strict=True):
@@ -51,9 +54,9 @@ def hull_of(vehicle: Vehicle, start: Start) -> np.ndarray:
 
 
 def in_wall(tank: Tank, points: np.ndarray) -> str:
-    """How far into which wall the farthest of points (..., 3) is, in words; empty where all are between walls and bottom.
+    """Describes which wall the points (..., 3) penetrate deepest, and by how much; empty when all are between walls and bottom.
 
-    The surface is no wall: who sticks out of the water floats.
+    The surface is no wall: a hull that sticks out of the water floats.
     """
     x, y, z = (points[..., axis] for axis in range(3))
     if tank.kind == "box":
@@ -68,7 +71,7 @@ def in_wall(tank: Tank, points: np.ndarray) -> str:
 
 
 def hull_levers(scenario: Scenario) -> dict[int, tuple[Start, np.ndarray]]:
-    """By each module's index, body after body: where its body starts, and (8, 3) the corners of its hull from there, body frame, m."""
+    """Initial pose of the body, and (8, 3) hull corners relative to it, body frame, m; by module index, body after body."""
     vehicles = [load_vehicle(module.vehicle) for module in scenario.module]
     bodies = [scenario.module[members[0]].start for members in scenario.groups]
     starts = starts_of(scenario, vehicles, bodies)
@@ -80,11 +83,11 @@ def hull_levers(scenario: Scenario) -> dict[int, tuple[Start, np.ndarray]]:
 
 
 def hulls_in_walls(scenario: Scenario, shifts_m: np.ndarray, yaws: np.ndarray) -> Iterator[tuple[int, str]]:
-    """Of each module whose hull would start in a wall its index, and in words how far into which; the farthest of all that a body is off.
+    """Yields (index, description) of each module whose hull would start in a wall at any combination of offsets; the worst case of each.
 
     Args:
-        shifts_m: (n, 3) by which a body is off its place, world.
-        yaws: (k,) by which it is turned, rad.
+        shifts_m: (n, 3) offsets of a body from its place, world.
+        yaws: (k,) rotations of a body about the vertical, rad.
     """
     turns = np.array([rotations.to_matrix(rotations.from_euler(0.0, 0.0, yaw)) for yaw in yaws.tolist()])
     for m, (start, levers) in hull_levers(scenario).items():
@@ -94,14 +97,14 @@ def hulls_in_walls(scenario: Scenario, shifts_m: np.ndarray, yaws: np.ndarray) -
 
 
 def refuse_in_walls(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:
-    """Raises DescriptionError where a hull would start in a wall."""
+    """Raises DescriptionError when a hull would start in a wall."""
     for module, vehicle, start in zip(scenario.module, vehicles, starts, strict=True):
         if where := in_wall(scenario.tank, hull_of(vehicle, start)):
             raise DescriptionError(f"{scenario.name}: in seed {seed} the hull of module {module.number} starts {where}; move it in")
 
 
 def refuse_overlap(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:
-    """Raises DescriptionError where two bodies would start one inside the other: balls that fit into their hulls overlap."""
+    """Raises DescriptionError when two bodies would start inside each other: the inscribed spheres of their hulls overlap."""
     radii = [0.5 * float(vehicle.hull.size_m.min()) for vehicle in vehicles]
     docked = {pair for members in scenario.groups for pair in itertools.combinations(members, 2)}
     for (i, one), (j, other) in itertools.combinations(enumerate(starts), 2):

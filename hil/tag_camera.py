@@ -1,4 +1,4 @@
-"""The simulated tag computer, a node of its own on the bus: from what cameras see to TAG frames."""
+"""The simulated tag computer, a node of its own on the bus: turns the sightings of cameras into TAG frames."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from hil.plant.world import World
 
 
 class TagCamera:
-    """The tag computer, number 31: sends what its cameras saw, in the world's frame, when its delay is over.
+    """The tag computer, number 31: sends the sightings of its cameras, in the world frame, after its processing delay.
 
-    It knows where its fixed cameras stand. What a carried camera sees it places in the world by the carrier's own tag in
-    a fixed camera's picture of the same moment, whose errors it takes over; without one the sighting is of no use and is dropped.
+    It knows the poses of its fixed cameras. A carried camera's sighting is placed in the world by way of a sighting of the carrier in a
+    picture of the same instant, and inherits its errors; without such a sighting it is dropped.
     """
 
     def __init__(
@@ -31,22 +31,22 @@ class TagCamera:
         self._counters = dict.fromkeys(self._number_of, 0)
         self._farthest_m = min(axis.factor * axis.raw_high for axis in self._position.field_details[:3])
         self.change: Callable[[Sighting, int], Sighting | None] = lambda sighting, carrier: sighting
-        """What a fault makes of every sighting by a camera that is carried by that module (-1: by none); None: lost."""
+        """Fault hook: changes a sighting by a camera on the given module (-1: fixed camera); returns None to lose it."""
         self.watch()
 
     def watch(self) -> None:
-        """Takes the pictures that have become due; each is stamped by the last SYNC heard before it. What no frame can say is dropped."""
+        """Takes the pictures that are due, stamped relative to the last SYNC. Sightings that a frame cannot represent are dropped."""
         for sighting in self._see():
             if self._sync is None or sighting.module not in self._number_of:
                 continue
             tick, sync_ns = self._sync
             offset_ns = sighting.capture_ns - sync_ns
-            is_near = all(abs(m) <= self._farthest_m for m in sighting.p_wt.tolist())  # else the frame would say that it is at the limit
-            if is_near and 0 <= offset_ns <= 25_500_000:  # what 8 bits of 0.1 ms can say
+            is_near = all(abs(m) <= self._farthest_m for m in sighting.p_wt.tolist())  # else the frame would saturate
+            if is_near and 0 <= offset_ns <= 25_500_000:  # range of 8 bits of 0.1 ms
                 self._waiting.append((sighting, tick, offset_ns))
 
     def _see(self) -> list[Sighting]:
-        """All sightings of the pictures that are due, in the world's frame, in the order of their pictures."""
+        """Returns all sightings of the pictures that are due, world frame, in order of capture."""
         fixed: list[Sighting] = []
         for camera in self._cameras:
             found = camera.watch(self._world)
@@ -62,7 +62,7 @@ class TagCamera:
         return sorted(fixed, key=lambda s: s.capture_ns)
 
     def sync(self, tick: int, time_ns: int) -> list[Frame]:
-        """Notes the time of SYNC and sends what is due."""
+        """Records the time of SYNC and returns the frames of sightings that are due."""
         self._sync = (tick, time_ns)
         frames = []
         while self._waiting and self._waiting[0][0].capture_ns + self._delay_ns <= time_ns:

@@ -1,1 +1,1 @@
-"""The world: water, bodies, thrusters, sensors. Written without the controller's model, so that no mistake cancels."""
+"""Simulated plant: water, bodies, thrusters, sensors. Shares no model with the controller, so no modelling error cancels out."""

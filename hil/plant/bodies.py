@@ -1,10 +1,10 @@
 """Motion of rigid bodies in water: Kirchhoff's equations.
 
-A body is one or more modules docked rigidly. Its frame has the axes of their lattice, origin O at its first hull's centre. Its
-state, (13,): position of O in the world, quaternion body to world, velocity of O and angular rate in the body frame.
+A body is one or more rigidly docked modules. Its frame has the axes of their lattice and its origin O at the centre of the first
+hull. Its state, (13,): position of O in the world, quaternion body to world, velocity of O and angular rate in the body frame.
 
-With the momenta of robot and entrained water (p, L) and of the water outside (h, l: added mass times velocity relative
-to the water), all about O in the body frame (Lamb, Hydrodynamics, ch. VI):
+The momenta are those of robot and entrained water (p, L) and of the water outside (h, l: added mass times velocity relative to
+the water), all about O in the body frame (Lamb, Hydrodynamics, ch. VI):
     d(p + h)/dt = F - w x (p + h),    d(L + l)/dt = N - w x (L + l) - v x p - v_r x h.
 """
 
@@ -44,7 +44,7 @@ from hil.plant.vectors import (
 from hil.plant.water import is_clear, push_of_walls, room
 
 NEAR_M = 1e-6
-"""Beyond its half diagonal: what rounding could hide."""
+"""Margin on a hull's half diagonal against rounding errors."""
 
 
 class Bodies(NamedTuple):
@@ -57,7 +57,7 @@ class Bodies(NamedTuple):
     added: np.ndarray
     """(b, 6, 6) added mass about O."""
     inverse: np.ndarray
-    """(b, 6, 6) inverse of their sum."""
+    """(b, 6, 6) inverse of rigid plus added mass."""
     weight: np.ndarray
     """(b, 8) weight W, entrained water included, and buoyancy B, N; W r_W and B r_B, N m."""
     hull: np.ndarray
@@ -65,7 +65,7 @@ class Bodies(NamedTuple):
     wrench: np.ndarray
     """(b, 6) working memory: force and moment about O, body frame."""
     clamped: np.ndarray
-    """(b,) 1 where a load cell holds the body in its place."""
+    """(b,) 1 where a load cell holds the body in place."""
 
 
 class Modules(NamedTuple):
@@ -78,7 +78,7 @@ class Modules(NamedTuple):
     turn: np.ndarray
     """(m, 3, 3) module frame to body frame."""
     quaternion: np.ndarray
-    """(m, 4) the same."""
+    """(m, 4) the same rotation as a quaternion."""
     size: np.ndarray
     """(m, 3) edges of the hull."""
     drag: np.ndarray
@@ -88,11 +88,11 @@ class Modules(NamedTuple):
     quadratic: np.ndarray
     """(m, 6) quadratic damping that a vehicle file publishes in place of areas."""
     shelter: np.ndarray
-    """(m,) row of the module's map; -1: it swims alone."""
+    """(m,) row of the module in `maps`; -1: the only module of its body."""
     sides: np.ndarray
-    """(m, 3) share of its sides across x, y, z that no other module covers."""
+    """(m, 3) share of the hull's sides across x, y, z that no other module covers."""
     maps: np.ndarray
-    """(k, 3, n, n, 4) see `shelter.seen_share`."""
+    """(k, 3, n, n, 4) shelter maps, see `shelter.seen_share`."""
 
 
 BODIES = types.NamedTuple((F2, F3, F3, F3, F2, F2, F2, I1), Bodies)
@@ -110,10 +110,10 @@ def add_force(wrench, b, at, f):
 
 @inlined
 def weigh(weight, weight_at, lift, lift_at, displaced, displaced_at, r, flow_rate):
-    """Force and moment of weight, buoyancy, and the pressure gradient of water that accelerates (Froude-Krylov), body frame.
+    """Force and moment of weight, buoyancy and the pressure gradient of accelerating water (Froude-Krylov), body frame.
 
     Args:
-        weight, lift, displaced: N, N, kg; `_at`: the same times where they act, N m, N m, kg m.
+        weight, lift, displaced: N, N, kg; `_at`: each multiplied by its point of action, N m, N m, kg m.
         r: body to world. flow_rate: acceleration of the water, world.
     """
     down, rate = r[2], turn_back(r, flow_rate)
@@ -123,11 +123,11 @@ def weigh(weight, weight_at, lift, lift_at, displaced, displaced_at, r, flow_rat
 
 @inlined
 def respond(rigid, added, inverse, r, v, w, flow, flow_rate, f, n):
-    """Kirchhoff's equations solved for the accelerations of O and of the rate, body frame.
+    """Solves Kirchhoff's equations for the linear acceleration of O and the angular acceleration, body frame.
 
     Args:
         rigid, added, inverse: mass matrices, see `Bodies`.
-        r: body to world. v, w: velocity of O and rate, body frame. flow, flow_rate: of the water, world.
+        r: body to world. v, w: velocity of O and rate, body frame. flow, flow_rate: velocity and acceleration of the water, world.
         f, n: force and moment about O.
     """
     u = turn_back(r, flow)
@@ -142,7 +142,7 @@ def respond(rigid, added, inverse, r, v, w, flow, flow_rate, f, n):
 
 @inlined
 def turning(q, w):
-    """Rate of change of a quaternion, body to world, that turns at w, body frame."""
+    """Time derivative of the quaternion q, body to world, at the angular rate w, body frame."""
     return (
         -0.5 * (q[1] * w[0] + q[2] * w[1] + q[3] * w[2]),
         0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1]),
@@ -153,7 +153,7 @@ def turning(q, w):
 
 @inlined
 def _add_weight(bodies, b, x, flow_rate):
-    """What `weigh` says of body b."""
+    """Adds the result of `weigh` to the wrench of body b."""
     weight, hull, r = bodies.weight, bodies.hull, matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
     f, n = weigh(
         weight[b, 0], triple(weight, b, 2), weight[b, 1], triple(weight, b, 5), hull[b, 0], triple(hull, b, 1), r, flow_rate
@@ -165,7 +165,7 @@ def _add_weight(bodies, b, x, flow_rate):
 
 @inlined
 def _add_drag(bodies, modules, m, water, x, flow):
-    """Drag of one module at its hull centre, by its velocity relative to the water."""
+    """Adds the drag of one module at its hull centre, from its velocity relative to the water."""
     b = modules.body[m]
     r, at, inside = (
         matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]),
@@ -192,7 +192,7 @@ def _add_drag(bodies, modules, m, water, x, flow):
 
 @inlined
 def touches(modules, m, water, x):
-    """Whether a module is so near to wall, bottom or surface that its corners must be looked at."""
+    """Whether a module may touch wall, bottom or surface, so that `add_walls` must check its corners."""
     b, (sx, sy, sz) = modules.body[m], triple(modules.size, m, 0)
     r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
     centre, half = plus(triple(x, b, 0), turn(r, triple(modules.position, m, 0))), (0.0, 0.0, 0.0)
@@ -208,7 +208,7 @@ def touches(modules, m, water, x):
 
 @callee
 def add_walls(bodies, modules, m, water, x):
-    """Walls, bottom and surface on the eight corners of one module."""
+    """Adds the forces of walls, bottom and surface on the eight corners of one module."""
     b = modules.body[m]
     r, inside = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), matrix(modules.turn, m)
     position, size, origin = triple(modules.position, m, 0), triple(modules.size, m, 0), triple(x, b, 0)
@@ -225,14 +225,14 @@ def add_walls(bodies, modules, m, water, x):
         p = plus(origin, turn(r, at))
         v = turn(r, plus(triple(x, b, 7), cross(triple(x, b, 10), at)))
         f = push_of_walls(water, p, v)
-        if p[2] < 0.0:  # out of the water: its quarter of the water plane carries less
+        if p[2] < 0.0:  # out of the water: this corner's quarter of the water plane loses buoyancy
             f = (f[0], f[1], f[2] + max(0.0, -lift * p[2] - water.damping * v[2]))
         add_force(bodies.wrench, b, at, turn_back(r, f))
 
 
 @inlined
 def accelerate(bodies, b, x, out, flow, flow_rate):
-    """Kirchhoff's equations solved for the accelerations, and the kinematics. A clamped body stays where it is."""
+    """Writes the derivative of the state of body b: kinematics and Kirchhoff's equations; zero for a clamped body."""
     if bodies.clamped[b]:
         for i in range(13):
             out[b, i] = 0.0
@@ -250,7 +250,7 @@ def accelerate(bodies, b, x, out, flow, flow_rate):
 
 @inlined
 def load(bodies, modules, water, flow, flow_rate, thrust, x):
-    """Writes into `bodies.wrench` what thrusters, weight, drag and walls do; arguments as `integrator.derivative`."""
+    """Writes the sum of thrust, weight, drag and wall forces into `bodies.wrench`; arguments as in `integrator.derivative`."""
     for b in range(x.shape[0]):
         for i in range(6):
             bodies.wrench[b, i] = thrust[b, i]
@@ -263,10 +263,10 @@ def load(bodies, modules, water, flow, flow_rate, thrust, x):
 
 @compiled(types.void(BODIES, MODULES, F2, F8, F2))
 def observe(bodies, modules, rates, gravity, out):
-    """Writes what each module is and feels.
+    """Writes pose, velocity, rate and specific force of each module.
 
     Args:
-        rates: (b, 13) derivative of the states now.
+        rates: (b, 13) current derivative of the states.
         out: (m, 16) hull centre (world), quaternion, velocity (world), rate and specific force (module frame).
     """
     x = bodies.state
@@ -293,10 +293,10 @@ def observe(bodies, modules, rates, gravity, out):
 
 @compiled(types.void(F1, V3, F1))
 def steered(x, nominal, out):
-    """Writes where the nominal centre of mass is (0:3), and its velocity (3:6), world.
+    """Writes position (0:3) and velocity (3:6) of the nominal centre of mass, world.
 
     Args:
-        x: (13,) state of one body; nominal: from its origin.
+        x: (13,) state of one body; nominal: centre of mass from its origin, body frame.
     """
     r, place = matrix_of(x[3], x[4], x[5], x[6]), (x[0], x[1], x[2])
     v, w = (x[7], x[8], x[9]), (x[10], x[11], x[12])

@@ -1,6 +1,6 @@
-"""The arrays of the world out of vehicle files, draws, and which module sits where in which body.
+"""Builds the arrays of the world from vehicle files, random draws and the seats of the modules in their bodies.
 
-Runs at the start and whenever bodies merge or split; the tick only reads the result.
+Runs at the start and whenever bodies merge or split, not in the tick.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from hil.plant.spec import WorldSpec
 from hil.plant.thrusters import Thrusters
 
 ALONE = -1
-"""In `Modules.shelter`: the module shares its body with no other."""
+"""Value in `Modules.shelter` for the only module of a body."""
 
 
 def make_thrusters(
     vehicles: Sequence[Vehicle], draws: Sequence[ModuleDraw], spec: WorldSpec, step_ns: int
 ) -> Thrusters:
-    """All thrusters at rest; `seat_thrusters` then puts them into their bodies."""
+    """Returns all thrusters at rest; `seat_thrusters` then places them in their bodies."""
     module = np.array([m for m, v in enumerate(vehicles) for _ in v.thruster], dtype=np.int64)
     curves = [vehicles[m].curve for m in module]
     constants = np.column_stack([
@@ -58,7 +58,7 @@ def make_thrusters(
 
 
 def seat_thrusters(thrusters: Thrusters, vehicles: Sequence[Vehicle], modules: Modules) -> None:
-    """Writes body, column and position of every thruster from where the modules sit."""
+    """Writes body, column and position of every thruster from the seats of the modules."""
     first = 0
     for m, vehicle in enumerate(vehicles):
         turn, last = modules.turn[m], first + len(vehicle.thruster)
@@ -76,10 +76,10 @@ def make_modules(
     groups: Sequence[Sequence[int]],
     places: Sequence[Place],
 ) -> Modules:
-    """All modules, seated in their bodies.
+    """Returns all modules, seated in their bodies.
 
     Args:
-        groups: modules of each body. places: where each module sits in its body.
+        groups: modules of each body. places: seat of each module in its body.
     """
     published = [v.drag.quadratic if len(v.drag.quadratic) == 6 else np.zeros(6) for v in vehicles]
     coefficients = [d.drag * (0.0 if len(v.drag.quadratic) else 1.0) for v, d in zip(vehicles, draws, strict=True)]
@@ -122,7 +122,7 @@ def _shelter(
 
 
 def _stack(maps: Sequence[np.ndarray]) -> np.ndarray:
-    """All maps in one array; where they differ in fineness, on the finest grid."""
+    """Stacks all maps into one array, refined to the finest grid among them."""
     if not maps:
         return shelter.no_maps()
     nodes = max(m.shape[2] for m in maps)
@@ -130,7 +130,7 @@ def _stack(maps: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def make_bodies(count: int) -> Bodies:
-    """Bodies at the origin and at rest, without mass; `fill_body` gives it."""
+    """Returns bodies at the origin, at rest and without mass; `fill_body` adds the mass."""
     return Bodies(
         np.zeros((count, 13)),
         np.zeros((count, 6, 6)),
@@ -146,8 +146,11 @@ def make_bodies(count: int) -> Bodies:
 def fill_body(
     bodies: Bodies, b: int, parts: Sequence[tuple[ModuleDraw, np.ndarray, np.ndarray]], spec: WorldSpec
 ) -> None:
-    """Sums the modules of body b: (draw, position of the hull centre, module to body rotation) of each."""
-    for array in bodies[1:6]:  # all but state, memory and clamp
+    """Sums the mass properties of the modules of body b.
+
+    parts: (draw, position of the hull centre, module to body rotation) of each.
+    """
+    for array in bodies[1:6]:  # all but state, working memory and clamp
         array[b] = 0.0
     for draw, r, turn in parts:
         bodies.rigid[b] += carried(draw.rigid, r, turn)
@@ -157,18 +160,18 @@ def fill_body(
         bodies.weight[b, 1] += draw.buoyancy_n
         bodies.weight[b, 2:5] += weight * (r + turn @ draw.com)
         bodies.weight[b, 5:8] += draw.buoyancy_n * (r + turn @ draw.buoyancy_at)
-        # Neutral but for the buoyancy error: the hull and what floods it displace what robot and entrained water weigh.
+        # Neutral except for the buoyancy error: hull and flooded volume displace the weight of robot and entrained water.
         displaced = draw.buoyancy_n / spec.gravity
         bodies.hull[b, 0] += displaced
         bodies.hull[b, 1:4] += displaced * (r + turn @ draw.buoyancy_at)
-        for load in draw.payload:  # trimmed: it weighs what it displaces, at one point
+        for load in draw.payload:  # trimmed: its weight equals its buoyancy, at the same point
             bodies.hull[b, 0] += load.dry_kg + load.entrained_kg
             bodies.hull[b, 1:4] += (load.dry_kg + load.entrained_kg) * (r + turn @ load.position_m)
     bodies.inverse[b] = np.linalg.inv(bodies.rigid[b] + bodies.added[b])
 
 
 def nominal_centre(vehicles: Sequence[Vehicle], places: Sequence[Place]) -> np.ndarray:
-    """(3,) centre of mass, entrained water and payloads included, by the vehicle files, in the body frame."""
+    """(3,) centre of mass according to the vehicle files, with entrained water and payloads, body frame."""
     mass, moment = 0.0, np.zeros(3)
     for vehicle, seat in zip(vehicles, places, strict=True):
         turn = rotations.to_matrix(seat.quaternion)

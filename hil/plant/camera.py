@@ -1,7 +1,7 @@
-"""A camera that finds the pose of tags in the tank: free-running, late, noisy, and blind where a hull is in the way.
+"""A camera that measures the pose of tags in the tank: free-running, delayed, noisy, and occluded by hulls.
 
-A planar tag has two poses that look nearly alike: the true one, and that turned half round about the line of sight and
-half round about the tag's own normal. Face-on both coincide.
+The pose of a planar tag is ambiguous: the true pose looks nearly the same as the one turned by 180 deg about the line of sight
+and by 180 deg about the tag's own normal. Both coincide when the tag is seen face-on.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from hil.plant.spec import CameraPose, SensorSpec
 from hil.plant.world import World
 
 SECOND_HAND = 0
-"""Quality of a tag that was placed in the world through another one."""
+"""Quality of a tag located in the world by way of another tag."""
 ALL_TAGS = 1 << 16
-"""Key of the first stream of the cameras that read every tag."""
+"""Key of the first random stream of the cameras that read every tag."""
 HALF_TURN_Z = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -37,11 +37,11 @@ class Sighting(NamedTuple):
     q_wt: np.ndarray
     quality: int
     carrier: int = -1
-    """Module that carries the camera: the pose is in its frame. -1: a fixed camera, the pose is in the world."""
+    """Module that carries the camera; the pose is in its frame. -1: fixed camera, pose in the world frame."""
 
 
 class _Drawn(NamedTuple):
-    """What chance does to one sighting."""
+    """Random errors of one sighting."""
 
     noise: np.ndarray
     lost: bool
@@ -49,7 +49,7 @@ class _Drawn(NamedTuple):
 
 
 class _Errors:
-    """Noise, losses and flips from streams of their own."""
+    """Noise, losses and flips, each from its own random stream."""
 
     def __init__(self, spec: SensorSpec, seed: int, key: int) -> None:
         self._spec = spec
@@ -57,13 +57,13 @@ class _Errors:
         self._loss, self._flip = uniforms(stream(seed, "tag_loss", key)), uniforms(stream(seed, "tag_flip", key))
 
     def draw(self) -> _Drawn:
-        """Fresh numbers; always the same count of them."""
+        """Returns the next errors; every call consumes the same count of random numbers."""
         lost = next(self._loss) < self._spec.tag_dropped
         return _Drawn(self._noise.take(), lost, next(self._flip) < self._spec.tag_flipped)
 
 
 class Camera:
-    """Takes a picture whenever one is due and reports the tags that it can read: of every module the best, or all."""
+    """Takes a picture whenever one is due and reports the readable tags: the best one of each module, or all."""
 
     def __init__(
         self,
@@ -85,16 +85,16 @@ class Camera:
         self._places = [(np.array(t.position_m), np.array(t.quaternion)) for _, t in self._tags]
         self._boxes = solid_boxes(vehicles)
         self._period_ns = round(1e9 / spec.tag_rate_hz)
-        # A carried camera is triggered together with the first one: its node needs both pictures of one moment.
+        # A carried camera is triggered together with the first one: the node needs both pictures from the same instant.
         phase = spec.tag_phase * stream(seed, "tag_phase", 0 if carrier >= 0 else index).uniform()
         self.next_ns = round(phase * self._period_ns)
-        # One stream per module and camera (and tag, where all are read), so that one more changes nothing for the others.
+        # One stream per module and camera (and per tag, where all are read), so adding one leaves the others unchanged.
         self._errors = [_Errors(spec, seed, index * 64 + m) for m in range(len(vehicles))]
         self._tag_errors = [_Errors(spec, seed, ALL_TAGS + (index * 64 + m) * 16 + t.id) for m, t in self._tags]
         self._before, self._before_ns = np.zeros((len(vehicles), 16)), 0
 
     def watch(self, world: World) -> list[Sighting]:
-        """Sightings of all pictures due up to the world's time. To be called at the start and after every advance."""
+        """Returns the sightings of all pictures due up to the world's time. Call at the start and after every advance."""
         before, before_ns = self._before, self._before_ns
         self._before, self._before_ns = world.seen(), world.time_ns
         found: list[Sighting] = []
@@ -106,7 +106,7 @@ class Camera:
         return found
 
     def _picture(self, poses: np.ndarray, capture_ns: int) -> list[Sighting]:
-        """The readable tags, with their errors. Draws the same numbers whatever it sees."""
+        """Returns the readable tags with their errors. Consumes the same random numbers whatever is visible."""
         looked = np.empty(len(self._tags))
         eye, axis = self._eye(poses)
         look(tuple(eye.tolist()), tuple(axis.tolist()), self._view, poses, self._rows, self._boxes, looked)
@@ -125,7 +125,7 @@ class Camera:
         return found
 
     def _best(self, cosines: Sequence[float]) -> list[int]:
-        """Tag of each module that faces the camera most; -1 for a module without tags."""
+        """Index of the tag of each module that faces the camera most directly; -1 for a module without tags."""
         best = [-1] * len(self._errors)
         for k, (m, _) in enumerate(self._tags):
             if best[m] < 0 or cosines[k] > cosines[best[m]]:
@@ -133,7 +133,7 @@ class Camera:
         return best
 
     def _eye(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lens and optical axis, world."""
+        """Position of the lens and optical axis, world."""
         if self.carrier < 0:
             return self._pose.position_m, self._axis
         p, q = poses[self.carrier, :3], poses[self.carrier, 3:].copy()
@@ -142,7 +142,7 @@ class Camera:
     def _blur(
         self, p: np.ndarray, q: np.ndarray, drawn: _Drawn, eye: np.ndarray, axis: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The pose of a tag as this picture shows it."""
+        """Returns the measured pose of a tag: the true pose, flipped where drawn, with noise."""
         if drawn.flipped:
             sight = (eye - p) / np.linalg.norm(eye - p)
             q = rotations.multiply(rotations.multiply(np.concatenate([[0.0], sight]), q), HALF_TURN_Z)
@@ -153,23 +153,23 @@ class Camera:
 
 @njit("Tuple((float64[::1],float64[::1]))(float64[::1],float64[::1],float64[::1],float64[::1],float64,float64,float64)", cache=True)
 def _smear(p, q, noise, axis, across, along, turn):
-    """A pose with six standard normal numbers on it: `across` and `along` the optical axis (m), and `turn` (rad)."""
+    """Adds six standard normal numbers to a pose, scaled by `across` and `along` the optical axis (m) and `turn` (rad)."""
     depth = axis[0] * noise[0] + axis[1] * noise[1] + axis[2] * noise[2]
     q = rotations.multiply(q, rotations.exp(turn * noise[3:]))
     return p + across * noise[:3] + (along - across) * depth * axis, rotations.normalise(q)
 
 
 def _seen_from(pose: np.ndarray, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A world pose in the frame of a module at `pose` (7,)."""
+    """Transforms a world pose into the frame of a module at `pose` (7,)."""
     back = rotations.conjugate(pose[3:].copy())
     return rotations.rotate(back, p - pose[:3]), rotations.multiply(back, q)
 
 
 def in_the_world(relative: Sighting, carrier: Sighting, tag: Tag) -> Sighting:
-    """What a carried camera saw, told in the world by what a fixed camera saw of the carrier in the same picture.
+    """Transforms a carried camera's sighting into the world, by a sighting of the carrier, world frame, from the same instant.
 
     Args:
-        carrier: a sighting of `tag` on the module that carries the camera. Its error goes into the result.
+        carrier: sighting of `tag` on the module that carries the camera. Its error propagates into the result.
     """
     back = rotations.conjugate(np.array(tag.quaternion))
     q_wc = rotations.multiply(carrier.q_wt, back)
@@ -180,22 +180,22 @@ def in_the_world(relative: Sighting, carrier: Sighting, tag: Tag) -> Sighting:
 
 
 def _tag_rows(tags: Sequence[tuple[int, Tag]]) -> np.ndarray:
-    """(t, 7) `tags` of `sight.look`; a tag's z axis points into the face."""
+    """(t, 7) argument `tags` of `sight.look`; a tag's z axis points into the face."""
     rows = [[m, *t.position_m, *-rotations.to_matrix(np.array(t.quaternion))[:, 2]] for m, t in tags]
     return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
 @njit("Tuple((float64[::1],float64[::1]))(float64[::1],float64[::1],float64[::1],float64[::1])", cache=True)
 def placed(p_wm, q_wm, position, quaternion):
-    """World pose of what is at `position` (3,), m, with the attitude `quaternion` (4,) on a module; a tag's z axis points into its face."""
+    """World pose of an object at `position` (3,), m, with attitude `quaternion` (4,) on a module; a tag's z axis points into its face."""
     return p_wm + rotations.rotate(q_wm, position), rotations.multiply(q_wm, quaternion)
 
 
 @njit("float64[:,::1](float64[:,::1],float64[:,::1],float64,float64)", cache=True)
 def _between(before, after, elapsed_s, span_s):
-    """(m, 7) poses `elapsed_s` after `before`, where `after` is `span_s` later: cubic in position, constant rate of turn.
+    """(m, 7) poses `elapsed_s` after `before`; `after` is `span_s` later. Cubic in position, constant angular rate.
 
-    before, after: (m, 16) of `World.seen`.
+    before, after: (m, 16) from `World.seen`.
     """
     out = np.empty((before.shape[0], 7))
     s = elapsed_s / span_s if span_s > 0.0 else 1.0

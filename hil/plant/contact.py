@@ -1,6 +1,6 @@
-"""Forces between modules of different bodies: faces on faces, magnets, funnels. At every stage of the integration.
+"""Forces between modules of different bodies: hull contact, magnets, funnels. Evaluated at every stage of the integration.
 
-Every force has its counter-force at the same point, so that nothing here changes the momentum of all bodies together.
+Every force has its counter-force at the same point, so the total momentum of all bodies is conserved.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from hil.plant.vectors import (
 from hil.plant.water import WATER
 
 NEAR_M = 0.14
-"""Modules whose hulls' circumscribed spheres are further apart do not act on each other."""
+"""Range of interaction: modules do not act on each other when the circumscribed spheres of their hulls are further apart."""
 FRICTION = 0.3
-"""Largest friction of a corner, share of the normal force (synthetic)."""
+"""Largest friction between hulls, share of the normal force (synthetic)."""
 
 
 class Faces(NamedTuple):
@@ -49,9 +49,9 @@ class Faces(NamedTuple):
     coil: np.ndarray
     """(m, 6) share of full current, -1 to 1."""
     inside: np.ndarray
-    """(m, m) 1 where the probe of the pair is in the funnel; i < j."""
+    """(m, m) 1 where the probe of the pair i < j is in the funnel."""
     stop: np.ndarray
-    """(m, m) gap at which a jam holds the pair apart, m; 0: none."""
+    """(m, m) gap at which a jam holds the pair apart, m; 0: no jam."""
     outline: np.ndarray
     """(2, CORNERS, 3) working memory of `overlap.patch`."""
     planes: np.ndarray
@@ -76,7 +76,7 @@ FACES = types.NamedTuple((F2, F2, F2, F2, F3, F2, *(F8,) * 10), Faces)
 
 @callee
 def face_to(r, d):
-    """Face (0..5: +x, -x, +y, ...) of a module with axes r that looks most along d (world)."""
+    """Face (0..5: +x, -x, +y, ...) of a module with axes r whose outward normal is closest to d (world)."""
     inside = turn_back(r, d)
     axis = 0
     for k in range(1, 3):
@@ -87,11 +87,11 @@ def face_to(r, d):
 
 @callee
 def _bear(plane, normal, p, v, w, faces):
-    """Pressure and friction on the second of two hulls, N/m^2, at a point p of the surface between them.
+    """Pressure and friction on the second of two hulls, N/m^2, at a point p of the surface between them. All in the first hull's frame.
 
     Args:
-        plane: (4,) the first hull's face, see `overlap.faces_that_meet`. normal: of the surface.
-        v, w: velocity of the second hull, at the first one's centre, and its rate, both as the first one sees them; all in its frame.
+        plane: (4,) face of the first hull, see `overlap.faces_that_meet`. normal: of the surface.
+        v, w: velocity and angular rate of the second hull relative to the first, at the first hull's centre.
     """
     depth, slip = plane[3] - (plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2]), plus(v, cross(w, p))
     out = dot(slip, normal)
@@ -104,11 +104,11 @@ def _bear(plane, normal, p, v, w, faces):
 
 @callee
 def _press(modules, faces, x, i, j, seats, wrench):
-    """Hulls i and j push each other apart where they overlap.
+    """Adds the contact force between the overlapping hulls i and j.
 
-    Each is a bed of springs: the pressure in it rises with the depth below its nearest face. They bear on the surface on which both are
-    equally deep (Elandt et al., A pressure field model, IROS 2019). That pressure is the gradient of an energy, the volume integral over
-    the overlap of the smaller of the two, whichever faces meet at whatever tilt: the springs give back what they took, and no more.
+    Each hull is a bed of springs whose pressure rises with the depth below the nearest face. The contact surface is where both depths
+    are equal (Elandt et al., A pressure field model, IROS 2019). The spring force is the gradient of an energy, the volume integral of
+    the smaller of the two pressures over the overlap, for any pair of faces at any tilt: the springs return exactly the energy put in.
     """
     (p_i, r_i), (p_j, r_j) = seats
     half, other = times(0.5, triple(modules.size, i, 0)), times(0.5, triple(modules.size, j, 0))
@@ -134,13 +134,13 @@ def _press(modules, faces, x, i, j, seats, wrench):
 
 @callee
 def _outward(r, f):
-    """Unit vector out of face f of a module with axes r."""
+    """Outward unit normal of face f of a module with axes r."""
     return times(1.0 if f % 2 == 0 else -1.0, column(r, f // 2))
 
 
 @callee
 def _facing(modules, i, j, seats):
-    """Faces of i and j that look at each other, their outward normals, their middles, the gap and how far they are beside it; world."""
+    """Faces of i and j that face each other, their outward normals, centres, gap and lateral offset; world."""
     (p_i, r_i), (p_j, r_j) = seats
     d = minus(p_j, p_i)
     f_i, f_j = face_to(r_i, d), face_to(r_j, times(-1.0, d))
@@ -154,7 +154,7 @@ def _facing(modules, i, j, seats):
 
 @callee
 def _roll(seats, facing, normal):
-    """Turn of the second of two faces about the first one's normal, from the nearest of four."""
+    """Rotation of the second of two faces about the first one's normal, relative to the nearest quarter turn."""
     (_, r_i), (_, r_j) = seats
     u, w = column(r_i, (facing[0] // 2 + 1) % 3), column(r_j, (facing[1] // 2 + 1) % 3)
     angle, quarter = math.atan2(dot(w, cross(normal, u)), dot(w, u)), 0.5 * math.pi
@@ -163,7 +163,7 @@ def _roll(seats, facing, normal):
 
 @compiled(types.UniTuple(F8, 8)(MODULES, FACES, F2, I8, I8))
 def mating(modules, faces, x, i, j):
-    """(face of i, face of j, gap, lateral error, tilt, turn from the nearest of four, closing speed, whether probe and drogue)."""
+    """(face of i, face of j, gap, lateral error, tilt, roll from the nearest quarter turn, closing speed, 1 if probe and drogue)."""
     seats = (pose_of(modules, x, i), pose_of(modules, x, j))
     (f_i, f_j), (n_i, n_j), (a, b), gap, side = _facing(modules, i, j, seats)
     tilt, roll = math.acos(max(-1.0, min(1.0, -dot(n_i, n_j)))), _roll(seats, (f_i, f_j), n_i)
@@ -175,14 +175,14 @@ def mating(modules, faces, x, i, j):
 
 @callee
 def _mate(modules, faces, x, i, j, seats, wrench):
-    """Magnets, funnel and jam of the two faces that look at each other."""
+    """Adds the forces of magnets, funnel and jam between the two faces that face each other."""
     (f_i, f_j), (n_i, n_j), (_, b), gap, side = _facing(modules, i, j, seats)
     if faces.kind[i, f_i] * faces.kind[j, f_j] >= 0.0:
         return
     g0, first, second = faces.magnet_gap, modules.body[i], modules.body[j]
     coil = 0.5 * (faces.coil[i, f_i] + faces.coil[j, f_j])
     if coil != 0.0:
-        far = math.sqrt((max(0.0, gap) + g0) ** 2 + dot(side, side))  # the gradient of -1/far: a loop takes no work
+        far = math.sqrt((max(0.0, gap) + g0) ** 2 + dot(side, side))  # force is the gradient of -1/far, hence conservative
         pull = coil * faces.pull * g0 * g0 / far**3
         push_apart(wrench, x, first, second, b, times(-pull, plus(side, times(max(0.0, gap) + g0, n_i))))
     if faces.inside[i, j] == 0.0:
@@ -190,7 +190,7 @@ def _mate(modules, faces, x, i, j, seats, wrench):
     v = minus(velocity_at(x, second, b), velocity_at(x, first, b))
     sideways = minus(v, times(dot(v, n_i), n_i))
     spin = minus(rate_of(x, second), rate_of(x, first))
-    if faces.stop[i, j] > 0.0:  # jammed: neither sideways nor further in
+    if faces.stop[i, j] > 0.0:  # jammed: damped sideways, stopped from going further in
         force = times(-faces.guide_damping, sideways)
         deep = faces.stop[i, j] - gap
         if deep > 0.0:
@@ -207,7 +207,7 @@ def _mate(modules, faces, x, i, j, seats, wrench):
 
 @inlined
 def _is_near(modules, x, i, j):
-    """As `near`."""
+    """Inlined body of `near`."""
     if modules.body[i] == modules.body[j]:
         return False
     d, a, b = minus(centre_of(modules, x, i), centre_of(modules, x, j)), triple(modules.size, i, 0), triple(modules.size, j, 0)
@@ -217,13 +217,13 @@ def _is_near(modules, x, i, j):
 
 @compiled(types.boolean(MODULES, F2, I8, I8))
 def near(modules, x, i, j):
-    """Whether modules i and j belong to different bodies and are close."""
+    """Whether modules i and j belong to different bodies and are close enough to interact."""
     return _is_near(modules, x, i, j)
 
 
 @callee
 def _meet(modules, faces, x, i, j, wrench):
-    """What modules i and j, which are near each other, do to each other."""
+    """Adds all forces between two modules i and j that are near each other."""
     seats = (pose_of(modules, x, i), pose_of(modules, x, j))
     _press(modules, faces, x, i, j, seats, wrench)
     _mate(modules, faces, x, i, j, seats, wrench)
@@ -231,7 +231,7 @@ def _meet(modules, faces, x, i, j, wrench):
 
 @callee
 def interact(bodies, modules, faces, x):
-    """Adds what modules of different bodies do to each other to `bodies.wrench`."""
+    """Adds the forces between modules of different bodies to `bodies.wrench`."""
     count = modules.body.shape[0]
     for i in range(count):
         for j in range(i + 1, count):
@@ -241,7 +241,10 @@ def interact(bodies, modules, faces, x):
 
 @compiled(types.void(BODIES, MODULES, FACES, WATER, I1))
 def touch(bodies, modules, faces, water, chosen):
-    """Adds what walls and modules of other bodies do to the modules where `chosen` (m,) is 1 to `bodies.wrench`."""
+    """Adds wall and contact forces of the modules where `chosen` (m,) is 1 to `bodies.wrench`.
+
+    A contact adds its counter-force to the other body as well.
+    """
     x, count = bodies.state, modules.body.shape[0]
     for m in range(count):
         if chosen[m] and touches(modules, m, water, x):

@@ -1,4 +1,4 @@
-"""Docking faces of the simulated world: magnets, funnel, contact, and the rule by which a dock jams. All synthetic but where said."""
+"""Parameters of the simulated docking faces: magnets, funnel, contact and jamming. All synthetic unless marked otherwise."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from firmware_py.description.schema import quantity
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DockSpec:
-    """Probe and drogue of a pair of faces. Each face has a coil that acts on the other's armature magnet: forward pulls, reverse
-    pushes, so that two forward coils pull twice and a forward one against a reverse one gives nothing."""
+    """Probe and drogue of a pair of faces. The coil of each face acts on the armature magnet of the other: forward pulls, reverse
+    pushes. Two forward coils pull with twice the force of one; a forward and a reverse coil cancel."""
 
     pull_n: float = quantity(40.0, unit="N", low=0, high=1e4, help="of both coils at no gap; also what holds a joint (synthetic)")
     magnet_gap_m: float = quantity(0.003, unit="m", low=1e-4, high=1, help="g0 of the pull 1/(gap + g0)^2 (synthetic)")
@@ -39,7 +39,7 @@ class DockSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JamRule:
-    """Whether a contact jams: outside any of the limits with one probability, inside all of them with another (issue's rule)."""
+    """Probability that a contact jams: one value within all limits, another outside any of them (rule from the issue)."""
 
     lateral_m: float = quantity(0.004, unit="m", low=0, high=1, help="lateral error at contact")
     speed_m_s: float = quantity(0.060, unit="m/s", low=0, high=10, help="closing speed at contact")
@@ -49,6 +49,6 @@ class JamRule:
     shallowest: float = quantity(0.3, low=0, high=1, help="a jam stops the probe at this share of its length at least (synthetic)")
 
     def probability(self, lateral_m: float, speed_m_s: float, tilt_deg: float) -> float:
-        """How likely a probe jams that meets its funnel with these errors, 0 to 1."""
+        """Probability, 0 to 1, that a probe jams when it meets the funnel with these errors."""
         inside = lateral_m <= self.lateral_m and speed_m_s <= self.speed_m_s and tilt_deg <= self.tilt_deg
         return self.probability_inside if inside else self.probability_outside

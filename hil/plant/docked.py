@@ -1,4 +1,4 @@
-"""Which modules make up which bodies in the plant, and what merging and parting do to their motion. The base of World."""
+"""Grouping of modules into bodies, and the motion of bodies that merge or split. Base class of World."""
 
 from __future__ import annotations
 
@@ -23,47 +23,47 @@ from hil.plant.water import Water
 
 
 class _FixedPoint(NamedTuple):
-    """What stays where it is when two bodies become one: their common centre of mass, or a module that a load cell holds."""
+    """Point that keeps its place when two bodies merge: their common centre of mass, or a module held by a load cell."""
 
     p_w: np.ndarray
-    """(3,) there, world, m."""
+    """(3,) world, m."""
     share: float
-    """Of the turn by which the two are off the lattice, what the first body makes of it; the second makes the rest."""
+    """Share of the misalignment from the lattice that the first body turns; the second turns the rest."""
     anchor: int | None = None
-    """The module; None: the centre of mass."""
+    """Index of the held module; None: the centre of mass is fixed."""
 
 
 class DockedBodies(ABC):
-    """Bodies of one or more modules. `World` makes the parts and moves time."""
+    """Bodies of one or more modules. `World` creates the arrays and advances time."""
 
     vehicles: tuple[Vehicle, ...]
     spec: WorldSpec
     docks: Docks
     bodies: list[tuple[int, ...]]
-    """Modules of each body, its leader first; in the order of the leaders."""
+    """Modules of each body, leader first; sorted by leader."""
     places: list[Place]
-    """Where each module sits in its body."""
+    """Seat of each module in its body."""
     _centres: list[tuple[float, ...]]
-    """(3,) what the vehicle files say of each body's centre of mass."""
+    """(3,) centre of mass of each body according to the vehicle files, body frame."""
     _draws: list[ModuleDraw]
     _thrusters: Thrusters
     _water: Water
     _modules: Modules
     _body_arrays: Bodies
     _held: set[int]
-    """A module of each body that a load cell holds."""
+    """One module of each body held by a load cell."""
     _stage: np.ndarray
     _hanging: dict[Joint, Hanging | None]
-    """By joint, once it was asked for and as long as no other opens or closes; None: other joints hold as well."""
+    """Cache of `_find_hanging` by joint, cleared when a joint opens or closes; None: other joints hold as well."""
     _hands: np.ndarray
-    """(m, 6) what jets and hands do to each module, about O of its body, body frame."""
+    """(m, 6) wrench of jets and external pushes on each module, about O of its body, body frame."""
 
     @abstractmethod
     def _step(self, steps: int) -> None:
-        """Moves everything on by so many sub-steps."""
+        """Integrates all bodies over `steps` sub-steps; 0 only updates the derived quantities."""
 
     def _seat(self, groups: Sequence[Sequence[int]], places: Sequence[Place]) -> None:
-        """Puts the modules into bodies; their states are the caller's business."""
+        """Groups the modules into bodies and rebuilds the arrays; the caller sets the states."""
         self.bodies = [tuple(members) for members in groups]
         self.places = list(places)
         centres = (nominal_centre([self.vehicles[m] for m in members], [places[m] for m in members]) for members in self.bodies)
@@ -82,8 +82,8 @@ class DockedBodies(ABC):
         self._hanging = {}
 
     def join(self, joint: Joint) -> None:
-        """Makes one body of the two that `joint` links, and closes whatever else then meets. Momentum and centre of mass stay as they are;
-        of a body that is clamped, place and attitude.
+        """Merges the two bodies that `joint` links, and closes every other joint that then meets. Conserves momentum and centre of mass; a
+        clamped body keeps its position and attitude instead.
         """
         a, b = sorted((int(self._modules.body[joint.module]), int(self._modules.body[joint.other])))
         old, total = self._body_arrays, self.momentum()
@@ -114,7 +114,7 @@ class DockedBodies(ABC):
         self._step(0)
 
     def _fixed_point(self, a: int, b: int) -> _FixedPoint:
-        """That of the bodies a and b, which are about to be one."""
+        """Fixed point of the merge of bodies a and b."""
         old = self._body_arrays
         if (held := next((k for k in (a, b) if old.clamped[k]), None)) is not None:
             anchor = self.bodies[held][0]
@@ -124,7 +124,7 @@ class DockedBodies(ABC):
         return _FixedPoint(centre_w, masses[1] / masses.sum())
 
     def part(self, joint: Joint) -> None:
-        """Opens a joint; what no other joint holds becomes a body of its own, moving as it did."""
+        """Opens a joint; a part held by no other joint becomes a body of its own, with unchanged motion."""
         b = int(self._modules.body[joint.module])
         self.docks.parted(joint)
         self._hanging = {}
@@ -145,7 +145,7 @@ class DockedBodies(ABC):
         self._step(0)
 
     def _restore(self, states: Mapping[int, np.ndarray]) -> None:
-        """Puts back the state of every body whose leader is the same."""
+        """Restores the state of every body from `states`, by leader."""
         for b, members in enumerate(self.bodies):
             self._body_arrays.state[b] = states[members[0]]
 
@@ -157,9 +157,9 @@ class DockedBodies(ABC):
         return self._water.flow[0] + self._water.flow[1]
 
     def _pull_on(self, joint: Joint) -> float:
-        """Force that pulls a joint open, N; 0 where others hold as well.
+        """Force that pulls a joint open, N; 0 where other joints hold as well.
 
-        A moment that bends the joint counts as a force at the disk's rim; one about the face's normal is borne by the pins.
+        A bending moment counts as a force at the rim of the disk; the pins carry the moment about the face normal.
         """
         if joint not in self._hanging:
             self._hanging[joint] = self._find_hanging(joint)
@@ -178,7 +178,7 @@ class DockedBodies(ABC):
         return float(-side * outward @ need[:3] + np.linalg.norm(bending) / DISK_M)
 
     def _find_hanging(self, joint: Joint) -> Hanging | None:
-        """What hangs on `joint` alone, on its other side, or on this one where a clamp holds the other; None where others hold it too."""
+        """The part held by `joint` alone: the unclamped side, preferably that of `joint.other`; None where other joints hold it too."""
         parts = pieces(self.bodies[int(self._modules.body[joint.module])], [j for j in self.docks.joints if j != joint])
         if len(parts) == 1:
             return None
@@ -186,7 +186,7 @@ class DockedBodies(ABC):
         return hanging(self._draws, self._modules, next((p for p in free if joint.other in p), free[0]), self.spec.gravity)
 
     def _touch_on(self, members: Sequence[int]) -> np.ndarray:
-        """(b, 6) what walls and other bodies do to these modules of one body, in that body's row, body frame."""
+        """(b, 6) wall and contact forces on these modules of one body, in that body's row, body frame."""
         chosen = np.zeros(len(self.vehicles), dtype=np.int64)
         chosen[list(members)] = 1
         found = self._body_arrays._replace(wrench=np.zeros((len(self.bodies), 6)))
@@ -194,15 +194,15 @@ class DockedBodies(ABC):
         return found.wrench
 
     def clamp(self, body: int) -> None:
-        """Holds a body where it is, by its leader, whatever joins it; `load` then says with what force."""
+        """Fixes a body in place by its leader, also after other bodies join it; `load` returns the force on the clamp."""
         self._held.add(self.bodies[body][0])
         self._body_arrays.clamped[body] = 1
         self._body_arrays.state[body, 7:13] = 0.0
 
     def load(self, body: int) -> np.ndarray:
-        """(6,) wrench about O that the body gives to whatever clamps it, body frame; zeros for a body that swims.
+        """(6,) wrench about O that the body exerts on its clamp, body frame; zeros for a body that is not clamped.
 
-        The water that flows around it adds what its momentum asks for: the force of its acceleration, and the Munk moment.
+        The flow around the body adds the added-mass force of the accelerating water and the Munk moment.
         """
         arrays = self._body_arrays
         if not arrays.clamped[body]:
@@ -214,7 +214,7 @@ class DockedBodies(ABC):
         return np.asarray(arrays.wrench[body] + added[:, :3] @ rate + np.concatenate([np.zeros(3), munk]))
 
     def momentum(self) -> np.ndarray:
-        """(b, 6) linear and angular momentum about the world's origin of each body with the water it moves, world."""
+        """(b, 6) linear and angular momentum of each body with its added mass, about the world's origin, world."""
         out = np.empty((len(self.bodies), 6))
         for b, x in enumerate(self._body_arrays.state[: len(self.bodies)]):
             r_wb = rotations.to_matrix(x[3:7])
@@ -226,7 +226,7 @@ class DockedBodies(ABC):
 
 
 def _moved_origin(x: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """(13,) the same motion told of the point r (3,) of the body frame in place of its origin."""
+    """(13,) state of the same motion with the origin moved to the point r (3,), body frame."""
     moved = x.copy()
     moved[:3] += rotations.rotate(x[3:7].copy(), r.copy())
     moved[7:10] += np.cross(x[10:13], r)

@@ -1,6 +1,6 @@
-"""What becomes of faces over time: coils rise and fall, probes meet funnels, jam or lock, joints give way. Once per tick.
+"""State machine of the docking faces: coil currents, contacts of probe and funnel, jams, locking and opening of joints. Once per tick.
 
-The forces are in contact.py; the world carries out what is decided here.
+contact.py computes the forces; the world carries out the decisions made here.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from hil.plant.overlap import CORNERS, FACES_OF_TWO
 
 KINDS = {"P": 1.0, "D": -1.0, "-": 0.0}
 RELAY = (0.0, 1.0, -1.0, 0.0)
-"""Current that each relay state asks for: off, forward, reverse, fault."""
+"""Steady current, share of full, of each relay state: off, forward, reverse, fault."""
 FORWARD = 1
 LEAST_HOLD = 0.05
-"""Share of the full pull below which magnets no longer hold a joint."""
+"""Share of the full pull below which the magnets release a joint."""
 OPENING_M_S = 0.001
-"""Faces that part faster than this do not lock: they were just pulled open."""
+"""Opening speed above which faces do not lock: they were just pulled open."""
 DISK_M = 0.07
-"""Radius of a docking disk: a moment that bends a joint is borne by a pull at its rim (synthetic)."""
+"""Radius of a docking disk: a bending moment on a joint is carried as a pull at the rim (synthetic)."""
 
 
 class Joint(NamedTuple):
-    """Two faces that are one."""
+    """Two faces locked together."""
 
     module: int
     face: int
@@ -41,7 +41,7 @@ class Joint(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """A probe met a funnel."""
+    """First contact of a probe with a funnel."""
 
     time_ns: int
     module: int
@@ -53,14 +53,14 @@ class Contact(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What the world has to do now."""
+    """Joints that the world has to close and to open."""
 
     join: list[Joint]
     part: list[Joint]
 
 
 class Docks:
-    """All docking faces of the world."""
+    """State of all docking faces of the world."""
 
     def __init__(self, vehicles: Sequence[Vehicle], spec: DockSpec, jam: JamRule, seed: int) -> None:
         m = len(vehicles)
@@ -75,17 +75,17 @@ class Docks:
         self.joints: list[Joint] = []
         self.contacts: list[Contact] = []
         self.gap_m = self.lateral_m = math.nan
-        """Between the faces of the pair that is nearest to docking."""
+        """Gap and lateral error between the pair of faces that is nearest to docking; nan: none is near."""
         self._hung = np.full((m, 6), -1, dtype=np.int64)
         self._surge = np.zeros((m, 6))
         self._engaged = np.zeros((m, 6))
         self.busy = False
-        """Whether any coil is on, or its current still falls."""
+        """Whether any coil is on or its current is still decaying."""
         self._jam = stream(seed, "jam")
         self._magnet_w = np.array([v.supply.magnet_w for v in vehicles])
 
     def set_relays(self, module: int, relays: Sequence[int]) -> None:
-        """What a DOCK_CMD asks of one module's six coils."""
+        """Applies the relay states of a DOCK_CMD to one module's six coils; stuck relays keep theirs."""
         wanted = np.where(self._hung[module] >= 0, self._hung[module], np.array(relays, dtype=np.int64))
         changed = wanted != self.relays[module]
         if changed.any():
@@ -94,19 +94,19 @@ class Docks:
             self.busy = True
 
     def hang(self, module: int, face: int, relay: int) -> None:
-        """A fault: from `move_hung` on this relay stays as it is told here, whatever comes."""
+        """Fault: makes a relay stick in the state `relay`; it takes effect at `move_hung` or the next command."""
         self._hung[module, face] = relay
 
     def free(self, module: int) -> None:
-        """None of a module's relays hangs any longer: they obey again, from the next command on."""
+        """Ends the stuck-relay faults of a module; the relays obey again from the next command on."""
         self._hung[module] = -1
 
     def move_hung(self, module: int) -> None:
-        """A module's relays that hang go where they hang, all at once."""
+        """Switches all stuck relays of a module to the states in which they stick."""
         self.set_relays(module, self.relays[module].tolist())
 
     def energise(self, joints: Sequence[Joint]) -> None:
-        """Modules that start docked start with their magnets on, long since."""
+        """Sets the joints of modules that start docked, with their magnets on and the currents settled."""
         self.joints = list(joints)
         for joint in joints:
             for m, f in ((joint.module, joint.face), (joint.other, joint.other_face)):
@@ -115,11 +115,11 @@ class Docks:
         self.busy = bool(joints)
 
     def magnet_power_w(self) -> np.ndarray:
-        """(m,) what the coils of each module take from its supply."""
+        """(m,) power that the coils of each module draw from its supply."""
         return np.asarray(self._magnet_w * (self.relays % 3 != 0).sum(axis=1))
 
     def current_ma(self) -> np.ndarray:
-        """(m, 6) current of every coil now, without the noise of its measurement."""
+        """(m, 6) present current of every coil, without measurement noise."""
         s = self.spec
         size = s.idle_ma + s.engaged_ma * self._engaged + s.surge_ma * self._surge
         return np.asarray(self.faces.coil * size)
@@ -132,7 +132,7 @@ class Docks:
         state: np.ndarray,
         load_n: Callable[[Joint], float],
     ) -> Verdict:
-        """What happened during the last tick; `load_n` gives the pull on a joint."""
+        """Advances the docking faces by one tick; `load_n` gives the pull on a joint."""
         verdict = Verdict([], [])
         if self.busy:
             self._coils(elapsed_s)
@@ -153,11 +153,11 @@ class Docks:
         return verdict
 
     def joined(self, joint: Joint) -> None:
-        """The world has made one body of two."""
+        """Records a joint that the world has closed."""
         self.joints.append(joint)
 
     def parted(self, joint: Joint) -> None:
-        """The world has opened a joint: the probe is still in its funnel."""
+        """Records that the world has opened a joint; the probe is still in its funnel."""
         self.joints.remove(joint)
         i, j = sorted((joint.module, joint.other))
         self.faces.inside[i, j], self.faces.stop[i, j] = 1.0, 0.0
@@ -169,7 +169,7 @@ class Docks:
         self.busy = bool(self.relays.any() or np.abs(self.faces.coil).max() > 1e-9)
 
     def _pair(self, time_ns: int, i: int, j: int, modules: Modules, state: np.ndarray, verdict: Verdict) -> None:
-        """Two modules of different bodies that are close."""
+        """Updates two modules of different bodies that are close: engagement, contact, release or lock."""
         face_i, face_j, gap, lateral, tilt, roll, closing, fits = mating(modules, self.faces, state, i, j)
         if not fits:
             return
@@ -212,7 +212,7 @@ class Docks:
 
 
 def joints_between(modules: Modules, kinds: np.ndarray) -> list[Joint]:
-    """Joints of modules that sit side by side in one body: probe against drogue."""
+    """Returns the joints between adjacent modules of one body, where a probe meets a drogue."""
     found = []
     for i, j in itertools.combinations(range(len(modules.body)), 2):
         if modules.body[i] != modules.body[j]:

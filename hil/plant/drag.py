@@ -1,7 +1,7 @@
-"""Drag of boxes in flow, from their own projected areas. Called at every stage of the integration.
+"""Drag of boxes in a flow, from their projected areas. Called at every stage of the integration.
 
-F = -1/2 rho Cd(d) A(d) |v| v. A box of edges a, b, c shows A(d) = bc|dx| + ac|dy| + ab|dz| to flow from d. Cd is the
-polynomial of fourth degree in d, with the symmetry of a cube, that takes the given values face-on and edge-on.
+F = -1/2 rho Cd(d) A(d) |v| v. The projected area of a box with edges a, b, c is A(d) = bc|dx| + ac|dy| + ab|dz| for flow from d. Cd
+is a fourth-degree polynomial in d with the symmetry of a cube, fitted to the given values face-on and edge-on.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ def translation(a, b, c, cd_face, cd_edge, vx, vy, vz):
 
 @inlined
 def strip(v, w, h):
-    """Integral over y from -h to h of |v + w y| (v + w y) y dy, m^5/s^2 per metre: strips of a side in cross-flow.
+    """Integral over y from -h to h of |v + w y| (v + w y) y dy, m^5/s^2 per metre: strip theory of a side in cross-flow.
 
-    v is the flow across the side, m/s; w the turning rate, rad/s; h half the length, m. Exact, by parts.
+    v is the flow across the side, m/s; w the angular rate, rad/s; h half the length, m. Exact, piecewise.
     """
     if abs(v) >= abs(w) * h:
         return 4.0 / 3.0 * abs(v) * w * h**3
@@ -40,21 +40,21 @@ def strip(v, w, h):
 
 @inlined
 def rotation(a, b, c, vx, vy, wz, open_x, open_y):
-    """Integral, m^5/s^2, of a box with edges a, b and c along z: times 1/2 rho Cd the moment against its rate wz.
+    """Integral, m^5/s^2, for a box with edges a, b and c along x, y, z; times 1/2 rho Cd: the moment that opposes the rate wz.
 
-    open_x, open_y: shares of the sides across x and y that the water reaches.
+    open_x, open_y: shares of the sides across x and y that are exposed to the water.
     """
     return c * (open_y * strip(vy, wz, 0.5 * a) + open_x * strip(-vx, wz, 0.5 * b))
 
 
 @inlined
 def box(size, sides, turning, linear, quadratic, half_rho, factor, moment, v, w):
-    """Force, and moment about the centre, of the water on one hull; all in the hull's frame.
+    """Force of the water on one hull, and its moment about the centre; all in the hull's frame.
 
     Args:
-        size, sides, linear, quadratic: a row of `bodies.Modules` each. turning: its coefficients of rotation.
-        half_rho: half the density of the water. factor: half_rho Cd(d) A(d) |v| of the part that the flow sees, see `translation`.
-        moment: because that part is not in the middle.
+        size, sides, linear, quadratic: one row each of `bodies.Modules`. turning: rotational coefficients, part of its `drag`.
+        half_rho: half the density of the water. factor: half_rho Cd(d) A(d) |v| of the part exposed to the flow, see `translation`.
+        moment: moment of the drag on that part, whose centre is off the hull's centre.
         v, w: velocity relative to the water, m/s, and rate, rad/s.
     """
     (sx, sy, sz), (ox, oy, oz), c = size, sides, turning

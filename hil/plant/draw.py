@@ -1,6 +1,6 @@
-"""What differs from the vehicle file in one run: drawn per seed, each source of error from a stream of its own.
+"""Random deviations from the vehicle file in one run, drawn per seed, each source of error from its own stream.
 
-The magnitude scales numbers that are always drawn, so switching one error off changes no other.
+The magnitude only scales numbers that are always drawn, so switching one error off changes no other.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ SOURCES = (
     "tag_phase", "tag_noise", "tag_loss", "tag_flip", "power", "rpm", "dock", "contact", "faults",
     "shape", "jam", "load", "start", "fuzz", "estop", "push", "operator",
 )  # fmt: skip
-"""Names of the streams. New ones go to the end: the order is part of what a seed means."""
+"""Names of the streams. Append new ones at the end: the order determines what a seed yields."""
 
 
 def stream(seed: int, source: str, module: int = 0) -> np.random.Generator:
-    """The generator of one source of error of one module: what SeedSequence(seed).spawn would give at its place."""
+    """Returns the generator for one source of error of one module, as nested SeedSequence(seed).spawn calls would create it."""
     sequence = np.random.SeedSequence(seed, spawn_key=(SOURCES.index(source), module))
     return np.random.Generator(np.random.PCG64(sequence))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModuleDraw:
-    """One module as it really is.
+    """True parameters of one simulated module.
 
     Attributes:
         dry_kg, entrained_kg: masses.
         com: (3,) centre of mass, where the weight of both acts, module frame.
-        buoyancy_at: (3,) where the buoyancy of all that is displaced acts, module frame.
-        buoyancy_n: that buoyancy.
+        buoyancy_at: (3,) centre of buoyancy of the whole displaced volume, module frame.
+        buoyancy_n: buoyancy that acts there.
         inertia: (3, 3) of robot and entrained water about `com`.
         added: (6,) added mass about the hull centre.
         drag: (5,) coefficients face-on, edge-on, of rotation about x, y, z.
         gain, deadband_n: (t,) of each thruster.
-        payload: what it carries, as its vehicle file says.
+        payload: payloads according to the vehicle file.
     """
 
     dry_kg: float
@@ -57,12 +57,12 @@ class ModuleDraw:
 
     @property
     def mass(self) -> float:
-        """Of robot and entrained water, kg."""
+        """Mass of robot and entrained water, kg."""
         return self.dry_kg + self.entrained_kg
 
     @property
     def rigid(self) -> np.ndarray:
-        """(6, 6) mass matrix of robot, payloads and the water inside them about the hull's centre, module frame."""
+        """(6, 6) mass matrix of robot, payloads and their entrained water about the hull's centre, module frame."""
         total = rigid_matrix(self.mass, self.com, self.inertia)
         for load in self.payload:
             mass = load.dry_kg + load.entrained_kg
@@ -72,7 +72,7 @@ class ModuleDraw:
 
 
 def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> ModuleDraw:
-    """Module number `module` of the run `seed`."""
+    """Draws the parameters of the module with index `module` in the run `seed`."""
     count, inertial = len(vehicle.thruster), vehicle.inertial
 
     def spread(source: str, share: float, size: int) -> np.ndarray:
@@ -110,26 +110,26 @@ def skew(a: np.ndarray) -> np.ndarray:
 
 
 def rigid_matrix(mass: float, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """(6, 6) mass matrix about a point O of a body with centre of mass `com` from O and `inertia` about that centre."""
+    """(6, 6) mass matrix of a body about O; `com` is its centre of mass from O, `inertia` is about that centre."""
     s = skew(com)
     return np.block([[mass * np.eye(3), -mass * s], [mass * s, inertia - mass * s @ s]])
 
 
 def carried(matrix: np.ndarray, position: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """A (6, 6) mass matrix about a module's origin, seen about O of its body: H^T M H.
+    """Transforms a (6, 6) mass matrix about a module's origin to O of its body: H^T M H.
 
-    H takes [v; w] of O in the body frame to [v; w] of the module in its own: v_m = T^T (v + w x r), w_m = T^T w.
+    H maps [v; w] of O in the body frame to [v; w] of the module in the module frame: v_m = T^T (v + w x r), w_m = T^T w.
     """
     h = np.block([[turn.T, -turn.T @ skew(position)], [np.zeros((3, 3)), turn.T]])
     return h.T @ matrix @ h
 
 
 BLOCK = 1024
-"""Random numbers drawn at a time: one call for each sample would cost more than the rest of the sensor."""
+"""Random numbers drawn per block: one call per sample would cost more than the rest of the sensor."""
 
 
 def uniforms(rng: np.random.Generator) -> Iterator[float]:
-    """Numbers from 0 to 1 for ever, from blocks drawn ahead."""
+    """Yields uniform numbers from 0 to 1 without end, from blocks drawn ahead."""
     while True:
         yield from rng.random(BLOCK).tolist()
 
@@ -142,14 +142,14 @@ class Noise:
         self._block = np.zeros((0, width))
 
     def take(self) -> np.ndarray:
-        """(width,) fresh numbers."""
+        """(width,) the next numbers."""
         if self._next >= BLOCK:
             self._block, self._next = self._rng.standard_normal((BLOCK, self._width)), 0
         self._next += 1
         return self._block[self._next - 1]
 
     def take_many(self, count: int) -> np.ndarray:
-        """(count, width) of them: what so many calls of `take` give."""
+        """(count, width) the next groups, the same as `count` calls of `take`."""
         parts = []
         while count > 0:
             parts.append(self.take()[None])

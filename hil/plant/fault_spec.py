@@ -1,4 +1,4 @@
-"""One fault, as a scenario's [[fault]] describes it. What it does is hil.faults' business."""
+"""Description and validation of one fault, a [[fault]] of a scenario. hil.faults implements its effect."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from firmware_py.description.vehicle import FACE_NAMES
 
 THRUSTER, FACE = "thruster", "face"
 ALL = -1
-"""Index of a fault that means every thruster, or every face."""
+"""Fault index that stands for every thruster, or every face."""
 FACES = len(FACE_NAMES)
 DIRECTIONS = ("to_plant", "from_plant", "both")
 NS = 1_000_000_000
 LARGEST = 1e6
-"""Of any fault's value, in the unit of its kind."""
+"""Largest magnitude of a fault's value, in the unit of its kind."""
 
 
 class Takes(NamedTuple):
-    """What a kind of fault takes, beyond the ranges of all kinds."""
+    """Which keys and values a kind of fault accepts, narrower than the ranges in `Fault`."""
 
     low: float = 0.0
     high: float = 0.0
-    """Range of the value; 0 to 0: it takes none."""
+    """Range of the value, from low to high; both 0: the kind takes no value."""
     idle: float = math.nan
-    """Value with which nothing would be wrong."""
+    """Value at which the fault has no effect, and which is therefore refused; nan: none."""
     whole: bool = False
-    """Whole numbers alone."""
+    """Whether only whole numbers are accepted."""
     one_module: bool = True
-    """It can be of one module alone, or else is always of the whole bus or of all the water."""
+    """Whether the fault can be restricted to one module; otherwise it always affects the whole bus or all the water."""
     part: str = ""
-    """What its index counts; empty: it takes none."""
+    """What the index counts, THRUSTER or FACE; empty: the kind takes no index."""
     directions: tuple[str, ...] = ("both",)
 
 
@@ -66,14 +66,14 @@ TAKES: Mapping[str, Takes] = {
     "process_killed": OF_ALL,
     "push": ANY_SIZE,
 }
-"""By kind."""
+"""What each kind of fault accepts."""
 THRUSTER_KINDS = tuple(kind for kind, takes in TAKES.items() if takes.part == THRUSTER)
 FRAME_KINDS = tuple(kind for kind, takes in TAKES.items() if takes.directions != ("both",))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """One fault."""
+    """One fault, active from `at_s` until `until_s`."""
 
     kind: str = quantity(choices=tuple(TAKES), help="what breaks")
     at_s: float = quantity(0.0, unit="s", low=0, high=1e6, help="when it begins")
@@ -89,10 +89,10 @@ class Fault:
     direction: str = quantity("both", choices=DIRECTIONS, help="frames: which way")
 
     def mistakes(self, thrusters: Mapping[int, int]) -> Iterator[tuple[str, str]]:
-        """Keys with which it would do nothing, or something else than it says, and what is wrong with each.
+        """Yields (key, message) for each value with which the fault would have no effect, or another than described.
 
         Args:
-            thrusters: number of each module's thrusters, by the module's number.
+            thrusters: number of thrusters of each module, by module number.
         """
         takes = TAKES[self.kind]
         if round(self.until_s * NS) <= round(self.at_s * NS):
@@ -115,5 +115,5 @@ class Fault:
             yield "index", f"{self.index} is not for {self.kind}, which is of no thruster and no face; leave it out"
 
     def is_on(self, time_ns: int) -> bool:
-        """Whether it is at work."""
+        """Whether the fault is active at `time_ns`."""
         return round(self.at_s * NS) <= time_ns < round(self.until_s * NS)

@@ -1,4 +1,4 @@
-"""One tick of the world: bodies, thrusters and water move on by Runge-Kutta of fourth order at a fixed sub-step."""
+"""One tick of the world: fourth-order Runge-Kutta integration of bodies, thrusters and water at a fixed sub-step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hil.plant.water import WATER, flow_at
 
 @inlined
 def wrenches(thrusters, external, out):
-    """Writes the wrench (b, 6) about O, body frame, of all thrusters and of `external` (b, 6)."""
+    """Writes the sum (b, 6) of all thrusters' wrenches and `external` (b, 6), about O, body frame."""
     for b in range(out.shape[0]):
         for i in range(6):
             out[b, i] = external[b, i]
@@ -23,7 +23,7 @@ def wrenches(thrusters, external, out):
     while t < thrusters.force.shape[0]:
         b = thrusters.body[t]
         f, n = triple(out, b, 0), triple(out, b, 3)
-        while t < thrusters.force.shape[0] and thrusters.body[t] == b:  # those of one body are summed in registers
+        while t < thrusters.force.shape[0] and thrusters.body[t] == b:  # thrusters of one body are summed in registers
             f = plus(f, times(thrusters.force[t], triple(column, t, 0)))
             n = plus(n, times(thrusters.force[t], triple(column, t, 3)))
             t += 1
@@ -41,7 +41,7 @@ def along(x, h, rate, out):
 
 @callee
 def close_step(x, h, stage):
-    """Sums the four stages into x and makes the quaternions of unit length."""
+    """Adds the weighted sum of the four stages to x and normalises the quaternions."""
     for b in range(x.shape[0]):
         for i in range(13):
             x[b, i] += h / 6.0 * (stage[0, b, i] + 2.0 * (stage[1, b, i] + stage[2, b, i]) + stage[3, b, i])
@@ -55,9 +55,9 @@ def derivative(bodies, modules, faces, water, flow, flow_rate, thrust, x, out):
     """Rate of change of the states.
 
     Args:
-        faces: None in a world of one body, in which nothing meets: merely to carry it along would cost a third of the time.
+        faces: None in a world of one body, which has no contacts: merely passing it through would cost a third of the time.
         flow, flow_rate: velocity and acceleration of the water, world.
-        thrust: (b, 6) wrench of all thrusters (and whatever else acts) about O, body frame.
+        thrust: (b, 6) wrench of all thrusters and external forces about O, body frame.
         x: (b, 13) states; out: (b, 13) written.
     """
     load(bodies, modules, water, flow, flow_rate, thrust, x)
@@ -71,18 +71,18 @@ def derivative(bodies, modules, faces, water, flow, flow_rate, thrust, x, out):
     types.void(BODIES, MODULES, faces, THRUSTERS, WATER, F2, I8, F8, F3, F2, F2) for faces in (FACES, types.none)
 ])
 def advance(bodies, modules, faces, thrusters, water, external, steps, h, stage, thrust, seen):
-    """Moves everything on by `steps` sub-steps of h seconds.
+    """Integrates the world over `steps` sub-steps of h seconds.
 
     Args:
         faces: see `derivative`.
-        external: (b, 6) wrench of jets and magnets about O, body frame, held over the call.
-        stage: (6, b, 13) working memory; stage[5] is left with the rates at the end.
+        external: (b, 6) wrench of jets and external pushes about O, body frame, constant over the call.
+        stage: (6, b, 13) working memory; stage[5] holds the derivative of the states at the end.
         thrust: (b, 6) working memory.
-        seen: (m, 16) written: what every module is and feels at the end (`bodies.observe`).
+        seen: (m, 16) written: pose, velocity, rate and specific force of every module at the end (`bodies.observe`).
     """
     x, trial = bodies.state, stage[4]
     for s in range(steps):
-        load_supplies(thrusters, 1)  # half-way, so that the error is of second order
+        load_supplies(thrusters, 1)  # at the midpoint, for second-order accuracy
         for k in range(4):
             share = 0.0 if k == 0 else (1.0 if k == 3 else 0.5)
             if k != 2:

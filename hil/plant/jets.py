@@ -1,4 +1,4 @@
-"""Jets: the water that a thruster throws pushes the first other module in its way. Once per tick."""
+"""Thruster jets: the water that a thruster expels pushes the first other module in its path. Once per tick."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from hil.plant.thrusters import THRUSTERS
 from hil.plant.vectors import F2, F8, I8, V3, compiled, dot, matrix_of, minus, plus, times, triple, turn, turn_back
 
 SPREADING = 0.1
-"""Widening of a round jet per length (Pope, Turbulent Flows, 2000, section 5.1: 0.094)."""
+"""Spreading rate of a round jet: growth of its radius per length (Pope, Turbulent Flows, 2000, section 5.1: 0.094)."""
 SAME_M = 1e-6
-"""Ways along a jet that differ by less are the same, so that rounding decides nothing: of two modules the earlier one is hit."""
+"""Distances along a jet that differ by less count as equal, against rounding: of two such modules the one with the lower index is hit."""
 
 
 @compiled(V3(F2, I8, V3))
 def to_world(x, b, r):
-    """A point of body b in the world."""
+    """Transforms a point r of body b to the world frame."""
     return plus(triple(x, b, 0), turn(matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6]), r))
 
 
 @compiled(types.UniTuple(F8, 2)(V3, V3, V3, F8))
 def in_the_way(gap, size, jet, radius):
-    """(way along the jet to the point nearest to a module's centre, share of the jet that it catches: 0 is a miss).
+    """(distance along the jet to the point nearest to a module's centre, share of the jet that the module catches: 0 is a miss).
 
     Args:
-        gap: from the jet's start to that centre; jet: unit vector in the same frame. What lies beside the start catches nothing,
-            and all of its share from a `radius` ahead.
+        gap: from the jet's start to that centre; jet: unit vector in the same frame. The share rises from zero beside the start to its
+            full value one `radius` ahead.
         size: edges of the hull.
     """
     ahead = dot(gap, jet)
@@ -42,11 +42,11 @@ def in_the_way(gap, size, jet, radius):
 
 @compiled(types.void(THRUSTERS, BODIES, MODULES, F8, F8, F8, F2))
 def add_jets(thrusters, bodies, modules, strength, length, radius, out):
-    """Adds the push of every jet to the wrenches out (m, 6) of the modules that it hits, about O of their bodies, body frame.
+    """Adds the push of every jet to the wrench out (m, 6) of the module that it hits, about O of that module's body, body frame.
 
-    A jet leaves against the force. `strength` of its thrust is felt at its start, half of that after `length` (m), at
-    the point of its axis nearest to the centre of the first module in its way. Modules of the same body count too: in the
-    frame of that body, for what it does to itself does not depend on where it is.
+    A jet flows opposite to the thruster's force. Its push is the share `strength` of the thrust at the start and half of that after
+    `length` (m); it acts at the point of the jet axis nearest to the centre of the first module in its path. A module of the same body
+    can be hit too; that case is computed in the body frame, so that it does not depend on the body's pose.
     """
     x = bodies.state
     for t in range(thrusters.force.shape[0]):

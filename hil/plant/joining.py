@@ -1,4 +1,4 @@
-"""Bodies that merge and part: where their modules come to sit, and the motion that keeps the momentum."""
+"""Merging and splitting bodies: new seats of their modules, and the motion that conserves momentum."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from hil.plant.lattice import QUATERNIONS, Place, nearest
 def seats_after_join(
     places: Sequence[Place], modules: Modules, joint: Joint, kept: int, moved: Sequence[int], q_kl: np.ndarray
 ) -> list[Place]:
-    """Places of all modules once the body of `moved` has come to the body that has module `kept`, faces on each other.
+    """Returns the seats of all modules after the body of `moved` has joined the body of module `kept`, face to face.
 
     Args:
-        q_kl: (4,) attitude of the moved body's frame in the kept one's, to be made a rotation of the lattice.
+        q_kl: (4,) attitude of the moved body's frame in the kept body's, rounded here to the nearest lattice rotation.
     """
     near_face, far, far_face = (
         (joint.face, joint.other, joint.other_face) if kept == joint.module else (joint.other_face, joint.module, joint.face)
@@ -39,7 +39,7 @@ def seats_after_join(
 
 
 def pieces(members: Sequence[int], joints: Sequence[Joint]) -> list[tuple[int, ...]]:
-    """The modules of a body, by what still hangs together; each piece in ascending order."""
+    """Splits the modules of a body into connected pieces; the modules of each piece are in ascending order."""
     linked: Mapping[int, set[int]] = {m: set() for m in members}
     for joint in joints:
         if joint.module in linked and joint.other in linked:
@@ -59,7 +59,7 @@ def pieces(members: Sequence[int], joints: Sequence[Joint]) -> list[tuple[int, .
 
 
 def motion_of(bodies: Bodies, b: int, momentum: np.ndarray, flow_w: np.ndarray) -> None:
-    """Gives body b, whose pose is set, the velocity at which it has a momentum (6,) about the world's origin, world."""
+    """Sets the velocity of body b, whose pose is already set, from its momentum (6,) about the world's origin, world."""
     x = bodies.state[b]
     turn = rotations.to_matrix(x[3:7].copy())
     p = turn.T @ momentum[:3]
@@ -69,25 +69,25 @@ def motion_of(bodies: Bodies, b: int, momentum: np.ndarray, flow_w: np.ndarray) 
 
 
 def centre_of(bodies: Bodies, b: int) -> np.ndarray:
-    """(3,) centre of mass of body b, water included, in its frame."""
+    """(3,) centre of mass of body b with its entrained water, body frame."""
     rigid = bodies.rigid[b]
     return np.array([rigid[5, 1], rigid[3, 2], rigid[4, 0]]) / rigid[0, 0]
 
 
 class Hanging(NamedTuple):
-    """What of a body hangs on one joint alone: some of its modules, and what they weigh. Body frame, about O."""
+    """Part of a body held by a single joint: its modules, mass and weight. Body frame, about O."""
 
     members: tuple[int, ...]
     mass: np.ndarray
-    """(6, 6) rigid and added."""
+    """(6, 6) rigid plus added mass."""
     weight_n: float
-    """In water."""
+    """Weight in water: weight minus buoyancy."""
     weight_at: np.ndarray
-    """(3,) N m: its moment is that of `weight_at` and the direction down."""
+    """(3,) N m: first moment of that weight; its moment is the cross product with the direction down."""
 
 
 def hanging(draws: Sequence[ModuleDraw], modules: Modules, members: Sequence[int], gravity: float) -> Hanging:
-    """These modules of a body."""
+    """Returns the part of a body that consists of these modules."""
     mass, weight_n, weight_at = np.zeros((6, 6)), 0.0, np.zeros(3)
     for m in members:
         d, r, turn = draws[m], modules.position[m], modules.turn[m]
@@ -99,10 +99,10 @@ def hanging(draws: Sequence[ModuleDraw], modules: Modules, members: Sequence[int
 
 
 def force_needed(part: Hanging, x: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """(6,) wrench about O, body frame, that these modules of a body need besides their weight to move as they do.
+    """(6,) wrench about O, body frame, that part of a body needs in addition to its weight for the present motion.
 
-    x, rate: (13,) state of the body and its derivative. Still water; drag is left out: it is shared by all and small at
-    the speeds of docking.
+    x, rate: (13,) state of the body and its derivative. Assumes still water and neglects drag, which acts on all modules and is small
+    at docking speeds.
     """
     down = rotations.to_matrix(x[3:7].copy())[2]
     p = part.mass @ x[7:13]

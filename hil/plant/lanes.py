@@ -1,8 +1,8 @@
-"""Lone modules of eight worlds side by side, for `hil.batch`: every sum is made for all eight at once, in vector instructions.
+"""SIMD integration of eight single-module worlds side by side, for `hil.batch`: every operation runs on all eight lanes at once.
 
-One array holds all numbers of eight worlds, a row of eight for each: a compiler makes vectors of a loop over lanes only where it can
-see how far apart the rows lie. The formulas are those of bodies.py, drag.py and thrusters.py, in the same order: each world is to the
-last bit where `World.advance` would have put it.
+One array holds all numbers of the eight worlds, a row of eight per quantity: the compiler vectorises a loop over lanes only where it
+knows the distance between rows. The formulas are those of bodies.py, drag.py and thrusters.py, in the same order, so the results are
+bit-identical to those of `World.advance`.
 """
 
 from __future__ import annotations
@@ -33,31 +33,31 @@ from hil.plant.vectors import (
 from hil.plant.water import WATER, room
 
 pasted = njit(inline="always")
-"""Numba's own way to make a function a part of its caller. The compiler's (`vectors.inlined`) is too late here: it no longer sees that an
-index is not negative."""
+"""Inlining by numba itself. Inlining by LLVM (`vectors.inlined`) comes too late here: by then the information that an index is not
+negative is lost."""
 LANES = 8
 CHANNELS = 8
-"""Thrusters of each module; where a vehicle has fewer the rest pushes nothing."""
+"""Thruster channels of each module; channels that a vehicle does not use produce no force."""
 
 STATE, TRIAL, RATES, STAGES = 0, 13, 26, 39
-"""Rows: state; state at which to look; rates of change there; those of the four stages, 13 each."""
+"""Rows: state; trial state of a stage; derivative there; derivatives of the four stages. 13 each."""
 RIGID = STAGES + 4 * 13
 ADDED, INVERSE = RIGID + 36, RIGID + 72
 """Mass matrices, row by row."""
 WEIGHT = INVERSE + 36
-"""Of `Bodies`: weight 8, hull 4."""
+"""Fields of `Bodies`: weight 8, hull 4."""
 SIZE = WEIGHT + 12
-"""Of `Modules`: size 3, drag 5, linear 6, quadratic 6, sides 3; half its diagonal."""
+"""Fields of `Modules`: size 3, drag 5, linear 6, quadratic 6, sides 3; then half the hull's diagonal 1."""
 WRENCH = SIZE + 24
-"""Force and moment about O, body frame: of the thrusters 6, of everything 6."""
+"""Force and moment about O, body frame: thrusters alone 6, total 6."""
 FLOW = WRENCH + 12
-"""Of `Water.flow`, 9; velocity and acceleration of the water at a stage, 6."""
+"""`Water.flow` 9; velocity and acceleration of the water at a stage 6."""
 SUPPLY = FLOW + 15
-"""Of `Thrusters`: supply 5, power 2."""
+"""Fields of `Thrusters`: supply 5, power 2."""
 ROOM = SUPPLY + 7
-"""To the nearest wall, less half the hull's diagonal."""
+"""Distance to the nearest of walls, bottom and surface, less half the hull's diagonal."""
 COLUMN = ROOM + 1
-"""From here on of `Thrusters`: for every number of a field as many rows as there are channels; working memory last."""
+"""From here on fields of `Thrusters`: CHANNELS rows for every number of a field; working memory last."""
 FORCE_CURVE = COLUMN + 6 * CHANNELS
 POWER_CURVE = FORCE_CURVE + 10 * CHANNELS
 GAIN = POWER_CURVE + 10 * CHANNELS
@@ -109,7 +109,7 @@ def _put(w, row, m, a):
 
 @pasted
 def _polynomial(w, row, j, x):
-    """As `thrusters.polynomial`, of thruster and lane j."""
+    """Lane version of `thrusters.polynomial`; j: index of thruster and lane."""
     total = x * (w[(row + 4 * CHANNELS) * LANES + j] + 0.0)
     total = x * (w[(row + 3 * CHANNELS) * LANES + j] + total)
     total = x * (w[(row + 2 * CHANNELS) * LANES + j] + total)
@@ -119,7 +119,7 @@ def _polynomial(w, row, j, x):
 
 @pasted
 def _curve(w, row, j, x, is_forward):
-    """The one of a thruster's two curves that holds; both are summed, since lanes cannot branch."""
+    """Value of the forward or reverse curve of a thruster; computes both, since lanes cannot branch."""
     forward, reverse = _polynomial(w, row, j, x), _polynomial(w, row + 5 * CHANNELS, j, x)
     return forward if is_forward else reverse
 
@@ -134,14 +134,14 @@ def _sum(w, first, m):
 
 @pasted
 def _reached(w, j, halves):
-    """Where the lag has taken the force of thruster and lane j so many half sub-steps from now."""
+    """Lagged force of thruster and lane j, `halves` half sub-steps ahead."""
     target, now = w[TARGET * LANES + j], w[NOW * LANES + j]
     return target + (now - target) * w[(DECAY + halves * CHANNELS) * LANES + j]
 
 
 @callee
 def _command(w, n):
-    """As `thrusters.command`; the commands stand in the memory."""
+    """Lane version of `thrusters.command`; reads the commands from the rows MEMORY."""
     for j in range(CHANNELS * n):
         given = w[MEMORY * LANES + j]
         force = _curve(w, FORCE_CURVE, j, min(1.0, abs(given)), given > 0.0)
@@ -151,7 +151,7 @@ def _command(w, n):
 
 @pasted
 def _load_supplies(w, n, halves):
-    """As `thrusters.load_supplies`."""
+    """Lane version of `thrusters.load_supplies`."""
     for j in range(CHANNELS * n):
         f = _reached(w, j, halves)
         w[MEMORY * LANES + j] = _curve(w, POWER_CURVE, j, abs(f), f > 0.0)
@@ -171,7 +171,7 @@ def _column(w, row, m):
 
 @pasted
 def _add(w, t, m, scale, f, moment):
-    """Force and moment with those of thruster t, whose lagged force stands in the memory; scale: share of the curve's voltage."""
+    """Adds force and moment of thruster t, whose lagged force is in the rows MEMORY; scale: voltage over the curve's voltage."""
     force = w[(GAIN + t) * LANES + m] * scale * scale * w[(MEMORY + t) * LANES + m]
     w[(FORCE + t) * LANES + m] = force
     f = plus(f, times(force, _column(w, COLUMN + t, m)))
@@ -180,7 +180,7 @@ def _add(w, t, m, scale, f, moment):
 
 @pasted
 def _push(w, n, halves):
-    """As `thrusters.forces_after` and `integrator.wrenches`; a loop over thrusters inside that over lanes would make no vectors."""
+    """Lane version of `thrusters.forces_after` and `integrator.wrenches`; unrolled, since an inner loop would prevent vectorisation."""
     for j in range(CHANNELS * n):
         w[MEMORY * LANES + j] = _reached(w, j, halves)
     for m in range(n):
@@ -199,14 +199,14 @@ def _push(w, n, halves):
 
 @callee
 def _settle(w, n):
-    """As `thrusters.settle`."""
+    """Lane version of `thrusters.settle`."""
     for j in range(CHANNELS * n):
         w[NOW * LANES + j] = _reached(w, j, 2)
 
 
 @callee
 def _flow(w, n, water, keep):
-    """As `water.flow_at`; keep: what the smoothing leaves of a difference by then."""
+    """Lane version of `water.flow_at`; keep: fraction of the difference from the target that remains by then."""
     rate = 1.0 / water.smoothing_s
     for m in range(n):
         mean, gust, target = _three(w, FLOW, m), _three(w, FLOW + 3, m), _three(w, FLOW + 6, m)
@@ -217,14 +217,14 @@ def _flow(w, n, water, keep):
 
 @callee
 def _along(w, n, h):
-    """As `integrator.along`."""
+    """Lane version of `integrator.along`."""
     for j in range(13 * n):
         w[TRIAL * LANES + j] = w[STATE * LANES + j] + h * w[RATES * LANES + j]
 
 
 @callee
 def _load(w, n, water):
-    """What `bodies.load` sums, but for the walls; how far these are."""
+    """Lane version of `bodies.load` without the walls; writes the distance to them into ROOM."""
     half_rho = 0.5 * water.density
     for m in range(n):
         at, q, v, rate = _three(w, TRIAL, m), _four(w, TRIAL + 3, m), _three(w, TRIAL + 7, m), _three(w, TRIAL + 10, m)
@@ -244,7 +244,7 @@ def _load(w, n, water):
 
 @callee
 def _meet_walls(w, n, bodies, modules, water):
-    """Walls for the few lanes that are near one; `bodies` is working memory."""
+    """Adds the wall forces of the few lanes that are near a wall; `bodies` is working memory."""
     for m in range(n):
         if w[ROOM * LANES + m] <= NEAR_M:
             for i in range(13):
@@ -259,7 +259,7 @@ def _meet_walls(w, n, bodies, modules, water):
 
 @callee
 def _accelerate(w, n):
-    """As `bodies.accelerate`."""
+    """Lane version of `bodies.accelerate`."""
     for m in range(n):
         q, v, rate = _four(w, TRIAL + 3, m), _three(w, TRIAL + 7, m), _three(w, TRIAL + 10, m)
         flow, flow_rate, f, moment = _three(w, FLOW + 9, m), _three(w, FLOW + 12, m), _three(w, WRENCH + 6, m), _three(w, WRENCH + 9, m)
@@ -275,7 +275,7 @@ def _accelerate(w, n):
 
 @callee
 def _close_step(w, n, h):
-    """As `integrator.close_step`."""
+    """Lane version of `integrator.close_step`."""
     for j in range(13 * n):
         inner = w[(STAGES + 13) * LANES + j] + w[(STAGES + 26) * LANES + j]
         w[STATE * LANES + j] += h / 6.0 * (w[STAGES * LANES + j] + 2.0 * inner + w[(STAGES + 39) * LANES + j])
@@ -288,7 +288,7 @@ def _close_step(w, n, h):
 
 @callee
 def _observe(w, gravity, out, k):
-    """As `bodies.observe`: tick k of out (worlds, k, 16)."""
+    """Lane version of `bodies.observe`; writes tick k of out (worlds, ticks, 16)."""
     for m in range(out.shape[0]):
         q, v, rate = _four(w, STATE + 3, m), _three(w, STATE + 7, m), _three(w, STATE + 10, m)
         r = matrix_of(q[0], q[1], q[2], q[3])
@@ -302,7 +302,7 @@ def _observe(w, gravity, out, k):
 
 @callee
 def _look(w, n, bodies, modules, water, since_s, ahead_s):
-    """Rates of change where the rates so far lead in `ahead_s`; the water is that of `since_s` into the tick."""
+    """Writes the derivative at the state extrapolated by `ahead_s` with the previous derivative, in the water `since_s` into the tick."""
     _flow(w, n, water, math.exp(-since_s / water.smoothing_s))
     _along(w, n, ahead_s)
     _load(w, n, water)
@@ -312,10 +312,10 @@ def _look(w, n, bodies, modules, water, since_s, ahead_s):
 
 @compiled(types.void(F1, I8, BODIES, MODULES, WATER, F3, F3, I8, F8, F3), nogil=True)
 def fly_lanes(w, n, bodies, modules, water, gusts, commands, steps, h, out):
-    """Moves the worlds on by all ticks; arguments as `integrator.advance`.
+    """Integrates all worlds over all ticks; arguments as in `integrator.advance`.
 
     Args:
-        w: of `gather`. n: LANES (who reads the code sees it as a number; a compiler that did would unroll the loops).
+        w: filled by `gather`. n: LANES, passed as an argument because the compiler would unroll loops over a constant.
         bodies: working memory. gusts: (n, k, 3). commands: (n, k, t). out: (worlds, k, 16) written.
     """
     for k in range(commands.shape[1]):
@@ -349,7 +349,7 @@ def fly_lanes(w, n, bodies, modules, water, gusts, commands, steps, h, out):
 
 @compiled(types.void(F1, I8, BODIES, MODULES, THRUSTERS, WATER))
 def gather(w, m, bodies, modules, thrusters, water):
-    """Copies a world of one lone module into lane m of w, (ROWS LANES,)."""
+    """Copies a single-module world into lane m of w, (ROWS * LANES,)."""
     lane, masses = w[m:], (bodies.rigid, bodies.added, bodies.inverse)
     for i in range(13):
         lane[(STATE + i) * LANES] = bodies.state[0, i]
@@ -380,7 +380,10 @@ def gather(w, m, bodies, modules, thrusters, water):
 
 @compiled(types.void(F1, I8, BODIES, THRUSTERS, WATER, F3, F2, F2))
 def scatter(w, m, bodies, thrusters, water, stage, seen, last):
-    """Copies what has moved in lane m back into its world; last: (k, 16) what was seen of it. `stage`, `seen`: of `plant.world.Arrays`."""
+    """Copies the results of lane m back into its world.
+
+    last: (k, 16) observations of that world after each tick. `stage`, `seen`: fields of `plant.world.Arrays`.
+    """
     lane = w[m:]
     for i in range(13):
         bodies.state[0, i], stage[5, 0, i] = lane[(STATE + i) * LANES], lane[(RATES + i) * LANES]

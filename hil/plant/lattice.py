@@ -1,6 +1,6 @@
-"""The plant's own account of the docking lattice: the 24 rotations of a cube, from quaternions, and places of modules.
+"""The plant's own implementation of the docking lattice: the 24 rotations of a cube as quaternions, and seats of modules.
 
-Rotation k means the same as in a fleet file. Nothing here comes from the controller's side; a test compares both.
+Rotation k is the same as in a fleet file. The code is independent of the controller's; a test compares both.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from firmware_py.core import rotations
 
 HALF = 0.5**0.5
 GENERATORS = (np.array([HALF, HALF, 0.0, 0.0]), np.array([HALF, 0.0, 0.0, HALF]))
-"""Quarter turns about x and z: their products are all rotations of the cube."""
+"""Quarter turns about x and z; their products generate all rotations of the cube."""
 WHOLE_TURNS = 4
 COUNT = 24
 
 
 class Place(NamedTuple):
-    """Where a module sits in its body."""
+    """Seat of a module in its body."""
 
     position: np.ndarray
     """(3,) hull centre, body frame, m."""
@@ -28,7 +28,7 @@ class Place(NamedTuple):
 
 
 def _order(quaternion: np.ndarray) -> tuple[int, ...]:
-    """Place in the fleet file's order: by the columns of the three non-zero elements, then by sign, plus first."""
+    """Sort key for the fleet file's order: columns of the three non-zero elements, then signs, plus first."""
     matrix = rotations.to_matrix(quaternion)
     columns = [int(c) for c in np.argmax(np.abs(matrix), axis=1)]
     return (*columns, *(int(matrix[i, c] < 0.0) for i, c in enumerate(columns)))
@@ -55,7 +55,7 @@ QUATERNIONS = _group()
 
 
 def place(cell: np.ndarray, rotation: int, pitch_m: float, origin: np.ndarray) -> Place:
-    """Where a module in lattice cell `cell` sits in a body whose frame starts at the cell `origin`."""
+    """Seat of a module in lattice cell `cell`, in a body whose frame has its origin at the cell `origin`."""
     return Place(pitch_m * (np.asarray(cell, dtype=float) - origin), QUATERNIONS[rotation].copy())
 
 
@@ -65,7 +65,7 @@ def nearest(quaternion: np.ndarray) -> int:
 
 
 def is_connected(cells: np.ndarray) -> bool:
-    """Whether all cells (n, 3) hang together by faces."""
+    """Whether the cells (n, 3) are distinct and connected through their faces."""
     left = {tuple(int(x) for x in c) for c in cells}
     if len(left) != len(cells):
         return False

@@ -1,7 +1,7 @@
-"""Where two boxes meet that run into each other: the surface on which both are equally deep. Working memory is given: nothing is made here.
+"""Contact surface of two overlapping boxes: the surface of equal depth. The caller provides working memory; nothing is allocated here.
 
-The depth of a point in a box is its distance from the nearest face. On the surface where the depths in both boxes are equal, each pair of
-faces, one of either box, has a flat patch. All is told in the frame of the first box, its centre the origin.
+The depth of a point in a box is its distance from the nearest face. Each pair of faces, one of either box, contributes a flat patch to
+the surface on which the depths in both boxes are equal. All quantities are in the frame of the first box, origin at its centre.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import math
 from hil.plant.vectors import callee, column, cross, dot, minus, plus, times, triple, turn, turn_back
 
 CORNERS = 24
-"""Room for the outline of a patch: a square cut by eleven faces has fifteen corners, and rounding must not overrun it."""
+"""Capacity for the outline of a patch: a square cut by eleven faces has fifteen corners; the margin covers rounding."""
 FACES_OF_TWO = 12
 SAME = 1e-12
-"""Normals (and places, m) of faces that differ by less are the same but for rounding."""
+"""Tolerance below which normals (and places, m) of two faces count as equal."""
 LEAST = 1e-5
-"""Share of the overlap's outline: patches that are smaller count for nothing."""
+"""Smallest patch considered, share of the largest face of the overlap's bounding box."""
 PARALLEL = 1e-6
-"""Faces at a smaller angle have no line in which they meet: it would be lost in rounding."""
+"""Smallest angle, rad, at which two faces have an intersection line; below it the line would be lost in rounding."""
 
 
 @callee
@@ -29,13 +29,13 @@ def _put(array, row, a):
 
 @callee
 def _size(a):
-    """Each component without its sign."""
+    """Absolute value of each component."""
     return (abs(a[0]), abs(a[1]), abs(a[2]))
 
 
 @callee
 def shared_box(half, other, r, at):
-    """Middle and half edges of a box, its edges along the first one's, that holds all that two boxes share; as `faces_that_meet`."""
+    """Centre and half edges of a box, aligned with the first one, that contains the overlap; arguments as in `faces_that_meet`."""
     reach = (dot(other, _size(r[0])), dot(other, _size(r[1])), dot(other, _size(r[2])))
     low = (max(-half[0], at[0] - reach[0]), max(-half[1], at[1] - reach[1]), max(-half[2], at[2] - reach[2]))
     high = (min(half[0], at[0] + reach[0]), min(half[1], at[1] + reach[1]), min(half[2], at[2] + reach[2]))
@@ -44,7 +44,7 @@ def shared_box(half, other, r, at):
 
 @callee
 def _least_overlap(half, other, r, at):
-    """Overlap of two boxes along the axis of the first one along which they overlap least, m, and that axis; as `faces_that_meet`."""
+    """Smallest overlap along an axis of the first box, m, and that axis; arguments as in `faces_that_meet`."""
     axis, least = 0, math.inf
     for k in range(3):
         overlap = half[k] + dot(other, _size(r[k])) - abs(at[k])
@@ -55,13 +55,13 @@ def _least_overlap(half, other, r, at):
 
 @callee
 def _list_faces(planes, n, half, middle, room, deepest, normal, place):
-    """Adds the faces of a box, in its own frame, that may be the nearest one to a point shared with another; how many there are then.
+    """Lists the faces of a box, in its own frame, that may be the nearest face of a point in the overlap; returns the new count.
 
     Args:
-        middle, room: of `shared_box`. deepest: such a point is no deeper, m.
-        normal, place: of the other box's face that looks at this one: no such point is before it.
+        middle, room: of `shared_box`. deepest: largest depth of such a point, m.
+        normal, place: of the face of the other box that looks at this one; all points of the overlap are behind it.
     """
-    before = place - dot(normal, middle) + dot(_size(normal), room)  # how far the deepest corner of what they share is behind that face
+    before = place - dot(normal, middle) + dot(_size(normal), room)  # how far the deepest corner of the overlap is behind that face
     for k in range(3):
         for sign in (1.0, -1.0):
             top, bottom = sign * middle[k] + room[k], max(sign * middle[k] - room[k], half[k] - deepest)
@@ -76,8 +76,9 @@ def _list_faces(planes, n, half, middle, room, deepest, normal, place):
 
 @callee
 def faces_that_meet(planes, half, other, r, at):
-    """Writes the faces that can be the nearest one to a point in both boxes; how many are the first box's, how many in all,
-    and how deep a point in both can be.
+    """Writes the faces that can be the nearest face of a point in both boxes.
+
+    Returns the number of faces of the first box, the number in all, and the largest depth of a point in both boxes, m.
 
     Args:
         planes: (FACES_OF_TWO, 4) written: outward normal n and place h of each; a point x is h - n.x behind it.
@@ -108,7 +109,7 @@ def faces_that_meet(planes, half, other, r, at):
 
 @callee
 def _is_listed(planes, n, normal, place):
-    """Whether a face is the same as one of n listed ones."""
+    """Whether a face equals one of the first n listed faces, within SAME."""
     for k in range(n):
         off = minus(triple(planes, k, 0), normal)
         if dot(off, off) < SAME * SAME and abs(planes[k, 3] - place) < SAME:
@@ -118,7 +119,7 @@ def _is_listed(planes, n, normal, place):
 
 @callee
 def _cut(outlines, now, n, y, z, most):
-    """Cuts off the outline of n corners in outlines[now] where (y, z).x is more than `most`; where the rest is, and its corners."""
+    """Clips the outline of n corners in outlines[now] to (y, z).x <= `most`; returns the index of the result and its corner count."""
     least, largest = math.inf, -math.inf
     for k in range(n):
         room = most - (y * outlines[now, k, 0] + z * outlines[now, k, 1])
@@ -144,10 +145,10 @@ def _cut(outlines, now, n, y, z, most):
 
 @callee
 def _three_points(outlines, now, n):
-    """A third of the area of an outline of n corners, and three points in it: of second-degree polynomials they have the mean.
+    """Quadrature of a convex outline of n corners: a third of its area, and three points in it, exact for second-degree polynomials.
 
-    Three points in even steps around an ellipse have the centroid and the second moments of the outline: those on the one that is twice
-    as large in area as the ellipse of its standard deviations, which fits into any convex outline (into a triangle it just fits).
+    Three evenly spaced points on an ellipse with twice the area of the outline's standard-deviation ellipse reproduce centroid and
+    second moments of the outline. That ellipse fits into any convex outline (into a triangle it just fits).
     """
     y0, z0 = outlines[now, 0, 0], outlines[now, 0, 1]
     area = y = z = yy = yz = zz = 0.0
@@ -170,9 +171,9 @@ def _three_points(outlines, now, n):
 
 @callee
 def _axes_along(n_a, n_b, apart):
-    """Two directions in the surface of equal depth, of any length: across the line in which two faces meet, and along it.
+    """Two directions in the surface of equal depth, not normalised: across the intersection line of two faces, and along it.
 
-    Of faces that are parallel but for rounding: any two.
+    For faces that are parallel within PARALLEL, two arbitrary directions in the surface.
     """
     line = cross(n_a, n_b)
     if dot(line, line) < PARALLEL * PARALLEL:
@@ -183,13 +184,13 @@ def _axes_along(n_a, n_b, apart):
 
 @callee
 def patch(outlines, planes, count, a, b, middle, room, deepest):
-    """Sums up the part of the surface of equal depth that is nearest to face a of the first box and b of the second.
+    """Computes the patch of the surface of equal depth whose nearest faces are a of the first box and b of the second.
 
     Args:
-        outlines: (2, CORNERS, 3) working memory: two coordinates along the surface, and how far from a cut.
+        outlines: (2, CORNERS, 3) working memory: two coordinates along the surface, and the distance from a cut.
         planes, count, deepest: of `faces_that_meet`. middle, room: of `shared_box`.
 
-    Returns a third of its area (0: there is no such part), its normal, from the first box to the second, and three points
+    Returns a third of the area (0: there is no such patch), the normal, from the first box to the second, and three points
     (see `_three_points`).
     """
     n_a, n_b = triple(planes, a, 0), triple(planes, b, 0)
@@ -198,7 +199,7 @@ def patch(outlines, planes, count, a, b, middle, room, deepest):
     if square < SAME * SAME or abs(shift) > dot(room, _size(apart)):
         return 0.0, apart, apart, apart, apart
     start, (across, line) = plus(middle, times(shift / square, apart)), _axes_along(n_a, n_b, apart)
-    # The depth is nothing in the line where the two faces meet, and rises from there: where it is more than `deepest` there is nothing.
+    # The depth is zero on the line where the two faces meet and rises from there; the patch ends where it exceeds `deepest`.
     rise, depth, scale = -dot(n_a, across), planes[a, 3] - dot(n_a, start), 1.0 / dot(across, across)
     high, side = scale * dot(room, _size(across)), dot(room, _size(line)) / dot(line, line)
     low = -high
@@ -230,5 +231,5 @@ def patch(outlines, planes, count, a, b, middle, room, deepest):
 
 @callee
 def _lift(start, across, line, p):
-    """A point of the surface by its two coordinates there."""
+    """Transforms a point of the surface from its two surface coordinates to three dimensions."""
     return plus(start, plus(times(p[0], across), times(p[1], line)))

@@ -1,4 +1,4 @@
-"""Where modules are, how the points of their bodies move, and forces between two bodies. Called at every stage of the integration."""
+"""Poses of modules, velocities of body points, and forces between two bodies. Called at every stage of the integration."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def pose_of(modules, x, m):
 
 @callee
 def velocity_at(x, b, p):
-    """Velocity of body b's point that is at p, world."""
+    """Velocity of the point of body b that is at p; both world."""
     r = matrix_of(x[b, 3], x[b, 4], x[b, 5], x[b, 6])
     at = turn_back(r, minus(p, triple(x, b, 0)))
     return turn(r, plus(triple(x, b, 7), cross(triple(x, b, 10), at)))
@@ -75,7 +75,7 @@ def rate_of(x, b):
 
 @callee
 def push_apart(wrench, x, i, j, p, f):
-    """Force f (world) on body j at the world point p, and its counter-force on body i."""
+    """Adds the force f (world) on body j at the world point p, and its counter-force on body i."""
     ri = matrix_of(x[i, 3], x[i, 4], x[i, 5], x[i, 6])
     rj = matrix_of(x[j, 3], x[j, 4], x[j, 5], x[j, 6])
     add_force(wrench, j, turn_back(rj, minus(p, triple(x, j, 0))), turn_back(rj, f))
@@ -84,7 +84,7 @@ def push_apart(wrench, x, i, j, p, f):
 
 @callee
 def turn_apart(wrench, x, i, j, n):
-    """Moment n (world) on body j, and its counter-moment on body i."""
+    """Adds the moment n (world) on body j, and its counter-moment on body i."""
     ni = turn_back(matrix_of(x[i, 3], x[i, 4], x[i, 5], x[i, 6]), n)
     nj = turn_back(matrix_of(x[j, 3], x[j, 4], x[j, 5], x[j, 6]), n)
     for k in range(3):

@@ -1,4 +1,4 @@
-"""Random connected shapes of docked modules: every joint a probe in a drogue."""
+"""Random connected shapes of docked modules; every joint is a probe in a drogue."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from hil.plant.lattice import COUNT, QUATERNIONS
 
 Cell = tuple[int, int, int]
 STEPS: tuple[Cell, ...] = tuple((int(x), int(y), int(z)) for x, y, z in FACE_NORMALS)
-"""The six ways from a cell to its neighbours."""
+"""Steps from a cell to its six neighbours."""
 MATES = ({"P", "D"}, {"D"})
-"""Kinds of two faces that may meet: a probe and a drogue dock, two drogues leave each other alone."""
+"""Kinds of two faces that may be adjacent: a probe and a drogue dock, two drogues do not interact."""
 
 
 class Seat(NamedTuple):
@@ -26,7 +26,7 @@ class Seat(NamedTuple):
 
 
 def grow(rng: np.random.Generator, count: int, faces: str) -> list[Seat]:
-    """A shape of `count` like modules, grown one by one at a random open face, each turned at random.
+    """Returns a shape of `count` identical modules, each added at a random open face with a random rotation.
 
     Args:
         faces: kinds of a module's six faces, as in a vehicle file.
@@ -46,7 +46,7 @@ def grow(rng: np.random.Generator, count: int, faces: str) -> list[Seat]:
 
 
 def _kinds(rotation: int, faces: str) -> dict[Cell, str]:
-    """Kind of the face that looks each way when the module is turned so."""
+    """Kind of the face in each lattice direction, for a module in this rotation."""
     turn = rotations.to_matrix(QUATERNIONS[rotation].copy())
     ways = [turn @ normal for normal in FACE_NORMALS]
     return {(round(float(x)), round(float(y)), round(float(z))): kind for (x, y, z), kind in zip(ways, faces, strict=True)}
@@ -57,7 +57,7 @@ def _beside(cell: Cell, step: Cell) -> Cell:
 
 
 def _fits(cell: Cell, kinds: dict[Cell, str], taken: dict[Cell, dict[Cell, str]]) -> bool:
-    """Whether every face that meets another may, and at least one docks."""
+    """Whether every pair of adjacent faces is allowed (`MATES`) and at least one pair docks."""
     docked = False
     for step in STEPS:
         other = taken.get(_beside(cell, step))

@@ -1,4 +1,4 @@
-"""Gyro, accelerometer and depth sensor of one module: truth plus bias that wanders plus noise. Sampled at SYNC."""
+"""Gyro, accelerometer and depth sensor of one module: truth plus random-walk bias plus noise. Sampled at SYNC."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Channel:
         self._then_ns = 0
 
     def sample(self, truth: np.ndarray, time_ns: int) -> np.ndarray:
-        """(width,) the truth with the error of now; the walk goes on by the time since the last sample."""
+        """(width,) the truth with its current error; advances the random walk by the time since the last sample."""
         walked = self._walk * math.sqrt(1e-9 * (time_ns - self._then_ns))
         self._then_ns = time_ns
         out = np.empty(self.bias.size)
@@ -33,7 +33,7 @@ class Channel:
 
 @compiled(types.void(F1, F8, F8, F1, F1, F1))
 def _sample(draw, walked, sigma, bias, truth, out):
-    """Moves `bias` (w,) on by `walked` standard deviations of its walk; writes `truth` (w,) with the error. draw: (2 w,) of variance 1."""
+    """Advances `bias` (w,) by a step of standard deviation `walked`; writes `truth` (w,) with bias and noise. draw: (2 w,), variance 1."""
     width = bias.shape[0]
     for i in range(width):
         bias[i] += walked * draw[i]
@@ -41,7 +41,7 @@ def _sample(draw, walked, sigma, bias, truth, out):
 
 
 class Sensors:
-    """What one module's MCU reads of its own motion."""
+    """Motion sensors of one module, as its MCU reads them."""
 
     def __init__(self, spec: SensorSpec, world: WorldSpec, seed: int, module: int) -> None:
         s = spec

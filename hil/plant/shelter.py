@@ -1,9 +1,9 @@
-"""Which part of a docked module the flow sees: modules shelter each other. Made once when bodies merge or split.
+"""Exposure of docked modules to the flow: modules shelter each other. Computed once when bodies merge or split.
 
-For a direction of flow every ray that starts on the outside of a module either leaves the body or runs into another
-module. The share of rays that leave, weighted by what each carries of the module's outline, times that outline is the
-module's part of the outline of the whole body; the parts add up to it exactly. Flow from both ends counts half: front and
-rear carry the pressure together, so the force is the same from ahead and astern.
+For a direction of flow, every ray that starts on the surface of a module either leaves the body or hits another module. The share of
+rays that leave, weighted by the part of the module's projected area that each represents, times that area is the module's share of the
+projected area of the whole body; the shares add up to it exactly. Flow from either end counts half: front and rear carry the pressure
+together, so the force is the same from ahead and astern.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from hil.plant.vectors import F1, F2, F8, I8, V3, callee, compiled, matrix_of, m
 
 F4, F5 = F8[:, :, :, ::1], F8[:, :, :, :, ::1]
 GRAZING = 1e-9
-"""A ray that stays in a hull for less (m) passes it: docked faces lie in one plane."""
+"""Shortest path inside a hull, m, that blocks a ray; docked faces lie in one plane, so grazing rays must pass."""
 FINE, COARSE = (13, 8), (7, 4)
-"""(nodes along a side of the map, rays along an edge of a face): few modules; many."""
+"""(nodes along a side of the map, rays along an edge of a face), for up to MANY_MODULES modules and for more."""
 MANY_MODULES = 12
 
 
 @callee
 def _blocked(start, d, boxes, own, centre, inside):
-    """Whether the ray from `start` along d (both in the frame of module `own`) runs into another box.
+    """Whether the ray from `start` along d (both in the frame of module `own`) hits a box of another owner.
 
     boxes: (k, 11) owner, centre (3), quaternion (4), half edges (3), all in the body frame.
     """
@@ -60,7 +60,7 @@ def _blocked(start, d, boxes, own, centre, inside):
 
 @compiled(types.void(V3, F8, F2, I8, I8, F1), makes_arrays=True)
 def _look(d, weight, boxes, own, rays, out):
-    """Adds to out (4,) what direction d sees of box `own`: share of its outline, and that times its centre."""
+    """Adds to out (4,) the part of box `own` exposed to direction d: share of its projected area, and that times its centre."""
     half = triple(boxes, own, 8)
     inside = matrix_of(boxes[own, 4], boxes[own, 5], boxes[own, 6], boxes[own, 7])
     centre = triple(boxes, own, 1)
@@ -85,7 +85,7 @@ def _look(d, weight, boxes, own, rays, out):
 
 @compiled(types.void(F2, I8, I8, F4), makes_arrays=True)
 def _fill(boxes, own, rays, out):
-    """Writes the map (3, n, n, 4) of module `own`: its first box is its hull."""
+    """Writes the map (3, n, n, 4) of module `own`, whose hull is row `own` of boxes."""
     n = out.shape[1]
     for axis in range(3):
         for i in range(n):
@@ -101,9 +101,9 @@ def _fill(boxes, own, rays, out):
 
 @callee
 def seen_share(tables, k, d):
-    """(share, share times centre (3)) of map k for flow along d (any length but zero), module frame; bilinear.
+    """(share, share times centre (3)) of map k for flow along d (of any non-zero length), module frame; bilinear.
 
-    The maps lie on three sides of a cube: opposite directions see the same.
+    The maps cover three sides of a cube, since opposite directions have the same share.
     """
     axis = 0 if abs(d[0]) >= abs(d[1]) and abs(d[0]) >= abs(d[2]) else (1 if abs(d[1]) >= abs(d[2]) else 2)
     n = tables.shape[2]
@@ -122,7 +122,7 @@ def seen_share(tables, k, d):
 
 
 def shelter_maps(positions: np.ndarray, quaternions: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """(m, 3, n, n, 4) maps of the modules of one body (`seen_share`).
+    """(m, 3, n, n, 4) shelter maps of the modules of one body, for `seen_share`.
 
     Args:
         positions, quaternions: (m, 3) and (m, 4) of the hulls in the body frame; sizes: (m, 3) their edges, m.
@@ -137,7 +137,7 @@ def shelter_maps(positions: np.ndarray, quaternions: np.ndarray, sizes: np.ndarr
 
 
 def refined(maps: np.ndarray, nodes: int) -> np.ndarray:
-    """The maps on a grid of `nodes` along a side: the same bilinear surface wherever both grids have a node."""
+    """Interpolates the maps to a grid of `nodes` along a side; exact at nodes that both grids share."""
     old = np.linspace(0.0, 1.0, maps.shape[2])
     new = np.linspace(0.0, 1.0, nodes)
     weight = np.array([np.interp(new, old, row) for row in np.eye(len(old))])
@@ -145,11 +145,11 @@ def refined(maps: np.ndarray, nodes: int) -> np.ndarray:
 
 
 def side_shares(maps: np.ndarray) -> np.ndarray:
-    """(m, 3) share of each module's sides across x, y and z that the flow along that axis sees."""
+    """(m, 3) share of each module's sides across x, y and z that is exposed to flow along that axis."""
     middle = (maps.shape[2] - 1) // 2
     return maps[:, :, middle, middle, 0].copy()
 
 
 def no_maps() -> np.ndarray:
-    """Of a world in which every module swims alone."""
+    """Empty maps for a world in which every module is alone."""
     return np.zeros((0, 3, 2, 2, 4))

@@ -1,4 +1,4 @@
-"""What a camera can see: which tags face it, are in view, and have no hull in the way. Once per picture."""
+"""Visibility of tags to a camera: which face it, are in view and not occluded by a hull. Once per picture."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ def crosses(a, b, boxes, k, poses):
 
 @compiled(types.void(V3, V3, F8, F2, F2, F2, F1))
 def look(eye, axis, cos_view, poses, tags, boxes, out):
-    """Writes the cosine between each tag's outward normal and the line of sight; OUT_OF_SIGHT where it is not to be seen.
+    """Writes the cosine between each tag's outward normal and the line of sight; OUT_OF_SIGHT where the tag is not visible.
 
     Args:
-        eye, axis: lens and optical axis, world; cos_view: cosine of half the cone in which it sees.
+        eye, axis: lens and optical axis, world; cos_view: cosine of the half angle of the cone of view.
         poses: (m, 7) hull centre and quaternion of every module, world.
         tags: (t, 7) module, centre (3) and outward normal (3) in the module frame.
-        boxes: (k, 7) module, centre (3) in the module frame, half edges (3): of each module its hull, which does not hide its own tags,
-            and then its payloads.
+        boxes: (k, 7) module, centre (3) in the module frame, half edges (3): for each module its hull, which does not hide its own
+            tags, followed by its payloads.
     """
     for t in range(tags.shape[0]):
         m = int(tags[t, 0])
@@ -78,7 +78,7 @@ def look(eye, axis, cos_view, poses, tags, boxes, out):
 
 
 def solid_boxes(vehicles: Sequence[Vehicle]) -> np.ndarray:
-    """(k, 7) `boxes` of `look`: the hull and the payloads of every module."""
+    """(k, 7) argument `boxes` of `look`: the hull and the payloads of every module."""
     rows = []
     for m, vehicle in enumerate(vehicles):
         rows.append([m, 0.0, 0.0, 0.0, *(0.5 * vehicle.hull.size_m)])

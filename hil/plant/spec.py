@@ -1,7 +1,7 @@
-"""Magnitudes of everything that goes wrong in the simulated world: water, body, thrusters, sensors.
+"""Magnitudes of all simulated errors and disturbances: water, body, thrusters, sensors.
 
-Read once from a scenario file. Each error has a magnitude, and zero switches it off. What has no measured source is
-marked (synthetic) in its help.
+Read once from a scenario file. A magnitude of zero switches an error off. Values without a measured source are marked
+(synthetic) in their help.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from firmware_py.description.schema import DescriptionError, quantity
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WorldSpec:
-    """Water, tank walls and how far the robot differs from its vehicle file."""
+    """Water, tank walls and the deviations of the robot from its vehicle file."""
 
     density: float = quantity(998.2, unit="kg/m^3", low=900, high=1100, help="of fresh water at 20 degC")
     gravity: float = quantity(9.81, unit="m/s^2", low=9, high=10, help="downwards")
@@ -80,7 +80,7 @@ CALM: dict[str, float] = dict.fromkeys(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SensorSpec:
-    """Errors of what the robot measures; sigma is a standard deviation. Quantisation comes from the real frames."""
+    """Measurement errors; sigma is a standard deviation. Quantisation comes from encoding into the real frames."""
 
     gyro_sigma: float = quantity(0.002, unit="rad/s", low=0, high=1, help="noise per sample: consumer MEMS (synthetic)")
     gyro_bias: float = quantity(0.005, unit="rad/s", low=0, high=1, help="bias drawn per axis, sigma (synthetic)")
@@ -123,13 +123,13 @@ IDEAL: dict[str, float] = dict.fromkeys(
 )  # fmt: skip
 """Overrides for perfect sensors: no noise, no bias, no delay."""
 HALF_A_COUNT = {"gyro_sigma": 0.00025, "accel_sigma": 0.001, "depth_sigma_m": 0.00005, "tag_sigma_deg": 0.09}
-"""Noise that stays, half a step of the frames: an IMU or a pressure that repeats itself to the last bit counts as frozen, and within one
-step of the tags' attitude a tilt of a tenth of a degree comes and goes unseen."""
+"""Noise that remains with ideal sensors: half a count of the frames. An IMU or pressure reading that repeats to the last bit counts as
+frozen, and a tilt of a tenth of a degree would be lost within one count of the tags' attitude."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tank:
-    """Where the water is. Origin at the centre of the surface, z down."""
+    """Shape and size of the tank. Origin at the centre of the surface, z down."""
 
     kind: str = quantity("box", choices=("box", "cylinder"), help="shape")
     size_m: np.ndarray = quantity(
@@ -139,7 +139,7 @@ class Tank:
     depth_m: float = quantity(3.0, unit="m", low=0.1, high=1000, help="cylinder: depth")
 
     def holds(self, p_wm: np.ndarray) -> bool:
-        """Whether a place (3,), world, m, lies between walls, surface and bottom."""
+        """Whether the point p_wm (3,), world, m, lies between walls, surface and bottom."""
         x, y, z = p_wm.tolist()
         if self.kind == "box":
             length, width, depth = self.size_m.tolist()
@@ -154,7 +154,7 @@ class Tank:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraPose:
-    """A tag camera, fixed in the world or carried by a module: then position and axis are in that module's frame."""
+    """A tag camera, fixed in the world or carried by a module; position and axis of a carried one are in the module's frame."""
 
     module: int = quantity(0, low=0, high=29, help="number of the module that carries it; 0: fixed in the world")
     position_m: np.ndarray = quantity(

@@ -1,7 +1,7 @@
 """Thrusters and their supply: command -> force, through deadband, lag, voltage, gain error and the supply's limit.
 
-The static force at the curve's voltage follows a first-order lag; what acts is that times gain and (V/V0)^2, since at a
-given duty the propeller's speed is proportional to the voltage. (Jets: jets.py.)
+The static force at the curve's voltage passes through a first-order lag; the acting force is the lagged force times gain and
+(V/V0)^2, since the propeller's speed at a given duty is proportional to the voltage. (Jets: jets.py.)
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from hil.plant.vectors import F1, F2, F3, I1, I8, compiled, inlined
 
 
 class Thrusters(NamedTuple):
-    """Arrays over t thrusters, module by module; and over m modules."""
+    """Arrays over t thrusters, sorted by module, and over m modules."""
 
     module: np.ndarray
     """(t,) index of the module."""
     body: np.ndarray
     """(t,) index of the body."""
     column: np.ndarray
-    """(t, 6) wrench of unit force about O of that body, body frame."""
+    """(t, 6) allocation column: wrench of unit force about O of that body, body frame."""
     position: np.ndarray
     """(t, 3) in the body frame."""
     force_curve: np.ndarray
@@ -33,11 +33,11 @@ class Thrusters(NamedTuple):
     constants: np.ndarray
     """(t, 3) gain, deadband N, speed at full command 1/min."""
     decay: np.ndarray
-    """(t, 3) what the lag leaves of a difference after no, half and a whole sub-step."""
+    """(t, 3) fraction of a difference that the lag leaves after zero, half and one whole sub-step."""
     level: np.ndarray
-    """(t, 2) where the force tends and where it is, N, at the curve's voltage."""
+    """(t, 2) target force and lagged force, N, at the curve's voltage."""
     force: np.ndarray
-    """(t,) force that acts now, N."""
+    """(t,) force acting now, N."""
     supply: np.ndarray
     """(m, 5) curve voltage, open-circuit voltage, resistance, largest current or infinity, power of the electronics."""
     power: np.ndarray
@@ -58,7 +58,7 @@ def polynomial(curves, t, side, x):
 
 @compiled(types.void(F3, F2, F2, I8, F1))
 def command(force_curve, constants, level, first, u):
-    """Gives thrusters `first` and on the commands u, -1 to 1; a force within the deadband is none. The arrays are those of Thrusters."""
+    """Commands the thrusters from index `first` on to u, -1 to 1; forces within the deadband become zero. Arrays as in Thrusters."""
     for i in range(u.shape[0]):
         t, side = first + i, 0 if u[i] > 0.0 else 1
         force = polynomial(force_curve, t, side, min(1.0, abs(u[i])))
@@ -69,16 +69,16 @@ def command(force_curve, constants, level, first, u):
 
 @inlined
 def idle_of(open_v, resistance, limit_a, electronics_w):
-    """Current of the electronics: no more than the supply gives at no voltage, or than its limit."""
+    """Current of the electronics, at most the supply's limit and its short-circuit current."""
     return min(limit_a, open_v / resistance, electronics_w / open_v) if open_v > 0.0 else 0.0
 
 
 @inlined
 def voltage_of(open_v, resistance, limit_a, idle_a, conductance):
-    """Voltage at which supply and load agree.
+    """Voltage at which supply and load are in equilibrium.
 
-    At a given duty the power of a thruster goes with V^3, so its current with V^2: I(V) = idle + conductance V^2. The
-    supply gives V = open - R I, and never more than its limit: nothing is left of V where the idle current takes all of it.
+    At a given duty the power of a thruster is proportional to V^3 and its current to V^2: I(V) = idle + conductance V^2. The supply
+    gives V = open - R I, with I at most its limit; V is zero where the idle current alone reaches the limit.
     """
     v = max(0.0, open_v - resistance * idle_a) if idle_a < limit_a else 0.0
     if resistance * conductance > 1e-12:
@@ -91,7 +91,7 @@ def voltage_of(open_v, resistance, limit_a, idle_a, conductance):
 
 @inlined
 def load_supplies(thrusters, halves):
-    """Finds voltage and current of every module from what its propellers do so many half sub-steps from now."""
+    """Computes voltage and current of every module from the load of its propellers `halves` half sub-steps ahead."""
     supply, power = thrusters.supply, thrusters.power
     for m in range(supply.shape[0]):
         power[m, 1] = 0.0
@@ -109,7 +109,7 @@ def load_supplies(thrusters, halves):
 
 @inlined
 def forces_after(thrusters, halves):
-    """Sets every thruster's force to that so many half sub-steps from now, at the voltages of `load_supplies`."""
+    """Sets every thruster's force to its value `halves` half sub-steps ahead, at the voltages of `load_supplies`."""
     for t in range(thrusters.force.shape[0]):
         target, now = thrusters.level[t, 0], thrusters.level[t, 1]
         m = thrusters.module[t]
@@ -121,7 +121,7 @@ def forces_after(thrusters, halves):
 
 @inlined
 def settle(thrusters):
-    """Moves the lagged forces on by a sub-step."""
+    """Advances the lagged forces by one sub-step."""
     level = thrusters.level
     for t in range(level.shape[0]):
         level[t, 1] = level[t, 0] + (level[t, 1] - level[t, 0]) * thrusters.decay[t, 2]
@@ -129,9 +129,9 @@ def settle(thrusters):
 
 @compiled(types.void(THRUSTERS, I8, F2))
 def feedback(thrusters, first, out):
-    """Writes rpm (1/min) and current (A) of thrusters `first` and on into out (n, 2).
+    """Writes rpm (1/min) and current (A) of the n thrusters from index `first` on into out (n, 2).
 
-    Thrust goes with the square of the speed; the gain error is the propeller's, so the speed does not show it.
+    Thrust is proportional to the square of the speed; the gain error is one of the propeller and does not show in the speed.
     """
     for i in range(out.shape[0]):
         t = first + i

@@ -1,4 +1,4 @@
-"""Vectors as tuples of three floats, for compiled code: they live in registers; arrays cost more than the sums."""
+"""Vectors as tuples of three floats for compiled code: tuples stay in registers, arrays would cost more than the arithmetic."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ M3 = types.UniTuple(V3, 3)
 
 
 def compiled(signature: Any, makes_arrays: bool = False, **options: bool) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles for one signature; None: for any, when it is used. Dividing by zero gives infinity as in numpy: to check costs a third.
+    """Compiles for one signature; None: lazily, for any. Division by zero gives infinity as in numpy, since checks would cost a third.
 
     Args:
-        makes_arrays: code that makes none need not count references, which costs more than the sums (numba's unpublished `_nrt`).
+        makes_arrays: whether the code allocates arrays. Code that does not can skip reference counting, which costs more than the
+            arithmetic (numba's undocumented option `_nrt`).
         options: of numba.njit.
     """
     how = {"cache": True, "error_model": "numpy", "_nrt": makes_arrays, **options}
@@ -26,9 +27,9 @@ def compiled(signature: Any, makes_arrays: bool = False, **options: bool) -> Cal
 
 
 callee = compiled(None)
-"""Compiles what only compiled code calls, for whatever types that gives it: it is made, and loaded, with its callers."""
+"""Compiles a function that only compiled code calls, for the types of each call; it is built and cached with its callers."""
 inlined = compiled(None, forceinline=True)
-"""As `callee`, and it becomes a part of its callers: a loop over lanes turns it into vector instructions."""
+"""As `callee`, and inlined into its callers, so that a loop over lanes can be vectorised."""
 
 
 @inlined
@@ -85,7 +86,7 @@ def column(r, k):
 
 @inlined
 def momenta(mass, v, w):
-    """Linear and angular momentum of a body with the velocity v and the rate w."""
+    """Linear and angular momentum of a body with velocity v and rate w: the product of `mass` (see `mass_of`) and (v, w)."""
     p, spin = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for j in range(3):
         p = plus(p, times(v[j], (mass[0][0][j], mass[0][1][j], mass[0][2][j])))
@@ -119,7 +120,7 @@ def block(array, b, i, j):
 
 @callee
 def mass_of(array, b):
-    """Matrix number b of masses by its blocks: force by linear, force by angular, moment by linear, moment by angular acceleration."""
+    """Mass matrix number b as four blocks: force by linear, force by angular, moment by linear, moment by angular acceleration."""
     return (block(array, b, 0, 0), block(array, b, 0, 3), block(array, b, 3, 0), block(array, b, 3, 3))
 
 

@@ -1,6 +1,6 @@
-"""The water and its edges: current with gusts, walls, bottom and surface of the tank.
+"""The water and its boundaries: current with gusts, walls, bottom and surface of the tank.
 
-The current is uniform over the tank: a mean that is drawn per seed and second-order Gauss-Markov gusts, of finite
+The current is uniform over the tank: a mean drawn per seed plus second-order Gauss-Markov gusts, which have finite
 acceleration. Walls are soft: springs and dampers at the corners of each hull.
 """
 
@@ -17,7 +17,7 @@ from hil.plant.spec import Tank, WorldSpec
 from hil.plant.vectors import F1, F2, F8, callee, compiled, dot, inlined, minus, plus, times, triple
 
 AHEAD = 128
-"""Ticks whose gusts are drawn together."""
+"""Number of ticks per block of gusts drawn ahead."""
 FRICTION = 0.3
 """Largest friction at a wall, share of the normal force (synthetic)."""
 
@@ -26,7 +26,7 @@ class Water(NamedTuple):
     """The water as arrays."""
 
     flow: np.ndarray
-    """(3, 3) mean current; gust now; where the gust tends, m/s, world."""
+    """(3, 3) mean current; present gust; target of the gust; m/s, world."""
     density: float
     gravity: float
     smoothing_s: float
@@ -34,7 +34,7 @@ class Water(NamedTuple):
     damping: float
     is_box: bool
     half_length: float
-    """Of a box; radius of a cylinder, m."""
+    """Half the length of a box, or the radius of a cylinder, m."""
     half_width: float
     depth: float
 
@@ -43,7 +43,7 @@ WATER = types.NamedTuple((F2, *(F8,) * 5, types.boolean, F8, F8, F8), Water)
 
 
 def make_water(spec: WorldSpec, tank: Tank) -> Water:
-    """Still water in `tank`."""
+    """Returns still water in `tank`."""
     is_box = tank.kind == "box"
     length, width, depth = tank.size_m.tolist() if is_box else (2 * tank.radius_m, 2 * tank.radius_m, tank.depth_m)
     wall = (spec.wall_stiffness, spec.wall_damping)
@@ -52,10 +52,11 @@ def make_water(spec: WorldSpec, tank: Tank) -> Water:
 
 
 class Gusts:
-    """Drives the gust: white noise through two lags, T1 (correlation) and T2 (smoothing), with the wanted variance.
+    """Generates the gust target: white noise after the first of two lags, T1 (correlation) and T2 (smoothing, in `flow_at`), scaled so
+    that the gust has the given variance.
 
-    The output of the first lag, of variance s1^2, has the covariance s1^2 T1/(T1+T2) with that of the second, whose
-    variance is the same figure (Lyapunov's equation of the two lags).
+    The output of the first lag has variance s1^2. Its covariance with the output of the second is s1^2 T1/(T1+T2), which is also
+    the variance of the second (Lyapunov equation of the two lags).
     """
 
     def __init__(self, spec: WorldSpec, rng: np.random.Generator, period_s: float) -> None:
@@ -74,20 +75,20 @@ class Gusts:
         self._taken = 0
 
     def step(self) -> np.ndarray:
-        """(3,) where the gust tends during the next tick, m/s."""
+        """(3,) target of the gust during the next tick, m/s."""
         if self._taken == len(self._ahead):
             self._ahead, self._taken = self._draw(AHEAD), 0
         self._taken += 1
         return cast("np.ndarray", self._ahead[self._taken - 1])
 
     def steps(self, count: int) -> np.ndarray:
-        """(count, 3) what so many calls of `step` give, at once."""
+        """(count, 3) the targets of the next `count` ticks, the same as `count` calls of `step`."""
         ready = self._ahead[self._taken : self._taken + count]
         self._taken += len(ready)
         return np.concatenate([ready, self._draw(count - len(ready))]) if count > len(ready) else ready
 
     def _draw(self, count: int) -> np.ndarray:
-        """(count, 3) the next ones."""
+        """(count, 3) newly drawn targets."""
         out = self._noise.take_many(count)
         _lag(self._unit, self._keep, self._push, out)
         self._unit = out[-1].copy()
@@ -96,7 +97,7 @@ class Gusts:
 
 @compiled(types.void(F1, F8, F8, F2))
 def _lag(start, keep, push, out):
-    """Puts white noise (k, 3), in place, through the first lag."""
+    """Filters the white noise out (k, 3) in place through the first lag; start: (3,) state before."""
     for k in range(out.shape[0]):
         for i in range(3):
             before = start[i] if k == 0 else out[k - 1, i]
@@ -105,7 +106,7 @@ def _lag(start, keep, push, out):
 
 @callee
 def flow_at(water, since_s):
-    """Velocity and acceleration of the water, world frame, `since_s` after `water.flow` was set."""
+    """Velocity and acceleration of the water, world, `since_s` after `water.flow` was set."""
     keep, rate = math.exp(-since_s / water.smoothing_s), 1.0 / water.smoothing_s
     target = triple(water.flow, 2, 0)
     gap = times(keep, minus(triple(water.flow, 1, 0), target))
@@ -114,7 +115,7 @@ def flow_at(water, since_s):
 
 @inlined
 def room(water, p):
-    """How far p is from the nearest of walls, bottom and surface, m."""
+    """Distance of p from the nearest of walls, bottom and surface, m; negative outside."""
     x, y, z = p
     corner = min(water.half_length - abs(x), water.half_width - abs(y))
     rim = water.half_length - math.sqrt(x * x + y * y)
@@ -133,7 +134,7 @@ def is_clear(water, centre, half):
 
 @callee
 def _push(water, deep, outward, v):
-    """Force of one wall on a point that is `deep` metres into it."""
+    """Force of one wall on a point that is `deep` metres inside it and moves with v; outward: unit vector into the wall."""
     if deep <= 0.0:
         return (0.0, 0.0, 0.0)
     into = dot(v, outward)
@@ -146,7 +147,7 @@ def _push(water, deep, outward, v):
 
 @callee
 def push_of_walls(water, p, v):
-    """Force of walls and bottom on one corner at p with velocity v, world frame."""
+    """Force of walls and bottom on one corner at p with velocity v; all world."""
     f = _push(water, p[2] - water.depth, (0.0, 0.0, 1.0), v)
     if water.is_box:
         x, y = (1.0 if p[0] > 0.0 else -1.0), (1.0 if p[1] > 0.0 else -1.0)

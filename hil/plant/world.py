@@ -1,6 +1,6 @@
-"""The world of one run: all modules, the water, and the truth about them. Everything else of the plant asks this.
+"""The world of one run: all modules, the water, and their true state. The interface of the plant to all other code.
 
-Time moves only by `advance`. Modules that are docked share a body; `groups` says which to begin with.
+Only `advance` moves time. Docked modules share a body; `groups` gives the initial grouping.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ STEP_NS = 2_500_000
 
 
 class Start(NamedTuple):
-    """Where a module is put into the water, at rest."""
+    """Initial pose of a module, at rest."""
 
     p_wm: np.ndarray
     q_wm: np.ndarray
 
 
 class Truth(NamedTuple):
-    """One module as it is now."""
+    """True state of one module."""
 
     time_ns: int
     p_wm: np.ndarray
@@ -61,12 +61,12 @@ class Truth(NamedTuple):
 
 
 class BodyTruth(NamedTuple):
-    """One body as it is now."""
+    """True state of one body."""
 
     time_ns: int
     modules: tuple[int, ...]
     p_wb: np.ndarray
-    """(3,) centre of mass by the vehicle files: the point that the controller steers."""
+    """(3,) centre of mass according to the vehicle files: the point that the controller steers."""
     q_wb: np.ndarray
     """(4,) body to world; the body frame has the axes of the lattice."""
     v_w: np.ndarray
@@ -82,7 +82,7 @@ class Arrays(NamedTuple):
     thrusters: Thrusters
     water: Water
     gusts: np.ndarray
-    """(k, 3) where the gust tends in each tick to come."""
+    """(k, 3) target of the gust in each of the next k ticks."""
     external: np.ndarray
     steps: int
     """Sub-steps of a tick."""
@@ -90,7 +90,7 @@ class Arrays(NamedTuple):
     stage: np.ndarray
     thrust: np.ndarray
     seen: np.ndarray
-    """(m, 16)."""
+    """(m, 16) written by `bodies.observe`."""
 
 
 class World(DockedBodies):
@@ -110,15 +110,15 @@ class World(DockedBodies):
         dock: DockSpec | None = None,
         jam: JamRule | None = None,
     ) -> None:
-        """A world at time 0.
+        """Creates a world at time 0.
 
         Args:
-            vehicles, starts: one per module; of modules that start docked the start of the first counts.
+            vehicles, starts: one per module; for modules that start docked, the leader's start places the body.
             groups: modules of each body, the leader first; each module alone when left out.
-            places: where each module sits in its body, whose frame starts at the leader's hull centre.
-            dock, jam: docking faces, and when they jam.
+            places: seat of each module in its body, whose frame has its origin at the leader's hull centre.
+            dock, jam: parameters of the docking faces and of their jams.
             seed: of every draw; the same seed gives the same world.
-            period_ns: what `advance` will be called with. Raises DescriptionError when step_ns does not divide it.
+            period_ns: the tick, for which `advance` will be called. Raises DescriptionError when step_ns does not divide it.
         """
         if period_ns % step_ns:
             raise DescriptionError(f"plant: the sub-step of {step_ns} ns does not divide the tick of {period_ns} ns")
@@ -142,7 +142,7 @@ class World(DockedBodies):
         self._held = set()
         self._broken: dict[tuple[int, int], tuple[str, float]] = {}
         self.push = np.zeros((len(vehicles), 6))
-        """Wrench of somebody's hand on each module about its hull's centre, module frame, N and N m."""
+        """(m, 6) external push on each module: wrench about its hull's centre, module frame, N and N m."""
         alone = [Place(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) for _ in vehicles]
         self._seat(groups or [(m,) for m in range(len(vehicles))], places or alone)
         for b, members in enumerate(self.bodies):
@@ -152,13 +152,13 @@ class World(DockedBodies):
         self._step(0)
 
     def _put(self, body: int, leader: int, start: Start) -> None:
-        """Puts a body where its leader starts."""
+        """Sets the pose of a body from the start of its leader."""
         x, q_wm = self._body_arrays.state[body], rotations.normalise(np.array(start.q_wm, dtype=np.float64))
         x[3:7] = rotations.normalise(rotations.multiply(q_wm, rotations.conjugate(self._modules.quaternion[leader])))
         x[:3] = start.p_wm - rotations.rotate(x[3:7].copy(), self._modules.position[leader].copy())
 
     def set_command(self, module: int, u: Sequence[float] | np.ndarray) -> None:
-        """Commands (t,) from -1 to 1 of one module's thrusters, held until the next call."""
+        """Sets the commands (t,), -1 to 1, of one module's thrusters, held until the next call."""
         wanted = np.array(u, dtype=np.float64)
         if self._broken:
             wanted = self._as_broken(module, wanted)
@@ -169,18 +169,18 @@ class World(DockedBodies):
                 self._thrusters.level[self._first[m] + t, 0] *= value
 
     def break_thruster(self, module: int, thruster: int, how: str, value: float = 0.0) -> None:
-        """A fault from the next command on.
+        """Makes a thruster faulty from the next command on.
 
         Args:
-            how: dead; weak: `value` is the share of its force left, and its propeller turns slower; reversed; stuck: at
-                the command `value`; fake_rpm: `value` is the share of its force left, and its ESC reports a healthy one.
+            how: dead; weak: `value` is the share of force left, with a slower propeller; reversed; stuck: at the command
+                `value`; fake_rpm: `value` is the share of force left, but the ESC reports the speed of a healthy thruster.
         """
         self._broken[module, thruster] = (how, value)
         share = value if how == "fake_rpm" else 1.0
         self._thrusters.constants[self._first[module] + thruster, 0] = share * self._draws[module].gain[thruster]
 
     def mend(self, module: int) -> None:
-        """Thrusters, battery and magnets of a module are as they were drawn at the start, and nobody's hand is on it."""
+        """Ends all faults of a module: restores thrusters, battery and magnets to their initial parameters and removes the push."""
         self._broken = {key: broken for key, broken in self._broken.items() if key[0] != module}
         self._thrusters.constants[self._first[module] : self._first[module + 1], 0] = self._draws[module].gain
         self._thrusters.supply[module, 1] = self.vehicles[module].supply.voltage_v
@@ -194,11 +194,11 @@ class World(DockedBodies):
         return wanted
 
     def sag(self, module: int, volts: float) -> None:
-        """The battery of a module gives so much less, open circuit, and nothing at worst."""
+        """Lowers the open-circuit voltage of a module's battery by `volts`, at most to zero."""
         self._thrusters.supply[module, 1] = max(0.0, self._thrusters.supply[module, 1] - volts)
 
     def advance(self, duration_ns: int) -> None:
-        """Moves the world on. The duration must be a multiple of the sub-step, else DescriptionError."""
+        """Advances the world. Raises DescriptionError when the duration is no multiple of the sub-step."""
         if duration_ns % self._step_ns:
             raise DescriptionError(f"plant: the sub-step of {self._step_ns} ns does not divide {duration_ns} ns")
         self._water.flow[2] = self._gusts.step()
@@ -208,7 +208,7 @@ class World(DockedBodies):
             self._dock(1e-9 * duration_ns)
 
     def set_relays(self, module: int, relays: Sequence[int]) -> None:
-        """Relay states of a module's six magnets: 0 off, 1 forward, 2 reverse."""
+        """Sets the relay states of a module's six magnets: 0 off, 1 forward, 2 reverse."""
         self.docks.set_relays(module, relays)
         self._power_magnets()
 
@@ -237,7 +237,7 @@ class World(DockedBodies):
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
 
     def _touch(self) -> None:
-        """What jets and hands do to the bodies."""
+        """Computes the wrenches of jets and external pushes on modules and bodies."""
         self._hands[:] = 0.0
         if len(self.vehicles) > 1 and self.jet_strength > 0.0:
             jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
@@ -249,10 +249,10 @@ class World(DockedBodies):
         np.add.at(self._external, self._modules.body, self._hands)
 
     def terms(self) -> tuple[object, ...]:
-        """What the worlds of one batch must agree in: water, tank, tick and sub-step.
+        """Returns the parameters that all worlds of one batch must share: water, tank, tick and sub-step.
 
-        Raises DescriptionError for more than one module, a thruster that is broken, a hand on it, a load cell that holds it, or a coil
-        with a current: these need Python between the ticks.
+        Raises DescriptionError for more than one module, a faulty thruster, an external push, a clamped body, or a coil that carries
+        current: these need Python between the ticks.
         """
         if len(self.vehicles) > 1 or self._broken:
             raise DescriptionError(
@@ -264,8 +264,8 @@ class World(DockedBodies):
         return (self._water[1:], self.period_ns, self._step_ns)
 
     def lend(self, ticks: int) -> Arrays:
-        """The arrays of a lone module for `hil.batch`, which has asked for the terms and moves them on by so many ticks; the clock already
-        stands at their end, and nobody may ask for the truth before the batch has flown.
+        """Lends the arrays of a single-module world to `hil.batch`, which has checked `terms` and advances them by `ticks`. Sets the clock
+        to the end of these ticks at once, so the truth must not be read before the batch has flown.
         """
         self._truths.clear()
         self._escs.clear()
@@ -276,7 +276,7 @@ class World(DockedBodies):
         )  # fmt: skip
 
     def truth(self, module: int) -> Truth:
-        """The truth about one module; its arrays are copies, the same ones until the world moves on."""
+        """Returns the true state of one module. Its arrays are copies, cached until the world advances."""
         if module not in self._truths:
             self._truths[module] = self._look_at(module)
         return self._truths[module]
@@ -292,11 +292,11 @@ class World(DockedBodies):
         )  # fmt: skip
 
     def seen(self) -> np.ndarray:
-        """(m, 16) of all modules, cheaper than their truths: place, quaternion, velocity, rate, specific force."""
+        """(m, 16) state of all modules, cheaper than `truth`: position, quaternion, velocity, rate, specific force."""
         return self._seen.copy()
 
     def body_truth(self, body: int) -> BodyTruth:
-        """The truth about one body, by its index in `bodies`."""
+        """Returns the true state of one body, by its index in `bodies`."""
         modules = self.bodies[body]
         x = self._body_arrays.state[body]
         seen = np.empty(6)
@@ -304,7 +304,7 @@ class World(DockedBodies):
         return BodyTruth(self.time_ns, modules, seen[:3], x[3:7].copy(), seen[3:], x[10:13].copy())
 
     def esc(self, module: int) -> np.ndarray:
-        """(t, 2) speed (1/min) and current (A) of each thruster of a module; the same array until the world moves on."""
+        """(t, 2) speed (1/min) and current (A) of each thruster of a module; cached until the world advances."""
         if module not in self._escs:
             first, last = self._first[module], self._first[module + 1]
             self._escs[module] = np.empty((last - first, 2))
@@ -312,16 +312,16 @@ class World(DockedBodies):
         return self._escs[module]
 
     def draw(self, module: int) -> ModuleDraw:
-        """What this seed made of a module."""
+        """Returns the parameters of a module drawn for this seed."""
         return self._draws[module]
 
     def kinetic_energy(self) -> np.ndarray:
-        """(b,) kinetic energy of each body and of still water that it moves, J."""
+        """(b,) kinetic energy of each body with its added mass, in still water, J."""
         arrays = self._body_arrays
         return np.array([0.5 * x[7:] @ (arrays.rigid[b] + arrays.added[b]) @ x[7:] for b, x in enumerate(arrays.state)])
 
     def set_motion(self, body: int, v_w: np.ndarray, w_b: np.ndarray) -> None:
-        """Gives a body a velocity (3,) of O, world, and an angular rate (3,), body frame."""
+        """Sets the velocity (3,) of O, world, and the angular rate (3,), body frame, of a body."""
         x = self._body_arrays.state[body]
         x[7:10], x[10:13] = rotations.rotate_back(x[3:7].copy(), np.array(v_w, dtype=np.float64)), w_b
         self._step(0)

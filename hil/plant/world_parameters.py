@@ -1,4 +1,4 @@
-"""What one seed made of the world, as named numbers: against these a campaign holds its metrics."""
+"""The random draws of one seed as named numbers, which a campaign compares with its metrics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hil.plant.water import Gusts
 
 
 def world_parameters(vehicles: Sequence[Vehicle], spec: WorldSpec, seed: int) -> dict[str, float]:
-    """Means over the modules of what was drawn for each; factors are of the vehicle file's value."""
+    """Means over the modules of the drawn parameters, and the mean current; factors are relative to the vehicle file."""
     modules = [_module_parameters(vehicle, spec, seed, m) for m, vehicle in enumerate(vehicles)]
     current = Gusts(spec, stream(seed, "gusts"), 1.0).mean
     means = {name: float(np.mean([module[name] for module in modules])) for name in modules[0]}
@@ -39,5 +39,5 @@ def _module_parameters(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int
 
 
 def _factor(drawn: np.ndarray, nominal: np.ndarray) -> float:
-    """Mean of drawn over nominal values; 1 where there is nothing to draw from."""
+    """Mean ratio of drawn to nominal values, without the nominal zeros; 1 where all nominal values are zero."""
     return float(np.mean(drawn[nominal != 0.0] / nominal[nominal != 0.0])) if np.any(nominal) else 1.0

@@ -1,4 +1,4 @@
-"""The C reference node in place of the plant's own MCU node: its board, in this process or behind a Unix socket."""
+"""The C reference node as a replacement for the plant's own MCU node, with its board: in this process or behind a Unix socket."""
 
 from hil.reference_node.board import Answer, Board, Readings, Request
 from hil.reference_node.in_process import CNodes, load_library

@@ -1,4 +1,4 @@
-"""The board under the C node: thrusters and sensors of one simulated module, without any of the bus's rules."""
+"""The hardware under the C node: thrusters, relays and sensors of one simulated module, without the bus protocol."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ class Answer(ctypes.Structure):
 
 
 class Board(Mcu):
-    """The plant's MCU, of which only thrusters, relays and sensors are used."""
+    """The plant's MCU, reduced to its thrusters, relays and sensors."""
 
     def drive(self, outputs: Outputs) -> None:
-        """The node's outputs take effect."""
+        """Applies the node's outputs to relays and thrusters."""
         self._switch([int(relay) for relay in outputs.relay])
         self._apply(list(outputs.thruster))
 
     def sample(self, due: int, readings: Readings) -> None:
-        """Fills `readings` with the fast sensors and, of the slow ones, those whose bit of `due` is set."""
+        """Fills `readings` with the fast sensors and with the slow messages whose bit is set in `due`."""
         truth = self._world.truth(self.module)
         readings.gyro[:] = [*self._sensors.gyro(truth).tolist(), 0.0]
         readings.accel[:] = [*self._sensors.accel(truth).tolist(), 0.0]
@@ -67,7 +67,7 @@ class Board(Mcu):
 
 
 def place(readings: Readings, name: str, values: Sequence[float]) -> None:
-    """The values of slow message `name`, in the order of its fields, go where the C node looks for them."""
+    """Writes the values of slow message `name`, in the order of its fields, into the C node's readings."""
     if name.startswith("DOCK_CURRENT"):
         readings.dock[0 if name.endswith("ABC") else 1][:] = [float(v) for v in values]
     elif name.startswith("ESC_FEEDBACK"):
@@ -77,7 +77,7 @@ def place(readings: Readings, name: str, values: Sequence[float]) -> None:
 
 
 def take_boards(nodes: Nodes, scenario: Scenario, rate_hz: int) -> dict[int, Board]:
-    """The boards of the modules of `nodes`, by number; the plant's own MCUs go."""
+    """Returns boards for the modules of `nodes`, by number, and removes the plant's own MCUs from `nodes`."""
     tick_ns = NS_PER_S // rate_hz
     boards = {
         number: Board(nodes.codec, number, mcu.module, nodes.world, scenario.sensors, tick_ns)

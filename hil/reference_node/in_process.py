@@ -1,4 +1,4 @@
-"""The C node's rules in the bench's own process: nodes of a bus whose MCUs are compiled C. For lockstep."""
+"""The C node in the bench's own process: nodes of a bus whose MCUs are compiled C. For lockstep flights."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class _Hardware(ctypes.Structure):
 
 
 def load_library(path: Path) -> ctypes.CDLL:
-    """libmodcube_node.so, as hil/reference_node/Makefile builds it. Raises OSError."""
+    """Loads libmodcube_node.so, which hil/reference_node/Makefile builds. Raises OSError."""
     library = ctypes.CDLL(str(path))
     library.node_size.restype = ctypes.c_size_t
     library.node_start.argtypes = (ctypes.c_void_p, ctypes.c_uint8, ctypes.c_uint16, ctypes.POINTER(_Hardware))
@@ -40,18 +40,18 @@ class CNode:
         self._library = library
         self._state = ctypes.create_string_buffer(library.node_size())
         self._answers: list[Frame] = []
-        # ctypes keeps no reference to callbacks that only C holds.
+        # Keeps the callbacks alive: ctypes holds no reference to callbacks stored in C.
         self._hardware = _Hardware(None, _APPLY(self._apply), _SAMPLE(self._sample), _SEND(self._send))
         library.node_start(self._state, board.number, rate_hz, ctypes.byref(self._hardware))
 
     def take(self, frame: Frame, time_ns: int) -> list[Frame]:
-        """One frame from the bus; returns the answers."""
+        """Passes one frame from the bus to the node and returns its answers."""
         self._library.node_take(self._state, frame.id, frame.data, len(frame.data), time_ns)
         answers, self._answers = self._answers, []
         return answers
 
     def watch(self, time_ns: int) -> None:
-        """The node's own clock."""
+        """Runs the node's timeouts at `time_ns`."""
         self._library.node_watch(self._state, time_ns)
 
     def _apply(self, context: object, outputs: ctypes._Pointer[Outputs]) -> None:
@@ -66,7 +66,7 @@ class CNode:
 
 
 class CNodes:
-    """Stands in for `nodes`: its cameras stay, its MCUs are C."""
+    """Replacement for `nodes` that keeps its cameras and runs its MCUs as C nodes."""
 
     def __init__(self, nodes: Nodes, scenario: Scenario, library: ctypes.CDLL, rate_hz: int) -> None:
         self.world = nodes.world
@@ -84,7 +84,7 @@ class CNodes:
         return answers
 
     def refuse_others(self, frames: Iterable[Frame], address: str) -> None:
-        """As `Nodes.refuse_others`, of the modules that are not C."""
+        """As `Nodes.refuse_others`, for the modules that are not run by C nodes."""
         self._nodes.refuse_others(frames, address)
 
     def watch(self) -> None:

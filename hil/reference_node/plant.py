@@ -1,4 +1,4 @@
-"""The plant in real time with the C node as a process: camera on the bus, board behind a Unix socket."""
+"""The plant in real time with the C node as a separate process: camera on the bus, board behind a Unix socket."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from hil.reference_node.board import Answer, Request, take_boards
 from hil.scenario import Scenario
 
 ACCEPT_S = 0.1
-"""How often the server looks whether it has been closed."""
+"""Period at which the server checks whether it has been closed."""
 
 
 class BoardServer:
-    """One node's connection: its requests wait in `requests`, in order; `arrival` is set when one comes."""
+    """Connection of one node: its requests queue in `requests`, in order; `arrival` is set when one comes in."""
 
     def __init__(self, path: Path, arrival: threading.Event) -> None:
         self.requests: deque[Request] = deque()
@@ -34,7 +34,7 @@ class BoardServer:
         self._thread.start()
 
     def answer(self, answer: Answer) -> None:
-        """To the node; nothing when it is gone."""
+        """Sends `answer` to the node; does nothing when the node is not connected."""
         if self._connection is not None:
             try:
                 self._connection.send(bytes(answer))
@@ -42,7 +42,7 @@ class BoardServer:
                 self._connection = None
 
     def close(self) -> None:
-        """The node sees the end of the connection, and ends."""
+        """Shuts the connection down, which ends the node, and stops the server."""
         self._closed = True
         if self._connection is not None:
             self._connection.shutdown(socket.SHUT_RDWR)
@@ -64,7 +64,7 @@ class BoardServer:
 
 
 class SocketPlant(PlantProcess):
-    """A plant of one module whose MCU is the C node at the other end of the Unix socket `path`."""
+    """A plant of one module whose MCU is the C node behind the Unix socket `path`."""
 
     def __init__(self, scenario: Scenario, seed: int, rate_hz: int, out: Path | None, path: Path) -> None:
         super().__init__(scenario, seed, rate_hz, out)
@@ -74,7 +74,7 @@ class SocketPlant(PlantProcess):
 
     @contextmanager
     def open_board(self, arrival: threading.Event) -> Iterator[None]:
-        """The node may connect inside; `arrival` is the one of the port that `serve` is given. Raises OSError."""
+        """Accepts the node while the context is open; `arrival` must be the event of the port passed to `serve`. Raises OSError."""
         self._server = BoardServer(self._path, arrival)
         try:
             yield
@@ -82,7 +82,7 @@ class SocketPlant(PlantProcess):
             self._server.close()
 
     def serve(self, port: Port, now_ns: Callable[[], int], stop: Callable[[], bool]) -> None:
-        """Answers the bus and the board, inside `open_board`."""
+        """Answers the bus and the board; call inside `open_board`."""
         server = self._server
         assert server is not None
         with self.recording():
