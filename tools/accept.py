@@ -1,7 +1,7 @@
-"""`make accept`: every acceptance figure of the issues, long ones too; writes accept.json and prints it.
+"""`make accept`: measures every acceptance figure of the issues, including the slow ones; writes accept.json and prints it.
 
-A figure belongs to a group, and a group to a command that anybody can type. New figures go into GROUPS at the end of
-this file, nothing else changes. `--only GROUP` measures some of them and leaves the others in accept.json as they were.
+Each figure belongs to a group, and each group has a command that anybody can run. New figures go into GROUPS at the end of this file;
+nothing else changes. `--only GROUP` measures the named groups and leaves the other entries of accept.json as they were.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Outcome:
 
 
 def outcomes(group: Group, values: Values) -> list[Outcome]:
-    """The group's figures held against their limits; one that was not measured fails."""
+    """Checks a group's measured values against the limits of its figures; a figure that was not measured fails."""
     found = []
     for figure in group.figures:
         value = float(values.get(figure.key, float("nan"))) * figure.scale
@@ -74,12 +74,12 @@ def outcomes(group: Group, values: Values) -> list[Outcome]:
 
 
 def read_outcomes(path: Path) -> list[dict[str, Any]]:
-    """What accept.json holds; nothing where there is none."""
+    """Entries of accept.json; an empty list when the file does not exist."""
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
 
 
 def write_outcomes(path: Path, measured: Sequence[Outcome], known: Sequence[Group]) -> list[dict[str, Any]]:
-    """Puts what was measured in place of the same groups' old entries, in the order of the groups; returns all."""
+    """Replaces the entries of the measured groups in accept.json, in the order of `known`; drops those of unknown groups. Returns all."""
     again = {outcome.group for outcome in measured}
     entries = [entry for entry in read_outcomes(path) if entry["group"] not in again]
     entries += [asdict(outcome) for outcome in measured]
@@ -90,7 +90,7 @@ def write_outcomes(path: Path, measured: Sequence[Outcome], known: Sequence[Grou
 
 
 def print_outcomes(entries: Sequence[Mapping[str, Any]]) -> None:
-    """The table."""
+    """Prints the entries as a table."""
     table = Table(title="acceptance figures", title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("issue", "figure", "value", "limit", ""):
         table.add_column(column, justify="right" if column in ("value", "limit") else "left")
@@ -125,7 +125,7 @@ def main(
 
 
 def strip(modules: int, sensors: str) -> Group:
-    """The Moebius strip, ten seeds. With ideal sensors its bars are of the control alone, the median's among them."""
+    """The Moebius strip, ten seeds. With ideal sensors the limits test the control alone, and the median has one too."""
     ideal = sensors == "ideal"
     title = f"Moebius strip, {modules} module{'s' if modules > 1 else ''}, {sensors} sensors, 10 seeds"
     median = Figure(f"{title}: position RMSE, median", "position_rmse_m.median", high=4.4, unit="mm", scale=MM)

@@ -1,4 +1,4 @@
-"""What `make accept` holds against what is measured: a figure with its limits, and the group that one measurement gives."""
+"""Data types of `make accept`: a figure with its limits, and a group of figures that come from one measurement."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hil.checks import UNBOUNDED
 
 @dataclass(frozen=True)
 class Figure:
-    """One number that must be within low..high, both in `unit`, after `scale` was applied to what was measured."""
+    """One number that must lie within low..high, both in `unit`, after the measured value is multiplied by `scale`."""
 
     name: str
     key: str
@@ -25,7 +25,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Group:
-    """Figures that one measurement gives."""
+    """Figures that come from one measurement."""
 
     name: str
     issue: int
@@ -35,5 +35,5 @@ class Group:
 
 
 def said(name: str, low: float = -UNBOUNDED, high: float = UNBOUNDED, unit: str = "") -> Figure:
-    """A figure that a test says by name."""
+    """A figure that a test reports by name."""
     return Figure(name, name, low, high, unit)

@@ -1,4 +1,4 @@
-"""What `make accept` measures: each function takes a folder and returns figures by name. The bars stand in accept.py."""
+"""Measurements of `make accept`: each takes a folder and returns figures by name. The limits are in accept.py."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ FEWER = range(8)
 JOBS = 2
 PLANTS = 10
 PASSES, CHUNK = 10_000, 250
-"""Near misses in all, and those that a process counts at a time."""
+"""Near misses in total, and per task of a worker process."""
 
 FIGURE = re.compile(r"^figure: (?P<name>.+) = (?P<value>\S+)", re.MULTILINE)
-"""A line of tests/figures.py."""
+"""Matches a line that tests/figures.py prints."""
 
 Values = Mapping[str, float]
 
 
 def flown(scenario: str, controller: str = "modcube", trials: int = 20, sensors: str = "real") -> Callable[[Path], Values]:
-    """Flies so many seeds.
+    """Flies `trials` seeds of a scenario.
 
-    Keys are `metric.quantile`, the share `passed` that passed every check, its lower 95 % bound, and of those that failed the share
-    that `failed.OUTCOME`.
+    Keys are `metric.quantile`; `passed`, the share of flights that passed every check; `passed.low`, its lower 95 % bound; and
+    `failed.OUTCOME`, the share of each outcome among the failed flights.
     """
 
     def measure(folder: Path) -> Values:
@@ -57,7 +57,7 @@ def flown(scenario: str, controller: str = "modcube", trials: int = 20, sensors:
 
 
 def saved_by_least_power(folder: Path) -> Values:
-    """Flies the Moebius strip in both modes of allocation: share of the supply's power saved, ratio of the position errors."""
+    """Flies the Moebius strip in both allocation modes: share of supply power saved, and ratio of the position errors."""
     found = {}
     for name in ("modcube", "least_power"):
         with campaign_progress(f"mobius-1, {name}", len(FEWER)) as progress:
@@ -69,9 +69,9 @@ def saved_by_least_power(folder: Path) -> Values:
 
 
 def loop_margins(folder: Path) -> Values:
-    """Least margins of all axes of bodies of 1, 2 and 4 modules, nominal and in the worst corner; keys `nominal.gain_db`."""
+    """Least margins over all axes of bodies of 1, 2 and 4 modules, nominal and in the worst corner; keys such as `nominal.gain_db`."""
     command, out = [sys.executable, Path(__file__).with_name("margins.py"), "--jobs", str(JOBS), "--out", folder], folder / "margins.json"
-    out.unlink(missing_ok=True)  # an earlier run's: were this one to fail, its figures would be taken for new
+    out.unlink(missing_ok=True)  # from an earlier run: if this one failed, its figures would pass for new ones
     subprocess.run(command, stdout=subprocess.DEVNULL)
     found = json.loads(out.read_text(encoding="utf-8"))
     kinds, keys = ("nominal", "worst"), ("gain_db", "phase_deg")
@@ -79,7 +79,9 @@ def loop_margins(folder: Path) -> Values:
 
 
 def characterised(folder: Path) -> Values:
-    """Wall time of tools/characterise.py for one module and for Table I with figure and report, each a process with all its imports, s."""
+    """Wall time of tools/characterise.py for one module, and for Table I with figure and report, s. Each is the median of 3 runs in
+    processes of their own, imports included.
+    """
     program, took = Path(__file__).with_name("characterise.py"), {}
     for name, words in (("module", ["modcube"]), ("table1", ["--table1", "--out", folder])):
         runs = []
@@ -92,12 +94,12 @@ def characterised(folder: Path) -> Values:
 
 
 def told_from_logs(folder: Path) -> Values:
-    """Ten robots that differ from their file, each identified from a log of three minutes with a load cell within 2 %."""
+    """Identifies ten robots that differ from their vehicle file, each from a three-minute log with a load cell within 2 %."""
     return identify_plants.examine_all(range(PLANTS), JOBS, folder)
 
 
 def passed_by(folder: Path) -> Values:
-    """Ten thousand near misses seen by the docking detector through real frames."""
+    """Counts the docks that the docking detector declares in ten thousand near misses, seen through real frames."""
     chunks = [range(first, first + CHUNK) for first in range(0, PASSES, CHUNK)]
     total: dict[str, int] = {}
     with processes(JOBS)() as pool:
@@ -108,7 +110,7 @@ def passed_by(folder: Path) -> Values:
 
 
 def printed_by(program: str) -> Callable[[Path], Values]:
-    """Runs one of the programs of `make bench` that print JSON: its figures by name."""
+    """Runs one of the `make bench` programs that print JSON; returns its figures by name."""
 
     def measure(folder: Path) -> Values:
         command = [sys.executable, Path(__file__).with_name(program)]
@@ -120,8 +122,8 @@ def printed_by(program: str) -> Callable[[Path], Values]:
 
 
 def said_by_tests(*arguments: str) -> Callable[[Path], Values]:
-    """Runs tests at full length, as pytest's `arguments` name them: of each figure that they say the largest, and as `NAME, sum` the sum;
-    `failed` is pytest's status.
+    """Runs the tests selected by pytest's `arguments` at full length. Returns the largest value of each figure that they report, its sum as
+    `NAME, sum`, and pytest's exit status as `failed`.
     """
 
     def measure(folder: Path) -> Values:
@@ -140,10 +142,10 @@ def said_by_tests(*arguments: str) -> Callable[[Path], Values]:
 
 
 def repeated(folder: Path) -> Values:
-    """Flies one seed twice and another once: logs of the twin that differ, logs of the other that are the same."""
+    """Flies one seed twice and another seed once: logs that differ between the twins, and logs of the other seed that equal the first's."""
     for name, seed in (("first", 0), ("second", 0), ("other", 1)):
         command = [Path(sys.executable).with_name("modcube"), "hil", "run", "spiral", "--no-plots"]
-        shutil.rmtree(folder / name, ignore_errors=True)  # an earlier run's logs, which a flight that cannot run would leave
+        shutil.rmtree(folder / name, ignore_errors=True)  # logs of an earlier run, which would remain if the flight cannot run
         subprocess.run([*command, "--seed", str(seed), "--out", folder / name], capture_output=True)
     logs = {run: [(folder / run / log).read_bytes() for log in LOGS] for run in ("first", "second", "other")}
     pairs = [zip(logs["first"], logs[run], strict=True) for run in ("second", "other")]
@@ -152,7 +154,7 @@ def repeated(folder: Path) -> Values:
 
 
 def timed(folder: Path) -> Values:
-    """Lockstep's speed on one core, out of `make bench`'s own measurement, and how fast that core was meanwhile."""
+    """Lockstep speed on one core, measured as in `make bench`, and the speed of that core meanwhile."""
     code = (
         "from bench_flight import measure_flight, time_additions, time_load\n"
         "for _ in range(5): print(measure_flight(0).speed, time_additions(), time_load())"

@@ -1,4 +1,4 @@
-"""For tools/accept.py: flights in which something breaks (hil/safety.py, hil/fuzz.py, hil/random_operator.py), over all seeds."""
+"""For tools/accept.py: flights with faults (hil/safety.py, hil/fuzz.py, hil/random_operator.py), over all seeds."""
 
 from __future__ import annotations
 
@@ -42,21 +42,23 @@ from hil.scenario import load_scenario
 from hil.workers import processes
 
 HEALTHY, SHAKEN, STOPPED, BLIND, LOSSY, OPERATED = range(100), range(40), range(1000), range(50), range(5), range(200)
-"""Seeds, as the issue counts them; of lossy spirals as many as take a minute."""
+"""Seeds, as many as the issue asks for; of lossy spirals as many as fit into a minute."""
 FUZZED_FRAMES = 1_000_000
 OPERATED_S = 30.0
 """Length of each flight with a random operator."""
 LOGGED_S = 600.0
-"""Length of the log that is replayed."""
+"""Length of the log to replay."""
 MOST_SIGMAS, SQUARES = 4.0, (0.5, 2.0)
-"""Of 100 normal numbers one is beyond 4 in one set of 160; their mean square leaves 0.7 to 1.3 in one of 30, so two is no chance."""
+"""Limits on the normalised errors. Of 100 standard normal numbers, the largest exceeds 4 in one set of 160, and their mean square lies
+outside 0.7 to 1.3 in one set of 30, so a factor of two is no coincidence.
+"""
 
 LEAST = tuple(
     Figure(f"the same: optimal filter that knows moments to {1e3 * known_n_m:g} mN m, {name}", key, unit="mm", scale=1e3)
     for known_n_m, keys in ((UNFORESEEN_N_M, ("least median", "least p95")), (EXACT_N_M, ("exact median", "exact p95")))
     for name, key in zip(("median", "95 %"), keys, strict=True)
 )
-"""Beside what the robot keeps without tags: tools/blind_floor.py."""
+"""The optimal filter's errors (tools/blind_floor.py), shown beside the robot's errors without tags."""
 
 
 def _all(work: Callable[[Any], Any], inputs: Iterable[Any]) -> list[Any]:
@@ -71,7 +73,7 @@ def _shaken(seed: int, scenario: Path) -> float:
 
 
 def thrusters_out(folder: Path) -> Values:
-    """Every thruster dead, every pair dead, every thruster lying, and healthy flights, all on the spiral; and healthy ones shaken hard."""
+    """Spirals with each thruster dead, each pair dead, each thruster lying, and none failed; and healthy flights with strong excitation."""
     matrix = assemble_vehicle(load_vehicle("modcube")).thrusters.matrix
     alone, pairs = (list(itertools.combinations(range(matrix.shape[1]), broken)) for broken in (1, 2))
     whole = {pair: bool(np.linalg.matrix_rank(np.delete(matrix, pair, axis=1)) == 6) for pair in pairs}
@@ -93,7 +95,7 @@ def thrusters_out(folder: Path) -> Values:
 
 
 def frames_lost(folder: Path) -> Values:
-    """Spirals through lost frames, and how long a command outlives the last frame."""
+    """Spirals through frame loss, and how long a command outlives the last frame."""
     return {"rmse": max(_all(spiral_through_loss, LOSSY)), "outlives": command_outlives_frames_ms()}
 
 
@@ -104,7 +106,7 @@ def stopped(folder: Path) -> Values:
 
 
 def operated(folder: Path) -> Values:
-    """Flights whose operator asks for anything while anything breaks."""
+    """Flights with random requests from the operator and random faults."""
     flights = _all(functools.partial(fly_with_random_operator, duration_s=OPERATED_S), OPERATED)
     modes = sum((flight.modes for flight in flights), Counter[str]())
     return {"broken": sum(flight.broken.total() for flight in flights), "modes": len(modes), "armed": modes.total() / 100.0}
@@ -123,20 +125,20 @@ def blind(folder: Path, imu: Imu | None = None) -> Values:
 
 
 def fuzzed(folder: Path) -> Values:
-    """Frames that nobody should send, at a robot that is armed."""
+    """Sends fuzzed frames to an armed robot."""
     result = fuzz_flight(FUZZED_FRAMES)
     return {"beyond": result.beyond, "unaccounted": abs(result.accepted + sum(result.dropped.values()) - result.frames)}
 
 
 def fault_matrix(folder: Path) -> Values:
-    """Every fault in every mode against what the table promises."""
+    """Runs every fault in every mode against the promises of the fault table."""
     command = [Path(sys.executable).with_name("modcube"), "hil", "campaign", "faults", "--out", folder / "faults"]
     with (folder / "faults.log").open("w", encoding="utf-8") as log:
         return {"failed": subprocess.run(command, stdout=log, stderr=subprocess.STDOUT).returncode}
 
 
 def replayed(folder: Path) -> Values:
-    """A hover of ten minutes, fed through the same code again."""
+    """Records a ten-minute hover and replays its log through the same code."""
     base = load_scenario("hover")
     task = dataclasses.replace(base.task, duration_s=LOGGED_S - base.task.settle_s)
     shutil.rmtree(folder, ignore_errors=True)

@@ -19,15 +19,15 @@ from hil.scenario import load_scenario
 from hil.workers import processes
 
 TRIALS = range(16)
-"""Of the campaign that is timed: enough for a start of its processes not to count."""
+"""Trials of the timed campaign: enough to make the start-up of its processes negligible."""
 REPETITIONS = 3
-"""One worker and two in turn, for this machine's speed changes within minutes."""
+"""Runs with one worker and with two, alternating because this machine's speed drifts within minutes."""
 WORKERS_TEST = "tests/closed_loop/test_campaign_workers.py"
 TUNE = ["tools/objectives/spiral-and-push.toml", "--detune", "1", "--trials", "1000", "--minutes", "10"]
 
 
 def speedup(folder: Path) -> Values:
-    """How many times as fast two processes fly a campaign as one does, by medians, and files of theirs that differ from the first's."""
+    """Median speed-up of a campaign flown by two processes over one, and the number of runs whose files differ from the first run's."""
     took_s: dict[int, list[float]] = {1: [], 2: []}
     tables = []
     for jobs in REPETITIONS * (1, 2):
@@ -41,7 +41,7 @@ def speedup(folder: Path) -> Values:
 
 
 def tuned(folder: Path) -> Values:
-    """One search from detuned gains: its objective on unseen seeds over the shipped gains', the detuned over it, and minutes taken."""
+    """One search from detuned gains: tuned over shipped objective on unseen seeds, detuned over tuned objective, and minutes taken."""
     out = folder / "tune"
     shutil.rmtree(out, ignore_errors=True)
     began_s = time.monotonic()

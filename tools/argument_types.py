@@ -1,4 +1,4 @@
-"""For the command lines of the tools: what they take, and where their results go, each refused in one line."""
+"""For the command lines of the tools: argument types and output folders, each rejected with a one-line message."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hil.replaceable import check_replaceable, is_json_with, made
 
 
 def whole(least: int) -> Callable[[str], int]:
-    """Reads a whole number that is not below `least`."""
+    """Returns a parser of whole numbers not below `least`."""
 
     def read(text: str) -> int:
         if not text.isdecimal() or int(text) < least:
@@ -29,7 +29,7 @@ def whole(least: int) -> Callable[[str], int]:
 
 
 def positive(text: str) -> float:
-    """Reads a finite number above zero."""
+    """Parses a finite number above zero."""
     try:
         value = float(text)
     except ValueError:
@@ -40,7 +40,7 @@ def positive(text: str) -> float:
 
 
 def cells_in(text: str) -> list[tuple[int, int, int]]:
-    """Reads lattice cells such as "0,0,0 1,0,0", at least one. Raises ValueError."""
+    """Parses lattice cells such as "0,0,0 1,0,0", at least one. Raises ValueError."""
     cells = [(int(x), int(y), int(z)) for x, y, z in (word.split(",") for word in text.replace(";", " ").split())]
     if not cells:
         raise ValueError
@@ -48,7 +48,7 @@ def cells_in(text: str) -> list[tuple[int, int, int]]:
 
 
 def run_command(app: typer.Typer, name: str) -> int:
-    """Runs the tool called `name`; its exit status. Wrong arguments, and a DescriptionError, give one line on stderr and status 2."""
+    """Runs the tool called `name`; returns its exit status. Wrong arguments and a DescriptionError give one line on stderr and status 2."""
     try:
         return int(app(prog_name=name, standalone_mode=False) or 0)
     except TyperException as error:
@@ -61,24 +61,24 @@ def run_command(app: typer.Typer, name: str) -> int:
 
 @contextmanager
 def folder_for_results(out: Path | None) -> Iterator[None]:
-    """Makes the folder of a tool's results, where there is to be one, and tries that it takes a file, before the minutes of the work.
-    What of it was made goes again where no result came. Raises DescriptionError.
+    """Creates the folder `out` for a tool's results, if given, and checks that it is writable before the minutes of work start. Folders
+    that it created are removed again if they are empty at the end. Raises DescriptionError.
     """
     with ExitStack() as stack:
         if out is not None:
-            with suppress(OSError):  # _try_folder says what is wrong
+            with suppress(OSError):  # _try_folder reports the cause
                 stack.enter_context(made(out))
             _try_folder(out, out)
         yield
 
 
 def check_results(out: Path, key: str, *results: str) -> None:
-    """Raises DescriptionError where files of these names are in `out` that no earlier run left; of one the first is JSON with `key`."""
+    """Raises DescriptionError where `out` holds `results` but no earlier run left them: then the first of them would be JSON with `key`."""
     check_replaceable(out, results, is_json_with(out / results[0], key), "earlier run")
 
 
 def make_room(out: Path) -> None:
-    """The same for the folder of one file. Raises DescriptionError."""
+    """Creates the folder of the file `out` and checks that it is writable. Raises DescriptionError."""
     if out.is_dir():
         raise DescriptionError(f"--out {out}: is a folder; a file is needed")
     _try_folder(out.parent, out)

@@ -1,7 +1,7 @@
-"""`make bench`: how fast the code is, beside what else would do the same; writes bench.json and prints it.
+"""`make bench`: how fast the code is, compared with alternatives that do the same; writes bench.json and prints it.
 
-One core unless said, BLAS single-threaded. Each figure is the median of repetitions that alternate with its peer's. `ratio` says
-how many times better than the peer; what has no peer has none.
+Runs on one core unless stated, with BLAS single-threaded. Each figure is the median of repetitions that alternate with those of its peer.
+`ratio` says how many times better than the peer a figure is; a figure without a peer has none.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ PERMITTED_DETECTION_US = 20.0
 
 
 def flight_entries() -> list[Entry]:
-    """Lockstep speed, durations of a tick, and where the time goes."""
+    """Lockstep speed, tick durations, and where the time goes."""
     flights, additions, loads = zip(*((measure_flight(seed), time_additions(), time_load()) for seed in range(FLIGHTS)), strict=True)
     detailed: FlightTimes = measure_flight(0, detailed=True)
     speed = median(f.speed for f in flights)
@@ -75,7 +75,7 @@ def flight_entries() -> list[Entry]:
 
 
 def codec_entries() -> list[Entry]:
-    """GYRO: three int16, counter and CRC; cantools and struct get the CRC from the same function."""
+    """GYRO: three int16, counter and CRC; cantools and struct use the same CRC function."""
     codec = Codec.load()
     gyro = codec.message("GYRO")
     database = cantools.database.load_file(str(resources.files("can_dbc") / "modcube.dbc"), frame_id_mask=0x7E0)
@@ -133,7 +133,7 @@ def port_entries() -> list[Entry]:
 
 
 def allocator_entries() -> list[Entry]:
-    """Thruster forces for a wrench that saturates, and one that does not; of one module, and of 64."""
+    """Thruster forces of one module for a wrench within limits and one that saturates, and of 64 modules for one that saturates."""
     entries = []
     for name, edge, force_n in (("within limits", 1, 5.0), ("saturated", 1, 60.0), ("saturated, 64 modules", 4, 4000.0)):
         body = cube_of(edge)
@@ -146,7 +146,7 @@ def allocator_entries() -> list[Entry]:
 
 
 def fleet_entries() -> list[Entry]:
-    """A tick of 64 docked modules beside that of one, its memory, and the docking detector."""
+    """A tick of 64 docked modules beside that of one, and the memory of the process."""
     one, many = Hold(cube_of(1)), Hold(cube_of(4))
     entries = compare(
         "pipeline.step, 64 modules docked", "us", lambda: many.run(TIMED_TICKS), {"one module": lambda: one.run(TIMED_TICKS)}
@@ -158,7 +158,7 @@ def fleet_entries() -> list[Entry]:
 
 
 def docking_entries() -> list[Entry]:
-    """What the docking detector adds to a tick of eight modules: the frames of its currents, and itself."""
+    """What the docking detector adds to a tick of eight modules: decoding its current frames, and the detection itself."""
     docking, tags_alone = DetectorBench(), DetectorBench(detects=False)
     rounds = [(docking.tick_us(), tags_alone.tick_us()) for _ in range(5 * REPETITIONS)]
     added_us = median(whole - without for whole, without in rounds)
@@ -180,11 +180,11 @@ MEASURES = (
     ground_entries,
     lateness_entries,
 )
-"""In the order of the table."""
+"""The groups of entries, in table order."""
 
 
 def print_entries(entries: Sequence[Entry]) -> None:
-    """The table."""
+    """Prints the entries as a table."""
     table = Table(title="one core unless said, medians of alternating repetitions", title_justify="left", box=box_style.SIMPLE_HEAD)
     for column in ("what", "value", "peer", "its value", "times better"):
         table.add_column(column, justify="left" if column in ("what", "peer") else "right")
@@ -198,7 +198,7 @@ def print_entries(entries: Sequence[Entry]) -> None:
 def main() -> None:
     """Measures everything; takes no arguments."""
     Parser(description=__doc__).parse_args()
-    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":  # read when numpy is imported: start again with it
+    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":  # read when numpy is imported, so restart with it set
         os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     print(f"bench: {(batch_entries.__doc__ or '').splitlines()[0]}", file=sys.stderr, flush=True)
     on_two_cores = batch_entries()

@@ -1,6 +1,6 @@
 """For tools/bench.py: many worlds in one call, beside MuJoCo's rollout of the same robot on the same cores.
 
-MuJoCo is no dependency: `make bench` installs it; where it is missing the plant is measured alone and the bench says so.
+MuJoCo is not a dependency: `make bench` installs it. Without it the plant is measured alone, and the bench says so.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hil.scenario import load_scenario, make_world
 
 WORLDS, TICKS, PERIOD_NS = 64, 1000, 10_000_000
 STEPS = PERIOD_NS // STEP_NS
-"""Sub-steps of a tick."""
+"""Sub-steps per tick."""
 THREADS = 2
 DIFFERENCES = (
     "plant against MuJoCo: both integrate one free body with eight lagged thrusters in water at 2.5 ms. The plant has besides: drag that "
@@ -32,7 +32,7 @@ DIFFERENCES = (
 
 
 def batch_entries() -> list[Entry]:
-    """Many worlds in one call, and a single step, beside MuJoCo's. Uses two cores: to be called before the process keeps to one."""
+    """Many worlds in one call, and a single step, beside MuJoCo's. Uses two cores: call it before the process is pinned to one."""
     vehicle = load_vehicle("modcube")
     commands = np.clip(0.3 * np.random.default_rng(0).standard_normal((WORLDS, TICKS, len(vehicle.thruster))), -1.0, 1.0)
     many, single = (_plant_us(commands[:count], threads) for count, threads in ((WORLDS, THREADS), (1, 1)))
@@ -52,7 +52,7 @@ def batch_entries() -> list[Entry]:
 
 
 def _plant_us(commands: np.ndarray, threads: int) -> Callable[[], float]:
-    """Duration of a sub-step of one world, us, of a fresh set of worlds."""
+    """Returns a function that measures the duration of one sub-step of one world, us, on a fresh set of worlds."""
     scenario = load_scenario("mobius-1")
 
     def run() -> float:
@@ -66,7 +66,7 @@ def _plant_us(commands: np.ndarray, threads: int) -> Callable[[], float]:
 
 
 def _mujoco_us(vehicle: Vehicle, commands: np.ndarray, integrator: str, threads: int) -> Callable[[], float]:
-    """The same of MuJoCo's rollout, its output allocated beforehand."""
+    """Same as `_plant_us` for MuJoCo's rollout, with its output allocated beforehand."""
     import mujoco
     from mujoco import rollout
 
@@ -89,7 +89,7 @@ def _mujoco_us(vehicle: Vehicle, commands: np.ndarray, integrator: str, threads:
 
 
 def model_xml(vehicle: Vehicle, integrator: str) -> str:
-    """MuJoCo's model of a lone module: a free box in water with a lagged thruster at each of its places."""
+    """MuJoCo model of a lone module: a free box in water with a lagged thruster at each thruster position."""
     inertial, curve = vehicle.inertial, vehicle.curve
     sites = "".join(
         f'<site name="t{i}" pos="{_words(p)}" zaxis="{_words(d)}"/>'

@@ -1,4 +1,4 @@
-"""For tools/bench.py: what detecting docks costs for eight docked modules, from the frames that it needs."""
+"""For tools/bench.py: the cost of dock detection for eight docked modules, from raw frames on."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ TICKS = 480
 MODULES_OF_A_BUS = 4
 CURRENT_MA = 100
 CURRENT_EVERY, PICTURES_PER_TICK, DELAY_TICKS = 4, 0.6, 4
-"""Currents at 25 Hz, pictures at 60 Hz that arrive 40 ms late."""
+"""Currents at 25 Hz, and pictures at 60 Hz that arrive 40 ms late."""
 
 
 class DetectorBench:
-    """A 2x2x2 of docked modules on two buses: their magnets' currents and top tags."""
+    """A 2x2x2 cube of docked modules on two buses, with their magnet currents and top tags."""
 
     def __init__(self, detects: bool = True) -> None:
-        """`detects`: with currents and detector; or the tags alone, which the estimator needs anyway."""
+        """`detects`: with currents and detector; otherwise the tags alone, which the estimator needs anyway."""
         self._detects = detects
         self._codec, self._body = Codec.load(), cube_of(2)
         self._addresses = [(m // MODULES_OF_A_BUS, 1 + m % MODULES_OF_A_BUS) for m in self._body.modules]
@@ -35,10 +35,12 @@ class DetectorBench:
         self._ticks = [[[f for at, f in frames if at == bus] for bus in range(2)] for frames in map(self._frames_of, range(TICKS))]
         self._table = tag_table([self._body])
         self.frames = sum(len(frames) for tick in self._ticks for frames in tick) / TICKS
-        """How many come in a tick, on the mean."""
+        """Mean number of frames per tick."""
 
     def tick_us(self) -> float:
-        """Raw frames to Inputs, and on to the state of the twelve joints, a tick. Raises RuntimeError when one is not found docked."""
+        """Duration per tick from raw frames to Inputs and on to the state of the twelve joints, us.
+        Raises RuntimeError when a joint is not found docked.
+        """
         collector = InputCollector(self._fleet, self._codec)
         bank = PairBank([joint.pair for joint in joints_of(self._body)], Docking())
         with quiet_garbage():

@@ -1,4 +1,4 @@
-"""For tools/bench.py: looking drag up, and building its table, beside what else would do the same."""
+"""For tools/bench.py: drag look-up, and building of the drag table, beside alternatives."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from firmware_py.prepare.projected_area import Solid, areas_and_centroids, box, 
 from hil.metrics import rms
 
 DIRECTIONS = 1000
-"""Directions of the paper's drag table, and look-ups in one repetition."""
+"""Directions in the paper's drag table, and look-ups per repetition."""
 
 
 @njit(cache=False)
@@ -43,13 +43,13 @@ def _nearest_all(directions, coefficients, velocities, out):  # type: ignore[no-
 
 
 def drag_entries() -> list[Entry]:
-    """Looking drag up, its error, and building its table."""
+    """Drag look-up, its error, and building the drag table."""
     vehicle = load_vehicle("modcube")
     return [*_look_up_entries(vehicle), *_build_entries(vehicle)]
 
 
 def _look_up_entries(vehicle: Vehicle) -> list[Entry]:
-    """Looking drag up in the table of a lone module, and among the paper's 1000 directions; against the exact drag, both."""
+    """Look-up in the drag table of a lone module, and among the paper's 1000 directions; both against the exact drag."""
     placements = [Placement(vehicle, (0, 0, 0), 0)]
     solids = [box(np.array(vehicle.hull.size_m))]
 
@@ -78,20 +78,20 @@ def _look_up_entries(vehicle: Vehicle) -> list[Entry]:
 
 
 def _build_entries(vehicle: Vehicle) -> list[Entry]:
-    """Building the table of a lone module, beside two ways by alpha shapes."""
+    """Building the drag table of a lone module, beside two ways by alpha shapes."""
 
     def build(method: drag_table.Outlines) -> Callable[[], float]:
         return lambda: each_us(lambda: _table(vehicle, method), 1)() * 1e-6
 
     name, exact_s = "drag table of one module", build(areas_and_centroids)
     entries = compare(name, "s", exact_s, {"alpha shapes of 1000 points": build(alpha.lattice_method)})
-    if importlib.util.find_spec("alphashape") is not None:  # it takes minutes: once
+    if importlib.util.find_spec("alphashape") is not None:  # takes minutes, so only once
         entries += compare(name, "s", exact_s, {"the alphashape package": build(_alphashape_package)}, repetitions=1)
     return entries
 
 
 def _table(vehicle: Vehicle, method: drag_table.Outlines) -> DragTable:
-    """That of a lone module, its outlines found by `method`."""
+    """Drag table of a lone module, with outlines found by `method`."""
     return drag_table.build([Placement(vehicle, (0, 0, 0), 0)], np.zeros(3), float(vehicle.hull.size_m[0]), method=method)
 
 
@@ -101,7 +101,7 @@ def _per_direction(function: Callable[[], object]) -> Callable[[], float]:
 
 
 def _alphashape_package(solids: Sequence[Solid], directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a user of the alphashape package would write; seconds per direction, so it is not in the lock."""
+    """Outlines as a user of the alphashape package would compute them; seconds per direction, so the package is not in the lock file."""
     import alphashape
 
     cloud = alpha.lattice_points(solids)

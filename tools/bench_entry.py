@@ -1,4 +1,4 @@
-"""For tools/bench.py: one line of its table, and how durations are taken."""
+"""For tools/bench.py: one line of its table, and the timing functions."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def compare(
 
 
 def each_us(function: Callable[[], object], times: int) -> Callable[[], float]:
-    """Runs `function` so many times; the duration of one, us."""
+    """Returns a function that calls `function` `times` times and returns the mean duration of a call, us."""
 
     def run() -> float:
         began = time.perf_counter()

@@ -1,8 +1,8 @@
-"""For tools/bench.py: what a tick of many docked modules costs beside that of one, with every module's sensors arriving.
+"""For tools/bench.py: the cost of a tick of many docked modules beside that of one, with the sensor data of every module.
 
     .venv/bin/python tools/bench_fleet.py EDGE
 
-holds a cube of EDGE^3 modules and prints the duration of a tick, how far it strayed, and the memory of the process.
+holds a cube of EDGE^3 modules and prints the duration of a tick, how far the cube strayed, and the memory of the process.
 """
 
 from __future__ import annotations
@@ -34,20 +34,19 @@ from firmware_py.runtime.realtime import quiet_garbage
 PERIOD_NS = 10_000_000
 PERIOD_S = 1e-9 * PERIOD_NS
 ARM_TICK, SETTLE_TICKS = 50, 300
-"""Armed when a pose is found; timed once the disturbance is learnt and the place held."""
+"""Tick at which the body is armed, its pose being known; and ticks before timing, until the disturbance is learnt and the position held."""
 TIMED_TICKS = 100
-"""Ten rounds of everything that comes at its own rate."""
+"""Ten rounds of the slowest sensor data."""
 START_W = np.array([0.0, 0.0, 2.0])
 CURRENT_N, TRIM_NM = np.array([0.6, -0.4, 0.3]), np.array([0.02, -0.03, 0.01])
-"""Each module's share of what pushes and turns the body: world, body frame."""
+"""Each module's share of the disturbance force (world frame) and moment (body frame)."""
 SIGMA_M, SIGMA_RAD, SIGMA_RATE, SIGMA_ACCEL = 0.002, 0.009, 0.002, 0.02
 DEPTH_EVERY, ESC_EVERY, SLOW_EVERY, TAG_EVERY, TAG_DELAY = 2, 5, 10, 2, 4
-"""Ticks between two readings of the depth, of an ESC, of supply, cabin and magnets, and between two pictures; and from a
-picture to its arrival."""
+"""Ticks between readings of depth, of an ESC, of supply, cabin and magnets, and between pictures; and from a picture to its arrival."""
 
 
 class FleetInWater:
-    """The body in water that is the controller's own model, with noise; every module answers in every tick."""
+    """A body in water simulated with the controller's own model plus noise; every module answers in every tick."""
 
     def __init__(self, body: Body, seed: int) -> None:
         t, modules = body.thrusters, range(len(body.modules))
@@ -55,7 +54,7 @@ class FleetInWater:
         self._plant = body.plant
         self._acts, self._tau = ThrusterLag(t, PERIOD_S), np.zeros(6)
         self.x = np.zeros(STATES)
-        """(32,) true state, as core.propagation orders it."""
+        """(32,) true state, in the order of core.propagation."""
         self.x[:3], self.x[3] = START_W, 1.0
         self.x[19:22], self.x[22:25] = len(modules) * CURRENT_N, len(modules) * TRIM_NM
         self._past: deque[np.ndarray] = deque([self.x], maxlen=TAG_DELAY + 1)
@@ -66,7 +65,7 @@ class FleetInWater:
         self._full_n = t.forward.sum(axis=1), t.reverse.sum(axis=1)
 
     def move(self, outputs: Outputs) -> None:
-        """One period with what a tick commanded."""
+        """Advances the simulation by one period under the commands of a tick."""
         t, powers = self._body.thrusters, np.arange(1, 6)
         self._tau = t.matrix @ self._acts.step()
         share = np.concatenate([outputs.modules[m].thrusters for m in self._body.modules])[self._channels, None]
@@ -76,7 +75,7 @@ class FleetInWater:
         self._past.append(self.x)
 
     def inputs(self, tick: int, requests: list[Request]) -> Inputs:
-        """Those of tick `tick`."""
+        """Inputs of tick `tick`."""
         down = to_matrix(self.x[3:7].copy())[2]
         felt = propagation.inertial_acceleration(self.x, self._tau, *self._plant) - GRAVITY * down
         force = self._acts.force_n
@@ -113,26 +112,26 @@ class FleetInWater:
 
 
 def cube_of(edge: int) -> Body:
-    """A body of edge^3 modules."""
+    """A cube-shaped body of edge^3 modules."""
     cells = np.array([(x, y, z) for x in range(edge) for y in range(edge) for z in range(edge)])
     return assemble(cells, [0] * len(cells), [load_vehicle("modcube")] * len(cells))
 
 
 class Hold:
-    """The pipeline of one body that is armed and holds its place in the water."""
+    """The pipeline of one armed body that holds its place in the water."""
 
     def __init__(self, body: Body, seed: int = 0) -> None:
         """Raises RuntimeError when it does not arm."""
         self._body, self._fleet, self._tick = body, FleetInWater(body, seed), 0
         self._pipeline, self._said = Pipeline([body], Parameters(), PERIOD_NS), list[str]()
         self.strayed_m = 0.0
-        """The farthest that it was from its set-point."""
+        """Largest distance from the set-point."""
         self.run(SETTLE_TICKS)
         self.strayed_m = 0.0
 
     @quiet_garbage()
     def run(self, ticks: int) -> float:
-        """Mean duration of pipeline.step, us. Raises RuntimeError when the body disarms, or leaves a healthy thruster out."""
+        """Mean duration of pipeline.step, us. Raises RuntimeError when the body disarms or a healthy thruster is left out."""
         took_ns = 0
         for _ in range(ticks):
             inputs = self._fleet.inputs(self._tick, [Request(Action.ARM, self._body.index)] if self._tick == ARM_TICK else [])
@@ -152,13 +151,13 @@ class Hold:
 
 
 def peak_memory_mb() -> float:
-    """The most memory that this process ever held, MB. getrusage's figure begins with that of the process that started it."""
+    """Peak memory of this process, MB. Not from getrusage, whose figure starts at that of the parent process."""
     status = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
     return float(status["VmHWM"].split()[0]) / 1024.0
 
 
 def main() -> None:
-    """Holds a cube of modules in a process of its own; prints what came of it."""
+    """Holds a cube of modules in a process of its own; prints the results."""
     parser = Parser(description=__doc__)
     parser.add_argument("side", type=int, help="of the cube, modules")
     flight = Hold(cube_of(parser.parse_args().side))

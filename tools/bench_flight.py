@@ -1,7 +1,7 @@
-"""For tools/bench.py: times one flight of the spiral, and what each stage of a tick takes of it.
+"""For tools/bench.py: times one flight of the spiral, and the share of each stage of a tick.
 
-Stages are timed by wrapping methods of their classes for the length of one flight; the firmware knows nothing of it.
-The speed is taken from flights in which nothing but the two whole ticks is wrapped.
+Stages are timed by wrapping methods of their classes for the length of one flight; the firmware is unaware of it. The speed comes from
+flights in which only the whole ticks are wrapped.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from hil.scenario import Scenario, load_scenario
 from hil.truth_log import TruthRecorder
 
 LINE = 8
-"""Numbers of 8 bytes in a line of the cache."""
+"""Numbers of 8 bytes in a cache line."""
 STAGE_METHODS = ("fuse", "step")
-"""What a stage of the pipeline does its work in."""
+"""Methods in which a stage of the pipeline does its work."""
 
 
 @dataclass(frozen=True)
 class FlightTimes:
-    """One flight."""
+    """Timing of one flight."""
 
     speed: float
-    """Simulated over wall time."""
+    """Ratio of simulated time to wall time."""
     pipeline_us: np.ndarray
     """(k,) each call of pipeline.step."""
     tick_us: np.ndarray
@@ -51,7 +51,7 @@ class FlightTimes:
 
 @dataclass
 class Stopwatch:
-    """Wraps methods while it is open and keeps every duration."""
+    """Wraps methods until it is stopped, and keeps every duration."""
 
     durations_ns: dict[str, list[int]] = field(default_factory=dict)
     _stack: ExitStack = field(default_factory=ExitStack)
@@ -71,11 +71,11 @@ class Stopwatch:
         self._stack.callback(setattr, owner, method, original)
 
     def stop(self) -> None:
-        """Puts every method back."""
+        """Restores every wrapped method."""
         self._stack.close()
 
     def total_s(self, label: str) -> float:
-        """Sum of the durations."""
+        """Sum of the durations under `label`, s."""
         return 1e-9 * sum(self.durations_ns[label])
 
 
@@ -98,7 +98,7 @@ def measure_flight(seed: int, detailed: bool = False) -> FlightTimes:
 
 
 def _watch_stages(watch: Stopwatch, scenario: Scenario) -> list[str]:
-    """Wraps the stages of the pipeline and all else that takes time; returns the labels within pipeline.step."""
+    """Wraps the stages of the pipeline and everything else that takes time; returns the labels within pipeline.step."""
     firmware = compose(fleet_of(scenario, "virtual:bench", 100), Parameters())
     chain = next(each for each in firmware.pipeline.formation.chains if isinstance(each, BodyPipeline))
     stages = []
@@ -131,7 +131,7 @@ def _shares(watch: Stopwatch, stages: list[str], wall_s: float) -> dict[str, flo
 
 
 def time_additions(count: int = 10_000_000) -> float:
-    """Time that so many additions take in plain Python, s: tells a slow processor from slow code."""
+    """Time of `count` additions in plain Python, s: tells a slow processor from slow code."""
     began, total = perf_counter_ns(), 0
     for i in range(count):
         total += i
@@ -139,9 +139,9 @@ def time_additions(count: int = 10_000_000) -> float:
 
 
 def time_load(size: int = 1 << 20, count: int = 1_000_000) -> float:
-    """Time of one load out of `size` numbers (8 MB) that waits for the one before, ns: tells a slow cache from slow code.
+    """Time of one load out of `size` numbers (8 MB), each depending on the one before, ns: tells a slow cache from slow code.
 
-    A tick's code and data are more than a core's own cache holds, and fit into the shared one.
+    The code and data of a tick exceed a core's own cache and fit into the shared one.
     """
     lines = np.random.default_rng(0).permutation(size // LINE) * LINE
     following = np.zeros(size, np.int64)
@@ -154,7 +154,7 @@ def time_load(size: int = 1 << 20, count: int = 1_000_000) -> float:
 
 @njit("int64(int64[::1], int64)", cache=True)
 def _follow(following, count):
-    """Where a chain of indices is after so many steps."""
+    """Index after following a chain of indices for `count` steps."""
     at = 0
     for _ in range(count):
         at = following[at]

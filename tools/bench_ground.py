@@ -1,7 +1,7 @@
-"""For tools/bench.py: what telemetry costs a tick, every message at 50 Hz on two links, against no ground side at all.
+"""For tools/bench.py: the cost of telemetry per tick, every message at 50 Hz on two links, against no ground side at all.
 
-The firmware runs against the clock on recorded inputs, half a second with and half a second without in turn. Run as a program, it
-prints JSON.
+The firmware runs in real time on recorded inputs, alternating half a second with telemetry and half a second without.
+Run as a program, it prints JSON.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ PERIOD_NS = 10_000_000
 RECORDED_TICKS = 300
 BLOCK_TICKS, PAIRS = 50, 40
 PERMITTED_PERCENT = 5.0
-"""Of a tick's time (issue 6)."""
+"""Permitted share of a tick's time (issue 6)."""
 
 
 class Ticks:
-    """A firmware that ticks against the clock on the inputs of a hover's first seconds, over and over."""
+    """A firmware that ticks in real time on the recorded inputs of a hover's first seconds, in a loop."""
 
     def __init__(self) -> None:
         self._inputs: list[Inputs] = []
@@ -63,11 +63,11 @@ class Ticks:
         self._clock = MonotonicClock()
 
     def keeper(self) -> RateKeeper:
-        """Of one kind of ticks."""
+        """Returns a new rate keeper, one for the ticks with telemetry and one for those without."""
         return RateKeeper(PERIOD_NS, self._clock, absolute_sleeper(self._clock))
 
     def run(self, keeper: RateKeeper, side: GroundSide | None) -> float:
-        """A block of ticks, with telemetry or without; how long they took, median, us."""
+        """Runs a block of ticks, with telemetry or without; returns their median duration, us."""
         spent_us = np.empty(BLOCK_TICKS)
         keeper.start(self._clock.now_ns() + PERIOD_NS)
         for i in range(BLOCK_TICKS):
@@ -88,7 +88,7 @@ class Ticks:
 
 
 def stream_everything(side: GroundSide) -> None:
-    """Every message at RATE_HZ on every link."""
+    """Requests every message at RATE_HZ on every link."""
     for channel in side.links.channels:
         side.station.join(channel, 0)
     for services in side.station.services.values():
@@ -98,14 +98,14 @@ def stream_everything(side: GroundSide) -> None:
 
 
 def ground_entries() -> list[Entry]:
-    """A tick beside telemetry: every message at 50 Hz on two links, and without."""
+    """A tick with telemetry, every message at 50 Hz on two links, and without."""
     ticks = Ticks()
     with ExitStack() as stack:
         clients = [stack.enter_context(closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))) for _ in range(LINKS)]
         for client in clients:
             client.bind(("127.0.0.1", 0))
         config = GroundConfig(links=tuple(f"udpout:127.0.0.1:{client.getsockname()[1]}" for client in clients))
-        planner = stack.enter_context(ThreadPoolExecutor(1))  # no mission is flown, and no process starts meanwhile
+        planner = stack.enter_context(ThreadPoolExecutor(1))  # no mission is flown, so no process starts meanwhile
         side = stack.enter_context(GroundSide(config, ticks.firmware, planner, priority=GROUND_PRIORITY))
         stream_everything(side)
         stack.enter_context(real_time(TICK_PRIORITY))
@@ -127,7 +127,7 @@ def ground_entries() -> list[Entry]:
 
 
 def compared(name: str, beside_us: float, without_us: float) -> Entry:
-    """A duration with telemetry, and without."""
+    """Entry of a duration with telemetry against the same without."""
     return Entry(name, beside_us, "us", "without", without_us, without_us / beside_us)
 
 

@@ -1,7 +1,7 @@
-"""For tools/bench.py: how late ticks start on this machine, beside a loop that does nothing but wake up at the same rate.
+"""For tools/bench.py: how late ticks start on this machine, beside a loop that only wakes up at the same rate.
 
-Run as a program, bench_lateness.py RATE SECONDS flies the hover in real time over udp, firmware and plant each in a
-process, and prints JSON. The idle loop is a third process of the same priority: what it is late by is the machine's own.
+Run as a program, bench_lateness.py RATE SECONDS flies the hover in real time over udp, firmware and plant in a process each, and prints
+JSON. The idle loop is a third process of the same priority: its lateness is that of the machine itself.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ SETTLE_S = 3.0
 BUS = "udp:239.74.163.11:43711"
 NS_PER_S = 1_000_000_000
 ENDS = 0.1
-"""Share of the flight: the drift is by how much its last ticks start later, against the grid of the first deadline, than those after the
-settling. Medians, from bins a quarter wide.
+"""Share of the flight at either end over which the drift is computed. The drift is how much later the last ticks start, against the grid of
+the first deadline, than those right after settling. Medians, from bins a quarter wide.
 """
 
 
 def idle_loop(rate_hz: int, duration_s: float, begin: Event, result: Connection) -> None:
-    """Says that it is there; from `begin` on wakes up as the tick does, then sends how late it was: p50, p99 and worst, ns."""
+    """Reports ready; from `begin` on wakes up as the tick does, then sends its lateness: p50, p99 and worst, ns."""
     result.send("ready")
     begin.wait()
     clock = MonotonicClock()
@@ -62,7 +62,7 @@ def idle_loop(rate_hz: int, duration_s: float, begin: Event, result: Connection)
 
 
 def fly(rate_hz: int, duration_s: float) -> dict[str, Any]:
-    """One flight and the idle loop beside it."""
+    """One real-time flight with the idle loop beside it."""
     scenario = load_scenario("hover")
     scenario = replace(scenario, task=replace(scenario.task, settle_s=SETTLE_S, duration_s=duration_s - SETTLE_S))
     deadlines_ns: list[int] = []
@@ -85,10 +85,10 @@ def fly(rate_hz: int, duration_s: float) -> dict[str, Any]:
 
 
 def drift_ns(counts: np.ndarray, deadlines_ns: Sequence[int], period_ns: int) -> float:
-    """How much later ticks start at the end of a flight than in the beginning.
+    """How much later ticks start at the end of a flight than at its beginning, ns.
 
     Args:
-        counts: (k, bins) of the lateness of all ticks so far, against their deadlines.
+        counts: (k, bins) lateness histogram of all ticks so far, against their deadlines.
         deadlines_ns: of all ticks.
     """
     moved = (np.array(deadlines_ns) - deadlines_ns[0] + period_ns // 2) % period_ns - period_ns // 2
@@ -101,7 +101,7 @@ def drift_ns(counts: np.ndarray, deadlines_ns: Sequence[int], period_ns: int) ->
 
 
 def lateness_entries() -> list[Entry]:
-    """How late ticks start in real time, a minute at each rate, beside the machine's own hiccups."""
+    """How late ticks start in real time, a minute at each rate, beside the machine's own latency."""
     entries = []
     for rate_hz in RATES_HZ:
         command = [sys.executable, __file__, str(rate_hz), str(FLIGHT_S)]
@@ -116,12 +116,12 @@ def lateness_entries() -> list[Entry]:
 
 
 def main() -> None:
-    """Flies; prints what came of it."""
+    """Flies once and prints the results."""
     parser = Parser(description=__doc__)
     parser.add_argument("rate", type=int, help="ticks a second")
     parser.add_argument("seconds", type=float, help="of the flight")
     given = parser.parse_args()
-    if hasattr(os, "sched_setaffinity"):  # the bench keeps to one processor, a vehicle does not
+    if hasattr(os, "sched_setaffinity"):  # the bench pins itself to one core, a vehicle does not
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
     print(json.dumps(fly(given.rate, given.seconds)))
 

@@ -1,13 +1,13 @@
-"""What the best filter there can be would keep of a hovering robot's place without tags: the floor under `make accept ONLY=blind`.
+"""Position error of the best possible filter of a hovering robot without tags: the floor under `make accept ONLY=blind`.
 
-A Kalman filter of one horizontal axis that is told every figure of the simulated world: the gusts' spectrum, the pull of the water, the
-noise of IMU and tags. Only what is drawn anew in every sample is unknown, and of that no filter knows more (Anderson and Moore 1979,
-chapter 5). The robot's own filter is told less, and its thrusters do not quite what they are told.
+The filter is a Kalman filter of one horizontal axis that knows every parameter of the simulated world: the gust spectrum, the drag of the
+water, the noise of IMU and tags. Only the noise drawn afresh at every sample is unknown, and no filter can know more about that (Anderson
+and Moore 1979, chapter 5). The robot's own filter knows less, and its thrusters do not follow their commands exactly.
 
-What tilts the robot is the one figure left open: the gyro measures the turning, and a filter that also knew the moments would know the
-tilt better. So the floor is told for several errors of the moment that a filter believes the thrusters to make. No moment tells a tilt from
-water that accelerates, though: the water's pressure gradient acts where the buoyancy does, so that the robot hangs along the gravity that
-it feels, and the accelerometer feels the same.
+The tilting moment is the one open figure: the gyro measures the rotation, and a filter that also knew the moments would know the tilt
+better. The floor is therefore given for several errors of the thruster moments that the filter assumes. Knowing the moments does not
+separate a tilt from accelerating water, though: the pressure gradient of the water acts where the buoyancy does, so the robot hangs along
+the apparent gravity, and the accelerometer measures the same.
 """
 
 from __future__ import annotations
@@ -27,40 +27,43 @@ from hil.scenario import load_scenario
 
 PLACE, SPEED, WATER, TENDS, TILT, RATE, MOMENT, STEADY, GYRO_BIAS, ACCEL_BIAS, PUSH = range(11)
 STATES = 11
-"""Of one axis: m, m/s, m/s of the water and of where its gust tends, rad, rad/s, N m that come and go and that stay, rad/s, m/s^2, and the
-steady push in m/s^2."""
+"""Number of states of one axis: place, m; speed, m/s; velocity of the water and the velocity that its gust tends to, m/s; tilt, rad; rate,
+rad/s; transient and steady moment, N m; gyro bias, rad/s; accelerometer bias, m/s^2; steady push, m/s^2.
+"""
 PERIOD_S = 0.01
 HOVERS = 4000
 PUSHED, TWISTED = 0.1, 0.1
-"""Sigma of the steady push before the first tag, m/s^2, and of the steady moment, N m: more than buoyancy, current and trim give."""
+"""Sigma of the steady push, m/s^2, and of the steady moment, N m, before the first tag: more than buoyancy, current and trim produce."""
 TILTED, TURNED, MOVED = 0.05, 0.05, 0.02
-"""The same of tilt, rad, rate, rad/s, and place, m."""
+"""Sigma of tilt, rad, rate, rad/s, and place, m, before the first tag."""
 MOMENT_S = 1.0
-"""Time over which a moment that nobody foresaw comes and goes: that of the gusts which the thrusters work against (`gust_smoothing_s`)."""
+"""Correlation time of the unforeseen moment: that of the gusts which the thrusters counteract (`gust_smoothing_s`)."""
 UNFORESEEN_N_M = 1e-3
-"""Sigma of it: thrusters of 5 % more or less that work against gusts of 0.01 m/s^2 at 0.1 m. By ten times that nothing changes any more."""
+"""Sigma of the unforeseen moment: thruster forces off by 5 % while they counteract gusts of 0.01 m/s^2 at a lever arm of 0.1 m. Ten times
+that sigma already changes nothing any more.
+"""
 EXACT_N_M = 1e-5
-"""The same of a filter that knows each thruster's force to a ten-thousandth of a newton."""
+"""Sigma of the unforeseen moment for a filter that knows each thruster's force to a ten-thousandth of a newton."""
 
 
 class Model(NamedTuple):
-    """Linear and Gaussian, over one tick."""
+    """Linear Gaussian model of one axis over one tick."""
 
     step: np.ndarray
-    """(11, 11) F."""
+    """(11, 11) transition matrix F."""
     noise: np.ndarray
-    """(11,) variances that a tick adds: the diagonal of Q."""
+    """(11,) process noise variances per tick: the diagonal of Q."""
     inertial: tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
-    """Of accelerometer and gyro: (11,) what it feels of the state, and the variance of its noise."""
+    """For accelerometer and gyro: (11,) row of the measurement matrix, and the variance of the measurement noise."""
     start: np.ndarray
-    """(11,) variances at the beginning."""
+    """(11,) initial variances."""
 
 
 def model(world: WorldSpec, sensors: SensorSpec, vehicle: Vehicle, unforeseen_n_m: float = UNFORESEEN_N_M) -> Model:
-    """A robot at rest over ground in the world's mean current, which water that accelerates takes along (Froude-Krylov and added mass).
+    """Model of a robot at rest over ground in the world's mean current; accelerating water carries it along (Froude-Krylov and added mass).
 
     Args:
-        unforeseen_n_m: sigma of the moment that comes and goes and that the filter is not told.
+        unforeseen_n_m: sigma of the transient moment, which is unknown to the filter.
     """
     t1, t2 = world.gust_time_s, world.gust_smoothing_s
     tends = world.gust_m_s * math.sqrt((t1 + t2) / t1)
@@ -92,14 +95,14 @@ def model(world: WorldSpec, sensors: SensorSpec, vehicle: Vehicle, unforeseen_n_
 
 
 def gain(covariance: np.ndarray, row: np.ndarray, variance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Kalman's gain (11,) of one measurement, and the covariance (11, 11) after it."""
+    """Kalman gain (11,) for one measurement, and the covariance (11, 11) after it."""
     seen = covariance @ row
     k = seen / (row @ seen + variance)
     return k, covariance - np.outer(k, seen)
 
 
 def with_tags(axis: Model, sensors: SensorSpec, seconds: float) -> np.ndarray:
-    """(11, 11) covariance after so long with every picture."""
+    """(11, 11) covariance after `seconds` with every picture."""
     covariance = np.diag(axis.start)
     tags = [(PLACE, sensors.tag_sigma_m**2), (TILT, math.radians(sensors.tag_sigma_deg) ** 2)]
     pictures = 0
@@ -115,7 +118,7 @@ def with_tags(axis: Model, sensors: SensorSpec, seconds: float) -> np.ndarray:
 
 
 def without_tags(axis: Model, covariance: np.ndarray, seconds: float) -> tuple[list[list[np.ndarray]], np.ndarray]:
-    """Kalman's gains, (11,) each, of every tick's accelerometer and gyro, and the covariance (11, 11) after so long with these alone."""
+    """Kalman gains, (11,) each, of accelerometer and gyro in every tick, and the covariance (11, 11) after `seconds` with these alone."""
     gains: list[list[np.ndarray]] = []
     for _ in range(round(seconds / PERIOD_S)):
         covariance = axis.step @ covariance @ axis.step.T + np.diag(axis.noise)
@@ -127,10 +130,10 @@ def without_tags(axis: Model, covariance: np.ndarray, seconds: float) -> tuple[l
 
 
 def largest_errors(axis: Model, covariance: np.ndarray, seconds: float) -> np.ndarray:
-    """(HOVERS,) the largest horizontal error of each in so long without tags, m: what the filter errs, drawn by its own statistics.
+    """(HOVERS,) largest horizontal error of each hover over `seconds` without tags, m: the filter's error, sampled from its own statistics.
 
     Args:
-        covariance: (11, 11) when the last tag came, of each of both axes.
+        covariance: (11, 11) at the last tag, for each of the two axes.
     """
     rng = np.random.default_rng(0)
     errors = rng.multivariate_normal(np.zeros(STATES), covariance, (2, HOVERS), method="eigh")
@@ -145,7 +148,7 @@ def largest_errors(axis: Model, covariance: np.ndarray, seconds: float) -> np.nd
 
 
 def floor(imu: Imu | None = None, unforeseen_n_m: float = UNFORESEEN_N_M) -> tuple[float, float]:
-    """Median and 95 % of the largest horizontal error in the blind part of the scenario `hover-blind`, m; with another IMU where given."""
+    """Median and 95 % quantile of the largest horizontal error in the blind part of the scenario `hover-blind`, m; with `imu` if given."""
     scenario = load_scenario("hover-blind")
     sensors = scenario.sensors if imu is None else SensorSpec(**imu._asdict())
     axis = model(scenario.world, sensors, load_vehicle(scenario.module[0].vehicle), unforeseen_n_m)

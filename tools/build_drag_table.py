@@ -46,13 +46,13 @@ FLOWS = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 1
 """The paper's seven flow directions."""
 
 SPEED_M_S = 1.0
-"""The paper's CFD runs at 1 m/s."""
+"""Speed of the paper's CFD runs."""
 
 SMALLEST_MOMENT_NM = 5e-4
-"""Moments below it are not printed."""
+"""Moments below this are not printed."""
 
 WIDTH = 100
-"""Characters of a table that does not go to a terminal."""
+"""Characters per line of a table that does not go to a terminal."""
 
 RANDOM_SEED = 0
 METHODS = {
@@ -64,7 +64,7 @@ app = typer.Typer(add_completion=False)
 
 
 def parse_cells(text: str) -> list[Cell]:
-    """Cells out of "0,0,0 1,0,0". Raises DescriptionError."""
+    """Parses cells such as "0,0,0 1,0,0". Raises DescriptionError."""
     try:
         return cells_in(text)
     except ValueError:
@@ -73,7 +73,7 @@ def parse_cells(text: str) -> list[Cell]:
 
 
 def shapes_of(text: str) -> dict[str, list[Cell]]:
-    """The shape that was asked for, or the paper's. Raises DescriptionError."""
+    """The requested shape, or the paper's shapes if `text` is empty. Raises DescriptionError."""
     if not text:
         return PAPER_SHAPES
     cells = parse_cells(text)
@@ -81,7 +81,7 @@ def shapes_of(text: str) -> dict[str, list[Cell]]:
 
 
 def check_docks(vehicle: Vehicle, shapes: dict[str, list[Cell]]) -> None:
-    """Raises DescriptionError where the modules of a shape, all upright, cannot be docked so."""
+    """Raises DescriptionError where the modules of a shape, all upright, cannot be docked."""
     for shape, cells in shapes.items():
         try:
             check_joints([Placement(vehicle, cell, 0) for cell in cells], range(len(cells)), PITCH_M)
@@ -90,7 +90,7 @@ def check_docks(vehicle: Vehicle, shapes: dict[str, list[Cell]]) -> None:
 
 
 def table_of(vehicle: Vehicle, cells: Sequence[Cell], mode: str, cache: DragCache | None) -> DragTable:
-    """The drag table of modules that all sit upright, about their centre of mass."""
+    """Drag table of upright modules, about their centre of mass."""
     body = assemble(cells, [0] * len(cells), [vehicle] * len(cells))
     placements = [Placement(vehicle, c, 0) for c in cells]
     centre = PITCH_M * np.array(cells[0]) - body.r_bm[0]
@@ -98,7 +98,7 @@ def table_of(vehicle: Vehicle, cells: Sequence[Cell], mode: str, cache: DragCach
 
 
 def force_at(table: DragTable, flow: Sequence[float]) -> tuple[float, float]:
-    """Size of force, N, and of moment, N m, at SPEED_M_S along a flow direction."""
+    """Magnitudes of force, N, and moment, N m, at SPEED_M_S along a flow direction."""
     unit = np.array(flow, dtype=float) / np.linalg.norm(flow)
     nu = np.concatenate([SPEED_M_S * unit, np.zeros(3)])
     wrench = drag_lookup.drag_wrench(table.nodes, table.rotational, table.linear, nu)
@@ -106,7 +106,7 @@ def force_at(table: DragTable, flow: Sequence[float]) -> tuple[float, float]:
 
 
 def print_forces(console: Console, tables: dict[str, dict[str, DragTable]]) -> None:
-    """Force, and moment about the centre of mass, in the seven flow directions."""
+    """Prints force, and moment about the centre of mass, in the seven flow directions."""
     view = Table(title=f"drag at {SPEED_M_S:g} m/s", title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=0)
     for heading in ("shape", "mode", "", *("(" + ",".join(map(str, flow)) + ")" for flow in FLOWS)):
         view.add_column(heading, justify="left" if len(view.columns) < 3 else "right", no_wrap=True)
@@ -120,7 +120,7 @@ def print_forces(console: Console, tables: dict[str, dict[str, DragTable]]) -> N
 
 
 def print_comparison(console: Console, vehicle: Vehicle, shapes: dict[str, list[Cell]], count: int) -> None:
-    """Areas by every mode against the exact ones over `count` directions, and what each takes."""
+    """Prints the projected areas of every mode against the exact ones over `count` directions, and the time each takes."""
     view = Table(title=f"projected area over {count} directions against the exact outline")
     for heading in ("shape", "mode", "mean m^2", "bias %", "rms %", "max %", "time s"):
         view.add_column(heading, justify="left" if heading in ("shape", "mode") else "right")
@@ -140,7 +140,7 @@ def print_comparison(console: Console, vehicle: Vehicle, shapes: dict[str, list[
 
 
 def check_format(path: Path) -> None:
-    """Raises DescriptionError where the ending names no format of pictures: before the minutes of the work."""
+    """Raises DescriptionError where the file ending is not a picture format; called before the minutes of work start."""
     from matplotlib.backend_bases import FigureCanvasBase
 
     known = sorted(FigureCanvasBase.get_supported_filetypes())
@@ -149,7 +149,7 @@ def check_format(path: Path) -> None:
 
 
 def draw(path: Path, tables: dict[str, DragTable]) -> None:
-    """The drag spaces: in each direction of motion, a point at the size of the force. Raises DescriptionError."""
+    """Draws the drag spaces: in each direction of motion, a point at the magnitude of the force. Raises DescriptionError."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -166,10 +166,10 @@ def draw(path: Path, tables: dict[str, DragTable]) -> None:
         surface = np.moveaxis(force[..., None] * d, -1, 0)
         axes.plot_surface(*surface, facecolors=colours, rstride=1, cstride=1, shade=False)
         limit = float(force.max())
-        axes.set(xlim=(-limit, limit), ylim=(limit, -limit), zlim=(limit, -limit))  # FRD: z down, y then the other way
+        axes.set(xlim=(-limit, limit), ylim=(limit, -limit), zlim=(limit, -limit))  # FRD: z down, so y is flipped too
         axes.set(xlabel="x, N", ylabel="y, N", zlabel="z, N")
         axes.set_box_aspect((1, 1, 1), zoom=0.92)  # room for the label of z
-        axes.set_title(f"{name}: {force.min():.1f} to {force.max():.1f} N at {SPEED_M_S:g} m/s", y=1.0)  # left to itself it is cut
+        axes.set_title(f"{name}: {force.min():.1f} to {force.max():.1f} N at {SPEED_M_S:g} m/s", y=1.0)  # the default position is cut off
     try:
         figure.savefig(path, dpi=110, format=path.suffix[1:] or "png")
     except (OSError, ValueError) as error:  # ValueError: no such format

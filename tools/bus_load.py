@@ -1,4 +1,4 @@
-"""How full the CAN buses of a fleet are, computed from the DBC; and that DBC written out for every id of the fleet.
+"""Load of the CAN buses of a fleet, computed from the DBC; can also write that DBC expanded to every id of the fleet.
 
     .venv/bin/python tools/bus_load.py                         1, 2 and 4 modules at 100 Hz, 2 at 200 Hz, 1 at 400 Hz
     .venv/bin/python tools/bus_load.py --fleet FILE            the buses of a fleet file
@@ -25,14 +25,14 @@ from firmware_py.description.fleet import load_fleet
 from firmware_py.description.schema import DescriptionError
 
 USUAL = ((1, 100), (2, 100), (4, 100), (2, 200), (1, 400))
-"""Modules and ticks a second that one bus must carry."""
+"""Modules and ticks per second that one bus must support."""
 
 
 def expanded_dbc(numbers: Sequence[int]) -> str:
-    """The DBC with one message per id that the modules `numbers` and the nodes beside them use, NAME_number.
+    """DBC with one message, NAME_number, per id that the modules `numbers` and the other nodes on their bus use.
 
     Raises:
-        ValueError: a number is not that of a module.
+        ValueError: a number is not a module number.
     """
     if wrong := [number for number in numbers if not 1 <= number <= 29]:
         raise ValueError(f"number {wrong[0]} is not a module's; 1 to 29")
@@ -63,13 +63,13 @@ def line(name: str, modules: int, rate_hz: int, load: BusLoad) -> str:
 
 
 def details(load: BusLoad) -> str:
-    """What each message takes."""
+    """One line per message: its length, rate and share of the bus."""
     rows = sorted(load.messages, key=lambda m: -m.share)
     return "\n".join(f"  {m.name:20s} {m.bits:4d} bits {m.frames_per_s:7.1f} /s {100 * m.share:6.2f} %" for m in rows)
 
 
 def cases(fleet_file: Path | None, rate_hz: int | None) -> list[tuple[str, list[int], int]]:
-    """(name, module numbers, rate) of each bus to look at. Raises DescriptionError."""
+    """(name, module numbers, rate) of each bus to examine. Raises DescriptionError."""
     if fleet_file is None:
         usual = USUAL if rate_hz is None else [(modules, rate_hz) for modules in (1, 2, 4)]
         return [("", list(range(1, n + 1)), rate) for n, rate in usual]
@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def write_dbcs(folder: Path, looked_at: Sequence[tuple[str, list[int], int]]) -> None:
-    """One expanded DBC per bus, named by its index."""
+    """Writes one expanded DBC per bus, named by its index."""
     folder.mkdir(parents=True, exist_ok=True)
     for index, (_, numbers, _) in enumerate(looked_at):
         path = folder / f"modcube_bus{index}.dbc"

@@ -40,19 +40,19 @@ ENDINGS = ("json", "csv", "png", "html")
 MODULE_PRICE_USD = 800.0
 """The paper's price of one module."""
 NOT_PRINTED = ("assumption", f"max_inscribed_ellipsoid_volume[{table.TABLE_NORMALISATION}]")
-"""Metrics that the printed table leaves out: a note says the first, another row the second."""
+"""Metrics left out of the printed table: a note states the first, another row shows the second."""
 WIDTH = 170
-"""Characters of a table that does not go to a terminal."""
+"""Characters per line of a table that does not go to a terminal."""
 MODULE = "modcube"
-"""What an assembly is made of, where --module does not say."""
+"""Vehicle of every module of an assembly, unless --module names another."""
 LARGEST_BOX = 64
-"""Modules of an assembly."""
+"""Largest number of modules in an assembly."""
 LEAST_DIRECTIONS, MOST_DIRECTIONS = 121, 100_000
-"""Harmonics of degree ten have 121 coefficients."""
+"""Limits of --directions: harmonics of degree ten have 121 coefficients."""
 
 
 def main() -> int:
-    """The command line."""
+    """Runs the tool; returns its exit status."""
     given = arguments()
     try:
         with folder_for_results(given.out):
@@ -63,7 +63,7 @@ def main() -> int:
 
 
 def arguments() -> argparse.Namespace:
-    """What is asked for."""
+    """Parses and checks the command line."""
     assert __doc__ is not None
     parser = Parser(description=__doc__)
     parser.add_argument("vehicle", nargs="*", help="vehicle names or .toml files")
@@ -94,7 +94,7 @@ def arguments() -> argparse.Namespace:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Does what is asked for. Raises DescriptionError."""
+    """Runs the requested characterisation. Raises DescriptionError."""
     if given.out:
         stem = "choice" if given.choose is not None else "table1" if given.table1 else "capability"
         key = "rank_by" if given.choose is not None else "vehicles"
@@ -121,7 +121,7 @@ def _console(error: bool = False) -> Console:
 
 
 def _assemblies(shape: str, module: Vehicle) -> list[Layout]:
-    """The layouts that an --assembly names. Raises DescriptionError."""
+    """Layouts named by --assembly. Raises DescriptionError."""
     if shape.endswith(".toml"):
         return _fleet(Path(shape))
     cells = _cells(shape)
@@ -129,7 +129,7 @@ def _assemblies(shape: str, module: Vehicle) -> list[Layout]:
 
 
 def _by_name(layouts: Sequence[Layout]) -> dict[str, Layout]:
-    """The columns. Raises DescriptionError where two would be one."""
+    """Layouts by name, the columns of the table. Raises DescriptionError where two have the same name."""
     names = [layout.name for layout in layouts]
     if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
         raise DescriptionError(f"{names.count(twice[0])} vehicles have the name {twice[0]!r}; give each file another `name`")
@@ -144,7 +144,7 @@ def _fleet(path: Path) -> list[Layout]:
 
 
 def _cells(shape: str) -> list[tuple[int, int, int]]:
-    """Cells of `2x2x1` or of `0,0,0 1,0,0`."""
+    """Parses cells from `2x2x1` or `0,0,0 1,0,0`."""
     try:
         if "," in shape:
             found = cells_in(shape)
@@ -161,7 +161,7 @@ def _cells(shape: str) -> list[tuple[int, int, int]]:
 
 
 def _all(layouts: dict[str, Layout], settings: dict[str, Any], jobs: int) -> dict[str, Capability]:
-    """Every layout characterised, with progress; in `jobs` processes where there are several."""
+    """Characterises every layout, with progress; in `jobs` processes where there are several layouts."""
     work: Callable[..., Capability] = partial(characterise, **settings)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     console = _console(error=True)
@@ -192,7 +192,7 @@ def _describe(bar: Progress, mark: Any, name: str, text: str) -> None:
 
 
 def _print(found: dict[str, Capability]) -> None:
-    """One column a vehicle."""
+    """Prints the table, one column per vehicle."""
     console = _console()
     shown = Table(title="What the body can do", title_justify="left")
     shown.add_column("figure")
@@ -227,7 +227,7 @@ def _write(
     titles: dict[str, str],
     html: str = "",
 ) -> None:
-    """CSV, JSON, PNG and HTML into `out`."""
+    """Writes CSV, JSON, PNG and HTML into `out`."""
     from characterise_draw import draw  # matplotlib takes a second to import
     from characterise_report import write_report
 
@@ -245,7 +245,7 @@ def _write(
 
 
 def _table1(settings: dict[str, Any], jobs: int, out: Path | None) -> None:
-    """The paper's seven robots, and beside them the authors' own files and the paper's text."""
+    """Prints the paper's seven robots, and beside them those from the authors' own files and from the paper's text."""
     from characterise_table1 import build_rows, show
 
     robots = tomllib.loads((DATA / "robots.toml").read_text(encoding="utf-8"))

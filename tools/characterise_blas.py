@@ -1,4 +1,4 @@
-"""One thread in linear algebra, set before numpy is loaded: the matrices are small, two processes share two cores."""
+"""Limits linear algebra to one thread, before numpy is loaded: the matrices are small, and two processes share two cores."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""`--choose N --task FILE` of characterise.py: all shapes of N modules for a task, best first."""
+"""`--choose N --task FILE` of characterise.py: ranks all shapes of N modules for a task, best first."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _COLUMNS = (
 
 
 def choose(count: int, path: Path, out: Path | None, console: Console, progress: Console) -> None:
-    """Print the ranking; with `out` also choice.csv and choice.json. Raises DescriptionError."""
+    """Prints the ranking; with `out` also writes choice.csv and choice.json. Raises DescriptionError."""
     task = load_task(path)
     vehicle = load_vehicle(task.vehicle, None if not task.vehicle.endswith(".toml") else path.parent)
     cache = DragCache(default_folder(os.environ, Path.home()))
@@ -81,7 +81,7 @@ def _row(place: int, choice: Choice) -> dict[str, Any]:
 
 
 def cells_text(cells: Cells) -> str:
-    """Cells as --assembly takes them."""
+    """Cells in the notation of --assembly."""
     return " ".join(",".join(str(c) for c in cell) for cell in cells)
 
 

@@ -1,4 +1,4 @@
-"""The capability figure: power and wrench surfaces in both frames, inscribed ellipsoids, each thruster's forces."""
+"""The capability figure: power and wrench surfaces in both frames, inscribed ellipsoids, and the forces of each thruster."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _CELL_INCHES = (2.9, 2.9)
 _VIOLIN_INCHES = 1.9
 _LINE_INCHES, _LETTERS_PER_INCH = 0.125, 19.0
 _MOST_MARKED = 16
-"""Thrusters up to which every one has its number on the axis."""
+"""Largest number of thrusters for which every one is numbered on the axis."""
 
 
 def draw(path: Path, found: Mapping[str, Capability], titles: Mapping[str, str]) -> None:
-    """One column a vehicle, one row a space; all panels of a row share one scale. Written to `path` (PNG)."""
+    """Draws one column per vehicle and one row per space, all panels of a row on one scale, to `path` (PNG)."""
     shown = {name: pictures(result) for name, result in found.items()}
     count = len(found)
     height = len(SPACES) * _CELL_INCHES[1] + 2 * _VIOLIN_INCHES + 1.0
@@ -84,7 +84,7 @@ def _solid(axes: Any, picture: Picture, limit: float) -> None:
             axes.add_collection3d(
                 Poly3DCollection(polygons, facecolor=to_rgba(face, alpha), edgecolor=edge, linewidth=line)
             )
-    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), zlim=(limit, -limit))  # FRD: z down, y then the other way
+    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), zlim=(limit, -limit))  # FRD: z down, so y is flipped too
     axes.set_box_aspect((1, 1, 1))
     for axis, component in zip((axes.xaxis, axes.yaxis, axes.zaxis), FRAMES[picture.frame], strict=True):
         axis.set_ticks([-_tick(limit), 0.0, _tick(limit)])
@@ -95,7 +95,7 @@ def _solid(axes: Any, picture: Picture, limit: float) -> None:
 
 
 def _tick(limit: float) -> float:
-    """A round number of at most nine tenths of the limit."""
+    """A round number of at most 0.9 times the limit."""
     power = 10.0 ** np.floor(np.log10(0.9 * limit))
     return float(power * max(step for step in (1, 2, 5) if step * power <= 0.9 * limit))
 
@@ -127,7 +127,7 @@ def _violins(figure: Any, grid: Any, row: int, frame: str, found: Mapping[str, C
 
 
 def _legend(figure: Any, height: float, drawn: Sequence[Picture]) -> None:
-    """Of the colours that there are."""
+    """Legend of the colours in use."""
     entries = (
         (_SURFACE["power"], "power above idle", any(picture.space == "power" for picture in drawn)),
         (_SURFACE["wrench"], "reachable wrench, 8 N of thrust in all", any(p.space == "wrench" and not p.declared for p in drawn)),

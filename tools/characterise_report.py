@@ -1,4 +1,4 @@
-"""report.html of characterise.py: one file without links, every surface to be turned around with the mouse."""
+"""report.html of characterise.py: one self-contained file in which every surface can be turned with the mouse."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _DIGITS = 4
 
 
 def write_report(path: Path, found: Mapping[str, Capability], titles: Mapping[str, str], tables: str = "") -> None:
-    """Write the page.
+    """Writes the page.
 
     Args:
         found: by vehicle; `titles` by the same names.
-        tables: HTML that comes after the surfaces.
+        tables: HTML that follows the surfaces.
     """
     template = Path(__file__).with_name("characterise_report.html").read_text(encoding="utf-8")
     rows = []

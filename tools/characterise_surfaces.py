@@ -1,4 +1,4 @@
-"""What is drawn of each space of one vehicle: polygons, the inscribed ellipsoid's and a caption. For PNG and HTML."""
+"""Drawing data for each space of one vehicle, for PNG and HTML: polygons of the surface and of the inscribed ellipsoid, and a caption."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from firmware_py.prepare.capability.wrench import embed
 
 SPACES = (("power", "force"), ("power", "torque"), ("wrench", "force"), ("wrench", "torque"))
 NORMALISATION = "equal_total_thrust"
-"""Drawn, so that vehicles of any size can be seen on one scale."""
+"""Normalisation of the drawn wrench spaces: shows vehicles of any size on one scale."""
 FLAT = 1e-6
-"""Share of the other frame's extent below which a space is what rounding left of none."""
+"""Share of the other frame's extent up to which a space counts as degenerate: nothing but rounding errors."""
 _POLAR, _AZIMUTH, _ELLIPSOID = 33, 65, (13, 25)
 _TURN = 120
 
@@ -32,9 +32,9 @@ class Picture:
         unit: of the coordinates.
         title: of the row.
         caption: for people.
-        polygons: (k, 3) corners in order, of a closed surface or of one flat piece; none where nothing can be reached.
+        polygons: (k, 3) corners in order, of a closed surface or of one flat piece; empty where nothing can be reached.
         ellipsoid: likewise.
-        declared: the passive degree of freedom is declared.
+        declared: whether the passive degree of freedom is declared.
         limit: largest coordinate, for a common scale; 0: degenerate, nothing can be drawn.
     """
 
@@ -94,7 +94,7 @@ def _wrench(result: Capability, frame: str) -> Picture:
 
 
 def _outline(reach: Reach) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Facets, or the border where two components are left, and the ellipsoid's, in all three axes of the frame."""
+    """Facets, or the border where two components are left, and those of the ellipsoid, in all three axes of the frame."""
     assert reach.section is not None and reach.ellipsoid is not None
     shape, centre = reach.ellipsoid.shape, reach.ellipsoid.centre
     polygons = reach.section.polygons()

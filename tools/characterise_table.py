@@ -1,4 +1,4 @@
-"""Tables of characterise.py: rows as in the paper's Table I, a word on each cell, CSV and JSON."""
+"""Tables of characterise.py: the rows of the paper's Table I, a verdict on each cell, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ DEGENERATE = "degenerate"
 AGREES, DIFFERS, INCONSISTENT, NOTHING = "agrees", "differs by definition", "inconsistent in the paper", "none of ours"
 
 CLOSE = 0.10
-"""Relative difference up to which a cell agrees: the paper gives its own layouts to about 5 %."""
+"""Relative difference up to which a cell agrees: the paper states its own layouts to about 5 %."""
 
 TABLE_NORMALISATION = "unit_thrust"
-"""The rows that stand beside the paper's: it says that power is normalised, and not how."""
+"""Normalisation of the rows compared with the paper's: the paper says that power is normalised, but not how."""
 
 Cell = float | str
 
@@ -73,7 +73,7 @@ LABELS = {
     "depth_m": ("depth rating", "m"),
     "size_cm": ("size", "cm"),
 }
-"""Each metric in words, and its unit; {} stands for W in power spaces, else for the unit of the frame."""
+"""Label and unit of each metric; {} stands for W in power spaces, otherwise for the unit of the frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +88,12 @@ class Row:
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """What names the row in table1.csv."""
+        """Key of the row in table1.csv."""
         return self.space, self.frame, self.metric
 
     @property
     def label(self) -> str:
-        """The metric in words, with its unit."""
+        """Label of the metric, with its unit."""
         words, unit = LABELS[self.metric]
         if self.space == "wrench" and "energy" in self.metric:
             words = f"{words}, unit thrust"
@@ -103,7 +103,7 @@ class Row:
 
 
 def rows_of(found: Mapping[str, Capability]) -> list[Row]:
-    """Rows of table1.csv in its order, then ours: normalisations, passive degrees of freedom declared, quality."""
+    """Rows of table1.csv in its order, then rows of our own: normalisations, passive degrees of freedom declared, quality."""
     rows: list[Row] = []
     for frame in FRAMES:
         power = {name: (c.power[frame], c.power_shape[frame]) for name, c in found.items()}
@@ -179,7 +179,7 @@ def _clean(value: float) -> float:
 
 
 def read_paper(path: Path) -> dict[tuple[str, str, str], dict[str, float]]:
-    """The paper's figures by row key and column."""
+    """Reads the paper's figures, by row key and column."""
     with path.open(newline="", encoding="utf-8") as file:
         return {
             (line["space"], line["frame"], line["metric"]): {
@@ -190,11 +190,11 @@ def read_paper(path: Path) -> dict[tuple[str, str, str], dict[str, float]]:
 
 
 def word(row: Row, column: str, paper: Mapping[str, float], columns: Sequence[str]) -> str:
-    """What is to be said of one cell beside the paper's."""
+    """Verdict on one cell beside the paper's."""
     ours, theirs = row.cells[column], paper[column]
     metric = row.metric
     if metric == "price_usd" and column == "bluerov2" and paper[column] > paper["bluerov2_heavy"]:
-        return INCONSISTENT  # dearer than itself with two thrusters more
+        return INCONSISTENT  # costs more than the heavy variant, which has two more thrusters
     if metric in ("price_usd", "depth_m"):
         if not isinstance(ours, float):
             return NOTHING
@@ -216,12 +216,12 @@ def _near(ours: float, theirs: float) -> bool:
 
 
 def size_word(ours: Sequence[float], theirs: Sequence[float]) -> str:
-    """What is to be said of a size, cm."""
+    """Verdict on a size, cm."""
     return AGREES if np.allclose(ours, theirs, rtol=CLOSE) else INCONSISTENT
 
 
 def spearman(ours: Mapping[str, Cell], paper: Mapping[str, float]) -> tuple[float, int]:
-    """Rank correlation of ours with the paper's, and over how many columns; degenerate and refused cells left out."""
+    """Rank correlation of our cells with the paper's, and the number of columns compared, without degenerate and refused cells."""
     pairs = [(v, paper[n]) for n, v in ours.items() if n in paper and isinstance(v, float) and math.isfinite(v)]
     if len(pairs) < 3:
         return math.nan, len(pairs)
@@ -232,13 +232,13 @@ def spearman(ours: Mapping[str, Cell], paper: Mapping[str, float]) -> tuple[floa
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:
-    """(n,) ranks, ties sharing their mean; values alike to nine digits are ties."""
+    """(n,) ranks; ties share their mean, and values equal to nine digits are ties."""
     rounded = np.array([float(f"{v:.9g}") for v in values])
     return np.array([np.mean(np.flatnonzero(np.sort(rounded) == v)) for v in rounded])
 
 
 def text(cell: Cell) -> str:
-    """A cell for people."""
+    """Text of a cell for people."""
     if isinstance(cell, str):
         return cell
     if not math.isfinite(cell):
@@ -247,7 +247,7 @@ def text(cell: Cell) -> str:
 
 
 def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> None:
-    """The columns of table1.csv: space, frame, metric, better, one a vehicle; a degenerate or refused cell says so."""
+    """Writes the columns of table1.csv: space, frame, metric, better, one per vehicle; degenerate or refused cells are written as such."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["space", "frame", "metric", "better", *columns])
@@ -258,6 +258,6 @@ def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> None:
 
 
 def write_json(path: Path, found: Mapping[str, Capability]) -> None:
-    """All figures, units in their names."""
+    """Writes all figures, with units in their names."""
     content = {"vehicles": {name: to_plain(c) for name, c in found.items()}}
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""`--table1` of characterise.py: ours beside the paper's, a word on each cell, rank correlation, thrust variance."""
+"""`--table1` of characterise.py: our figures beside the paper's, a verdict on each cell, rank correlation, thrust variance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SPACES = {"power": "power space", "wrench": "wrench space"}
 
 
 def build_rows(found: Mapping[str, Capability], robots: Mapping[str, Any], module_price: float) -> list[table.Row]:
-    """The rows of table1.csv first, price and depth among them, then size and ours."""
+    """Rows of table1.csv first, including price and depth, then size and our own rows."""
     rows = table.rows_of(found)
     paper_rows = 7 * len(FRAMES)
     everyone = (*robots["robot"], *robots["beside"])
@@ -42,7 +42,7 @@ def build_rows(found: Mapping[str, Capability], robots: Mapping[str, Any], modul
 
 
 def _size_cm(robot: Mapping[str, Any]) -> np.ndarray:
-    """(3,) outer edges, largest first, as the paper writes them."""
+    """(3,) outer edges, largest first as in the paper."""
     cells = np.array(robot["cells"])
     edges = load_vehicle(robot["vehicle"]).hull.size_m + PITCH_M * (cells.max(axis=0) - cells.min(axis=0))
     return 100.0 * (np.sort(edges)[::-1] if len(cells) > 1 else edges)
@@ -59,7 +59,7 @@ def show(
     robots: Mapping[str, Any],
     found: Mapping[str, Capability],
 ) -> None:
-    """Everything that `--table1` says."""
+    """Prints everything that `--table1` shows."""
     columns = [robot["column"] for robot in robots["robot"]]
     shown = Table(title="Table I: ours / the paper's / a word", title_justify="left", show_lines=True)
     shown.add_column("row")
@@ -103,7 +103,7 @@ def _size_cell(robot: Mapping[str, Any]) -> str:
 
 
 def _further(console: Console, robots: Mapping[str, Any], found: Mapping[str, Capability]) -> None:
-    """Ours alone, one robot a line: all normalisations, passive degrees of freedom declared, worst direction."""
+    """Prints our own figures, one robot per line: all normalisations, passive degrees of freedom declared, worst direction."""
     for frame, unit in UNITS.items():
         volume = f"ellipsoid\n({unit})^3" if " " in unit else f"ellipsoid\n{unit}^3"
         shown = Table(title=f"Ours, {frame} frame: volume of the inscribed ellipsoid, and energies", title_justify="left")
@@ -146,7 +146,7 @@ def _volume(reach: Reach, frame: str = "") -> str:
 def _variance(
     console: Console, found: Mapping[str, Capability], paper: Mapping[tuple[str, str, str], Mapping[str, float]]
 ) -> None:
-    """Thrust variance over one, two and four modules, as ratios to four."""
+    """Prints the thrust variance of one, two and four modules, as ratios to that of four."""
     for frame in FRAMES:
         theirs = paper["power", frame, "thrust_variance"]
         trios = {

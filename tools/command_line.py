@@ -1,6 +1,6 @@
-"""For the tools: how a command line ends: what is wrong in one line, and Ctrl-C without a word.
+"""For the tools: how a command line ends: errors in one line, Ctrl-C silently.
 
-A tool imports this before all that takes long to import: from here on Ctrl-C ends it without a word.
+A tool imports this module before anything that is slow to import: from then on Ctrl-C ends it silently.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from types import FrameType
 from typing import Any, NoReturn
 
 REASONS = {errno.EEXIST: "is a file; a folder is needed"}
-"""In place of the system's words, where these do not say what would be right."""
+"""Replacements for system error messages that do not say what is needed."""
 INTERRUPTED = 130
-"""Exit status after Ctrl-C: 128 and SIGINT, as a shell has it."""
+"""Exit status after Ctrl-C: 128 + SIGINT, as in a shell."""
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one line; exit status 2. Its description is shown as it is written."""
+    """Reports wrong arguments in one line with exit status 2. Shows its description as written."""
 
     def __init__(self, **how: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **how)
@@ -32,7 +32,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def refuse(tool: str, error: Exception) -> int:
-    """Says what is wrong, in one line; of a file that the system refuses, its name first. The exit status of a tool that cannot run."""
+    """Prints an error in one line, for a system error the file name first. Returns the exit status of a tool that cannot run."""
     words = str(error)
     if isinstance(error, OSError) and error.filename is not None:
         words = f"{error.filename}: {REASONS.get(error.errno or 0, error.strerror)}"
@@ -41,12 +41,12 @@ def refuse(tool: str, error: Exception) -> int:
 
 
 def _end_at_once(number: int, frame: FrameType | None) -> NoReturn:
-    """Of a tool that is still being imported: it leaves nothing behind, and an exception would be lost in some of what it imports."""
+    """Handles SIGINT during a tool's imports: nothing needs cleaning up, and some imported packages would swallow an exception."""
     os._exit(INTERRUPTED)
 
 
 def _is_tool(program: object) -> bool:
-    """Whether the program that runs is a tool: not a test that imports one, and none of the processes that a tool starts."""
+    """Whether the running program is a tool, not a test that imports one or a process that a tool started."""
     return Path(getattr(program, "__file__", None) or "/").resolve().parent == Path(__file__).resolve().parent
 
 
@@ -55,7 +55,7 @@ if _is_tool(sys.modules["__main__"]) and signal.getsignal(signal.SIGINT) is sign
 
 
 def run_tool(main: Callable[[], int | None]) -> NoReturn:
-    """Ends with what the tool's `main` returns; Ctrl-C ends it in silence."""
+    """Exits with the status that the tool's `main` returns; Ctrl-C ends it silently."""
     if signal.getsignal(signal.SIGINT) is _end_at_once:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -1,4 +1,4 @@
-"""Draws docs/supervisor.md from the tables of the supervisor, so that the drawing cannot differ from what runs.
+"""Draws docs/supervisor.md from the supervisor's tables, so that the drawing always matches the code.
 
     .venv/bin/python tools/draw_supervisor.py            writes docs/supervisor.md
     .venv/bin/python tools/draw_supervisor.py --check    exits 1 when it is not up to date
@@ -38,7 +38,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def words(name: str) -> str:
-    """An enum member's name for people."""
+    """Readable form of an enum member's name."""
     return name.lower().replace("_", " ")
 
 
@@ -53,7 +53,7 @@ def diagram() -> list[str]:
 
 
 def transitions() -> list[str]:
-    """Every row of the table."""
+    """Table of all transitions."""
     rows = [
         (
             row.state.name,
@@ -69,7 +69,7 @@ def transitions() -> list[str]:
 
 
 def modes() -> list[str]:
-    """What each mode needs."""
+    """Table of what each mode needs."""
     rows = [
         (row.mode.name, str(int(row.mode)), ", ".join(words(n.name) for n in sorted(row.needs)), "yes" if row.by_pilot else "")
         for row in MODE_TABLE
@@ -78,12 +78,12 @@ def modes() -> list[str]:
 
 
 def arming() -> list[str]:
-    """The arming checks."""
+    """Table of the arming checks."""
     return table(("check", "forced arming"), [(c.name, "skips it" if c.may_be_skipped else "checks it") for c in CHECKS])
 
 
 def counts_in(row: Row) -> str:
-    """Modes in which a fail-safe counts."""
+    """Modes in which a fail-safe is active."""
     if row.modes == ANY:
         return "always"
     if len(row.modes) > len(Mode) // 2:
@@ -93,7 +93,7 @@ def counts_in(row: Row) -> str:
 
 
 def failsafes() -> list[str]:
-    """The fail-safes with their default parameters."""
+    """Table of the fail-safes with their default parameters."""
     parameters = Parameters().failsafes
     rows = []
     for row in TABLE:
@@ -107,7 +107,7 @@ def failsafes() -> list[str]:
 
 
 def permitted() -> list[str]:
-    """What may be entered while a cause lasts, and what each action tries."""
+    """Table of the modes that may be entered while a cause lasts, and of what each action tries."""
     rows = []
     for level in Level:
         allowed = PERMITTED[level]

@@ -1,11 +1,11 @@
-"""Fit the paper's fifth-order polynomials to a thruster's load-cell measurement, rising all the way as the vehicle file asks.
+"""Fit the paper's fifth-order polynomials to a thruster's load-cell measurement, monotonic throughout as the vehicle file requires.
 
     .venv/bin/python tools/fit_thruster.py bench.csv --voltage 12 --out curve.toml
 
-The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w, above 0 wherever it pushes. Force is brought
-to one voltage by its square, power by its cube. Power measured at the command nearest zero, where nothing pushes, is the electronics',
-which a vehicle file counts apart (idle_w): it is taken off first. Written are the fields of a vehicle file's [curve], for it or
-for --curve of tools/identify.py; what was not measured (power, lag, speed) is --vehicle's.
+The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w, above 0 wherever the thruster pushes. Force is
+scaled to one voltage by its square, power by its cube. Power measured at the command nearest zero, where nothing pushes, is that of the
+electronics, which a vehicle file counts separately (idle_w), and is subtracted first. The output is the fields of a vehicle file's [curve],
+for that file or for --curve of tools/identify.py; what was not measured (power, lag, speed) comes from --vehicle.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
 DEGREE = 5
 LEAST_SLOPE = 1e-3
-"""Share of its mean slope: no curve stands still."""
+"""Least slope, as a share of the mean slope: no curve is flat anywhere."""
 LEAST_POINTS = 6
-"""On either side, beyond the deadband."""
+"""Required on either side, beyond the deadband."""
 COLUMNS = ("command", "force_n")
 OPTIONAL = ("voltage_v", "power_w")
 MOST = 1e6
-"""Of any number that is read; W and N beyond it no thruster has."""
+"""Largest magnitude of any number read; no thruster reaches it in W or N."""
 VOLTAGE = limits_of(ThrusterCurve, "voltage_v")
 
 
 def rising_polynomial(x: np.ndarray, y: np.ndarray, end: float, least: float) -> np.ndarray:
-    """(5,) c of c[0] x + ... + c[4] x^5, the least-squares fit to (k,) points that rises all over 0..end, by no less than `least` / end.
+    """(5,) coefficients c of c[0] x + ... + c[4] x^5: the least-squares fit to (k,) points whose slope is at least `least` / end on 0..end.
 
-    Its slope is a sum of Bernstein polynomials of degree 4 with coefficients above zero, found by non-negative least squares
-    (Lawson and Hanson 1974); a slope that needs a negative coefficient though it never falls is approximated.
+    The slope is a sum of Bernstein polynomials of degree 4 with positive coefficients, found by non-negative least squares (Lawson and
+    Hanson 1974); a non-negative slope that would need a negative coefficient is approximated.
     """
     basis = np.zeros((DEGREE, DEGREE))
     for i in range(DEGREE):  # slope binom(4, i) t^i (1-t)^(4-i), t = x / end, integrated
@@ -54,7 +54,7 @@ def rising_polynomial(x: np.ndarray, y: np.ndarray, end: float, least: float) ->
 
 
 def read_points(path: Path) -> dict[str, np.ndarray]:
-    """The columns of the CSV. Raises DescriptionError and OSError."""
+    """Reads the columns of the CSV. Raises DescriptionError and OSError."""
     rows = _rows(path)
     points = {}
     for name in (*COLUMNS, *OPTIONAL):
@@ -68,7 +68,7 @@ def read_points(path: Path) -> dict[str, np.ndarray]:
 
 
 def _rows(path: Path) -> list[dict[str, str | None]]:
-    """At least one; every one has COLUMNS."""
+    """Reads the rows: at least one, each with COLUMNS."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
@@ -90,11 +90,11 @@ def _rows(path: Path) -> list[dict[str, str | None]]:
 
 
 def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: float, zero_n: float) -> tuple[ThrusterCurve, float]:
-    """The curve, and the root mean square of what is left of the forces beyond the deadband, N. Raises DescriptionError.
+    """The curve, and the RMS residual of the forces beyond the deadband, N. Raises DescriptionError.
 
     Args:
-        points: columns of `read_points`. like: what was not measured. voltage_v: to which force and power are brought.
-        zero_n: size of a force that counts as none.
+        points: columns of `read_points`. like: source of what was not measured. voltage_v: to which force and power are scaled.
+        zero_n: magnitude up to which a force counts as zero.
     """
     if not VOLTAGE.low <= voltage_v <= VOLTAGE.high:
         raise DescriptionError(f"--voltage {voltage_v:g} is out of range; permitted: {describe(VOLTAGE)}")
@@ -129,7 +129,7 @@ def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: flo
 
 
 def idle_power(points: dict[str, np.ndarray], zero_n: float) -> float | None:
-    """The electronics': power at the command nearest zero, W; None where it was not measured or something pushes there."""
+    """Power of the electronics: at the command nearest zero, W; None where it was not measured or the thruster pushes there."""
     size = np.abs(points["command"])
     nearest = size == size.min()
     if "power_w" not in points or np.any(np.abs(points["force_n"][nearest]) > zero_n):
@@ -138,13 +138,13 @@ def idle_power(points: dict[str, np.ndarray], zero_n: float) -> float | None:
 
 
 def _propeller_power(points: dict[str, np.ndarray], works: np.ndarray, voltage_v: float, idle_w: float, side: str) -> np.ndarray:
-    """Power above idle at the points that push, brought to `voltage_v`, W. Raises DescriptionError."""
+    """Power above idle at the points that push, scaled to `voltage_v`, W. Raises DescriptionError."""
     power = points["power_w"][works]
     if np.any(power <= 0.0):
         raise DescriptionError(f"{side}: power_w {power.min():g} with a force; it must be above 0 wherever the thruster pushes")
     if power.max() <= idle_w:
         raise DescriptionError(f"{side}: power_w {power.max():g} at the most is not above the {idle_w:g} at zero command")
-    # At one command the speed goes with the voltage, force with the speed's square, power with its cube.
+    # At a given command, speed is proportional to voltage, force to the square of the speed, power to its cube.
     return np.asarray((power - idle_w) * ((voltage_v / points["voltage_v"][works]) ** 3 if "voltage_v" in points else 1.0))
 
 
@@ -159,14 +159,14 @@ def _number(text: str | None, path: Path, line: int) -> float:
 
 
 def checked_toml(curve: ThrusterCurve, out: Path) -> str:
-    """The TOML text of the curve for `out`, as a vehicle file takes it. Raises DescriptionError."""
+    """TOML text of the curve, checked against the rules of a vehicle file; `out` is named in errors. Raises DescriptionError."""
     text = to_toml(curve)
     build(ThrusterCurve, tomllib.loads(text), Source(f"{out} (not written)", text))
     return text
 
 
 def check_out(path: Path) -> None:
-    """Raises DescriptionError where no curve can go to `path`, or something else than one is there."""
+    """Raises DescriptionError where no file can be written at `path`, or where it holds something other than a curve."""
     make_room(path)
     if path.exists() and path.stat().st_size:
         try:
@@ -177,7 +177,7 @@ def check_out(path: Path) -> None:
 
 
 def main() -> int:
-    """The command line."""
+    """Runs the tool; returns its exit status."""
     parser = Parser(description=__doc__)
     parser.add_argument("csv", type=Path, help="the measurement")
     parser.add_argument("--voltage", type=float, help="V of the curve; else the vehicle's")

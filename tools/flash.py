@@ -1,7 +1,7 @@
-"""Puts this checkout's release on a vehicle, over OpenSSH.
+"""Installs this checkout's release on a vehicle, over OpenSSH.
 
-Builds the wheel, ships it with its locked dependencies, installs it into a release folder of its own, switches the
-service to it, waits for its health report, and goes back to the release before when there is none.
+Builds the wheel, ships it with its locked dependencies, installs it into a release folder of its own, switches the service to it, waits for
+its health report, and rolls back to the previous release when there is none.
 
     .venv/bin/python tools/flash.py USER@HOST              flash
     .venv/bin/python tools/flash.py USER@HOST --dry-run    check everything, change nothing
@@ -10,7 +10,7 @@ service to it, waits for its health report, and goes back to the release before 
     .venv/bin/python tools/flash.py USER@HOST --rollback   back to the release before
     .venv/bin/python tools/flash.py USER@HOST --armed      also while it is armed: the service is stopped in flight
 
-Exit status: 0 done, 1 switched in vain (the old release runs again) or out of sight, 2 cannot run (nothing was changed).
+Exit status: 0 done, 1 switch failed (the old release runs again) or connection lost meanwhile, 2 cannot run (nothing was changed).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from flash_payload import Payload, PayloadError, make_payload
 from flash_ssh import LostError, UntouchedError, Vehicle, VehicleError
 
 UNPACKED = 4.0
-"""Bytes on the vehicle's disk per byte of wheel, compiled code included (3.3 measured)."""
+"""Bytes on the vehicle's disk per byte of wheel, including compiled code (3.3 measured)."""
 MACHINES = ("aarch64", "x86_64")
 PROBE = """
 echo machine=$(uname -m)
@@ -51,7 +51,7 @@ true
 
 
 class Target(NamedTuple):
-    """What was found out about a vehicle."""
+    """Properties of a vehicle, as found by `inspect`."""
 
     machine: str
     python: str
@@ -60,11 +60,11 @@ class Target(NamedTuple):
 
 
 class FlashError(Exception):
-    """The vehicle cannot take the release; one line. Nothing was changed."""
+    """The vehicle cannot take the release, with a one-line message. Nothing was changed."""
 
 
 def inspect(vehicle: Vehicle, pythons: str) -> Target:
-    """Looks at a vehicle without changing it. Raises VehicleError and FlashError."""
+    """Examines a vehicle without changing it. Raises VehicleError and FlashError."""
     text = vehicle.shell(PROBE.format(pythons=pythons, root=quote(vehicle.root)))
     found = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
     host = vehicle.host
@@ -86,7 +86,7 @@ def inspect(vehicle: Vehicle, pythons: str) -> Target:
 
 
 def check_room(vehicle: Vehicle, target: Target, payload: Payload) -> None:
-    """Raises FlashError when the disk is too small for a whole new release."""
+    """Raises FlashError when the disk is too small for a whole additional release."""
     needed = round(payload.size_bytes * UNPACKED)
     if target.free_bytes < needed:
         raise FlashError(
@@ -95,7 +95,7 @@ def check_room(vehicle: Vehicle, target: Target, payload: Payload) -> None:
 
 
 def ship(vehicle: Vehicle, target: Target, payload: Payload, armed: bool, say: Callable[[str], None]) -> None:
-    """Sends what is missing there and installs the release beside the one that runs; `armed`: even if it is. Raises VehicleError."""
+    """Sends the missing wheels and installs the release beside the running one; `armed`: even while armed. Raises VehicleError."""
     vehicle.install_tools()
     digests = payload.digests()
     missing = set(vehicle.device("missing", {"wheels": digests, "armed": armed}))
@@ -110,7 +110,7 @@ def ship(vehicle: Vehicle, target: Target, payload: Payload, armed: bool, say: C
 
 
 def progress_of(total: int, say: Callable[[str], None]) -> Callable[[int], None]:
-    """Says every fifth of `total` bytes."""
+    """Returns a callback that reports every fifth of `total` bytes."""
     done = [0]
 
     def progress(size: int) -> None:
@@ -123,7 +123,7 @@ def progress_of(total: int, say: Callable[[str], None]) -> Callable[[int], None]
 
 
 def flash(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[str], None]) -> int:
-    """The whole of it; returns the exit status. Raises VehicleError, PayloadError and FlashError."""
+    """Builds, ships, installs and activates a release; returns the exit status. Raises VehicleError, PayloadError and FlashError."""
     target = inspect(vehicle, given.python)
     say(f"1/4 build for {target.machine}, Python {target.version}")
     payload = make_payload(target.machine, target.version, given.cache, given.offline)
@@ -140,8 +140,8 @@ def flash(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[str], None
 
 
 def switch(vehicle: Vehicle, say: Callable[[str], None], command: str, given: Mapping[str, Any]) -> int:
-    """Has the vehicle activate or roll back; returns the exit status. Raises UntouchedError where it refused before it began: of all
-    else nobody can say any more that nothing was changed.
+    """Makes the vehicle activate a release or roll back; returns the exit status. Raises UntouchedError where the vehicle refused before it
+    began: after any other error it is uncertain whether something was changed.
     """
     try:
         release = vehicle.device(command, given)
@@ -156,7 +156,7 @@ def switch(vehicle: Vehicle, say: Callable[[str], None], command: str, given: Ma
 
 
 def status_lines(vehicle: Vehicle) -> list[str]:
-    """What `--status` prints. Raises VehicleError and FlashError."""
+    """Lines that `--status` prints. Raises VehicleError and FlashError."""
     found = vehicle.device("status")
     service = found["service"]
     lines = [f"current   {found['current'] or 'none'}{' (on trial)' if found['trial'] else ''}"]
@@ -168,18 +168,18 @@ def status_lines(vehicle: Vehicle) -> list[str]:
 
 
 def was_flashed(vehicle: Vehicle) -> bool:
-    """Whether there is anything on it to ask. Raises VehicleError."""
+    """Whether the vehicle was ever flashed, so that it can answer commands. Raises VehicleError."""
     return bool(vehicle.shell(f"test -e {quote(vehicle.root)}/flash/flash_device.py && echo yes || true").strip())
 
 
 def check_disarmed(vehicle: Vehicle, service: dict[str, str], armed: bool) -> None:
-    """Raises FlashError where its service may not be stopped, unless it may even `armed`."""
+    """Raises FlashError where the service may not be stopped, unless `armed` permits that."""
     if not armed and (line := in_flight(service)):
         raise FlashError(f"{vehicle.host}: {line}")
 
 
 def look_or_go_back(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[str], None]) -> int:
-    """--status and --rollback; returns the exit status. Raises VehicleError and FlashError."""
+    """Runs --status and --rollback; returns the exit status. Raises VehicleError and FlashError."""
     inspect(vehicle, given.python)
     if not was_flashed(vehicle):
         raise FlashError(f"{vehicle.host}: nothing was ever flashed to {vehicle.root}")
@@ -195,7 +195,7 @@ def look_or_go_back(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The command line."""
+    """Parses the command line."""
     parser = Parser(prog="flash", description="Puts this checkout's release on a vehicle, over OpenSSH.")
     parser.add_argument("host", metavar="USER@HOST", help="as ssh takes it")
     what = parser.add_mutually_exclusive_group()
@@ -236,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def refuse(line: str, status: int) -> int:
-    """One line on stderr."""
+    """Prints one line on stderr; returns `status`."""
     print(f"flash: {line}", file=sys.stderr)
     return status
 

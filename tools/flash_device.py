@@ -3,13 +3,13 @@
 Layout of the root folder (say /opt/modcube):
 
     wheels/            every wheel ever shipped and still used, checked by SHA-256
-    releases/ID/       one release: its own environment, `bin/modcube`, `release.json`; ID.partial while it is made
+    releases/ID/       one release: its own environment, `bin/modcube`, `release.json`; ID.partial while it is being made
     current, previous  links to releases; the service starts `current/bin/modcube`
-    trial.json         while a new release has not proved itself: links and units to go back to, and who is watching
+    trial.json         while a new release is on trial: the links and units to restore, and the identity of the watching process
 
-Whatever is interrupted, and wherever: before the switch `current` is untouched; from the switch on, a release that is on
-trial without its watcher is taken back by `boot`, which a unit of its own (flash_units.py) runs before every start of the
-service, or by the next flash. Standard library alone.
+An interruption is safe at any point: before the switch, `current` is untouched; after the switch, a release on trial whose watcher is gone
+is rolled back by `boot`, which a unit of its own (flash_units.py) runs before every start of the service, or by the next flash.
+Uses only the standard library.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ from flash_units import GUARD, as_root, guard_unit, installed_units, release_uni
 SERVICE = "modcube.service"
 UNIT_FOLDER = Path("/etc/systemd/system")
 HEALTHY_S = 5.0
-"""How long a new release must run well."""
+"""How long a new release must run healthily."""
 HEALTH_LIMIT_S = 60.0
-"""Longest wait for that."""
+"""Timeout for becoming healthy."""
 POLL_S = 0.5
 KEPT_RELEASES = 3
 COMPILERS = ("numba", "llvmlite", "numpy")
-"""What compiled code depends on besides its sources."""
+"""Distributions on which compiled code depends besides its sources."""
 STATUS_FIELDS = ("ActiveState", "SubState", "MainPID", "NRestarts", "StatusText")
 COMMANDS = ("missing", "install", "activate", "rollback", "boot", "status")
 LOOKING = ("boot", "status")
-"""Commands that take nothing, and never wait for another flash."""
+"""Commands that take no input, and never wait for another flash."""
 DISTURBING = ("missing", "activate", "rollback")
-"""Commands that stop the service, and the first of those that end in that."""
+"""Commands refused while armed: those that stop the service, and the first step of a flash, which ends in that."""
 
 
 class Device:
@@ -68,8 +68,8 @@ class Device:
     Args:
         root: the folder.
         run: runs a command, returns its output; raises RefusedError when it fails.
-        sleep: waits so many seconds.
-        step: told the name of every step before it is done (tests pull the plug there).
+        sleep: waits that many seconds.
+        step: called with the name of every step before it is done (tests cut the power there).
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Device:
         self._run, self._sleep, self._step = run, sleep, step
 
     def missing_wheels(self, wheels: dict[str, str]) -> list[str]:
-        """Those of `wheels` (name -> SHA-256) that have to be shipped. What is there and wrong is removed."""
+        """Those of `wheels` (name -> SHA-256) that have to be shipped. Removes wheels with a wrong digest."""
         self._step("folders")
         for folder in (self.releases, self.wheels):
             folder.mkdir(parents=True, exist_ok=True)
@@ -98,7 +98,7 @@ class Device:
         return missing
 
     def install(self, release: str, wheels: dict[str, str], facts: dict[str, str]) -> None:
-        """Makes releases/`release` of wheels that are there; nothing to do when it exists. Raises RefusedError."""
+        """Makes releases/`release` from wheels already present; does nothing when it exists. Raises RefusedError."""
         target = self.releases / release
         if (target / "release.json").is_file():
             return
@@ -124,7 +124,7 @@ class Device:
         sync_folder(self.releases)
 
     def _make_environment(self, partial: Path) -> Path:
-        """A virtual environment without pip, and the command; returns where packages go."""
+        """Makes a virtual environment without pip, and the command; returns the folder for packages."""
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
         packages = partial / "lib" / f"python{version}" / "site-packages"
         packages.mkdir(parents=True)
@@ -133,7 +133,7 @@ class Device:
         (partial / "bin" / "python").symlink_to(interpreter)
         (partial / "pyvenv.cfg").write_text(f"home = {interpreter.parent}\nversion = {sys.version.split()[0]}\n")
         command = partial / "bin" / "modcube"
-        # The release is renamed when it is whole, so nothing in it may know its own path.
+        # The release is renamed when it is complete, so nothing in it may contain its own path.
         command.write_text(
             '#!/bin/sh\nhere=$(dirname "$(readlink -f "$0")")\n'
             'exec "$here/python" -I -c "from firmware_py.__main__ import main; main()" "$@"\n'
@@ -142,7 +142,7 @@ class Device:
         return packages
 
     def _carry_over(self, wheels: dict[str, str], packages: Path) -> None:
-        """Compiled code of the release that runs, where all that it was made of is the same: it saves minutes."""
+        """Copies compiled code from the current release if everything it was built from is the same: saves minutes."""
         old = self.linked(self.current)
         if old is None:
             return
@@ -153,7 +153,7 @@ class Device:
                 carry_compiled(source, packages)
 
     def activate(self, release: str) -> None:
-        """Switches to `release`, restarts the service, waits for its health, goes back when it has none.
+        """Switches to `release`, restarts the service, waits until it is healthy, and rolls back otherwise.
 
         Raises:
             RefusedError: it was not healthy; the old release runs again, or the service is stopped if there was none.
@@ -164,7 +164,7 @@ class Device:
         self._settle()
         self._install_units(guard_unit(self.root), GUARD)
         units = release_units(target, self.root)
-        old = None if self.trial.exists() else self.linked(self.current)  # never one that has not proved itself
+        old = None if self.trial.exists() else self.linked(self.current)  # never one that is still on trial
         if old == release:
             self._install_units(units, SERVICE)
             self._start_and_wait(release)
@@ -186,11 +186,11 @@ class Device:
         self.prune()
 
     def roll_back(self) -> str:
-        """Activates the release before this one; returns its name. Raises RefusedError."""
+        """Activates the previous release; returns its name. Raises RefusedError."""
         tried = self.linked(self.current)
         self._settle()
         now, earlier = self.linked(self.current), self.linked(self.previous)
-        if now is not None and now != tried:  # this one was on trial still, and is taken back already
+        if now is not None and now != tried:  # the current one was still on trial and is rolled back already
             self._start_and_wait(now)
             return now
         if earlier is None:
@@ -199,18 +199,18 @@ class Device:
         return earlier
 
     def boot(self) -> str:
-        """Before the service starts: takes back a release on trial whose watcher is gone. Returns what it did."""
+        """Before the service starts: rolls back a release on trial whose watcher is gone. Returns what it did."""
         trial = self._on_trial()
         if trial is None or watches(trial):
             return ""
         said = self._settle()
         if said:
-            with contextlib.suppress(RefusedError):  # if systemd refused the unit on trial, nobody has asked for the service
+            with contextlib.suppress(RefusedError):  # needed if systemd refused the unit on trial: then nothing else starts the service
                 self._run([*as_root(), "systemctl", "--no-block", "restart", SERVICE])
         return said
 
     def _on_trial(self) -> dict[str, Any] | None:
-        """What trial.json says: nothing if it is torn, None if there is none."""
+        """Contents of trial.json: empty if it is torn, None if there is none."""
         if not self.trial.is_file():
             return None
         try:
@@ -220,21 +220,21 @@ class Device:
         return trial if isinstance(trial, dict) else {}
 
     def _settle(self) -> str:
-        """Takes back a trial that nobody watches: whoever has the lock may be sure of that. Returns what it did.
+        """Rolls back a trial without a watcher; returns what it did. Called with the lock held, or once the watcher is known to be gone.
 
-        A vehicle's first release has none to go back to: it may run, and stays on trial until the next flash.
+        A vehicle's first release has none to go back to: it keeps running, and stays on trial until the next flash.
         """
         trial = self._on_trial()
         if trial is None or trial.get("old", "") is None:
             return ""
         if "old" not in trial:
-            remove(self.trial)  # torn while it was written: the switch had not come yet
+            remove(self.trial)  # torn while being written, so the switch had not happened yet
             return "removed a torn trial.json"
         self._take_back(trial)
         return f"release {trial.get('release')} had not proved itself: back to {self.linked(self.current)}"
 
     def _take_back(self, trial: dict[str, Any]) -> None:
-        """Links and units as they were before a trial; it is over when all are. Raises RefusedError."""
+        """Restores links and units from before a trial, then ends the trial. Raises RefusedError."""
         links = {self.current: trial["old"]} | ({self.previous: trial["previous"]} if "previous" in trial else {})
         for link, release in links.items():
             if release is None:
@@ -246,7 +246,7 @@ class Device:
         remove(self.trial)
 
     def status(self) -> dict[str, object]:
-        """What is installed and how the service is."""
+        """What is installed, and the state of the service."""
         return {
             "current": self.linked(self.current),
             "previous": self.linked(self.previous),
@@ -256,21 +256,21 @@ class Device:
         }
 
     def names(self) -> list[str]:
-        """Whole releases, oldest first."""
+        """Complete releases, oldest first."""
         if not self.releases.is_dir():
             return []
         whole = [path for path in self.releases.iterdir() if (path / "release.json").is_file()]
         return [path.name for path in sorted(whole, key=lambda path: path.stat().st_mtime) if path.suffix != ".partial"]
 
     def linked(self, link: Path) -> str | None:
-        """The release that a link leads to; None where there is no link or no such release."""
+        """The release that a link points to; None where there is no link or no such release."""
         if not link.is_symlink():
             return None
         name = Path(os.readlink(link)).name
         return name if (self.releases / name / "release.json").is_file() else None
 
     def service(self) -> dict[str, str]:
-        """What systemd says of the service; empty where it does not answer."""
+        """State of the service as reported by systemd; empty when systemd does not answer."""
         try:
             text = self._run(["systemctl", "show", SERVICE, *(f"--property={field}" for field in STATUS_FIELDS)])
         except RefusedError:
@@ -278,12 +278,12 @@ class Device:
         return dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
 
     def check_disarmed(self) -> None:
-        """Raises UntouchedError where the service controls an armed vehicle, or does not say that it controls none."""
+        """Raises UntouchedError where the service controls an armed vehicle, or does not report that it is disarmed."""
         if line := in_flight(self.service()):
             raise UntouchedError(line)
 
     def prune(self) -> None:
-        """Removes releases beyond KEPT_RELEASES, and wheels that none of the rest needs."""
+        """Removes releases beyond KEPT_RELEASES, and wheels that no remaining release needs."""
         self._step("prune")
         kept = {self.linked(self.current), self.linked(self.previous), *self.names()[-KEPT_RELEASES:]}
         for path in self.releases.iterdir():
@@ -297,7 +297,7 @@ class Device:
                 wheel.unlink()
 
     def _switch(self, link: Path, release: str) -> None:
-        """Lets `link` lead to `release`, in one step that happens or does not."""
+        """Points `link` to `release` atomically."""
         self._step(f"switch {link.name}")
         fresh = link.with_name(f"{link.name}.new")
         fresh.unlink(missing_ok=True)
@@ -306,18 +306,18 @@ class Device:
         sync_folder(self.root)
 
     def _install_units(self, units: dict[str, str], enabled: str) -> None:
-        """Lets systemd have `units` (name -> text), and starts one of them at every boot from now on. Raises RefusedError."""
+        """Installs `units` (name -> text) in systemd and enables the unit `enabled` at boot. Raises RefusedError."""
         self._step("units")
         there = installed_units(units, UNIT_FOLDER)
         for name, text in units.items():
             if there.get(name) != text:
                 self._install_unit(name, text)
-        if units:  # every time: an interrupted flash may have left the files, and no more
+        if units:  # every time: an interrupted flash may have left only the files
             self._run([*as_root(), "systemctl", "daemon-reload"])
             self._run([*as_root(), "systemctl", "enable", "--quiet", enabled])
 
     def _install_unit(self, name: str, text: str) -> None:
-        """One unit in systemd's folder, there with all of its text or as it was before."""
+        """Installs one unit atomically: after a power cut systemd's folder has the whole new text or the old one."""
         rendered, fresh = self.root / f"{name}.new", str(UNIT_FOLDER / f"{name}.new")
         write_whole(rendered, text)
         self._run([*as_root(), "install", "-m", "644", str(rendered), fresh])
@@ -327,7 +327,7 @@ class Device:
         rendered.unlink()
 
     def _start_and_wait(self, release: str) -> None:
-        """Restarts the service and waits until it has run well for HEALTHY_S. Raises RefusedError."""
+        """Restarts the service and waits until it has run healthily for HEALTHY_S. Raises RefusedError."""
         self._step("restart")
         with contextlib.suppress(RefusedError):  # it may not be loaded yet
             self._run([*as_root(), "systemctl", "reset-failed", SERVICE])
@@ -352,7 +352,7 @@ class Device:
         raise RefusedError(f"no health report within {HEALTH_LIMIT_S:.0f} s")
 
     def _go_back(self, trial: dict[str, Any]) -> str:
-        """After a release that was not healthy; returns what became of the service."""
+        """Rolls back from an unhealthy release; returns what became of the service."""
         old = trial["old"]
         try:
             self._take_back(trial)
@@ -370,18 +370,18 @@ class Device:
 
 
 def ticks(status: dict[str, str]) -> int | None:
-    """The tick that the service reported last; None before its first report."""
+    """The tick that the service last reported; None before its first report."""
     tick = report(status).get("tick", "")
     return int(tick) if tick.isdigit() else None
 
 
 def report(status: dict[str, str]) -> dict[str, str]:
-    """The words KEY=VALUE of the service's own report."""
+    """The KEY=VALUE words of the service's own report."""
     return dict(word.split("=", 1) for word in status.get("StatusText", "").split() if "=" in word)
 
 
 def in_flight(status: dict[str, str]) -> str:
-    """Why the service may not be stopped now, in a line; empty where it may: it does not run, does not tick yet, or has nobody armed."""
+    """Reason why the service may not be stopped now, in one line; empty if it may: not running, not ticking yet, or no module armed."""
     if status.get("ActiveState") in ("inactive", "failed") or ticks(status) is None:
         return ""
     armed = report(status).get("armed", "")
@@ -397,7 +397,7 @@ def made_by(wheels: dict[str, str], name: str) -> str:
 
 
 def parse(words: Sequence[str] | None) -> argparse.Namespace:
-    """The command line."""
+    """Parses the command line."""
     parser = Parser(prog="flash_device", description="Installs and switches releases; flash.py runs it on the vehicle.")
     parser.add_argument("root", type=Path, help="folder of the releases")
     parser.add_argument("command", choices=COMMANDS, help="all but boot and status take JSON on standard input")
@@ -407,10 +407,10 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
 def main(words: Sequence[str] | None = None) -> int:
     """flash_device.py ROOT COMMAND, with the command's JSON on standard input where it takes any.
 
-    Prints one line of JSON: {"error": line, "untouched": whether nothing was begun} or the command's result. Exit status 0 or 1; 2 where
-    the words are wrong.
+    Prints one line of JSON: {"error": line, "untouched": whether nothing was begun} or the command's result.
+    Exit status 0 or 1; 2 for wrong arguments.
     """
-    # A lost connection must not end what it began.
+    # A lost connection must not interrupt what was begun.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     asked = parse(words)
     device, command = Device(asked.root, run), asked.command
@@ -429,7 +429,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def perform(device: Device, command: str, given: dict[str, Any]) -> object:
-    """One command. Raises RefusedError."""
+    """Runs one command. Raises RefusedError."""
     if command in DISTURBING and not given.get("armed"):
         device.check_disarmed()
     if command == "missing":
@@ -447,7 +447,7 @@ def perform(device: Device, command: str, given: dict[str, Any]) -> object:
 
 @contextlib.contextmanager
 def alone(root: Path, command: str) -> Iterator[None]:
-    """Two flashes at once are refused; the service's start and a look at the status never wait."""
+    """Holds the lock of a flash; a second flash is refused. Commands in LOOKING, such as the one at service start, take no lock."""
     if command in LOOKING:
         yield
         return

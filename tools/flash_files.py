@@ -1,6 +1,6 @@
-"""Files that survive a power cut, processes that cannot be mistaken, wheels without pip. Runs on the vehicle too.
+"""Files that survive a power cut, unmistakable process identities, wheels without pip. Runs on the vehicle too.
 
-Standard library of Python 3.11 alone, and a module of ours that is so too; flash.py ships both beside flash_device.py.
+Uses only the standard library of Python 3.11 and a module of ours that does the same; flash.py ships both beside flash_device.py.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from pathlib import Path
 from firmware_py.compiled_code import cached_sources, taken_in
 
 FILE_TIME_S = 315532800
-"""1980-01-01, of every file of a release: caches of compiled code know their source by time and size."""
+"""1980-01-01, the time of every file of a release: caches of compiled code identify their source by time and size."""
 
 
 OWN_PACKAGES = ("firmware_py", "hil")
 
 
 class RefusedError(Exception):
-    """Something cannot be done; one line."""
+    """An operation failed or is not possible, with a one-line message."""
 
 
 class UntouchedError(RefusedError):
-    """It was not begun: everything runs as before."""
+    """Refused before anything was begun: everything runs as before."""
 
 
 def unpack(wheel: Path, packages: Path) -> None:
-    """A wheel's files into a site-packages folder (PEP 427); scripts and headers are left out."""
+    """Unpacks a wheel into a site-packages folder (PEP 427), without scripts and headers."""
     with zipfile.ZipFile(wheel) as archive:
         for name in archive.namelist():
             parts = name.split("/")
@@ -50,9 +50,9 @@ def unpack(wheel: Path, packages: Path) -> None:
 
 
 def carry_compiled(old: Path, new: Path) -> bool:
-    """Copies numba's caches from one site-packages folder to another, if all that they were compiled from is the same there.
+    """Copies numba's caches between site-packages folders if everything they were compiled from is the same; returns whether it was.
 
-    One compiled function contains others, and constants, so that all of them have to be the same, or none is taken.
+    A compiled function contains others, and constants, so all of them must be the same or no cache is copied.
     """
     cached = cached_sources(old, OWN_PACKAGES)
     if compiled_from(old, cached) != compiled_from(new, cached):
@@ -66,7 +66,7 @@ def carry_compiled(old: Path, new: Path) -> bool:
 
 
 def compiled_from(packages: Path, cached: set[str]) -> dict[str, bytes]:
-    """The files of `cached`, our others that use numba, and those that either imports modules or constants from, by place."""
+    """Contents, by path, of the files `cached`, our others that use numba, and those that either imports modules or constants from."""
     files = [path for package in OWN_PACKAGES for path in (packages / package).rglob("*.py") if b"numba" in path.read_bytes()]
     return taken_in(packages, cached | {str(path.relative_to(packages)) for path in files})
 
@@ -80,7 +80,7 @@ def file_digest(path: Path) -> str:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """A file that is there with all of its text, or not at all."""
+    """Writes a file atomically: after a power cut it has all of its text or none."""
     fresh = path.with_name(f"{path.name}.part")
     with fresh.open("w") as file:
         file.write(text)
@@ -91,13 +91,13 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def remove(path: Path) -> None:
-    """Away with a file or link, for good."""
+    """Removes a file or link durably."""
     path.unlink(missing_ok=True)
     sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:
-    """What was renamed or removed in `folder` is on the disk."""
+    """Flushes renames and removals in `folder` to the disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -106,7 +106,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def watcher() -> dict[str, object]:
-    """This process, in a way that no later one can be mistaken for."""
+    """Identity of this process, which no later process can share."""
     return {"pid": os.getpid(), "started": start_time(os.getpid()), "boot": boot_id()}
 
 
@@ -117,12 +117,12 @@ def watches(trial: dict[str, object]) -> bool:
 
 
 def boot_id() -> str:
-    """Of this boot of the machine."""
+    """ID of the current boot of the machine."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def start_time(pid: int) -> str:
-    """When a process started, in clock ticks since boot (proc(5), field 22); empty when there is none."""
+    """Start time of a process, in clock ticks since boot (proc(5), field 22); empty when there is no such process."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
     except (OSError, IndexError):
@@ -130,7 +130,7 @@ def start_time(pid: int) -> str:
 
 
 def run(command: Sequence[str]) -> str:
-    """A command's output. Raises RefusedError with its last line when it fails."""
+    """Output of a command. Raises RefusedError with the last line of output when it fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What is shipped to a vehicle: the project's wheel and those of its locked dependencies, for the vehicle's own Python.
+"""Payload of a flash: the project's wheel and those of its locked dependencies, for the vehicle's own Python.
 
 Wheels are fetched once into a cache, by the hashes of requirements.lock; the vehicle needs no network and no pip.
 """
@@ -28,11 +28,11 @@ GLIBC_VERSIONS = (28, 27, 26, 24, 17)
 
 
 class PayloadError(Exception):
-    """The payload cannot be made; one line."""
+    """The payload cannot be made, with a one-line message."""
 
 
 class Payload(NamedTuple):
-    """One release."""
+    """One release and its wheels."""
 
     release: str
     wheels: tuple[Path, ...]
@@ -43,15 +43,15 @@ class Payload(NamedTuple):
 
     @property
     def size_bytes(self) -> int:
-        """All wheels together."""
+        """Total size of the wheels."""
         return sum(path.stat().st_size for path in self.wheels)
 
 
 def make_payload(machine: str, python: str, cache: Path, offline: bool) -> Payload:
-    """The release of this checkout for `machine` (aarch64, x86_64) and `python` ("3.11").
+    """Makes the release of this checkout for `machine` (aarch64, x86_64) and `python` ("3.11").
 
     Args:
-        cache: folder of wheels that were fetched before.
+        cache: folder of wheels fetched earlier.
         offline: take wheels from the cache alone.
 
     Raises:
@@ -68,7 +68,7 @@ def make_payload(machine: str, python: str, cache: Path, offline: bool) -> Paylo
 
 
 def release_name(own: Path, lock: str) -> str:
-    """Version and a hash of contents: the same sources and lock are the same release."""
+    """Version and a hash of the contents: the same sources and lock give the same name."""
     whole = hashlib.sha256(lock.encode())
     with zipfile.ZipFile(own) as archive:
         for name in sorted(archive.namelist()):
@@ -78,7 +78,7 @@ def release_name(own: Path, lock: str) -> str:
 
 
 def build_wheel(cache: Path) -> Path:
-    """The project's own wheel, built from a clean copy: build/ in a checkout keeps deleted modules."""
+    """Builds the project's own wheel from a clean copy: build/ in a checkout keeps deleted modules."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder, "source")
         source.mkdir()
@@ -93,7 +93,7 @@ def build_wheel(cache: Path) -> Path:
 
 
 def locked(path: Path) -> dict[str, str]:
-    """Blocks of a lock by canonical name: the pin, its marker and its hashes."""
+    """Blocks of a lock file by canonical name: the pin, its marker and its hashes."""
     blocks: dict[str, str] = {}
     for block in re.split(r"\n(?=[A-Za-z0-9])", path.read_text()):
         lines = [line for line in block.splitlines() if not line.lstrip().startswith("#")]
@@ -104,7 +104,7 @@ def locked(path: Path) -> dict[str, str]:
 
 
 def runtime_names() -> set[str]:
-    """Everything that the project needs to run, without its extras, by walking what is installed here."""
+    """Names of everything that the project needs to run, without its extras, found by walking the packages installed here."""
     found: set[str] = set()
     waiting = ["modcube"]
     while waiting:
@@ -117,7 +117,7 @@ def runtime_names() -> set[str]:
 
 
 def requirements_of(name: str) -> Iterator[str]:
-    """Names that distribution `name` requires without extras; none where it is not installed."""
+    """Names that the distribution `name` requires without extras; none where it is not installed."""
     try:
         lines = metadata.requires(name) or []
     except metadata.PackageNotFoundError:
@@ -131,11 +131,11 @@ def requirements_of(name: str) -> Iterator[str]:
 def platforms(machine: str) -> list[str]:
     """Platform tags that a wheel may have."""
     tags = [f"manylinux_2_{n}_{machine}" for n in GLIBC_VERSIONS]
-    return [*tags, f"manylinux2014_{machine}", f"linux_{machine}"]  # 2014: another name of 2_17
+    return [*tags, f"manylinux2014_{machine}", f"linux_{machine}"]  # 2014: alias of 2_17
 
 
 def fetch(lock: str, house: Path, machine: str, python: str, offline: bool) -> None:
-    """Fills the house with the locked wheels. Raises PayloadError."""
+    """Downloads the locked wheels that are missing in `house`. Raises PayloadError."""
     missing = [line for line in pins(lock) if not wheel_of(*line, house)]
     if not missing:
         return
@@ -154,7 +154,7 @@ def fetch(lock: str, house: Path, machine: str, python: str, offline: bool) -> N
 
 
 def pins(lock: str) -> list[tuple[str, str]]:
-    """(name, version) of the lock's lines that hold on a Linux vehicle."""
+    """(name, version) of the lock's lines that apply to a Linux vehicle."""
     found: list[tuple[str, str]] = []
     for line in lock.splitlines():
         if "==" not in line or line.startswith(" "):
@@ -167,7 +167,7 @@ def pins(lock: str) -> list[tuple[str, str]]:
 
 
 def wheel_of(name: str, version: str, house: Path) -> Path | None:
-    """The wheel of one pin."""
+    """Wheel of one pin; None if it is missing."""
     for path in house.glob("*.whl"):
         if (canonicalize_name(path.name.split("-")[0]), path.name.split("-")[1]) == (name, version):
             return path
@@ -175,12 +175,12 @@ def wheel_of(name: str, version: str, house: Path) -> Path | None:
 
 
 def wheels_of(lock: str, house: Path) -> list[Path]:
-    """The wheels of all pins, which are there."""
+    """Wheels of all pins that are present."""
     return [path for pin in pins(lock) if (path := wheel_of(*pin, house)) is not None]
 
 
 def pip(*words: str) -> None:
-    """Runs this environment's pip. Raises PayloadError with its last line."""
+    """Runs this environment's pip. Raises PayloadError with its last error line."""
     command = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", *words]
     environment = os.environ | {"SOURCE_DATE_EPOCH": "315532800", "PIP_NO_INPUT": "1"}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)

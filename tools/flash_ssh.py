@@ -1,4 +1,4 @@
-"""One vehicle over OpenSSH: runs commands there, streams files, says in one line what is wrong."""
+"""One vehicle over OpenSSH: runs commands there, streams files, reports errors in one line."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ DEVICE_FILES = {
     "firmware_py/compiled_code.py": PACKAGE / "compiled_code.py",
     "firmware_py/__init__.py": PACKAGE / "runtime" / "__init__.py",
 }
-"""What flash_device.py is made of, by place in its folder. An empty __init__.py, for a package without any is found last:
-behind one that the vehicle's Python may have."""
+"""Files of flash_device.py by path in its folder. Includes an empty __init__.py because a package without one is found last, after any that
+the vehicle's Python may have.
+"""
 LOST = 255
-"""ssh's own exit status."""
+"""Exit status of ssh for its own errors."""
 REASONS = (
     ("Could not resolve hostname", "there is no host of this name"),
     ("Permission denied", "it accepts none of your keys: try `ssh-copy-id {host}`"),
@@ -40,7 +41,7 @@ REASONS = (
 
 
 class VehicleError(Exception):
-    """The vehicle cannot be reached, or refused; one line."""
+    """The vehicle cannot be reached, or refused, with a one-line message."""
 
 
 class UntouchedError(VehicleError):
@@ -48,15 +49,15 @@ class UntouchedError(VehicleError):
 
 
 class LostError(VehicleError):
-    """The connection went while a command ran: what it began may go on."""
+    """The connection was lost while a command ran, which may still go on."""
 
 
 class Vehicle:
-    """USER@HOST.
+    """A vehicle reached as USER@HOST.
 
     Args:
         host: as ssh takes it.
-        options: further words for ssh, such as -p PORT.
+        options: further arguments for ssh, such as -p PORT.
         root: the folder for releases there.
     """
 
@@ -64,11 +65,11 @@ class Vehicle:
         self.host = host
         self.root = root
         self.python = "python3"
-        # Of an option that is given twice ssh takes the first.
+        # ssh uses the first value of an option that is given twice.
         self._ssh = ["ssh", *options, *(word for option in OPTIONS for word in ("-o", option)), host]
 
     def shell(self, script: str, data: bytes = b"") -> str:
-        """The output of a shell command there. Raises VehicleError."""
+        """Output of a shell command run there. Raises VehicleError."""
         try:
             done = subprocess.run([*self._ssh, script], input=data, capture_output=True, check=False)
         except OSError as error:
@@ -79,7 +80,7 @@ class Vehicle:
         return output
 
     def send(self, files: Mapping[str, Path], folder: str, progress: Callable[[int], None]) -> None:
-        """Streams files (by place there) into a folder there, as one tar; `progress` is told bytes. Raises VehicleError."""
+        """Streams files (by their path there) into a folder there as one tar; passes byte counts to `progress`. Raises VehicleError."""
         command = [*self._ssh, f"mkdir -p {quote(folder)} && tar -x -C {quote(folder)}"]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as ssh:
             assert ssh.stdin is not None and ssh.stderr is not None
@@ -87,15 +88,15 @@ class Vehicle:
             with suppress(BrokenPipeError), tarfile.open(fileobj=pipe, mode="w|") as archive:
                 for place, path in files.items():
                     archive.add(path, place, filter=_anonymous)
-            with suppress(BrokenPipeError):  # of what was not yet written: closed it is in any case
+            with suppress(BrokenPipeError):  # from data not yet written; the pipe is closed in any case
                 ssh.stdin.close()
             text = ssh.stderr.read().decode(errors="replace")
-            ssh.stdin = None  # not to be flushed again
+            ssh.stdin = None  # prevents another flush
         if ssh.returncode:
             raise self._error(ssh.returncode, text, "")
 
     def install_tools(self) -> None:
-        """The device's own scripts, switched to as one: the service needs them to start. Raises VehicleError."""
+        """Installs the device's own scripts and switches to them atomically: the service needs them to start. Raises VehicleError."""
         digest = hashlib.sha256(b"".join(path.read_bytes() for path in DEVICE_FILES.values())).hexdigest()[:8]
         folder, link = f"tools/{digest}", quote(f"{self.root}/flash")
         self.send(DEVICE_FILES, f"{self.root}/{folder}", lambda size: None)
@@ -128,7 +129,7 @@ class Vehicle:
 
 
 def _refusal(text: str) -> VehicleError:
-    """With the line in flash_device.py's own answer, or the text as it is."""
+    """Error with the message from flash_device.py's own answer, or with the text as it is."""
     try:
         answer = json.loads(text)
         return (UntouchedError if answer.get("untouched") else VehicleError)(str(answer["error"]))
@@ -144,13 +145,13 @@ def _anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:
 
 
 class _Counted:
-    """What tarfile writes to: counts bytes on their way."""
+    """Sink for tarfile that counts the bytes written through it."""
 
     def __init__(self, sink: IO[bytes], progress: Callable[[int], None]) -> None:
         self._sink, self._progress = sink, progress
 
     def write(self, data: bytes) -> int:
-        """All of it."""
+        """Writes all of `data`."""
         self._sink.write(data)
         self._progress(len(data))
         return len(data)

@@ -1,12 +1,12 @@
-"""Fit a vehicle file to recorded flights of one module, with 95 % intervals; the bench's logs or a real vehicle's.
+"""Fit a vehicle file to recorded flights of one module, with 95 % intervals; logs of the bench or of a real vehicle.
 
     .venv/bin/python tools/identify.py runs/shaken                                  # no reference: ratios only
     .venv/bin/python tools/identify.py runs/shaken --curve curve.toml --thruster 1 --accuracy 2
     .venv/bin/python tools/identify.py runs/shaken --weight 2.0:0.22:60:120 --hung-at 0 0 0.105
     .venv/bin/python tools/identify.py --excitation shake.toml                      # the flight to begin with
 
-A log is the folder that `modcube run --out` or `modcube hil run --out` left; can.log and signals.mcap are read, truth.mcap is not.
-Left in --out: identified.json; vehicle.toml with a reference and where no motion is missing; excite.toml where one is.
+A log is a folder written by `modcube run --out` or `modcube hil run --out`; can.log and signals.mcap are read, truth.mcap is not.
+Written to --out: identified.json; vehicle.toml with a reference and where no motion is missing; excite.toml where one is.
 Exit status 0: everything within 10 %; 1: a motion is missing; 2: cannot run.
 """
 
@@ -38,20 +38,20 @@ from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import ThrusterCurve, Vehicle, load_vehicle
 
 FARTHEST_M = 10.0
-"""From the hull's middle, as the vehicle file permits of its parts."""
+"""Largest distance from the hull's middle, as the vehicle file permits for its parts."""
 RESULTS = ("identified.json", "vehicle.toml", "excite.toml")
 """Files that a run may leave in --out."""
 
 
 def read_curve(path: Path) -> ThrusterCurve:
-    """A curve that tools/fit_thruster.py wrote. Raises DescriptionError."""
+    """Reads a curve written by tools/fit_thruster.py. Raises DescriptionError."""
     table, source = read_toml(path)
     curve: ThrusterCurve = build(ThrusterCurve, table, source)
     return curve
 
 
 def parse_weight(text: str, at_m: Sequence[float] | None = None) -> Weight:
-    """NEWTON:KG:FROM:UNTIL, and where it hung. Raises DescriptionError."""
+    """Parses NEWTON:KG:FROM:UNTIL; `at_m` is where the weight hung. Raises DescriptionError."""
     try:
         newton, kg, from_s, until_s = (float(word) for word in text.split(":"))
     except ValueError:
@@ -66,7 +66,7 @@ def parse_weight(text: str, at_m: Sequence[float] | None = None) -> Weight:
 
 
 def check_hung(weight: Weight, flight: Equations) -> None:
-    """Raises DescriptionError where the weight neither came nor went."""
+    """Raises DescriptionError where the weight hung during all or none of the flight."""
     hung = (flight.time_s >= weight.from_s) & (flight.time_s < weight.until_s)
     if hung.all() or not hung.any():
         raise DescriptionError(
@@ -76,7 +76,7 @@ def check_hung(weight: Weight, flight: Equations) -> None:
 
 
 def reference_of(recording: Recording, thruster: int | None, accuracy_percent: float | None) -> Reference:
-    """The load-cell curve as a reference: of the first thruster and good to 2 %, where nothing is said. Raises DescriptionError."""
+    """The load-cell curve as a reference, by default of the first thruster and accurate to 2 %. Raises DescriptionError."""
     thruster = 1 if thruster is None else thruster
     accuracy_percent = 2.0 if accuracy_percent is None else accuracy_percent
     count = len(recording.vehicle.thruster)
@@ -88,7 +88,7 @@ def reference_of(recording: Recording, thruster: int | None, accuracy_percent: f
 
 
 def check_fitted(vehicle: Vehicle) -> None:
-    """Raises DescriptionError where no flight of this vehicle can be fitted, so that none is asked for either."""
+    """Raises DescriptionError for a vehicle whose flights cannot be fitted, so that none is flown in vain."""
     if vehicle.drag.quadratic.size:
         raise DescriptionError(f"vehicle {vehicle.name}: its drag is published damping; only cd_face and cd_edge can be fitted")
     if not vehicle.tag:
@@ -96,7 +96,7 @@ def check_fitted(vehicle: Vehicle) -> None:
 
 
 def check_excitation(path: Path) -> None:
-    """Raises DescriptionError where no scenario can go to `path`, or something of somebody's is there."""
+    """Raises DescriptionError where `path` does not name a .toml file, or exists already."""
     if path.suffix != ".toml":
         raise DescriptionError(f"--excitation {path}: a scenario's file is a .toml file; give {path}.toml")
     if path.exists():
@@ -104,12 +104,12 @@ def check_excitation(path: Path) -> None:
 
 
 def fly_it(path: Path) -> str:
-    """How the scenario in `path` is flown, as a shell takes it."""
+    """Line that tells how to fly the scenario in `path`, quoted for a shell."""
     return f"fly it: .venv/bin/modcube hil run {shlex.quote(str(path))}"
 
 
 def print_findings(found: Sequence[Finding]) -> None:
-    """The table."""
+    """Prints the table of findings."""
     table = Table(box=box_style.SIMPLE_HEAD)
     for column in ("what", "value", "95 % interval", "", "unit"):
         table.add_column(column, justify="left" if column in ("what", "unit") else "right")
@@ -119,7 +119,7 @@ def print_findings(found: Sequence[Finding]) -> None:
 
 
 def write_results(out: Path, texts: Mapping[str, str]) -> None:
-    """Writes those of RESULTS that are in `texts`; the others, of an earlier run, go: what lies there together is of one run."""
+    """Writes the RESULTS in `texts` and deletes the others, so that all files there are of one run."""
     for name in RESULTS:
         if name in texts:
             (out / name).write_text(texts[name], encoding="utf-8")
@@ -128,7 +128,7 @@ def write_results(out: Path, texts: Mapping[str, str]) -> None:
 
 
 def identify(given: argparse.Namespace) -> int:
-    """Fits, prints and writes; the exit status. Raises DescriptionError and OSError."""
+    """Fits, prints and writes; returns the exit status. Raises DescriptionError and OSError."""
     check_space(given.space)
     if given.excitation is not None:
         check_excitation(given.excitation)
@@ -162,7 +162,7 @@ def identify(given: argparse.Namespace) -> int:
 
 
 def leave(given: argparse.Namespace, result: Fit, recording: Recording, curve: ThrusterCurve) -> int:
-    """Prints and writes what was found with that curve; the exit status. Raises OSError."""
+    """Prints and writes the result of the fit with `curve`; returns the exit status. Raises OSError."""
     vehicle = recording.vehicle
     found, logs = findings(result, vehicle), ", ".join(given.logs)
     print_findings(found)
@@ -188,7 +188,7 @@ def leave(given: argparse.Namespace, result: Fit, recording: Recording, curve: T
 
 
 def main() -> int:
-    """The command line."""
+    """Runs the tool; returns its exit status."""
     parser = Parser(description=__doc__)
     parser.add_argument("logs", nargs="*", metavar="LOG", help="folders of flights of one vehicle, one module alone")
     parser.add_argument("--curve", type=Path, metavar="FILE", help="curve of one thruster, from tools/fit_thruster.py")

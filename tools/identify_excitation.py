@@ -1,4 +1,4 @@
-"""For tools/identify.py: the flight that shows what a log did not: a scenario for `modcube hil run FILE`."""
+"""For tools/identify.py: a scenario for `modcube hil run FILE` with the motions that a log lacks."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from firmware_py.description.schema import DescriptionError
 
 SPACE_M = (0.6, 0.5, 0.3)
-"""How far it moves to either side of the middle when nothing else is said: keeps the peak below 0.45 m/s and 0.35 m/s^2."""
+"""Default travel to either side of the middle: keeps the peaks below 0.45 m/s and 0.35 m/s^2."""
 RATE_HZ = 9.0 / 170.0
-"""Rounds a second at that size; at another, as many as keep the acceleration."""
+"""Rounds per second at SPACE_M; a smaller space gets more rounds, to keep the acceleration."""
 FREQUENCY = (1.0, 1.3, 1.7)
-"""Of the axes, in rounds: never in step, so that axes, diagonals and all speeds between come by."""
+"""Oscillations of each axis per round, out of step so that axes, diagonals and all speeds in between occur."""
 YAW_TURNS, ROLL_TURNS = 0.81, 0.57
-"""Turns a round: half a rad/s each at its peak; slower turning leaves the inertia to the damping."""
+"""Turns per round: each peaks at half a rad/s; in slower turning the damping hides the inertia."""
 MOTIONS: Mapping[str, tuple[tuple[int, ...], bool]] = {
     "along x": ((0,), False),
     "along y": ((1,), False),
@@ -25,7 +25,7 @@ MOTIONS: Mapping[str, tuple[tuple[int, ...], bool]] = {
     "fast edge-on": ((0, 1), False),
     "turning": ((), True),
 }
-"""Axes along which each goes to and fro, and whether it turns."""
+"""Axes along which each motion oscillates, and whether it turns."""
 
 TEMPLATE = """\
 # Written by tools/identify.py: {why}.
@@ -69,7 +69,7 @@ high = 0.0
 
 
 def check_space(space_m: Sequence[float]) -> None:
-    """Raises DescriptionError where a room is none, m."""
+    """Raises DescriptionError unless the distances, m, are finite and not negative."""
     if not all(0.0 <= free < math.inf for free in space_m):
         raise DescriptionError(f"--space {_words(space_m)}: three distances of 0 m or more are needed, what is free to either side")
 
@@ -79,7 +79,7 @@ def _words(space_m: Sequence[float]) -> str:
 
 
 def excitation(motions: Collection[str], vehicle: str, space_m: Sequence[float] = SPACE_M, duration_s: float = 170.0) -> str:
-    """The TOML text of a scenario that makes the `motions` (keys of MOTIONS). Raises DescriptionError where one has no room.
+    """TOML text of a scenario that makes the `motions` (keys of MOTIONS). Raises DescriptionError where one has no room.
 
     Args:
         vehicle: name or file. space_m: (3,) how far the vehicle may go to either side of the middle, along each world axis.

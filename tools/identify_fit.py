@@ -1,9 +1,9 @@
-"""For tools/identify.py: the unknowns that explain recorded flights best, and how well they are known.
+"""For tools/identify.py: the unknowns that best explain recorded flights, and their uncertainty.
 
-Gauss-Newton on the rows of all flights. The gusts of each flight are unknowns too, as likely as a Gauss-Markov process makes them; how
-strong they are, and how noisy the rows, is found with them (expectation maximisation: Dempster, Laird and Rubin 1977). What the model
-leaves out even so is no white noise. So the covariance is the sandwich of Newey and West (1987) over a window of 10 s, and an interval
-is as much wider than the normal one as that window's share of the record asks for (Kiefer and Vogelsang 2005, table 1).
+Gauss-Newton on the rows of all flights. The gusts of each flight are unknowns too, with a Gauss-Markov process as their prior; the standard
+deviations of gusts and rows are estimated along with them (expectation maximisation: Dempster, Laird and Rubin 1977). The remaining model
+error is not white noise. The covariance is therefore the sandwich of Newey and West (1987) over a window of 10 s, and the intervals are
+wider than normal ones according to that window's share of the record (Kiefer and Vogelsang 2005, table 1).
 """
 
 from __future__ import annotations
@@ -16,38 +16,38 @@ import numpy as np
 from identify_model import NUISANCES, Equations, Unknown, beginning, gust_precision, places, unknowns
 
 MEMORY_S = 10.0
-"""How far apart in time errors still know of one another."""
+"""Time over which errors are assumed to be correlated."""
 GUST_M_S = 0.02
-"""Standard deviation of gusts with which the search begins."""
+"""Initial value of the standard deviation of gusts."""
 MOST_STEPS = 15
 STILL = 0.05
-"""Of a standard error, the largest step after which the search ends."""
+"""Largest step, in standard errors, at which the search ends."""
 CERTAIN = 1e-6
-"""Standard deviation that fixes a scale which nothing measures."""
+"""Standard deviation of the prior that fixes a scale which nothing measures."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What one thruster's gain is known to be: 1, for the curve that was measured on it, to within `accuracy` of it."""
+    """Known gain of one thruster: 1, for the curve that was measured on it, to within `accuracy` of it."""
 
     thruster: int
     accuracy: float
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of bounds within which everything is as likely (GUM 4.3.7)."""
+        """Standard deviation of a uniform distribution between the bounds (GUM 4.3.7)."""
         return self.accuracy / math.sqrt(3.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What was found.
+    """Result of a fit.
 
     Attributes:
-        x: (p,) unknowns of the vehicle. places: where each stands, by name.
+        x: (p,) unknowns of the vehicle. places: slice of each in x, by name.
         covariance: (p, p). critical: half-width of a 95 % interval in standard errors.
-        residual: (6,) standard deviation of what is left, m/s^2 and rad/s^2. gust_m_s: that of the gusts.
-        has_scale: whether anything absolute was known: else gains are such that their mean is 1.
+        residual: (6,) standard deviation of the residuals, m/s^2 and rad/s^2. gust_m_s: that of the gusts.
+        has_scale: whether any absolute reference was known; otherwise gains are scaled to a mean of 1.
     """
 
     x: np.ndarray
@@ -59,11 +59,11 @@ class Fit:
     has_scale: bool
 
     def value(self, name: str) -> np.ndarray:
-        """One unknown."""
+        """Value of one unknown."""
         return self.x[self.places[name]]
 
     def interval(self, function: Callable[[np.ndarray], float]) -> tuple[float, float]:
-        """A function of the unknowns, and the half-width of its 95 % interval, to first order."""
+        """Value of a function of the unknowns, and the half-width of its 95 % interval, to first order."""
         sigma = np.sqrt(np.diag(self.covariance))
         slope = np.zeros(len(self.x))
         for i in np.flatnonzero(sigma):
@@ -75,7 +75,7 @@ class Fit:
 
 
 def fit(flights: Sequence[Equations], reference: Reference | None = None, has_weight: bool = False) -> Fit:
-    """Fits all flights of one vehicle at once; without `reference` and weight the mean gain is 1 by decree."""
+    """Fits all flights of one vehicle at once; without `reference` and weight the mean gain is defined as 1."""
     vehicle = flights[0].vehicle
     mine = unknowns(len(vehicle.thruster))
     shared, count = places(mine), sum(u.size for u in mine)
@@ -86,7 +86,7 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
     first = np.zeros(len(width))
     first[:count] = np.concatenate(list(beginning(vehicle).values()))
     scale, pull = _scale_row(shared["gain"], len(first), reference, has_weight)
-    prior = np.diag(width**-2.0) + pull * np.outer(scale, scale)  # about `first`, whose gains are 1 as the scale's row wants it
+    prior = np.diag(width**-2.0) + pull * np.outer(scale, scale)  # about `first`, whose gains of 1 satisfy the scale row
     x, noise, gust = first.copy(), np.zeros(6), GUST_M_S
     for _ in range(MOST_STEPS):
         for at, precision in zip(own, gusts, strict=True):
@@ -114,7 +114,7 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
 
 
 def _with_nuisances(mine: Sequence[Unknown], flights: Sequence[Equations]) -> tuple[list[Unknown], list[dict[str, slice]]]:
-    """All unknowns, the vehicle's and then each flight's own, and where each flight's stand among them, by name."""
+    """All unknowns, the vehicle's and then those of each flight, and the slices of each flight's own by name."""
     parts, own = list(mine), []
     for flight in flights:
         nuisances = [*NUISANCES, Unknown("gust", 3 * flight.knots.shape[1], math.inf)]
@@ -124,18 +124,18 @@ def _with_nuisances(mine: Sequence[Unknown], flights: Sequence[Equations]) -> tu
 
 
 def _gust_m_s(x: np.ndarray, inverse: np.ndarray, where: Sequence[slice], precisions: Sequence[np.ndarray]) -> float:
-    """Standard deviation of the gusts of all flights: of what was found, and of how far that may be off (`inverse`: covariance)."""
+    """Standard deviation of the gusts of all flights, from their estimates and the uncertainty of these (`inverse`: covariance)."""
     squares = [x[at] @ p @ x[at] + np.sum(p * inverse[at, at]) for at, p in zip(where, precisions, strict=True)]
     return math.sqrt(sum(squares) / sum(map(len, precisions)))
 
 
 def critical_value(share: float) -> float:
-    """Half-width of a 95 % interval in standard errors whose window is this share of the record; 1.96 for none."""
+    """Half-width of a 95 % interval in standard errors for a window that is `share` of the record; 1.96 for a share of 0."""
     return 1.96 + 2.9694 * share + 0.4160 * share**2 - 0.5324 * share**3
 
 
 def _scale_row(gains: slice, count: int, reference: Reference | None, has_weight: bool) -> tuple[np.ndarray, float]:
-    """(p,) row that is to be 1, and how strongly: the reference's thruster, or else the mean gain."""
+    """(p,) row whose product with the unknowns should be 1, and the weight of that: the reference's thruster, or else the mean gain."""
     row = np.zeros(count)
     if reference is not None:
         row[gains.start + reference.thruster] = 1.0
@@ -145,7 +145,7 @@ def _scale_row(gains: slice, count: int, reference: Reference | None, has_weight
 
 
 def _rows(flight: Equations, x: np.ndarray, step: np.ndarray, where: dict[str, slice]) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 6) what was measured less what was expected, and (n, 6, p) slopes of the expectation."""
+    """(n, 6) residuals, measured less predicted, and (n, 6, p) slopes of the prediction."""
     expected = flight.predict({name: x[at] for name, at in where.items()})
     slopes = np.zeros((*expected.shape, len(x)))
     for at in (where[name] for name in where if name != "gust"):
@@ -153,13 +153,13 @@ def _rows(flight: Equations, x: np.ndarray, step: np.ndarray, where: dict[str, s
             ahead = x.copy()
             ahead[i] += step[i]
             slopes[:, :, i] = (flight.predict({name: ahead[k] for name, k in where.items()}) - expected) / step[i]
-    mean = slopes[:, :, where["current"]]  # a gust acts as the mean does, at its knot's times
+    mean = slopes[:, :, where["current"]]  # a gust acts like the mean, at the times of its knot
     slopes[:, :, where["gust"]] = (mean[:, :, None, :] * flight.knots[:, None, :, None]).reshape(*expected.shape, -1)
     return flight.measured - expected, slopes
 
 
 def _long_run(scores: np.ndarray, lags: int) -> np.ndarray:
-    """(p, p) covariance of the sum of (n, p) scores that know of one another over `lags` rows: Bartlett's weights."""
+    """(p, p) covariance of the sum of (n, p) scores that are correlated over `lags` rows: Bartlett weights."""
     total = scores.T @ scores
     for lag in range(1, min(lags, len(scores) - 1) + 1):
         between = scores[:-lag].T @ scores[lag:]

@@ -1,4 +1,4 @@
-"""For tools/identify.py: a recorded flight of one module, as arrays: what its sensors said and what its thrusters were told.
+"""For tools/identify.py: a recorded flight of one module as arrays: sensor readings and thruster commands.
 
 Reads what the firmware writes (can.log and signals.mcap), through the firmware's own frames; never the plant's truth.
 """
@@ -24,7 +24,7 @@ from firmware_py.runtime.flight_log import FlightLog, LogError
 
 HALVES = ("THRUSTER_CMD_A", "THRUSTER_CMD_B")
 LEAST_S = 10.0
-"""Shorter logs are refused: nothing can be told from them."""
+"""Shorter logs are refused: they contain too little information."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +32,12 @@ class Recording:
     """One flight of n ticks; body frame, SI units.
 
     Attributes:
-        name: its folder. vehicle_name: as the fleet has it.
-        vehicle, body, noise: what the firmware believed of the robot and of its sensors.
+        name: its folder. vehicle_name: as in the fleet file.
+        vehicle, body, noise: the firmware's own models of the robot and of its sensors.
         period_s: of a tick. time_ns: (n,) of each tick.
-        gyro, accel: (n, 3) rate and specific force at the IMU; NaN where none came.
+        gyro, accel: (n, 3) rate and specific force at the IMU; NaN where none was received.
         command: (n, t) share of full command that acted during the tick that ends at that row.
-        armed: (n,) whether it did. voltage_v: (n,) of the supply, between readings interpolated.
+        armed: (n,) whether the thrusters were armed during that tick. voltage_v: (n,) of the supply, interpolated between readings.
         poses: every tag picture.
     """
 
@@ -57,7 +57,7 @@ class Recording:
 
 
 def read_recording(folder: Path) -> Recording:
-    """The flight in `folder`. Raises LogError (no log, more than one module, a gap, too short) and OSError."""
+    """Reads the flight in `folder`. Raises LogError (no log, more than one module, a gap, too short) and OSError."""
     log = FlightLog(folder)
     if log.configuration is None:
         raise LogError(f"{folder}: its log does not say what flew; this version's logs do")
@@ -81,7 +81,7 @@ def read_recording(folder: Path) -> Recording:
 
 
 class _Heard(NamedTuple):
-    """What a log says, tick by tick; of tags every picture."""
+    """Contents of a log, tick by tick; `poses` holds every tag picture."""
 
     time_ns: list[int]
     modules: list[ModuleInputs]
@@ -115,14 +115,14 @@ def _heard(log: FlightLog, firmware: Firmware) -> _Heard:
 
 
 class _Commands:
-    """The shares in the THRUSTER_CMD frames that a tick sent."""
+    """Decodes the shares in the THRUSTER_CMD frames that a tick sent."""
 
     def __init__(self, count: int) -> None:
         codec = Codec.load()
         self._halves, self._count = [codec.message(name) for name in HALVES], count
 
     def of(self, lines: Sequence[str]) -> tuple[bool, np.ndarray]:
-        """Whether armed, and (t,) shares; a disarmed tick pushes nothing. `lines` are those of can.log."""
+        """Whether armed, and (t,) shares, 0 when disarmed. `lines` are those of can.log."""
         shares, armed = np.zeros(8), False
         for line in lines:
             number, _, data = line.split(" ")[2].partition("#")
@@ -134,7 +134,7 @@ class _Commands:
 
 
 def _delayed(column: np.ndarray) -> np.ndarray:
-    """What acts during the tick that ends at each row: sent in tick k, applied at SYNC k+1, at work until SYNC k+2."""
+    """Column as it acts during the tick that ends at each row: sent in tick k, applied at SYNC k+1, in effect until SYNC k+2."""
     return np.concatenate([np.zeros_like(column[:2]), column[:-2]])
 
 

@@ -1,16 +1,15 @@
-"""For tools/identify.py: the equations of motion of one module, with what is to be found in them.
+"""For tools/identify.py: the equations of motion of one module, with their unknowns.
 
 Newton and Euler about the centre of mass, body frame, motion relative to the water (Fossen 2011, ch. 6 and 8):
 
     M a  =  sum k_i F_i d_i + D(v) + n down                                 - w' x s - w x (w x s)  + M (w x v) - w x (M v)
     I w' =  sum k_i F_i r_i x d_i - (rot |w| + cross c(v)) w - arm x down   - s x a                 - w x (I w) - v x (M v)
 
-a is what the accelerometer feels plus gravity, w' the derivative of the gyro; F_i is the thruster's curve over the commands that went
-out, behind a first-order lag, at the measured voltage; v the velocity less that of the water, which is a mean and a gust in a knot
-every 2.5 s, straight lines between them; s the first moment of mass about where the file has the centre. A known weight adds its
-force, less its mass times a, to the first, and the moment of that where it hangs to the second. M, I, s, D, n, arm and k have one
-factor in common that no motion shows. Both sides are seen through one window of 11 ticks: that of a straight line's slope through
-the gyro.
+a is the measured specific force plus gravity, w' the derivative of the gyro; F_i is the thruster's curve over the commands sent, behind a
+first-order lag, at the measured voltage; v is the velocity less that of the water, which is a mean plus a gust given at knots 2.5 s apart
+and linear between them; s is the first moment of mass about the centre in the vehicle file. A known weight adds its force, less its mass
+times a, to the first equation, and the moment of that at its point of attachment to the second. M, I, s, D, n, arm and k have one common
+factor that no motion shows. Both sides are filtered with one window of 11 ticks: that of the slope of a straight line through the gyro.
 """
 
 from __future__ import annotations
@@ -32,34 +31,34 @@ from firmware_py.description.vehicle import ThrusterCurve, Vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 
 HALF_WINDOW = 5
-"""Ticks to either side of a row; rows follow every so many twice, so that hardly a sample is in two."""
+"""Ticks to either side of a row. Rows are twice as many ticks apart, so that hardly any sample contributes to two."""
 DEADBAND_EDGE_N = 0.01
-"""Over which a thruster's deadband ends, so that its place can be searched by slopes."""
+"""Width of the smoothed edge of a thruster's deadband, which makes the deadband searchable by slopes."""
 SHORTEST_LAG_S = 0.005
 NO_GUST = np.zeros(0)
 DOWN = np.array([0.0, 0.0, 1.0])
 GUST_S = 5.0
-"""How long gusts last: they forget themselves as exp(-t / GUST_S)."""
+"""Correlation time of gusts: their autocorrelation is exp(-t / GUST_S)."""
 KNOT_S = 2.5
-"""Between two knots of the gusts."""
+"""Time between two knots of the gusts."""
 
 
 class Unknown(NamedTuple):
-    """So many numbers that are searched, with the width of what is thinkable around where the vehicle file has them."""
+    """`size` unknowns under one name, with the standard deviation `width` of their prior about the vehicle file's values."""
 
     name: str
     size: int
     width: float
     step: float = 1e-4
-    """For slopes."""
+    """Step of the finite differences."""
 
 
 def unknowns(thrusters: int) -> tuple[Unknown, ...]:
-    """What belongs to the vehicle. mass, inertia: logarithms of the totals; SI units.
+    """Unknowns of the vehicle. mass, inertia: logarithms of the totals; SI units.
 
-    shape: how the curve's shape is wrong. Shares of the force: reverse against forward, small commands against full ones forwards and in
-    reverse; and what small commands push too little, N, forwards and in reverse. A load cell with 0.02 N of noise is off by some per cent
-    where a robot that hovers pushes, and with it would be the gains of thrusters that push one way against those that push the other.
+    shape: errors of the curve's shape. Shares of the force: reverse against forward, small commands against full ones, forward and in
+    reverse; then the force missing at small commands, N, forward and in reverse. A load cell with 0.02 N of noise is off by some per cent
+    at the forces of a hovering robot, which would bias the gains of thrusters that push one way against those that push the other.
     """
     return (
         Unknown("mass", 3, 1.0),
@@ -78,30 +77,30 @@ def unknowns(thrusters: int) -> tuple[Unknown, ...]:
 
 
 NUISANCES = (Unknown("current", 3, 0.3), Unknown("bias", 3, 0.3))
-"""What belongs to one flight: the water's mean velocity, m/s, and the accelerometer's bias, m/s^2."""
+"""Unknowns of one flight: the water's mean velocity, m/s, and the accelerometer's bias, m/s^2."""
 
 
 def places(parts: Sequence[Unknown], first: int = 0) -> dict[str, slice]:
-    """Where each stands in the vector of all."""
+    """Slice of each unknown in the vector of all, by name."""
     ends = first + np.cumsum([p.size for p in parts])
     return {p.name: slice(int(end) - p.size, int(end)) for p, end in zip(parts, ends, strict=True)}
 
 
 class Weight(NamedTuple):
-    """A known weight that hung at the vehicle for part of a flight."""
+    """A known weight that hung on the vehicle for part of a flight."""
 
     newton: float
-    """In water."""
+    """Weight in water."""
     kg: float
-    """In air."""
+    """Mass in air."""
     from_s: float
     until_s: float
     at_m: tuple[float, float, float] | None = None
-    """Where, module frame as in the vehicle file; None: the middle of the hull's bottom."""
+    """Point of attachment, module frame as in the vehicle file; None: the middle of the hull's bottom."""
 
 
 def beginning(vehicle: Vehicle) -> dict[str, np.ndarray]:
-    """The unknowns as the vehicle file has them."""
+    """The unknowns at the vehicle file's values."""
     body, count = assemble_vehicle(vehicle), len(vehicle.thruster)
     total = np.diag(body.mass)
     return {
@@ -121,10 +120,10 @@ def beginning(vehicle: Vehicle) -> dict[str, np.ndarray]:
 
 
 class Equations:
-    """The equations over one flight: what was measured, and what it should have been for given unknowns."""
+    """The equations of one flight: the measurements, and their predictions for given unknowns."""
 
     def __init__(self, recording: Recording, motion: Motion, curve: ThrusterCurve, weight: Weight | None = None) -> None:
-        """`curve` is the thrusters' in place of the recording's. Raises DescriptionError where no row is of use."""
+        """`curve` replaces that of the recording's thrusters. Raises DescriptionError where no row is usable."""
         vehicle, window = recording.vehicle, _window(HALF_WINDOW)
         inner = np.arange(HALF_WINDOW, len(recording.time_ns) - HALF_WINDOW, 2 * HALF_WINDOW)
         steady = np.convolve(recording.armed, np.ones(len(window)), "valid") > len(window) - 0.5
@@ -156,7 +155,7 @@ class Equations:
     def predict(self, x: Mapping[str, np.ndarray]) -> np.ndarray:
         """(n, 6) acceleration of the centre of mass and derivative of the rate; `x` holds the unknowns and nuisances by name.
 
-        Where it holds (3 k,) "gust", that is the velocity x, y, z of the water at each of the k knots, more than its mean.
+        (3 k,) "gust", if present, is the velocity x, y, z of the water at each of the k knots, in excess of its mean.
         """
         thrust = np.column_stack([
             self._once(i, np.array([x["lag"][0], x["deadband"][i], *x["shape"]]), self._thrust) for i in range(len(x["gain"]))
@@ -176,7 +175,7 @@ class Equations:
         return np.hstack([force / (mass + self._load.kg * self._loaded[:, None]) + x["bias"], moment / inertia])
 
     def _once(self, key: object, at: np.ndarray, compute):  # type: ignore[no-untyped-def]
-        """What `compute(key, at)` gave the last time, where `at` has not changed."""
+        """Cached result of `compute(key, at)`, recomputed when `at` has changed."""
         kept = self._kept.get(key)
         if kept is None or kept[0] != at.tobytes():
             kept = self._kept[key] = at.tobytes(), compute(key, at)
@@ -194,21 +193,21 @@ class Equations:
         return self._seen(lfilter([1.0 - keep], [1.0, -keep], static * working) * self._scale)
 
     def _drag(self, key: str, at: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        """(n, 3) velocity through water of a mean (3,) and gusts, and the (n, 3) force for coefficients (1, 0) and (0, 1)."""
+        """(n, 3) velocity through the water of a mean (3,) and gusts, and the (n, 3) force for coefficients (1, 0) and (0, 1)."""
         gusts = at[3:].reshape(-1, 3)
         v = _each(self._q, self._v_w - at[:3] - self.knots[:, : len(gusts)] @ gusts)
         speed = np.linalg.norm(v, axis=1, keepdims=True)
         return v, [-np.array([look_up(nodes, row)[:1] for row in np.ascontiguousarray(v)]) * speed * v for nodes in self._nodes]
 
     def _seen(self, series: np.ndarray) -> np.ndarray:
-        """A series of all ticks, through the window, at the rows."""
+        """Filters a series of all ticks with the window and samples it at the rows."""
         columns = series.reshape(len(series), -1).T
         seen = np.column_stack([np.convolve(c, self._window, "valid") for c in columns])[self._rows - HALF_WINDOW]
         return seen if series.ndim > 1 else seen[:, 0]
 
 
 def _each(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """(n, 3) world vectors, each seen in the body of its attitude."""
+    """(n, 3) world vectors, each rotated into the body frame of its attitude."""
     axis = -q[:, 1:]
     twice = 2.0 * _cross(axis, vectors)
     return np.asarray(vectors + q[:, :1] * twice + _cross(axis, twice))
@@ -220,13 +219,13 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _knots(time_s: np.ndarray) -> np.ndarray:
-    """(n, k) share of each knot in what the gust is at each time."""
+    """(n, k) weight of each knot in the gust at each time."""
     count = 2 + int(time_s[-1] / KNOT_S)
     return np.maximum(0.0, 1.0 - np.abs(time_s[:, None] / KNOT_S - np.arange(count)))
 
 
 def gust_precision(knots: int) -> np.ndarray:
-    """(k, k) inverse covariance of gusts of unit variance at the knots: that of a first-order Gauss-Markov process."""
+    """(k, k) inverse covariance of gusts of unit variance at the knots, a first-order Gauss-Markov process."""
     keep = math.exp(-KNOT_S / GUST_S)
     diagonal = np.full(knots, 1.0 + keep**2)
     diagonal[[0, -1]] = 1.0
@@ -235,7 +234,7 @@ def gust_precision(knots: int) -> np.ndarray:
 
 
 def _window(half: int) -> np.ndarray:
-    """(2 half + 1,) weights with which the slope of a straight line through so many samples means the derivative between them."""
+    """(2 half + 1,) weights with which the slope of a straight line through as many samples averages the derivative between them."""
     j = np.arange(-half, half)
     between = half * (half + 1) - j * (j + 1.0)
     weights = np.zeros(2 * half + 1)
@@ -245,7 +244,7 @@ def _window(half: int) -> np.ndarray:
 
 
 def _slope(series: np.ndarray, period_s: float) -> np.ndarray:
-    """(n - 2 half, k) slope of the straight line through the samples around each."""
+    """(n - 2 half, k) slope of the straight line through the samples around each sample."""
     j = np.arange(-HALF_WINDOW, HALF_WINDOW + 1.0)
     return np.column_stack([np.convolve(c, -j / (j @ j) / period_s, "valid") for c in series.T])
 
@@ -264,7 +263,7 @@ def _drag_nodes(vehicle: Vehicle) -> list[np.ndarray]:
 
 
 def hung_at(weight: Weight, vehicle: Vehicle) -> np.ndarray:
-    """(3,) where a weight hung, module frame, m."""
+    """(3,) point where a weight hung, module frame, m."""
     return np.array(weight.at_m) if weight.at_m is not None else 0.5 * vehicle.hull.size_m * DOWN
 
 

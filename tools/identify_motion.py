@@ -1,8 +1,8 @@
-"""For tools/identify.py: how a recorded flight really moved, by kinematics alone: no mass, no drag, no thruster enters.
+"""For tools/identify.py: the actual motion of a recorded flight, from kinematics alone, without mass, drag or thrusters.
 
-A Kalman filter of position, velocity, attitude and the biases of gyro and accelerometer, driven by these two and corrected by tags
-at the times of their pictures, then smoothed backwards (Rauch, Tung, Striebel 1965). So nothing that the firmware believes of the
-vehicle can leak into what is fitted.
+A Kalman filter of position, velocity, attitude and the biases of gyro and accelerometer, driven by these two sensors and corrected by tags
+at the times of their pictures, then smoothed backwards (Rauch, Tung, Striebel 1965). Nothing that the firmware assumes about the vehicle
+can therefore leak into the fit.
 
 State x (16,): position and velocity (world) 0:6, attitude 6:10, biases of gyro 10:13 and accelerometer 13:16. Its error e (15,):
 dp 0:3 and dv 3:6 world, dtheta 6:9 body, dbg 9:12, dba 12:15.
@@ -21,15 +21,15 @@ from firmware_py.core.rotations import difference, exp, multiply, normalise, rot
 
 STATES, ERRORS = 16, 15
 INITIAL_SIGMA = np.repeat([0.05, 0.3, 0.05, 0.05, 0.3], 3)
-"""Of the error at the first tag: m, m/s, rad, rad/s, m/s^2."""
+"""Sigma of the error at the first tag: m, m/s, rad, rad/s, m/s^2."""
 GATE = float(chi2.ppf(0.9999, 6))
-"""Largest normalised innovation squared of a tag that is believed."""
+"""Largest normalised innovation squared (NIS) of a tag that is accepted."""
 SIXTH_DIFFERENCE = np.array([1.0, -6.0, 15.0, -20.0, 15.0, -6.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """n ticks as they were: position (n, 3) m and velocity (n, 3) m/s in the world, attitude (n, 4), rate (n, 3) rad/s in the body."""
+    """Motion over n ticks: position (n, 3) m and velocity (n, 3) m/s in the world, attitude (n, 4), rate (n, 3) rad/s in the body frame."""
 
     p_wb: np.ndarray
     v_w: np.ndarray
@@ -38,19 +38,19 @@ class Motion:
 
 
 def noise_of(samples: np.ndarray) -> float:
-    """Standard deviation of the white noise of (n, 3) samples: motion is smooth, so sixth differences hold noise alone."""
+    """Standard deviation of the white noise of (n, 3) samples: motion is smooth, so sixth differences contain noise alone."""
     differences = sum(c * samples[i : len(samples) - 6 + i] for i, c in enumerate(SIXTH_DIFFERENCE))
     typical = 1.4826 * np.nanmedian(np.abs(differences), axis=0)
     return float(np.sqrt(np.mean(np.square(typical)) / np.sum(np.square(SIXTH_DIFFERENCE))))
 
 
 def smooth(recording: Recording) -> Motion:
-    """The motion of the centre of mass."""
+    """Motion of the centre of mass, by the filter and the backward smoother."""
     gyro, accel = filled(recording.gyro), filled(recording.accel)
     noise = recording.noise
     density = np.repeat(
         [0.0, noise_of(accel), noise_of(gyro), noise.gyro_bias_walk, noise.accel_bias_walk], 3
-    ) ** 2  # per sample where the sensors' own, per second where a walk
+    ) ** 2  # sensor noise per sample, bias walks per second
     density[3:9] *= recording.period_s
     poses = recording.poses
     tags = np.array([[(p.capture_ns - recording.time_ns[0]) * 1e-9 / recording.period_s, p.tags] for p in poses])
@@ -66,7 +66,7 @@ def smooth(recording: Recording) -> Motion:
 
 
 def filled(samples: np.ndarray) -> np.ndarray:
-    """(n, k) with what did not come interpolated."""
+    """(n, k) samples with missing ones interpolated."""
     out, rows = samples.copy(), np.arange(len(samples))
     for column in out.T:
         known = np.isfinite(column)
@@ -97,7 +97,7 @@ def _moved(x, gyro, accel, dt):
 
 
 def _corrected(x, covariance, picture, late_s, gyro, variance, gate):
-    """State and covariance after a picture taken `late_s` after the tick; as they were where the gate is exceeded."""
+    """State and covariance after a picture taken `late_s` after the tick; unchanged where the gate is exceeded."""
     w = gyro - x[10:13]
     q = normalise(multiply(x[6:10].copy(), exp(late_s * w)))
     r = to_matrix(q)
@@ -130,7 +130,7 @@ def _added(x, e):
 
 
 def _taken(a, b):
-    """(15,) error that added to b gives a."""
+    """(15,) error that, added to b, gives a."""
     out = np.empty(ERRORS)
     out[:6] = a[:6] - b[:6]
     out[6:9] = difference(a[6:10].copy(), b[6:10].copy())
@@ -143,8 +143,8 @@ def _smooth(start, sigma, gyro, accel, dt, density, tags, pictures, variance, ga
 
     Args:
         gyro, accel: (n, 3). density: (15,) process noise, per second.
-        tags: (k, 2) time of each picture in ticks since the first, and how many tags it is worth; pictures: (k, 10) tag centre,
-            its lever, attitude. variance: (6,) of one tag.
+        tags: (k, 2) time of each picture in ticks since the first tick, and its number of tags, which divides the variance;
+            pictures: (k, 10) tag centre, its lever, attitude. variance: (6,) measurement noise of one tag.
     """
     n = gyro.shape[0]
     ahead, after = np.empty((n, STATES)), np.empty((n, STATES))

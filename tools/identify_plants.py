@@ -1,8 +1,8 @@
-"""How well tools/identify.py finds plants that are known: each seed's robot is shaken on the bench and told from its log alone.
+"""How well tools/identify.py finds known plants: each seed's robot is shaken on the bench and identified from its log alone.
 
     .venv/bin/python tools/identify_plants.py --plants 10 --jobs 2
 
-The load cell: 41 forces of thruster 1 with 0.02 N of noise, through a scale that is off by up to 2 %, drawn per seed.
+The load cell: 41 forces of thruster 1 with 0.02 N of noise, and a scale error of up to 2 %, drawn per seed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MASS, DRAG, GAIN = "mass", "drag", "gain"
 
 
 def load_cell(draw: ModuleDraw, curve: ThrusterCurve, seed: int) -> dict[str, np.ndarray]:
-    """The columns of tools/fit_thruster.py for thruster 1 of a plant, measured with a scale that is a little off."""
+    """Load-cell measurement of thruster 1 of a plant, as columns of tools/fit_thruster.py, with an error of scale."""
     rng = np.random.default_rng([seed, 9])
     u = np.linspace(-1.0, 1.0, CELL_POINTS)
     force = curve_force(curve, u)
@@ -49,7 +49,7 @@ def load_cell(draw: ModuleDraw, curve: ThrusterCurve, seed: int) -> dict[str, np
 
 
 def truth_of(draw: ModuleDraw) -> dict[str, float]:
-    """What a plant is, by the names of identify_quantities."""
+    """True values of a plant, by the names of identify_quantities."""
     total = draw.dry_kg + draw.entrained_kg + draw.added[:3]
     truth = {f"total mass along {axis}": float(kg) for axis, kg in zip("xyz", total, strict=True)}
     truth |= {f"drag coefficient, {side}": float(cd) for side, cd in zip(("face-on", "edge-on"), draw.drag[:2], strict=True)}
@@ -60,8 +60,8 @@ def examine(seed: int, folder: Path, duration_s: float = 170.0) -> dict[str, obj
     """Flies one plant and identifies it.
 
     Returns:
-        seed; error: by name, share of the truth; before: the same of the vehicle file; covers: by name, whether the 95 % interval holds
-        the truth; half_width: of it, share of the value; states_mass: whether the same log without the reference states one.
+        seed; error: by name, share of the truth; before: the same for the vehicle file; covers: by name, whether the 95 % interval contains
+        the truth; half_width: of that interval, share of the value; states_mass: whether a mass is stated without the reference.
     """
     out = folder / str(seed)
     out.mkdir(parents=True, exist_ok=True)
@@ -90,7 +90,9 @@ def examine(seed: int, folder: Path, duration_s: float = 170.0) -> dict[str, obj
 
 
 def summary(plants: Sequence[dict]) -> dict[str, float]:  # type: ignore[type-arg]
-    """Worst errors of masses, drag and relative gains, found and before; share of intervals that hold the truth; masses stated blindly."""
+    """Worst errors of masses, drag and relative gains, identified and before; share of intervals that contain the truth; number of plants
+    for which a mass was stated without reference.
+    """
     worst = {
         kind + suffix: max(abs(e) for p in plants for name, e in p[when].items() if kind in name)
         for when, suffix in (("error", ""), ("before", "_before"))
@@ -101,7 +103,7 @@ def summary(plants: Sequence[dict]) -> dict[str, float]:  # type: ignore[type-ar
 
 
 def examine_all(seeds: Sequence[int], jobs: int, folder: Path, duration_s: float = 170.0) -> dict[str, float]:
-    """Examines all plants in so many processes; plants.json is left in `folder`."""
+    """Examines all plants in `jobs` processes; writes plants.json into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     with processes(jobs)() as pool:
         plants = list(pool.map(partial(examine, folder=folder, duration_s=duration_s), seeds))
@@ -110,7 +112,7 @@ def examine_all(seeds: Sequence[int], jobs: int, folder: Path, duration_s: float
 
 
 def main() -> int:
-    """The command line."""
+    """Runs the tool; returns its exit status."""
     parser = Parser(description=__doc__)
     parser.add_argument("--plants", type=whole(1), default=10, help="number of seeds")
     parser.add_argument("--seed", type=whole(0), default=0, help="first seed")

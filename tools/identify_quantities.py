@@ -1,4 +1,4 @@
-"""For tools/identify.py: what a fit says, as numbers for people: absolute ones where a reference allows them, ratios otherwise."""
+"""For tools/identify.py: the result of a fit as numbers for people: absolute ones where a reference allows them, ratios otherwise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from firmware_py.prepare.assembly import assemble_vehicle
 AXES = "xyz"
 SIDES = ("face-on", "edge-on")
 GOOD = 0.10
-"""Half-width of an interval, share of the value, above which something was not excited."""
+"""Half-width of an interval, as a share of the value, above which the motion was not excited enough."""
 NO_SCALE = (
     "no absolute reference: masses, drag and thrust have one factor in common that no motion shows, so only ratios are given and no mass "
     "is stated; give --curve (tools/fit_thruster.py) or --weight"
@@ -25,14 +25,14 @@ NO_SCALE = (
 
 
 class Quantity(NamedTuple):
-    """One number out of the unknowns x; `motion` (of identify_excitation) is what shows it, empty where nothing need be done."""
+    """One function of the unknowns x; `motion` (of identify_excitation) makes it observable, empty where no motion is asked for."""
 
     name: str
     unit: str
     function: Callable[[np.ndarray], float]
     motion: str = ""
     of: Callable[[np.ndarray], float] | None = None
-    """What its interval is measured against; None: itself."""
+    """Value to which its interval is compared; None: the quantity itself."""
 
 
 class Finding(NamedTuple):
@@ -43,12 +43,12 @@ class Finding(NamedTuple):
     value: float
     half_width: float
     share: float
-    """The half-width over the value."""
+    """Half-width as a share of the value."""
     motion: str
 
 
 def absolute(fit: Fit, vehicle: Vehicle) -> list[Quantity]:
-    """What only a known scale gives."""
+    """Quantities that need a known scale."""
     at = fit.places
     mass, inertia, drag, arm = (at[name].start for name in ("mass", "inertia", "drag", "arm"))
     rotational = assemble_vehicle(vehicle).drag.rotational
@@ -66,7 +66,7 @@ def absolute(fit: Fit, vehicle: Vehicle) -> list[Quantity]:
 
 
 def ratios(fit: Fit) -> list[Quantity]:
-    """What every log gives: the common factor cancels."""
+    """Quantities that every log gives: the common factor cancels."""
     at = fit.places
     mass, gains = at["mass"].start, at["gain"]
 
@@ -101,7 +101,7 @@ def ratios(fit: Fit) -> list[Quantity]:
 
 
 def findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
-    """Everything that may be said."""
+    """All findings of a fit: absolute quantities where the scale is known, and ratios."""
     quantities = (absolute(fit, vehicle) if fit.has_scale else []) + ratios(fit)
     found = []
     for quantity in quantities:
@@ -112,7 +112,7 @@ def findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
 
 
 def missing(found: list[Finding]) -> dict[str, list[str]]:
-    """Motions that were not made, or not enough, and what would need them."""
+    """Motions that were missing or too small, and the quantities that need them."""
     wanted: dict[str, list[str]] = {}
     for each in found:
         if each.motion and each.share > GOOD:
@@ -121,10 +121,10 @@ def missing(found: list[Finding]) -> dict[str, list[str]]:
 
 
 def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) -> Vehicle:
-    """The vehicle file with what was found. What the vehicle carries stays as it is described.
+    """The vehicle file with the fitted values. The payload stays as described.
 
-    The dry mass stays as it was weighed. Rigid and added mass appear only as their sum: the sum is shared as the file has it, the
-    rigid part alike along all axes. What has no field (trim, gains one by one) stays in the report.
+    The dry mass stays as weighed. Only the sum of rigid and added mass is observable: it is divided as in the file, with the same factor on
+    the rigid part along all axes. Quantities without a field (trim, individual gains) stay in the report.
     """
     old, body = vehicle.inertial, assemble_vehicle(vehicle)
     whole, own = np.diag(body.mass), np.diag(assemble_vehicle(dataclasses.replace(vehicle, payload=())).mass)
@@ -159,12 +159,12 @@ def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) 
 
 
 def _number(i: int) -> Callable[[np.ndarray], float]:
-    """One of the unknowns."""
+    """Function that returns one unknown."""
     return lambda x: float(x[i])
 
 
 def _exponential(i: int) -> Callable[[np.ndarray], float]:
-    """One that is searched by its logarithm."""
+    """Function that returns one unknown which is searched by its logarithm."""
     return lambda x: float(np.exp(x[i]))
 
 

@@ -1,10 +1,10 @@
-"""Open-loop response of the attitude and position loops at the plant's input, measured on the code that flies.
+"""Open-loop response of the attitude and position loops at the plant's input, measured on the flight code.
 
-The stages of a tick (measure, estimate, control, allocate, limit) run against the bench's plant, with its thruster lag, the bus's
-tick of delay and tags at 60 Hz that are 40 ms late; noise, current, deadband and quantisation are off, so what is left is linear
-in small motions. Sines are added to the forces behind the controller's back, each axis at frequencies of its own, all at once. With u
-what the controller gives and p = u + sines what reaches the plant, the loop broken at that axis, all others closed, is
-L(jw) = -U(jw) / P(jw), exact at every frequency of the record's grid.
+The stages of a tick (measure, estimate, control, allocate, limit) run against the bench's plant, with its thruster lag, the bus delay of
+one tick and tags at 60 Hz that are 40 ms late; noise, current, deadband and quantisation are off, so the rest is linear for small motions.
+Sines are added to the forces downstream of the controller, on all axes at once, each at frequencies of its own. With u the controller's
+output and p = u + sines the plant's input, the loop broken at that axis, all others closed, is L(jw) = -U(jw) / P(jw), exact at every
+frequency of the record's grid.
 """
 
 from __future__ import annotations
@@ -37,31 +37,32 @@ BODIES: dict[int, list[tuple[int, int, int]]] = {
     2: [(0, 0, 0), (1, 0, 0)],
     4: [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)],
 }
-"""Cells of the bodies that are examined, by their number of modules: one, a line, two by two."""
+"""Cells of the examined bodies, by their number of modules: one, a line, two by two."""
 PERIOD_NS = 10_000_000
 PRESSURE_EVERY = 2
-"""Ticks from one pressure reading to the next."""
+"""Ticks between pressure readings."""
 SETTLE_TICKS, RECORD_TICKS = 4000, 5000
-"""Until the filter's gains stand still; and of the record, whose frequencies are multiples of 2 pi / 50 s."""
+"""Ticks until the filter's gains have settled; and length of the record, whose frequencies are multiples of 2 pi / 50 s."""
 LOWEST_RAD_S, HIGHEST_RAD_S, LINES = 0.3, 30.0, 20
-"""Frequencies at which each axis is shaken."""
+"""Range and number of the excitation frequencies of each axis."""
 SHAKE = np.repeat([0.01, 0.02], 3)
-"""Acceleration of one sine, m/s^2 and rad/s^2: all together stay far from the thrusters' limits."""
+"""Acceleration of one sine, m/s^2 and rad/s^2: their sum stays far from the thrusters' limits."""
 MOST_STRAY = 0.05
-"""Stable loops have up to 0.015, by the beat of tags and ticks; those that swing 0.14 and more (measured)."""
+"""Largest stray share of a stable loop. Measured: stable ones up to 0.015, from the beat of tags and ticks; oscillating ones from 0.14."""
 LEAST_SHARE = 0.1
-"""Of a force or moment asked for along one axis, what the thrusters must give of it for the axis to be controlled. The shares add up to
-the rank, so one axis always is. Layout.unreachable is stricter: it has the surge of a BlueROV2, which tilts it a little, beside its pitch.
+"""Least share of a force or moment requested along one axis that the thrusters must deliver for the axis to count as controlled. The shares
+add up to the rank, so one axis always is. Layout.unreachable is stricter: beside the pitch of a BlueROV2 it lists the surge, which tilts
+it a little.
 """
 HEIGHT_M = 1.5
 HOME = rest_at(np.array([0.0, 0.0, HEIGHT_M]), np.array([1.0, 0.0, 0.0, 0.0]))
 STEP = np.repeat([0.05, math.radians(5.0)], 3)
-"""Of the set-point: small enough for no thruster to reach its limit."""
+"""Step of the set-point: small enough to keep every thruster below its limit."""
 STEP_SETTLE_TICKS, STEP_TICKS = 2000, 500
 
 
 class Scale(NamedTuple):
-    """How the plant differs from what the controller believes: factors of mass, inertia (water's included) and thruster lag."""
+    """How the plant differs from the controller's model: factors of mass, inertia (both with added mass) and thruster lag."""
 
     mass: float = 1.0
     inertia: float = 1.0
@@ -78,7 +79,7 @@ def corners(spread: float) -> list[Scale]:
 
 
 def body_of(modules: int, vehicle: str) -> Body:
-    """The body of so many of these vehicles. Raises DescriptionError."""
+    """The body of `modules` such vehicles. Raises DescriptionError."""
     return assemble(BODIES[modules], [0] * modules, [load_vehicle(vehicle)] * modules)
 
 
@@ -88,13 +89,13 @@ class Response(NamedTuple):
     frequency: np.ndarray
     loop: np.ndarray
     stray: float = 0.0
-    """Share of what the controller gives that is beside the sines: a loop that swings by itself has much of it."""
+    """Share of the controller's output outside the excitation frequencies: large in a loop that oscillates by itself."""
     controlled: bool = True
     """Whether the thrusters can push along the axis."""
 
 
 class Loop:
-    """One body of docked modules that holds its place: firmware and plant, tick by tick."""
+    """One body of docked modules that holds its position: firmware and plant, tick by tick."""
 
     def __init__(self, modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicle: str = "modcube") -> None:
         described = load_vehicle(vehicle)
@@ -109,12 +110,12 @@ class Loop:
         self._commanded = np.zeros(self.body.thrusters.f_max.size)
         self._tick = 0
         self.is_ready = False
-        """Whether the estimator knows its place."""
+        """Whether the estimator knows the pose."""
         self.pose = np.zeros(6)
-        """Estimated place, m, and rotation vector, rad."""
+        """Estimated position, m, and rotation vector, rad."""
 
     def step(self, shake: np.ndarray) -> np.ndarray:
-        """(6,) wrench that the controller gives in this tick; `shake` (6,) N, N m goes to the thrusters with that of the tick before."""
+        """(6,) wrench that the controller gives in this tick; `shake` (6,) N, N m is applied together with that of the tick before."""
         tick, self._tick = self._tick, self._tick + 1
         self._push(self._commanded + self.body.thrusters.pinv @ shake)
         inputs = self._sample(tick)
@@ -130,14 +131,14 @@ class Loop:
         return np.asarray(self.body.thrusters.matrix @ self._commanded)
 
     def _push(self, force_n: np.ndarray) -> None:
-        """At SYNC the plant takes the forces that were commanded in the tick before."""
+        """Applies the forces commanded in the tick before to the plant, as at SYNC."""
         t, u = self.body.thrusters, np.zeros(force_n.size)
         commands(np.ascontiguousarray(force_n), np.ones(force_n.size), t.forward, t.reverse, np.zeros(force_n.size), u)
         for module in range(len(self.body.modules)):
             self._world.set_command(module, u[t.module == module].tolist())
 
     def _sample(self, tick: int) -> Inputs:
-        """What the sensors say at SYNC, and the tags that have arrived."""
+        """Sensor readings at SYNC, and the tags that have arrived by then."""
         time_ns = self._world.time_ns
         delay_ns = round(1e6 * self._sensors_spec.tag_delay_ms)
         modules = []
@@ -161,7 +162,7 @@ def _scaled(vehicle: Vehicle, scale: Scale) -> Vehicle:
             entrained_kg=i.entrained_kg * scale.mass,
             inertia=i.inertia * scale.inertia,
             added=i.added * np.repeat([scale.mass, scale.inertia], 3),
-            righting_arm_m=i.righting_arm_m / scale.mass,  # the moment stays as it is
+            righting_arm_m=i.righting_arm_m / scale.mass,  # keeps the moment
         ),
     )
 
@@ -194,7 +195,7 @@ def lines() -> np.ndarray:
 
 
 def measure(modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicle: str = "modcube") -> list[Response]:
-    """The open-loop response of each axis of a body of so many modules. Raises DescriptionError where it never finds its pose."""
+    """Open-loop response of each axis of a body of `modules` modules. Raises DescriptionError where the body never finds its pose."""
     loop, chosen = Loop(modules, parameters, scale, vehicle), lines()
     phase = 2.0 * math.pi * np.random.default_rng(0).uniform(size=chosen.shape)
     time = np.arange(SETTLE_TICKS + RECORD_TICKS) / RECORD_TICKS
@@ -203,7 +204,7 @@ def measure(modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicl
     given = np.array([loop.step(each) for each in shake])
     if not loop.is_ready:
         raise DescriptionError(f"{vehicle}: its loops are open, for the camera sees no tag of it; margins need a vehicle with a tag on top")
-    # What was commanded in one tick is pushed in the next: the sine of a tick meets the wrench of the tick before.
+    # A command of one tick is applied in the next, so the sine of a tick is paired with the wrench of the tick before.
     u = np.fft.rfft(given[SETTLE_TICKS - 1 : -1], axis=0)
     p = u + np.fft.rfft(shake[SETTLE_TICKS:], axis=0)
     base = 2.0 * math.pi / (RECORD_TICKS * PERIOD_NS * 1e-9)
@@ -214,7 +215,7 @@ def measure(modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicl
 
 
 def step_responses(parameters: Parameters, axes: Sequence[int], vehicle: str) -> np.ndarray:
-    """(k, STEP_TICKS) share of a step of the set-point that a lone vehicle has made, tick by tick, one of `axes` after the other."""
+    """(k, STEP_TICKS) share of a set-point step that a lone vehicle has completed, tick by tick, for each of `axes` in turn."""
     loop, found, still = Loop(1, parameters, vehicle=vehicle), [], np.zeros(6)
     for _ in range(STEP_SETTLE_TICKS):
         loop.step(still)
@@ -237,25 +238,25 @@ class Margins(NamedTuple):
     """Smallest distances of a loop from instability."""
 
     gain_db: float
-    """By how much the gain may change, up or down."""
+    """Factor by which the gain may change, up or down."""
     phase_deg: float
     crossover_rad_s: float
     """Highest frequency at which the gain is one."""
 
 
 class Readings(NamedTuple):
-    """Where the margins of a loop are read off, frequencies in rad/s."""
+    """Points at which the margins of a loop are read off, frequencies in rad/s."""
 
     gain: list[tuple[float, float]]
-    """Frequency at which the phase is -180 deg or whole turns off it, and gain there, dB."""
+    """Frequency at which the phase is -180 deg, modulo whole turns, and gain there, dB."""
     phase: list[tuple[float, float]]
     """Frequency at which the gain is one, and phase margin there, deg."""
 
 
 def margins(response: Response) -> Margins:
-    """Margins of one loop; infinite where an axis is not controlled.
+    """Margins of one loop; infinite for an axis that is not controlled.
 
-    A loop that swings by itself has none, and none can be stated of one that does not cross 0 dB at the frequencies measured.
+    They are zero for a loop that oscillates by itself, and for one that does not cross 0 dB at the frequencies measured.
     """
     if not response.controlled:
         return Margins(math.inf, math.inf, math.nan)
@@ -270,7 +271,7 @@ def margins(response: Response) -> Margins:
 def read_off(response: Response) -> Readings:
     """All candidates for the margins of one loop, interpolated over the logarithm of the frequency.
 
-    Where the phase reaches -180 degrees above the last frequency, the gain there counts: it is not more by then.
+    Where the phase reaches -180 degrees only above the last frequency, the gain at the last frequency is used: it does not rise after that.
     """
     x = np.log(response.frequency)
     gain_db = 20.0 * np.log10(np.maximum(np.abs(response.loop), 1e-300))
@@ -286,6 +287,6 @@ def read_off(response: Response) -> Readings:
 
 
 def _crossings(x: np.ndarray, y: np.ndarray) -> list[float]:
-    """Where y, taken as straight between its points, is zero."""
+    """Zeros of y, interpolated linearly between its points."""
     at = np.flatnonzero(np.signbit(y[1:]) != np.signbit(y[:-1]))
     return [float(x[i] + (x[i + 1] - x[i]) * y[i] / (y[i] - y[i + 1])) for i in at]

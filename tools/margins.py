@@ -1,10 +1,10 @@
-"""Gain and phase margins of the loops broken at the plant's input, and how far they shrink where the plant is not as believed.
+"""Gain and phase margins of the loops broken at the plant's input, and how far they shrink where the plant differs from the model.
 
 .venv/bin/python tools/margins.py                                     # the shipped gains, bodies of 1, 2 and 4 modules
 .venv/bin/python tools/margins.py --controller runs/tune/parameters.toml --modules 1
 .venv/bin/python tools/margins.py --vehicle bluerov2_heavy --modules 1 --out runs/margins
 
-Status 1 where a margin is under its bar, or a controlled axis swings or never crosses 0 dB. An axis that the thrusters cannot push is
+Status 1 where a margin is below its limit, or a controlled axis oscillates or never crosses 0 dB. An axis that the thrusters cannot push is
 named and does not count. In DIR: margins.json and margins.png, the Bode plot.
 """
 
@@ -37,13 +37,13 @@ BARS = {"nominal": (8.0, 40.0), "worst": (6.0, 35.0)}
 """Least gain margin, dB, and phase margin, deg."""
 SPREAD = 0.15
 COLOURS = ("#d55e00", "#0072b2", "#009e73")
-"""Of the three axes of a panel (Okabe and Ito's palette)."""
+"""Colours of the three axes of a panel (Okabe and Ito's palette)."""
 
 Found = dict[int, dict[Scale, list[Response]]]
 
 
 def measured(modules: Sequence[int], parameters: Parameters, vehicle: str, jobs: int) -> Found:
-    """The responses of every body in the nominal world and in the eight corners."""
+    """Responses of every body in the nominal world and in the eight corners."""
     cases = [(n, scale) for n in modules for scale in (NOMINAL, *corners(SPREAD))]
     found: Found = {n: {} for n in modules}
     with processes(jobs)() as pool:
@@ -55,7 +55,7 @@ def measured(modules: Sequence[int], parameters: Parameters, vehicle: str, jobs:
 
 
 def check_bodies(modules: Sequence[int], vehicle: str) -> None:
-    """Raises DescriptionError where so many of this vehicle cannot be docked, before minutes are spent on the bodies that can."""
+    """Raises DescriptionError where one of the bodies cannot be docked from this vehicle, before minutes are spent on the others."""
     described = load_vehicle(vehicle)
     for count in modules:
         try:
@@ -65,7 +65,7 @@ def check_bodies(modules: Sequence[int], vehicle: str) -> None:
 
 
 def rows(found: Found) -> list[dict[str, Any]]:
-    """One row for each body, axis and bar: margins, and in which corner the worst are."""
+    """One row for each body, axis and limit: margins, and the corner of the worst phase margin."""
     result = []
     for modules, responses in found.items():
         for axis, name in enumerate(AXES):
@@ -80,7 +80,7 @@ def rows(found: Found) -> list[dict[str, Any]]:
 
 
 def print_table(table_rows: Sequence[dict[str, Any]]) -> None:
-    """One line for each body and axis."""
+    """Prints one line for each body and axis."""
     table = Table(box=box.SIMPLE_HEAD, title=f"margins at the plant's input; worst over mass, inertia and lag +-{SPREAD:.0%}")
     for column in ("modules", "axis", "crossover", "gain", "phase", "gain, worst", "phase, worst", "phase worst at mass, inertia, lag", ""):
         table.add_column(column, justify="left" if column in ("axis", "") else "right")
@@ -102,7 +102,7 @@ def print_table(table_rows: Sequence[dict[str, Any]]) -> None:
 
 
 def draw(path: Path, found: Found) -> None:
-    """Bode plot: a column for each body and kind of axis, bands over all corners."""
+    """Draws the Bode plot: a column for each body and kind of axis, bands over all corners."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -141,7 +141,7 @@ def draw(path: Path, found: Found) -> None:
 
 
 def mark(gain: Any, phase: Any, response: Response, name: str, colour: str) -> None:
-    """Marks where the least margins of a loop are read off, with a bar for each, and tells them in the legends."""
+    """Marks where the least margins of a loop are read off, with a bar for each, and lists them in the legends."""
     if math.isnan(margins(response).crossover_rad_s):
         gain.plot([], [], color=colour, label=f"{name}, no margins")
         return
@@ -159,14 +159,14 @@ def mark(gain: Any, phase: Any, response: Response, name: str, colour: str) -> N
 
 
 def bode(response: Response) -> tuple[np.ndarray, np.ndarray]:
-    """Gain, dB, and phase, deg, nearest to -180 at crossover."""
+    """Gain, dB, and phase, deg, shifted by whole turns to be nearest to -180 at crossover."""
     gain = 20.0 * np.log10(np.abs(response.loop))
     phase = np.degrees(np.unwrap(np.angle(response.loop)))
     return gain, phase - 360.0 * round((phase[int(np.argmin(np.abs(gain)))] + 180.0) / 360.0)
 
 
 def leave(out: Path, found: Found) -> int:
-    """Prints the table and leaves margins.json and margins.png; the exit status. Raises OSError."""
+    """Prints the table and writes margins.json and margins.png; returns the exit status. Raises OSError."""
     table_rows = rows(found)
     print_table(table_rows)
     finite = [{k: v if not isinstance(v, float) or math.isfinite(v) else None for k, v in row.items()} for row in table_rows]
@@ -177,7 +177,7 @@ def leave(out: Path, found: Found) -> int:
 
 
 def main() -> int:
-    """The command line."""
+    """Runs the tool; returns its exit status."""
     parser = Parser(description=__doc__)
     parser.add_argument("--modules", type=int, nargs="+", choices=list(BODIES), default=list(BODIES), help="sizes of body")
     parser.add_argument("--controller", default="modcube", help=f"{', '.join(CONTROLLERS)}, or a file of parameters")

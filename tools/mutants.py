@@ -1,9 +1,9 @@
-"""Mutation tests of what must be trusted: changes one thing at a time in limiter, supervisor, tables and fail-safes, and runs their tests.
+"""Mutation tests of safety-critical code: changes one thing at a time in limiter, supervisor, tables and fail-safes, and runs their tests.
 
     .venv/bin/python tools/mutants.py [MODULE ...] [--jobs N] [--list]
 
-Prints killed and survived per module, names each survivor with its line, and exits 1 when there is one. A mutant lives in a forked process
-alone: no file is touched. Everything heavy is imported before the fork.
+Prints killed and survived per module, names each survivor with its line, and exits 1 when there is one. A mutant exists only in a forked
+process: no file is touched. Everything slow to import is imported before the fork.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "firmware_py.core.failsafes": ("tests/unit/test_failsafes.py",),
     "firmware_py.core.limiter": ("tests/unit/test_limiter.py",),
 }
-"""The tests of each module, those that must kill its mutants."""
+"""Tests of each module, which must kill its mutants."""
 QUICKLY = (
     "-x", "-q", "--assert=plain", "--tb=no", "-pno:cacheprovider", "-pno:unraisableexception", "-pno:threadexception",
 )  # fmt: skip
-"""pytest's options: whether a test fails is all that is asked."""
+"""pytest's options: only whether a test fails matters."""
 HEAVY = (
     "numba", "numpy", "pytest", "scipy.spatial.transform", "firmware_py.core.drag_lookup", "firmware_py.core.rotations",
     "firmware_py.core.thruster", "firmware_py.core.missing_thrust", "firmware_py.core.body", "firmware_py.prepare.assembly",
 )  # fmt: skip
-"""Imported before the fork. None of them imports a target."""
+"""Modules imported before the fork. None of them imports a target."""
 
 COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
@@ -58,12 +58,12 @@ OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
     ast.BitAnd: ast.BitOr,
 }  # fmt: skip
 CELLS = {"G": "ALWAYS", "F": "NOTHING", "Need": "DEPTH"}
-"""Short names of the tables: a cell is replaced by this member, so that no row's guard or effect can be lost unseen."""
+"""Short names in the tables: a cell is replaced by this member, so that losing a row's guard or effect is tested too."""
 STATES = {"D": "A", "A": "E", "E": "D"}
 
 
 class Mutant(NamedTuple):
-    """One change."""
+    """One change to a module."""
 
     line: int
     what: str
@@ -71,7 +71,7 @@ class Mutant(NamedTuple):
 
 
 def mutants(source: str) -> Iterator[Mutant]:
-    """All mutants of a module's text, in the order of its lines."""
+    """All mutants of a module's source, in breadth-first order of its syntax tree."""
     tree = ast.parse(source)
     skipped = {id(node) for node in _annotations(tree)}
     for index, node in enumerate(ast.walk(tree)):
@@ -85,7 +85,7 @@ def mutants(source: str) -> Iterator[Mutant]:
 
 
 def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
-    """Nodes whose change means nothing at run time: annotations, how a function is compiled, zip's check, and text alone on a line."""
+    """Nodes whose change has no effect at run time: annotations, compiler options of a function, zip's check, and bare string constants."""
     for node in ast.walk(tree):
         roots: list[ast.AST | None] = []
         if isinstance(node, (ast.AnnAssign, ast.arg)):
@@ -102,7 +102,7 @@ def _annotations(tree: ast.Module) -> Iterator[ast.AST]:
 
 
 def _changes(node: ast.AST) -> list[tuple[str, Callable[[], object]]]:
-    """What can be changed at a node: a name, and the function that changes it in place."""
+    """Possible changes at a node: a name, and the function that makes the change in place."""
     found: list[tuple[str, Callable[[], object]]] = []
     if isinstance(node, ast.Compare):
         for i, op in enumerate(node.ops):
@@ -133,7 +133,7 @@ def _changes(node: ast.AST) -> list[tuple[str, Callable[[], object]]]:
 
 
 def _cells(call: ast.Call) -> list[tuple[str, Callable[[], object]]]:
-    """Cells of a table's row."""
+    """Changes to the cells of a table row."""
     found: list[tuple[str, Callable[[], object]]] = []
     for cell in call.args:
         if isinstance(cell, ast.Attribute) and isinstance(cell.value, ast.Name) and CELLS.get(cell.value.id, cell.attr) != cell.attr:
@@ -144,7 +144,7 @@ def _cells(call: ast.Call) -> list[tuple[str, Callable[[], object]]]:
 
 
 def _statements(function: ast.FunctionDef) -> list[tuple[str, Callable[[], object]]]:
-    """Statements that do something and can be left out."""
+    """Changes that leave out a statement with an effect."""
     found: list[tuple[str, Callable[[], object]]] = []
     for holder in ast.walk(function):
         for name in ("body", "orelse"):
@@ -177,7 +177,7 @@ def _become(node: ast.AST, other: ast.AST) -> None:
 
 
 def _uncompiled(tree: ast.Module) -> ast.Module:
-    """The same in plain Python: Numba would spend seconds on each mutant, or hand it what it compiled before."""
+    """The module in plain Python: Numba would spend seconds on each mutant, or serve it code that it compiled before."""
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):
             node.decorator_list = [each for each in node.decorator_list if not ast.unparse(each).startswith("njit")]
@@ -202,7 +202,7 @@ class Loader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def start(name: str, tree: ast.Module, quiet: bool) -> int:
-    """Forks a process that runs the tests of module `name` with `tree` in its place; its exit status is pytest's. Returns its id."""
+    """Forks a process that runs the tests of module `name` on `tree` and exits with pytest's status. Returns the process id."""
     process = os.fork()
     if process:
         return process
@@ -217,7 +217,7 @@ def start(name: str, tree: ast.Module, quiet: bool) -> int:
 
         sys.meta_path.insert(0, Loader(name, tree))
         status = int(pytest.main([*QUICKLY, *TARGETS[name]]))
-    except BaseException as error:  # whatever a mutant does, it ends here
+    except BaseException as error:  # whatever a mutant raises ends here
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
     finally:
         sys.stdout.flush()
@@ -225,7 +225,7 @@ def start(name: str, tree: ast.Module, quiet: bool) -> int:
 
 
 def run(name: str, todo: list[Mutant], jobs: int) -> list[Mutant]:
-    """The mutants that survive."""
+    """Runs mutants in `jobs` processes; returns the survivors."""
     waiting, running, survivors = list(reversed(todo)), dict[int, Mutant](), list[Mutant]()
     while waiting or running:
         while waiting and len(running) < jobs:
@@ -240,7 +240,7 @@ def run(name: str, todo: list[Mutant], jobs: int) -> list[Mutant]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs all mutants of the modules asked for."""
+    """Runs all mutants of the requested modules; returns the exit status."""
     parser = Parser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("module", nargs="*", help="last part of a module's name; all when none is given")
     parser.add_argument("--jobs", type=whole(1), default=os.cpu_count() or 1, help="processes")
@@ -262,24 +262,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def source_of(name: str) -> str:
-    """The text of a module."""
+    """Source of a module."""
     return (ROOT / (name.replace(".", "/") + ".py")).read_text()
 
 
 def list_mutants(names: Sequence[str]) -> int:
-    """Says what would be tried; the exit status."""
+    """Lists the mutants that would be run; returns the exit status."""
     for name in names:
         print("\n".join(f"{name}:{m.line}: {m.what}" for m in mutants(source_of(name))))
     return 0
 
 
 def run_mutants(names: Sequence[str], jobs: int) -> int:
-    """Runs all mutants of these modules; the exit status."""
+    """Runs all mutants of these modules; returns the exit status."""
     total = alive = 0
     for name in names:
         source = source_of(name)
         todo, began = list(mutants(source)), time.monotonic()
-        # served as its mutants are: what cannot even be imported so would count as killed
+        # served like its mutants: otherwise a module that cannot even be imported this way would count as killed
         _, status = os.waitpid(start(name, ast.parse(source), quiet=False), 0)
         if os.waitstatus_to_exitcode(status) != 0:
             print(f"{name}: its tests fail without any mutant", file=sys.stderr)

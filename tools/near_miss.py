@@ -1,8 +1,8 @@
-"""Near misses in thousands: a module drifts past another's face, magnets on or off, and the docking detector looks on through real frames.
+"""Near misses by the thousand: a module drifts past another's face, magnets on or off, watched by the docking detector.
 
-Nobody steers: one module is clamped, the other is pushed off and left to water, magnets and funnel; or it is held just where it would
-dock, with a magnet that does not work. A pass in which the faces really lock is no miss. What remains shows what each condition of
-the detector would have believed alone.
+The detector works on real frames. There is no controller: one module is clamped, the other is pushed off and left to water, magnets and
+funnel; or it is held just where it would dock, with a magnet that does not work. A pass in which the faces really lock is not a near
+miss. The others show what each condition of the detector would have declared alone.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from hil.starts import PITCH_M
 PASS_S = 2.5
 PERIOD_NS = 10_000_000
 MOST_GAP_M, MOST_BESIDE_M, MOST_SPEED_M_S, MOST_TURN_DEG = 0.030, 0.015, 0.08, 4.0
-"""Of a pass: gap between the faces, height off the axis, speed along the face, and tilt."""
+"""Limits of a pass: gap between the faces, height off the axis, speed along the face, and tilt."""
 HELD = 0.2
-"""Share of the passes in which the module is held before the face, a magnet off; gap and height then are so much smaller:"""
+"""Share of the passes in which the module is held before the face with a magnet off; gap, height and tilt are then scaled by HELD_NEAR."""
 HELD_NEAR = 0.2
 FORWARD = 1
 
 
 class Pass(NamedTuple):
-    """What happened in one pass."""
+    """Outcome of one pass."""
 
     current: bool
-    """The current's condition held at some time."""
+    """Whether the condition on the current held at any time."""
     position: bool
     declared: bool
-    """Both held at once."""
+    """Whether both held at once."""
     joined: bool
-    """The faces really locked."""
+    """Whether the faces really locked."""
 
 
 def fly_by(seed: int) -> Pass:
-    """One pass, all of it drawn from its seed."""
+    """Simulates one pass, all of it drawn from its seed."""
     scenario, velocity, relays = _drawn(seed)
     fleet, vehicle = fleet_of(scenario, "virtual:near-miss", 100), load_vehicle(scenario.module[0].vehicle)
     world, codec = make_world(scenario, seed, PERIOD_NS), _codec()
@@ -79,7 +79,7 @@ def fly_by(seed: int) -> Pass:
 
 
 def count(seeds: Iterable[int]) -> dict[str, int]:
-    """Passes that were misses, and how many of them each condition alone, and both, would have declared."""
+    """Number of near misses among the passes, and in how many each condition alone, and both, would have declared a dock."""
     misses = [found for found in map(fly_by, seeds) if not found.joined]
     return {
         "misses": len(misses),

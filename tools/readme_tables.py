@@ -1,7 +1,7 @@
-"""Writes the tables of README.md and docs/figures.md between their markers, out of accept.json and bench.json: no figure is typed by hand.
+"""Writes the tables of README.md and docs/figures.md between their markers, from accept.json and bench.json: no figure is typed by hand.
 
 A marker names a table: `<!-- table: accept -->` (all groups), `<!-- table: accept hover spiral -->` (those groups),
-`<!-- table: bench -->`, or `<!-- table: bench WORD -->` (names with WORD in them); `headlines` in their place takes those of
+`<!-- table: bench -->`, or `<!-- table: bench WORD -->` (names with WORD in them); `headlines` in their place selects those of
 HEADLINES. Each ends at `<!-- end -->`. A table whose file is missing stays as it is, and so does a figure of `accept` while any
 group of its table has not been measured.
 """
@@ -18,7 +18,7 @@ from typing import Any
 from command_line import Parser, refuse, run_tool
 
 RowName = tuple[str, str, str]
-"""Command, what `the same` means, and name: `rows_by_name`."""
+"""Command, the figure that `the same` refers to, and name: see `rows_by_name`."""
 PAGES = (Path("README.md"), Path("docs/figures.md"))
 SOURCES = {"accept": Path("accept.json"), "bench": Path("bench.json")}
 MARKER = re.compile(r"(<!-- table: (?P<kind>\w+)(?P<words>[^>]*?) -->\n)(?P<old>.*?)(<!-- end -->)", re.DOTALL)
@@ -50,13 +50,13 @@ HEADLINES = {
         ("", "plant step (RK4), 64 worlds on two cores"),
     ),
 }
-"""Group and name of the figures that README shows, by their file; those of bench.json have no groups."""
+"""Group and name of the figures shown in README, by their file; those of bench.json have no groups."""
 
 Entries = Sequence[dict[str, Any]]
 
 
 def number(value: float | None) -> str:
-    """Three figures that mean something: `3.53`, `26.4`, `0.0411`."""
+    """Text with three significant digits, and all those before the point: `3.53`, `26.4`, `0.0411`."""
     if value is None:
         return ""
     return f"{value:.0f}" if abs(value) >= 100 or float(value).is_integer() else f"{value:.3g}"
@@ -72,7 +72,7 @@ def accept_table(entries: Entries, groups: Sequence[str], old: str) -> str:
     """The figures of these groups, of all or the headlines, with limit, verdict and the command that measures them.
 
     Args:
-        old: the table as it stands; its rows stay where some groups were measured and others were not.
+        old: the current table; its rows are kept while some of the groups have not been measured.
     """
     body = [
         (
@@ -95,13 +95,13 @@ def chosen(kind: str, entries: Entries, words: Sequence[str], named: Callable[[d
 
 
 def rows_by_name(table: str) -> dict[RowName, str]:
-    """The lines of a table by their command, by what `the same` means among the figures of that command, and by name."""
+    """Rows of a table by command, by the figure of that command that `the same` refers to, and by name."""
     found, meant, before = {}, "", ""
     for line in table.splitlines(keepends=True):
         _, name, *_, command, _ = (cell.strip() for cell in line.split("|"))
         if not name.startswith("the same"):
             meant = name
-        elif command != before:  # a figure that has a command of its own
+        elif command != before:  # a figure with a command of its own
             meant = ""
         found[command, meant, name] = line
         before = command
@@ -109,7 +109,7 @@ def rows_by_name(table: str) -> dict[RowName, str]:
 
 
 def merged(old: Mapping[RowName, str], new: Mapping[RowName, str]) -> str:
-    """The old lines with the new ones in their places; one that is new altogether stands behind the new one before it."""
+    """Merges new rows into old ones; an additional row goes after the new row that precedes it."""
     names, place, lines = list(old), 0, {**old, **new}
     for name in new:
         if name not in old:
@@ -119,7 +119,7 @@ def merged(old: Mapping[RowName, str], new: Mapping[RowName, str]) -> str:
 
 
 def bench_table(entries: Entries, words: Sequence[str], old: str) -> str:
-    """What `make bench` measured, beside its peers."""
+    """The figures of `make bench`, beside its peers."""
     body = [
         (
             e["name"], f"{number(e['value'])} {e['unit']}", e["peer"] or "",
@@ -134,7 +134,7 @@ TABLES = {"accept": accept_table, "bench": bench_table}
 
 
 def filled(text: str, sources: dict[str, Entries]) -> str:
-    """`text` with every table written anew whose source is there. Raises KeyError for a table of no known kind."""
+    """`text` with every table rewritten whose source exists. Raises KeyError for an unknown kind of table."""
 
     def table(match: re.Match[str]) -> str:
         make = TABLES[match["kind"]]
@@ -146,7 +146,7 @@ def filled(text: str, sources: dict[str, Entries]) -> str:
 
 
 def read_source(path: Path) -> Entries:
-    """What was measured. Raises ValueError where the file is not as the tools write it."""
+    """Reads the measured figures. Raises ValueError where the file is not in the format that the tools write."""
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -157,7 +157,7 @@ def read_source(path: Path) -> Entries:
 
 
 def main() -> int:
-    """The command line."""
+    """Runs the tool; returns its exit status."""
     Parser(description=__doc__).parse_args()
     if missing := [page for page in PAGES if not page.is_file()]:
         print(f"readme: no {missing[0]} in {Path.cwd()}; run this in the root of the project", file=sys.stderr)
@@ -173,7 +173,7 @@ def main() -> int:
 
 
 def write_tables() -> None:
-    """Writes the pages; says what is missing. Raises KeyError, ValueError and OSError."""
+    """Writes the pages; reports missing sources. Raises KeyError, ValueError and OSError."""
     sources = {kind: read_source(path) for kind, path in SOURCES.items() if path.exists()}
     for kind in set(SOURCES) - set(sources):
         print(f"readme: no {SOURCES[kind]}; its tables stay as they are (make {kind})", file=sys.stderr)

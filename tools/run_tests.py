@@ -1,8 +1,8 @@
 """Run every test that this machine can run; name what was left out, and why, in the last lines.
 
-Arguments: the Debian packages that the tests marked `vcan` need. Those run in a virtual machine, beside all others. Before, beside the
-setup of the clients, `make lint` reads the code, and numba compiles what is not compiled yet, so that no two processes of pytest do. The
-exit status is the worst of pytest's two and lint's.
+Arguments: the Debian packages that the tests marked `vcan` need. Those tests run in a virtual machine, in parallel with all others. Before
+that, in parallel with the setup of the clients, `make lint` checks the code, and numba compiles what is not compiled yet, so that no two
+processes of pytest do. The exit status is the worst of pytest's two and lint's.
 """
 
 import os
@@ -16,17 +16,17 @@ from command_line import run_tool
 
 MAKEFILE = Path(__file__).resolve().parents[1] / "Makefile"
 CLIENTS = Path(".venv-clients/.stamp")
-"""There once every client is installed."""
+"""Exists once every client is installed."""
 PYTEST = [sys.executable, "-m", "pytest"]
 ALL = [*PYTEST, "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
-"""A file's fixtures are set up in one process; the files with the long flights come first."""
+"""The fixtures of a file are set up in one process; the files with the long flights come first."""
 COMPILE = [sys.executable, "-c", "import hil.batch, hil.cli"]
-"""Nearly everything that numba compiles is compiled when it is imported."""
+"""Nearly all numba functions are compiled on import."""
 VCAN = [*PYTEST, "--capture=no", "-rs", "-m", "vcan", "tests/vcan"]
 
 
 def is_installed(package: str) -> bool:
-    """Whether dpkg has the package; False where there is no dpkg."""
+    """Whether dpkg has the package installed; False where there is no dpkg."""
     try:
         query = ["dpkg-query", "--show", "--showformat=${Status}", package]
         return subprocess.run(query, capture_output=True, text=True).stdout == "install ok installed"
@@ -35,7 +35,7 @@ def is_installed(package: str) -> bool:
 
 
 def packages_of(makefile: str) -> list[str]:
-    """The Debian packages that the Makefile gives to this tool."""
+    """Debian packages that the Makefile passes to this tool."""
     return "".join(re.findall(r"^SYSTEM_PACKAGES := (.*)$", makefile, re.MULTILINE)).split()
 
 

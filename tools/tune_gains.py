@@ -1,11 +1,11 @@
-"""Tune controller and estimator parameters on the bench with Optuna. Killed and started again, it goes on: no finished trial is lost.
+"""Tune controller and estimator parameters on the bench with Optuna. A killed run resumes when started again: no finished trial is lost.
 
 .venv/bin/python tools/tune_gains.py tools/objectives/spiral-and-push.toml --trials 60 --out runs/tune
 .venv/bin/python tools/tune_gains.py tools/objectives/spiral-and-push.toml --detune 1 --minutes 15   # from gains off by up to 3
 .venv/bin/python tools/tune_gains.py tools/objectives/hover.toml --live mavlink:udpin:127.0.0.1:14550   # a vehicle that hovers
 
-The objective is a file: which flights, which seeds, which parameters within which bounds, and what each metric costs. In DIR: the
-best parameters as a file for --controller, tuning.json with the figures on seeds that the search never saw beside those of the
+The objective is a file: which flights, which seeds, which parameters within which bounds, and the cost of each metric. In DIR: the best
+parameters as a file for --controller, tuning.json with the figures on seeds unseen by the search beside those of the
 shipped gains, and plots.
 """
 
@@ -35,13 +35,13 @@ from hil.trial_file import TrialFile
 from hil.workers import Pool, dask_cluster, kept, processes
 
 DETUNED = 3.0
-"""Largest factor by which --detune puts each gain off."""
+"""Largest factor by which --detune changes each gain."""
 LOOK_S = 20.0
-"""How long --live looks at each step, where --seconds does not say."""
+"""How long --live observes each step, unless --seconds is given."""
 
 
 def unseen_costs(objective: Objective, parameters: Parameters, pool: Pool, folder: Path) -> list[float]:
-    """The cost of every flight in the worlds of the comparison; each is a campaign of its own and goes on where it was."""
+    """Cost of every flight in the worlds of the comparison; each flight is a campaign of its own, which can resume."""
     costs = []
     for number, spec in enumerate(objective.flight):
         scenario = spec.flown()
@@ -113,7 +113,7 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
 
 
 def arguments() -> argparse.Namespace:
-    """What the command line says."""
+    """Parses and checks the command line."""
     parser = Parser(description=__doc__)
     parser.add_argument("objective", type=Path, help="objective file, such as tools/objectives/spiral.toml")
     parser.add_argument("--trials", type=whole(1), default=40, help="trials in all, earlier ones in the same folder counted")
@@ -134,7 +134,7 @@ def arguments() -> argparse.Namespace:
 
 
 def begin(objective: Objective, start: Parameters, given: argparse.Namespace) -> int:
-    """Tunes the vehicle or on the bench; the exit status. Raises what makes it end before."""
+    """Tunes the vehicle, or on the bench; returns the exit status. Raises whatever ends the run early."""
     if given.live:
         from tune_live import tune_live
 
@@ -146,7 +146,7 @@ def begin(objective: Objective, start: Parameters, given: argparse.Namespace) ->
 
 
 def main() -> int:
-    """The command line."""
+    """Runs the tool; returns its exit status."""
     given = arguments()
     try:
         objective = load_objective(given.objective)

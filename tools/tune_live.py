@@ -1,8 +1,8 @@
-"""tune_gains --live: tunes a vehicle that hovers, through MAVLink parameters, one confirmed step at a time.
+"""tune_gains --live: tunes a hovering vehicle through MAVLink parameters, one confirmed step at a time.
 
-One parameter moves in a step, up or down by a factor; what makes the objective smaller stays, the rest goes back at once. A person
-says yes to every step. On a fail-safe, an e-stop, a disarmed vehicle, another mode, silence, an interrupt or an error of this program
-every parameter gets the value that it had in the beginning; so it does when the program was killed and is started again.
+A step changes one parameter, up or down by a factor; a change that lowers the objective is kept, any other is reverted at once. A person
+confirms every step. On a fail-safe, an e-stop, a disarmed vehicle, another mode, silence, an interrupt or an error of this program, every
+parameter is restored to its initial value; also when the program is started again after it was killed.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.files import write_atomically
 
 FACTOR, SMALLEST_FACTOR = 1.25, 1.03
-"""Of a step; where neither way helped, its square root is tried next."""
+"""Factor of a step, whose square root is used after a round in which nothing helped, and the factor at which the search ends."""
 BETTER = 0.97
-"""Share of the best cost that counts as better: two looks at one hover differ by a per cent or two."""
+"""Share of the best cost that counts as better: two observations of one hover differ by a per cent or two."""
 BEFORE_FILE = "live-before.json"
 ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that end the tuning; SIGHUP comes when the terminal is closed or the connection is lost."""
 
 
 class Person(Protocol):
-    """Who confirms."""
+    """The person who confirms the steps."""
 
     def answer(self, question: str) -> str:
-        """y, n or q. Raises TroubleError when the vehicle is in trouble meanwhile."""
+        """Returns y, n or q. Raises TroubleError when the vehicle gets into trouble meanwhile."""
         ...
 
 
 class Typist:
-    """A person at the terminal. While an answer is waited for the vehicle is listened to."""
+    """A person at the terminal. The vehicle is monitored while waiting for an answer."""
 
     def __init__(self, vehicle: Vehicle, stream: BinaryIO) -> None:
-        """`stream` is unbuffered: what select says of it is all that is there."""
+        """`stream` is unbuffered, so that select sees all of its data."""
         self._vehicle, self._stream = vehicle, stream
 
     def answer(self, question: str) -> str:
-        """First letter of what is typed; q at the end of the input. Raises TroubleError."""
+        """First letter of the typed answer; n for an empty line, q at the end of the input. Raises TroubleError."""
         print(question, end=" ", flush=True)
         while not select.select([self._stream], [], [], 0.0)[0]:
             self._vehicle.listen(0.1)
@@ -59,9 +59,9 @@ class Typist:
 
 
 def proposals(now: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]) -> Iterator[tuple[str, float]]:
-    """Steps without end, until all are too small: name and value, one parameter after the other. `now` is read anew for each.
+    """Steps, as name and value, one parameter after the other, until the factor is too small. `now` is read again for each.
 
-    What did not change `now` is not proposed again.
+    A step that did not change `now` is not proposed again.
     """
     factor = FACTOR
     refused: set[tuple[str, float]] = set()
@@ -82,13 +82,13 @@ def proposals(now: Mapping[str, float], bounds: Mapping[str, tuple[float, float]
 
 
 def _stepped(before: float, way: float, bounds: tuple[float, float]) -> float:
-    """`before` times `way` within the bounds; from outside as far as that towards them, and away from them not at all."""
+    """`before` times `way`, clamped to the bounds; a value outside them moves towards them by that factor at most, and never away."""
     least, most = sorted((before, before * way))
     return min(max(min(max(before * way, bounds[0]), bounds[1]), least), most)
 
 
 def tune_live(objective: Objective, live: str, steps: int, seconds: float, out: Path) -> int:
-    """Tunes the vehicle at mavlink:ADDRESS by what is typed; returns the exit status as `tune` does. Raises DescriptionError."""
+    """Tunes the vehicle at mavlink:ADDRESS, with typed answers; returns the exit status as `tune` does. Raises DescriptionError."""
     scheme, _, address = live.partition(":")
     if scheme != "mavlink" or not address:
         raise DescriptionError(f"--live {live!r} is no address; it needs mavlink:ADDRESS, such as mavlink:udpin:127.0.0.1:14550")
@@ -100,14 +100,14 @@ def tune_live(objective: Objective, live: str, steps: int, seconds: float, out: 
 
 
 def _end(number: int, frame: object) -> None:
-    """The first of ENDINGS interrupts. Those that follow, as when a terminal is closed, find the old values going back."""
+    """Interrupts on the first of ENDINGS. Ignores those that follow, as when a terminal is closed, while the old values are restored."""
     for each in ENDINGS:
         signal.signal(each, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
 def tune(objective: Objective, vehicle: Vehicle, person: Person, steps: int, seconds: float, out: Path) -> int:
-    """Tunes; returns the exit status: 0 the person ended it, 1 trouble, old values are back. Raises DescriptionError."""
+    """Tunes; returns the exit status: 0 ended by the person, 1 trouble, old values restored. Raises DescriptionError."""
     seen = [term.metric for term in objective.term if term.metric in SEEN]
     if not seen:
         raise DescriptionError(f"--live: the objective has no term that can be seen from outside; it needs {' or '.join(SEEN)}")
@@ -141,7 +141,7 @@ def tune(objective: Objective, vehicle: Vehicle, person: Person, steps: int, sec
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Nothing comes between the vehicle and its old values."""
+    """Ignores ENDINGS while the old values are restored."""
     before = {number: signal.signal(number, signal.SIG_IGN) for number in ENDINGS}
     try:
         yield
@@ -151,7 +151,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def put_back(vehicle: Vehicle, values: Mapping[str, float], memory: Path) -> None:
-    """Sets every value, then forgets them. Raises DescriptionError with what the vehicle did not take in RESTORE_S."""
+    """Restores every value, then deletes their file. Raises DescriptionError with the values not accepted within RESTORE_S."""
     vehicle.watch(False)
     left = vehicle.restore(values)
     if left:
@@ -162,13 +162,13 @@ def put_back(vehicle: Vehicle, values: Mapping[str, float], memory: Path) -> Non
 
 
 def _say(text: str) -> None:
-    """A line on stdout, or where that is gone on stderr; never in the way of what comes after."""
+    """Prints a line on stdout, or on stderr if stdout is gone; never fails, so that what follows is done."""
     with suppress(OSError, ValueError):
         try:
             print(text, flush=True)
         except OSError:
             print(text, file=sys.stderr, flush=True)
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what it still holds must not become the exit status
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # its unflushed rest must not change the exit status
 
 
 def _steps(
@@ -180,7 +180,7 @@ def _steps(
     steps: int,
     seconds: float,
 ) -> bool:
-    """The steps; whether the person keeps what was found. `now` follows."""
+    """Runs the steps and updates `now`; returns whether the person keeps the result."""
     for name, (low, high) in bounds.items():
         if not np.float32(low) <= np.float32(now[name]) <= np.float32(high):
             leads = f"by a factor of {FACTOR:g} a step at most" if now[name] * (low + high) > 0.0 else "by no factor, so it stays"
@@ -205,5 +205,5 @@ def _steps(
 
 
 def _cost(objective: Objective, metrics: Mapping[str, float]) -> float:
-    """The objective's terms that can be seen from outside."""
+    """Sum of the objective's terms that can be observed from outside."""
     return sum(term.weight * metrics[term.metric] / term.per for term in objective.term if term.metric in metrics)

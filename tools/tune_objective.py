@@ -1,4 +1,4 @@
-"""What tune_gains makes small: which flights in which worlds, which parameters within which bounds, and what each metric costs."""
+"""The objective that tune_gains minimises: the flights and their worlds, the parameters and their bounds, and the cost of each metric."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class FlightSpec:
     weight: float = quantity(1.0, low=0, high=1e3, help="share in the sum")
 
     def flown(self) -> Scenario:
-        """The scenario with what changes of it. Raises DescriptionError."""
+        """The scenario with its changes applied. Raises DescriptionError."""
         scenario = load_scenario(self.scenario)
         times = {name: value for name in ("settle_s", "duration_s") if (value := getattr(self, name)) > 0.0}
         scenario = dataclasses.replace(scenario, task=dataclasses.replace(scenario.task, **times))
@@ -47,7 +47,7 @@ class FlightSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Search:
-    """One parameter and its bounds."""
+    """One parameter to search, and its bounds."""
 
     parameter: str = quantity(help="as group.field")
     low: float = quantity(help="lowest tried")
@@ -57,7 +57,7 @@ class Search:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Term:
-    """What a metric costs."""
+    """Cost of a metric."""
 
     metric: str = quantity(help="name in result.json")
     per: float = quantity(low=1e-12, high=1e12, help="this much of the metric costs `weight`")
@@ -66,7 +66,7 @@ class Term:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stability:
-    """Margins that the loops broken at the plant's input should keep in one world; what they lack costs."""
+    """Margins that the loops broken at the plant's input should keep in one world; a shortfall has a cost."""
 
     modules: int = quantity(1, low=1, high=4, help="of the body: 1, 2 or 4")
     mass: float = quantity(1.0, low=0.5, high=2, help="factor of the mass that the controller believes")
@@ -78,13 +78,13 @@ class Stability:
     per_deg: float = quantity(low=1e-3, high=180, help="so many degrees too little cost 1")
 
     def cost(self, gain_db: float, phase_deg: float) -> float:
-        """What margins cost; given are the least gain margin and the least phase margin of all axes."""
+        """Cost of the margins, given the least gain margin and the least phase margin of all axes."""
         return max(0.0, self.gain_db - gain_db) / self.per_db + max(0.0, self.phase_deg - phase_deg) / self.per_deg
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Objective:
-    """What is to be made small."""
+    """The objective to minimise."""
 
     help: str = quantity(help="one line")
     flight: tuple[FlightSpec, ...] = quantity(help="flights of each seed, the cheapest to fly first: a bad trial ends early")
@@ -124,14 +124,14 @@ class Objective:
                 raise DescriptionError(what, "stability", i, "modules")
 
     def cost(self, spec: FlightSpec, metrics: Mapping[str, float | None]) -> float:
-        """Of one flight. A metric that is missing costs the most."""
+        """Cost of one flight. A missing metric costs FAILED_COST."""
         values = [metrics.get(term.metric) for term in self.term]
         costs = [term.weight * value / term.per for term, value in zip(self.term, values, strict=True) if value is not None]
         total = spec.weight * math.fsum(costs)
         return min(total, FAILED_COST) if len(costs) == len(self.term) and math.isfinite(total) else FAILED_COST
 
     def total(self, costs: Sequence[float]) -> float:
-        """The objective, out of the costs of all flights: their mean, and of the worst one its share."""
+        """The objective from the costs of all flights: their mean, and `worst_share` of the worst one."""
         return (1.0 - self.worst_share) * float(np.mean(costs)) + self.worst_share * max(costs)
 
     @property
@@ -140,7 +140,7 @@ class Objective:
         return self.flight[0].flown().module[0].vehicle
 
     def shortfall(self, parameters: Parameters) -> float:
-        """What the margins lack; comes on top of the flights."""
+        """Cost of missing margins, added to that of the flights."""
         costs = []
         for wanted in self.stability:
             responses = measure(wanted.modules, parameters, Scale(wanted.mass, wanted.inertia, wanted.lag), self.vehicle)
@@ -149,7 +149,7 @@ class Objective:
         return math.fsum(costs)
 
     def start(self, parameters: Parameters) -> dict[str, float]:
-        """Where the search begins: the values in `parameters`, moved within the bounds."""
+        """Start of the search: the values in `parameters`, clamped to the bounds."""
         return {s.parameter: min(max(float(attrgetter(s.parameter)(parameters)), s.low), s.high) for s in self.search}
 
 
@@ -161,21 +161,21 @@ def with_values(parameters: Parameters, values: Mapping[str, float]) -> Paramete
 
 
 def detuned(objective: Objective, parameters: Parameters, factor: float, seed: int) -> Parameters:
-    """A copy in which everything that is searched is off by a random factor, log-uniform from 1/factor to factor, within its bounds."""
+    """A copy in which every searched parameter is off by a random factor, log-uniform from 1/factor to factor, clamped to its bounds."""
     factors = factor ** np.random.default_rng(seed).uniform(-1.0, 1.0, len(objective.search))
     off = [(s, attrgetter(s.parameter)(parameters) * float(f)) for s, f in zip(objective.search, factors, strict=True)]
     return with_values(parameters, {s.parameter: min(max(value, s.low), s.high) for s, value in off})
 
 
 def check_terms(spec: FlightSpec, terms: Sequence[Term]) -> None:
-    """Raises DescriptionError for a flight that cannot be flown, or whose trials lack the metric of a term: all would cost the most."""
+    """Raises DescriptionError for a flight that cannot be flown or lacks the metric of a term, so that all trials had the top cost."""
     had = set(metric_names(spec.flown())) - set(WALL_CLOCK)
     if lacking := next((term.metric for term in terms if term.metric not in had), ""):
         raise DescriptionError(f"a trial of {spec.scenario} has no {lacking}, which a term asks of every flight")
 
 
 def load_objective(path: Path) -> Objective:
-    """The objective in a file, its scenarios checked. Raises DescriptionError, one line."""
+    """Loads the objective from a file and checks its scenarios. Raises DescriptionError, one line."""
     table, source = read_toml(path)
     objective: Objective = build(Objective, table, source)
     checks = [("flight", i, partial(check_terms, spec, objective.term)) for i, spec in enumerate(objective.flight)]

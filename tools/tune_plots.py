@@ -1,4 +1,4 @@
-"""What tune_gains draws: step responses, open-loop Bode plot with margins, how the search went and what mattered in it."""
+"""Plots of tune_gains: step responses, open-loop Bode plot with margins, history of the search and importance of the parameters."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from firmware_py.description.vehicle import AXES
 from hil.workers import processes
 
 SHOWN = (0, 2, 3, 5)
-"""Axes of the plots: surge (sway is its like), heave, roll (pitch is its like), yaw."""
+"""Axes of the plots: surge (sway is similar), heave, roll (pitch is similar), yaw."""
 COLOURS = {"start": "#8c959f", "shipped": "#0072b2", "tuned": "#d55e00"}
 LINES = {"start": {"linestyle": "--", "zorder": 3}, "shipped": {"linewidth": 3.5}, "tuned": {}}
-"""So that each is seen where the others agree with it."""
+"""Line styles that keep each curve visible where the others coincide with it."""
 GREY = "#30363d"
 JOBS = 2
 
@@ -59,7 +59,7 @@ def _save(figure: Any, path: Path, title: str) -> None:
 
 
 def draw_steps(path: Path, steps: Mapping[str, np.ndarray]) -> None:
-    """A panel for each axis: the share of a step of the set-point that is made, over time."""
+    """Draws a panel for each axis: the completed share of a set-point step over time."""
     figure, panels = _panels(1, len(SHOWN), (13, 3.6), sharey=True)
     time_s = 1e-9 * PERIOD_NS * np.arange(1, STEP_TICKS + 1)
     for k, (axis, panel) in enumerate(zip(SHOWN, panels.flat, strict=True)):
@@ -73,13 +73,13 @@ def draw_steps(path: Path, steps: Mapping[str, np.ndarray]) -> None:
 
 
 def steps_range(steps: Mapping[str, np.ndarray]) -> tuple[float, float]:
-    """Lowest and highest share that the axes show: all that is made of the steps, but of what swings away 0.2 below and 0.8 above."""
+    """Lowest and highest share that the axes show: the range of all responses, limited to 0.2 below 0 and 0.8 above 1 for unstable ones."""
     made = np.array(list(steps.values()))
     return max(min(float(made.min()) - 0.05, -0.05), -0.2), min(max(float(made.max()) + 0.05, 1.1), 1.8)
 
 
 def draw_bode(path: Path, loops: Mapping[str, list[Response]]) -> None:
-    """Gain and phase of the loops broken at the plant's input, with their margins."""
+    """Draws gain and phase of the loops broken at the plant's input, with their margins."""
     figure, panels = _panels(2, len(SHOWN), (13, 6), sharex=True, sharey="row")
     for axis, (gain, phase) in zip(SHOWN, panels.T, strict=True):
         for name, responses in loops.items():
@@ -101,7 +101,7 @@ def draw_bode(path: Path, loops: Mapping[str, list[Response]]) -> None:
 
 
 def draw_search(path: Path, objective: Objective, study: optuna.Study) -> None:
-    """How the best fell from trial to trial, and the share of each parameter in what the objective does."""
+    """Draws the best objective from trial to trial, and the share of each parameter in the objective's variance."""
     figure, panels = _panels(1, 2, (13, 3.8), gridspec_kw={"width_ratios": (3, 2)})
     history, importance = panels.flat
     complete = [t for t in study.trials if t.state == optuna.trial.TrialState.COMPLETE]

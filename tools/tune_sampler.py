@@ -1,9 +1,8 @@
-"""Optuna sampler for dear and smooth objectives: a Gaussian process over the trials, and where it expects the most of one more.
+"""Optuna sampler for expensive, smooth objectives: a Gaussian process over the trials, and the candidate of largest expected improvement.
 
-Optuna's own wants torch. Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006: equations 2.25, 2.26 (prediction), 5.8
+Optuna's own needs torch. Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006: equations 2.25, 2.26 (prediction), 5.8
 (likelihood); Matern 5/2 kernel, one length for each parameter. Jones, Schonlau and Welch, J. Global Optimization 13, 1998: expected
-improvement. On six gains
-it needs half the trials of TPE.
+improvement. On six gains it needs half the trials of TPE.
 """
 
 from __future__ import annotations
@@ -21,31 +20,31 @@ from scipy.optimize import minimize
 from scipy.stats import norm
 
 NOISE = 1e-3
-"""Standard deviation of the logarithm of the objective: one world flown twice costs the same, but ticks and frames are steps."""
+"""Standard deviation of the logarithm of the objective: a world flown twice costs the same, but ticks and frames make steps."""
 LEAST = 1e-9
-"""Of an objective: what is below counts as this, for its logarithm is taken."""
+"""Least value of an objective: smaller ones count as this, because the logarithm is taken."""
 WORST = 2.0
-"""Logarithms above the best that still count: how badly the unstable fly teaches nothing."""
+"""Upper limit of the logarithm, above the best: how badly unstable gains fly carries no information."""
 LENGTH, LENGTH_SPREAD = 0.5, 1.0
-"""Prior of a kernel's length, in shares of the parameter's range: median, and standard deviation of its logarithm."""
+"""Prior of a kernel's length, as a share of the parameter's range: median, and standard deviation of its logarithm."""
 ANYWHERE, NEAR, NEARNESS = 2048, 1024, (0.03, 0.1)
-"""Candidates over the whole range, and about the best trial so far, with their spreads."""
+"""Candidates over the whole range, and around the best trial so far, with their spreads."""
 
 
 class GaussianProcessSampler(optuna.samplers.BaseSampler):
-    """Proposes at random at first; what it proposes depends on the seed, the trial's number and the trials before it alone."""
+    """Samples at random at first; each proposal depends only on the seed, the trial's number and the trials before it."""
 
     def __init__(self, bounds: Mapping[str, FloatDistribution], seed: int, first_at_random: int) -> None:
         self._bounds, self._seed, self._first = dict(bounds), seed, first_at_random
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        """All parameters, together."""
+        """All parameters, sampled jointly."""
         return dict(self._bounds)
 
     def sample_relative(
         self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """The next trial."""
+        """Parameters of the next trial."""
         rng = np.random.default_rng([self._seed, trial.number])
         done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED))
         if len(done) < self._first:
@@ -57,7 +56,7 @@ class GaussianProcessSampler(optuna.samplers.BaseSampler):
         return self._values(candidates[np.argmax(expected_improvement(x, y, candidates))])
 
     def sample_independent(self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution) -> Any:
-        """Never asked: every parameter is in the relative space. Raises ValueError."""
+        """Never called: every parameter is in the relative space. Raises ValueError."""
         raise ValueError(f"{param_name} is none of the parameters that are searched")
 
     def _values(self, shares: np.ndarray) -> dict[str, float]:
@@ -78,7 +77,7 @@ def _value(d: FloatDistribution, share: float) -> float:
 def logarithms(trials: list[FrozenTrial]) -> np.ndarray:
     """(n,) logarithm of the objective, which is not negative, at most `WORST` above the best.
 
-    What was ended early goes on as the others did, in the median.
+    A trial that was ended early is extrapolated by the median ratio of the complete trials from that flight to the end.
     """
     whole = [t for t in trials if t.state == TrialState.COMPLETE]
     values = []
@@ -95,18 +94,18 @@ def _log(value: float) -> float:
 
 
 def kernel(a: np.ndarray, b: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """(n, m) Matern 5/2 of the rows of a (n, k) and b (m, k)."""
+    """(n, m) Matern 5/2 kernel of the rows of a (n, k) and b (m, k)."""
     r = math.sqrt(5.0) * np.sqrt(np.sum(((a[:, None] - b[None]) / lengths) ** 2, axis=2))
     return (1.0 + r + r * r / 3.0) * np.exp(-r)
 
 
 def expected_improvement(x: np.ndarray, y: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """(m,) of each candidate (m, k), after x (n, k) gave y (n,)."""
+    """(m,) expected improvement of each candidate (m, k), after x (n, k) gave y (n,)."""
     z = (y - y.mean()) / max(float(y.std()), 1e-9)
     noise = (NOISE / max(float(y.std()), NOISE)) ** 2 * np.eye(len(x))
 
     def unlikely(logarithm: np.ndarray) -> float:
-        """Minus the logarithm of posterior probability, the signal's size put to its best."""
+        """Negative logarithm of the posterior probability, up to a constant, with the signal's variance at its optimum."""
         factor = cho_factor(kernel(x, x, np.exp(logarithm)) + noise, lower=True)
         size = float(z @ cho_solve(factor, z)) / len(z)
         prior = np.sum(((logarithm - math.log(LENGTH)) / LENGTH_SPREAD) ** 2)

@@ -1,7 +1,7 @@
-"""The search of tune_gains: a sampler proposes, the bench flies, every trial is on the disk before the next one begins.
+"""The search of tune_gains: a sampler proposes, the bench flies, and every trial is on disk before the next one begins.
 
-A trial's proposal depends on the seed, its number and the trials before it, and on nothing else. So a search that was killed and is
-started again proposes what it would have proposed, and ends in the same bytes as one that never was.
+A trial's proposal depends only on the seed, its number and the trials before it. A search that was killed and is started again therefore
+makes the same proposals, and ends in the same bytes as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from hil.trial_file import TrialFile
 
 TRIALS_FILE = "search.jsonl"
 SOURCES = ("loop_response.py", "tune_objective.py", "tune_sampler.py", "tune_search.py")
-"""What a trial depends on beside the packages."""
+"""Sources here on which a trial depends, besides the packages."""
 FIRST_AT_RANDOM = 8
-"""Trials before the sampler has something to go by, the start among them."""
+"""Trials, including the start, before the sampler uses its model."""
 
 
 class Progress(NamedTuple):
-    """What is shown after every trial."""
+    """Progress shown after every trial."""
 
     number: int
     value: float
@@ -42,7 +42,9 @@ class Progress(NamedTuple):
 
 
 def identity(objective: Objective, start: Parameters, seed: int) -> str:
-    """Same identity and same number, same trial: the flights as they are in their files, and the code here and in the packages."""
+    """Hash of the search: with the same identity and number, a trial is the same. Covers the objective, the flights as they are in their
+    files, the start, the seed, and the code here and in the packages.
+    """
     flights = [campaign.identity(spec.flown(), start) for spec in objective.flight]
     here = [(Path(__file__).parent / name).read_bytes() for name in SOURCES]
     parts = (flights, hashlib.sha256(b"".join(here)).hexdigest(), asdict(objective), seed)
@@ -50,9 +52,9 @@ def identity(objective: Objective, start: Parameters, seed: int) -> str:
 
 
 def running_totals(objective: Objective, parameters: Parameters, pool: Executor) -> Iterator[float]:
-    """The objective over the search's seeds, after each flight of it that was flown in all worlds.
+    """Yields the objective over the search's seeds after each of its flights has been flown in all worlds.
 
-    The margins are measured here, while the first flight is in the air.
+    The margins are measured in this process while the first flight is flown.
     """
     costs: list[float] = []
     code, lacking = code_digest(), None
@@ -73,9 +75,9 @@ def search(
     tell: Callable[[Progress], None],
     end_s: float = float("inf"),
 ) -> optuna.Study:
-    """Goes on in `out` until `trials` trials are done, or no more is begun after `end_s` of time.monotonic(); returns the study.
+    """Resumes in `out` until `trials` trials are done, or begins none after `end_s` of time.monotonic(); returns the study.
 
-    Raises DescriptionError where `out` holds the trials of another search: nobody's hours are thrown away.
+    Raises DescriptionError where `out` holds the trials of another search, which would be lost.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     bounds = {s.parameter: FloatDistribution(s.low, s.high, log=s.logarithmic) for s in objective.search}
@@ -96,7 +98,7 @@ def search(
 
 
 def _flown(study: optuna.Study, trial: optuna.Trial, objective: Objective, start: Parameters, pool: Executor) -> dict[str, Any]:
-    """Flies one trial, as far as it is worth it; returns its line."""
+    """Flies one trial until it is complete or pruned; returns its line."""
     parameters, seen = with_values(start, trial.params), []
     pruned = False
     for step, value in enumerate(running_totals(objective, parameters, pool)):

@@ -1,4 +1,4 @@
-"""A vehicle behind MAVLink as tune_gains --live sees it: is it still as it was, what are its parameters, how still does it hover."""
+"""A vehicle behind MAVLink for tune_gains --live: whether its state is unchanged, what its parameters are, how still it hovers."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ import numpy as np
 from firmware_py.description.schema import DescriptionError
 
 SETTLE_S = 3.0
-"""After a change, before it is looked at; by the vehicle's clock."""
+"""Settling time between a change and its evaluation, by the vehicle's clock."""
 SILENT_S, ANSWER_S, ANSWERS = 5.0, 1.0, 5
-"""Without a heartbeat the vehicle is lost; a parameter is sent again after so long, so often."""
+"""Time without a heartbeat after which the vehicle is lost; timeout of a parameter's answer, and number of attempts."""
 RESTORE_S, PAUSE_S = 60.0, 0.2
-"""So long every value that was changed is set again; after one that was not taken nothing is sent for so long."""
+"""Timeout for restoring all changed values; pause after a value that was not accepted."""
 STATE_ACTIVE, ARMED, ERROR = 4, 0x80, 3
-"""MAV_STATE_ACTIVE; MAV_MODE_FLAG_SAFETY_ARMED; worst severity that is only said."""
+"""MAV_STATE_ACTIVE; MAV_MODE_FLAG_SAFETY_ARMED; MAV_SEVERITY_ERROR: this and graver severities count as trouble."""
 ONBOARD_CONTROLLER, INVALID_AUTOPILOT = 18, 8
-"""MAV_TYPE: not a ground station, whose loss the vehicle would act upon."""
+"""MAV_TYPE and MAV_AUTOPILOT of our heartbeat: not a ground station, since the vehicle would act on the loss of one."""
 NETWORK, LAST_PORT = ("udp", "udpin", "udpout", "udpbcast", "tcp", "tcpin"), 65535
-"""Kinds of address that end in a port, of which pymavlink finds some wrong only when it sends."""
+"""Kinds of address that end in a port, and the largest port; pymavlink notices some wrong ports only when it sends."""
 RIGHT = "an address such as mavlink:udpin:0.0.0.0:14550"
 SEEN = ("position_rmse_m", "attitude_rmse_rad")
-"""Metrics that telemetry gives; the objective's other terms are left out."""
+"""Metrics available from telemetry; the objective's other terms are left out."""
 
 
 class TroubleError(Exception):
-    """The vehicle is no longer as it was when the tuning began; the message says why."""
+    """The vehicle is no longer in the state in which the tuning began; the message says why."""
 
 
 class Link(Protocol):
-    """What is used of pymavlink's connection."""
+    """The part of pymavlink's connection that is used."""
 
     mav: Any
     target_system: int
@@ -44,12 +44,12 @@ class Link(Protocol):
         ...
 
     def close(self) -> None:
-        """End it."""
+        """Closes the link."""
         ...
 
 
 def connect(address: str) -> Link:
-    """The link to a MAVLink address. Raises DescriptionError."""
+    """Opens the link to a MAVLink address. Raises DescriptionError."""
     kind, _, place = address.partition(":")
     port = place.rpartition(":")[2]
     if kind in NETWORK and not (port.isascii() and port.isdecimal() and len(port) <= 5 and int(port) <= LAST_PORT):
@@ -73,14 +73,14 @@ class Vehicle:
         self._mode: int | None = None
         self._watched = False
         self.seen: list[Any] = []
-        """Messages since `seen` was emptied."""
+        """Messages since `seen` was last cleared."""
         with suppress(TroubleError):
             self.hear()
         if self._mode is None:
             raise DescriptionError(f"--live: no heartbeat in {SILENT_S:g} s; is the vehicle's link set to this address?")
 
     def listen(self, timeout_s: float) -> None:
-        """Takes what comes for at most so long. Raises TroubleError on silence, and once `watch` was called on any trouble."""
+        """Receives messages, waiting at most `timeout_s`. Raises TroubleError on silence, and after `watch(True)` on any trouble."""
         self._receive(timeout_s)
         if self._clock() - self._heard_s > SILENT_S:
             raise TroubleError(f"the vehicle has been silent for {SILENT_S:g} s")
@@ -96,13 +96,13 @@ class Vehicle:
             message = self.link.recv_match(blocking=False)
 
     def hear(self) -> None:
-        """Until the next heartbeat. Raises TroubleError."""
+        """Receives messages until the next heartbeat. Raises TroubleError."""
         self.seen.clear()
         while not any(m.get_type() == "HEARTBEAT" for m in self.seen):
             self.listen(0.1)
 
     def watch(self, on: bool) -> None:
-        """From now on trouble is trouble, or no longer."""
+        """Turns on or off the reaction to trouble other than silence."""
         self._watched = on
 
     def _take(self, message: Any) -> None:
@@ -134,7 +134,7 @@ class Vehicle:
             raise TroubleError(f"parameter {name} was set to {value:g}, but the vehicle keeps {kept:g}")
 
     def restore(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Sets every parameter until the vehicle confirms it, for at most RESTORE_S however silent it is; returns what it did not take."""
+        """Sets every parameter until the vehicle confirms it, for at most RESTORE_S even if it is silent; returns those not confirmed."""
         left, end = dict(values), self._clock() + RESTORE_S
         while left and self._clock() < end:
             name = next(iter(left))
@@ -142,7 +142,7 @@ class Vehicle:
             try:
                 self.set(name, value)
             except (TroubleError, OSError):
-                left[name] = value  # behind the others
+                left[name] = value  # after the others
                 self._sleep(PAUSE_S)
         return {name: value for name, value in values.items() if name in left}
 
@@ -159,7 +159,7 @@ class Vehicle:
         raise TroubleError(f"parameter {name}: no answer in {ANSWERS * ANSWER_S:g} s")
 
     def look(self, seconds: float) -> dict[str, float]:
-        """Metrics of so long a hover, after it has settled: RMS about the mean pose, by the vehicle's own clock and estimate."""
+        """Metrics of a hover of `seconds`, after settling: RMS about the mean pose, by the vehicle's own clock and estimate."""
         self.seen.clear()
         began_ms: int | None = None
         poses: dict[str, list[list[float]]] = {"LOCAL_POSITION_NED": [], "ATTITUDE": []}
