@@ -1,4 +1,4 @@
-"""The bench: an independent model of the world behind the same CAN messages, and what judges a run."""
+"""The bench: an independent model of the world behind the same CAN messages, and the evaluation of a run."""
 
 from pathlib import Path
 

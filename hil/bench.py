@@ -1,4 +1,4 @@
-"""The bench: firmware and plant on one bus in lockstep, one process and one thread. It owns time, flies a scenario and judges it."""
+"""The bench: firmware and plant on one bus in lockstep, one process and one thread. It owns time and flies a scenario."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from hil.truth_log import TruthRecorder
 
 DEFAULT_BUS = "virtual:modcube"
 LOOK_S = 0.005
-"""Between two looks at a bus that is listened to: SYNC comes at 50 Hz at least."""
+"""Polling period while listening to a bus: SYNC comes at 50 Hz at least."""
 SCRIPTS: dict[str, Callable[[Scenario, Fleet], Orders]] = {"dock": DockScript, "force": ForceScript, "mode": ModeScript}
-"""By kind of task; a trajectory's is Script."""
+"""Orders by kind of task; the remaining kinds, which are trajectories, use Script."""
 
 
 @dataclass(slots=True)
@@ -49,17 +49,17 @@ class Bench:
     plant_port: Port
     faults: Faults
     patience_looks: int = PATIENCE_LOOKS
-    """Looks at a socket before a frame counts as lost by the bus."""
+    """Number of polls of a socket after which a frame counts as lost by the bus."""
     is_dead: bool = False
-    """The firmware's process is killed, and another waits to take its place."""
+    """Whether the firmware's process is killed. Its replacement is already composed."""
 
     @quiet_garbage()
     def fly(
         self, observers: Sequence[Observer] = (), progress: Callable[[float], None] | None = None, truth: TruthRecorder | None = None
     ) -> float:
-        """Flies to the end of the script; returns the wall time it took, s.
+        """Flies to the end of the script; returns the wall time that took, s.
 
-        Raises DescriptionError where somebody else answers as one of the simulated modules.
+        Raises DescriptionError if another node answers as one of the simulated modules.
         """
         lockstep, fleet = Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks), self.firmware.fleet
         sent: list[BusFrame] = []
@@ -82,9 +82,9 @@ class Bench:
         return time.perf_counter() - began
 
     def listen(self) -> None:
-        """Before the first SYNC, on a bus that reaches others, as the vehicle's process does: a robot there has a leader already.
+        """Listens before the first SYNC, as the vehicle's process does; not on a virtual bus, which reaches no other process.
 
-        Raises PortError where somebody else sends SYNC.
+        Raises PortError if another node sends SYNC: a robot on the bus already has a leader.
         """
         if self.plant_port.address.startswith("virtual:"):
             return
@@ -96,9 +96,9 @@ class Bench:
             time.sleep(LOOK_S)
 
     def _step_plant(self, tick: int, sent: Sequence[BusFrame], truth: TruthRecorder | None) -> list[BusFrame]:
-        """The plant's half of a tick: it hears what was sent, moves on by a period and answers; returns the answers."""
+        """The plant's half of a tick: takes the sent frames, advances by a period and answers; returns the answers."""
         heard = [frame for _, frame in drain([self.plant_port], sent, self.patience_looks)]
-        if tick <= self.firmware.fleet.rate_hz:  # later this one was the first
+        if tick <= self.firmware.fleet.rate_hz:  # later, this bench was there first
             self.nodes.refuse_others(heard, self.plant_port.address)
         answers = send([self.plant_port], [(0, frame) for frame in self.nodes.step(heard)])
         if truth is not None:
@@ -106,7 +106,7 @@ class Bench:
         return answers
 
     def _without_firmware(self, observers: Sequence[Observer]) -> Lockstep:
-        """After a tick in which the firmware's process is dead; returns the one that will be started in its place."""
+        """Completes a tick in which the firmware's process is dead; returns the lockstep of the firmware that will replace it."""
         self.firmware_port.receive()
         if not self.is_dead:
             self.is_dead, self.firmware = True, compose(self.firmware.fleet, self.firmware.parameters)
@@ -122,7 +122,7 @@ def fleet_of(scenario: Scenario, bus: str, rate_hz: int) -> Fleet:
 
 
 def script_of(scenario: Scenario, fleet: Fleet) -> Orders:
-    """Whoever gives the orders in a scenario."""
+    """The script that gives the orders in a scenario."""
     return SCRIPTS.get(scenario.task.kind, Script)(scenario, fleet)
 
 
@@ -149,10 +149,10 @@ def fly_scenario(
     progress: Callable[[float], None] | None = None,
     before_logs: Callable[[], None] | None = None,
 ) -> float:
-    """Flies `scenario` and leaves the logs in `out`; returns the wall time of the flight, s. Raises OSError where the disk is full.
+    """Flies `scenario` and leaves the logs in `out`; returns the wall time of the flight, s. Raises OSError if the disk is full.
 
-    `before_logs` is called when nothing is refused any more; until then logs of an earlier flight are as they were. From then on Ctrl-C
-    waits for the end of a tick: the logs are whole up to that.
+    `before_logs` is called once nothing can be refused any more; until then the logs of an earlier flight are untouched. From then on
+    Ctrl-C takes effect at the end of a tick, so that the logs are complete up to it.
     """
     with writing_to(out), ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, parameters, bus, rate_hz)

@@ -1,8 +1,8 @@
 """Many seeds of one scenario on any concurrent.futures executor: processes here, or a dask cluster.
 
-Every trial goes to trials.jsonl the moment it is flown. Started again in the same folder, a campaign flies what is missing; since a seed
-always gives the same flight, it ends in the same bytes as one that was never interrupted. campaign.json and trials.csv say what came of it.
-A worker that dies costs the trials under way, and these are flown again.
+Every trial goes to trials.jsonl as soon as it is flown. Started again in the same folder, a campaign flies the missing seeds; since a seed
+always gives the same flight, the files end up with the same bytes as without an interruption. campaign.json and trials.csv summarise it.
+When a worker dies, the trials under way are lost and flown again.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from hil.workers import Pool, deaths
 
 SUMMARY_FILE, TABLE_FILE, TRIALS_FILE = "campaign.json", "trials.csv", "trials.jsonl"
 WALL_CLOCK = ("real_time_factor", "deadline_misses")
-"""Metrics of the machine and not of the flight: no two campaigns would agree on them."""
+"""Metrics of the machine rather than the flight, left out because they differ from campaign to campaign."""
 PACKAGES = ("firmware_py", "hil", "can_dbc")
 SOURCES = (".py", ".toml", ".dbc")
 FEW = max(8, 2 * (os.cpu_count() or 1))
-"""Trials under way after a worker's death: enough to keep this machine busy, and no more than these does the next death cost."""
+"""Limit of trials under way after a worker has died: enough to keep this machine busy, and the most that the next death can cost."""
 IN_VAIN = 12
-"""Deaths without a trial between them that are no seed's fault."""
+"""Consecutive worker deaths without a finished trial after which the campaign gives up: no single seed is to blame."""
 
 
 @cache
 def code_digest() -> str:
-    """What all code and data of the robot and the bench come to."""
+    """SHA-256 digest of all code and data of the robot and the bench."""
     digest = hashlib.sha256()
     for package in PACKAGES:
         root = Path(str(resources.files(package)))
@@ -60,7 +60,7 @@ def code_digest() -> str:
 
 
 def identity(scenario: Scenario, parameters: Parameters) -> str:
-    """Same identity and same seed, same trial."""
+    """Digest of everything that determines a trial, apart from its seed."""
     vehicles = [load_vehicle(m.vehicle) for m in scenario.module]
     meshes = [hashlib.sha256(Path(v.hull.mesh).read_bytes()).hexdigest() if v.hull.mesh else "" for v in vehicles]
     parts = (code_digest(), dataclasses.asdict(scenario), list(map(dataclasses.asdict, vehicles)), meshes, dataclasses.asdict(parameters))
@@ -68,7 +68,7 @@ def identity(scenario: Scenario, parameters: Parameters) -> str:
 
 
 def fly_trial(scenario: Scenario, parameters: Parameters, seed: int, bus: str, code: str) -> Trial:
-    """One trial, logs thrown away. Raises DescriptionError where this machine's code is not `code`."""
+    """Flies one trial and discards its logs. Raises DescriptionError if the digest of this machine's code is not `code`."""
     if code_digest() != code:
         raise DescriptionError("a worker runs other code than this machine; install the same version there")
     with tempfile.TemporaryDirectory() as folder:
@@ -84,7 +84,7 @@ def fly_trial(scenario: Scenario, parameters: Parameters, seed: int, bus: str, c
 
 
 def outcome_of(result: Result) -> str:
-    """In words: passed, why a dock came to nothing, or the first check that failed."""
+    """Outcome in words: passed, why a dock failed, or the first check that failed."""
     failed = [check.name for check in result.checks if not check.passed]
     if failed[:1] == ["docked"]:
         return OUTCOMES[int(result.metrics["outcome"])]
@@ -104,10 +104,10 @@ def run_campaign(
     progress: Callable[[int, int], None] | None = None,
     anew: bool = False,
 ) -> dict[str, Any]:
-    """Flies every seed that `out` does not hold yet; writes campaign.json and trials.csv there; returns what the first holds.
+    """Flies every seed that `out` does not hold yet; writes campaign.json and trials.csv there; returns the content of campaign.json.
 
-    Raises DescriptionError where `out` holds another campaign, which `anew` throws away, a flight, or files that are no campaign's, and
-    for seeds that kill their workers; OSError where the disk takes no more.
+    Raises DescriptionError if `out` holds another campaign (which `anew` discards instead), a flight, or files of another origin, and for
+    seeds that kill their workers; OSError if the disk is full.
     """
     with made(out), writing_to(out):
         check_replaceable(out, (SUMMARY_FILE, TABLE_FILE, *LOGS), is_json_with(out / TRIALS_FILE, OWNER), "campaign")
@@ -125,7 +125,9 @@ def run_campaign(
 
 
 def _flown(scenario: Scenario, parameters: Parameters, seeds: Sequence[int], pool: Pool) -> Iterator[Trial]:
-    """Trials as they come. Those under way at a worker's death are flown again when the others are done: among few, then alone, twice."""
+    """Yields trials as they finish. Those under way when a worker dies are flown again after the others: FEW at a time, then one at a
+    time, twice.
+    """
     left, code, in_vain = set(seeds), code_digest(), 0
 
     def begin(executor: Executor, seed: int) -> Future[Trial]:
@@ -148,7 +150,7 @@ def _flown(scenario: Scenario, parameters: Parameters, seeds: Sequence[int], poo
 
 
 def _together(begin: Callable[[int], Future[Trial]], waiting: deque[int], at_once: int) -> Iterator[Trial]:
-    """Flies seeds out of `waiting`. When a worker dies no more are begun, and BrokenExecutor is raised as soon as none is under way."""
+    """Flies the seeds in `waiting`. After a worker dies no more are started, and BrokenExecutor is raised once none is under way."""
     under_way: set[Future[Trial]] = set()
     ended: SimpleQueue[Future[Trial]] = SimpleQueue()
     died = False
@@ -173,4 +175,4 @@ def _together(begin: Callable[[int], Future[Trial]], waiting: deque[int], at_onc
         for future in under_way:
             future.cancel()
     if died:
-        raise BrokenExecutor  # told to a pool that is kept
+        raise BrokenExecutor  # makes a kept pool replace its workers

@@ -1,4 +1,4 @@
-"""What many trials say: success and metrics with confidence intervals, worst seeds, and what each metric depends on."""
+"""Statistics of many trials: success and metrics with confidence intervals, worst seeds, and what each metric depends on."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-import scipy  # its parts load when they are used: a second that no worker needs
+import scipy  # submodules load on first use; importing them takes a second, and the workers do not need them
 
 CONFIDENCE = 0.95
 WORST = 5
-"""Seeds named as the worst: those that failed first."""
+"""Number of seeds named as the worst, failed ones first."""
 QUANTILES = {"min": 0.0, "q05": 0.05, "median": 0.5, "q95": 0.95, "max": 1.0}
 LEAST_TRIALS = 10
-"""Fewer say nothing of what a metric depends on."""
+"""Minimum number of trials for sensitivities."""
 NEARLY_ONE = 1.0 - 1e-12
 """The largest correlation that Fisher's transform takes."""
 
 Trial = Mapping[str, Any]
-"""`seed`, `passed`, `outcome`, `metrics` and `world`: names to numbers, None where there was none."""
+"""`seed`, `passed`, `outcome`, `metrics` and `world`. The last two map names to numbers, or None where there was none."""
 
 
 def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
-    """The content of campaign.json. Success has Wilson's interval, a median that of its order statistics."""
+    """The content of campaign.json, with Wilson's interval for success and an order-statistics interval for each median."""
     succeeded = sum(bool(trial["passed"]) for trial in trials)
     interval = scipy.stats.binomtest(succeeded, len(trials)).proportion_ci(CONFIDENCE, method="wilson")
     worst = sorted(trials, key=_goodness)[:WORST]
@@ -45,7 +45,7 @@ def summarise(scenario: str, trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def _goodness(trial: Trial) -> tuple[bool, float]:
-    """Failed ones first, those with the largest error before the others; the worst is one that has no figure."""
+    """Sort key, worst first: failed trials before passed ones, then by falling position error; a trial without that metric is the worst."""
     error_m = trial["metrics"].get("position_rmse_m")
     return bool(trial["passed"]), -math.inf if error_m is None else -error_m
 
@@ -55,7 +55,7 @@ def _names(trials: Sequence[Trial], part: str) -> list[str]:
 
 
 def _known(trials: Sequence[Trial], part: str, name: str) -> np.ndarray:
-    """(k,) the finite values."""
+    """(k,) finite values of one metric or world parameter."""
     values = np.array([trial.get(part, {}).get(name) for trial in trials], dtype=float)
     return values[np.isfinite(values)]
 
@@ -67,9 +67,9 @@ def _spread(known: np.ndarray) -> dict[str, float | None]:
 
 
 def median_interval(values: np.ndarray) -> tuple[float | None, float | None]:
-    """The order statistics between which the median of the distribution lies in at least 95 % of cases, whatever it is.
+    """Distribution-free confidence interval of the median: order statistics that enclose it in at least 95 % of cases.
 
-    None where there are too few values (David and Nagaraja, Order Statistics, 2003, section 7.1).
+    None if there are too few values (David and Nagaraja, Order Statistics, 2003, section 7.1).
     """
     n, ordered = values.size, np.sort(values)
     below = int(scipy.stats.binom.ppf(0.5 * (1.0 - CONFIDENCE), n, 0.5)) - 1 if n else -1
@@ -83,7 +83,7 @@ def median_interval(values: np.ndarray) -> tuple[float | None, float | None]:
 def sensitivities(trials: Sequence[Trial]) -> dict[str, dict[str, dict[str, float]]]:
     """Spearman's rank correlation of each metric with each parameter of the world, with its 95 % interval.
 
-    The interval is Fisher's, with Bonett and Wright's variance (Psychometrika 65, 2000). Where either never changes there is none.
+    The interval is Fisher's, with Bonett and Wright's variance (Psychometrika 65, 2000). A pair in which either never changes is left out.
     """
     if len(trials) < LEAST_TRIALS:
         return {}
@@ -105,9 +105,10 @@ def _rank_correlation(pairs: np.ndarray) -> dict[str, float]:
 
 
 def surely_not_zero(correlation: Mapping[str, float], pairs: int) -> bool:
-    """Whether a correlation of `sensitivities` is not zero, where `pairs` of them are looked at together.
+    """Whether a correlation of `sensitivities` differs significantly from zero when `pairs` of them are examined together.
 
-    Of many pairs one is outside its own 95 % interval by chance: Bonferroni's has a `pairs`-th of the chance to miss.
+    Among many pairs some lie outside their own 95 % interval by chance, so the interval is widened by Bonferroni's correction: it misses
+    with 1/`pairs` of the probability.
     """
     rho = correlation["rho"]
     z, nearer = (math.atanh(max(-NEARLY_ONE, min(NEARLY_ONE, r))) for r in (rho, correlation["low" if rho > 0.0 else "high"]))
@@ -116,12 +117,12 @@ def surely_not_zero(correlation: Mapping[str, float], pairs: int) -> bool:
 
 
 def _deviations(confidence: float) -> float:
-    """Standard deviations of a normal variable on either side of its mean that hold that share of it."""
+    """Half-width of the central interval that contains this share of a normal variable, in standard deviations."""
     return NormalDist().inv_cdf(0.5 + 0.5 * confidence)
 
 
 def table_of(trials: Sequence[Trial]) -> str:
-    """trials.csv: a row for each seed; metrics, then the world that the seed made."""
+    """The content of trials.csv: a row per seed with the metrics, then the world parameters of the seed."""
     metrics, world = _names(trials, "metrics"), _names(trials, "world")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -12,7 +12,7 @@ RESULT_FILE = "result.json"
 
 
 UNBOUNDED = 1e9
-"""A bound of this size or more is none."""
+"""A bound of this size or more means no bound."""
 
 
 class Bounds(Protocol):
@@ -50,7 +50,7 @@ class Check(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What a run came to, as result.json holds it, less `told` and `unseen`."""
+    """The result of a run. result.json holds all of it but `told` and `unseen`."""
 
     scenario: str
     seed: int
@@ -60,18 +60,18 @@ class Result(NamedTuple):
     told: tuple[str, ...] = ()
     """Warnings of the firmware, a line each (hil.metrics.told)."""
     unusual: tuple[str, ...] = ()
-    """What flew otherwise than the scenario has it: vehicle, controller, sensors."""
+    """Options that differ from the scenario or the defaults: vehicle, controller, sensors."""
     unseen: str = ""
-    """Why no tag was seen in a flight that could not be flown for that, in words."""
+    """Why no tag was seen, in words, if the flight could not be flown for that reason."""
 
     @property
     def flown(self) -> str:
-        """Which flight of the scenario it was, for people."""
+        """Human-readable description of the flight: its seed and unusual options."""
         return ", ".join([f"seed {self.seed}", *self.unusual])
 
 
 def limit_text(low: float, high: float) -> str:
-    """A range in words; empty where there is none."""
+    """A range in words; empty if neither side is bounded."""
     if low <= -UNBOUNDED and high >= UNBOUNDED:
         return ""
     if low <= -UNBOUNDED:

@@ -1,4 +1,4 @@
-"""The commands `modcube hil ...`: run a scenario, run many seeds of it, list what there is."""
+"""The commands `modcube hil ...`: run a scenario, run many seeds of it, run the plant alone, list the scenarios."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ app = typer.Typer(help="The bench: the firmware against a simulated plant on the
 FAILED = 1
 """Exit status when a check failed."""
 RATES_HZ = tuple(rate for rate in range(50, 401) if 1_000_000_000 % (rate * STEP_NS) == 0)
-"""Ticks a second whose period is whole sub-steps of the plant."""
+"""Tick rates whose period is a whole number of the plant's sub-steps."""
 
 ScenarioName = Annotated[str, typer.Argument(help="name of a scenario (`modcube hil list`), or a .toml file")]
 Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, paper_sequence, or a file of parameters")]
@@ -33,7 +33,7 @@ Sensors = Annotated[str, typer.Option(help="real, or ideal: no noise, no delay")
 
 
 def parameters_of(controller: str) -> Parameters:
-    """The parameters called `controller`, or those in that file. Raises DescriptionError."""
+    """The parameters named `controller`, or those of a .toml file. Raises DescriptionError."""
     if controller.endswith(".toml"):
         return load_parameters(Path(controller))
     if controller not in CONTROLLERS:
@@ -44,7 +44,7 @@ def parameters_of(controller: str) -> Parameters:
 
 
 def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
-    """The scenario `name` with what the command line changes of it. Raises DescriptionError."""
+    """The scenario `name` with the changes from the command line. Raises DescriptionError."""
     scenario = load_scenario(name)
     if sensors not in ("real", "ideal"):
         raise DescriptionError(f"sensors {sensors!r} is unknown; there are real, ideal")
@@ -54,20 +54,20 @@ def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
 
 
 def check_rate(rate_hz: int) -> None:
-    """Raises DescriptionError for a rate whose ticks are not whole sub-steps of the plant."""
+    """Raises DescriptionError for a rate whose period is not a whole number of the plant's sub-steps."""
     if rate_hz not in RATES_HZ:
         why = f"a tick is no whole number of the plant's sub-steps of {1e-6 * STEP_NS:g} ms"
         raise DescriptionError(f"--rate {rate_hz}: {why}; it takes {', '.join(map(str, RATES_HZ))}")
 
 
 def check_reaches_others(bus: str, who: str, kinds: tuple[str, ...] = ("virtual:",)) -> None:
-    """Raises DescriptionError where a bus of those kinds ends with its process, and `who` needs another process at its other end."""
+    """Raises DescriptionError if `bus` is of one of `kinds`, which do not reach other processes, while `who` needs one at the other end."""
     if bus.startswith(kinds):
         raise DescriptionError(f"bus {bus!r} does not reach another process; {who} needs udp:GROUP:PORT or socketcan:IFACE")
 
 
 def unusual_in(vehicle: str, controller: str, sensors: str) -> list[str]:
-    """What of a flight is not as the scenario has it, as part of a folder's name."""
+    """The options that differ from the scenario or the defaults, as parts of a folder name."""
     given = ((vehicle, ""), (controller, "modcube"), (sensors, "real"))
     return [Path(chosen).stem for chosen, usual in given if chosen != usual]
 
@@ -110,7 +110,7 @@ def run(
 
 @contextmanager
 def _told_where_the_log_is(folder: Path) -> Iterator[None]:
-    """Says what is left of a run that is interrupted."""
+    """When the run inside is interrupted, prints where its log is, or that nothing was flown."""
     log, before = folder / CAN_LOG, _written_at(folder / CAN_LOG)
     try:
         yield
@@ -121,7 +121,7 @@ def _told_where_the_log_is(folder: Path) -> Iterator[None]:
 
 
 def _written_at(path: Path) -> int | None:
-    """When a file was written last, ns; None where there is none."""
+    """Time of the last write to a file, ns; None if it does not exist."""
     return path.stat().st_mtime_ns if path.exists() else None
 
 
@@ -142,7 +142,7 @@ def campaign(
     sensors: Sensors = "real",
     draw: Annotated[int, typer.Option(min=0, max=5, help="so many of the worst seeds are flown again for logs, plots and report")] = 1,
 ) -> None:
-    """Fly many seeds of a scenario; prints a table and leaves every trial. Interrupted and started again, it goes on.
+    """Fly many seeds of a scenario; prints a table and keeps every trial. Started again after an interruption, it resumes.
 
     `faults`: everything that can break, in every mode; takes --jobs, --seed and --out.
     """
@@ -171,7 +171,7 @@ def campaign(
 
 @contextmanager
 def _told_that_it_goes_on() -> Iterator[None]:
-    """Says so when it is interrupted."""
+    """When the campaign inside is interrupted, prints that the same command resumes it."""
     try:
         yield
     except KeyboardInterrupt:
@@ -180,11 +180,11 @@ def _told_that_it_goes_on() -> Iterator[None]:
 
 
 FAULT_OPTIONS = ("scenario", "jobs", "seed", "out")
-"""Of `campaign`, those that apply to the matrix of faults."""
+"""Options of `campaign` that apply to the fault matrix."""
 
 
 def _check_fault_options(context: typer.Context) -> None:
-    """Raises DescriptionError where an option was given that the matrix of faults does not take."""
+    """Raises DescriptionError if the command line has an option that the fault matrix does not take."""
     given = [name for name in context.params if (source := context.get_parameter_source(name)) and source.name == "COMMANDLINE"]
     if idle := [f"--{name}" for name in given if name not in FAULT_OPTIONS]:
         takes = ", ".join(f"--{name}" for name in FAULT_OPTIONS[1:])
@@ -192,7 +192,7 @@ def _check_fault_options(context: typer.Context) -> None:
 
 
 def _fly_faults(jobs: int, seed: int, out: Path | None) -> int:
-    """The matrix of faults; returns the exit status."""
+    """Flies and prints the fault matrix; returns the exit status."""
     from hil.console import campaign_progress
     from hil.fault_campaign import run_fault_campaign
     from hil.fault_matrix import print_faults

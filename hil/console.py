@@ -1,4 +1,4 @@
-"""What a bench run shows in the terminal: progress while it flies, and the table of its result."""
+"""Terminal output of a bench run: progress while it flies, and the table of its result."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from hil.checks import Result
 from hil.metrics import metric_order, shown, shown_limit, shown_value
 
 TOLD = ("position_rmse_m", "attitude_rmse_rad")
-"""Metrics of a campaign for which it is said what they go with."""
+"""Metrics of a campaign for which correlated parameters of the world are printed."""
 TOLD_LINES = 6
-"""Warnings of a run that are shown."""
+"""Number of warnings shown of a run."""
 
 
 @contextmanager
 def flight_progress(title: str, duration_s: float, console: Console | None = None) -> Iterator[Callable[[float], None]]:
-    """A progress bar over simulated time; it is to be told how much was flown, s."""
+    """A progress bar over simulated time; yields a function that takes the time flown so far, s."""
     columns = (TextColumn("{task.completed:5.1f} of {task.total:.1f} s flown"), TimeElapsedColumn())
     with _bar(title, duration_s, columns, console) as update:
         yield lambda done_s: update(completed=done_s)
@@ -34,7 +34,7 @@ def flight_progress(title: str, duration_s: float, console: Console | None = Non
 
 @contextmanager
 def campaign_progress(title: str, trials: int, console: Console | None = None) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar over trials; it is to be told how many were flown, and of how many."""
+    """A progress bar over trials; yields a function that takes the number of trials flown and the total."""
     columns = (TextColumn("{task.completed:.0f} of {task.total:.0f} flown"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     with _bar(title, trials, columns, console) as update:
         yield lambda done, total: update(completed=done, total=total)
@@ -42,14 +42,14 @@ def campaign_progress(title: str, trials: int, console: Console | None = None) -
 
 @contextmanager
 def _bar(title: str, total: float, columns: Sequence[ProgressColumn], console: Console | None) -> Iterator[Callable[..., None]]:
-    """A bar that leaves one line; where the output is no terminal, it shows nothing. Yields what updates it, as rich's `update` does."""
+    """A bar that leaves one line, or nothing if the output is not a terminal. Yields its update function, as rich's `update`."""
     console = console or Console()
     with Progress(TextColumn("{task.description}"), BarColumn(), *columns, console=console, disable=not console.is_terminal) as progress:
         yield partial(progress.update, progress.add_task(title, total=total))
 
 
 def campaign_table(summary: Mapping[str, Any]) -> Table:
-    """Quantiles of every metric over the trials of a campaign.json; its title says how many passed."""
+    """Quantiles of every metric over the trials of a campaign.json; the title gives the number that passed."""
     low, high = summary["confidence_interval"]
     passed = f"{summary['succeeded']} of {summary['trials']} passed ({low:.1%} to {high:.1%}, 95 % confidence)"
     title = Text(f"{summary['scenario']}: {passed}", style="bold")
@@ -65,7 +65,7 @@ def campaign_table(summary: Mapping[str, Any]) -> Table:
 
 
 def print_campaign(summary: Mapping[str, Any], console: Console | None = None) -> None:
-    """The table, what the failures were, and the seeds to look at first."""
+    """Prints the table, the kinds of failure, the seeds to look at first, and the correlated parameters."""
     console = console or Console()
     console.print(campaign_table(summary))
     failures = [f"{name} {count}" for name, count in summary["outcomes"].items() if name != "passed"]
@@ -80,10 +80,10 @@ def print_campaign(summary: Mapping[str, Any], console: Console | None = None) -
 
 
 def what_matters(correlations: Mapping[str, Mapping[str, float]], pairs: int = 0) -> str:
-    """Parameters of the world whose rank correlation is surely not zero, strongest first: `mass_factor 0.61 (0.24 to 0.83)`.
+    """The three strongest world parameters with a significant rank correlation, strongest first: `mass_factor 0.61 (0.24 to 0.83)`.
 
-    With 95 % confidence none of the `pairs` that are looked at together is named wrongly; left out, they are those given. The
-    interval shown is that of the pair by itself.
+    With 95 % confidence none of the `pairs` examined together is named wrongly; by default `pairs` is the number of correlations
+    given. The interval shown is that of the pair by itself.
     """
     sure = {name: c for name, c in correlations.items() if surely_not_zero(c, max(pairs, len(correlations)))}
     ordered = sorted(sure.items(), key=lambda item: -abs(item[1]["rho"]))
@@ -91,7 +91,7 @@ def what_matters(correlations: Mapping[str, Mapping[str, float]], pairs: int = 0
 
 
 def result_table(result: Result) -> Table:
-    """Metrics of a run, and beside those that are checked their limit and verdict."""
+    """Metrics of a run, with limit and verdict beside those that are checked."""
     checks = {check.name: check for check in result.checks}
     title = Text(f"{result.scenario}, {result.flown}", style="bold")
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
@@ -111,13 +111,13 @@ def result_table(result: Result) -> Table:
 
 
 def told_lines(told: Sequence[str]) -> list[str]:
-    """The first warnings of the firmware under a heading, and how many more there are; nothing where there is none."""
+    """The first warnings of the firmware under a heading, and the number of further ones; empty if there are none."""
     more = [f"  and {len(told) - TOLD_LINES} more"] if len(told) > TOLD_LINES else []
     return ["warnings of the firmware:", *(f"  {line}" for line in told[:TOLD_LINES]), *more] if told else []
 
 
 def print_result(result: Result, report: Path | None = None, console: Console | None = None) -> None:
-    """The table, what the firmware warned of, the verdict in one line, and where the report is."""
+    """Prints the table, the firmware's warnings, the verdict in one line, and the path of the report."""
     console = console or Console()
     console.print(result_table(result))
     for line in told_lines(result.told):

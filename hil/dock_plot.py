@@ -13,26 +13,26 @@ from hil.signals import SIGNAL_LOG, rows_of
 from hil.truth_log import TRUTH_LOG
 
 THRESHOLD_MA = 70.0
-"""The paper's; what a flight used may differ."""
+"""The paper's threshold; that of the flight may differ."""
 FACES = ("#0b63b0", "#c0392b")
 GAP, LATERAL = "#7b3294", "#e69f00"
 HOLDS = "#2e8b57"
 MARK = "#555f6b"
 STAGES = ("pre-approach", "align", "approach", "push", "verify", "docked", "release", "back off", "aborted", "failed")
-"""By the number that the log has."""
+"""Names of the stages, indexed by the number in the log."""
 DOCK_PLOT = "docking.png"
 TRUE_GAP = "true gap (near by, until locked)"
-"""The plant's own, which has none for modules that are far from each other, or of one body."""
+"""Label of the plant's own gap, which does not exist for modules far from each other or of the same body."""
 PAUSE_NS = 1_000_000_000
-"""Between two rows of a pair, from which on the second is of another dock."""
+"""Pause between two rows of a pair above which the second belongs to another dock."""
 LAST_SHARE = 0.08
-"""Of the time axis, for the last tick of a dock, with which its last stage begins."""
+"""Share of the time axis added after a dock's last tick, in which its last stage begins."""
 LEAST_SHARE = 0.04
-"""Of the time axis, that a stage before the last takes if it is named."""
+"""Share of the time axis above which a stage is labelled; the last stage always is."""
 
 
 def write_dock_plot(folder: Path, start_ns: int) -> list[Path]:
-    """Draws the dock of the run in `folder`; nothing where none was begun."""
+    """Draws the first dock of the run in `folder`; nothing if there was none."""
     docks = read_signals(folder / SIGNAL_LOG).get("/firmware/docks")
     truth = read_signals(folder / TRUTH_LOG).get("/plant/docks")
     if docks is None or truth is None:
@@ -59,7 +59,7 @@ def docking(docks: Columns, truth: Columns, start_ns: int) -> Any:
     from matplotlib import pyplot
 
     pair = (docks["module_b"] == docks["module_b"][0]) & (docks["module_a"] == docks["module_a"][0])
-    again = np.flatnonzero(np.diff(docks["time_ns"][pair]) > PAUSE_NS)  # the same two, undocked and docked once more
+    again = np.flatnonzero(np.diff(docks["time_ns"][pair]) > PAUSE_NS)  # the same pair, undocked and docked again
     rows = rows_of(docks, np.flatnonzero(pair)[: again[0] + 1 if again.size else None])
     time_s = 1e-9 * (rows["time_ns"] - start_ns)
     figure, (currents, gap, conditions) = pyplot.subplots(

@@ -1,4 +1,4 @@
-"""What the person at the bench does in a docking scenario: arm everybody, then one step of the scenario after the other."""
+"""The operator's script of a docking scenario: arm every body, then run the steps of the scenario one after the other."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from hil.scenario import Scenario, Step
 from hil.script import refuse_outside
 
 NOBODY = -1
-"""Index of a module that a step is not about."""
+"""Index in place of a module that a step does not have."""
 AFTERWARDS_NS = 3_000_000_000
-"""The run goes on so long after the last step: what was joined or parted must stay so."""
+"""Time that the run continues after the last step: joined modules must stay joined, and parted ones apart."""
 
 
 class DockScript(Orders):
@@ -37,19 +37,19 @@ class DockScript(Orders):
         self._steps = list(scenario.step)
         self._running: list[_Running] = []
         self._armed: set[int] = set()
-        """Modules that have been."""
+        """Modules that have been armed."""
         self._over_ns: int | None = None
         self.ticks = scenario.task.end_ns // fleet.period_ns
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
-        """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
+        """The requests in the tick at `time_ns` since the start, given the outputs of the previous tick."""
         if last is None:
             return []
         self._bodies = _bodies_of(last, len(self._fleet.module))
         asked = self._arm(time_ns, last)
         if time_ns < self._scenario.task.begin_ns:
             return asked
-        if any([self._is_given_up(r, last) for r in self._running]):  # the steps after it have lost their sense
+        if any([self._is_given_up(r, last) for r in self._running]):  # the later steps no longer make sense
             self._running, self._steps = [], []
         self._running = [r for r in self._running if not self._is_over(r, time_ns)]
         if not self._running and self._steps:
@@ -62,11 +62,11 @@ class DockScript(Orders):
         return asked
 
     def is_over(self, time_ns: int) -> bool:
-        """Whether every step is over, and has been for a while."""
+        """Whether every step has been over for AFTERWARDS_NS."""
         return self._over_ns is not None and time_ns >= self._over_ns + AFTERWARDS_NS
 
     def _arm(self, time_ns: int, last: Outputs) -> list[Request]:
-        """Arms every body once; then each hovers level where it is, whichever way it hung until it was armed."""
+        """Arms every body once; each then hovers level where it is, whatever its attitude before arming."""
         asked: list[Request] = []
         for record in last.records:
             if record.body not in self._armed:
@@ -95,7 +95,7 @@ class DockScript(Orders):
         return [Request(Action.TRACK, body, _path(step, self._scenario, record.setpoint.p_wb, record.setpoint.q_wb))]
 
     def _is_given_up(self, running: _Running, last: Outputs) -> bool:
-        """Whether a dock that was under way has ended, and its bodies are still two. One that is refused never was."""
+        """Whether a dock that was under way has ended with its bodies still apart. A refused dock was never under way."""
         if running.step.do != "dock":
             return False
         docking = [r.mode == Mode.DOCK for r in last.records if r.body == self._number(running.module)]
@@ -108,16 +108,16 @@ class DockScript(Orders):
         return time_ns >= running.end_ns
 
     def _are_one(self, running: _Running) -> bool:
-        """Whether the two modules of a step are of one body."""
+        """Whether the two modules of a step belong to the same body."""
         return self._number(running.module) == self._number(running.target)
 
     def _number(self, module: int) -> int:
-        """Number of the body that holds a module; NOBODY where none does."""
+        """Number of the body that contains a module; NOBODY if none does."""
         return next((number for number, modules in self._bodies.items() if module in modules), NOBODY)
 
 
 def _bodies_of(last: Outputs, modules: int) -> dict[int, set[int]]:
-    """Modules of each body, by its number. In the tick in which bodies join or part its joints are still those before."""
+    """Modules of each body, by its number. In the tick in which bodies join or part, `last.joints` still has the previous joints."""
     body_of = list(range(modules))
     for a, b in [] if last.joints is None else last.joints["module"].tolist():
         body_of = [body_of[a] if body == body_of[b] else body for body in body_of]
@@ -133,7 +133,7 @@ class _Running:
     module: int
     target: int
     docking: bool = False
-    """Whether its body was in the mode DOCK in the tick before."""
+    """Whether its body was in mode DOCK in the previous tick."""
 
 
 def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) -> Trajectory:

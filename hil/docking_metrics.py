@@ -1,4 +1,4 @@
-"""What came of the docks of a run, from its logs alone: who ended up together, in how many tries, and how it failed."""
+"""Outcome of the docks of a run, from its logs alone: which modules ended up joined, in how many tries, and how a dock failed."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from hil.signals import SIGNAL_LOG, by_number, rows_of
 from hil.truth_log import TRUTH_LOG
 
 BELIEVED, TRUE = "/firmware/body", "/plant/body"
-"""Channels of the bodies, before the number of the leader: as the firmware takes them to be, and as they are."""
+"""Prefixes of the body channels, before the leader's number: as the firmware believes, and as they really are."""
 DOCKED, JAMMED, UNSTABLE, REFUSED, GAVE_UP = range(len(OUTCOMES))
 DECLARED = STAGES.index("docked")
-"""Stage of a dock in the tick in which the firmware takes two bodies for one."""
+"""Stage of a dock in the tick in which the firmware declares two bodies joined."""
 FACING = math.cos(math.radians(30.0))
-"""Least cosine between the normals of faces that meet and the way from centre to centre: 30 deg, a third of a quarter turn."""
+"""Least cosine between the normals of mated faces and the line from centre to centre: 30 deg, a third of a quarter turn."""
 UNSTABLE_RAD, KEPT_UP_TICKS = math.radians(30.0), 200
-"""A module that stays so far from the attitude that it was bound for is out of control."""
+"""A body whose attitude stays this far from its set-point, for this many ticks, is out of control."""
 
 
 def wishes_of(scenario: Scenario) -> dict[tuple[int, int], list[Step]]:
-    """Docks and undocks of each pair of modules (fleet indices, the lower first), in their order."""
+    """Dock and undock steps of each pair of modules (fleet indices, the lower first), in order."""
     pairs: dict[tuple[int, int], list[Step]] = {}
     for step in scenario.step:
         if step.do in ("dock", "undock"):
@@ -39,17 +39,16 @@ def wishes_of(scenario: Scenario) -> dict[tuple[int, int], list[Step]]:
 
 
 def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
-    """What came of a run with [[step]]s.
+    """Docking metrics of a run with [[step]]s.
 
     Returns:
-        docked: modules came together and apart as the steps want; gap_min_m: smallest distance between faces that are opposite each other,
-        NaN where none came near; tries: meetings of a probe and a funnel; jams; outcome:
-        index into OUTCOMES; false_declarations: bodies that the firmware joined and that were not; join_jump_n: largest step
-        of a thruster's commanded force in a tick in which bodies were joined, N; docked_rmse_m: position of all joined bodies
-        against their set-points.
+        docked: whether modules joined and parted as the steps ask; gap_min_m: smallest distance between opposite faces, NaN if none came
+        near; tries: contacts of a probe with a funnel; jams: jammed contacts; outcome: index into OUTCOMES; false_declarations: joins
+        declared by the firmware that did not happen; join_jump_n: largest step of a thruster's commanded force in a tick in which bodies
+        were joined, N; docked_rmse_m: position RMSE of all joined bodies against their set-points.
 
     Raises:
-        OSError: a log is missing. ValueError: it holds no docks.
+        OSError: a log is missing. ValueError: the truth log has no docks.
     """
     truths, signals = read_signals(folder / TRUTH_LOG), read_signals(folder / SIGNAL_LOG)
     docks = truths.get("/plant/docks")
@@ -70,7 +69,7 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
 
 
 def _together(truths: Mapping[str, Columns], ticks: np.ndarray) -> np.ndarray:
-    """(k, m, m) whether two modules share a body in each of these ticks."""
+    """(k, m, m) whether each two modules share a body in each of these ticks."""
     bodies = by_number(truths, TRUE).values()
     count = next(iter(bodies))["member"].shape[1]
     found = np.zeros((len(ticks), count, count), dtype=bool)
@@ -81,18 +80,18 @@ def _together(truths: Mapping[str, Columns], ticks: np.ndarray) -> np.ndarray:
 
 
 def is_obeyed(wishes: Sequence[bool], together: np.ndarray) -> bool:
-    """Whether two modules came together (True) and apart as was wished, one after the other, and are so at the end.
+    """Whether two modules joined and parted in the order of the wishes, and end in the last wished state.
 
     Args:
-        wishes: of them, at least one.
-        together: (k,) whether they were, over the run.
+        wishes: at least one; True to join, False to part.
+        together: (k,) whether the two shared a body, over the run.
     """
     changes = iter(together[np.append(True, together[1:] != together[:-1])])
     return all(wish in changes for wish in wishes) and bool(together[-1]) == wishes[-1]
 
 
 def _meet(scenario: Scenario, step: Step, truths: Mapping[str, Columns]) -> bool:
-    """Whether the faces of a dock are those that meet at the end of the run."""
+    """Whether the faces that a dock step names face each other at the end of the run."""
     active, target = (truths[f"/plant/module{scenario.index_of(number)}"] for number in step.modules)
     way = target["p_wm"][-1] - active["p_wm"][-1]
     way = way / np.linalg.norm(way)
@@ -103,7 +102,7 @@ def _meet(scenario: Scenario, step: Step, truths: Mapping[str, Columns]) -> bool
 
 
 def _later_dock(scenario: Scenario, last: Step, together: np.ndarray) -> list[Step]:
-    """The dock after `last`, an undock, that brought its two modules together again with others of their bodies; empty: none."""
+    """The dock step after the undock `last` that rejoined its two modules by docking other modules of their bodies; empty if none."""
     low, high = map(scenario.index_of, last.modules)
     apart = np.flatnonzero(~together[:, low, high])
     if last.do == "dock" or not apart.size:
@@ -117,7 +116,7 @@ def _later_dock(scenario: Scenario, last: Step, together: np.ndarray) -> list[St
 
 
 def is_as_asked(scenario: Scenario, truths: Mapping[str, Columns]) -> bool:
-    """Whether docks and undocks were obeyed, each in its turn, with the faces that they name; without any, nothing joined or parted."""
+    """Whether all docks and undocks happened in order, with the faces that they name; without any, whether nothing joined or parted."""
     together, pairs = _together(truths, truths["/plant/docks"]["tick"]), wishes_of(scenario)
     if not pairs:
         return bool((together == together[0]).all())
@@ -129,13 +128,15 @@ def is_as_asked(scenario: Scenario, truths: Mapping[str, Columns]) -> bool:
 
 
 def _bodies(channels: Mapping[str, Columns], prefix: str, ticks: np.ndarray) -> np.ndarray:
-    """(k,) number of bodies in each of the ticks."""
+    """(k,) number of bodies in each tick."""
     there = (np.isin(ticks, columns["tick"]) for columns in by_number(channels, prefix).values())
     return sum(there, np.zeros(len(ticks), dtype=np.int64))
 
 
 def _false_declarations(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> int:
-    """By those that hang together, and by how many bodies there are, which knows of joins that no dock declared."""
+    """Number of joins that the firmware declared but that did not happen: the larger of two counts. One checks each declared pair against
+    the true bodies; the other compares the numbers of bodies, which also catches joins that no dock declared.
+    """
     ticks = truths["/plant/docks"]["tick"]
     believed, real = _bodies(signals, BELIEVED, ticks), _bodies(truths, TRUE, ticks)
     joined = np.diff(believed, prepend=believed[:1]) < 0
@@ -159,7 +160,7 @@ def _failure(docks: Columns, signals: Mapping[str, Columns]) -> int:
 
 
 def _off_attitude(signals: Mapping[str, Columns]) -> float:
-    """Largest angle between set-point and estimate that any body, its pose known, keeps up for a while, rad."""
+    """Largest angle between set-point and estimate that any body with a known pose sustains over KEPT_UP_TICKS, rad."""
     worst = 0.0
     for columns in by_number(signals, BELIEVED).values():
         if len(columns["tick"]) >= KEPT_UP_TICKS:
@@ -170,7 +171,9 @@ def _off_attitude(signals: Mapping[str, Columns]) -> float:
 
 
 def _join_jump_n(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> float:
-    """Over all joins that docks declared; a joined body has the target's thrusters first, then the active one's. NaN without any."""
+    """Largest step of a thruster's commanded force over all declared joins, N; NaN without any. A joined body lists the thrusters of the
+    target first, then those of the active body.
+    """
     bodies, docks, worst = by_number(signals, BELIEVED), signals.get("/firmware/docks"), math.nan
     if docks is None:
         return worst
@@ -186,28 +189,32 @@ def _join_jump_n(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) 
 
 
 def _members(truths: Mapping[str, Columns], leader: int, tick: int, thrusters: int) -> np.ndarray:
-    """Modules of a body that has so many thrusters for the firmware: those of the true one when it last had as many, for it joins first."""
+    """Modules of a body that has this many thrusters in the firmware's view: the members of the true body when it last had as many, since
+    the true body joins before the firmware's.
+    """
     true = _body_with(truths, leader)
     alike = (true["tick"] < tick) & (_thrusters(truths, true) == thrusters)
     return np.flatnonzero(true["member"][alike][-1:].any(axis=0))
 
 
 def _body_with(truths: Mapping[str, Columns], module: int) -> Columns:
-    """The true body that has a module, tick by tick: it bears the number of its lowest one, and the firmware's that of its leader."""
+    """The true body that contains `module`, tick by tick. True bodies carry the number of their lowest module, the firmware's that of
+    their leader.
+    """
     parts = [rows_of(columns, columns["member"][:, module] > 0.0) for columns in by_number(truths, TRUE).values()]
     found = {name: np.concatenate([part[name] for part in parts]) for name in ("tick", "member", "p_wb")}
     return rows_of(found, np.argsort(found["tick"]))
 
 
 def _thrusters(truths: Mapping[str, Columns], true: Columns) -> np.ndarray:
-    """(k,) of all modules of a true body, tick by tick; those of one fleet may be of several kinds."""
+    """(k,) number of thrusters of a true body, tick by tick; the modules of a fleet may be of several kinds."""
     each = [truths[f"/plant/module{m}"]["force_n"].shape[1] for m in range(true["member"].shape[1])]
     return np.asarray((true["member"] > 0.0) @ each)
 
 
 def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]) -> float:
-    """Position of the truth against the set-point over the ticks in which both logs know of a joined body, and the firmware of its pose;
-    NaN without any.
+    """Position RMSE of the truth against the set-point, over the ticks in which both logs have the joined body and the firmware knows its
+    pose; NaN without any.
     """
     squares = [np.zeros(0)]
     for leader, believed in by_number(signals, BELIEVED).items():
@@ -223,6 +230,6 @@ def _docked_rmse_m(truths: Mapping[str, Columns], signals: Mapping[str, Columns]
 
 
 def _forces(columns: Columns, tick: int) -> np.ndarray | None:
-    """Commanded forces (n,) of a body in a tick, N; None when it was not there."""
+    """Commanded forces (n,) of a body in a tick, N; None if the body did not exist then."""
     row = np.flatnonzero(columns["tick"] == tick)
     return columns["commanded_n"][row[0]][np.isfinite(columns["commanded_n"][row[0]])] if row.size else None

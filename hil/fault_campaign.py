@@ -1,4 +1,4 @@
-"""`modcube hil campaign faults`: every fault in every mode; what happened beside what is promised."""
+"""`modcube hil campaign faults`: every fault in every mode, what happened against what is promised."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from hil.workers import Pool
 SCENARIO = "faults"
 RESULT_FILE = "faults.json"
 BEFORE_S = 0.015
-"""The tick before the fault is looked at too, so that what changes at once is seen to change."""
+"""Includes the tick before the fault, so that an immediate change is seen as a change."""
 BLAMED = re.compile(r"thruster (\d+) ")
-"""Words with which a thruster is left out."""
+"""Thruster named in an event, as it is when one is left out."""
 SETTLE_TICKS = 300
-"""After a mode without a place: the body comes to rest."""
+"""Time for the body to come to rest after a mode outside PLACED."""
 KNOWN_NS = 1_000_000_000
-"""Age of the last tag until which a place is known."""
+"""Age of the last tag up to which the position counts as known."""
 
 
 class Cell(NamedTuple):
@@ -46,20 +46,20 @@ class Cell(NamedTuple):
     happened: str
     """In words."""
     broken: tuple[str, ...]
-    """Promises that were not kept; empty: all were."""
+    """Promises that were not kept; empty if all were."""
     promise: str
     """What the robot promises about the fault, in words."""
 
 
 def scenario_of(row: Row, mode: str) -> Scenario:
-    """The flight of one cell."""
+    """The scenario of one cell."""
     base = load_scenario(SCENARIO)
     task = dataclasses.replace(base.task, mode=mode, **row.task)
     return dataclasses.replace(base, task=task, fault=(row.fault, *row.also) if row.fault is not None else ())
 
 
 def fly_cell(row: Row, mode: str, seed: int, parameters: Parameters | None = None) -> Cell:
-    """Flies one cell and judges it by its logs."""
+    """Flies one cell and judges it from its logs."""
     scenario = scenario_of(row, mode)
     with tempfile.TemporaryDirectory() as folder:
         fly_scenario(scenario, seed, parameters or Parameters(), Path(folder), f"virtual:{row.name}-{mode}-{seed}")
@@ -97,13 +97,13 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Vehicle) -> Cell:
 
 
 def _told(flight: Flight) -> list[tuple[str, float]]:
-    """What the firmware said from the fault on, and how long after it, s."""
+    """Texts of the firmware's events from the fault on, each with its time after the fault, s."""
     events = zip(flight.events["text"], flight.events["log_time"] * 1e-9 - AT_S, strict=True)
     return [(str(text), float(at_s)) for text, at_s in events if at_s >= 0.0]
 
 
 def _wrong_commands(commanded: np.ndarray, names: Sequence[str], vehicle: Vehicle) -> dict[str, bool]:
-    """What no thruster's command may be, whatever breaks, and whether it was; commanded: (k, t) N, in the states `names`."""
+    """Violations that no fault may cause, and whether each occurred. `commanded`: (k, t) N, in the states `names`."""
     still = np.array([name in ("DISARMED", "ESTOP") for name in names])
     return {
         "a command was no number": not np.isfinite(commanded).all(),
@@ -113,9 +113,10 @@ def _wrong_commands(commanded: np.ndarray, names: Sequence[str], vehicle: Vehicl
 
 
 def worst_errors(flight: Flight, names: Sequence[str]) -> tuple[float, float]:
-    """Largest distance from the set-point, m, and angle, deg, in modes with a place; NaN without one, infinite where either is no number.
+    """Largest distance from the set-point, m, and angle, deg, in the modes in PLACED; NaN without such ticks, infinite if an error is NaN.
 
-    After a mode without a place the body has SETTLE_TICKS to come to rest, and without tags nobody knows the place.
+    Leaves out the SETTLE_TICKS after any other mode, in which the body comes to rest, and ticks without recent tags, whose position is
+    unknown.
     """
     placed, ticks = np.array([name in PLACED for name in names]), np.arange(len(names))
     lost = np.maximum.accumulate(np.where(placed, -SETTLE_TICKS, ticks))
@@ -133,7 +134,7 @@ def _name(state: int, mode: int) -> str:
 def run_fault_campaign(pool: Pool, out: Path, seed: int = 0, progress: Callable[[int, int], None] | None = None) -> list[Cell]:
     """Flies every cell and writes faults.json into `out`; returns the cells, row by row.
 
-    Raises DescriptionError where `out` holds a flight, or a faults.json that is none.
+    Raises DescriptionError if `out` holds a flight, or a faults.json that no campaign of faults wrote.
     """
     with made(out):
         check_replaceable(out, (RESULT_FILE, *LOGS), is_json_with(out / RESULT_FILE, "promise"), "campaign of faults")

@@ -1,4 +1,4 @@
-"""How the matrix of `modcube hil campaign faults` looks in the terminal."""
+"""Terminal output of `modcube hil campaign faults`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hil.fault_campaign import Cell
 
 
 def print_faults(cells: Sequence[Cell]) -> None:
-    """The matrix of faults and modes: what happened, and what was promised; then every promise that was broken."""
+    """Prints the matrix of faults and modes (what happened, and what was promised), then every broken promise."""
     console = Console()
     modes = list(dict.fromkeys(cell.mode for cell in cells))
     promises = {cell.fault: cell.promise for cell in cells}

@@ -1,6 +1,6 @@
-"""What is broken in `modcube hil campaign faults`, and what the robot then promises in each mode: one row per fault.
+"""The faults of `modcube hil campaign faults` and what the robot promises in each mode: one row per fault.
 
-The promises are those of the fail-safe table (docs/supervisor.md) with its default parameters, and figures of our own where it has none.
+The promises are those of the fail-safe table (docs/supervisor.md) with its default parameters, and limits of our own where it has none.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from hil.plant.fault_spec import Fault
 from hil.scenario import MODES
 
 AT_S = 8.0
-"""When it breaks."""
+"""Time of the fault."""
 THRUSTER = 5
-"""The one that breaks; MOTOR_DETECT turns it after that."""
+"""Index of the thruster that breaks; MOTOR_DETECT turns it after the fault."""
 PILOTED = ("MANUAL", "STABILIZE", "ALT_HOLD")
 PLACED = ("POSHOLD", "AUTO", "GUIDED")
-"""Modes in which the place is held or followed."""
+"""Modes that hold a position or follow one."""
 NUMBER = f"thruster {THRUSTER + 1}"
 
 
@@ -36,25 +36,25 @@ class Row:
     """In words."""
     fault: Fault | None = None
     also: tuple[Fault, ...] = ()
-    """What is broken besides."""
+    """Faults that occur together with `fault`."""
     ends: Mapping[str, str] = field(default_factory=dict)
-    """Where it ends, by mode: a mode, DISARMED or ESTOP; the mode itself where it is not named."""
+    """Final state by initial mode: a mode, DISARMED or ESTOP. A mode that is not listed is kept."""
     within_s: float = math.inf
-    """At most so long after the fault it is there."""
+    """Latest time after the fault at which the final state is reached."""
     error_m: float = math.inf
-    """Largest distance from the set-point in modes with a place, while the place is known."""
+    """Largest distance from the set-point in the modes in PLACED, while the position is known."""
     angle_deg: float = math.inf
-    """Largest angle off the wanted attitude in modes with a place."""
+    """Largest attitude error in the modes in PLACED."""
     says: str = ""
-    """What must be said ..."""
+    """Text that an event must contain ..."""
     says_in: tuple[str, ...] = MODES
     """... in these modes."""
     task: Mapping[str, Any] = field(default_factory=dict)
-    """What else about the task changes: who falls silent."""
+    """Changes to the task: who falls silent, and when."""
 
     @property
     def leaves_out(self) -> bool:
-        """Whether the thruster that breaks is no longer flown with."""
+        """Whether the broken thruster must be left out from then on."""
         return NUMBER in self.says
 
 
@@ -139,4 +139,4 @@ ROWS = (
     ),
 )  # fmt: skip
 ALONE = tuple(row.fault for row in ROWS if row.fault is not None and not row.also)
-"""What may break by itself."""
+"""Faults that occur alone, without a second one."""

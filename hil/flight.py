@@ -1,4 +1,4 @@
-"""One run from scenario to result: fly it, read the logs back, judge it, and leave plots and report."""
+"""One run from scenario to result: fly it, read the logs back, judge it, and write plots and report."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from hil.signals import SIGNAL_LOG, Flight, by_number, period_of, read_flight
 from hil.truth_log import TRUTH_LOG, is_truth_log
 
 LEFT_BEHIND = (RESULT_FILE, REPORT_FILE, DOCK_PLOT, *(f"{name}.png" for name in PLOTS))
-"""What an earlier flight may have left in a folder, beside the logs, which are written anew."""
+"""Files that an earlier flight may have left in a folder, besides the logs, which are overwritten."""
 LOGS = (CAN_LOG, SIGNAL_LOG, TRUTH_LOG)
 LATE_SHARE = 0.01
-"""Of the ticks of a run in real time, frames of which may be lost on a bus with others on it."""
+"""Share of ticks that may be missing from a log in real time, because frames may be lost on a bus shared with others."""
 ARMED_AT_ALL = 0.01
-"""Share of the ticks below which a robot has not flown its task."""
+"""Least share of armed ticks for a task to count as flown."""
 PAPER_RMSE_MM = {"spiral": PAPER_SPIRAL_RMSE_MM}
-"""What the paper measured, by the kind of task."""
+"""The paper's position RMSE by kind of task."""
 
 
 def fly_and_judge(
@@ -57,9 +57,9 @@ def fly_and_judge(
     realtime: bool = False,
     unusual: Sequence[str] = (),
 ) -> Result:
-    """Flies `scenario`; the logs and result.json are in `out` afterwards, and nothing of an earlier flight is.
+    """Flies `scenario` and leaves the logs and result.json in `out`, replacing everything of an earlier flight.
 
-    Raises DescriptionError and PortError; what an earlier flight left, or anybody else, is then as it was, and no empty folder is left.
+    Raises DescriptionError and PortError; existing files are then untouched, and no empty folder is left.
     """
     scenario = scenario.for_seed(seed)
     flight = (scenario, seed, parameters, out, bus, rate_hz, progress)
@@ -76,20 +76,20 @@ def fly_and_judge(
 
 
 def check_folder(folder: Path) -> None:
-    """Raises DescriptionError where a flight into `folder` would write over what no flight left there."""
+    """Raises DescriptionError if a flight into `folder` would overwrite files that no flight left there."""
     is_flight = is_truth_log(folder / TRUTH_LOG) or is_json_with(folder / RESULT_FILE, "checks")
     check_replaceable(folder, (*LOGS, *LEFT_BEHIND), is_flight, "flight of the bench")
 
 
 def _clear(folder: Path) -> None:
-    """Removes what an earlier flight left in `folder`, logs apart."""
+    """Removes the files of an earlier flight from `folder`, except the logs."""
     for name in LEFT_BEHIND:
         (folder / name).unlink(missing_ok=True)
 
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Raises DescriptionError where another flight is being written into `folder`."""
+    """Locks `folder` while inside. Raises DescriptionError if another flight is being written into it."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         try:
@@ -104,11 +104,11 @@ def _alone_in(folder: Path) -> Iterator[None]:
 def judge_logs(
     scenario: Scenario, seed: int, folder: Path, wall_s: float = 0.0, deadline_misses: int = 0, lost_share: float = 0.0
 ) -> Result:
-    """The result of the flight whose logs are in `folder`: what the scenario checks, that no tick is missing, and that it was flown.
+    """The result of the flight whose logs are in `folder`: the scenario's checks, that no tick is missing, and that it was flown.
 
     Args:
-        wall_s: what the whole run took.
-        lost_share: of the ticks, which a log may lack.
+        wall_s: wall time of the whole run.
+        lost_share: share of the ticks that may be missing from a log.
     """
     whole = read_flight(folder)
     period_ns, begin_ns = period_of(whole.ticks), begin_of(scenario, whole)
@@ -129,7 +129,7 @@ def judge_logs(
 
 
 def unseen(scenario: Scenario, whole: Flight) -> str:
-    """Why no tag was seen in the `whole` flight, in words; empty where one was, or the robot was armed without."""
+    """Why no tag was seen in the `whole` flight, in words; empty if one was seen, or if the robot was armed without."""
     if whole.placed.any() or np.isin(whole.firmware["state"], list(ARMED)).any():
         return ""
     without = [module.vehicle for module in scenario.module if not load_vehicle(module.vehicle).tag]
@@ -144,7 +144,9 @@ def unseen(scenario: Scenario, whole: Flight) -> str:
 
 
 def _armed_at_all(scenario: Scenario, whole: Flight, folder: Path) -> list[Limit]:
-    """That the robot was armed at all, where the scenario says nothing of it; of a dock one of its bodies, in the `whole` flight."""
+    """The check that the robot was armed at all, if the scenario has no check on `armed_share`. For a dock it is enough that one of the
+    bodies was armed at some time in the `whole` flight.
+    """
     if any(check.metric == "armed_share" for check in scenario.check):
         return []
     if scenario.task.kind == "dock":
@@ -157,7 +159,7 @@ def _armed_at_all(scenario: Scenario, whole: Flight, folder: Path) -> list[Limit
 
 
 def wanted_in(scenario: Scenario, flight: Flight, begin_ns: int) -> Poses | None:
-    """What the task, begun at `begin_ns`, wants in every tick of `flight`; None where it is no path."""
+    """Reference poses of the task, begun at `begin_ns`, in every tick of `flight`; None if the task is not a path."""
     if scenario.task.kind in SCRIPTS:
         return None
     path = Script(scenario, fleet_of(scenario, DEFAULT_BUS, 100)).trajectory
@@ -166,7 +168,7 @@ def wanted_in(scenario: Scenario, flight: Flight, begin_ns: int) -> Poses | None
 
 
 def as_wanted(scenario: Scenario, flight: Flight) -> Flight:
-    """The same with what the task wants in place of the firmware's own set-points, in the ticks that are judged by it."""
+    """The flight with the firmware's set-points replaced by the task's reference in the judged ticks."""
     begin_ns = begin_of(scenario, flight)
     time_ns = flight.firmware["time_ns"]
     judged = (time_ns >= begin_ns) & (time_ns <= begin_ns + scenario.task.duration_ns)
@@ -178,23 +180,23 @@ def as_wanted(scenario: Scenario, flight: Flight) -> Flight:
 
 
 def begin_of(scenario: Scenario, flight: Flight) -> int:
-    """Time of the first tick that is not before the task, ns."""
+    """Time of the first tick at or after the start of the task, ns."""
     period_ns = period_of(flight.ticks)
     return start_of(flight) + _first_tick(scenario, period_ns) * period_ns
 
 
 def ticks_of(scenario: Scenario, period_ns: int) -> int:
-    """Ticks of the task, both ends among them: the one in which it begins and the last of the run."""
+    """Number of ticks of the task, including the one in which it begins and the last of the run."""
     return scenario.task.end_ns // period_ns - _first_tick(scenario, period_ns) + 1
 
 
 def _first_tick(scenario: Scenario, period_ns: int) -> int:
-    """The first tick that is not before the task."""
+    """The first tick at or after the start of the task."""
     return -(-scenario.task.begin_ns // period_ns)
 
 
 def start_of(flight: Flight) -> int:
-    """Time of the start of a run, one tick before its first, ns; also where the first ticks are not in the log."""
+    """Time of the start of a run, one period before its first tick, ns; correct even if the first ticks are missing from the log."""
     return int(flight.ticks["time_ns"][0] - flight.ticks["tick"][0] * period_of(flight.ticks))
 
 

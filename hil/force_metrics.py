@@ -1,4 +1,4 @@
-"""Force tracking: what the load cells measured against what the firmware asked of its thrusters, with and without interference."""
+"""Force tracking: force measured by the load cells against force requested by the firmware, with and without jet interference."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from hil.scenario import Scenario
 
 DEGREE = 3
-"""Of the polynomial that is fitted to the measured force over the wanted one."""
+"""Degree of the polynomial fitted to measured force over wanted force."""
 NAMES = {1: "one", 2: "two"}
 PHASES = ("off", "on")
 """Before and after the jets interfere."""
 
 
 def force_names(counts: Iterable[int]) -> list[str]:
-    """Names of the metrics of bodies with so many modules each."""
+    """Metric names for bodies with these numbers of modules."""
     names = [NAMES.get(count, str(count)) for count in counts]
     rmse = [f"force_rmse_{name}_{phase}_n" for phase in PHASES for name in names]
     fits = [f"force_fit{k}_{name}_{phase}" for phase in PHASES for name in names for k in range(DEGREE + 1)]
@@ -35,7 +35,7 @@ def force_names(counts: Iterable[int]) -> list[str]:
 def force_metrics(scenario: Scenario, folder: Path, begin_ns: int) -> dict[str, float]:
     """RMSE per module of each body, their difference, and the fits; `off` and `on`: before and after the jets interfere.
 
-    Forces are along the body's x axis, per module, N. The difference is that of the two RMSE over that of one module.
+    Forces are along the body's x axis, per module, N. The difference is that of the two RMSE, relative to that of one module.
 
     Raises:
         OSError: a log is missing. KeyError: a body is not in it.
@@ -58,7 +58,7 @@ def force_metrics(scenario: Scenario, folder: Path, begin_ns: int) -> dict[str, 
 
 
 def _fit(wanted: np.ndarray, measured: np.ndarray) -> list[float]:
-    """Coefficients of the polynomial, from degree 0 on; no numbers where nothing was asked for."""
+    """Coefficients of the polynomial, from degree 0 up; NaN if the wanted force never changes."""
     if np.ptp(wanted) == 0.0:
         return [math.nan] * (DEGREE + 1)
     fitted: list[float] = np.polynomial.polynomial.polyfit(wanted, measured, DEGREE).tolist()

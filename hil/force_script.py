@@ -1,4 +1,4 @@
-"""What the person at the bench does in the force test: arm the clamped bodies, then move the stick along a force trajectory."""
+"""The operator's script of the force test: arm the clamped bodies, then move the stick along a force trajectory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STICKS_EVERY_S = 0.02
 WAVES = ((0.6, 0.1), (0.4, 0.25))
 """Share and frequency (Hz) of the sines that make up the trajectory."""
 MANUAL_BEFORE_S = 2.0
-"""Manual mode is on so long before the trajectory begins."""
+"""Time in manual mode before the trajectory begins."""
 
 
 def stick_at(t_s: float, amplitude: float) -> float:
@@ -25,7 +25,7 @@ def stick_at(t_s: float, amplitude: float) -> float:
 
 
 class ForceScript(Orders):
-    """The requests of one run: the same stick for every body, so the same share of what it can."""
+    """The requests of one run: the same stick position for every body, hence the same share of its capability."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         self._fleet, self._task = fleet, scenario.task
@@ -34,7 +34,7 @@ class ForceScript(Orders):
         self.ticks = scenario.task.end_ns // fleet.period_ns
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
-        """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
+        """The requests in the tick at `time_ns` since the start, given the outputs of the previous tick."""
         if last is None or time_ns < ARM_FROM_S * 1e9:
             return []
         asked: list[Request] = []

@@ -1,4 +1,4 @@
-"""Frames that nobody should send, fed to a robot in flight: bits turned, lengths wrong, ids unknown, old frames again, and whole lies."""
+"""Bad frames fed to a robot in flight: flipped bits, wrong lengths, random ids, repeated frames, and valid frames with false content."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from hil.plant.draw import stream
 from hil.scenario import MODES, load_scenario, make_world
 
 STOPPING = 0.0002
-"""Share of the frames with ids of ESTOP and SYNC: they stop the robot, so they are few."""
+"""Share of frames with the ids of ESTOP and SYNC. Small, because these stop the robot."""
 LOWEST_OTHER_ID = 0x040
 A_TICK = 100
 ARM_EVERY, CLEAR_EVERY = 20, 30
-"""Ticks: a pilot is there, who takes another mode, arms it by force and clears the e-stop again and again."""
+"""Ticks between a pilot's requests: another mode with forced arming, and the release of the e-stop."""
 
 
 class Fuzzer:
-    """Makes frames of all kinds; seeded."""
+    """Generates bad frames of all kinds from a seed."""
 
     def __init__(self, codec: Codec, seed: int) -> None:
         self._rng = stream(seed, "fuzz")
@@ -37,7 +37,7 @@ class Fuzzer:
         self._kinds = (self._noise, self._turned, self._cut, self._again, self._lie)
 
     def frames(self, count: int, real: Sequence[Frame]) -> list[Frame]:
-        """So many frames; `real` are those of this tick, to be spoilt now and repeated later."""
+        """`count` bad frames. `real` are the genuine frames of this tick, available for corruption and repetition from now on."""
         self._old = [*self._old[-200:], *real]
         return [self._one() for _ in range(count)]
 
@@ -66,7 +66,7 @@ class Fuzzer:
         return self._old[int(self._rng.integers(len(self._old)))]
 
     def _lie(self) -> Frame:
-        """Whole in every check, and nothing in it is true."""
+        """A frame that passes every check, with random content."""
         return self._random_of(self._messages[int(self._rng.integers(len(self._messages)))])
 
     def _random_of(self, message: MessageCodec) -> Frame:
@@ -77,22 +77,22 @@ class Fuzzer:
 
 @dataclass(slots=True)
 class Fuzzed:
-    """What came of it."""
+    """Counts of one fuzzed flight."""
 
     frames: int = 0
-    """Fuzzed and real ones, all that the firmware took."""
+    """All frames fed to the firmware, fuzzed and real."""
     accepted: int = 0
-    """Frames that a receiver beside the firmware found good: as many as `frames` less those that the firmware dropped."""
+    """Frames that a second receiver beside the firmware accepted: as many as `frames` less those that the firmware dropped."""
     dropped: dict[str, int] = field(default_factory=dict)
-    """Frames that the firmware dropped, by what was wrong with them."""
+    """Frames that the firmware dropped, by reason."""
     beyond: int = 0
-    """Commands that were no number or beyond their limits."""
+    """Commands that were not finite or beyond their limits, plus ticks in which not exactly eight shares were sent."""
     armed_ticks: int = 0
     ticks: int = 0
 
 
 def fuzz_flight(frames: int, seed: int = 0) -> Fuzzed:
-    """Flies a hover into which so many fuzzed frames come, A_TICK in every tick. What the firmware raises comes through."""
+    """Flies a hover until the firmware was fed `frames` frames, A_TICK fuzzed ones in every tick. The firmware's exceptions propagate."""
     scenario = load_scenario("hover")
     fleet = fleet_of(scenario, "virtual:fuzz", 100)
     codec = Codec.load()
@@ -127,7 +127,7 @@ def _asked(tick: int) -> list[Request]:
 
 
 def _beyond(outputs: Outputs, sent: Sequence[Frame], halves: dict[int, MessageCodec], vehicle: Vehicle) -> int:
-    """Commands of one tick that should not be: forces, shares and frames."""
+    """Number of invalid commands in one tick: forces, shares, and shares in the frames sent."""
     force, command = outputs.records[0].commanded_n, outputs.modules[0].thrusters
     wrong = int(np.sum(~np.isfinite(force) | (force > vehicle.force_max_n) | (force < vehicle.force_min_n)))
     wrong += int(np.sum(~np.isfinite(command) | (np.abs(command) > 1.0)))

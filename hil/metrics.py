@@ -1,4 +1,4 @@
-"""Figures of a flight from its logs alone: truth against reference, estimate against truth. Every tick counts."""
+"""Metrics of a flight from its logs alone: truth against reference, estimate against truth. Every tick counts."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from hil.signals import Flight
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 WARNING = 4
-"""syslog severity."""
+"""Syslog severity."""
 PAPER_SPIRAL_RMSE_MM = 20.92
 """Position RMSE of the paper's robot on its spiral in a real tank (RS-ModCubes)."""
 
 
 class Shown(NamedTuple):
-    """How people read a metric: a name, and a unit for which the value is multiplied by `scale`, or words by number."""
+    """How a metric is displayed: label, and a unit for which the value is multiplied by `scale`, or words indexed by the value."""
 
     label: str
     unit: str = ""
@@ -29,13 +29,13 @@ class Shown(NamedTuple):
     digits: int = 2
     words: tuple[str, ...] = ()
     low: float = 0.0
-    """Least value that a flight can have, before it is scaled."""
+    """Smallest value that a flight can have, unscaled."""
     high: float = math.inf
-    """Largest."""
+    """Largest value that a flight can have, unscaled."""
 
 
 OUTCOMES = ("as asked", "jammed", "unstable control", "refused", "gave up")
-"""What came of a run's docks, by the number that the metric `outcome` has."""
+"""Outcomes of a run's docks, indexed by the metric `outcome`."""
 SHOWN = {
     "position_rmse_m": Shown("Position RMSE, truth against reference", "mm", 1e3),
     "position_max_m": Shown("Position error, largest", "mm", 1e3),
@@ -69,23 +69,23 @@ SHOWN = {
 }
 """Metrics in the order in which tables show them."""
 DOCKING = ("docked", "gap_min_m", "tries", "jams", "outcome", "false_declarations", "docked_rmse_m", "join_jump_n")
-"""Those that only a run with [[step]]s has."""
+"""Metrics that only a run with [[step]]s has."""
 FORCE_METRIC = re.compile(r"force_(rmse|fit|difference)(\d?)_(?:(\w+)_)?(on|off)(?:_n)?")
 
 
 def metric_order(names: Iterable[str]) -> list[str]:
-    """Every name once: those that `SHOWN` knows in its order, then the others as they come."""
+    """Every name once: the names in `SHOWN`, in its order, then the others in the given order."""
     given = dict.fromkeys(names)
     return [name for name in SHOWN if name in given] + [name for name in given if name not in SHOWN]
 
 
 def shown(metric: str) -> Shown:
-    """How people read `metric`; one that has no name but its own keeps its unit too."""
+    """How `metric` is displayed; a metric without an entry is shown by its own name, unscaled."""
     return SHOWN.get(metric) or _force_shown(metric) or Shown(metric, digits=4)
 
 
 def _force_shown(metric: str) -> Shown | None:
-    """Those of force tracking (hil.force_metrics), of which there are as many as bodies."""
+    """Display of a force-tracking metric (hil.force_metrics), whose names depend on the bodies; None for any other metric."""
     if (match := FORCE_METRIC.fullmatch(metric)) is None:
         return None
     what, degree, body, phase = match.groups()
@@ -99,7 +99,7 @@ def _force_shown(metric: str) -> Shown | None:
 
 
 def shown_value(metric: str, value: float) -> str:
-    """The value as people read it: `2.72 mm`."""
+    """The value as displayed: `2.72 mm`."""
     how = shown(metric)
     if not math.isfinite(value):
         return "none"
@@ -109,7 +109,7 @@ def shown_value(metric: str, value: float) -> str:
 
 
 def shown_limit(metric: str, low: float, high: float) -> str:
-    """The bounds of a check as people read them: `<= 5 mm`, or the words that pass."""
+    """The bounds of a check as displayed: `<= 5 mm`, or the words that pass."""
     how = shown(metric)
     if how.words:
         return " or ".join(word for number, word in enumerate(how.words) if low <= number <= high)
@@ -133,7 +133,7 @@ def rotation_vectors(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class Poses(NamedTuple):
-    """Where a body is in k ticks, or is wanted to be: its centre of mass and its attitude in the world."""
+    """Actual or wanted poses of a body in k ticks: centre of mass and attitude in the world."""
 
     p_wb: np.ndarray
     """(k, 3) m."""
@@ -142,7 +142,7 @@ class Poses(NamedTuple):
 
 
 def errors(flight: Flight, wanted: Poses | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(k,) distance, m, and (k,) angle, rad, of the truth from where it is wanted; from the firmware's own set-points when left out."""
+    """(k,) distance, m, and (k,) angle, rad, of the truth from `wanted`, by default from the firmware's own set-points."""
     wanted = wanted or Poses(flight.firmware["setpoint_p_wb"], flight.firmware["setpoint_q_wb"])
     return np.linalg.norm(flight.p_wb - wanted.p_wb, axis=1), np.linalg.norm(rotation_vectors(flight.q_wb, wanted.q_wb), axis=1)
 
@@ -154,12 +154,12 @@ def flight_metrics(
     wall_s: float = 0.0,
     deadline_misses: int = 0,
 ) -> dict[str, float]:
-    """All metrics of result.json of a flight of one body.
+    """All metrics in result.json for a flight of one body.
 
     Args:
-        flight: the ticks of the trajectory, from its start to its end (`Flight.between`). Of none nothing is a number.
-        wanted: where the task wants the body in each of them; the firmware's own set-point, which may be any, when left out.
-        wall_s: time that the machine took for the same ticks, s; 0 where it is not known gives a real-time factor of 0.
+        flight: the ticks of the trajectory, from its start to its end (`Flight.between`). Without any tick all metrics are NaN.
+        wanted: reference pose of the task in each of them; by default the firmware's own set-point, which may be anything.
+        wall_s: wall time that the same ticks took, s; 0 if unknown, which gives a real-time factor of 0.
         deadline_misses: ticks that began late; 0 in lockstep.
     """
     firmware = flight.firmware
@@ -174,7 +174,7 @@ def flight_metrics(
         "wrench_margin_min": float(np.fmin.reduce(firmware["wrench_margin"])),
         "tags_rejected": float(refused(firmware["rejected"])),
         "warnings": float(warnings(flight.events["severity"], flight.events["text"])),
-        "duration_s": float(time_s[-1]),  # from start to end, whose ticks both count
+        "duration_s": float(time_s[-1]),  # from start to end, both ticks included
         "real_time_factor": len(time_s) * period_s / wall_s if wall_s > 0.0 else 0.0,
         "ticks": float(len(time_s)),
         "unmatched_ticks": float(len(flight.lost_ns)),
@@ -183,7 +183,7 @@ def flight_metrics(
 
 
 def _tracking(flight: Flight, wanted: Poses | None) -> dict[str, float]:
-    """How far the truth is from where it is wanted."""
+    """Errors of the truth against the reference."""
     error, angle = errors(flight, wanted)
     return {
         "position_rmse_m": rms(error),
@@ -194,7 +194,7 @@ def _tracking(flight: Flight, wanted: Poses | None) -> dict[str, float]:
 
 
 def _estimation(flight: Flight) -> dict[str, float]:
-    """How far the estimate is from the truth, and whether that is as far as the filter believes."""
+    """Errors of the estimate against the truth, and whether they agree with the filter's covariance."""
     firmware = flight.firmware
     off_m, off_rad = firmware["p_wb"] - flight.p_wb, rotation_vectors(flight.q_wb, firmware["q_wb"])
     within = np.abs(np.hstack([off_m, off_rad])) <= 3.0 * np.hstack([firmware["sigma_p"], firmware["sigma_q"]])
@@ -214,21 +214,21 @@ def rms(values: np.ndarray) -> float:
 
 
 def rate_rms(values: np.ndarray, period_s: float) -> float:
-    """RMS of the rate of change of (n, k) values that come every `period_s` seconds, per second; not a number of less than two."""
+    """RMS of the rate of change of (n, k) values sampled every `period_s` seconds, per second; NaN for fewer than two samples."""
     return float(np.sqrt(np.nanmean(np.square(np.diff(values, axis=0) / period_s)))) if len(values) > 1 else math.nan
 
 
 def warnings(severity: np.ndarray, text: np.ndarray) -> int:
-    """Events of syslog severity warning or worse in the whole flight. That arming waits for the first tags is none."""
+    """Events of syslog severity warning or worse in the whole flight, except `ARM refused`, which is normal until the first tags."""
     waiting = np.char.startswith(text, "ARM refused") if text.size else np.zeros(0, bool)
     return int(np.count_nonzero((severity <= WARNING) & ~waiting))
 
 
 def told(events: Columns, start_ns: int) -> tuple[str, ...]:
-    """Events of syslog severity warning or worse, each text once, in their order: `1.0 s: ARM refused: no pose yet (12 x)`.
+    """Events of syslog severity warning or worse, each text once, in order: `1.0 s: ARM refused: no pose yet (12 x)`.
 
     Args:
-        events: of the whole flight. start_ns: from when time counts.
+        events: of the whole flight. start_ns: time zero of the displayed times.
     """
     grave = events["severity"] <= WARNING
     texts, first, counts = np.unique(events["text"][grave], return_index=True, return_counts=True)
@@ -238,12 +238,12 @@ def told(events: Columns, start_ns: int) -> tuple[str, ...]:
 
 
 def refused(rejected: np.ndarray) -> int:
-    """Tag observations that the gate refused over these ticks, of the filter's count, which a body that joins or parts begins anew."""
+    """Tag observations rejected by the gate over these ticks, from the filter's counter, which restarts when its body joins or parts."""
     return int(np.maximum(np.diff(rejected), 0).sum())
 
 
 def nis_mean(nis: np.ndarray, dof: np.ndarray) -> float:
-    """Normalised innovation squared of the accepted tag updates over its expectation (1 for a consistent filter).
+    """NIS of the accepted tag updates over its expectation (1 for a consistent filter).
 
     (k,) per tick, summed over the updates of the tick; ticks without one are NaN or have dof 0. NaN without any.
     """

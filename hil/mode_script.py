@@ -1,4 +1,4 @@
-"""What the person at the bench does to fly one mode: arms, takes the mode, and goes on steering in it: sticks, set-points, a path."""
+"""The operator's script for flying one mode: arm, enter the mode, then keep steering in it with sticks, set-points or a path."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from hil.orders import Orders, is_due, is_time_to_arm
 from hil.scenario import Scenario
 
 STREAM_EVERY_S = 0.1
-"""Sticks and set-points."""
+"""Period of sticks, set-points and the ground station's heartbeat."""
 PILOTED = (Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD)
 RADIUS_M, TURN_S = 0.25, 15.0
-"""Circle of AUTO and of GUIDED's set-points, and the time of one round."""
+"""Circle of AUTO and of GUIDED's set-points, and the time for one lap."""
 
 
 class ModeScript(Orders):
-    """The requests of one run. Once armed it never arms again: what a fault has disarmed stays so."""
+    """The requests of one run. It arms only once: a robot that a fault disarmed stays disarmed."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         self._fleet, self._task = fleet, scenario.task
@@ -32,7 +32,7 @@ class ModeScript(Orders):
         self._armed = self._begun = False
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
-        """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
+        """The requests in the tick at `time_ns` since the start, given the outputs of the previous tick."""
         if last is None:
             return []
         self._armed = self._armed or last.records[0].state in ARMED
@@ -60,7 +60,7 @@ class ModeScript(Orders):
         return [Request(Action.SET_POINT, 0, self._point(t_s))] if self._mode == Mode.GUIDED else []
 
     def _point(self, t_s: float) -> Setpoint:
-        """On a circle through the start, (3,) m of the place; at an even speed."""
+        """Set-point on a circle through the start, at constant speed."""
         angle, rate = 2.0 * math.pi * t_s / TURN_S, 2.0 * math.pi / TURN_S
         out, along = np.array([math.cos(angle) - 1.0, math.sin(angle), 0.0]), np.array([-math.sin(angle), math.cos(angle), 0.0])
         place = rest_at(self._task.centre_m + RADIUS_M * out, np.array([1.0, 0.0, 0.0, 0.0]))

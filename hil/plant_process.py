@@ -21,17 +21,17 @@ from hil.scenario import Scenario, make_world
 from hil.truth_log import TRUTH_LOG, TruthRecorder, is_truth_log
 
 CHUNK_NS = 2_500_000
-"""The world moves in steps of this; what an MCU samples is at most so old."""
+"""Time step of the world, and so the maximum age of the state that an MCU samples."""
 
 
 def started_clock() -> Callable[[], int]:
-    """The plant's own clock: nanoseconds since now."""
+    """A clock of the plant's own: nanoseconds since this call."""
     start_ns = time.monotonic_ns()
     return lambda: time.monotonic_ns() - start_ns
 
 
 def check_served(scenario: Scenario) -> None:
-    """Raises DescriptionError for a fault that is not the plant's to make."""
+    """Raises DescriptionError for a fault that the plant alone cannot produce."""
     for i, fault in enumerate(scenario.fault):
         if fault.kind == "process_killed":
             where = f"scenario {scenario.name!r}: fault[{i}].kind"
@@ -55,10 +55,10 @@ def serve_until_signal(scenario: Scenario, seed: int, bus: str, rate_hz: int, ou
 
 
 class PlantProcess:
-    """The world and its nodes, moved along by a clock. `serve` returns when `stop` says so.
+    """The world and its nodes, advanced by a clock. `serve` returns once `stop()` is true.
 
-    Both raise DescriptionError, `serve` where somebody else answers as one of its modules in its first second of ticks: later it was
-    the first, and the other has to go.
+    The constructor and `serve` raise DescriptionError. `serve` does so if another node answers as one of its modules within the first
+    second of ticks; after that this plant was there first, and the other one has to leave.
     """
 
     def __init__(self, scenario: Scenario, seed: int, rate_hz: int, out: Path | None) -> None:
@@ -74,7 +74,7 @@ class PlantProcess:
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """Truth goes into the folder inside; an earlier log in it is whole until then."""
+        """Records the truth into the folder while inside. An earlier log there stays intact until then."""
         if self._out is None:
             yield
             return
@@ -83,7 +83,7 @@ class PlantProcess:
             yield
 
     def serve(self, port: Port, now_ns: Callable[[], int], stop: Callable[[], bool]) -> None:
-        """Answers what comes at `port`; `now_ns` starts near zero."""
+        """Answers the frames that arrive at `port`; `now_ns` starts near zero."""
         with self.recording():
             while not stop():
                 port.wait(self._world.time_ns + CHUNK_NS)
@@ -97,7 +97,7 @@ class PlantProcess:
             self._nodes.watch()
 
     def _answer(self, port: Port, frame: Frame) -> None:
-        """A tick begins with its SYNC, whatever becomes of that on the wire."""
+        """Answers one frame. A SYNC begins a tick even if a simulated wire fault drops it."""
         is_tick = frame.id == self._sync.id_of(0) and len(frame.data) == self._sync.length
         if self._guarded_ticks > 0:
             self._guarded_ticks -= is_tick

@@ -16,10 +16,10 @@ TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
 PLOTS = ("overview", "position", "attitude", "estimate", "thrusters", "disturbance")
 """Names of the files, without .png."""
 NOT_JUDGED = "before or after the task, not judged"
-"""What grey stands for in every plot over time."""
+"""Meaning of grey in every plot over time."""
 ROUNDING_S = 1e-6
 MODULE_COLUMNS = 4
-"""Modules whose thrusters stand side by side."""
+"""Modules whose thrusters are plotted side by side."""
 GREY = "#e4e9ee"
 AXIS_COLOURS = ("#cc3311", "#009988", "#0077bb")
 STYLE: dict[str, Any] = {
@@ -61,8 +61,8 @@ def write_plots(
         window: the judged part; the rest is shaded.
         tank_m: (2, 3) lowest and highest corner of the tank, world, m.
         force_limits_n: (2,) reverse and forward limit of each thruster, N.
-        paper_rmse_mm: what the paper measured in the same task, to stand beside ours.
-        numbers: of the fleet's modules, in its order; from 1 on when left out.
+        paper_rmse_mm: the paper's measurement in the same task, for comparison.
+        numbers: module numbers in fleet order; 1, 2, ... by default.
 
     Returns:
         their paths, the overview first.
@@ -91,7 +91,7 @@ def write_plots(
 
 
 def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: float | None) -> Any:
-    """3D path beside the size of position and attitude error."""
+    """3D path, with the size of position and attitude error beside it."""
     figure = _figure(11.0, 5.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0))
     inside = _inside(flight, window)
@@ -118,7 +118,7 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
 
 
 def _once_placed(flight: Flight, values: np.ndarray) -> np.ndarray:
-    """(k, ...) the values as floats, NaN until the firmware knows its pose."""
+    """(k, ...) the values as floats, NaN before the firmware knows its pose."""
     return np.where(flight.placed.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 
 
@@ -140,7 +140,7 @@ def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray, inside: np.ndarray) 
     for which, text in (("x", "north x (m)"), ("y", "east y (m)"), ("z", "down z (m)")):
         getattr(axes, f"set_{which}label")(text, labelpad=7)
     axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), zlim=(high[2], low[2]))
-    # y runs backwards as z does: with one of them alone the picture would be a mirror image.
+    # y is reversed together with z: reversing only one of them would mirror the picture.
     axes.set_box_aspect(high - low, zoom=0.93)
     axes.locator_params(nbins=5)
     axes.view_init(elev=22, azim=-58)
@@ -149,13 +149,13 @@ def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray, inside: np.ndarray) 
 
 
 def _apart(flight: Flight) -> list[np.ndarray]:
-    """(k, 3) paths of the modules that are not in the body all the time; NaN while they are."""
+    """(k, 3) paths of the modules that are outside the body at some time; NaN while they are inside."""
     outside = flight.truth["member"] == 0.0
     return [np.where(outside[:, [m]], module["p_wm"], np.nan) for m, module in enumerate(flight.modules) if outside[:, m].any()]
 
 
 def position(flight: Flight, window: Window) -> Any:
-    """Position per axis, and beside it what it is off by."""
+    """Position per axis, with its errors beside it."""
     figure = _figure(11.0, 6.6)
     cells = figure.subplots(3, 2, sharex=True)
     truth = flight.p_wb
@@ -251,10 +251,10 @@ def _tag_age(axes: Any, flight: Flight, window: Window) -> None:
 
 
 def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray, numbers: Sequence[int] = ()) -> Any:
-    """Force of each thruster: commanded after the limiter, and what the plant's thruster gave. Of several modules a column for each.
+    """Force of each thruster: commanded after the limiter, and delivered by the plant. Several modules get a column each.
 
     Args:
-        numbers: of the fleet's modules, in its order; from 1 on when left out.
+        numbers: module numbers in fleet order; 1, 2, ... by default.
     """
     commanded, given = flight.firmware["commanded_n"], flight.truth["force_n"]
     names = _module_names(flight, numbers)
@@ -263,7 +263,7 @@ def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray, number
     layout = _columns_of(len(names), per)
     figure = _figure(11.0, 1.2 + (1.45 if len(names) == 1 else 1.05) * len(layout))
     cells = figure.subplots(*layout.shape, sharex=True, sharey=True, squeeze=False)
-    widest = 1.15 * max(1.0, *(float(np.nanmax(np.abs(force))) for force in (commanded, given)))  # NaN: not yet in this body
+    widest = 1.15 * max(1.0, *(float(np.nanmax(np.abs(force))) for force in (commanded, given)))  # NaN: not in this body in that tick
     for (row, column), i in np.ndenumerate(layout):
         cell = cells[row, column]
         if i < 0:
@@ -286,14 +286,14 @@ def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray, number
 
 
 def _module_names(flight: Flight, numbers: Sequence[int]) -> list[str]:
-    """Of those that were in the body, in the order of its true forces."""
+    """Names of the modules that were in the body, in the order of its true forces."""
     member = flight.truth["member"] > 0.0
     every = [f"Module {number}" for number in numbers or range(1, 1 + member.shape[1])]
     return [every[m] + ("" if member[:, m].all() else ", while docked") for m in np.flatnonzero(member.any(axis=0))]
 
 
 def _columns_of(modules: int, per: int) -> np.ndarray:
-    """(rows, columns) thrusters in their panels, -1 in those left empty: one module's over two columns, else a column for each module."""
+    """(rows, columns) thruster of each panel, -1 if empty: a single module takes two columns, several take a column each."""
     if modules == 1:
         layout = np.full((-(-per // 2), 2), -1)
         layout.flat[:per] = range(per)
@@ -306,7 +306,7 @@ def _columns_of(modules: int, per: int) -> np.ndarray:
 
 
 def disturbance(flight: Flight, window: Window) -> Any:
-    """The disturbance that the estimator believes in, the wrench that was asked, and the water's velocity."""
+    """Estimated disturbance, commanded force and water velocity."""
     figure = _figure(11.0, 6.6)
     cells = figure.subplots(2, 2, sharex=True)
     wrench = flight.firmware["wrench_wanted"]
@@ -329,7 +329,7 @@ def disturbance(flight: Flight, window: Window) -> Any:
 
 
 def _say_none(axes: Any, title: str, why: str) -> None:
-    """An empty panel, and why it is empty."""
+    """Marks a panel as empty and writes the reason in it."""
     axes.set(title=f"{title}: none", yticks=[])
     _write_across(axes, why)
 
@@ -350,12 +350,12 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _inside(flight: Flight, window: Window) -> np.ndarray:
-    """(k,) ticks that are judged; seconds carry rounding, ticks are far longer."""
+    """(k,) judged ticks. The margin absorbs rounding of the seconds and is far shorter than a tick."""
     return (flight.time_s >= window.start_s - ROUNDING_S) & (flight.time_s <= window.end_s + ROUNDING_S)
 
 
 def _limit_to_window(axes: Any, flight: Flight, window: Window, values: np.ndarray) -> None:
-    """Scale to what is judged: the take-off would flatten everything else."""
+    """Scales an axis to the judged part; the take-off would flatten everything else."""
     judged = values[:, _inside(flight, window)]
     low, high = (float(end(judged, initial=0.0, where=np.isfinite(judged))) for end in (np.min, np.max))
     margin = 0.08 * max(high - low, 1e-9)
@@ -374,7 +374,7 @@ def _finish_time_axis(axes: Any, flight: Flight, window: Window, last: bool = Fa
 
 
 def _legends_below(figure: Any, cells: Any) -> None:
-    """One legend for the whole figure, under it; grey comes last."""
+    """One legend for the whole figure, below it, with grey last."""
     handles = {label: handle for cell in cells for handle, label in zip(*cell.get_legend_handles_labels(), strict=True)}
     handles = dict(sorted(handles.items(), key=lambda item: item[0] == NOT_JUDGED))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))

@@ -1,6 +1,6 @@
-"""Somebody who asks for anything at any time while anything breaks, and the rules that no tick may break whatever is asked.
+"""A random operator who makes any request at any time while anything may fail, and the rules that every tick must keep regardless.
 
-Requests come as a ground station's do: arms, modes, places, docks, motor tests, parameters, e-stops and their release, in any order.
+Requests are those of a ground station: arming, modes, set-points, docks, motor tests, parameters, e-stops and their release, in any order.
 """
 
 from __future__ import annotations
@@ -42,32 +42,32 @@ from hil.plant.fault_spec import Fault
 from hil.scenario import load_scenario
 
 SCENARIOS = ("dock", "mobius-2", "hover")
-"""Two bodies that may become one, one of two modules that may be parted, and one alone."""
+"""Two bodies that may dock, one body of two modules that may undock, and a single module."""
 ASK_EVERY, STREAM_EVERY = 25, 5
-"""Ticks from one request to the next, and from one look at the sticks and sign of life of the ground station to the next."""
+"""Ticks between random requests, and between stick positions and heartbeats of the ground station."""
 LEAVES = 0.01
-"""Chance that the ground station falls silent, or is back, each time it would be heard."""
+"""Probability that the ground station falls silent, or returns, whenever a heartbeat is due."""
 FACING = (FACE_NAMES.index("-x"), FACE_NAMES.index("+x"))
 """Faces with which the second module of these scenarios meets the first."""
 MOST_FAULTS = 5
 BREAKS = [fault for fault in ALONE if fault.kind != "process_killed"]
-"""What may break: all of the fault matrix but the process itself, which forgets what it was asked."""
+"""Faults that may be drawn: those of the fault matrix that come alone, except a killed process, which forgets its requests."""
 REGISTRY = tuple(registry())
 SOON = 2
-"""Ticks within which a request is acted on."""
+"""Ticks within which a request takes effect."""
 
 
 class RandomOperator(Orders):
-    """The orders of one flight of a fleet; seeded."""
+    """The random requests of one flight of a fleet, drawn from `rng`."""
 
     def __init__(self, rng: np.random.Generator, modules: int, ticks: int) -> None:
         self.ticks = ticks
         self.asked = dict.fromkeys(Action, -math.inf)
-        """Tick in which each action was asked for last."""
+        """Tick of the last request for each action."""
         self._rng, self._modules, self._is_there = rng, modules, True
 
     def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
-        """What is asked for in the tick after `last`."""
+        """The requests in the tick after `last`."""
         if last is None:
             return []
         body, tick, asked = int(self._rng.choice([record.body for record in last.records])), last.tick + 1, list[Request]()
@@ -82,7 +82,7 @@ class RandomOperator(Orders):
         return asked
 
     def _sticks(self) -> Sticks:
-        """Let go of, two times of three."""
+        """Random stick positions; centred two times out of three."""
         pushed = self._rng.uniform(-1.0, 1.0, 6) * (self._rng.random() < 0.33)
         return Sticks(tuple(pushed[:3].tolist()), tuple(pushed[3:].tolist()))
 
@@ -91,7 +91,7 @@ WEIGHTS: Mapping[Action, float] = {
     Action.ARM: 0.38, Action.DISARM: 0.05, Action.HOLD: 0.05, Action.ESTOP: 0.02, Action.CLEAR_ESTOP: 0.08, Action.SET_MODE: 0.12,
     Action.SET_POINT: 0.05, Action.TRACK: 0.03, Action.SET_PARAMETER: 0.05, Action.DOCK: 0.08, Action.UNDOCK: 0.04, Action.MOTOR_TEST: 0.05,
 }  # fmt: skip
-"""How often each is asked for: mostly to arm, for who is disarmed breaks no rule."""
+"""Probability of each action. Arming is by far the most frequent, because a disarmed robot breaks no rule."""
 
 
 def _forced(rng: np.random.Generator, modules: int) -> bool:
@@ -112,12 +112,12 @@ def _path(rng: np.random.Generator, modules: int) -> Trajectory:
 
 
 def _motor(rng: np.random.Generator, modules: int) -> tuple[int, float, float]:
-    """One more than there are, too."""
+    """Thruster, share of full command and seconds; the thruster index may be one past the last."""
     return (int(rng.integers(CHANNELS + 1)), float(rng.uniform(-1.0, 1.0)), float(rng.uniform(0.0, 3.0)))
 
 
 def _parameter(rng: np.random.Generator, modules: int) -> tuple[str, float | str]:
-    """Any that there is, now and then out of its range."""
+    """Name and value of any parameter; the value is sometimes out of range."""
     name, limits = REGISTRY[int(rng.integers(len(REGISTRY)))]
     if limits.choices:
         return (name, str(rng.choice(limits.choices)))
@@ -141,23 +141,23 @@ ARGUMENTS: Mapping[Action, Callable[[np.random.Generator, int], Any]] = {
     Action.MOTOR_TEST: _motor, Action.SET_PARAMETER: _parameter, Action.DOCK: _faces, Action.UNDOCK: _faces, Action.ESTOP: _nothing,
     Action.CLEAR_ESTOP: _nothing,
 }  # fmt: skip
-"""What each is asked for with, given how many modules there are."""
+"""Generator of each action's argument, given the number of modules."""
 
 
 class Seen(NamedTuple):
     """One module in one tick."""
 
     flown_by: int
-    """Number of bodies that say that it is theirs."""
+    """Number of bodies that claim the module."""
     record: BodyRecord
-    """Of its body."""
+    """Record of the module's body."""
     command: ModuleCommand
     before: int
-    """State of its body in the tick before."""
+    """State of the module's body in the previous tick."""
     was_armed: bool
-    """Its body holds a module that was armed in the tick before: it, or one that it has docked to."""
+    """Whether its body contains a module that was armed in the previous tick: this one, or one that it has docked to."""
     told_ago: Mapping[Action, float]
-    """Ticks since each action was asked for."""
+    """Ticks since the last request for each action."""
 
 
 def _is_finite(record: BodyRecord) -> bool:
@@ -177,21 +177,21 @@ RULES: Mapping[str, Callable[[Seen], bool]] = {
     ),
     "signals are numbers": lambda s: _is_finite(s.record),
 }  # fmt: skip
-"""What holds of each module in every tick."""
+"""Invariants of each module in every tick."""
 
 
 class Operated(NamedTuple):
     """One flight with a random operator."""
 
     broken: Counter[str]
-    """Modules and ticks by the rule that they broke."""
+    """Number of violations of each rule, one per module and tick."""
     modes: Counter[str]
-    """Ticks of each module armed, by its mode."""
+    """Number of armed ticks in each mode, summed over the modules."""
     ticks: int
 
 
 def fly_with_random_operator(seed: int, duration_s: float) -> Operated:
-    """Flies for so long, with faults and orders of the seed's. What the firmware raises comes through."""
+    """Flies for `duration_s` with faults and requests drawn from `seed`. The firmware's exceptions propagate."""
     rng, base = stream(seed, "operator"), load_scenario(SCENARIOS[seed % len(SCENARIOS)])
     scenario = dataclasses.replace(base, fault=tuple(_fault(rng, duration_s) for _ in range(rng.integers(MOST_FAULTS + 1))))
     operated = Operated(Counter(), Counter(), round(100 * duration_s))
@@ -219,13 +219,13 @@ def _fault(rng: np.random.Generator, duration_s: float) -> Fault:
 
 
 def _seen(bench: Bench, operator: RandomOperator, outputs: Outputs, before: Mapping[int, int]) -> dict[int, Seen]:
-    """What the rules look at after a tick, by module; `before`: the state of each module's body in the tick before."""
+    """Input of the rules after a tick, by module; `before`: state of each module's body in the previous tick."""
     bodies, told_ago = bench.firmware.pipeline.bodies, {action: outputs.tick - tick for action, tick in operator.asked.items()}
     records = {record.body: record for record in outputs.records}
     seen = {}
     for module, command in enumerate(outputs.modules):
         holders = [body for body in bodies if module in body.modules]
-        holder = holders[0] if holders else bodies[0]  # one that is nobody's breaks the first rule, whatever the others say
+        holder = holders[0] if holders else bodies[0]  # a module of no body breaks the first rule in any case
         was_armed = any(before.get(other) in ARMED for other in holder.modules)
         record, state = records[holder.index], before.get(module, State.DISARMED)
         seen[module] = Seen(len(holders), record, command, state, was_armed, told_ago)

@@ -36,7 +36,7 @@ from hil.workers import end_with_parent
 
 
 class RealTimeFlight(NamedTuple):
-    """How the ticks went."""
+    """Timing of a flight in real time."""
 
     wall_s: float
     deadline_misses: int
@@ -44,22 +44,22 @@ class RealTimeFlight(NamedTuple):
     lateness_ns: dict[str, int]
     """p50, p99, worst."""
     refused: list[str]
-    """What the system would not give of real time, a line each."""
+    """Real-time settings that the system refused, a line each."""
 
 
 class Handshake(NamedTuple):
-    """Between a flight and its plant's process."""
+    """Events between a flight and its plant's process."""
 
     ready: ProcessEvent
-    """Set by the plant when its world stands."""
+    """Set by the plant when its world is built."""
     begin: ProcessEvent
-    """The world's clock may start: not before the firmware's, for a robot that nobody has armed yet drifts."""
+    """Set when the world's clock may start: not before the firmware's clock, because an unarmed robot drifts."""
     stop: ProcessEvent
     """Set by the flight when it is over."""
 
 
 def serve_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, handshake: Handshake) -> None:
-    """The plant's process."""
+    """Main function of the plant's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     plant = PlantProcess(scenario, seed, rate_hz, out)
@@ -71,10 +71,10 @@ def serve_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path
 
 
 def serve_between(handshake: Handshake, plant: PlantProcess, bus: str, arrival: threading.Event) -> None:
-    """Serves `bus` from `begin` until `stop`, on a clock that starts with it; `arrival` is the one of its port."""
+    """Serves `bus` from `begin` until `stop`, on a clock that starts at `begin`. `arrival` is the event of its port."""
     handshake.ready.set()
     handshake.begin.wait()
-    if handshake.stop.is_set():  # the flight came to nothing
+    if handshake.stop.is_set():  # the flight failed before it began
         return
     clock = MonotonicClock.started_now()
     with open_port(bus, reader=True, now_ns=clock.now_ns, arrival=arrival) as port:
@@ -95,16 +95,16 @@ def fly_in_real_time(
     serve: Callable[..., None] = serve_plant,
     before_logs: Callable[[], None] | None = None,
 ) -> RealTimeFlight:
-    """Flies `scenario` against the clock; the logs are in `out`. Raises DescriptionError and PortError.
+    """Flies `scenario` in real time and leaves the logs in `out`. Raises DescriptionError and PortError.
 
     Args:
-        start_method: of the plant's process. `fork` spares its imports; only for a process without threads.
-        observers: called after each tick, besides the recorder.
-        serve: what the plant's process runs, with the arguments of `serve_plant`.
-        before_logs: called when nothing is refused any more; until then logs of an earlier flight are as they were.
+        start_method: of the plant's process. `fork` saves its imports; only for a process without threads.
+        observers: called after each tick, in addition to the recorder.
+        serve: function that the plant's process runs, with the arguments of `serve_plant`.
+        before_logs: called once nothing can be refused any more; until then the logs of an earlier flight are untouched.
     """
     check_served(scenario)
-    make_world(scenario, seed, CHUNK_NS)  # told of here, before there are two processes to tell of it: a world that cannot be,
+    make_world(scenario, seed, CHUNK_NS)  # raises here, while there is only one process to report it: an impossible world,
     open_port(bus).close()  # a bus that cannot be opened,
     fleet = fleet_of(scenario, bus, rate_hz)
     orders = _Started(script_of(scenario, fleet))  # a path that cannot be flown
@@ -149,23 +149,23 @@ class _Started:
     start_ns: int = 0
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
-        """As `Orders.requests`, at a time of the firmware's clock."""
+        """As `Orders.requests`, with the time of the firmware's clock."""
         return self.script.requests(time_ns - self.start_ns, last)
 
     def are_over(self, tick: int, time_ns: int) -> bool:
-        """Whether the run ends with this tick, at a time of the firmware's clock."""
+        """Whether the run ends with this tick; `time_ns` is the firmware's clock."""
         return tick >= self.script.ticks or self.script.is_over(time_ns - self.start_ns)
 
 
 def _wait_until_ready(plant: BaseProcess, handshake: Handshake) -> None:
-    """Raises RuntimeError where the plant's process ends instead."""
+    """Waits for the plant. Raises RuntimeError if its process ends instead."""
     while not handshake.ready.wait(timeout=1.0):
         if not plant.is_alive():
             raise RuntimeError("the plant's process ended before it was ready")
 
 
 def _recorder(stack: ExitStack, out: Path, firmware: Firmware, scenario: str, seed: int, rate_hz: int) -> Recorder:
-    """One that is closed with `stack`, writes in a thread of its own, and opens the bodies' channels before the first tick."""
+    """A recorder that is closed with `stack`, writes in its own thread, and opens the bodies' channels before the first tick."""
     recorder = Recorder(out, configuration_of(firmware, scenario=scenario, seed=seed, rate_hz=rate_hz), queued=True)
     stack.callback(recorder.close)
     for body in firmware.pipeline.bodies:
@@ -174,7 +174,7 @@ def _recorder(stack: ExitStack, out: Path, firmware: Firmware, scenario: str, se
 
 
 def _flown(loop: RealTimeLoop, rate_hz: int, refused: list[str]) -> RealTimeFlight:
-    """What came of a loop that has ended."""
+    """The timing of a loop that has ended."""
     keeper, late = loop.rate_keeper, loop.rate_keeper.lateness
     ticks = loop.last.tick if loop.last is not None else 0
     lateness_ns = {"p50": late.quantile_ns(0.5), "p99": late.quantile_ns(0.99), "worst": late.worst_ns}
@@ -183,7 +183,7 @@ def _flown(loop: RealTimeLoop, rate_hz: int, refused: list[str]) -> RealTimeFlig
 
 @contextmanager
 def _plant(start_method: str, serve: Callable[..., None], *arguments: Any) -> Iterator[tuple[BaseProcess, Handshake]]:
-    """The plant's process, which serves inside. Raises RuntimeError at the end where it failed."""
+    """Runs the plant's process while inside. Raises RuntimeError at the end if it failed."""
     spawn, fork = multiprocessing.get_context("spawn"), multiprocessing.get_context("fork")
     context: SpawnContext | ForkContext = fork if start_method == "fork" else spawn
     handshake = Handshake(context.Event(), context.Event(), context.Event())

@@ -1,5 +1,5 @@
-"""Folders that a run writes into. What may be written over: files that an earlier run of the same kind left. Anybody else's of the same
-names are refused, not lost.
+"""Folders that a run writes into. Only files left by an earlier run of the same kind are overwritten; a folder with other files of the
+same names is refused, so that nothing is lost.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from firmware_py.description.schema import DescriptionError
 
 
 def check_replaceable(folder: Path, names: Iterable[str], is_earlier_run: bool, run: str) -> None:
-    """Raises DescriptionError where `folder` holds something under these names and no earlier run's.
+    """Raises DescriptionError if `folder` holds anything under these names that is not an earlier run's. Empty files do not count.
 
     Args:
-        is_earlier_run: whether `folder` is one that a run of this kind left, by a file that nothing else writes.
-        run: what would have left them, for people: "flight".
+        is_earlier_run: whether a run of this kind left `folder`, judged by a file that nothing else writes.
+        run: the kind of run, for the error message: "flight".
     """
     held = [name for name in names if (folder / name).exists() and (not (folder / name).is_file() or (folder / name).stat().st_size)]
     if held and not is_earlier_run:
@@ -26,19 +26,19 @@ def check_replaceable(folder: Path, names: Iterable[str], is_earlier_run: bool, 
 
 @contextmanager
 def made(folder: Path) -> Iterator[None]:
-    """Makes `folder` and those that it lies in; what of them was made, and has nothing in it at the end, goes again. Raises OSError."""
+    """Makes `folder` and its parents; at the end removes those of them that it made and that are empty. Raises OSError."""
     new = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         yield
     finally:
-        with suppress(OSError):  # the first that holds something, and all in which that lies
+        with suppress(OSError):  # the first one that is not empty stays, with its parents
             for each in new:
                 each.rmdir()
 
 
 def is_json_with(path: Path, key: str) -> bool:
-    """Whether `path` is JSON whose object, or whose first of a list or of lines, has `key`."""
+    """Whether `path` is JSON or JSON lines, and its object, or the first object of its list or lines, has `key`."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, ValueError):

@@ -1,6 +1,6 @@
-"""Flights in which something breaks, and their figures: thrusters that die or lie, tags that stay away, frames that are lost, e-stops.
+"""Flights with faults, and their metrics: thrusters that die or lie, missing tags, lost frames, e-stops.
 
-Used by the tests and, over all seeds, by `make accept`. Every figure comes from the logs, or from the frames themselves.
+Used by the tests and, over all seeds, by `make accept`. Every metric comes from the logs, or from the frames themselves.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from hil.scenario import MODES, Scenario, load_scenario
 from hil.signals import Flight, read_flight
 
 BREAKS_AFTER_S = 10.0
-"""Into the spiral."""
+"""Time from the start of the spiral to the fault."""
 COMMANDED_N = 0.3
-"""A thruster is watched from the moment it is first commanded more."""
+"""The time to detect a broken thruster counts from its first command above this."""
 LEFT_OUT = re.compile(r"thruster (\d+) .*: left out")
 
 
 def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None) -> Flight:
-    """The flight of a scenario, its logs thrown away."""
+    """Flies a scenario and returns the flight; its logs are discarded."""
     with tempfile.TemporaryDirectory() as folder:
         fly_scenario(scenario, seed, parameters or Parameters(), Path(folder), f"virtual:{Path(folder).name}")
         return read_flight(Path(folder))
 
 
 def in_task(scenario: Scenario, flight: Flight) -> tuple[Flight, Poses]:
-    """The ticks of the task, and where its path wants the body in each: not the firmware's own set-point, which may be any."""
+    """The ticks of the task, and the path's reference pose in each, rather than the firmware's own set-point, which may be anything."""
     part = flight.between(scenario.task.begin_ns, scenario.task.end_ns)
     wanted = wanted_in(scenario, part, scenario.task.begin_ns)
     assert wanted is not None, scenario.task.kind
@@ -54,7 +54,7 @@ def in_task(scenario: Scenario, flight: Flight) -> tuple[Flight, Poses]:
 
 
 def timed(name: str, settle_s: float, duration_s: float, *faults: Fault) -> Scenario:
-    """A scenario with other times, in which something breaks."""
+    """A scenario with other times and these faults."""
     scenario = load_scenario(name)
     task = dataclasses.replace(scenario.task, settle_s=settle_s, duration_s=duration_s)
     return dataclasses.replace(scenario, task=task, fault=faults)
@@ -67,18 +67,18 @@ class ThrusterFlight(NamedTuple):
     """A spiral in which thrusters broke."""
 
     rmse_m: float
-    """Truth against the path, from the spiral's start to its end or to the mode that a fail-safe took."""
+    """Truth against the path, from the spiral's start to its end or to the first change of mode by a fail-safe."""
     peak_m: float
     angle_peak_deg: float
     found_s: tuple[float, ...]
-    """Of each broken thruster: from its first command of COMMANDED_N after it broke until it was left out; infinite: never."""
+    """For each broken thruster, time from its first command above COMMANDED_N after the fault until it was left out; infinite if never."""
     blamed: tuple[int, ...]
-    """Healthy ones that were left out."""
+    """Healthy thrusters that were left out."""
     ends_in: str
 
 
 def spiral_with(broken: Sequence[int], kind: str = "thruster_dead", seed: int = 0) -> ThrusterFlight:
-    """Flies the spiral; `broken` thrusters break at once in the middle of it."""
+    """Flies the spiral; the `broken` thrusters all fail BREAKS_AFTER_S into it."""
     base = load_scenario("spiral")
     at_s = base.task.settle_s + BREAKS_AFTER_S
     faults = tuple(Fault(kind=kind, at_s=at_s, index=index) for index in broken)
@@ -110,10 +110,10 @@ def _found_after(flight: Flight, index: int, left_out: dict[int, float]) -> floa
 
 
 class BlindFlight(NamedTuple):
-    """A hover without tags for a while."""
+    """A hover with a period without tags."""
 
     error_m: float
-    """Largest horizontal distance of the truth from the place."""
+    """Largest horizontal distance of the truth from the set place."""
     rmse_m: float
     """Root mean square of that distance over the time without tags."""
     normalised: tuple[float, float]
@@ -130,11 +130,11 @@ class Imu(NamedTuple):
 
 
 ICM_20602 = Imu(math.radians(0.004) * math.sqrt(50.0), 100e-6 * 9.81 * math.sqrt(50.0))
-"""One of many autopilots: 0.004 deg/s and 100 ug per root of Hz (TDK InvenSense DS-000176), over the 50 Hz of 100 samples a second."""
+"""IMU of many autopilots: 0.004 deg/s and 100 ug per root of Hz (TDK InvenSense DS-000176), over the 50 Hz of 100 samples a second."""
 
 
 def hover_blind(seed: int, imu: Imu | None = None) -> BlindFlight:
-    """Hovers, and loses the tags for a while; with another IMU the filter is told of its noise in the proportion of the shipped figures."""
+    """Flies a hover that loses the tags for a while. With another IMU the filter's noise parameters keep their ratio to the sensor's."""
     scenario, parameters = load_scenario("hover-blind"), Parameters()
     for name, sigma in imu._asdict().items() if imu is not None else ():
         told = getattr(parameters.estimation, name) / getattr(scenario.sensors, name)
@@ -150,14 +150,17 @@ def hover_blind(seed: int, imu: Imu | None = None) -> BlindFlight:
 
 
 def spiral_through_loss(seed: int, share: float = 0.3) -> float:
-    """Position RMSE of a spiral of which a share of the frames is lost in both directions, m."""
+    """Position RMSE of a spiral with a share of the frames lost in both directions, m."""
     base = load_scenario("spiral")
     flight, wanted = in_task(base, flown(dataclasses.replace(base, fault=(Fault(kind="frame_loss", value=share),)), seed))
     return float(flight_metrics(flight, wanted=wanted)["position_rmse_m"])
 
 
 def command_outlives_frames_ms() -> float:
-    """How long an MCU's command outlives the last frame that it accepted, when all frames are lost in flight, ms."""
+    """Longest time that an MCU keeps a command after the last frame that it accepted, when all frames are lost in flight, ms.
+
+    Infinite if it still applies one at the end.
+    """
     scenario = timed("hover", 4.0, 2.0, Fault(kind="frame_loss", at_s=5.0, value=1.0))
     longest = 0.0
     with ExitStack() as stack:
@@ -165,7 +168,7 @@ def command_outlives_frames_ms() -> float:
         mcu = next(iter(bench.nodes.mcus.values()))
 
         class Watch:
-            """Looks at the MCU where the truth is recorded: once a tick."""
+            """Stands in for the truth recorder to look at the MCU once a tick."""
 
             def record_world(self, tick: int, world: Any) -> None:
                 nonlocal longest
@@ -184,14 +187,14 @@ class StoppedFlight(NamedTuple):
     """A flight with an e-stop."""
 
     ticks: int
-    """After the one that took the e-stop."""
+    """Number of ticks after the one that took the e-stop."""
     violations: int
-    """Of those, the ones in which a thruster was commanded, or was not told that it is disarmed."""
+    """Number of these ticks in which a thruster was commanded, or was not told that it is disarmed."""
     was_armed: bool
 
 
 def fly_to_estop(seed: int) -> StoppedFlight:
-    """A short flight in a mode and with a fault of the seed's; an e-stop at any tick, and people who go on asking for everything."""
+    """A short flight in a mode and with a fault drawn from the seed, an e-stop at a random time, and random requests after it."""
     rng = stream(seed, "estop")
     faults = [fault for fault in ALONE if fault.kind not in OWN_FIGURES and not (fault.kind == "frame_loss" and fault.value == 1.0)]
     fault = dataclasses.replace(faults[int(rng.integers(len(faults)))], at_s=float(rng.uniform(1.5, 4.5)), until_s=1e6)
@@ -222,18 +225,18 @@ def fly_to_estop(seed: int) -> StoppedFlight:
 
 
 OWN_FIGURES = ("process_killed", "estop")
-"""Faults that are no company for an e-stop: the one ends the firmware, the other is one."""
+"""Faults that cannot be combined with an e-stop: the first ends the firmware, the second is an e-stop itself."""
 
 
 class _Nagging:
-    """A script, and somebody who from the e-stop on asks for everything but its release; and at `estop_s` for it, unless it is pressed."""
+    """A script with random requests from the e-stop on, but never its release. At `estop_s` it requests the e-stop, unless pressed."""
 
     def __init__(self, script: Orders, rng: np.random.Generator, estop_s: float, is_pressed: bool) -> None:
         self._script, self._rng, self._estop_s, self._is_asked = script, rng, estop_s, is_pressed
         self.ticks, self.is_over = script.ticks, script.is_over
 
     def requests(self, time_ns: int, last: Outputs | None) -> list[Request]:
-        """The script's, and from the e-stop on one more in every third tick."""
+        """The script's requests, and from the e-stop on another one in about every third tick."""
         asked = list(self._script.requests(time_ns, last))
         if time_ns < self._estop_s * 1e9:
             return asked
@@ -250,4 +253,4 @@ ASKED = (
     Request(Action.MOTOR_TEST, 0, (1, 0.3, 2.0)), Request(Action.STICKS, 0, Sticks((0.5, 0.0, 0.0), (0.0, 0.3, 0.0))),
     *(Request(Action.SET_MODE, 0, Mode[mode]) for mode in MODES),
 )  # fmt: skip
-"""What people ask for who do not know that the robot is stopped."""
+"""Requests of operators who do not know that the robot is stopped."""

@@ -1,6 +1,4 @@
-"""What the person at the bench does: arm, wait at the start, begin the task. It speaks to the firmware by requests
-alone.
-"""
+"""The operator's script of a trajectory task: arm, wait at the start, begin the task. It uses the firmware through requests alone."""
 
 from __future__ import annotations
 
@@ -25,17 +23,17 @@ from hil.scenario import Scenario, Task
 from hil.starts import hull_levers, in_wall
 
 MOEBIUS_RAMP_SHARE = 0.25
-"""Share of the time over which the speed rises, and falls again: 0.25 keeps the peak at 4/3 of the mean, so drag errors stay small."""
+"""Share of the duration in which the speed rises, and likewise falls: 0.25 keeps the peak at 4/3 of the mean, so drag errors stay small."""
 APART_M, APART_DEG = 0.01, 1.0
-"""Between the first waypoint and the start: what a spreadsheet may round, and no move of its own before the task."""
+"""Tolerance between the first waypoint and the start: allows for rounding in a spreadsheet, but is no move of its own before the task."""
 LOOKS = 500
-"""Places of a path that are looked at: every 3 cm of the longest that is flown here."""
+"""Number of points of a path that are checked: every 3 cm of the longest path flown here."""
 LONGER_S = 1e-6
-"""By which rounding may make a path longer than its task."""
+"""Rounding tolerance of a path's duration against its task's."""
 
 
 class Script(Orders):
-    """The requests of one run. Raises DescriptionError for a path that leaves the tank and a file of waypoints that cannot be flown."""
+    """The requests of one run. Raises DescriptionError for a path that leaves the tank or a waypoint file that cannot be flown."""
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -49,7 +47,7 @@ class Script(Orders):
         self._begun = False
 
     def requests(self, time_ns: int, last: Outputs | None) -> Sequence[Request]:
-        """What is asked for in the tick at `time_ns` since the start, given the outputs of the tick before."""
+        """The requests in the tick at `time_ns` since the start, given the outputs of the previous tick."""
         if time_ns >= self._task.begin_ns and not self._begun:
             self._begun = True
             return [Request(Action.TRACK, 0, self.trajectory)]
@@ -62,7 +60,7 @@ class Script(Orders):
 
 
 def refuse_outside(path: Trajectory, scenario: Scenario) -> None:
-    """Raises DescriptionError where the body's centre would have to leave the tank."""
+    """Raises DescriptionError if the path takes the body's centre out of the tank."""
     for time_s in np.linspace(0.0, path.duration_s, LOOKS).tolist():
         place = path.sample(time_s).p_wb
         if not scenario.tank.holds(place):
@@ -72,7 +70,7 @@ def refuse_outside(path: Trajectory, scenario: Scenario) -> None:
 
 
 def refuse_in_wall(path: Trajectory, scenario: Scenario) -> None:
-    """Raises DescriptionError where a hull of the first body would have to go into a wall."""
+    """Raises DescriptionError if the path takes a hull of the first body into a wall."""
     members = scenario.groups[0]
     hulls = np.concatenate([levers for m, (_, levers) in hull_levers(scenario).items() if m in members])
     for time_s in np.linspace(0.0, path.duration_s, LOOKS).tolist():
@@ -110,7 +108,7 @@ def _lissajous(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
 
 
 def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
-    """The path of the file as it is: what does not fit its limits, the thrusters, its task or the start is refused, not stretched."""
+    """The path of the file, unchanged. One that does not fit its limits, the thrusters, its task or the start is refused, not stretched."""
     mission = _from_start(read_mission(task.file_text, task.file), start)
     _refuse_unbounded(mission, task.file)
     try:
@@ -130,7 +128,7 @@ def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
 
 
 def _refuse_unbounded(mission: Mission, file: str) -> None:
-    """Raises DescriptionError for a file that leaves free how long its path takes."""
+    """Raises DescriptionError for a file that does not determine how long its path takes."""
     limits = mission.limits.limits()
     bounds = (limits.velocity, limits.acceleration, limits.angular_rate, limits.angular_acceleration)
     if mission.duration_s > 0.0 or mission.waypoint[-1].duration_s > 0.0 or any(bound is not None for bound in bounds):
@@ -141,7 +139,7 @@ def _refuse_unbounded(mission: Mission, file: str) -> None:
 
 
 def _from_start(mission: Mission, start: Setpoint) -> Mission:
-    """The same with the attitude of the start where its first waypoint has none."""
+    """The mission, with the attitude of the start if its first waypoint has none."""
     first, *others = mission.waypoint
     if len(first.quaternion):
         return mission

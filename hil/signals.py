@@ -14,18 +14,18 @@ from hil.truth_log import TRUTH_LOG
 
 SIGNAL_LOG = "signals.mcap"
 REGULAR_TICKS = 50
-"""Ticks at the start of a log that its period is read from."""
+"""Ticks at the start of a log from which its period is derived."""
 NO_TAG_NS = 1 << 60
-"""Age of the last tag in the firmware's log before there was any."""
+"""Age of the last tag in the firmware's log from which on there was none yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One body over the ticks that both logs hold, row by row; `lost_ns` are the times of ticks that one of them lacks.
+    """One body over the ticks that both logs hold, row by row; `lost_ns` are the times of ticks missing from one of them.
 
-    `truth` has the columns of the body's leading module (its `force_n` and `power_w` those of all its modules), and with them
+    `truth` has the columns of the body's leading module (but `force_n` and `power_w` of all its modules), and in addition
     `member`, `p_wb`, `q_wb`, `v_wb`, `w_bb` of the body. `modules` has `p_wm`, `q_wm`, `force_n` and
-    `power_w` of every module of the fleet, in its order, whichever body it is in.
+    `power_w` of every module, in fleet order, whichever body it is in.
     """
 
     firmware: Columns
@@ -43,7 +43,7 @@ class Flight:
 
     @property
     def p_wb(self) -> np.ndarray:
-        """(k, 3) where the point that the firmware steers, the body's nominal centre of mass, really is, world, m."""
+        """(k, 3) true position of the point that the firmware steers, the body's nominal centre of mass, world, m."""
         return self.truth["p_wb"]
 
     @property
@@ -53,7 +53,7 @@ class Flight:
 
     @property
     def placed(self) -> np.ndarray:
-        """(k,) whether tags have told heading and place by then: before, what the firmware believes and wants is no pose."""
+        """(k,) whether tags have given heading and position by then. Before that, the firmware's estimate and set-point are not a pose."""
         told = self.firmware["ready"] & (self.firmware["tag_age_ns"] < NO_TAG_NS)
         return np.logical_or.accumulate(told)
 
@@ -67,20 +67,20 @@ class Flight:
 
 
 def rows_of(columns: Columns, which: np.ndarray) -> Columns:
-    """The same columns of some rows: a mask (k,), or their indices in the order that is wanted."""
+    """The same columns with some of the rows, given by a mask (k,) or by indices in the wanted order."""
     return {name: column[which] for name, column in columns.items()}
 
 
 def by_number(channels: Mapping[str, Columns], prefix: str) -> dict[int, Columns]:
-    """The channels `prefix`0, `prefix`1, ... of a log by their number: of a module, or of a body's leader."""
+    """The channels `prefix`0, `prefix`1, ... of a log by number, which is that of a module or of a body's leader."""
     return {int(name.removeprefix(prefix)): columns for name, columns in channels.items() if name.startswith(prefix)}
 
 
 def read_flight(folder: Path) -> Flight:
-    """The flight of the body that module 0 leads, whose logs are in `folder`.
+    """The flight of the body that module 0 leads, from the logs in `folder`.
 
     Raises:
-        OSError: a log is missing. ValueError: a log holds nothing of the body, or they share no tick.
+        OSError: a log is missing. ValueError: a log lacks the body, or the logs share no tick.
     """
     signals, truths = read_signals(folder / SIGNAL_LOG), read_signals(folder / TRUTH_LOG)
     if "/firmware/body0" not in signals or "/plant/body0" not in truths:
@@ -100,7 +100,7 @@ def read_flight(folder: Path) -> Flight:
 
 
 def period_of(ticks: Columns) -> int:
-    """Of the firmware's ticks, by their numbers and times, ns; 1 of a single one, which tells none."""
+    """Period of the firmware's ticks from their numbers and times, ns; 1 for a single tick, which has no period."""
     numbers, times = ticks["tick"][:REGULAR_TICKS], ticks["time_ns"][:REGULAR_TICKS]
     return int(np.min(np.diff(times) // np.diff(numbers))) if len(numbers) > 1 else 1
 
@@ -112,7 +112,7 @@ def _fleet(truths: Mapping[str, Columns], ticks: np.ndarray) -> tuple[Columns, .
 
 
 def _joined(truths: Mapping[str, Columns]) -> Columns:
-    """The truth of module 0 with that of the body it leads, over the ticks of both."""
+    """The truth of module 0 together with that of the body it leads, over their common ticks."""
     module, body = truths["/plant/module0"], truths["/plant/body0"]
     _, mine, theirs = np.intersect1d(module["tick"], body["tick"], return_indices=True)
     joined = rows_of(module, mine)
@@ -130,14 +130,14 @@ def _joined(truths: Mapping[str, Columns]) -> Columns:
 
 
 def _at(columns: Columns, ticks: np.ndarray, name: str) -> np.ndarray:
-    """Rows of a column at these ticks; every tick of a module's truth has all modules."""
+    """Rows of a column at these ticks; the truth has all modules in every tick, so the ticks exist."""
     return columns[name][np.searchsorted(columns["tick"], ticks)]
 
 
 def _tell_of_same_body(firmware: Columns, truth: Columns, thrusters: int) -> None:
-    """Between the tick in which faces lock or open and the one in which the firmware notices, the two disagree about who forms the body.
-    For these ticks the true pose becomes that of the body that the firmware still steers: of its leading module, and of what hung rigidly
-    on it when its body last had that many modules, or next has.
+    """Replaces the true pose in ticks in which truth and firmware disagree about the modules of the body: between the tick in which faces
+    lock or open and the one in which the firmware notices. The new pose is that of the body that the firmware still steers: its leading
+    module's, with the rigid offset from the last (else the next) tick in which both saw that number of modules.
     """
     believed = np.isfinite(firmware["commanded_n"]).sum(axis=1) // thrusters
     actual = (truth["member"] > 0.0).sum(axis=1)

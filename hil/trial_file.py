@@ -1,4 +1,4 @@
-"""trials.jsonl: every trial of a campaign or a search on the disk the moment it is over, and found again after a kill."""
+"""trials.jsonl: stores every trial of a campaign or a search on disk as soon as it is over, and restores them after a kill."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from firmware_py.description.schema import DescriptionError
 from hil.campaign_summary import Trial
 
 OWNER = "campaign"
-"""Key of the first line, which says whose trials these are."""
+"""Key of the first line, which identifies the owner of the trials."""
 _HEAD = json.dumps({OWNER: ""}).encode()[:-2]
-"""How the first line begins, as far as it was written."""
+"""Beginning of every first line; a torn first line may be only part of it."""
 
 
 class TrialFile:
-    """trials.jsonl: who it belongs to, then a line for each trial, with the disk before the next one is waited for."""
+    """trials.jsonl: a line for the owner, then a line per trial, each synced to disk before the next trial is awaited."""
 
     def __init__(
         self, path: Path, owner: str, key: str = "seed", anew: bool = False, who: str = "scenario, controller or code"
     ) -> None:
-        """Goes on in `path` if it is `owner`'s; a line that was torn is flown again.
+        """Continues `path` if it belongs to `owner`; drops a torn line and everything after it, to be flown again.
 
         Args:
-            key: tells trials apart.
-            anew: throws another owner's trials away.
-            who: in what another owner may differ, for people.
+            key: identifies a trial.
+            anew: discards the trials of another owner.
+            who: what may distinguish another owner, for the error message.
 
         Raises:
-            DescriptionError: `path` is being written, holds trials of another owner, or none at all but something else.
+            DescriptionError: `path` is being written, holds trials of another owner, or is not a file of trials.
             OSError: it cannot be written.
         """
         self.trials: dict[int, Trial] = {}
@@ -47,14 +47,17 @@ class TrialFile:
             refused.pop_all()
 
     def _claim(self, path: Path) -> None:
-        """The file is this one's until it is closed."""
+        """Locks the file until it is closed."""
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise DescriptionError(f"{path} is being written by another campaign; wait for it or give another --out") from None
 
     def _read(self, path: Path, head: Trial, who: str) -> int:
-        """Bytes that stand; without `who` those of another head do not."""
+        """Reads the trials; returns the number of valid bytes, 0 if the head is another's.
+
+        Raises DescriptionError for trials of another owner, unless `who` is empty, and for a file that holds no trials.
+        """
         self._file.seek(0)
         lines = self._file.readlines()
         if not lines or _entry(lines[0]) != head:
@@ -73,7 +76,7 @@ class TrialFile:
         return stands
 
     def add(self, trial: Trial) -> None:
-        """One more trial, on the disk when this returns."""
+        """Adds a trial, which is on the disk when this returns."""
         self.trials[int(trial[self._key])] = trial
         self._write(trial)
 
@@ -90,7 +93,7 @@ class TrialFile:
 
 
 def _entry(line: bytes) -> Trial | None:
-    """What a line holds; None where it was torn."""
+    """The entry in a line; None if the line is torn."""
     try:
         entry = json.loads(line) if line.endswith(b"\n") else None
     except ValueError:

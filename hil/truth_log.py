@@ -1,6 +1,6 @@
 """The plant's own log, truth.mcap: where everything really is, tick by tick.
 
-The plant writes with another library than the firmware (mcap here, foxglove there): neither hides the other's faults.
+The plant uses a different library than the firmware (mcap here, foxglove there), so that neither hides the other's faults.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 TRUTH_LOG = "truth.mcap"
 WRITER = "modcube"
-"""Who wrote it, in the header of the truth's log."""
+"""Name of the writer in the header of the truth log."""
 HEADER_BYTES = 64
-"""More than magic and header take."""
+"""Upper bound on the size of magic and header."""
 CHUNK_BYTES = 65536
-"""About two seconds of one module at 100 Hz; a killed bench loses no more than that and what waits."""
+"""About two seconds of one module at 100 Hz. A killed bench loses at most one chunk and the waiting messages."""
 AT_ONCE = 20
-"""Messages that are made and written together, ten ticks of one module: by code that is then at hand and not out of the cache."""
+"""Messages that are encoded and written as one batch, ten ticks of one module, so that the code for it stays in the cache."""
 
 
 def module_signals(thrusters: int) -> tuple[Signal, ...]:
@@ -58,7 +58,7 @@ def body_signals(modules: int) -> tuple[Signal, ...]:
 
 
 def dock_signals(modules: int) -> tuple[Signal, ...]:
-    """Truth of all docking faces in one tick, in the order in which `TruthRecorder.record_world` gives it."""
+    """Truth of all docking faces in one tick, in the order of `TruthRecorder.record_world`."""
     return (
         Signal("tick", kind="int"),
         Signal("time_ns", unit="ns", kind="int"),
@@ -72,7 +72,7 @@ def dock_signals(modules: int) -> tuple[Signal, ...]:
 
 
 def is_truth_log(path: Path) -> bool:
-    """Whether a TruthRecorder wrote `path`: by its header, so a torn one too."""
+    """Whether a TruthRecorder wrote `path`. Reads only the header, so a torn log counts too."""
     try:
         with path.open("rb") as file:
             begin = file.read(HEADER_BYTES)
@@ -82,19 +82,19 @@ def is_truth_log(path: Path) -> bool:
 
 
 class TruthRecorder:
-    """Writes /plant/moduleN and /plant/bodyN (N: its leader), a message per tick and module or body. A context
-    manager. Raises OSError when the disk is full.
+    """Writes /plant/moduleN and /plant/bodyN (N: its leader), a message per tick and module or body, and /plant/docks for a fleet of
+    several modules. A context manager. Raises OSError when the disk is full.
     """
 
     def __init__(self, folder: Path, thrusters: tuple[int, ...]) -> None:
-        """`thrusters` has the number of thrusters of each module of the fleet, in its order."""
+        """`thrusters` is the number of thrusters of each module, in fleet order."""
         self._file = (folder / TRUTH_LOG).open("wb")
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(profile="", library=WRITER)
-        self._file.flush()  # whatever comes, the folder is known as a flight's
+        self._file.flush()  # marks the folder as a flight's, even if the process is killed
         self._sequence = 0
         self._waiting: list[tuple[int, int, Row, tuple[Any, ...]]] = []
-        """Messages that are not made yet: channel, time, and the row and the values for it."""
+        """Messages not yet encoded: channel, time, row encoder, values."""
         self._modules = []
         for module, count in enumerate(thrusters):
             self._modules.append(self._opened(f"/plant/module{module}", Layout("Module", module_signals(count))))
@@ -108,12 +108,12 @@ class TruthRecorder:
             self._docks = self._opened("/plant/docks", Layout("Docks", dock_signals(len(thrusters))))
 
     def _opened(self, topic: str, layout: Layout) -> tuple[int, Row]:
-        """A channel, and what makes its messages."""
+        """A new channel and the row that encodes its messages."""
         schema = self._writer.register_schema(layout.schema_name, "protobuf", layout.schema)
         return self._writer.register_channel(topic, "protobuf", schema), layout.row()
 
     def record_world(self, tick: int, world: World) -> None:
-        """Truth of everything at the moment of SYNC `tick`."""
+        """Records the truth of all modules, bodies and docks at the moment of SYNC `tick`."""
         for module in range(len(world.vehicles)):
             self.record(tick, module, world.truth(module))
         for body in range(len(world.bodies)):
@@ -126,16 +126,16 @@ class TruthRecorder:
             self._add(channel, world.time_ns, row, values)
 
     def record(self, tick: int, module: int, truth: Truth) -> None:
-        """Truth of `module` at the moment of SYNC `tick`; the power is all that its supply gives, electronics and magnets included."""
+        """Records the truth of `module` at the moment of SYNC `tick`. Power is the supply's total, including electronics and magnets."""
         channel, row = self._modules[module]
         t, power_w = truth, truth.voltage_v * truth.current_a
         self._add(channel, t.time_ns, row, (tick, t.time_ns, t.p_wm, t.q_wm, t.v_w, t.w_b, t.force_n, t.current_w, power_w))
 
     def record_body(self, tick: int, truth: BodyTruth, load: np.ndarray) -> None:
-        """Truth of a body at the moment of SYNC `tick`; its channel has the number of its leader.
+        """Records the truth of a body at the moment of SYNC `tick`, in the channel with the number of its leader.
 
         Args:
-            load: (6,) what an ideal load cell reads of a clamped body about its leader's hull centre, body frame, N and N m.
+            load: (6,) reading of an ideal load cell that clamps the body, about its leader's hull centre, body frame, N and N m.
         """
         leader, b = truth.modules[0], truth
         if leader not in self._bodies:
@@ -158,7 +158,7 @@ class TruthRecorder:
         self._waiting.clear()
 
     def close(self) -> None:
-        """Finish the file; a second time does nothing."""
+        """Finishes the file. Calling it again does nothing."""
         if not self._file.closed:
             self._write()
             self._writer.finish()

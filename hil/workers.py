@@ -20,14 +20,14 @@ from typing import Any
 from firmware_py.description.schema import DescriptionError
 
 Pool = Callable[[], AbstractContextManager[Executor]]
-"""What begins and ends the workers."""
+"""Makes a context that starts the workers and ends them."""
 
 
 class Processes(ProcessPoolExecutor):
-    """Starts each process with Ctrl-C blocked, which it inherits: it would print a traceback."""
+    """Starts each process with SIGINT blocked, which the process inherits; otherwise it would print a traceback on Ctrl-C."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Begins one call, for which a process is started where none is idle."""
+        """Submits one call; starts a process for it if none is idle."""
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             return super().submit(fn, *args, **kwargs)
@@ -36,9 +36,9 @@ class Processes(ProcessPoolExecutor):
 
 
 def processes(jobs: int) -> Pool:
-    """So many processes of this machine, which end with this one, however it ends, and whose temporary files go with them.
+    """`jobs` processes of this machine. They end with this process, however it ends, and their temporary files are deleted with them.
 
-    Ctrl-C, which a terminal sends to them too, they leave to this one, which ends them with what they do.
+    They ignore Ctrl-C, which a terminal sends to them too; this process handles it and terminates them, whatever they are doing.
     """
 
     @contextmanager
@@ -62,13 +62,13 @@ def processes(jobs: int) -> Pool:
 
 
 def begin(scratch: str) -> None:
-    """In a child, before its first call: its temporary files go to the folder `scratch`."""
+    """Prepares a child before its first call: it ends with its parent, and its temporary files go to the folder `scratch`."""
     end_with_parent()
     tempfile.tempdir = scratch
 
 
 def end_with_parent() -> None:
-    """In a child: a parent that is killed tells nobody, and its children would go on for ever."""
+    """Makes a child exit when its parent does. Without this, the children of a killed parent would run on."""
 
     def wait() -> None:
         if parent := parent_process():
@@ -80,7 +80,7 @@ def end_with_parent() -> None:
 
 @contextmanager
 def kept(pool: Pool) -> Iterator[Pool]:
-    """The pool, whose workers stay from one use to the next: to start them takes longer than a flight. A broken one is made anew."""
+    """The pool with its workers kept between uses, because starting them takes longer than a flight. A broken pool is replaced."""
     with ExitStack() as stack:
         executors: list[Executor] = []
 
@@ -98,14 +98,14 @@ def kept(pool: Pool) -> Iterator[Pool]:
 
 
 class DaskExecutor(Executor):
-    """The workers of a dask client. Dask's own executor never answers for what was under way when the scheduler was lost."""
+    """The workers of a dask client. Dask's own executor never resolves the calls that were under way when the scheduler was lost."""
 
     def __init__(self, client: Any) -> None:
-        """Executor of this client, which stays the caller's to close."""
+        """Uses `client`, which the caller must close."""
         self._client = client
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Begins one call. Raises BrokenExecutor where the scheduler is gone."""
+        """Submits one call. Raises BrokenExecutor if the scheduler is gone."""
         task = self._client.submit(fn, *args, pure=False, **kwargs)
         if self._client.status != "running":
             raise BrokenExecutor("the dask scheduler is gone")
@@ -115,7 +115,7 @@ class DaskExecutor(Executor):
 
 
 def _pass_on(future: Future[Any], task: Any) -> None:
-    """Tells `future` what has come of dask's `task`; its result may be lost with the scheduler that holds it."""
+    """Copies the outcome of dask's `task` to `future`; a result that was lost with the scheduler becomes BrokenExecutor."""
     if not future.set_running_or_notify_cancel():
         return
     try:
@@ -128,7 +128,10 @@ def _pass_on(future: Future[Any], task: Any) -> None:
 
 
 def dask_cluster(address: str) -> Pool:
-    """The workers of the dask scheduler at `address`, such as tcp://host:8786. Raises DescriptionError when none answers, now or later."""
+    """The workers of the dask scheduler at `address`, such as tcp://host:8786.
+
+    Raises DescriptionError if none answers, now or on later use.
+    """
 
     @contextmanager
     def use() -> Iterator[Executor]:
@@ -152,11 +155,11 @@ def _dask_client(address: str) -> Any:
         from distributed import Client
 
         return Client(address, timeout=10, set_as_default=False)
-    except (OSError, OverflowError, UnicodeError) as error:  # the last: a name that no host can have
+    except (OSError, OverflowError, UnicodeError) as error:  # UnicodeError: an invalid host name
         raise DescriptionError(f"no dask scheduler at {address}: {error}; start one with `dask scheduler`") from None
 
 
 def deaths() -> tuple[type[BaseException], ...]:
-    """What a future raises whose worker has died; dask has words of its own for it, and cancels all when its scheduler is gone."""
+    """Exceptions of a future whose worker has died. Dask has one of its own, and cancels all futures when its scheduler is gone."""
     dask = sys.modules.get("distributed")
     return (BrokenExecutor, CancelledError, *((dask.KilledWorker,) if dask else ()))

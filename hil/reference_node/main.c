@@ -23,7 +23,7 @@
 
 /* To the plant. */
 struct request {
-    double due;  /* slow messages that are sent in this tick, a bit each; OUTPUTS_ALONE: no answer wanted */
+    double due;  /* slow messages sent in this tick, one bit each; OUTPUTS_ALONE: no answer expected */
     struct node_outputs outputs;
 };
 
@@ -61,7 +61,7 @@ static void apply(void *context, const struct node_outputs *outputs)
     tell(board, OUTPUTS_ALONE);
 }
 
-/* Half a tick is the longest that an answer may take; one that comes later is thrown away with the next. */
+/* An answer may take at most half a tick. A later one is discarded while the next answer is awaited. */
 static bool sample(void *context, uint32_t due, struct node_readings *readings)
 {
     struct board *board = context;
@@ -80,7 +80,7 @@ static bool sample(void *context, uint32_t due, struct node_readings *readings)
     return true;
 }
 
-/* A bus that is down or full loses the frame; the firmware counts a node that does not answer. */
+/* A bus that is down or full loses the frame; the firmware counts nodes that do not answer. */
 static void send_frame(void *context, uint16_t id, const uint8_t *data, uint8_t length)
 {
     struct board *board = context;
@@ -128,7 +128,7 @@ static void serve(struct node *node, struct board *board)
     while (!board->is_plant_gone) {
         struct can_frame frame;
         poll(events, 2, WATCH_MS);
-        board->is_plant_gone |= (events[1].revents & (POLLERR | POLLHUP)) != 0;  /* it may end when nothing is told any more */
+        board->is_plant_gone |= (events[1].revents & (POLLERR | POLLHUP)) != 0;  /* it may end while nothing is sent to it */
         while (read(board->can, &frame, sizeof frame) == (ssize_t)sizeof frame) {
             if ((frame.can_id & (CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG)) == 0) {
                 node_take(node, (uint16_t)frame.can_id, frame.data, frame.can_dlc, now_ns());

@@ -1,4 +1,4 @@
-/* The rules of the reference node; node.h says what it is. */
+/* The rules of the reference node, which node.h describes. */
 #include "node.h"
 
 #include <string.h>
@@ -82,7 +82,7 @@ static void take_dock(struct node *node, const uint8_t *data, int64_t now_ns)
     node->hardware.apply(node->hardware.context, &node->applied);
 }
 
-/* Magnets that push go off; those that pull hold joints, and stay. Returns whether there were any. */
+/* Switches off pushing magnets. Pulling ones hold joints and stay on. Returns whether any was pushing. */
 static bool end_push(struct node *node)
 {
     bool pushed = false;
@@ -95,7 +95,7 @@ static bool end_push(struct node *node)
     return pushed;
 }
 
-/* Three scaled axes and a status; GYRO and ACCEL have one layout and factors of their own. */
+/* Sends three scaled axes and a status each: GYRO and ACCEL have the same layout but different factors. */
 static void send_inertial(struct node *node, const struct node_readings *r, uint8_t counter)
 {
     uint8_t data[MESSAGE_BYTES];
@@ -173,7 +173,7 @@ static void pack_environment(uint8_t *data, const double *v)
     modcube_environment_pack(data, &environment, MESSAGE_BYTES);
 }
 
-/* Both docking messages, and all four ESC messages, have one layout each (tests compare them with the DBC). */
+/* Both docking messages share one layout, and so do all four ESC messages (tests compare them with the DBC). */
 static void send_slow(struct node *node, int slow, const struct node_readings *r)
 {
     uint8_t data[MESSAGE_BYTES];
@@ -199,7 +199,7 @@ static void send_status(struct node *node, uint32_t tick, uint8_t errors, uint8_
     send(node, MODCUBE_MCU_STATUS, data, (uint8_t)tick);
 }
 
-/* Applies the last accepted command; returns the state that it leads to. */
+/* Applies the last accepted command; returns the resulting state. */
 static uint8_t apply_command(struct node *node, int64_t now_ns)
 {
     double thruster[NODE_THRUSTERS];
@@ -207,7 +207,7 @@ static uint8_t apply_command(struct node *node, int64_t now_ns)
     for (int half = 0; half < 2; half++) {
         bool live = is_live(node, half, now_ns);
         timed_out = timed_out || !live;
-        disarmed = disarmed || (live && !node->armed[half]);  /* one fresh half that says so disarms both */
+        disarmed = disarmed || (live && !node->armed[half]);  /* one live half that is not armed disarms both */
     }
     for (int i = 0; i < NODE_THRUSTERS; i++) {
         bool allowed = is_live(node, i / 4, now_ns) && !disarmed && !node->stopped;
@@ -247,7 +247,7 @@ static void take_sync(struct node *node, const uint8_t *data, int64_t now_ns)
     send_status(node, sync.tick, errors, state);
 }
 
-/* A frame that was meant for this node and dropped is reported in the next status. */
+/* Records a dropped frame that was meant for this node, for the next status. */
 static void blame(struct node *node, const uint32_t *before)
 {
     const uint32_t *now = node->receiver.dropped;

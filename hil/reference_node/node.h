@@ -1,6 +1,6 @@
 /* Reference node: what the microcontroller of one module does on the bus, without its hardware. SYNC in, status and
- * sensors out, zero thrust after 100 ms of silence, no magnet that pushes after 2 s. No allocation, no clock, no global
- * state: the caller gives the time and three functions of the hardware. can_dbc/README.md says the rules. */
+ * sensors out, zero thrust after 100 ms of silence, pushing magnets off after 2 s. No allocation, no clock, no global
+ * state: the caller provides the time and three hardware functions. The rules are in can_dbc/README.md. */
 #ifndef MODCUBE_NODE_H
 #define MODCUBE_NODE_H
 
@@ -11,17 +11,17 @@
 #define NODE_SLOW (9)
 #define NODE_VERSION (1u)
 #define NODE_TIMEOUT_NS (100000000)  /* a half of THRUSTER_CMD that is older commands zero */
-#define NODE_RELEASE_NS (200000000)  /* an e-stop may be released when none came for so long */
-#define NODE_PUSH_NS (2000000000)  /* a magnet that pushes goes off when DOCK_CMD is older; one that pulls stays */
+#define NODE_RELEASE_NS (200000000)  /* silence of ESTOP frames after which the e-stop may be released */
+#define NODE_PUSH_NS (2000000000)  /* a pushing magnet is switched off when DOCK_CMD is older; a pulling one stays on */
 
-/* What the hardware does. */
+/* Commands to the hardware. */
 struct node_outputs {
     double tick;  /* the last SYNC */
     double thruster[NODE_THRUSTERS];  /* share of full command, -1 to 1 */
     double relay[NODE_FACES];  /* 0 off, 1 forward, 2 reverse */
 };
 
-/* What the sensors say, in the units of the DBC. */
+/* Sensor readings, in the units of the DBC. */
 struct node_readings {
     double gyro[4];  /* x, y, z, status */
     double accel[4];
@@ -35,7 +35,7 @@ struct node_readings {
 struct node_hardware {
     void *context;
     void (*apply)(void *context, const struct node_outputs *outputs);
-    /* Fills in the readings; bit i of `due`: the slow message i (DEPTH is 0) is sent now. False: no sensors. */
+    /* Fills in the readings. Bit i of `due` is set if slow message i (DEPTH is 0) is sent now. False: no sensors. */
     bool (*sample)(void *context, uint32_t due, struct node_readings *readings);
     void (*send)(void *context, uint16_t id, const uint8_t *data, uint8_t length);
 };
@@ -59,13 +59,13 @@ struct node {
 /* A node at rest: nothing commanded, nothing accepted. */
 void node_start(struct node *node, uint8_t number, uint16_t rate_hz, const struct node_hardware *hardware);
 
-/* One frame from the bus at `now_ns`, whatever it holds. */
+/* Handles one frame from the bus at `now_ns`, whatever its content. */
 void node_take(struct node *node, uint16_t id, const uint8_t *data, size_t length, int64_t now_ns);
 
-/* What happens without any frame; call it at least every 10 ms. */
+/* Handles timeouts, which need no frame; call it at least every 10 ms. */
 void node_watch(struct node *node, int64_t now_ns);
 
-/* Bytes of a struct node, for those who do not see it. */
+/* Size of a struct node in bytes, for callers without its definition. */
 size_t node_size(void);
 
 #endif

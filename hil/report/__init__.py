@@ -23,7 +23,7 @@ from hil.signals import Flight
 
 REPORT_FILE = "report.html"
 FRAMES_HZ = 25.0
-"""Samples of the animation a second; it interpolates between them."""
+"""Samples per second of the animation, which interpolates between them."""
 CAPTIONS = {
     "overview": "The whole flight: path in the tank, position and attitude error.",
     "position": "Position per axis: reference, truth and estimate, and what they are off by.",
@@ -41,9 +41,9 @@ TILES = (
     "duration_s",
     "real_time_factor",
 )
-"""Metrics that stand beside the headline."""
+"""Metrics shown beside the headline."""
 DOCK_TILES = ("duration_s", "false_declarations", "tries", "jams", "docked_rmse_m", "join_jump_n", "gap_min_m")
-"""The same of a run that docks."""
+"""The same for a run that docks."""
 MOST_TILES = 6
 NOT_MEASURED = (
     "Everything here was flown in a simulated tank, by the firmware of the vehicle, over the vehicle's CAN frames. "
@@ -53,16 +53,16 @@ NOT_MEASURED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
-    """What the animation draws besides the flight.
+    """What the report and its animation show besides the flight.
 
     Attributes:
         title: heading, such as `Spiral`; description: one sentence under it.
         tank: `box` or `cylinder`; tank_m: (2, 3) its lowest and highest corner, world, m.
-        modules: what each module of the fleet is, in its order.
+        modules: vehicle of each module, in fleet order.
         force_limits_n: (2,) reverse and forward limit of each thruster.
         window: the judged part, s since the flight's first tick.
-        paper_rmse_mm: what the paper measured in the same task, or None.
-        notes: what is assumed or synthetic; shown at the foot.
+        paper_rmse_mm: the paper's measurement in the same task, or None.
+        notes: assumptions and synthetic data; shown at the foot.
     """
 
     title: str
@@ -104,10 +104,10 @@ def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plo
 
 
 def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
-    """What the viewer needs: the scene, and the flight thinned to `FRAMES_HZ`.
+    """Input of the viewer: the scene, and the flight thinned to `FRAMES_HZ`.
 
-    `p`, `q`, `ref_p` and `ref_q` are of the body that was flown; `modules` are all there are, in whichever body. Errors are null
-    until the firmware knows its pose.
+    `p`, `q`, `ref_p` and `ref_q` are of the body that was flown; `modules` are all modules, whichever body they are in. Errors are
+    null before the firmware knows its pose.
     """
     time_s = flight.time_s
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
@@ -135,7 +135,7 @@ def animation(flight: Flight, scene: Scene) -> dict[str, Any]:
 
 
 def _module(vehicle: Vehicle, truth: Columns, member: np.ndarray, keep: slice) -> dict[str, Any]:
-    """What a module is, where it was, what its thrusters gave, and when it was in the body that was flown."""
+    """Geometry of a module, its poses, its thruster forces, and when it was in the body that was flown."""
     return {
         "hull": _short(vehicle.hull.size_m, 4),
         "thrusters": {"p": _short(vehicle.positions, 4), "d": _short(vehicle.directions, 4)},
@@ -147,7 +147,7 @@ def _module(vehicle: Vehicle, truth: Columns, member: np.ndarray, keep: slice) -
 
 
 def _cuts(flight: Flight, keep: slice) -> list[int]:
-    """Frames at which the body that is steered, and the reference with it, is another one: it has more or fewer thrusters."""
+    """Frames at which the number of thrusters changes: there the steered body, and its reference, is a different one."""
     thrusters = np.isfinite(flight.firmware["commanded_n"][keep]).sum(axis=1)
     return (1 + np.flatnonzero(np.diff(thrusters))).tolist()
 
@@ -157,7 +157,7 @@ def _short(values: np.ndarray, digits: int) -> Any:
 
 
 def _known(values: np.ndarray) -> list[float | None]:
-    """Values, and null where there is none, which JSON has no number for."""
+    """The values, with None (null) for those that are not finite, which JSON cannot represent."""
     return [round(value, 3) if math.isfinite(value) else None for value in values.tolist()]
 
 
@@ -166,7 +166,7 @@ def _asset(name: str) -> str:
 
 
 def _headline(result: Result, scene: Scene) -> str:
-    """What the scenario's first check asks for, large; an RMSE beside the paper's, as bars, where the paper flew the same."""
+    """Metric of the scenario's first check in large type; a position RMSE also as a bar beside the paper's, if the paper flew the task."""
     name = _asked_first(result)
     if name == "docked":
         text = _big(shown_value("outcome", result.metrics["outcome"]), "", shown("outcome").label)  # a task may end with an undock
@@ -224,7 +224,7 @@ def _table(result: Result) -> str:
 
 
 def _told(result: Result) -> str:
-    """What a flight lacked, and the firmware's warnings, under the table; nothing where there is none."""
+    """Why no tag was seen and the firmware's warnings, shown under the table; empty if there is neither."""
     lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in result.told)
     lacked = [f"<p>{html.escape(result.unseen)}</p>"] if result.unseen else []
     return "\n".join([*lacked, *([f"<h3>Warnings of the firmware</h3>\n<ul>\n{lines}\n</ul>"] if lines else [])])

@@ -21,7 +21,7 @@ def free_port() -> int:
 
 
 class FlyingBench:
-    """A bench that flies, and what it measured once it has landed."""
+    """A flying bench, and its measurements once it has landed."""
 
     def __init__(self, *arguments: str) -> None:
         command = [sys.executable, "-m", "tests.clients.flying_bench", *arguments]
@@ -33,7 +33,7 @@ class FlyingBench:
         assert self._process.stdout.readline() == "ready\n", "the bench did not start"
 
     def land(self) -> dict[str, Any]:
-        """End it; error of each mode."""
+        """Ends the flight; returns the errors of each mode."""
         try:
             output, _ = self._process.communicate(timeout=STOP_S)
         except subprocess.TimeoutExpired:
@@ -43,7 +43,7 @@ class FlyingBench:
         return dict(json.loads(output.splitlines()[-1]))
 
     def stop(self) -> None:
-        """End it, however the test went: with its input closed it lands by itself."""
+        """Ends the process, however the test went. It lands by itself when its input is closed."""
         if self._process.poll() is None:
             self.land()
 

@@ -1,7 +1,8 @@
 """The robot in its tank behind a ground link, paced by the clock: a process for real clients to connect to.
 
-`python -m tests.clients.flying_bench ADDRESS... [--identity ardusub] [--store DIR] [--pace X]`. Says `ready` once it
-swims, ends when its input closes, and then prints one line of JSON: how far truth was from the set-point in each mode.
+`python -m tests.clients.flying_bench ADDRESS... [--identity ardusub] [--store DIR] [--logs DIR] [--scenario NAME] [--pace X]`.
+Prints `ready` after READY_S, ends when its input closes, and then prints one line of JSON: the distance of the truth from the
+set-point in each mode.
 """
 
 import argparse
@@ -24,13 +25,13 @@ from hil.scenario import load_scenario
 
 PERIOD_S = 0.01
 LONGEST_LAG_S = 0.1
-"""What a slow machine falls behind by more than this is not made up."""
+"""A slow machine catches up a lag of at most this; any excess is dropped."""
 READY_S = 2.0
-"""Until the estimator is sure of its place."""
+"""Time until the estimator is sure of its position."""
 
 
 class Errors:
-    """Distance of truth from the set-point, by mode, and how far the set-point went."""
+    """Distance of the truth from the set-point, and the path length of the set-point, by mode."""
 
     def __init__(self) -> None:
         self._square: dict[str, list[float]] = defaultdict(list)
@@ -56,7 +57,7 @@ class Errors:
 
 
 class Pilot:
-    """In place of the bench's script: hands over what clients ask for, and keeps to the clock."""
+    """Stands in for the bench's script: passes on the clients' requests and keeps pace with the clock."""
 
     ticks = 2**31
 

@@ -1,4 +1,4 @@
-"""What a program with MAVSDK does with the robot; each step prints a line of JSON. Runs in .venv-clients."""
+"""A MAVSDK program that operates the robot; each step prints a line of JSON. Runs in .venv-clients."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from mavsdk.plugins.telemetry import Telemetry
 
 ORIGIN = (30.2084, 120.1614)
 METRES_PER_DEGREE = (110855.9, 96284.0)
-"""At the origin, by the series of metres a degree of WGS 84: independent of the firmware's own conversion."""
+"""Metres per degree at the origin, by the WGS 84 series, independent of the firmware's own conversion."""
 WAYPOINTS = (
     (0.15, 0.10, 0.38), (0.20, -0.10, 0.34), (0.0, -0.20, 0.30), (-0.20, -0.10, 0.36), (-0.15, 0.15, 0.42),
     (0.05, 0.20, 0.38), (0.20, 0.0, 0.32), (0.0, 0.0, 0.38),

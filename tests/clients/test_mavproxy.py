@@ -1,4 +1,4 @@
-"""MAVProxy flies the robot in its tank under ArduSub's identity, by the commands that a person types."""
+"""MAVProxy flies the robot in its tank under ArduSub's identity, with the commands that a person types."""
 
 import os
 import re
@@ -24,7 +24,7 @@ PATIENCE_S = 60.0
 
 
 class MavProxy:
-    """A person at MAVProxy's prompt: types, and reads on until the answer is there."""
+    """A person at MAVProxy's prompt: types commands and reads until the answer appears."""
 
     def __init__(self, port: int, home: Path) -> None:
         command = [
@@ -43,7 +43,7 @@ class MavProxy:
         self._process.stdin.flush()
 
     def read(self, pattern: str) -> re.Match[str]:
-        """Read on until `pattern` is there; what came before it is gone."""
+        """Reads until `pattern` appears; the text before it is discarded."""
         assert self._process.stdout is not None
         end = time.monotonic() + PATIENCE_S
         with selectors.DefaultSelector() as selector:
@@ -84,11 +84,11 @@ def test_mavproxy_flies_the_robot(mavproxy: MavProxy, tmp_path: Path) -> None:
     mission = tmp_path / "mission.txt"
     mission.write_text(MISSION)
     mavproxy.read(r"Mode POSHOLD")
-    # it asks for all by itself; by hand too
+    # MAVProxy requests all parameters by itself; one is fetched by hand too
     mavproxy.read(rf"Received {exposed} parameters")
     fetched = mavproxy.ask("param fetch POS_BW", r"POS_BW = (\S+)")
     assert float(fetched[1]) == pytest.approx(Parameters().control.position_bandwidth)
-    mavproxy.type("param set POS_BW 2.7")  # it says nothing when that worked
+    mavproxy.type("param set POS_BW 2.7")  # prints nothing on success
     while float(mavproxy.ask("param fetch POS_BW", r"POS_BW = (\S+)")[1]) != pytest.approx(2.7):
         pass
     mavproxy.ask("arm throttle", r"ARMED POSHOLD")

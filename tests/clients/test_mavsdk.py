@@ -17,7 +17,7 @@ MISSION_RMSE_MM = 10.0
 
 @pytest.fixture(scope="module")
 def session() -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """What each step of the session said, and the errors of the flight."""
+    """The output of each step of the session, and the errors of the flight."""
     port = free_port()
     with flying_bench(f"udpout:127.0.0.1:{port}") as bench:
         command = [str(CLIENT_PYTHON), str(ROOT / "tests/clients/mavsdk_session.py"), f"udpin://127.0.0.1:{port}"]

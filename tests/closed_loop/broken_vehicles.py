@@ -1,4 +1,4 @@
-"""Vehicles that are built otherwise than their files say, and the checks that notice."""
+"""Vehicles that differ from their files, and the checks that notice it."""
 
 import dataclasses
 import math

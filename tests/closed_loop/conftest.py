@@ -1,6 +1,6 @@
 """Whole flights for tests: the real firmware against the plant in lockstep, judged by the scenario's own checks.
 
-What is broken on purpose is broken on the plant's side; the firmware flies unchanged.
+The fixtures here break the plant's side; the firmware flies unchanged.
 """
 
 import shutil
@@ -23,7 +23,7 @@ from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The log of five seconds, 500 ticks: arms, holds, and begins to climb."""
+    """The log of five seconds, 500 ticks, in which the robot arms, holds, and begins to climb."""
     folder = tmp_path_factory.mktemp("flown")
     fly_scenario(shortened("spiral", duration_s=2.0, settle_s=3.0), 0, Parameters(), folder, "virtual:flown")
     return folder
@@ -31,13 +31,13 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def log(flown: Path, tmp_path: Path) -> Path:
-    """A copy of that log, to spoil."""
+    """A copy of that log for the test to damage."""
     return Path(shutil.copytree(flown, tmp_path / "log"))
 
 
 @pytest.fixture
 def fly(tmp_path: Path) -> Fly:
-    """Flies a scenario on a bus of its own; the logs are in the test's folder."""
+    """Flies a scenario on a separate bus; the logs are in the test's folder."""
 
     def fly_it(scenario: Scenario, seed: int = 0, parameters: Parameters | None = None, folder: str = "run") -> Result:
         return fly_and_judge(scenario, seed, parameters or Parameters(), tmp_path / folder, f"virtual:{tmp_path.name}")
@@ -47,7 +47,7 @@ def fly(tmp_path: Path) -> Fly:
 
 @pytest.fixture
 def rebuild(monkeypatch: pytest.MonkeyPatch) -> Rebuild:
-    """rebuild(change): the robot in the water is `change` of its vehicle file; the firmware knows only the file."""
+    """rebuild(change): applies `change` to the vehicle in the water; the firmware knows only the unchanged file."""
 
     def rebuild_it(change: Callable[[Vehicle], Vehicle]) -> None:
         monkeypatch.setattr(hil.scenario, "load_vehicle", lambda name: change(load_vehicle(name)))

@@ -1,4 +1,4 @@
-"""What the flight tests share: scenarios of another length, and the types of the fixtures in conftest.py."""
+"""Shared by the flight tests: scenarios of another length, and the types of the fixtures in conftest.py."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,7 +15,7 @@ Corrupt = Callable[[Callable[[Frame], Frame], bool], None]
 
 
 def shortened(name: str, duration_s: float | None = None, settle_s: float | None = None) -> Scenario:
-    """Scenario `name` with another length of its task or of the time before it, s."""
+    """Scenario `name` with another duration of its task or of the time before it, s."""
     scenario = load_scenario(name)
     times = {"duration_s": duration_s, "settle_s": settle_s}
     task = dataclasses.replace(scenario.task, **{key: value for key, value in times.items() if value is not None})

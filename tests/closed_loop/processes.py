@@ -1,4 +1,4 @@
-"""Commands of `modcube` as processes of their own, which end by a deadline, and with the test, however it goes."""
+"""Commands of `modcube` as separate processes, which end at a deadline or with the test, however it goes."""
 
 import os
 import signal
@@ -12,18 +12,18 @@ from contextlib import contextmanager, suppress
 DIE_WITH_TEST = f"from firmware_py.runtime.realtime import die_with; die_with({os.getpid()})"
 MODCUBE = [sys.executable, "-c", f"{DIE_WITH_TEST}; from firmware_py.cli import main; main()"]
 DEADLINE_S = 300.0
-"""Longest that a process may take on a machine that is busy with other tests."""
+"""Longest time that a process may take on a machine that is busy with other tests."""
 
 
 def free_group() -> str:
-    """A multicast address that nobody else on this machine uses now."""
+    """A multicast address that no other process on this machine uses now."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return f"udp:239.74.163.9:{probe.getsockname()[1]}"
 
 
 class Running:
-    """A command that runs, in a session of its own."""
+    """A running command, in its own session."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
@@ -40,7 +40,7 @@ class Running:
         raise AssertionError(f"it ended by itself or after {DEADLINE_S:.0f} s, and never said {words}: {said}")
 
     def end(self, how: signal.Signals = signal.SIGINT) -> str:
-        """Sends the signal. Returns what else was said, when nobody is left who could say more."""
+        """Sends the signal, waits until every process has closed the output, and returns the rest of it."""
         self._process.send_signal(how)
         rest, _ = self._process.communicate(timeout=DEADLINE_S)
         assert self._process.returncode == (0 if how == signal.SIGINT else -how), rest
@@ -49,7 +49,7 @@ class Running:
 
 @contextmanager
 def running(*words: str) -> Iterator[Running]:
-    """`modcube WORDS`, killed at the end with all that it started, unless it has ended."""
+    """Runs `modcube WORDS`; kills it at the end with all its children, unless they have ended."""
     process = subprocess.Popen([*MODCUBE, *words], stdout=subprocess.PIPE, text=True, start_new_session=True)
 
     def kill() -> None:

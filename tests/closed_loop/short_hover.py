@@ -1,4 +1,4 @@
-"""A scenario that is over in seconds, for campaigns that are killed."""
+"""A scenario that takes only seconds, for campaigns that are killed."""
 
 SCENARIO = """
 name = "short"

@@ -1,4 +1,4 @@
-"""Bodies of several modules fly their paths with the same gains as one; all seeds belong to `make accept`."""
+"""Bodies of several modules fly their paths with the gains of a single one; all seeds belong to `make accept`."""
 
 import pytest
 
@@ -23,7 +23,7 @@ def test_moebius_strip_is_flown_by_one_two_and_four_modules(fly: Fly, name: str,
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 8])
 def test_healthy_robot_that_turns_over_in_a_current_keeps_all_its_thrusters(fly: Fly, seed: int) -> None:
-    """Its righting arm is off by 3 and 4 mm, and it meets the current from all sides: no motion that a thruster is to blame for."""
+    """The righting arm is off by 3 and 4 mm, and the current meets the robot from all sides; neither motion is a thruster's fault."""
     assert fly(load_scenario("mobius-1").with_ideal_sensors(), seed).metrics["warnings"] == 0.0
 
 

@@ -1,4 +1,4 @@
-"""What is broken on purpose must fail a check: else the checks would prove nothing."""
+"""Deliberate faults must fail a check; otherwise the checks would prove nothing."""
 
 import dataclasses
 import fcntl
@@ -25,7 +25,7 @@ from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
 
 HOVER_S = 20.0
 PROTECTED_FROM = 0x040
-"""Ids below carry no CRC (ESTOP, SYNC); HEARTBEAT is not sent here."""
+"""Lower ids carry no CRC (ESTOP, SYNC); HEARTBEAT is not sent here."""
 
 
 def crc_off_by_one_bit(frame: Frame) -> Frame:
@@ -38,7 +38,7 @@ def crc_off_by_one_bit(frame: Frame) -> Frame:
 @pytest.mark.parametrize("thruster", [0, 4])
 def test_one_reversed_thruster_fails_the_flight(fly: Fly, rebuild: Rebuild, thruster: int) -> None:
     rebuild(lambda vehicle: reversed_thruster(vehicle, thruster))
-    # the firmware finds it and flies on without it, so its warning is what fails
+    # the firmware detects the thruster and flies on without it, so only the check on warnings fails
     assert "warnings" in failed(fly(shortened("hover", HOVER_S)))
 
 
@@ -51,7 +51,7 @@ def test_tag_glued_on_ten_degrees_askew_fails_the_flight(fly: Fly, rebuild: Rebu
 
 @pytest.mark.slow
 def test_drag_feed_forward_of_the_wrong_sign_fails_the_flight(fly: Fly) -> None:
-    """The spiral's drag is a quarter of a newton, which the disturbance makes up for within the check: twice the error shows it."""
+    """The spiral's drag is a quarter of a newton; the disturbance estimate compensates it well enough to pass, but the error doubles."""
     wrong = Parameters().replace("control.drag_feedforward", -1.0)
     assert failed(fly(load_scenario("mobius-1"), 0, wrong)) == {"position_rmse_m"}
     spiral = load_scenario("spiral")
@@ -70,7 +70,7 @@ def test_crc_off_by_one_bit_on_one_side_fails_the_flight(
 
 @pytest.fixture
 def deaf(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """deaf(action, ...): the firmware does not hear these requests."""
+    """deaf(action, ...): the firmware does not receive these requests."""
     step = Firmware.step
 
     def deafen(*actions: Action) -> None:
@@ -140,7 +140,7 @@ def test_undock_that_is_not_heard_and_a_move_that_is_not_flown_are_no_success(fl
 @pytest.mark.slow
 @pytest.mark.parametrize(("at_s", "until_s", "lost"), [(7.0, 1e6, 101), (0.0, 5.5, 150)])
 def test_ticks_without_firmware_are_no_success(fly: Fly, at_s: float, until_s: float, lost: int) -> None:
-    """Also where they are the first of the run: what is judged begins when the task does."""
+    """Also if they are the first ticks of the run: the judged part begins when the task does."""
     hover = shortened("hover", 4.0, 4.0)
     gone = dataclasses.replace(hover, fault=(Fault(kind="process_killed", at_s=at_s, until_s=until_s),))
     result = fly(gone)
@@ -149,7 +149,7 @@ def test_ticks_without_firmware_are_no_success(fly: Fly, at_s: float, until_s: f
 
 @pytest.mark.slow
 def test_ticks_that_both_logs_lack_are_missed(fly: Fly, tmp_path: Path) -> None:
-    """As those that a vehicle's process skips in real time."""
+    """Like the ticks that a vehicle's process skips in real time."""
     hover = shortened("hover", 4.0, 4.0)
     assert fly(hover).passed
     longer = shortened("hover", 4.5, 4.0)
@@ -158,7 +158,7 @@ def test_ticks_that_both_logs_lack_are_missed(fly: Fly, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_task_begins_in_the_first_tick_that_is_not_before_it(fly: Fly) -> None:
-    """At 3.005 s in ticks of 10 ms, so 5 ms late, which is no error of the flight."""
+    """With 3.005 s in ticks of 10 ms the task begins 5 ms late, which does not count as an error of the flight."""
     late, early = (fly(shortened("spiral", 20.0, settle_s)).metrics["position_rmse_m"] for settle_s in (3.005, 3.01))
     assert abs(late - early) < 1e-5
 
@@ -172,7 +172,7 @@ def test_flight_whose_firmware_is_gone_before_the_task_begins_fails_and_ends_no_
 
 @pytest.mark.slow
 def test_folder_holds_one_flight(fly: Fly, tmp_path: Path) -> None:
-    """Nothing of an earlier one stays, and two are not flown into it at once."""
+    """Nothing of an earlier flight remains, and two flights cannot write into it at once."""
     folder = tmp_path / "run"
     folder.mkdir()
     for name in ("report.html", "docking.png", "result.json", "notes.txt"):

@@ -1,4 +1,4 @@
-"""The same flight on every bus: in lockstep neither the bus nor strangers on it change it. tests/vcan: on SocketCAN."""
+"""The same flight on every bus: in lockstep neither the bus nor foreign frames on it change it. tests/vcan: on SocketCAN."""
 
 import dataclasses
 import os
@@ -22,13 +22,13 @@ from hil.scenario import Scenario, Step, load_scenario
 from tests.closed_loop.flights import shortened
 
 UDP = f"udp:239.74.163.4:{40_000 + os.getpid() % 20_000}"
-"""A port of its own for each process: test processes run side by side."""
+"""A separate port for each process, because test processes run in parallel."""
 STRANGERS = (Frame(0x71E, bytes(8)), Frame(0x7FE, b""), Frame(0x0A1, bytes(8)), Frame(0x441, b"no"))
 """A wrong length, an unknown id, a wrong CRC and a wrong length in the robot's own ids."""
 
 
 def fly(scenario: Scenario, bus: str, folder: Path, stranger: Port | None = None) -> dict[str, bytes]:
-    """The logs of one flight. From when the robot is armed, `stranger` sends in every tick."""
+    """The logs of one flight. Once the robot is armed, `stranger` sends in every tick."""
     folder.mkdir()
 
     def disturb(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
@@ -45,7 +45,7 @@ def fly(scenario: Scenario, bus: str, folder: Path, stranger: Port | None = None
 
 
 def sent(logs: dict[str, bytes]) -> list[bytes]:
-    """What the firmware sent."""
+    """The frames that the firmware sent."""
     return [line for line in logs[CAN_LOG].splitlines() if line.endswith(b" T")]
 
 

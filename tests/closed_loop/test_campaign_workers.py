@@ -1,4 +1,4 @@
-"""Campaigns on real workers: a cluster that loses one or its scheduler, a campaign killed with its processes, a seed that kills its own."""
+"""Campaigns on real workers: a cluster loses a worker or its scheduler, a campaign is killed, a seed kills its own process."""
 
 import importlib
 import os
@@ -37,18 +37,18 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(scenario: Path) -> list[bytes]:
-    """The tables of a campaign that nothing befell, flown in this process."""
+    """The tables of an undisturbed campaign, flown in this process."""
     return completed(scenario, scenario.parent / "whole")
 
 
 def completed(scenario: Path, out: Path) -> list[bytes]:
-    """The tables of the campaign in `out`, whose missing trials are flown in this process."""
+    """The tables of the campaign in `out`, after flying its missing trials in this process."""
     run_campaign(load_scenario(str(scenario)), Parameters(), range(TRIALS), Inline, out)
     return tables(out)
 
 
 def campaign(scenario: Path, out: Path, *arguments: str, errors: IO[bytes] | None = None) -> subprocess.Popen[bytes]:
-    """modcube hil campaign, in a group of its own."""
+    """Starts modcube hil campaign in its own process group."""
     command = [sys.executable, "-c", "from firmware_py.cli import main; main()", "hil", "campaign", str(scenario)]
     words = [*command, "--trials", str(TRIALS), "--draw", "0", "--out", str(out), *arguments]
     return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True)
@@ -60,9 +60,9 @@ def flown(out: Path) -> int:
 
 
 def wait_for(out: Path, trials: int, process: subprocess.Popen[bytes]) -> None:
-    """Until so many trials are on the disk."""
+    """Waits until this many trials are on the disk."""
     while flown(out) < trials:
-        with pytest.raises(subprocess.TimeoutExpired):  # it has not ended
+        with pytest.raises(subprocess.TimeoutExpired):  # the process is still running
             process.wait(0.05)
 
 
@@ -72,7 +72,7 @@ def tables(out: Path) -> list[bytes]:
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """Address of a dask scheduler; its two workers and itself, all with this Python."""
+    """Address of a dask scheduler, and the processes of its two workers and itself, all with this Python."""
     log, dask = folder / "scheduler.log", [sys.executable, "-m", "distributed.cli.dask_scheduler"]
     with log.open("wb") as file:
         scheduler = subprocess.Popen([*dask, "--host", "127.0.0.1", "--port", "0", "--no-dashboard"], stderr=file)
@@ -108,7 +108,7 @@ def test_campaign_killed_with_all_its_processes_goes_on_to_the_same_bytes(whole:
 def test_dask_cluster_that_loses_a_worker_gives_the_same_table_and_when_its_scheduler_is_lost_the_campaign_goes_on_elsewhere(
     whole: list[bytes], scenario: Path, tmp_path: Path
 ) -> None:
-    """One cluster for both: to start it takes longer than the flights."""
+    """One cluster for both, because starting it takes longer than the flights."""
     first, second, said = tmp_path / "first", tmp_path / "second", tmp_path / "said"
     with cluster(tmp_path) as (address, (worker, _, scheduler)):
         process = campaign(scenario, first, "--dask", address)
@@ -148,8 +148,8 @@ def test_seed_that_kills_its_process_costs_no_other(tmp_path: Path, monkeypatch:
         run_campaign(load_scenario("hover"), Parameters(), range(20), processes(2), tmp_path)
     assert len((tmp_path / TRIALS_FILE).read_bytes().splitlines()) == 1 + 19
     started = (tmp_path / "started").read_text().split()
-    assert started.count("0") == 4  # with all, with few, and alone twice
-    assert len(started) <= 19 + 4 + 2 * 3  # and what two processes had under way at the two deaths that were not alone
+    assert started.count("0") == 4  # with all, with a few, and twice alone
+    assert len(started) <= 19 + 4 + 2 * 3  # plus the trials under way in two processes at the two deaths that were not alone
 
 
 def test_workers_end_with_the_process_that_began_them() -> None:
@@ -198,7 +198,7 @@ PRESS = "os.killpg(0, signal.SIGINT)"
 
 @pytest.mark.parametrize("moment", ["at_import", "in_flight"])
 def test_workers_that_a_terminal_interrupts_end_at_once_without_a_word_and_leave_no_file(moment: str, tmp_path: Path) -> None:
-    """It tells all of them."""
+    """A terminal signals all of them."""
     (tmp_path / "tmp").mkdir()
     (tmp_path / "program.py").write_text(PROGRAM.format(**{"at_import": "pass", "in_flight": "pass", moment: PRESS}), encoding="utf-8")
     places = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(tmp_path / "tmp")}

@@ -1,4 +1,4 @@
-"""Docks flown whole, one seed of each scenario; hundreds of seeds belong to `make accept`."""
+"""Complete docks, one seed of each scenario; hundreds of seeds belong to `make accept`."""
 
 import dataclasses
 from pathlib import Path
@@ -18,7 +18,7 @@ from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly
 
 LARGEST_JUMP_N = 1.0
-"""Of a thruster's command in the tick in which two bodies become one."""
+"""Largest step of a thruster's command in the tick in which two bodies become one."""
 
 
 @pytest.mark.slow
@@ -33,7 +33,7 @@ def test_modules_dock_and_no_command_jumps(fly: Fly, name: str) -> None:
 
 @pytest.mark.slow
 def test_both_pieces_know_where_they_are_from_the_first_pictures_after_an_undock(fly: Fly, tmp_path: Path) -> None:
-    """The magnets have pushed them apart for most of a second by then, while they were believed to be one."""
+    """By then the magnets have pushed them apart for most of a second, while the firmware still took them for one body."""
     fly(load_scenario("dock-undock-dock"), 1)
     believed = read_signals(tmp_path / "run" / "signals.mcap")
     truth = read_signals(tmp_path / "run" / "truth.mcap")
@@ -64,7 +64,7 @@ def test_both_come_to_meet_each_other_where_that_is_asked_for(fly: Fly, tmp_path
 
 @pytest.mark.slow
 def test_paper_s_dock_is_not_tried_again(fly: Fly) -> None:
-    """Seed 0 of its world jams."""
+    """Seed 0 jams in the paper's world."""
     scenario = load_scenario("dock")
     metrics = fly(scenario, 0, PAPER).metrics
     assert (metrics["docked"], metrics["tries"], metrics["jams"]) == (0.0, 1.0, 1.0)
@@ -89,12 +89,12 @@ def test_lower_module_that_nobody_sees_is_refused_and_nothing_moves(fly: Fly) ->
 def test_module_that_passes_close_by_with_magnets_on_is_not_believed_docked(fly: Fly) -> None:
     metrics = fly(load_scenario("dock-near-miss"), 0).metrics
     assert metrics["false_declarations"] == 0.0
-    assert metrics["docked"] == 1.0  # they are apart, as wanted
+    assert metrics["docked"] == 1.0  # they have parted, as wanted
 
 
 @pytest.mark.slow
 def test_detector_needs_both_conditions() -> None:
-    """Through real frames: each condition alone would have believed in docks that were none; together they believe in none."""
+    """Through real frames: each condition alone would have declared false docks; both together declare none."""
     found = near_miss.count(range(90))
     assert found["misses"] > 40
     assert found["current"] >= 3
@@ -105,8 +105,8 @@ def test_detector_needs_both_conditions() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("magnet", [0.0, -1.0])
 def test_module_whose_magnet_fails_in_flight_is_missed(fly: Fly, tmp_path: Path, magnet: float) -> None:
-    """One dead coil leaves half of the pull, which holds: the pair stops, and stays one. One that repels tears the joint open: the two
-    are flown apart.
+    """One dead coil leaves half of the pull, which holds: the pair stops and stays one body. A repelling coil tears the joint open, and the
+    two then fly separately.
     """
     scenario = load_scenario("mobius-2")
     fault = Fault(kind="magnet", module=2, index=FACE_NAMES.index("-x"), value=magnet, at_s=16.0)

@@ -1,4 +1,4 @@
-"""Every fault in one mode, and the judge of the matrix on flights that broke their promise. All modes: `modcube hil campaign faults`."""
+"""Every fault in one mode, and the matrix's verdict on flights that broke their promise. All modes: `modcube hil campaign faults`."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ from hil.scenario import MODES
 
 BY_NAME = {row.name: row for row in ROWS}
 ELSEWHERE = {"magnet", "jets"}
-"""Faults of docking bodies."""
+"""Faults of docking bodies, tested elsewhere."""
 
 
 def test_table_breaks_everything_that_can_break() -> None:
@@ -46,7 +46,7 @@ def test_leak_brings_the_robot_up_from_every_mode(mode: str) -> None:
     [("IMU frozen", "MOTOR_DETECT"), ("ground station silent", "MOTOR_DETECT"), ("thruster stuck at half", "AUTO")],
 )
 def test_robot_that_tumbles_or_is_turned_over_comes_to_rest(fault: str, mode: str) -> None:
-    """One thruster after another at 3 N turns a module on its head; one stuck at half its speed turns it by 20 deg until it is left out."""
+    """One thruster after another at 3 N turns a module upside down; one stuck at half its speed turns it by 20 deg until it is left out."""
     assert fly_cell(BY_NAME[fault], mode, 0).broken == ()
 
 

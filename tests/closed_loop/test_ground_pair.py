@@ -22,11 +22,11 @@ AXES = {
     "forward": (0, {"x": HALF}), "right": (1, {"y": HALF}), "down": (2, {"z": 250}),
     "right side down": (3, {"t": HALF}), "nose up": (4, {"s": HALF}), "clockwise": (5, {"r": HALF}),
 }  # fmt: skip
-"""Axis of the body, and the stick that moves it to its positive end."""
+"""Axis of the body, and the stick that moves the body along it in the positive direction."""
 
 
 class Pilot:
-    """In place of the bench's script: a client that arms and then holds one stick after another."""
+    """Stands in for the bench's script: a client that arms and then holds one stick after another."""
 
     trusted = False
 
@@ -55,7 +55,7 @@ class Pilot:
 
 @pytest.fixture(scope="module")
 def flight() -> tuple[Pilot, np.ndarray, np.ndarray]:
-    """The pilot afterwards, and place (k, 3) and attitude (k, 4) of the pair at each tick."""
+    """The pilot after the flight, and position (k, 3) and attitude (k, 4) of the pair at each tick."""
     places, attitudes = [], []
     with ExitStack() as stack:
         bench = open_bench(stack, load_scenario("mobius-2"), 0, Parameters())

@@ -12,7 +12,7 @@ from hil.signals import read_flight
 from tests.closed_loop.flights import Fly, shortened
 
 HOVER_S = 20.0
-"""Of the scenario's 60 s; the full length belongs to `make accept`."""
+"""Duration flown, of the scenario's 60 s; the full length belongs to `make accept`."""
 SINGLE_SEED_LIMIT_M = 0.005
 
 
@@ -21,7 +21,7 @@ def test_module_in_still_water_with_ideal_sensors_keeps_its_place_within_half_a_
     result = fly(shortened("hover", HOVER_S).with_calm_world().with_ideal_sensors())
     assert result.passed
     assert result.metrics["position_rmse_m"] <= 0.0005  # 0.18 mm measured; the tag's frame has steps of 0.5 mm
-    assert result.metrics["attitude_rmse_rad"] <= 0.003  # one tag arrives 0.0031 rad off: can_dbc/README.md
+    assert result.metrics["attitude_rmse_rad"] <= 0.003  # encoding one tag attitude costs 0.0031 rad RMS: can_dbc/README.md
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -30,7 +30,7 @@ def test_module_with_real_sensors_in_a_gusty_current_keeps_its_place_within_five
 ) -> None:
     result = fly(shortened("hover", HOVER_S), seed)
     assert result.passed
-    assert 0.0005 <= result.metrics["position_rmse_m"] <= SINGLE_SEED_LIMIT_M  # better than 0.5 mm would be a leak
+    assert 0.0005 <= result.metrics["position_rmse_m"] <= SINGLE_SEED_LIMIT_M  # below 0.5 mm the estimator would have to leak the truth
     assert result.metrics["ticks"] == pytest.approx(100 * HOVER_S, abs=1)
     assert result.metrics["unmatched_ticks"] == 0
 
@@ -44,7 +44,7 @@ def test_estimate_of_a_hovering_module_is_as_good_as_it_says(fly: Fly) -> None:
 
 
 def errors_in_sigmas(folder: Path, seed: int, rate_hz: int) -> np.ndarray:
-    """(k, 6) errors of the estimated pose of a hover that has settled, in the sigmas that the estimator tells."""
+    """(k, 6) errors of the estimated pose in a settled hover, in the estimator's own sigmas."""
     folder.mkdir()
     scenario = shortened("hover", 10.0)
     fly_scenario(scenario, seed, Parameters(), folder, f"virtual:{folder.name}", rate_hz)
@@ -57,7 +57,7 @@ def errors_in_sigmas(folder: Path, seed: int, rate_hz: int) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [50, 100, 200, 400])
 def test_estimate_is_as_good_as_it_says_at_every_tick_rate(rate_hz: int, tmp_path: Path) -> None:
-    """Over several seeds: how far off the tags of a flight are on the mean is one draw, which turns the whole flight alike (seed 3)."""
+    """Uses several seeds, because the mean tag error of a flight is a single draw that turns the whole flight alike (seed 3)."""
     off = np.vstack([errors_in_sigmas(tmp_path / f"{rate_hz}-{seed}", seed, rate_hz) for seed in range(4)])
     assert 0.5 <= np.mean(np.square(off)) <= 1.2
     assert np.mean(np.abs(off) <= 3.0) >= 0.985

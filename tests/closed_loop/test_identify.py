@@ -1,6 +1,6 @@
-"""A robot that differs from its vehicle file is shaken on the bench, and told from its log alone: one plant, short.
+"""A robot that differs from its vehicle file is excited on the bench and identified from its log alone: one plant, a short flight.
 
-tools/identify_plants.py does ten of three minutes; `make accept ONLY=identify`.
+tools/identify_plants.py does ten plants of three minutes; `make accept ONLY=identify`.
 """
 
 import copy
@@ -38,7 +38,7 @@ SEED, SECONDS = 5, 20.0
 
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
-    """The log's folder, and what was found against what is so."""
+    """The folder of the log, and the identified values with the true ones."""
     folder = tmp_path_factory.mktemp("identify")
     return folder / str(SEED), identify_plants.examine(SEED, folder, SECONDS)
 
@@ -51,7 +51,7 @@ def equations(plant: tuple[Path, dict]) -> object:
 
 
 def test_plant_is_found_from_its_log(plant: tuple[Path, dict]) -> None:
-    """Twenty seconds. Each bar is one that the vehicle file itself fails."""
+    """Twenty seconds. The vehicle file itself fails each of these limits."""
     found = identify_plants.summary([plant[1]])
     for kind in (identify_plants.MASS, identify_plants.DRAG):
         assert found[kind] < 0.05 < found[f"{kind}_before"]
@@ -85,7 +85,7 @@ def test_without_a_reference_no_mass_is_stated(
 
 
 def test_wrong_shape_of_the_measured_curve_moves_no_gain(equations) -> None:  # type: ignore[no-untyped-def]
-    """Reverse 2 % strong, small commands some per cent off: as by the noise of a load cell. Thrusters push one way more than the other."""
+    """Reverse is 2 % too strong and small commands some per cent off, as by load-cell noise. Thrusters push more one way than the other."""
     free = without_weight(equations)
     x = identify_model.beginning(free.vehicle)
     x["gain"] = x["gain"] * np.linspace(0.95, 1.05, 8)
@@ -107,7 +107,7 @@ def test_weight_that_neither_came_nor_went_states_no_mass(
 
 
 def test_with_a_curve_it_leaves_a_vehicle_file_of_the_plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Thirty seconds: after twenty the thrusters' lag is known to ten percent, which is just what a vehicle file asks for."""
+    """Thirty seconds: after twenty the thrusters' lag is only known to ten percent, which a vehicle file just permits."""
     identify_plants.examine(SEED, tmp_path / "flown", 30.0)
     vehicle = load_vehicle("modcube")
     curve = tmp_path / "curve.toml"
@@ -122,14 +122,14 @@ def test_with_a_curve_it_leaves_a_vehicle_file_of_the_plant(tmp_path: Path, monk
 
 
 def test_one_factor_of_everything_changes_no_motion(equations) -> None:  # type: ignore[no-untyped-def]
-    """The errata's homogeneity: so no log alone can tell a mass."""
+    """The homogeneity of the errata: no log alone determines a mass."""
     x = identify_model.beginning(equations.vehicle) | {"current": np.array([0.05, -0.02, 0.0]), "bias": np.full(3, 0.03)}
     x["offset"], x["crossflow"], x["weight"] = np.full(3, 0.01), np.full(3, 0.2), np.array([0.3])
     factor, logarithms, rest = 1.3, ("mass", "inertia"), ("lag", "deadband", "shape", "current", "bias")
     scaled = {k: v + np.log(factor) if k in logarithms else v * (1.0 if k in rest else factor) for k, v in x.items()}
     free = without_weight(equations)
     assert free.predict(scaled) == pytest.approx(free.predict(x), rel=1e-9, abs=1e-12)
-    assert np.abs(equations.predict(scaled) - equations.predict(x)).max() > 0.01  # a known weight tells
+    assert np.abs(equations.predict(scaled) - equations.predict(x)).max() > 0.01  # a known weight makes the difference
 
 
 def without_weight(equations):  # type: ignore[no-untyped-def]
@@ -140,7 +140,7 @@ def without_weight(equations):  # type: ignore[no-untyped-def]
 
 
 def test_known_weight_takes_the_place_of_the_load_cell(equations) -> None:  # type: ignore[no-untyped-def]
-    """The flight as it would have been with 2 N hung on for half of it, by the equations, and white noise."""
+    """Uses a flight simulated by the equations with 2 N attached for half of it, plus white noise."""
     x = identify_model.beginning(equations.vehicle)
     x["mass"] = x["mass"] + 0.2
     x["gain"] = x["gain"] * np.linspace(1.1, 1.3, 8)
@@ -181,7 +181,7 @@ def test_log_of_five_seconds_is_refused_and_leaves_no_empty_folder(
 
 @pytest.mark.parametrize("seed", [0, 4])
 def test_healthy_robot_that_turns_while_it_swims_keeps_all_its_thrusters(fly: Fly, seed: int, tmp_path: Path) -> None:
-    """Its masses differ by a tenth from axis to axis and the flow brakes its turns: no motion that a thruster is to blame for."""
+    """The masses differ by a tenth between axes, and the flow damps the turns; neither motion is a thruster's fault."""
     file = tmp_path / "shake.toml"
     file.write_text(identify_excitation.excitation(identify_excitation.MOTIONS, "modcube", duration_s=90.0), encoding="utf-8")
     result = fly(load_scenario(str(file)), seed)

@@ -1,6 +1,4 @@
-"""`modcube hil run` that somebody stops with Ctrl-C, and again at once, as impatient people do, or with SIGTERM: one line, and the log is
-whole.
-"""
+"""`modcube hil run` stopped by Ctrl-C twice in a row, as by impatient users, or by SIGTERM: prints one line, and the log is complete."""
 
 import signal
 import subprocess
@@ -72,7 +70,7 @@ CPUCodeLibrary._object_getbuffer_hook = classmethod(loaded)
 
 
 def run(folder: Path, how: str, *options: str, ending: str = "SIGINT", status: int = 128 + signal.SIGINT) -> str:
-    """What a run that is told twice to end says on stderr, until the last of its processes has closed that."""
+    """The stderr of a run that gets the signal twice, up to where the last of its processes has closed it."""
     (folder / "long.toml").write_text(LONG)
     program = PROCESS.format(ending=ending, die=DIE_WITH_TEST, how=how)
     words = [sys.executable, "-c", program, "hil", "run", "long.toml", "--out", "run", *options]

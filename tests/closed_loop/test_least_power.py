@@ -1,4 +1,4 @@
-"""Least power against least squares on the Moebius strip, at its own speed: less from the supply, the same path."""
+"""Least-power against least-squares allocation on the Moebius strip, at the scenario's speed: less supply power, same path."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ from firmware_py.description.parameters import CONTROLLERS
 from tests.closed_loop.flights import Fly, shortened
 
 LAPS, LAP_S = 1.0, 30.0
-"""Of the scenario's two laps in 60 s; both, and more worlds, belong to `make accept`."""
+"""Laps flown, of the scenario's two in 60 s; both, and more worlds, belong to `make accept`."""
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Sixty-four docked modules fly as one does: in a process of its own, against water of the controller's own model."""
+"""Sixty-four docked modules fly like one, in a separate process, in water that follows the controller's own model."""
 
 import json
 import subprocess
@@ -13,7 +13,7 @@ PROGRAM = Path(__file__).parents[2] / "tools" / "bench_fleet.py"
 @pytest.mark.slow
 @pytest.mark.parametrize("edge", [1, 2, 4])
 def test_cube_of_modules_holds_its_place_in_the_current_within_300_megabytes(edge: int) -> None:
-    """The program exits with an error where a body does not arm, disarms, or leaves out a thruster that pushes as it should."""
+    """The program exits with an error if a body does not arm, disarms, or leaves out a healthy thruster."""
     done = subprocess.run([sys.executable, str(PROGRAM), str(edge)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)

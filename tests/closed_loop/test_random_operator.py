@@ -1,4 +1,4 @@
-"""Robots whose operator asks for anything, and robots that are broken so that each rule is."""
+"""Robots with a random operator, and robots broken so that each rule is violated."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The C reference node flies: in place of the plant's own MCU, frame for frame the same as it."""
+"""The C reference node flies in place of the plant's own MCU, with the same frames."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> CDLL:
 
 
 def fly(bench: Bench) -> tuple[list[Any], float]:
-    """The frames of every tick, and how fast the module was in the end, m/s."""
+    """The frames of every tick, and the final speed of the module, m/s."""
     log: list[Any] = []
 
     def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
@@ -142,7 +142,7 @@ def test_estop_ends_pushing_at_once_and_until_it_is_released(nodes: CNodes) -> N
 
 
 def test_c_node_switches_its_magnets_as_the_plants_own_does_frame_for_frame(nodes: CNodes) -> None:
-    """Frames come, stay away, and come again around the 2 s and an e-stop."""
+    """Frames come, stop, and come again around the 2 s timeout and an e-stop."""
     scenario = shortened("hover", 1.0)
     own = make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, scenario)
     stop, release = [Frame(0x000, b"")], thrust(0.0, DISARMED, 2)

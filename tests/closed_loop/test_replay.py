@@ -1,4 +1,4 @@
-"""A recorded flight goes through the same code again and comes out the same, and what does not is named."""
+"""A recorded flight is replayed through the same code with the same result; any difference is named."""
 
 import dataclasses
 import re
@@ -25,9 +25,9 @@ from tests.closed_loop.flights import Fly, shortened
 
 TICKS = 500
 THRUSTER_CMD_A, GYRO = "081", "101"
-"""Ids of the one module."""
+"""Ids of the only module."""
 NOISE = "\x1b" * 9000
-"""What no line should hold, and no terminal should be given."""
+"""Content that no line should hold and no terminal should receive."""
 
 
 def spoil(path: Path, frame_id: str, tick: int, change: int) -> None:
@@ -151,7 +151,7 @@ def test_logs_of_two_flights_are_not_taken_for_one(log: Path) -> None:
 
 
 def spoil_messages(path: Path) -> None:
-    """From the first message of a tick on, the signal log is noise; its end says that it is whole."""
+    """Turns the signal log into noise from the first message of a tick on, but keeps the end that marks it as complete."""
     data = path.read_bytes()
     first = next(message.data for message in read_messages(path) if message.topic == TICKS_TOPIC)
     begin = data.index(first) - 64
@@ -160,7 +160,7 @@ def spoil_messages(path: Path) -> None:
 
 @pytest.mark.parametrize(("spoilt", "why"), [(CAN_LOG, "can.log ends before tick 1"), (SIGNAL_LOG, "signals.mcap ends before can.log")])
 def test_log_without_a_whole_tick_is_no_replay(log: Path, spoilt: str, why: str) -> None:
-    """Nothing is said of bytes that were never compared, nor of a way to mend it: there is none."""
+    """No claim is made about bytes that were never compared, nor about a repair, since none is possible."""
     if spoilt == CAN_LOG:
         (log / CAN_LOG).write_bytes(b"")
     else:
@@ -197,7 +197,7 @@ def test_line_that_is_no_frame_is_named_in_short(log: Path) -> None:
 
 @pytest.mark.parametrize("frame", ["FFFFFFFF#00", "-101#00", f"101#{'00' * 65}"])
 def test_frame_that_no_bus_carries_is_named(log: Path, frame: str) -> None:
-    """A byte that was spoilt on the disk makes such a one of another."""
+    """A corrupt byte on disk can turn a valid frame into such a one."""
     lines = (log / CAN_LOG).read_text().splitlines(True)
     at = next(i for i, line in enumerate(lines) if f" {GYRO}#" in line)
     lines[at] = f"{lines[at].partition(' ')[0]} can0 {frame} R\n"
@@ -241,7 +241,7 @@ def test_sent_line_that_is_no_frame_differs_in_short(log: Path) -> None:
 
 
 def test_spoilt_configuration_is_refused(log: Path) -> None:
-    """The attachment has no checksum of its own where it was written as the log went on."""
+    """The attachment has no checksum of its own if it was written while the log was growing."""
     data = (log / SIGNAL_LOG).read_bytes()
     begin = data.index(b'{"') + 1
     (log / SIGNAL_LOG).write_bytes(data[:begin] + b"!" + data[begin + 1 :])

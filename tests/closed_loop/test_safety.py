@@ -1,6 +1,6 @@
-"""People put their hands near these thrusters: the figures of `make accept`, on a few seeds.
+"""People put their hands near these thrusters: the safety figures of `make accept`, on a few seeds.
 
-Thrusters that die or lie on the spiral, lost frames, e-stops at any tick, tags that stay away, a million frames that nobody should send.
+Thrusters that die or lie on the spiral, lost frames, e-stops at any tick, missing tags, fuzzed frames (a million in `make accept`).
 """
 
 import dataclasses
@@ -65,7 +65,7 @@ def test_healthy_spiral_blames_no_thruster() -> None:
 
 @pytest.mark.slow
 def test_module_that_turns_over_while_nobody_drives_it_is_armed_and_comes_to_rest() -> None:
-    """This one does not float upright: to wait until it is still would be to wait until it shows no tag."""
+    """This module does not float upright; by the time it came to rest it would show no tag."""
     turning = np.linalg.norm(flown(timed("hover-blind", 3.0, 2.0), 41).firmware["nu"][:, 3:], axis=1)
     assert turning[:110].max() > 1.0
     assert turning[-50:].max() < 0.1
@@ -91,7 +91,7 @@ def test_after_an_e_stop_nothing_turns_whatever_else_happens(seed: int) -> None:
 
 
 def test_stop_that_was_raised_before_the_start_stands_though_the_first_answers_of_the_modules_are_lost() -> None:
-    """A module lets go of it at the first command that says disarmed: none may be sent before it is known."""
+    """A module releases its stop at the first DISARMED command, so none may be sent before the stop is known."""
     silence = Fault(kind="frame_loss", value=1.0, at_s=0.0, until_s=0.035, direction="from_plant")
 
     def press(bench: Bench) -> None:
@@ -107,7 +107,7 @@ def test_stop_that_was_raised_before_the_start_stands_though_the_first_answers_o
 @pytest.mark.slow
 @pytest.mark.parametrize("direction", ["both", "from_plant"])
 def test_docked_module_that_falls_silent_is_carried_in_place_by_the_other(direction: str) -> None:
-    """With its bias of another, what is left of the mean IMU drove the pair 25 mm off."""
+    """When the mean IMU lost one module's share, the change of its bias used to drive the pair 25 mm off."""
     silence = Fault(kind="frame_loss", value=1.0, at_s=6.0, module=2, direction=direction)
     off_m: list[float] = []
 
@@ -138,7 +138,7 @@ def fly(scenario: str, seconds: float, fault: Fault, prepare: Callable[[Bench], 
 
 @pytest.mark.slow
 def test_hover_without_tags_drifts_no_farther_than_it_says_and_less_with_a_quieter_imu() -> None:
-    """How far is a figure of `make accept`: gusts that move the whole water drift even a perfect filter (tools/accept_safety.py)."""
+    """The drift itself is a figure of `make accept`: gusts that move all the water carry even a perfect filter (tools/accept_safety.py)."""
     shipped, quiet = ([hover_blind(seed, imu) for seed in range(6)] for imu in (None, ICM_20602))
     assert max(flight.error_m for flight in [*shipped, *quiet]) <= 0.25
     assert np.abs([flight.normalised for flight in [*shipped, *quiet]]).max() <= 3.0

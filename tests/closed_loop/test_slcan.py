@@ -1,4 +1,4 @@
-"""A module behind serial CAN adapters flies as on any bus, and goes on when an adapter was pulled out and plugged in."""
+"""A module behind serial CAN adapters flies as on any bus, and continues after an adapter is unplugged and plugged in again."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 
 def fly(folder: Path | None, observe: Callable[[Bench, int, Outputs], None] | None = None) -> list[tuple[BusFrame, ...]]:
-    """What the firmware sent in each tick of a hover; over slcan adapters in `folder`, or over the virtual bus."""
+    """The frames that the firmware sent in each tick of a hover, over slcan adapters in `folder` or over the virtual bus."""
     log: list[tuple[BusFrame, ...]] = []
 
     def note(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:

@@ -1,4 +1,4 @@
-"""The paper's spiral, whole and with the acceptance bars of one seed; all twenty seeds belong to `make accept`."""
+"""The paper's complete spiral with the acceptance limits of one seed; all twenty seeds belong to `make accept`."""
 
 import pytest
 
@@ -10,7 +10,7 @@ WORST_SEED_LIMIT_M = 0.008
 ATTITUDE_LIMIT_RAD = 0.0261799
 """1.5 deg."""
 PAPER_BAND_M = (0.008, 0.040)
-"""Around the 20.92 mm of the paper's real tank; outside it the world or the baseline is wrong."""
+"""Range around the 20.92 mm of the paper's real tank; outside it the world or the baseline is wrong."""
 
 
 @pytest.mark.slow
@@ -33,7 +33,7 @@ def test_paper_controller_on_the_same_spiral_errs_about_as_much_as_the_paper_mea
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_heavy_bluerov_flies_the_same_spiral_a_hand_from_the_walls(fly: Fly, seed: int) -> None:
-    """Its drag is ten times the module's per kilogram, so that the current disturbs it ten times as much."""
+    """Its drag per kilogram is ten times the module's, so the current disturbs it ten times as much."""
     result = fly(load_scenario("spiral").with_vehicle("bluerov2_heavy"), seed)
     assert result.passed
 

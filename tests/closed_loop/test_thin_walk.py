@@ -1,4 +1,4 @@
-"""Each of the four uses once, end to end: the vehicle's process, a tuning script, and a dock seen through the bus."""
+"""The main uses once each, end to end: the vehicle's process, a tuning script, and a dock seen through the bus."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Whatever happens to the process or its disk: the log is there up to a second before, is read up to its tear, and can be mended."""
+"""Whatever happens to the process or its disk, the log is kept up to a second before, is readable up to the damage, and can be repaired."""
 
 import errno
 import os
@@ -59,7 +59,7 @@ def ticks_of(folder: Path) -> list[int]:
 
 
 def tear(path: Path, share: float) -> None:
-    """Leaves only the beginning of a file."""
+    """Cuts a file down to this share of its beginning."""
     data = path.read_bytes()
     path.write_bytes(data[: round(share * len(data))])
 
@@ -146,7 +146,7 @@ def test_mend_that_is_killed_between_two_renames_loses_nothing(
 @pytest.mark.parametrize("fill", [b"\0", b"\xff", b"\n", b"\r", b"7"])
 @pytest.mark.parametrize("begin", [100_000, 100_017])
 def test_can_log_with_a_spoilt_block_is_read_up_to_it_and_mended(log: Path, fill: bytes, begin: int) -> None:
-    """As a disk leaves it that lost its power, or a card that wears out."""
+    """As left by a disk that lost power, or by a worn-out card."""
     path = log / CAN_LOG
     data = path.read_bytes()
     path.write_bytes(data[:begin] + 4096 * fill + data[begin + 4096 :])
@@ -164,7 +164,7 @@ def test_can_log_with_a_spoilt_block_is_read_up_to_it_and_mended(log: Path, fill
 
 
 def test_block_that_can_log_holds_twice_is_not_kept_by_its_mending(log: Path) -> None:
-    """The ticks before the damage stand in it once more."""
+    """The repeated block contains the ticks before the damage a second time."""
     path, begin = log / CAN_LOG, 100_017
     data = path.read_bytes()
     path.write_bytes(data[:begin] + data[begin - 8192 :])
@@ -175,7 +175,7 @@ def test_block_that_can_log_holds_twice_is_not_kept_by_its_mending(log: Path) ->
 
 
 def test_damage_is_told_of_a_log_that_was_not_closed_too(log: Path) -> None:
-    """As a lost supply leaves both: that the end is missing is the lesser loss."""
+    """A lost supply causes both; the missing end is the lesser loss."""
     path = log / CAN_LOG
     path.write_bytes(path.read_bytes()[:100_000] + 4096 * b"\0" + path.read_bytes()[104_096:])
     tear(log / SIGNAL_LOG, 0.9)
@@ -235,7 +235,7 @@ def test_log_of_which_nothing_is_whole_is_refused_and_left(log: Path) -> None:
 
 
 def fly_recorded(folder: Path, queued: bool = False) -> tuple[list[BusFrame], list[str]]:
-    """Five seconds: the frames that the firmware sent, and what was said of the log."""
+    """Flies five seconds; returns the frames that the firmware sent and the events about the log."""
     sent_all: list[BusFrame] = []
     said: list[str] = []
 
@@ -297,7 +297,7 @@ def test_disk_that_stalls_holds_up_no_tick(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(GuardedFile, "_append", append_when_it_goes_on)
     monkeypatch.setattr(guarded_file, "CLOSE_S", 0.0)
-    give_up = threading.Timer(60.0, stalled.set)  # should it hold up a tick after all, the test fails instead of hanging
+    give_up = threading.Timer(60.0, stalled.set)  # if a tick waits for the disk after all, the test fails instead of hanging
     give_up.start()
     flown, said = fly_recorded(tmp_path, queued=True)
     give_up.cancel()

@@ -1,4 +1,4 @@
-"""tune_gains is killed, with its workers, between two trials: started again, it ends in the bytes of a run that was left alone."""
+"""tune_gains is killed, with its workers, between two trials; started again, it ends with the same bytes as an undisturbed run."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ FILES = ("search.jsonl", "parameters.toml", "tuning.json")
 
 
 def objective(folder: Path) -> Path:
-    """One parameter, one hover of seconds."""
+    """Writes an objective with one parameter and one hover of a few seconds; returns its path."""
     scenario, path = folder / "short.toml", folder / "objective.toml"
     scenario.write_text(SCENARIO)
     path.write_text(
@@ -30,7 +30,7 @@ def objective(folder: Path) -> Path:
 
 
 def words(path: Path, out: Path) -> list[str]:
-    """The command line."""
+    """The command line of tune_gains."""
     return [str(ROOT / "tools/tune_gains.py"), str(path), "--trials", str(TRIALS), "--jobs", "1", "--no-plots", "--out", str(out)]
 
 
@@ -38,7 +38,7 @@ def words(path: Path, out: Path) -> list[str]:
 def test_tuning_that_was_killed_goes_on_to_the_same_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Who is not killed tunes in this process."""
+    """The runs that are not killed tune in this process."""
     path, whole, torn = objective(tmp_path), tmp_path / "whole", tmp_path / "torn"
     monkeypatch.setattr(tune_gains, "processes", lambda jobs: Inline)
 

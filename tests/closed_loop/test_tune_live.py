@@ -1,6 +1,6 @@
-"""tune_gains --live against a robot that flies in its tank: one confirmed step at a time, and the old values back whatever happens.
+"""tune_gains --live against a robot flying in its tank: one confirmed step at a time, and the old values restored whatever happens.
 
-The bench flies when the tuner waits, so both live by the bench's clock.
+The bench flies while the tuner waits, so both use the bench's clock.
 """
 
 import io
@@ -33,7 +33,7 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 
 SECONDS = 2.0
-"""Of a look: whatever happens a second after it began is in the next heartbeat, and that in the look."""
+"""Duration of a look: an event a second after its begin is in the next heartbeat, which is still within the look."""
 SHIPPED = Parameters().control
 BANDWIDTH = SHIPPED.position_bandwidth
 UP, DOWN = (float(str(np.float32(value))) for value in (1.25 * BANDWIDTH, BANDWIDTH / 1.25))  # as MAVLink carries them
@@ -52,7 +52,7 @@ term = [{ metric = "position_rmse_m", per = 0.001 }, { metric = "thrust_rms_n", 
 
 
 class Robot:
-    """A bench with a ground station, and pymavlink's end of its link: waiting for a message lets it fly."""
+    """A bench with a ground station, and pymavlink's end of its link. The bench flies while a message is awaited."""
 
     def __init__(self, stack: ExitStack) -> None:
         port = free_port()
@@ -66,9 +66,9 @@ class Robot:
         self._sent: list[Any] = []
         self.tick = 0
         self._events: deque[tuple[int, Request | BaseException]] = deque()
-        """What somebody else asks or does to the tuner, and in which tick."""
+        """Requests by others and exceptions in the tuner, each with its tick."""
         self.silent_until_s = 0.0
-        """Till then the link is cut, both ways."""
+        """Time until which the link is cut in both directions."""
         self._events += [(200, Request(Action.ARM)), (300, Request(Action.SET_MODE, 0, Mode.POSHOLD))]
         self.wait(5.0)
 
@@ -86,7 +86,7 @@ class Robot:
 
     @property
     def control(self) -> Any:
-        """The gains with which it flies."""
+        """The gains in use."""
         return self._bench.firmware.pipeline.parameters.control
 
     def clock(self) -> float:
@@ -102,14 +102,14 @@ class Robot:
         pass
 
     def wait(self, seconds: float) -> None:
-        """Flies on; nobody listens."""
+        """Flies on and discards all messages."""
         for _ in range(round(100 * seconds)):
             self._fly()
             while self._mavlink.recv_match(blocking=False) is not None:
                 pass
 
     def soon(self, event: Request | BaseException) -> None:
-        """A second from now."""
+        """Schedules an event for a second from now."""
         self._events.append((self.tick + 100, event))
 
     def _fly(self) -> None:
@@ -129,7 +129,7 @@ class Robot:
 
 
 class Scripted:
-    """A person who answers what is written, and sees to what happens after the last answer."""
+    """A person who gives the scripted answers, and calls `then` at the last question."""
 
     def __init__(self, *answers: str, then: Callable[[], None] = lambda: None) -> None:
         self._answers, self._then = list(answers), then
@@ -143,19 +143,19 @@ class Scripted:
 
 
 class ClosedOutput(io.TextIOBase):
-    """Nobody reads it any more."""
+    """An output whose reader is gone."""
 
     def write(self, text: str) -> int:
         raise BrokenPipeError
 
 
 class PlugError(Exception):
-    """Somebody pulled the plug of the tuner's computer."""
+    """The tuner's computer lost power."""
 
 
 @pytest.fixture
 def live(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The module tune_live; it waits less."""
+    """The module tune_live, with a shorter settling time."""
     import tune_live
     import tune_vehicle
 
@@ -171,16 +171,16 @@ def hovering() -> Iterator[Robot]:
 
 @pytest.fixture
 def robot(hovering: Robot) -> Iterator[Robot]:
-    """It hovers with the shipped gains, before and after."""
+    """The hovering robot. Asserts that it has the shipped gains before and after the test."""
     assert hovering.control == SHIPPED
     yield hovering
-    hovering.wait(0.1)  # what was set counts from the next tick on
+    hovering.wait(0.1)  # new values apply from the next tick on
     assert hovering.control == SHIPPED
 
 
 @pytest.fixture
 def tuned(live: Any, robot: Robot, tmp_path: Path) -> Callable[..., int]:
-    """The status of a session with that person, about that objective."""
+    """tuned(person, text): runs a session with this person and objective; returns its exit status."""
     import tune_objective
 
     def run(person: Scripted, text: str = OBJECTIVE) -> int:
@@ -203,7 +203,7 @@ def test_step_is_taken_when_it_is_confirmed_and_goes_when_nothing_is_kept(tuned:
 def test_what_makes_the_hover_stiller_stays_and_the_rest_goes_back_at_once(
     live: Any, robot: Robot, tuned: Callable[..., int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As if the softer the stiller."""
+    """Pretends that softer gains give a stiller hover."""
 
     def look(vehicle: Any, seconds: float) -> dict[str, float]:
         robot.wait(0.1)
@@ -231,7 +231,7 @@ TROUBLES: dict[str, tuple[Request | BaseException, str, list[Request]]] = {
         Request(Action.DISARM, 0, True), "is stopped, or disarmed", [Request(Action.ARM), Request(Action.SET_MODE, 0, Mode.POSHOLD)],
     ),
 }  # fmt: skip
-"""What happens in the middle of a step, what is said of it, and what somebody asks to make the robot hover again."""
+"""An event in the middle of a step, the words printed about it, and the requests that make the robot hover again."""
 
 
 @pytest.mark.slow
@@ -271,7 +271,7 @@ def test_output_that_nobody_reads_any_more_puts_the_old_values_back(
 
 @pytest.fixture
 def signals(live: Any) -> Iterator[tuple[signal.Signals, ...]]:
-    """Those that end the tuning; they interrupt, and are as they were afterwards."""
+    """The signals that end the tuning; they raise KeyboardInterrupt, and their handlers are restored afterwards."""
     wanted = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {number: signal.signal(number, signal.default_int_handler) for number in wanted}
     yield wanted
@@ -283,7 +283,7 @@ def signals(live: Any) -> Iterator[tuple[signal.Signals, ...]]:
 def test_terminal_that_is_closed_interrupts_once(
     first: str, live: Any, signals: tuple[signal.Signals, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A shell tells its children of it again."""
+    """A shell passes the signal on to its children once more."""
 
     def tune(*_: object) -> None:
         with pytest.raises(KeyboardInterrupt):
@@ -332,7 +332,7 @@ def test_tuner_that_was_killed_puts_the_old_values_back_when_it_is_started_again
 
 @pytest.mark.slow
 def test_vehicle_that_fell_silent_is_to_be_set_by_hand_or_by_the_next_start(robot: Robot, tuned: Callable[..., int]) -> None:
-    """It was tried for a minute."""
+    """The tuner keeps trying for a minute."""
 
     def cut() -> None:
         robot.silent_until_s = math.inf
@@ -371,7 +371,7 @@ def test_objective_that_telemetry_does_not_show_is_refused(tuned: Callable[..., 
 
 
 def test_e_stop_puts_the_old_values_back(robot: Robot, tuned: Callable[..., int], capsys: Any) -> None:
-    """The last one: the robot is stopped after it."""
+    """Must be the last test, because it leaves the robot stopped."""
     assert tuned(Scripted("y", then=lambda: robot.soon(Request(Action.ESTOP)))) == 1
     assert "the vehicle" in capsys.readouterr().out
     with pytest.raises(DescriptionError, match="let it hover, armed, before it is tuned"):

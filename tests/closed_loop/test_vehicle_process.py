@@ -1,8 +1,8 @@
-"""The vehicle's process from outside: how soon it flies, how soon again when it was killed, how much memory it takes.
+"""The vehicle's process from outside: time until it flies, time until it flies again after a kill, and memory.
 
-The module floats upright, so that nothing but the process is waited for. The clock counts with MODCUBE_FULL=1 (`make accept`). Beside
-other tests it says nothing: there the processor time that the process needs until its first tick is held to twice the limit, which
-compiling anew, 20 s, would break; and nobody waits for it to arm.
+The module floats upright, so that the test waits for nothing but the process. Wall time is checked with MODCUBE_FULL=1 (`make accept`).
+Beside other tests it means nothing; there the test checks the processor time until the first tick against twice the limit, which
+recompiling (20 s) would exceed, and does not wait for arming.
 """
 
 import os
@@ -27,18 +27,18 @@ TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class Flight(NamedTuple):
-    """How one went."""
+    """Measurements of one flight."""
 
     armed_s: float
-    """On the clock, until it was armed and held its place."""
+    """Wall time until the vehicle is armed and holds its place; without FULL, until it runs."""
     started_s: float
-    """Of processor time, until its first tick."""
+    """Processor time until the first tick."""
     memory_mb: float
-    """Peak."""
+    """Peak memory."""
 
 
 def fly(bus: str, out: Path, how: signal.Signals) -> Flight:
-    """Starts the vehicle, whose compiled code the plant has cached, and ends it once it holds its place."""
+    """Starts the vehicle, with compiled code cached by the plant's process, and ends it once it holds its place (FULL) or runs."""
     began = time.monotonic()
     with running("run", "--bus", bus, "--hold", "--out", str(out), "--ground", "udpin:127.0.0.1:0") as vehicle:
         proc = Path(f"/proc/{vehicle.pid}")
@@ -53,7 +53,7 @@ def fly(bus: str, out: Path, how: signal.Signals) -> Flight:
 
 
 def upright(folder: Path) -> Path:
-    """The hover of a module that floats upright: a seed that tumbles while nobody drives it shows its tag only now and then."""
+    """A hover scenario with a module that floats upright; one that tumbles while unpowered shows its tag only now and then."""
     text = resources.files("hil").joinpath("scenarios", "hover.toml").read_text(encoding="utf-8")
     path = folder / "upright.toml"
     path.write_text(text + "\n[world]\ntrim_m = 0.0\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A path out of a file of waypoints, flown whole: the robot is where the file says when the file says."""
+"""A complete flight of a waypoint file: the robot is at each waypoint at the time in the file."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from tests.closed_loop.broken_vehicles import failed, turned_tags
 from tests.closed_loop.flights import Fly, Rebuild
 
 POSITION_LIMIT_M, ATTITUDE_LIMIT_RAD = 0.010, 0.0349066
-"""At a waypoint: twice the worst tick of three seeds, 4.3 mm; 2 deg."""
+"""Limits at a waypoint: twice the worst tick of three seeds, 4.3 mm; 2 deg."""
 
 
 @pytest.mark.slow
@@ -22,7 +22,7 @@ def test_module_is_at_every_waypoint_of_the_file_at_its_time(fly: Fly, tmp_path:
     scenario = load_scenario("waypoints")
     result = fly(scenario, 0)
     assert result.passed
-    assert result.metrics["position_rmse_m"] >= 0.0005  # better would be a leak
+    assert result.metrics["position_rmse_m"] >= 0.0005  # below this the estimator would have to leak the truth
     flight = read_flight(tmp_path / "run")
     time_s = (flight.firmware["time_ns"] - start_of(flight)) * 1e-9 - scenario.task.settle_s
     points = read_mission(scenario.task.file_text, scenario.task.file).waypoint

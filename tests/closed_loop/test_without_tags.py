@@ -1,4 +1,4 @@
-"""A robot that no camera sees: stabilised by gravity, held at its depth and brought up; and what happens when tags come at last."""
+"""A robot that no camera sees: stabilised by gravity, held at its depth and brought up; and its behaviour when tags appear."""
 
 import dataclasses
 from contextlib import ExitStack
@@ -19,7 +19,7 @@ from hil.scenario import load_scenario
 
 
 class Pilot:
-    """Takes a mode, arms in it as soon as that is granted, and may steer ahead for a while and then ask for another mode."""
+    """Sets a mode, arms in it as soon as that is granted; can steer ahead for a while and later set another mode."""
 
     def __init__(
         self, mode: Mode, duration_s: float, ahead_s: tuple[float, float] = (0.0, 0.0), stick: float = 0.3,
@@ -47,7 +47,7 @@ class Pilot:
 
 
 class Traveller(Pilot):
-    """Holds its place, and asks for another one at half past six, s."""
+    """Holds its place, and requests another one at 6.5 s."""
 
     def __init__(self, duration_s: float, north_m: float) -> None:
         super().__init__(Mode.POSHOLD, duration_s)
@@ -59,7 +59,7 @@ class Traveller(Pilot):
 
 
 class Flight:
-    """Every tick of a flight in which no tag is seen between two times: truth, record, words."""
+    """A flight without tags between two times: truth and record of every tick, and the texts of all events."""
 
     def __init__(self, pilot: Pilot, *faults: Fault, blind_s: tuple[float, float] = (0.0, 1e6), seed: int = 1, size_m: float = 8.0) -> None:
         absent = Fault(kind="tag_absent", at_s=blind_s[0], until_s=blind_s[1])
@@ -83,13 +83,13 @@ class Flight:
         return list(zip(self.truth, self.records, strict=True))[round(100 * first_s) : round(100 * last_s)]
 
     def tilt_error_deg(self, first_s: float, last_s: float) -> float:
-        """Largest angle between the way down and the believed one."""
+        """Largest angle between the true and the estimated down direction."""
         pairs = [(down_b(t.q_wb), down_b(r.estimate.q_wb)) for t, r in self.between(first_s, last_s)]
         return float(np.degrees(max(np.arccos(min(1.0, a @ b)) for a, b in pairs)))
 
 
 def down_b(q_wb: np.ndarray) -> np.ndarray:
-    """(3,) the way down, body frame."""
+    """(3,) down direction, body frame."""
     return np.asarray(to_matrix(np.ascontiguousarray(q_wb))[2])
 
 
@@ -106,7 +106,7 @@ def test_depth_and_attitude_are_held_without_any_tag_and_the_place_once_there_ar
         assert abs(truth.p_wb[2] - record.estimate.p_wb[2]) < 0.05
     assert flight.tilt_error_deg(3.0, 12.0) < 1.0
     before = flight.truth[1199]
-    for truth, record in flight.between(12.3, 16.0):  # told where it is, it does not turn to a north that it believed in before
+    for truth, record in flight.between(12.3, 16.0):  # given its pose, it does not turn to the heading that it assumed before
         assert record.estimate.placed
         np.testing.assert_allclose(record.estimate.p_wb, truth.p_wb, atol=0.01)
         assert abs(truth.p_wb[2] - before.p_wb[2]) < 0.02
@@ -132,7 +132,7 @@ def test_robot_that_leaks_comes_up_level_without_any_tag_and_stays_up(seed: int)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_robot_that_lost_its_tags_rests_at_the_surface(seed: int) -> None:
-    """What it feels there no model foresees: half a second of waiting for late tags made it rise and dive with all its force."""
+    """No model predicts the forces at the surface: waiting half a second for late tags made the robot rise and dive at full force."""
     flight = Flight(Pilot(Mode.STABILIZE, 55.0), Fault(kind="leak", at_s=6.0), seed=seed, blind_s=(5.0, 1e6))
     at_the_top = flight.between(45.0, 55.0)
     assert flight.records[-1].mode == Mode.SURFACE
@@ -148,7 +148,7 @@ def test_pilot_steers_a_stabilised_robot_without_any_tag() -> None:
     way_w = flight.truth[1000].p_wb - flight.truth[300].p_wb
     ahead_w = rotate(heading(flight.truth[300].q_wb), np.array([1.0, 0.0, 0.0]))
     assert way_w @ ahead_w > 1.0 and abs(way_w[2]) < 0.05
-    for truth, record in flight.between(11.0, 16.0):  # the tags came while it was under way
+    for truth, record in flight.between(11.0, 16.0):  # the tags appeared while it was moving
         np.testing.assert_allclose(record.estimate.p_wb, truth.p_wb, atol=0.01)
 
 
@@ -169,7 +169,7 @@ def test_robot_that_is_driven_ahead_for_a_minute_without_a_tag_stays_level(
 @pytest.mark.slow
 @pytest.mark.parametrize("seconds", [11.0, 20.0])
 def test_robot_that_comes_up_where_tags_are_does_not_swim_back_to_where_it_believed_to_be(seconds: float) -> None:
-    """A hand pushes it while nobody sees: told its place it sped there with 1000 N and was 5 m off."""
+    """A hand pushes the robot out of sight. Once it knew its position again, it used to rush back with 1000 N and was 5 m off."""
     back_s = 6.0 + seconds
     faults = Fault(kind="push", at_s=6.5, until_s=back_s, value=5.0), Fault(kind="leak", at_s=6.2)
     flight = Flight(Pilot(Mode.ALT_HOLD, back_s + 8.0), *faults, blind_s=(6.0, back_s), size_m=40.0)
@@ -181,7 +181,7 @@ def test_robot_that_comes_up_where_tags_are_does_not_swim_back_to_where_it_belie
 
 @pytest.mark.slow
 def test_robot_whose_pilot_falls_silent_holds_its_depth_before_it_comes_up() -> None:
-    """As one that loses its tags does: in 22 s a pilot may come back."""
+    """It behaves as if it had lost its tags: a pilot may return within 22 s."""
     flight = Flight(Pilot(Mode.STABILIZE, 35.0, until_s=6.0))
     for begin_s, end_s, mode in ((5.0, 6.9, Mode.STABILIZE), (7.1, 28.9, Mode.ALT_HOLD), (29.1, 35.0, Mode.SURFACE)):
         assert {record.mode for _, record in flight.between(begin_s, end_s)} == {mode}
@@ -190,7 +190,7 @@ def test_robot_whose_pilot_falls_silent_holds_its_depth_before_it_comes_up() -> 
 
 @pytest.mark.slow
 def test_blind_robot_that_a_wall_stops_lets_go_of_the_place_that_it_cannot_reach() -> None:
-    """It took what the wall did for a current, and believed to go on: 0.4 m beyond the wall after five seconds."""
+    """It used to take the wall's force for a current and to believe that it moved on: 0.4 m beyond the wall after five seconds."""
     flight = Flight(Traveller(14.0, north_m=1.4), blind_s=(6.0, 1e6), size_m=1.6)
     touches_s = next(t for t, truth in enumerate(flight.truth) if truth.p_wb[0] > 0.68) / 100
     assert "ARMED POSHOLD -> ARMED ALT_HOLD" in flight.words

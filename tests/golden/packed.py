@@ -1,6 +1,6 @@
-"""A golden log: a flight's log, thinned and packed. `pack` makes one, `unpack` gives the folder that `modcube replay` takes.
+"""A golden log: a flight's log, thinned and packed. `pack` makes one, `unpack` restores a folder for `modcube replay`.
 
-Every frame is kept, and of the signals of bodies and joints those of some ticks.
+Every frame is kept; the signals of bodies and docks are kept in some ticks only.
 """
 
 import json
@@ -11,11 +11,11 @@ from firmware_py.runtime.log_recovery import rewrite
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG
 
 KEEP_EVERY = {"/firmware/body": 50, "/firmware/docks": 10}
-"""Ticks, by how a topic begins; of other topics every message is kept."""
+"""Tick interval of the messages kept, by prefix of the topic; other topics keep every message."""
 
 
 def pack(log: Path, golden: Path, period_ns: int) -> None:
-    """Makes the folder `golden` of the log in the folder `log`."""
+    """Makes the folder `golden` from the log in the folder `log`."""
     golden.mkdir(exist_ok=True)
     thin = log / "thin.mcap"
 

@@ -1,6 +1,6 @@
-"""Golden logs: short flights that the code must reproduce, on any machine. `pytest tests/golden --update-golden` flies them anew.
+"""Golden logs: short flights that the code must reproduce, on any machine. `pytest tests/golden --update-golden` flies them again.
 
-A change of behaviour shows here first, with the tick and the signal in which it begins. Update the logs only when it is meant.
+A change of behaviour shows here first, with the tick and the signal in which it begins. Update the logs only if the change is intended.
 """
 
 import dataclasses
@@ -18,13 +18,13 @@ from tests.golden.packed import pack, unpack
 
 FOLDER = Path(__file__).parent
 TOLERANCE = 1e-6
-"""Share by which another processor's rounding may move a signal; frames may differ by one count."""
+"""Relative deviation of a signal allowed for another processor's rounding; frames may differ by one count."""
 MOST_BYTES = 450_000
-"""All golden logs together."""
+"""Maximum size of all golden logs together."""
 
 
 def flight(name: str, settle_s: float, duration_s: float, *faults: Fault) -> Scenario:
-    """A short flight of a scenario."""
+    """A scenario with other times and these faults."""
     scenario = load_scenario(name)
     task = dataclasses.replace(scenario.task, settle_s=settle_s, duration_s=duration_s)
     return dataclasses.replace(scenario, task=task, fault=faults)
@@ -59,7 +59,7 @@ def test_code_reproduces_the_golden_flight(name: str, tmp_path: Path, request: p
 
 
 def update(name: str, folder: Path) -> None:
-    """Flies it and keeps its log."""
+    """Flies a golden flight and replaces its log."""
     scenario, controller, rate_hz = GOLDEN[name]()
     fly_scenario(scenario, 0, CONTROLLERS[controller], folder, f"virtual:golden-{name}", rate_hz)
     pack(folder, FOLDER / name, 1_000_000_000 // rate_hz)

@@ -1,4 +1,4 @@
-"""A release with compiled code, made here for the guest's processor: emulated, compiling takes many minutes."""
+"""A release with code compiled here for the guest's processor; in the emulated guest, compiling takes many minutes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flash_device import Device
 from flash_payload import make_payload
 
 INTERPRETER = "/usr/bin/python3.11"
-"""Of the guest."""
+"""The guest's interpreter."""
 
 
 def make_seed(folder: Path, cache: Path) -> Path:

@@ -1,6 +1,6 @@
 """A release is flashed to a Debian machine with systemd, flies there, and the machine survives bad releases and power cuts.
 
-Marked `jetson`; `make test-flash` runs it. In order: each test goes on where the one before left the machine.
+Marked `jetson`; `make test-flash` runs it. The tests run in order, each from the state in which the previous one left the machine.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def guest(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guest]:
 
 
 def checkout(folder: Path, name: str, old: str = "", new: str = "") -> Path:
-    """A copy of the sources whose command line says `name`, with one more change."""
+    """A copy of the sources, marked with `RELEASE = name` in its cli.py, where `old` is replaced by `new`."""
     target = folder / name
     target.mkdir()
     for each in COPIED:
@@ -68,12 +68,12 @@ def current(guest: Guest) -> str:
 
 
 def report(guest: Guest) -> str:
-    """What the service says of itself."""
+    """State and status text of the service."""
     return guest.run("systemctl show modcube -p ActiveState -p StatusText --value", check=False).stdout
 
 
 def description(guest: Guest) -> str:
-    """Of the service, as systemd has read its unit."""
+    """Description of the service, as systemd has read it from the unit."""
     return guest.run("systemctl show modcube -p Description --value", check=False).stdout.strip()
 
 
@@ -89,7 +89,7 @@ def test_release_is_flashed_and_the_service_flies_the_hover_on_vcan0(guest: Gues
     assert done.returncode == 0, done.stdout + done.stderr
     assert "answered=1/1" in wait_for(guest, "answered=1/1")
     figure("flashed Debian machine: modules that answer its service", 1)
-    refused = flash(guest, ROOT)  # it hovers
+    refused = flash(guest, ROOT)  # refused because the robot is armed
     assert refused.returncode == 2 and "1/1 modules are armed" in refused.stderr, refused.stdout + refused.stderr
     journal = guest.run("sudo journalctl -u modcube --no-pager").stdout
     assert "-> ARMED" in journal, journal[-2000:]
@@ -120,7 +120,7 @@ def test_power_cut_half_way_through_a_flash_brings_the_old_release_up(guest: Gue
             if line.startswith("4/4"):
                 break
         end = time.monotonic() + WAIT_S
-        while "interrupted" not in description(guest) and time.monotonic() < end:  # switched, and its unit installed and read
+        while "interrupted" not in description(guest) and time.monotonic() < end:  # switched, and the new unit installed and read
             time.sleep(0.2)
         assert current(guest) != before
         guest.cut_power()

@@ -1,4 +1,4 @@
-"""Whatever wrench is asked for and whichever thruster is dead: within limits and along the wanted directions."""
+"""For any wrench and any dead thruster, the allocator stays within limits and keeps the directions of force and moment."""
 
 import numpy as np
 from hypothesis import given, settings

@@ -1,4 +1,4 @@
-"""The codec against cantools, over every message and both ways, and what the receiver lets through."""
+"""The codec against cantools, for every message in both directions, and the frames that the receiver accepts."""
 
 import math
 from importlib import resources
@@ -48,7 +48,7 @@ def any_raws(message):
 
 
 def physical(message):
-    """Inside the limits, and not only on the grid of the wire."""
+    """Values inside the limits, not only on the wire's grid."""
     return st.tuples(
         *(
             st.integers(field.raw_low, field.raw_high)
@@ -286,7 +286,7 @@ def unit_quaternions():
 @given(q=unit_quaternions())
 @MANY_EXAMPLES
 def test_tag_attitude_survives_the_wire_to_ten_milliradians(q):
-    """Half a step of sqrt(2)/510 in three components, where all four are equal: 0.0096 rad (rms 0.0031)."""
+    """The worst case is half a step of sqrt(2)/510 in three components, with all four equal: 0.0096 rad (rms 0.0031)."""
     back = unpack_quaternion(*pack_quaternion(q))
     assert np.linalg.norm(back) == pytest.approx(1.0, abs=1e-12)
     angle = 2 * math.acos(min(1.0, abs(float(back @ q))))

@@ -14,7 +14,7 @@ gaps = st.lists(st.integers(1, 4), min_size=1, max_size=150)
 @always
 @given(gaps)
 def test_ring_holds_what_a_list_would(ticks_between: list[int]) -> None:
-    """Each push stands for itself and fills the ticks skipped before it, with its wrench and without sensors."""
+    """Each push adds its own tick and fills the ticks skipped before it with its wrench and without sensors."""
     history = History(PERIOD)
     plain: list[tuple[float, bool]] = []
     tick = 0
@@ -47,7 +47,7 @@ def test_sample_after_a_time_is_the_first_that_is_later(count: int, offset: int,
 @always
 @given(st.lists(st.tuples(st.integers(1, 4), st.integers(-PERIOD * 2 // 5, PERIOD * 2 // 5)), min_size=2, max_size=150))
 def test_tick_that_comes_off_its_time_shifts_no_other(ticks: list[tuple[int, int]]) -> None:
-    """Ticks off an even grid by up to 40 % of a period: every sample is still found where it was, within twice that."""
+    """With ticks off an even grid by up to 40 % of a period, every sample is still found at its time, within twice that."""
     history, tick, actual = History(PERIOD), 0, {}
     for gap, off in ticks:
         tick += gap

@@ -1,4 +1,4 @@
-"""Whatever is asked for, tick after tick, nothing beyond the limits leaves the robot."""
+"""The limiter's output never exceeds the limits, for any sequence of requests."""
 
 import numpy as np
 from hypothesis import given, settings

@@ -1,4 +1,4 @@
-"""What holds for every rotation, found by hypothesis."""
+"""Properties of every rotation, tested with hypothesis."""
 
 import numpy as np
 from hypothesis import given, settings

@@ -1,4 +1,4 @@
-"""Every permitted set of parameters survives being written and read; every other value is refused."""
+"""Every permitted set of parameters survives being written and read back; every other value is refused."""
 
 from operator import attrgetter
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Paths of least snap keep their limits, however unlike the durations of their pieces are."""
+"""Minimum-snap paths keep their limits, however much the durations of their segments differ."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, 
 
 always = settings(derandomize=True, deadline=None, database=None, max_examples=60)
 octaves = st.lists(st.floats(-5.0, 5.0), min_size=2, max_size=4)
-"""Of the durations of the pieces: they differ by up to a thousand times."""
+"""Binary logarithms of the segments' durations, which differ by a factor of up to a thousand."""
 
 
 def waypoints(count: int, seed: int) -> list[Waypoint]:

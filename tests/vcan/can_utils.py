@@ -1,4 +1,4 @@
-"""can-utils as test instruments: candump listens, cansend and cangen talk, canplayer plays a log back."""
+"""can-utils as test instruments: candump listens, cansend and cangen send, canplayer plays a log back."""
 
 import select
 import subprocess
@@ -24,7 +24,7 @@ class LoggedFrame(NamedTuple):
 
     @classmethod
     def parse(cls, line: str) -> "LoggedFrame":
-        """From `(1700000000.000000) vcan0 123#0011`."""
+        """Parses `(1700000000.000000) vcan0 123#0011`."""
         stamp, interface, frame = line.split()[:3]
         identifier, _, data = frame.partition("#")
         return cls(float(stamp.strip("()")), interface, int(identifier, 16), bytes.fromhex(data))
@@ -42,13 +42,13 @@ def write_log(path: Path, frames: list[LoggedFrame]) -> None:
 
 
 def _listeners(interface: str) -> int:
-    """How many sockets read everything on the interface."""
+    """Number of sockets that read everything on the interface."""
     rows = (RECEIVE_LISTS / "rcvlist_all").read_text().splitlines()
     return sum(row.split()[:1] == [interface] for row in rows)
 
 
 class Candump:
-    """A running candump; `take` hands out what it heard, in order."""
+    """A running candump; `take` returns the received frames in order."""
 
     def __init__(self, interface: str, buffer_bytes: int = 1 << 20) -> None:
         listening = _listeners(interface)
@@ -66,7 +66,7 @@ class Candump:
             self._ready.poll(POLL_MS)
 
     def take(self, count: int, timeout_s: float = TIMEOUT_S) -> list[LoggedFrame]:
-        """The next `count` frames, or fewer when they do not come in time."""
+        """The next `count` frames, or fewer if they do not arrive in time."""
         deadline = time.monotonic() + timeout_s
         while self._text.count(b"\n") < count and (left_s := deadline - time.monotonic()) > 0:
             if not self._ready.poll(left_s * 1e3) or not (read := self._out.read(1 << 16)):
@@ -85,7 +85,7 @@ class Candump:
 
 @contextmanager
 def candump(interface: str) -> Iterator[Candump]:
-    """A candump that already listens when the block begins, and ends with it."""
+    """A candump that is listening when the block begins, and ends with the block."""
     listener = Candump(interface)
     try:
         yield listener
@@ -98,25 +98,25 @@ def cansend(interface: str, identifier: int, data: bytes) -> None:
 
 
 def canplayer(log: Path, interface: str, logged: str | None = None, *, as_recorded: bool = False) -> None:
-    """Plays a log to the interface (its frames of `logged`, by default the same), at once or at the recorded pace."""
+    """Plays the log's frames of interface `logged` (default: the same) to `interface`, at once or at the recorded pace."""
     pace = [] if as_recorded else ["-t"]
     subprocess.run(["canplayer", "-I", log, *pace, f"{interface}={logged or interface}"], check=True)
 
 
 def cangen_command(interface: str, gap_ms: float, *options: str) -> list[str]:
-    """The words of a cangen of eight-byte frames, without an end."""
-    # a full buffer is waited for and the payload counts up, so that a run can be checked frame by frame
+    """Command line of an endless cangen of eight-byte frames."""
+    # cangen waits when the buffer is full, and the payload counts up, so that a run can be checked frame by frame
     return ["cangen", interface, "-g", str(gap_ms), "-p", "1000", "-L", "8", "-D", "i", *options]
 
 
 def cangen(interface: str, count: int, identifier: int, gap_ms: float = 0.0) -> None:
-    """Sends `count` frames of eight bytes whose payload counts up, little-endian, and returns when they are out."""
+    """Sends `count` frames of eight bytes whose payload counts up, little-endian; returns when they are sent."""
     subprocess.run(cangen_command(interface, gap_ms, "-I", f"{identifier:X}", "-n", str(count)), check=True)
 
 
 @contextmanager
 def cangen_flood(interface: str, identifier: int | None = None, gap_ms: float = 0.0) -> Iterator[None]:
-    """Floods the interface for as long as the block lasts: with one identifier, or with all of them in turn."""
+    """Floods the interface during the block, with one identifier or with all of them in turn."""
     options = ["-I", "i" if identifier is None else f"{identifier:X}"]
     flood = subprocess.Popen(cangen_command(interface, gap_ms, *options), stderr=subprocess.DEVNULL)
     try:

@@ -1,7 +1,7 @@
-"""Where the tests of this folder run: here when the machine lets us make vcan interfaces, otherwise inside the guest.
+"""Where the tests of this folder run: here if this machine can make vcan interfaces, otherwise inside the guest.
 
-`test_in_guest` boots the guest once and runs the whole folder inside. Tests that ask for the fixture `guest` boot their
-own and run outside only: their files end in `_in_guest.py`. Everything in the folder carries the marker `vcan`.
+`test_in_guest` boots the guest once and runs the whole folder inside. Tests with the fixture `guest` boot their own guest
+and run outside only; their files end in `_in_guest.py`. Everything in the folder carries the marker `vcan`.
 """
 
 import os
@@ -15,7 +15,7 @@ from tests.vcan.links import Interface, can_make_interfaces
 
 HERE = Path(__file__).resolve().parent
 IN_GUEST = "IN_VCAN_GUEST" in os.environ
-collect_ignore_glob = ["*_in_guest.py"] if IN_GUEST else []  # what they import costs time there
+collect_ignore_glob = ["*_in_guest.py"] if IN_GUEST else []  # their imports take long in the guest
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -43,7 +43,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session")
 def guest() -> Guest:
-    """The virtual machine, from outside; skips where its Debian packages are missing."""
+    """The virtual machine, from outside; skips if its Debian packages are missing."""
     if missing := missing_packages():
         pytest.skip(f"missing Debian packages: {' '.join(missing)} (make setup-system)")
     return Guest()
@@ -51,7 +51,7 @@ def guest() -> Guest:
 
 @pytest.fixture
 def link() -> Iterator[Interface]:
-    """A vcan interface of the test's own, up, for it to break."""
+    """A vcan interface for this test alone to break; up at first."""
     interface = Interface("vcanlink")
     interface.delete()
     interface.create()
@@ -62,7 +62,7 @@ def link() -> Iterator[Interface]:
 
 @pytest.fixture(scope="session")
 def vcan0() -> str:
-    """The bus that everybody uses: made where the machine has none of that name, left as it is where it has."""
+    """The shared bus: made if the machine has none of that name, otherwise used as it is. Brought up if it is down."""
     bus = Interface("vcan0")
     if not bus.exists():
         bus.create()

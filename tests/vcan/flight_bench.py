@@ -1,4 +1,4 @@
-"""Short lockstep flights for the tests on SocketCAN: a bench on any bus, each tick open to a test."""
+"""Short lockstep flights for the tests on SocketCAN: a bench on any bus, with hooks in every tick."""
 
 import dataclasses
 import os
@@ -15,15 +15,15 @@ from hil.scenario import Scenario, load_scenario
 from tests.vcan.guest import FULL_LENGTH
 
 FULL = FULL_LENGTH in os.environ
-"""Whole lengths and counts, for `make accept`; otherwise reduced ones."""
+"""Whether to use full lengths and counts, as `make accept` does, or reduced ones."""
 SETTLE_S = 2.0
-"""Until the task begins in a short flight; arming is asked for from 1 s on."""
+"""Time until the task of a short flight begins; attempts to arm begin at 1 s."""
 PATIENCE_LOOKS = 100
-"""On vcan a frame is there when send returns; what is not by now is lost."""
+"""On vcan a frame has arrived when send returns; one that is missing after this many polls is lost."""
 
 
 def short(name: str, duration_s: float, settle_s: float = SETTLE_S) -> Scenario:
-    """Scenario `name` as far as `duration_s`; a spiral as steep as the whole one."""
+    """The first `duration_s` of scenario `name`; a spiral keeps its slope."""
     scenario = load_scenario(name)
     task, share = scenario.task, duration_s / scenario.task.duration_s
     task = dataclasses.replace(
@@ -41,7 +41,7 @@ def bench_on(bus: str, scenario: Scenario, seed: int = 0) -> Iterator[Bench]:
 
 
 def record(bench: Bench, folder: Path, observers: Sequence[Observer] = ()) -> list[str]:
-    """Flies to the end; the lines of can.log."""
+    """Flies to the end; returns the lines of can.log."""
     folder.mkdir(parents=True, exist_ok=True)
     recorder = Recorder(folder)
     try:
@@ -52,7 +52,7 @@ def record(bench: Bench, folder: Path, observers: Sequence[Observer] = ()) -> li
 
 
 def sent(lines: Sequence[str]) -> list[str]:
-    """The lines of what the firmware sent."""
+    """The lines of the frames that the firmware sent."""
     return [line for line in lines if line.endswith(" T")]
 
 
@@ -63,7 +63,7 @@ def frame_of(line: str) -> Frame:
 
 
 def between(bench: Bench, act: Callable[[], None]) -> None:
-    """From now on `act` runs in every tick between the plant's hearing and its answering."""
+    """From now on `act` runs in every tick after the plant has received its frames and before it answers."""
     step = bench.nodes.step
 
     def step_and_act(frames: Sequence[Frame]) -> list[Frame]:

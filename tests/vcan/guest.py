@@ -1,4 +1,4 @@
-"""The guest from outside: the packages it misses, and one call that boots it, runs a command and says how it ended."""
+"""The guest from outside: the packages it lacks, and one call that boots it, runs a command and returns the result."""
 
 import os
 import subprocess
@@ -7,18 +7,18 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 FULL_LENGTH = "MODCUBE_FULL"
-"""Set: whole lengths and counts, for `make accept`; not set: reduced ones."""
+"""Environment variable. Set: full lengths and counts, for `make accept`; not set: reduced ones."""
 RUN = ROOT / "hil" / "guest" / "run"
 
 
 def missing_packages() -> list[str]:
-    """The Debian packages that the guest needs and this machine has not."""
+    """The Debian packages that the guest needs and this machine lacks."""
     prepare = str(RUN.with_name("prepare"))
     return subprocess.run([prepare, "--missing"], capture_output=True, text=True, check=False).stdout.split()
 
 
 class Guest:
-    """Runs commands in a freshly booted guest; nothing stays between two calls but what lands in `out`."""
+    """Runs commands in a freshly booted guest; nothing persists between two calls except the files in `out`."""
 
     def run(
         self,
@@ -35,14 +35,14 @@ class Guest:
 
         Args:
             counted: the guest's clock counts instructions, so that lateness does not depend on this machine's load.
-            processors: of the guest; 1 when counted.
+            processors: number of the guest's processors; 1 when counted.
             warm_up: shell command run outside first, to fill the cache of compiled code that the guest reads.
             out: receives the files that the command leaves in $VG_OUT.
-            timeout_s: after which the guest is ended.
-            capture: returns stdout and stderr; otherwise they go where this process's go.
+            timeout_s: time after which the guest is terminated.
+            capture: whether stdout and stderr are returned; otherwise they go to those of this process.
 
         Returns:
-            returncode: the command's; 124 time-out, 125 the guest did not finish, 126 it could not be prepared.
+            returncode: the command's; 124 timeout, 125 the guest did not finish, 126 it could not be prepared.
         """
         switches = {"VG_SMP": str(processors), "VG_TIMEOUT": str(timeout_s), "VG_WARM": warm_up}
         switches["VG_PASS"] = f"{FULL_LENGTH} {os.environ.get('VG_PASS', '')}"

@@ -1,4 +1,4 @@
-"""A bad day of a bus: random link events, seeded. An interface is down, up, deleted, made again, or its buffer full."""
+"""Random link events of a bus, from a seed: an interface goes down, comes up, is deleted, made again, or its buffer is full."""
 
 import random
 import time
@@ -14,7 +14,7 @@ EVENTS = {
     "deleted": ("create_up",),
     "full": ("empty", "delete", "make_again"),
 }
-"""What may happen next, by the state of the interface."""
+"""Events that may happen next, by the state of the interface."""
 STATE_AFTER = {
     "down": "down",
     "up": "up",
@@ -25,12 +25,12 @@ STATE_AFTER = {
     "empty": "up",
 }
 USABLE_S = (0.1, 0.8)
-"""Shortest and longest time in real time that a link stays usable."""
+"""Shortest and longest time that a link stays usable, in real time."""
 BROKEN_S = (0.02, 0.2)
 
 
 class BadDay:
-    """Strikes one interface, which is up at first and after `heal`."""
+    """Random events on one interface, which is up at first and after `heal`."""
 
     def __init__(self, link: Interface, seed: int) -> None:
         self.random = random.Random(seed)
@@ -39,7 +39,7 @@ class BadDay:
         self._link = link
 
     def strike(self) -> str:
-        """One event; returns the state afterwards: up, down, deleted, full."""
+        """Causes one event; returns the state afterwards: up, down, deleted, full."""
         event = self.random.choice(EVENTS[self.state])
         self.counts[event] += 1
         if event == "create_up":
@@ -51,13 +51,13 @@ class BadDay:
         return self.state
 
     def heal(self) -> None:
-        """Events until the interface is usable."""
+        """Causes events until the interface is usable."""
         while self.state != "up":
             self.strike()
 
 
 def break_link(link: Interface, seed: int, events: int, begin: Event, done: SimpleQueue) -> None:
-    """A process of its own: waits for `begin`, strikes until `events` have happened and the link is up.
+    """Runs as a separate process: waits for `begin`, then causes events until `events` have happened and the link is up.
 
     Puts into `done` a list of (time on the machine's clock in ns, state from then on).
     """

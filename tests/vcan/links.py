@@ -1,6 +1,6 @@
 """Link control: one vcan interface that goes down, comes up, is deleted, made again, or whose send buffer is full.
 
-What `ip link` does, asked of the kernel directly: a process costs 35 to 75 ms in the guest, an event here 0.1 to 16 ms.
+Asks the kernel directly for what `ip link` does: a process costs 35 to 75 ms in the guest, an event here 0.1 to 16 ms.
 """
 
 import os
@@ -21,7 +21,7 @@ LINK = struct.Struct("=BxHiII")
 IFF_UP = 0x1
 """Flag of linux/if.h."""
 RTM_NEWQDISC, RTM_DELQDISC, REPLACE = 36, 37, 0x500
-"""Of linux/rtnetlink.h, and NLM_F_CREATE | NLM_F_REPLACE."""
+"""Message types of linux/rtnetlink.h, and NLM_F_CREATE | NLM_F_REPLACE."""
 TCA_KIND, TCA_OPTIONS, TC_H_ROOT = 1, 2, 0xFFFFFFFF
 QDISC = struct.Struct("=BxxxiIII")
 """struct tcmsg of linux/rtnetlink.h: family, interface, handle, parent, info."""
@@ -30,7 +30,7 @@ NETEM = struct.Struct("=IIIIII")
 HELD_FRAMES = 1
 """Frames that a full buffer holds before it refuses with ENOBUFS."""
 HOLD_TICKS = 200 * 1_000_000_000 // 64
-"""200 s in the packet scheduler's ticks of 64 ns: how long it holds them; 32 bits take at most 274 s."""
+"""Time that a full buffer holds frames: 200 s in the packet scheduler's ticks of 64 ns; 32 bits allow at most 274 s."""
 
 
 def _attribute(kind: int, value: bytes) -> bytes:
@@ -39,7 +39,7 @@ def _attribute(kind: int, value: bytes) -> bytes:
 
 
 def _ask(kind: int, how: int, body: bytes, name: str) -> None:
-    """One request of rtnetlink(7), and the kernel's answer to it."""
+    """Sends one request of rtnetlink(7) and checks the kernel's answer."""
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, NETLINK_ROUTE) as kernel:
         kernel.send(HEADER.pack(HEADER.size + len(body), kind, REQUEST_AND_ACK | how, 1, 0) + body)
         (answer,) = struct.unpack_from("=i", kernel.recv(4096), HEADER.size)
@@ -57,7 +57,7 @@ def _queue(name: str, kind: int, how: int = 0, attributes: bytes = b"") -> None:
 
 
 def can_make_interfaces() -> bool:
-    """Whether this machine's kernel has vcan and lets us make interfaces."""
+    """Whether this machine's kernel has vcan and permits making interfaces."""
     probe = Interface("vcanprobe")
     try:
         probe.create()
@@ -68,10 +68,10 @@ def can_make_interfaces() -> bool:
 
 
 class Interface:
-    """A vcan interface, by name (at most 15 characters). Each method returns when the kernel has done it.
+    """A vcan interface, by name (at most 15 characters). Each method returns when the kernel is done.
 
     Raises:
-        OSError: the kernel refused; its errno.
+        OSError: the kernel refused, with its errno.
     """
 
     def __init__(self, name: str) -> None:
@@ -85,12 +85,12 @@ class Interface:
         return self.exists() and bool(int(self._flags.read_text(), 16) & IFF_UP)
 
     def create(self) -> None:
-        """A new interface of the name, down."""
+        """Makes a new interface of this name, down."""
         vcan = _attribute(IFLA_LINKINFO, _attribute(IFLA_INFO_KIND, b"vcan"))
         _change(self.name, RTM_NEWLINK, NEW_ONLY, attributes=vcan)
 
     def delete(self) -> None:
-        """Away with it; nothing to do when there is none."""
+        """Deletes the interface; does nothing if there is none."""
         if self.exists():
             _change(self.name, RTM_DELLINK)
 
@@ -101,17 +101,17 @@ class Interface:
         _change(self.name, RTM_NEWLINK, changed=IFF_UP)
 
     def make_again(self) -> None:
-        """Deleted, made and up in one go: a new interface of the old name."""
+        """Deletes the interface, makes a new one of the same name and brings it up."""
         self.delete()
         self.create()
         self.up()
 
     def fill(self) -> None:
-        """From now on the buffer keeps HELD_FRAMES frames and refuses the next, like a bus that nobody acknowledges."""
+        """From now on the buffer holds HELD_FRAMES frames and refuses the next, like a bus on which no node acknowledges."""
         netem = NETEM.pack(HOLD_TICKS, HELD_FRAMES, 0, 0, 0, 0)
         attributes = _attribute(TCA_KIND, b"netem\0") + _attribute(TCA_OPTIONS, netem)
         _queue(self.name, RTM_NEWQDISC, REPLACE, attributes)
 
     def empty(self) -> None:
-        """Ends `fill`; the frames held are lost."""
+        """Undoes `fill`; the held frames are lost."""
         _queue(self.name, RTM_DELQDISC)

@@ -1,8 +1,7 @@
-"""Run inside the guest: hovers in real time, plant and firmware as two processes, in the company that the plan asks
-for.
+"""Runs inside the guest: hovers in real time, with plant and firmware as two processes and the disturbances of the plan.
 
-Arguments: JSON, a list of plans (fields of Plan); the C reference node's program. Leaves in $VG_OUT `flights.json`, how
-late ticks were and how soon the flight went on after link events, and the logs of flight N in folder N.
+Arguments: JSON, a list of plans (fields of Plan); the C reference node's program. Writes to $VG_OUT `flights.json` (lateness
+of ticks, and times until the flight resumed after link events) and the logs of flight N in folder N.
 """
 
 import dataclasses
@@ -37,11 +36,11 @@ from tests.vcan.links import Interface
 
 BUS = "vcan0"
 FLOOD_ID = 0x71E
-"""HEARTBEAT of number 30, with a wrong length: stops nobody and commands nothing."""
+"""HEARTBEAT of number 30, with a wrong length: stops no node and commands nothing."""
 MCU_ARMED = 2
 """State in MCU_STATUS."""
 NODE_PRIORITY = READER_PRIORITY - 1
-"""Of the C node's process: it stands for hardware, which no plant keeps waiting."""
+"""Priority of the C node's process: it stands for hardware, which never waits for a plant."""
 NODE_ENDS_S = 5.0
 
 
@@ -68,18 +67,18 @@ def hover(plan: Plan) -> Scenario:
 
 @dataclass
 class TickLog:
-    """What became of each tick; `on_first` and `on_armed` are called once."""
+    """Observations in each tick. `on_first` is called in the first one, `on_armed` in the first one flying."""
 
     on_first: Callable[[], None]
     on_armed: Callable[[], None]
     ended_ns: list[int] = field(default_factory=list)
-    """On the machine's clock."""
+    """End of each tick on the machine's clock."""
     flying: list[bool] = field(default_factory=list)
-    """Every module has answered, and armed modules obey."""
+    """Whether every module has answered and is armed, tick by tick."""
     readers: int = 0
-    """Threads that read a bus, at the last tick."""
+    """Number of threads that read a bus, at the last tick."""
     waits: int = 0
-    """Page faults of any thread of this process that waited for a file, after the first tick."""
+    """Page faults that waited for a file, in any thread of this process, after the first tick."""
     _waits_before: int = 0
 
     def observe(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
@@ -117,11 +116,11 @@ def process(target: Callable[..., None], *arguments: Any) -> Iterator[Any]:
 def flood(begin: Event) -> None:
     begin.wait()
     command = cangen_command(BUS, 0.0, "-I", f"{FLOOD_ID:X}")
-    os.execvp(command[0], command)  # in this process's place, so that it ends when this is killed
+    os.execvp(command[0], command)  # replaces this process, so that killing it ends cangen
 
 
 def serve_socket_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, out: Path | None, handshake: Handshake) -> None:
-    """The plant's process, and the C node as its child."""
+    """Runs the plant's process, with the C node as its child."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     path, arrival = Path(mkdtemp(), "board.socket"), threading.Event()
     plant = SocketPlant(scenario, seed, rate_hz, out, path)
@@ -133,12 +132,12 @@ def serve_socket_plant(scenario: Scenario, seed: int, bus: str, rate_hz: int, ou
 
 
 def fly(plan: Plan, folder: Path) -> dict[str, Any]:
-    """One flight and its figures; its logs are in `folder`."""
+    """Flies one plan and returns its figures; the logs are in `folder`."""
     folder.mkdir(parents=True)
     context = multiprocessing.get_context("fork")
     begin, history = context.Event(), context.SimpleQueue()
     with ExitStack() as stack:
-        # An idle machine's counted clock jumps while files are waited for: it is kept busy until the first tick.
+        # The counted clock of an idle machine jumps while a process waits for a file, so the machine is kept busy until the first tick.
         spinner = stack.enter_context(process(spin, True))
         for _ in range(plan.busy_loops):
             stack.enter_context(process(spin, False))
@@ -164,7 +163,7 @@ def fly(plan: Plan, folder: Path) -> dict[str, Any]:
 
 
 def resumed_s(events: Sequence[tuple[int, str]], log: TickLog) -> list[float]:
-    """For each time that the link became usable, s until the flight went on, or until the link broke again."""
+    """For each time that the link became usable, seconds until the flight resumed or the link broke again."""
     waits = []
     for index, (time_ns, state) in enumerate(events):
         if state == "up":
@@ -179,7 +178,7 @@ def main() -> None:
     plans = [Plan(**plan) for plan in json.loads(sys.argv[1])]
     out = Path(os.environ["VG_OUT"])
     folders = [Path("/tmp/flights", str(number)) for number in range(len(plans))]
-    # Both processes, their readers and the flood share one processor: what they had of a second beyond 95 % would stop them all.
+    # Both processes, their readers and the flood share one processor; above 95 % of a second the real-time limit would stop them all.
     Path("/proc/sys/kernel/sched_rt_runtime_us").write_text("-1")
     flights = []
     for plan, folder in zip(plans, folders, strict=True):

@@ -1,6 +1,6 @@
-"""The bench in lockstep on real SocketCAN: the bytes of the virtual bus, beside strangers, through link events.
+"""The bench in lockstep on real SocketCAN: same bytes as on the virtual bus, also beside foreign frames; and flights with link events.
 
-Reduced lengths here; with MODCUBE_FULL=1 the whole spiral and a thousand link events.
+Reduced lengths by default; with MODCUBE_FULL=1 the whole spiral and a thousand link events.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -28,27 +28,27 @@ from tests.vcan.links import Interface
 SHORT = short("spiral", 0.8)
 COMPARED = load_scenario("spiral") if FULL else SHORT
 HEARD_TICKS = 40
-"""Ticks that candump is read along with."""
+"""Number of ticks during which candump is read."""
 FLOOD_ID = 0x71E
-"""HEARTBEAT of number 30, with a wrong length: stops nobody and commands nothing. 0x000..0x01F would stop everyone."""
+"""HEARTBEAT of number 30, with a wrong length: stops no node and commands nothing. 0x000..0x01F would stop every node."""
 FLOOD_GAP_MS = 2.0
-"""A flood at full speed overruns what a reader in Python can take; that is for real time, where it may lose frames."""
+"""A flood at full speed overruns a reader in Python; that is tested in real time, where frames may be lost."""
 ARMED_TICK, SYNC_TICK, ESTOP_TICK = 150, 165, 185
 CHUNK_FRAMES = 120
-"""Played back at once; a socket holds 278 unread frames at least."""
+"""Frames played back at once; a socket holds at least 278 unread frames."""
 CHUNKS = 3
-"""Of a log, spread over it, in the short form; the full form plays all of it."""
+"""Number of chunks played, spread over a log, in the short form; the full form plays the whole log."""
 EVENTS = 250 if FULL else 16
 SEEDS = range(4 if FULL else 1)
 TICKS_APART = (1, 25)
 RESUMED_TICKS = 50
-"""0.5 s."""
+"""Longest time until the flight resumes, 0.5 s."""
 MCU_DISARMED, MCU_ARMED, MCU_STOPPED = 1, 2, 4
 """States in MCU_STATUS."""
 
 
 class Flown(NamedTuple):
-    """One flight on vcan0: its log, and what candump heard of its first ticks."""
+    """One flight on vcan0: its log, and the frames of its first ticks from candump."""
 
     log: Path
     lines: list[str]
@@ -57,7 +57,7 @@ class Flown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def on_virtual(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Scenario], list[str]]:
-    """on_virtual(scenario): the lines of can.log over a virtual bus; each scenario is flown once."""
+    """on_virtual(scenario): the lines of can.log from a virtual bus; each scenario is flown once."""
 
     @cache
     def fly_it(scenario: Scenario) -> list[str]:
@@ -130,7 +130,7 @@ def test_flight_beside_a_stranger_s_frames_sends_what_it_sends_alone(
         bench = stack.enter_context(bench_on(f"socketcan:{link.name}", SHORT))
 
         def flood(received: Sequence[BusFrame], to_bus: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-            if outputs.tick == ARMED_TICK:  # before, so many bad frames are a reason not to arm
+            if outputs.tick == ARMED_TICK:  # earlier, so many bad frames would prevent arming
                 assert outputs.records[0].state in ARMED
                 stack.enter_context(cangen_flood(link.name, FLOOD_ID, FLOOD_GAP_MS))
 
@@ -164,7 +164,7 @@ def test_foreign_sync_is_an_alarm_and_an_estop_stops_the_thrusters(link: Interfa
     assert not any(armed[ESTOP_TICK + 2 :])
     assert not any(turning[ESTOP_TICK + 2 :])
     assert set(mcu[ESTOP_TICK + 2 : ESTOP_TICK + 18]) == {MCU_STOPPED}
-    assert mcu[-1] == MCU_DISARMED  # 200 ms without ESTOP and told to be disarmed: the module lets go, the robot stays
+    assert mcu[-1] == MCU_DISARMED  # 200 ms without ESTOP and with DISARMED commands: the module releases, the robot stays stopped
 
 
 @pytest.mark.parametrize("seed", SEEDS)

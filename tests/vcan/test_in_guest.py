@@ -1,4 +1,4 @@
-"""The folder's tests on a machine without vcan: one boot of the guest, one pytest in it."""
+"""Runs the folder's tests on a machine without vcan: boots the guest once and runs one pytest in it."""
 
 import os
 import shlex
@@ -15,7 +15,7 @@ TIMEOUT_S = 10_800 if FULL_LENGTH in os.environ else 2400
 
 
 def test_everything_on_real_socketcan_passes_in_the_guest(guest: Guest) -> None:
-    # Collecting imports what the tests import: compiled code of both kinds is then in the caches that the guest reads.
+    # Collecting imports everything that the tests import, which fills both caches of compiled code that the guest reads.
     warm_up = shlex.join([*PYTEST, "--collect-only", "-qq"]) + " >/dev/null"
     inner = [*PYTEST, "--capture=no", "-m", "vcan", "-rs", "--durations=5"]
     result = guest.run(inner, warm_up=warm_up, timeout_s=TIMEOUT_S, capture=False)

@@ -1,4 +1,4 @@
-"""What the other tests here stand on: a bus that passes frames, can-utils that see them, links that break on demand."""
+"""The basis of the other tests here: a bus that passes frames, can-utils that see them, links that break on demand."""
 
 import errno
 import socket

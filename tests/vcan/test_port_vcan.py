@@ -1,6 +1,6 @@
-"""The ports' suite on real SocketCAN, and what becomes of a port when its interface goes down, away or full.
+"""The port suite on real SocketCAN, and a port's behaviour when its interface goes down, disappears or is full.
 
-Outside the virtual machine one test runs this file inside it; everything else exists only in there.
+Outside the virtual machine one test runs this file inside it; all other tests exist only there.
 """
 
 import os
@@ -48,7 +48,7 @@ else:
 
     @pytest.fixture
     def vcan2():
-        """An interface of the test's own, to be broken."""
+        """An interface for this test alone to break."""
         ip("link", "add", "vcan2", "type", "vcan")
         ip("link", "set", "vcan2", "up")
         yield "socketcan:vcan2"
@@ -94,7 +94,7 @@ else:
                 assert receive(listener, 1) == [FRAMES[1]]
 
     def test_full_send_queue_is_counted_and_empties():
-        """A slow queue in front of vcan1 stands for a bus that nobody acknowledges."""
+        """A slow queue in front of vcan1 stands for a bus on which no node acknowledges."""
         subprocess.run(
             ["tc", "qdisc", "add", "dev", "vcan1", "root", "netem", "delay", "300ms", "limit", "5"], check=True
         )

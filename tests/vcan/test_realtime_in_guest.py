@@ -1,8 +1,8 @@
 """Real time on vcan0, plant and firmware as two processes: lateness, a flood at full speed, link events, the C node.
 
 The guest's clock counts instructions here, so that lateness is the program's own and not that of a busy machine. All
-flights that were asked for share one boot. Reduced: three short flights. With MODCUBE_FULL=1 ten seconds of hover each, the
-C node and the busy loops in flights of their own, 200 Hz too, and a thousand link events.
+selected flights share one boot. Reduced: three short flights. With MODCUBE_FULL=1 ten seconds of hover each, the
+C node and the busy loops in separate flights, 200 Hz too, and a thousand link events.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ SETTLE_S = 5.0 if FULL else 2.5
 HOVER_S = 10.0 if FULL else 1.0
 EVENTS = 100 if FULL else 6
 EVENT_S = 0.4
-"""Time from one link event to the next: 0.11 to 0.45 s on average, by how the link is."""
+"""Time between link events: 0.11 to 0.45 s on average, depending on the state of the link."""
 DAYS = [f"link events of seed {seed}" for seed in range(10 if FULL else 1)]
 ON_TIME = ["alone", "beside four busy loops", "200 Hz", "200 Hz beside four busy loops"] if FULL else []
 NODES = ["C node"] if FULL else ["C node beside four busy loops"]
@@ -50,7 +50,7 @@ Flight = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def flights(request: pytest.FixtureRequest, guest: Guest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Flight]:
-    """All flights of the tests that were selected, in one boot: their figures by name."""
+    """Figures, by name, of all flights of the selected tests, flown in one boot."""
     asked = {item.callspec.params.get("flight") for item in request.session.items if hasattr(item, "callspec")}
     plans = {name: plan for name, plan in PLANS.items() if name in asked}
     out, node = tmp_path_factory.mktemp("realtime"), tmp_path_factory.mktemp("node")
@@ -60,7 +60,7 @@ def flights(request: pytest.FixtureRequest, guest: Guest, tmp_path_factory: pyte
         make = ["make", "-C", str(ROOT / "hil/reference_node"), f"BUILD={node}", f"PYTHON={sys.executable}"]
         subprocess.run(make, check=True, capture_output=True)
     words = [json.dumps([dataclasses.asdict(plan) for plan in plans.values()]), str(node / "modcube_node")]
-    # Composing the firmware compiles what the guest then finds in its cache.
+    # The warm-up compiles the code that the guest then finds in its cache.
     warm_up = shlex.join([sys.executable, "-c", f"import {PROGRAM}"])
     run = guest.run([sys.executable, "-m", PROGRAM, *words], counted=True, warm_up=warm_up, out=out, timeout_s=TIMEOUT_S)
     assert run.returncode == 0, run.stdout + run.stderr
@@ -74,7 +74,7 @@ def flights(request: pytest.FixtureRequest, guest: Guest, tmp_path_factory: pyte
 
 @pytest.fixture
 def flight(request: pytest.FixtureRequest, flights: dict[str, Flight]) -> Flight:
-    """The flight that the test names, which kept its threads and flew to its end."""
+    """The flight that the test names. Asserts that it kept its threads and flew to the end."""
     flown = flights[request.param]
     print(json.dumps({"flight": request.param, **flown}))
     assert flown["refused"] == []
