@@ -1,4 +1,4 @@
-"""The command `modcube` from its first moment on: Ctrl-C ends it without a word while it still imports, as it does later."""
+"""Entry point of the command `modcube`. Ctrl-C ends it silently, already while it imports."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NO_ROOM = "modcube: compiled code cannot be kept: {}; make room on that disk, or
 
 
 def main() -> None:
-    """Runs the command line; what takes a second or more to import is imported here."""
+    """Runs the command line. Imports that take a second or more are made here."""
     if PASSING_PLACE:
         print(COMPILED_IN_PASSING, file=sys.stderr, flush=True)
     try:
@@ -48,14 +48,14 @@ def main() -> None:
 
 @contextmanager
 def compiling_told(out: TextIO | None) -> Iterator[None]:
-    """Meanwhile who waits at a terminal is told when numba compiles the first function that it does not find compiled."""
-    if out is None or not out.isatty():  # None: it is closed
+    """Inside, prints COMPILING to `out`, if it is a terminal, when numba compiles the first function that is not in its cache."""
+    if out is None or not out.isatty():  # None: the stream is closed
         yield
         return
     from numba.core.event import Listener, install_listener
 
     class FirstCompiled(Listener):
-        """Says it once."""
+        """Prints COMPILING once."""
 
         told = False
 
@@ -65,7 +65,7 @@ def compiling_told(out: TextIO | None) -> Iterator[None]:
                 print(COMPILING, file=out, flush=True)
 
         def on_end(self, event: object) -> None:
-            """Nobody waits any more."""
+            """Required by Listener; does nothing."""
 
     with install_listener("numba:compile", FirstCompiled()):
         yield

@@ -27,14 +27,14 @@ from firmware_py.runtime.folders import folder_of
 from firmware_py.runtime.interrupts import ended_at_once
 
 CANNOT_RUN = 2
-"""Exit status when nothing could be started: wrong usage, no such bus, a file that is wrong."""
+"""Exit status when nothing could be started: wrong usage, no such bus, an invalid file."""
 REASONS = {errno.EEXIST: "is a file; a folder is needed"}
-"""In place of the system's words, where these do not say what would be right."""
+"""Replacements for system error texts that do not say what would be right."""
 BUS, VEHICLE, RATE_HZ = "socketcan:can0", "modcube", 100
-"""Of one module, where the command line does not say."""
+"""Defaults of the command line, for a fleet of one module."""
 _STDERR = 2
 LIVE_HOST, LIVE_PORT = "127.0.0.1", 8765
-"""Where the live view listens, where the command line does not say."""
+"""Default address of the live view."""
 Log = Annotated[Path, typer.Argument(parser=folder_of, help="folder that a run left: can.log and signals.mcap")]
 
 app = typer.Typer(
@@ -90,7 +90,7 @@ def run(
     links = ground_config(ground_file, ground or [], identity, store, out, len(described.module))
     notifier = Notifier.of(os.environ)
     with ExitStack() as stack:
-        # Its threads start before this process takes its real-time priority, which they would inherit.
+        # The view's threads start before this process takes its real-time priority, which they would inherit.
         view = stack.enter_context(LiveView(live_host or LIVE_HOST, live_port or LIVE_PORT)) if live else None
         summary = run_vehicle(described, chosen, hold, out, notifier=notifier, ground=links, live=view)
     for line in stats_lines(summary) if stats else ():
@@ -98,7 +98,7 @@ def run(
 
 
 def fleet_of(file: Path | None, bus: str | None, vehicle: str | None, rate_hz: int | None) -> Fleet:
-    """The fleet in `file`, or else one module; what is None keeps its default. Raises DescriptionError."""
+    """The fleet in `file`, or a fleet of one module without a file; None selects the default. Raises DescriptionError."""
     from firmware_py.app.firmware import read_fleet
 
     options = {"--bus": bus, "--vehicle": vehicle, "--rate": rate_hz}
@@ -113,12 +113,12 @@ def fleet_of(file: Path | None, bus: str | None, vehicle: str | None, rate_hz: i
 def ground_config(
     file: Path | None, links: list[str], identity: str | None, store: str | None, logs: Path | None, modules: int
 ) -> GroundConfig | None:
-    """What the command line, and else `file`, says of ground stations; None without either. Raises DescriptionError.
+    """Configuration of the ground side: the command line takes precedence over `file`; None without either. Raises DescriptionError.
 
     Args:
-        identity, store: None where the command line does not say.
+        identity, store: None where the command line does not give them.
         logs: folder of the logs, unless the file names one.
-        modules: of the fleet.
+        modules: number of modules in the fleet.
     """
     if file is None and not links:
         if identity is not None or store is not None:
@@ -210,7 +210,7 @@ def clear_estop(
 
 @log_app.command()
 def recover(log: Log) -> None:
-    """Mend a log that is torn (kill -9, a pulled plug) or damaged: whole ticks before that stay; what it was is kept as NAME.torn."""
+    """Repair a log that is torn (kill -9, power loss) or damaged: keeps the whole ticks before that, and the originals as NAME.torn."""
     from firmware_py.runtime.log_recovery import recover as mend
 
     ticks, torn = mend(log)
@@ -218,17 +218,20 @@ def recover(log: Log) -> None:
 
 
 def fill_standard_streams() -> None:
-    """Whoever starts this process may have closed one: the next file would take its number, and a log all lines that are said."""
+    """Opens /dev/null for each standard stream that the parent process closed.
+
+    Otherwise the next file that is opened, such as a log, would take that number and receive every line that is printed.
+    """
     while (handle := os.open(os.devnull, os.O_RDWR)) <= _STDERR:
         pass
     os.close(handle)
 
 
 def main() -> None:
-    """Runs the command line; wrong input ends in one line on stderr and status 2."""
+    """Runs the command line; wrong input gives one line on stderr and status 2."""
     fill_standard_streams()
     own = {command.name or command.callback.__name__ for command in app.registered_commands if command.callback is not None}
-    if own.isdisjoint(sys.argv[1:2]):  # the vehicle's process has no room for the bench
+    if own.isdisjoint(sys.argv[1:2]):  # saves the vehicle's process the memory of the bench
         for entry in sorted(entry_points(group="modcube.commands"), key=lambda e: e.name):
             with ended_at_once():
                 command = entry.load()
@@ -240,7 +243,7 @@ def main() -> None:
     except (DescriptionError, PortError) as error:
         status = _refuse(f"modcube: {error}")
     except OSError as error:
-        if error.filename is None and error.errno not in disk.FAILURES:  # no file, folder or disk of the user's is to blame
+        if error.filename is None and error.errno not in disk.FAILURES:  # not caused by a file, folder or disk of the user
             raise
         place = f"{error.filename}: " if error.filename else ""
         status = _refuse(f"modcube: {place}{REASONS.get(error.errno or 0, error.strerror)}")
@@ -248,7 +251,7 @@ def main() -> None:
 
 
 def usage_error(error: TyperException) -> str:
-    """One line: which command, what is wrong with its arguments, what there is instead."""
+    """One line: the command, what is wrong with its arguments, and the alternatives."""
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "modcube"
     known = ", ".join(getattr(context.command, "commands", ())) if context is not None else ""

@@ -1,6 +1,6 @@
-"""Where numba keeps our compiled code, and which files it was made of. Standard library alone: flash.py ships it beside flash_device.py.
+"""Where numba caches our compiled code, and from which files. Standard library only: flash.py ships this file beside flash_device.py.
 
-One compiled function contains others, and constants, of which numba knows nothing: it compares a cache with the source beside it alone.
+A compiled function contains other functions and constants that numba does not track: it compares a cache only with the source beside it.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 CACHE_FOLDER = "NUMBA_CACHE_DIR"
-"""Numba's own word in the environment; inherited by the processes that this one starts."""
+"""Numba's environment variable for its cache folder; inherited by child processes."""
 
 
 def caches(package: Path) -> list[Path]:
-    """numba's index files below `package`; a folder that vanishes or cannot be read meanwhile holds none (Path.rglob would raise)."""
+    """numba's index files below `package`. Skips folders that vanish meanwhile or cannot be read (Path.rglob would raise)."""
     return [Path(folder, name) for folder, _, names in os.walk(package) for name in names if name.endswith(".nbi")]
 
 
 def cached_sources(root: Path, packages: Iterable[str]) -> set[str]:
-    """Files of `packages`, as they are called from their folder `root` on, beside which compiled code lies."""
+    """Source files of `packages`, as paths relative to `root`, that have compiled code beside them."""
     found = {path.parents[1] / f"{path.name.split('.')[0]}.py" for package in packages for path in caches(root / package)}
     return {str(path.relative_to(root)) for path in found}
 
 
 def taken_in(root: Path, names: Iterable[str]) -> dict[str, bytes]:
-    """What the files `names` below `root` hold, and those that they import modules or constants (in capitals) from, by name."""
+    """Contents, by name, of the files `names` below `root` and of all from which they import modules or constants (in capitals)."""
     found = dict[str, bytes]()
     left = set(names)
     while left:
@@ -37,7 +37,7 @@ def taken_in(root: Path, names: Iterable[str]) -> dict[str, bytes]:
 
 
 def _sources(text: str) -> set[str]:
-    """Where the modules and constants may be that a file imports."""
+    """Paths that may hold the modules and constants that a file imports."""
     found = set[str]()
     for module, names in re.findall(r"^from ([\w.]+) import (\([^)]*\)|[^\n]*)", text, re.MULTILINE):
         folder = module.replace(".", "/")
@@ -48,8 +48,8 @@ def _sources(text: str) -> set[str]:
 
 
 def forget_stale_code(root: Path, package: str, *used: str) -> None:
-    """Deletes what numba has cached in `package`, a folder of `root`, before a file was changed from which its functions, or those of the
-    packages `used`, were compiled. Caches that NUMBA_CACHE_DIR leads elsewhere are not looked at.
+    """Deletes numba's caches in `package`, a folder of `root`, that are older than the newest source from which its functions, or those
+    of the packages `used`, were compiled. Ignores caches that NUMBA_CACHE_DIR puts elsewhere.
     """
     mine = caches(root / package)
     if not mine:
@@ -57,20 +57,20 @@ def forget_stale_code(root: Path, package: str, *used: str) -> None:
     try:
         sources = taken_in(root, cached_sources(root, (package, *used)))
         newest = max((root / name).stat().st_mtime for name in sources) if sources else 0.0
-    except OSError:  # a source that cannot be read is imported by nobody
+    except OSError:  # a source that cannot be read cannot be imported either
         return
     for path in mine:
         try:
             if path.stat().st_mtime < newest:
                 path.unlink()
-        except OSError:  # another process was here first, or nothing may be written here
+        except OSError:  # another process was faster, or the folder is read-only
             pass
 
 
 def passing_place(package: Path, environment: Mapping[str, str]) -> str:
-    """A new folder for compiled code, for as long as this process lives; empty where numba finds a place that lasts, or there is none.
+    """Creates a temporary folder for compiled code, removed at exit; "" where numba finds a lasting place, or none can be created.
 
-    Numba itself looks beside each source and in the user's folder for caches, and raises where neither can be written.
+    Numba itself tries the folder beside each source and the user's cache folder, and raises where neither can be written.
     """
     home = environment.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache"))
     if environment.get(CACHE_FOLDER) or _takes_files(Path(home, "numba")) or all(map(_takes_files, _beside_sources(package))):
@@ -93,6 +93,6 @@ def _beside_sources(package: Path) -> list[Path]:
 
 
 def _takes_files(folder: Path) -> bool:
-    """Whether files can be made in `folder`, or it can itself. What is in somebody else's home is not there (Path.exists would raise)."""
+    """Whether `folder` is writable or can be created. A path in another user's home counts as absent (Path.exists would raise)."""
     there = next(path for path in (folder, *folder.absolute().parents) if os.path.exists(path))
     return os.path.isdir(there) and os.access(there, os.W_OK | os.X_OK)

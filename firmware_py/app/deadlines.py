@@ -1,4 +1,4 @@
-"""How ticks kept their deadlines, for whom it concerns: the log, ground stations, and who ends a run (`--stats`)."""
+"""Reports how ticks kept their deadlines: to the log, to ground stations, and at the end of a run (`--stats`)."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from firmware_py.runtime.recorder import Recorder
 
 RECORD_EVERY_S = 0.5
 BAR = 40
-"""Characters of the fullest bin."""
+"""Length of the fullest bin's bar, characters."""
 
 
 class Summary(NamedTuple):
-    """How a run went."""
+    """Timing figures of a run."""
 
     ticks: int
     overruns: int
     skipped: int
     unanswered: int
     lateness: Histogram
-    """How long after their deadlines ticks began."""
+    """How long after its deadline each tick began."""
     compute: Histogram
-    """How long they ran, the wait for the modules' answers included."""
+    """How long each tick ran, including the wait for the modules' answers."""
 
 
 def summary_of(loop: RealTimeLoop) -> Summary:
-    """The run so far."""
+    """The figures of the run so far."""
     keeper = loop.rate_keeper
     return Summary(keeper.lateness.total, keeper.overruns, keeper.skipped, loop.unanswered, keeper.lateness, keeper.compute)
 
 
 def stats_lines(summary: Summary) -> Iterator[str]:
-    """What `modcube run --stats` prints: counts, quantiles, and both histograms."""
+    """Lines that `modcube run --stats` prints: counts, quantiles, and both histograms."""
     for name in ("ticks", "overruns", "skipped", "unanswered"):
         yield f"{name:20s} {getattr(summary, name)}"
     histograms = {"lateness": summary.lateness, "compute": summary.compute}
@@ -52,7 +52,7 @@ def stats_lines(summary: Summary) -> Iterator[str]:
 
 
 def histogram_lines(histogram: Histogram) -> Iterator[str]:
-    """A line for each bin from the first to the last that holds a tick."""
+    """One line per bin, from the first to the last bin that holds a tick."""
     counts = [int(count) for count in histogram.coarse()]
     held = [bin for bin, count in enumerate(counts) if count]
     for bin in range(held[0], held[-1] + 1) if held else ():
@@ -73,6 +73,6 @@ def recording_times(recorder: Recorder, keeper: RateKeeper, rate_hz: int) -> Obs
 
 
 def times_of(keeper: RateKeeper) -> Times:
-    """As telemetry tells it."""
+    """The figures as telemetry sends them; the load is the 99th percentile of the compute time over the period."""
     load = keeper.compute.quantile_ns(0.99) / keeper.period_ns
     return Times(load, tuple(keeper.lateness.coarse().tolist()), tuple(keeper.compute.coarse().tolist()))

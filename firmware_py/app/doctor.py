@@ -1,6 +1,6 @@
-"""`modcube doctor`: whether this machine and its buses are fit to fly, in words a person can act on.
+"""`modcube doctor`: checks whether this machine and its buses are fit to fly, and advises what to do.
 
-Looks, and changes nothing; on a bus where nobody sends SYNC it sends a few, which move no thruster.
+Changes nothing; on a bus without SYNC it sends a few SYNC frames, which move no thruster.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from firmware_py.runtime.realtime import real_time
 
 OK, WARNING, FAILED = "ok", "warn", "FAIL"
 SPARE_BYTES, NEEDED_BYTES = 2_000_000_000, 200_000_000
-"""Room for logs: an hour takes 600 MB (0.17 MB/s measured at 100 Hz)."""
+"""Free disk space for logs: an hour takes 600 MB (0.17 MB/s measured at 100 Hz)."""
 STEADY_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock")
 EARLIEST_YEAR = 2024
-"""A Jetson without a battery for its clock starts in 1970."""
+"""Earliest plausible date: a Jetson without a clock battery starts in 1970."""
 SLOW_IMPORT_S = 8.0
-"""Longest that importing the tick's code takes when all of it is compiled and cached."""
+"""Longest time to import the tick's code when all of it is compiled and cached."""
 WARM_MODULES = ("firmware_py.app.vehicle", "firmware_py.app.firmware")
-"""Importing these compiles everything that a tick calls, or finds it in the cache."""
+"""Modules whose import compiles everything that a tick calls, or loads it from the cache."""
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at; `advice` says what to do when it is not ok."""
+    """Result of one check; `advice` says what to do when it is not ok."""
 
     name: str
     state: str
@@ -44,11 +44,11 @@ class Finding(NamedTuple):
 
 
 Look = Callable[[str], str]
-"""Text of a file; empty where there is none."""
+"""Returns the text of a file; empty where there is none."""
 
 
 def read_file(path: str) -> str:
-    """Text of a file of /proc or /sys; empty where there is none."""
+    """Text of a file in /proc or /sys; empty where there is none."""
     try:
         return Path(path).read_text().strip()
     except OSError:
@@ -56,7 +56,7 @@ def read_file(path: str) -> str:
 
 
 def check_machine(folder: Path, look: Look = read_file) -> list[Finding]:
-    """Everything but the buses. `folder` is where logs go."""
+    """Runs every check but those of the buses. `folder` is where logs go."""
     return [
         check_kernel(look),
         *check_permissions(),
@@ -69,7 +69,7 @@ def check_machine(folder: Path, look: Look = read_file) -> list[Finding]:
 
 
 def check_kernel(look: Look) -> Finding:
-    """Kernel and PREEMPT_RT."""
+    """Checks the kernel for PREEMPT_RT."""
     release = f"Linux {platform.release()} {platform.machine()}"
     if look("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version():
         return Finding("kernel", OK, f"{release}, PREEMPT_RT")
@@ -78,7 +78,7 @@ def check_kernel(look: Look) -> Finding:
 
 
 def check_permissions() -> Iterator[Finding]:
-    """Real-time priority, fine timers, small pages and locked memory, by trying them."""
+    """Checks real-time priority, fine timers, small pages and locked memory by trying them."""
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     with real_time() as refused:
         pass
@@ -91,7 +91,7 @@ def check_permissions() -> Iterator[Finding]:
 
 
 def check_governor(look: Look) -> Finding:
-    """Frequency scaling of the processors."""
+    """Checks the frequency scaling of the processors."""
     governor = look("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
     text = f"{os.cpu_count()} processors, governor {governor or 'none'}"
     if governor in ("", "performance"):
@@ -100,8 +100,8 @@ def check_governor(look: Look) -> Finding:
 
 
 def check_throttle(look: Look, processors: int) -> Finding:
-    """What the kernel leaves real-time threads of each second. A reader that works through a flood needs a processor whole; on one that
-    the tick shares with it the tick stood still for 15 to 20 ms (measured in a flood of cangen).
+    """Checks the share of time that the kernel allows real-time threads. A reader that works through a flood takes a whole processor;
+    on a processor shared with it, the tick was held up for 15 to 20 ms (measured in a flood of cangen).
     """
     runtime, period = (int(look(f"/proc/sys/kernel/sched_rt_{name}_us") or -1) for name in ("runtime", "period"))
     if runtime < 0 or period <= runtime:
@@ -113,7 +113,7 @@ def check_throttle(look: Look, processors: int) -> Finding:
 
 
 def check_clock(look: Look, year: int) -> Finding:
-    """Source of time, and whether the date can be true."""
+    """Checks the clock source, and whether the date is plausible."""
     source = look("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown"
     if source not in STEADY_CLOCKS:
         return Finding("clock", WARNING, f"source {source}", f"slow to read; right are {', '.join(STEADY_CLOCKS)}")
@@ -123,7 +123,7 @@ def check_clock(look: Look, year: int) -> Finding:
 
 
 def check_logs(folder: Path) -> Finding:
-    """Whether logs can go to `folder`; where it is not there yet a run makes it, so the one is looked at that it would lie in."""
+    """Checks whether logs can go to `folder`. A run creates a missing folder, so the nearest existing parent is checked instead."""
     place = next(each for each in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(each))
     if not place.is_dir():
         return Finding("disk", FAILED, f"{place} is a file; logs need a folder", "give another with --out")
@@ -136,7 +136,7 @@ def check_logs(folder: Path) -> Finding:
 
 
 def check_disk(folder: Path, free_bytes: int) -> Finding:
-    """Room for logs."""
+    """Checks the free disk space for logs."""
     text = f"{free_bytes / 1e9:.1f} GB free for logs in {folder}"
     if free_bytes >= SPARE_BYTES:
         return Finding("disk", OK, text)
@@ -145,7 +145,7 @@ def check_disk(folder: Path, free_bytes: int) -> Finding:
 
 
 def check_cache() -> Finding:
-    """Whether compiled code is there: by how long a fresh process takes to load it."""
+    """Checks whether compiled code is cached, by the time a fresh process takes to load it."""
     try:
         took_s = warm_up()
     except DescriptionError as error:
@@ -157,8 +157,9 @@ def check_cache() -> Finding:
 
 
 def warm_up() -> float:
-    """Loads what a tick calls, compiling what is not cached, in a process of its own; returns the seconds it took. Raises
-    DescriptionError where that process fails.
+    """Loads what a tick calls in a separate process, which compiles what is not cached; returns the seconds that took.
+
+    Raises DescriptionError where that process fails.
     """
     began = time.perf_counter()
     words = "; ".join(f"import {name}" for name in WARM_MODULES)
@@ -170,7 +171,7 @@ def warm_up() -> float:
 
 
 def check_interface(name: str, show: Callable[[str], str] | None = None) -> Finding:
-    """State of a SocketCAN interface, as `ip` tells it."""
+    """Checks a SocketCAN interface, from the output of `ip`."""
     title = f"bus {name}"
     text = (show or show_link)(name)
     try:
@@ -189,7 +190,7 @@ def check_interface(name: str, show: Callable[[str], str] | None = None) -> Find
 
 
 def judge_controller(title: str, name: str, data: dict[str, Any], queue: int) -> Finding:
-    """A real controller that is up: bit rate, restart, state, queue."""
+    """Judges a real controller that is up: bit rate, restart-ms, state and queue."""
     rate, state = int(data.get("bittiming", {}).get("bitrate", 0)), str(data.get("state", "?"))
     restart = int(data.get("restart_ms", 0))
     text = f"{rate // 1000} kbit/s, {state}, restart-ms {restart}, queue {queue}"
@@ -208,7 +209,7 @@ def judge_controller(title: str, name: str, data: dict[str, Any], queue: int) ->
 
 
 def show_link(name: str) -> str:
-    """JSON of `ip` about an interface; empty where there is none."""
+    """JSON output of `ip` for an interface; empty where there is none."""
     try:
         done = subprocess.run(
             ["ip", "-json", "-details", "link", "show", name], capture_output=True, text=True, check=False
@@ -219,7 +220,7 @@ def show_link(name: str) -> str:
 
 
 def lines_of(findings: Sequence[Finding]) -> list[str]:
-    """What is printed: a line each, and the advice beneath."""
+    """Lines to print: one per finding with its advice below, then a summary."""
     lines = []
     for finding in findings:
         lines.append(f"{finding.state:4s}  {finding.name:14s} {finding.text}")

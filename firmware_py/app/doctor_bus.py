@@ -1,4 +1,4 @@
-"""`modcube doctor` on a bus: who is there, in which state, and how full it is."""
+"""Bus checks of `modcube doctor`: which nodes are present, their state, and the bus load."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from firmware_py.bus.load import BIT_RATE, MEAN_LIMIT, bus_load, frame_bits, is_
 from firmware_py.bus.port import Port
 
 LISTEN_S = 0.3
-"""A foreign SYNC shows itself in a fraction of it (50 Hz at least)."""
+"""Listening time. A foreign SYNC (at least 50 Hz) appears within a fraction of it."""
 TICK_S = 0.01
 TICKS = 60
-"""SYNCs sent: every slow message of a module comes at least once in 200 ms but HEARTBEAT."""
+"""Number of SYNCs sent: every slow message of a module but HEARTBEAT comes at least once in 200 ms."""
 STATES = ("boot", "disarmed", "armed", "time-out of commands", "e-stop", "fault")
 FIT_STATES = (1, 2, 3)
-"""Of those; a module in another one turns no thruster when it is armed."""
+"""Indices into STATES. A module in any other state turns no thruster when it is armed."""
 ERRORS = ("bad CRC", "bad counter", "bad length", "command time-out", "sensor fault", "relay fault")
 TOO_MANY = 1.5
-"""Commands of a module for each SYNC, which are more than one controller sends, however many of either were missed."""
+"""Commands to a module per SYNC above which more than one controller must be sending, however many of either were missed."""
 TIME_OUT = 1 << 3
-"""Of MCU_STATUS: nobody commands while the doctor looks, so it is no fault."""
+"""Error bit of MCU_STATUS. Not a fault here, because no one commands the module during the check."""
 WRONG: Mapping[str, Mapping[int, str]] = {
     "Leak": {1: "water in its cabin"},
     "PowerStatus": {1: "a low supply", 2: "a critical supply", 15: "a dead supply sensor"},
@@ -30,31 +30,31 @@ WRONG: Mapping[str, Mapping[int, str]] = {
     **{f"EscStatus{number}": {1: f"a fault of ESC {number}", 2: f"an ESC {number} that is too hot"} for number in range(1, 9)},
     **{f"RelayEcho{face}": {3: f"a fault of relay {face}"} for face in "ABCDEF"},
 }
-"""By field and value, what a module's frames say of it. A silent ESC is not there: an MCU says so of one that the vehicle lacks."""
+"""Faults that a module reports, by field and value. A silent ESC is left out: an MCU reports that also of one that the vehicle lacks."""
 
 
 @dataclass(slots=True)
 class Seen:
-    """What came from one bus."""
+    """Everything received from one bus."""
 
     seconds: float = 0.0
     bits: int = 0
     frames: int = 0
     sync: int = 0
     commands: dict[int, int] = field(default_factory=dict)
-    """By number of the module: how often it was commanded, by its THRUSTER_CMD_A."""
+    """How often each module, by number, was commanded, counted by its THRUSTER_CMD_A."""
     estop: set[int] = field(default_factory=set)
     status: dict[int, tuple[int, int, int]] = field(default_factory=dict)
     """By module: version, errors, state."""
     wrong: dict[int, dict[str, None]] = field(default_factory=dict)
-    """By module: what its frames said to be wrong, each once, in order."""
+    """By module: faults that its frames reported, each once, in order."""
     messages: dict[int, set[str]] = field(default_factory=dict)
-    """By number: names of what came."""
+    """By number: names of the messages received."""
     dropped: dict[str, int] = field(default_factory=dict)
 
 
 def look_at(port: Port, codec: Codec, wait: Callable[[float], None]) -> Seen:
-    """Listens; where nobody sends SYNC, sends TICKS of them. `wait` lets so many seconds pass."""
+    """Listens to the bus; without a foreign SYNC, then sends TICKS SYNCs. `wait` sleeps for a number of seconds."""
     seen, receiver = Seen(), Receiver(codec)
     port.receive()
     for _ in range(round(LISTEN_S / TICK_S)):
@@ -74,13 +74,13 @@ def look_at(port: Port, codec: Codec, wait: Callable[[float], None]) -> Seen:
 
 
 def count(frame: Frame, seen: Seen) -> None:
-    """A frame's share of the bus."""
+    """Counts a frame into the bus load."""
     seen.bits += frame_bits(len(frame.data))
     seen.frames += 1
 
 
 def take(port: Port, receiver: Receiver, seen: Seen) -> None:
-    """What came in one tick."""
+    """Takes the frames that arrived in one tick."""
     seen.seconds += TICK_S
     for frame in port.receive():
         count(frame, seen)
@@ -101,7 +101,7 @@ def take(port: Port, receiver: Receiver, seen: Seen) -> None:
 
 
 def complaints(received: Received) -> Iterator[str]:
-    """What a frame says to be wrong."""
+    """Faults that a frame reports."""
     for name, value in zip(received.message.fields, received.values, strict=True):
         if word := WRONG.get(name, {}).get(int(value)):
             yield word
@@ -131,7 +131,7 @@ def judge(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec
 
 
 def judge_commands(title: str, seen: Seen) -> Iterator[Finding]:
-    """Modules that are commanded by somebody who is not the one controller of the bus: that one commands once after each SYNC."""
+    """Finds modules commanded by a second controller. The one controller of a bus commands each module once after each SYNC."""
     commanded = sorted(number for number, count in seen.commands.items() if count > TOO_MANY * seen.sync)
     if not commanded:
         return
@@ -141,7 +141,7 @@ def judge_commands(title: str, seen: Seen) -> Iterator[Finding]:
 
 
 def judge_module(title: str, number: int, seen: Seen, codec: Codec) -> Finding:
-    """One module of the fleet."""
+    """Finding about one module of the fleet."""
     if number not in seen.status:
         return Finding(title, FAILED, f"module {number} is silent", "is it powered, its number set? candump shows ids")
     version, errors, state = seen.status[number]
@@ -158,12 +158,12 @@ def judge_module(title: str, number: int, seen: Seen, codec: Codec) -> Finding:
 
 
 def expected_of(codec: Codec) -> set[str]:
-    """What every module sends."""
+    """Names of the messages that every module sends."""
     return {message.name for message in codec.messages if is_of_a_module(message)}
 
 
 def judge_load(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec) -> Finding:
-    """How full the bus is, and will be at most."""
+    """Finding about the bus load now and the highest expected in flight."""
     now = seen.bits / BIT_RATE / max(seen.seconds, TICK_S)
     load = bus_load(codec, numbers, rate_hz)
     text = (

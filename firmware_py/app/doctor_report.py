@@ -1,4 +1,4 @@
-"""`modcube doctor` put together: the machine, each bus of the fleet, and the exit status."""
+"""All of `modcube doctor`: the machine, each bus of the fleet, and the exit status."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNFIT = 1
 
 
 def examine(fleet: Fleet, folder: Path, say: Callable[[str], None], wait: Callable[[float], None] = time.sleep) -> int:
-    """Prints what was found; returns the exit status."""
+    """Prints the findings; returns the exit status."""
     codec = Codec.load()
     findings = check_machine(folder)
     for index, address in enumerate(fleet.buses):
@@ -31,7 +31,7 @@ def examine(fleet: Fleet, folder: Path, say: Callable[[str], None], wait: Callab
 def check_bus(
     address: str, numbers: list[int], rate_hz: int, codec: Codec, wait: Callable[[float], None]
 ) -> Iterator[Finding]:
-    """One bus: its interface, then what can be heard on it."""
+    """Checks one bus: its interface, then its traffic."""
     kind, _, name = address.partition(":")
     title = f"bus {name if kind == 'socketcan' else address}"
     if kind == "socketcan":

@@ -1,7 +1,7 @@
-"""Whether an e-stop stands, for the next process: one small file in the folder of the logs, which no full disk, spoilt log or pulled plug
-takes away.
+"""Keeps for the next process whether an e-stop stands: one small file in the folder of the logs, which survives a full disk, a damaged
+log and power loss.
 
-It has one length whatever it says: a disk that is full has no room for more, but what is there can be written over.
+Both contents have the same length: on a full disk an existing file can be overwritten, but not extended.
 """
 
 from __future__ import annotations
@@ -27,35 +27,35 @@ STANDS, CLEAR = b"stands\n", b"clear \n"
 CLOSE_S = 5.0
 """How long the end of a run waits for a disk."""
 AGAIN_S = 1.0
-"""How long after a note could not be written it is tried again."""
+"""Delay before a failed write of the note is retried."""
 
 
 def estop_stands(folder: Path) -> bool:
-    """Whether the note in `folder` says so. One that says neither, or cannot be read, does: who cannot tell arms nobody."""
+    """Whether the note in `folder` says that an e-stop stands. True, the safe answer, for an unreadable note or other content."""
     try:
         return (folder / NOTE).read_bytes() != CLEAR
     except (FileNotFoundError, NotADirectoryError):
-        return False  # no process that logged here came to a tick
+        return False  # no process that logged here reached a tick
     except OSError:
         return True
 
 
 def write_note(folder: Path, stands: bool) -> None:
-    """Notes in `folder` that an e-stop stands, or that none does; when this returns it is on the disk. Raises OSError."""
+    """Writes the note into `folder` and syncs it to the disk before it returns. Raises OSError."""
     path, data = folder / NOTE, STANDS if stands else CLEAR
     try:
         with path.open("r+b", buffering=0) as file:
             file.write(data)
             file.truncate(len(data))
             os.fsync(file.fileno())
-    except OSError:  # there is none, it is somebody else's, or this disk has no room to write over it
+    except OSError:  # no note yet, another user's, or a disk without room to overwrite it
         write_atomically(path, data)
 
 
 def clear(folder: Path) -> bool:
-    """Notes in `folder` that no e-stop stands, for a person; returns whether one did. Raises DescriptionError and OSError.
+    """Clears the note in `folder`, on a person's order; returns whether an e-stop stood. Raises DescriptionError and OSError.
 
-    Refused while a vehicle runs there: its own e-stop would stand on.
+    Refused while a vehicle runs there, because that vehicle's own e-stop would remain.
     """
     if not (folder / NOTE).exists():
         raise DescriptionError(f"{folder} holds no {NOTE}: no vehicle has logged there; give the folder of modcube run --out")
@@ -71,7 +71,7 @@ def clear(folder: Path) -> bool:
 
 
 def hold(folder: Path) -> int | None:
-    """A handle, to be closed to let go of `folder`; until then nobody else has it. None where somebody else does. Raises OSError."""
+    """Locks `folder` exclusively; returns a handle to close for release. None where another process holds the lock. Raises OSError."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -84,14 +84,14 @@ def hold(folder: Path) -> int | None:
 
 
 class EstopNote:
-    """Writes the note by a thread of its own: no tick waits for a disk. To be made before this process takes its real-time priority.
-    Until `close`, nobody else writes it. Raises DescriptionError where somebody else has the folder.
+    """Writes the note in its own thread, so that no tick waits for a disk. Create it before this process takes its real-time priority.
+    Holds the lock on the folder until `close`. Raises DescriptionError where another process holds it.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._handle: int | None = None
-        with suppress(OSError):  # a folder that cannot be opened is said by the first note that it does not take
+        with suppress(OSError):  # a folder that cannot be opened is reported by the first failed write
             self._handle = hold(folder)
             if self._handle is None:
                 raise DescriptionError(f"another vehicle that runs logs into {folder}: end it first, or give this one another --out")
@@ -101,17 +101,17 @@ class EstopNote:
         self._thread.start()
 
     def write(self, stands: bool) -> None:
-        """As soon as the disk takes it: what it does not take is tried again, until something else is to be written."""
+        """Queues a write. A failed write is retried until it succeeds or a newer one replaces it."""
         self._queue.put(stands)
 
     def failures(self) -> list[Event]:
-        """A warning for one that could not be written, where there is any that was not told of."""
+        """A warning for one failed write that was not reported yet, if there is any."""
         if self._failed.empty():
             return []
         return [Event(WARNING, f"the next start will not know of an e-stop: {NOTE}: {self._failed.get().strerror}")]
 
     def close(self) -> None:
-        """Writes what waits, for CLOSE_S at the most; a second time does nothing."""
+        """Writes what is queued, waiting at most CLOSE_S, and releases the folder; a second call does nothing."""
         self._queue.put(None)
         self._thread.join(CLOSE_S)
         if self._handle is not None:
@@ -134,16 +134,18 @@ class EstopNote:
             except OSError as error:
                 if fresh:
                     self._failed.put(error)
-            if self._handle is None:  # there was no folder before
+            if self._handle is None:  # the folder did not exist before
                 with suppress(OSError):
                     self._handle = hold(self._folder)
 
 
 def noting_estop(note: EstopNote, stands: bool, recorder: Recorder | None = None) -> Observer:
-    """An observer that notes for the next process whether an e-stop stands: from one on, and where one stood before this process
-    (`stands`), until a person clears it or arms. The note is there from the first tick on, for a disk that is full later; it and the log
-    (`recorder`) are soon on the disk when one is raised: who has pressed a stop pulls the plug next. Each that is raised is noted, also
-    while one stands: a person may have cleared that by hand meanwhile.
+    """An observer that keeps the note of the e-stop for the next process. An e-stop stands from when it is raised, or from before this
+    process (`stands`), until a person clears it or arms.
+
+    The first tick writes the note already, in case the disk fills up later. When an e-stop is raised, the note and the log (`recorder`)
+    go to the disk at once, because a person who pressed a stop tends to cut the power next. Every e-stop raised is written, even while
+    one stands, because a person may have cleared the note by hand meanwhile.
     """
     noted: bool | None = None
     raised = False

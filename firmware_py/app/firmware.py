@@ -1,4 +1,4 @@
-"""One firmware process without its clock: frames in, frames out. Lockstep and real time both drive this object."""
+"""The firmware of one process without a clock: frames in, frames out. Lockstep and real time both drive it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Firmware:
         return self.encoder.sync(tick)
 
     def forget_heard(self) -> None:
-        """Begins to collect anew: the first tick takes only what comes after its SYNC, as the log has it."""
+        """Discards what was collected, so that the first tick takes only frames after its SYNC, as the log records it."""
         self.collector = InputCollector(self.fleet, self.codec)
 
     def step(
@@ -57,11 +57,11 @@ class Firmware:
         return inputs, outputs, self.frames(outputs)
 
     def frames(self, outputs: Outputs) -> list[BusFrame]:
-        """What is sent of a tick. A module's thrusters are not commanded before it has said how it is."""
+        """The frames to send in a tick. A module's thrusters are commanded only after its first MCU_STATUS."""
         return self.encoder.frames(outputs, self.collector.unmet)
 
     def tick(self, inputs: Inputs) -> Outputs:
-        """Steps the fleet; what it wants prepared goes to the worker, what the worker has done enters `inputs`."""
+        """Steps the fleet. Finished results of the worker enter `inputs`; new preparation requests go to the worker."""
         inputs.prepared = self.worker.results()
         outputs = self.pipeline.step(inputs)
         for request in outputs.preparations:
@@ -71,12 +71,12 @@ class Firmware:
 
 
 def vehicles_of(fleet: Fleet) -> dict[str, Vehicle]:
-    """The vehicles that a fleet names; each file is read once."""
+    """The vehicles that a fleet names, by name; each file is read once."""
     return {name: load_vehicle(name) for name in dict.fromkeys(m.vehicle for m in fleet.module)}
 
 
 def read_fleet(path: Path) -> Fleet:
-    """The fleet in `path`, whose modules can be docked as it says. Raises DescriptionError, which names the file."""
+    """The fleet in `path`, checked that its modules can be docked as it says. Raises DescriptionError, which names the file."""
     fleet = load_fleet(path)
     try:
         check_fleet(fleet, vehicles_of(fleet))
@@ -88,7 +88,7 @@ def read_fleet(path: Path) -> Fleet:
 def compose(
     fleet: Fleet, parameters: Parameters, vehicles: Mapping[str, Vehicle] | None = None, worker: Worker | None = None
 ) -> Firmware:
-    """The firmware of `fleet`, ready to step; slow work runs on the spot unless a worker is given.
+    """The firmware of `fleet`, ready to step; slow work runs inline unless a worker is given.
 
     Raises:
         DescriptionError: the fleet or a vehicle is wrong.

@@ -1,8 +1,8 @@
-"""The ground side beside the loop: links and GroundStation in a thread of their own. A tick only hands results over.
+"""The ground side: links and GroundStation in their own thread beside the loop. A tick only hands results over.
 
-The thread works once a tick is over, while the loop waits for the next: both want the one interpreter. Nobody wakes it, which would
-take 40 us of each tick: it sleeps until the next tick should be over.
-Missions are planned in a process of their own, so that planning takes nothing from the tick.
+The thread works after a tick, while the loop waits for the next, because both share one interpreter. The loop does not wake it, which
+would cost 40 us per tick; the thread sleeps until the next tick should be over.
+Missions are planned in a separate process, so that planning takes no time from the tick.
 """
 
 from __future__ import annotations
@@ -42,30 +42,30 @@ from firmware_py.runtime.realtime import die_with, use_ordinary_priority, use_pr
 from firmware_py.runtime.teller import Teller, write_line
 
 _AFTER = 0.1
-"""Share of a period that ticks may differ in length before the thread comes too early for one."""
+"""Margin for ticks of different length, as a share of a period, before the thread would wake up too early."""
 _LONGEST = 10.0
-"""Periods that it sleeps while the loop stands still."""
+"""Longest sleep of the thread while the loop stands still, in periods."""
 _SWITCH_S = 50e-6
-"""A tick that wakes up waits this long at most for the interpreter, where Python's own 5 ms would make it late."""
+"""Longest time that a waking tick waits for the interpreter. Python's default of 5 ms would make it late."""
 _MOST_TICKS = 200
-"""Ticks that may wait for the thread; the oldest go."""
+"""Longest queue of ticks for the thread; the oldest are dropped."""
 _MOST_REQUESTS = 256
-"""That may wait for a tick."""
+"""Longest queue of requests for a tick."""
 _SAVE_EVERY_NS = 1_000_000_000
-"""How often the signing time stamp is stored; the store is that much ahead. A new key is stored at once."""
+"""Interval between saves of the signing time stamp; the saved stamp is ahead by as much. A new key is saved at once."""
 
 
 _NOTHING = PlanJob(0, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), 0.1, 1.0)
-"""A plan of no legs: makes the planning process load what it needs."""
+"""A job without legs, which makes the planning process load its code."""
 
 Awaited = Array[Any]
-"""Of each body the serial number of the job whose plan it waits for, shared by both processes."""
+"""By body: serial number of the job whose plan it waits for. Shared by both processes."""
 _AWAITED: ContextVar[Awaited | None] = ContextVar("awaited", default=None)
-"""Set in the planning process alone."""
+"""Set in the planning process only."""
 
 
 def _plan_mission(job: PlanJob, body: Body | None) -> Plan:
-    """In the planning process alone: its solvers take 20 MB that the vehicle's process has no need of."""
+    """Runs in the planning process only: its solvers take 20 MB that the vehicle's process does not need."""
     from firmware_py.app.mission_plan import plan_mission
 
     awaited = _AWAITED.get()
@@ -78,22 +78,22 @@ def _planner(awaited: Awaited) -> ProcessPoolExecutor:
 
 
 def _serve(parent: int, awaited: Awaited) -> None:
-    """The planning process ends when the vehicle's does, and not by the Ctrl-C that asks the vehicle to disarm first."""
-    use_ordinary_priority()  # one that takes the place of another is started by a thread of real-time priority
+    """Sets up the planning process to end with the vehicle's process, and to ignore the Ctrl-C that asks the vehicle to disarm first."""
+    use_ordinary_priority()  # a replacement process is started by a thread of real-time priority
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     die_with(parent)
     _AWAITED.set(awaited)
 
 
 class GroundSide:
-    """Links, station, and what passes between them and the loop. `pump` does one round of the work.
+    """Links, station, and the queues between them and the loop. `pump` does one round of the work.
 
     Args of the constructor:
-        executor: plans missions; None starts a process for it.
+        executor: runs the planning of missions; None starts a process for it.
         unix_now_ns: the time of day, for signing.
-        priority: SCHED_FIFO priority of the thread, beside a loop that has one; 0: an ordinary thread.
+        priority: SCHED_FIFO priority of the thread, for use with a real-time loop; 0: an ordinary thread.
         started: parameters before the stored ones were laid over them; None: the firmware's.
-        say: told in one line what failed first, by a thread of its own.
+        say: receives one line about the first error, in its own thread.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class GroundSide:
         started: Parameters | None = None,
         say: Callable[[str], None] = write_line,
     ) -> None:
-        """Opens the links. Raises DescriptionError for a link, key file or parameter file that is wrong."""
+        """Opens the links. Raises DescriptionError for an invalid link, key file or parameter file."""
         self._config, self._pipeline, self._unix_now_ns = config, firmware.pipeline, unix_now_ns
         self._period_ns = firmware.fleet.period_ns
         self.station = GroundStation(config, firmware.fleet, started or firmware.parameters, _signing_of(config))
@@ -129,17 +129,17 @@ class GroundSide:
         self._saved_key = self.station.signing.key
         self._switch_s = 0.0
         self.keeper: RateKeeper | None = None
-        """Of a loop on a clock; telemetry tells how its ticks keep their deadlines."""
+        """Rate keeper of a real-time loop, from which telemetry reports how ticks keep their deadlines."""
         self.error: Exception | None = None
-        """The first that nobody foresaw. The thread goes on, and so does the vehicle."""
+        """The first unexpected error. The thread and the vehicle carry on."""
 
     def observe(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        """Observer of the loop: hands the tick over, once its commands are out."""
+        """Observer of the loop: hands over the tick after its commands are sent."""
         self._ticks.append((inputs, outputs))
         self._handed_over_ns = self._clock.now_ns()
 
     def requests(self) -> list[Request]:
-        """What ground stations ask of this tick."""
+        """Takes the queued requests of ground stations, for this tick."""
         return [self._requests.popleft() for _ in range(len(self._requests))]
 
     def pump(self) -> None:
@@ -148,11 +148,11 @@ class GroundSide:
             part()
 
     def _parts(self) -> Sequence[Callable[[], None]]:
-        """Of a round, in order. None needs another to succeed: a stop passes through hearing and handing over alone."""
+        """The steps of a round, in order. None needs another to succeed: a stop needs only `_hear` and `_hand_over`."""
         return self._look, self._hear, self._hand_over, self._plan, self._speak, self._save
 
     def _look(self) -> None:
-        """Take ticks."""
+        """Take the ticks that were handed over."""
         station = self.station
         station.signing.advance(self._unix_now_ns())
         if self.keeper is not None:
@@ -163,14 +163,14 @@ class GroundSide:
             station.observe(inputs, outputs, self._pipeline.bodies)
 
     def _hear(self) -> None:
-        """Take bytes."""
+        """Take the bytes received on the links."""
         station, now_ns = self.station, self.station.picture.time_ns
         failed: list[Exception] = []
         for got in self.links.receive():
             try:
                 if station.take(got.channel, got.data, now_ns, got.datagram, got.trusted):
                     self.links.believe(got.channel)
-            except Exception as error:  # what comes behind it may be a stop
+            except Exception as error:  # the data that follows may hold a stop
                 failed.append(error)
         for number in self.links.channels:
             station.join(number, now_ns)
@@ -180,7 +180,7 @@ class GroundSide:
             raise failed[0]
 
     def _hand_over(self) -> None:
-        """What was asked, to the next tick, in order. Of too many nothing but a stop is taken."""
+        """Queue requests for the next tick, in order. When the queue is full only stops are still accepted, up to twice its length."""
         for request in self.station.requests():
             room = _MOST_REQUESTS * (2 if request.action in STOPPING else 1)
             if len(self._requests) < room:
@@ -194,11 +194,11 @@ class GroundSide:
 
     @property
     def reboot_asked(self) -> bool:
-        """Whether a client wants the process started anew."""
+        """Whether a client asked for a restart of the process."""
         return self.station.reboot_asked
 
     def __enter__(self) -> GroundSide:
-        """Start the thread, and by it the process that plans."""
+        """Start the thread, which starts the planning process."""
         self._switch_s = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
         self._thread = threading.Thread(target=self._run, args=(Teller(self._say),), name="ground", daemon=True)
@@ -224,7 +224,7 @@ class GroundSide:
     def _run(self, teller: Teller) -> None:
         self._try(self._start_planner, teller)
         if self._priority:
-            use_priority(self._priority)  # where the system refuses it, the loop has said so
+            use_priority(self._priority)  # a refusal was reported by the loop already
         while not self._stopping:
             time.sleep(self._rest_s())
             for part in self._parts():
@@ -232,7 +232,7 @@ class GroundSide:
         teller.close()
 
     def _try(self, act: Callable[[], None], teller: Teller) -> None:
-        """Does it, and lives on whatever comes of it: a stop that is asked for next must be heard. Only the first error is told."""
+        """Calls `act` and survives any error, so that a later stop is still heard. Reports only the first error."""
         try:
             act()
         except Exception as error:
@@ -241,13 +241,13 @@ class GroundSide:
             self.error = self.error or error
 
     def _rest_s(self) -> float:
-        """Until shortly after the next tick; when it is overdue, half as long again as it is already waited for."""
+        """Sleep until shortly after the next tick, s; when the tick is overdue, half the time already waited, up to _LONGEST periods."""
         since = (self._clock.now_ns() - self._handed_over_ns) / self._period_ns
         return max(1.0 + _AFTER - since, min(since / 2, _LONGEST)) * self._period_ns * 1e-9
 
     def _plan(self) -> None:
-        """Hand out what is to be planned, in place of what was to be for the same body; take back what is."""
-        self._awaited[:] = self.station.awaited()  # before a job of them is begun; what is being planned for nobody ends by it
+        """Submit new planning jobs, each replacing an unstarted one of the same body; collect finished plans."""
+        self._awaited[:] = self.station.awaited()  # before these jobs start; also stops the planning of plans no longer awaited
         bodies = {body.index: body for body in self._pipeline.bodies}
         for job in self.station.jobs():
             self._plans = [(other, future) for other, future in self._plans if other.body != job.body or not future.cancel()]
@@ -261,13 +261,13 @@ class GroundSide:
             self.station.planned(job.body, plan)
 
     def _start_planner(self) -> None:
-        """By the thread, with which it ends whatever it is busy with (`die_with`); it takes seconds to be ready."""
+        """Starts the planning process, from the thread with which it dies even when busy (`die_with`); it takes seconds to be ready."""
         if self._executor is None:
             self._executor = _planner(self._awaited)
             self._executor.submit(_plan_mission, _NOTHING, None)
 
     def _begin(self, job: PlanJob, body: Body | None) -> Future[Plan]:
-        """By the planning process; by a new one where that was killed, as the system does when memory is short."""
+        """Submits a job to the planning process, or to a new one if that was killed, as the system does when memory is short."""
         try:
             if self._executor is not None:
                 return self._executor.submit(_plan_mission, job, body)

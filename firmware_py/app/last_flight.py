@@ -1,5 +1,5 @@
-"""How the process before this one ended, by what it left: who was in flight, which magnets pulled, whether an e-stop stood; and who is
-armed for that.
+"""How the previous process ended, from its log and e-stop note: which modules were in flight, which magnets pulled, whether an e-stop
+stood. Decides which modules are therefore armed.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from firmware_py.runtime.log_folder import log_folders
 from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG
 
 RECENT_NS = 60_000_000_000
-"""A log that was last written longer ago says nothing of now: the vehicle may be out of the water, in somebody's hands."""
+"""Age beyond which a log says nothing about the present: the vehicle may be out of the water, in somebody's hands."""
 TAIL_BYTES = 32_768
-"""Of can.log, for each module: 80 ticks. DOCK_CMD comes in every 40th at 400 Hz, the commands of thrusters in each."""
+"""Bytes read from the end of can.log per module: 80 ticks. At 400 Hz DOCK_CMD comes every 40th tick, thruster commands every tick."""
 _THRUSTERS = ("THRUSTER_CMD_A", "THRUSTER_CMD_B")
 _ARMED = 1
 _PULLS = 1
@@ -48,34 +48,35 @@ Face = tuple[int, int]
 
 
 class LastFlight(NamedTuple):
-    """What the process before told its modules last."""
+    """The last commands of the previous process to its modules."""
 
     armed: frozenset[int] = frozenset()
-    """Fleet indices; none where the machine was started anew since then: no clock says how long ago that was."""
+    """Fleet indices of armed modules; empty if the machine was rebooted since, because no clock then tells how long ago that was."""
     pulling: frozenset[Face] = frozenset()
     """Every magnet that pulled."""
     let_go: frozenset[Face] = frozenset()
-    """Every magnet whose last command was not to pull; and the faces of joints that were open when that process started, of modules that it
-    did not fly."""
+    """Every magnet whose last command was not to pull, and the faces of joints that were open when that process started, of modules that
+    it did not fly."""
     stopped: bool = False
-    """An e-stop stood at the end, of that process or of one before: since then nobody cleared it, and nobody armed. It grows not old."""
+    """Whether an e-stop stands, from that process or an earlier one, that no person has cleared or armed after. Does not expire."""
 
     def docked(self, firmware: Firmware) -> frozenset[Face]:
-        """Faces that are joined and of no joint of the fleet file."""
+        """Faces that are docked but belong to no joint of the fleet file."""
         return self.pulling - _joined_faces(firmware)
 
     def apart(self, firmware: Firmware) -> frozenset[Face]:
-        """Faces of joints of the fleet file that were undone."""
+        """Faces of joints of the fleet file that were undocked."""
         return self.let_go & _joined_faces(firmware)
 
 
 def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -> LastFlight:
-    """How the newest log under `out` ends in which anything was sent, and whether an e-stop stands, by the note there. One that is
-    unreadable or old, or ends before its flight, says nothing; nor do those before it.
+    """The end of the newest log under `out` in which anything was sent, and whether the note there says that an e-stop stands.
+
+    An unreadable or old log says nothing, and nor do the logs before it.
 
     Args:
         now_ns: the time of day, to compare with that of the file.
-        boot: of this start of the machine, to compare with the log's.
+        boot: identifies this boot of the machine, to compare with the log's.
     """
     stopped = estop_stands(out)
     for folder in log_folders(out):
@@ -88,7 +89,7 @@ def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -
 
 
 def outdate(out: Path, now_ns: int) -> None:
-    """A process that keeps no log flies after those under `out`: none of them says how the last flight ended."""
+    """Dates recent logs under `out` back to 1970, for a process that keeps no log: none of them tells how the last flight ended."""
     for folder in log_folders(out):
         with suppress(OSError):
             if _is_recent((folder / CAN_LOG).stat(), now_ns):
@@ -100,10 +101,10 @@ def _is_recent(status: os.stat_result, now_ns: int) -> bool:
 
 
 def to_arm(before: LastFlight, firmware: Firmware, hold: bool, say: Callable[[str], None]) -> set[int]:
-    """Modules that are armed without a person: all with `hold`; with REARM, those in whose flight the process before was killed.
+    """Modules to arm without a person: all with `hold`; with REARM, those that were in flight when the previous process was killed.
 
-    With REARM nobody is where modules were docked in flight: the fleet file has them apart, and its relays let go of them. Nobody at all is
-    where they were undocked: the fleet file has them as one body, which they no longer are; and nobody where an e-stop stands.
+    REARM arms none if modules were docked in flight: the fleet file has them apart, and its relays release them. Neither option arms any
+    if modules were undocked in flight, because the fleet file has them as one body that no longer exists, or if an e-stop stands.
     """
     fleet, docked, apart = firmware.fleet, before.docked(firmware), before.apart(firmware)
     for faces, what in ((docked, DOCKED_SINCE), (apart, PARTED_SINCE)):
@@ -142,7 +143,7 @@ def _told(sent: Sequence[LoggedFrame], notes: dict[str, Any], fleet: Fleet, code
 
 
 def _magnets_rest(notes: dict[str, Any]) -> bool:
-    """Whether the limiter switched magnets of joints off in turns: one that is off was not told to let go then."""
+    """Whether the limiter switched magnets of joints off in turns, so that a magnet that is off was not necessarily told to let go."""
     try:
         return float(notes["parameters"]["limiter"]["relay_duty"]) < 1.0
     except (KeyError, TypeError, ValueError):
@@ -150,12 +151,12 @@ def _magnets_rest(notes: dict[str, Any]) -> bool:
 
 
 def _joined_faces(firmware: Firmware) -> frozenset[Face]:
-    """Both sides of every joint that the fleet file has."""
+    """Both faces of every joint in the fleet file."""
     return frozenset(side for body in firmware.pipeline.bodies for joint in joints_of(body) for side in sides(joint.request))
 
 
 def _notes_of(folder: Path) -> dict[str, Any]:
-    """What a log says of its run; nothing where it was torn before that."""
+    """The configuration attached to a log; empty where the log was torn before it."""
     with suppress(OSError, ValueError):
         found = json.loads(read_attachment(folder / SIGNAL_LOG, CONFIGURATION) or b"{}")
         return found if isinstance(found, dict) else {}
@@ -163,14 +164,14 @@ def _notes_of(folder: Path) -> dict[str, Any]:
 
 
 def _last_sent(folder: Path, now_ns: int, most_bytes: int) -> list[LoggedFrame] | None:
-    """The frames that the end of a log says were sent; half a line at either end is left out. None where it says nothing of now."""
+    """Frames sent, from the end of a log; partial lines at either end are left out. None where the log is unreadable or old."""
     try:
         with (folder / CAN_LOG).open("rb") as file:
             status = os.fstat(file.fileno())
             file.seek(max(0, status.st_size - most_bytes))
             lines = file.read().decode("ascii", errors="replace").splitlines(keepends=True)
     except FileNotFoundError:
-        return []  # that process was ended while it started
+        return []  # that process ended while it started
     except OSError:
         return None
     if not _is_recent(status, now_ns):

@@ -1,7 +1,7 @@
-"""Live view: a Foxglove WebSocket server with the log's own channels and a 3D scene. Loopback unless told otherwise.
+"""Live view: a Foxglove WebSocket server with the channels of the log and a 3D scene. Listens on loopback by default.
 
-The server runs on threads of its own outside Python. The scene is drawn in the tick's thread, twenty times a second,
-and only while somebody looks at it.
+The server runs in its own threads outside Python. The scene is drawn in the tick's thread, twenty times a second, and only while a client
+subscribes to it.
 """
 
 from __future__ import annotations
@@ -43,25 +43,25 @@ LOOPBACK, PORT = "127.0.0.1", 8765
 SCENE_HZ = 20
 NS_PER_S = 1_000_000_000
 SHOWN_N = 0.05
-"""A weaker thruster has no arrow."""
+"""Least thrust that is drawn as an arrow."""
 METRES_PER_NEWTON = 0.03
 TAG_M, THICKNESS_M = 0.10, 0.004
-"""Edge of a tag as drawn, and thickness of what is flat."""
+"""Edge length and thickness of a tag as drawn."""
 HULL, REFERENCE, TAG, THRUST = (Color(r=r, g=g, b=b, a=a) for r, g, b, a in (
     (0.95, 0.70, 0.10, 0.85), (0.20, 0.80, 0.30, 0.25), (0.05, 0.05, 0.05, 1.0), (0.15, 0.45, 0.95, 0.9),
 ))  # fmt: skip
 UP = FrameTransform(
     parent_frame_id="up", child_frame_id="world", translation=Vector3(), rotation=Quaternion(x=1.0, y=0.0, z=0.0, w=0.0)
 )
-"""World is NED; viewers draw z upwards."""
+"""The world frame is NED; viewers draw z upwards."""
 
 
 class LiveViewError(DescriptionError):
-    """The server cannot be opened; one line."""
+    """The server cannot be opened; the text is one line."""
 
 
 class _Watchers(ServerListener):
-    """Counts who looks at what."""
+    """Counts the subscriptions to the scene."""
 
     def __init__(self) -> None:
         self.scene = 0
@@ -77,12 +77,12 @@ class LiveView:
     """A server on which the channels of `context` can be watched; close it, or use it in a `with` statement.
 
     Attributes:
-        context: give it to the Recorder, whose channels then are served too.
+        context: pass it to the Recorder to serve its channels too.
         address: of the server, ws://HOST:PORT.
     """
 
     def __init__(self, host: str = LOOPBACK, port: int = PORT) -> None:
-        """Opens the server before any thread of this process is raised in priority. Raises LiveViewError."""
+        """Opens the server; call it before any thread of this process raises its priority. Raises LiveViewError."""
         self.context = foxglove.Context()
         self._watchers = _Watchers()
         self._scene = SceneUpdateChannel("/scene", context=self.context)
@@ -97,7 +97,7 @@ class LiveView:
 
     @property
     def is_watched(self) -> bool:
-        """Whether anybody looks at the scene."""
+        """Whether any client subscribes to the scene."""
         return self._watchers.scene > 0
 
     def __enter__(self) -> LiveView:
@@ -107,11 +107,11 @@ class LiveView:
         self.close()
 
     def close(self) -> None:
-        """Ends the server."""
+        """Stops the server."""
         self._server.stop()
 
     def drawing(self, fleet: Fleet, vehicles: Mapping[str, Vehicle], bodies: Callable[[], list[Body]]) -> Observer:
-        """An observer that draws the scene of each tick in which somebody looks; `bodies` as they are docked now."""
+        """An observer that draws the scene at SCENE_HZ while it is watched; `bodies` returns the bodies as currently docked."""
         every = max(1, fleet.rate_hz // SCENE_HZ)
         of_module = [vehicles[module.vehicle] for module in fleet.module]
         drawn: set[int] = set()
@@ -132,12 +132,12 @@ class LiveView:
 
 
 def _in_words(error: RuntimeError) -> str:
-    """The system's words alone, without who told of them, and their number."""
+    """The system's error text alone, without its prefix and error number."""
     return re.sub(r" \(os error \d+\)$", "", str(error)).rpartition(": ")[2]
 
 
 def stamp(time_ns: int) -> Timestamp:
-    """A tick's time."""
+    """The time of a tick as a message."""
     return Timestamp(sec=time_ns // NS_PER_S, nsec=time_ns % NS_PER_S)
 
 
@@ -154,7 +154,7 @@ def quaternion(q: np.ndarray) -> Quaternion:
 
 
 def frames_of(shown: Sequence[tuple[Body, BodyRecord]], time_ns: int) -> list[FrameTransform]:
-    """body0, reference0 and so on, each in the world."""
+    """Frames body0, reference0 and so on, each relative to the world."""
     transforms = []
     for body, record in shown:
         for name, pose in (("body", record.estimate), ("reference", record.setpoint)):
@@ -173,7 +173,7 @@ def frames_of(shown: Sequence[tuple[Body, BodyRecord]], time_ns: int) -> list[Fr
 def scene_of(
     shown: Sequence[tuple[Body, BodyRecord]], gone: set[int], of_module: Sequence[Vehicle], time_ns: int
 ) -> SceneUpdate:
-    """Hulls, tags and thrusts of each body in its own frame, and its hulls where it should be."""
+    """Hulls, tags and thrust arrows of each body in its own frame, and its hulls at its set-point."""
     entities = []
     for body, record in shown:
         hulls = [hull_of(body, i, of_module[module].hull.size_m, HULL) for i, module in enumerate(body.modules)]
@@ -191,7 +191,7 @@ def scene_of(
 
 
 def entity(name: str, time_ns: int, cubes: list[CubePrimitive], arrows: list[ArrowPrimitive]) -> SceneEntity:
-    """What is drawn in the frame of the same name, until it is drawn anew."""
+    """A scene entity in the frame of the same name, valid until it is redrawn."""
     return SceneEntity(
         timestamp=stamp(time_ns), frame_id=name, id=name, lifetime=Duration(sec=0), frame_locked=True,
         cubes=cubes, arrows=arrows,
@@ -214,14 +214,14 @@ def tags_of(body: Body) -> list[CubePrimitive]:
 
 
 def arrows_of(body: Body, record: BodyRecord, of_module: Sequence[Vehicle]) -> list[ArrowPrimitive]:
-    """An arrow for each thruster that pushes, the way it pushes the body, as long as it is strong."""
+    """An arrow per thruster of at least SHOWN_N, in the direction of its force on the body, METRES_PER_NEWTON long."""
     arrows = []
     thrusters = body.thrusters
     for i, force_n in enumerate(record.commanded_n.tolist()):
         if abs(force_n) < SHOWN_N:
             continue
         place, channel = int(thrusters.module[i]), int(thrusters.channel[i])
-        # Compiled functions take no read-only arrays, which descriptions are.
+        # Compiled functions take no read-only arrays, such as those of descriptions.
         position = of_module[body.modules[place]].thruster[channel].position_m.copy()
         tail = body.r_bm[place] + rotations.rotate(body.q_bm[place].copy(), position)
         direction = np.ascontiguousarray(thrusters.matrix[:3, i]) * np.sign(force_n)
@@ -237,7 +237,7 @@ def arrows_of(body: Body, record: BodyRecord, of_module: Sequence[Vehicle]) -> l
 
 
 def towards(direction: np.ndarray) -> np.ndarray:
-    """(4,) the shortest turn that takes +x to a unit vector; about z where it is -x."""
+    """(4,) quaternion of the shortest rotation from +x to a unit vector; about z where the vector is -x."""
     x, y, z = direction.tolist()
     if x < -0.999999:
         return np.array([0.0, 0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""Lockstep: the bench owns time. One process, one thread, any bus; a run repeats byte for byte."""
+"""Lockstep: the bench controls time. One process, one thread, any bus; runs are reproducible byte for byte."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from firmware_py.bus.port import Port
 from firmware_py.core.types import Outputs, Request
 
 PATIENCE_LOOKS = 20_000
-"""Looks at the sockets before frames count as lost by the bus: about half a second; not reached on a working bus."""
+"""Polls of the sockets before missing frames count as lost by the bus: about half a second; not reached on a working bus."""
 
 
 class Lockstep:
@@ -31,14 +31,14 @@ class Lockstep:
         self._sync: list[BusFrame] = []
 
     def start_tick(self, tick: int, time_ns: int) -> list[BusFrame]:
-        """Sends SYNC on every bus; returns what went out."""
+        """Sends SYNC on every bus; returns the frames that went out."""
         self._sync = self._firmware.sync(tick, time_ns)
         return send(self._ports, self._sync)
 
     def finish_tick(
         self, tick: int, time_ns: int, requests: Sequence[Request], expected: Sequence[BusFrame]
     ) -> tuple[Outputs, list[BusFrame]]:
-        """Takes the `expected` frames that the other side sent, steps, sends; returns the commands that went out."""
+        """Receives the `expected` frames of the other side, steps the firmware and sends; returns outputs and frames that went out."""
         received = drain(self._ports, expected, self._patience_looks)
         inputs, outputs, frames = self._firmware.step(tick, time_ns, received, requests)
         sent = send(self._ports, frames)
@@ -48,17 +48,17 @@ class Lockstep:
 
 
 def send(ports: Sequence[Port], frames: Sequence[BusFrame]) -> list[BusFrame]:
-    """Sends `frames`; returns those that the bus took, which the other side may wait for."""
+    """Sends `frames`; returns those that the bus accepted, which the other side may wait for."""
     return [(bus, frame) for bus, frame in frames if ports[bus].send(frame)]
 
 
 def drain(
     ports: Sequence[Port], expected: Sequence[BusFrame], patience_looks: int = PATIENCE_LOOKS
 ) -> list[BusFrame]:
-    """Everything that is there, until every frame of `expected` is among it.
+    """Receives frames until every frame of `expected` has come; returns all that came.
 
-    Other senders' frames come as they come and stand for none of the expected ones. Nothing waits for ever: a frame
-    that the bus lost is given up after `patience_looks` looks.
+    Frames of other senders are returned too and do not count as expected ones. A frame that the bus lost is given up after
+    `patience_looks` polls.
     """
     received: list[BusFrame] = []
     missing: Counter[BusFrame] | None = None
@@ -66,7 +66,7 @@ def drain(
         fresh = [(bus, frame) for bus, port in enumerate(ports) for frame in port.receive()]
         received += fresh
         if missing is None:
-            if received == expected:  # by far the most frequent case, and the cheapest to see
+            if received == expected:  # by far the most frequent case, and the cheapest check
                 break
             missing = Counter(expected)
         missing -= Counter(fresh)

@@ -14,11 +14,11 @@ from firmware_py.runtime.flight_log import LoggedTick, shown
 from firmware_py.runtime.tick_messages import Message
 
 SMALL = 1e-3
-"""Values below this may differ by the tolerance of it."""
+"""Absolute tolerance over relative tolerance: numbers below this may differ by the tolerance times it."""
 
 
 class Difference(NamedTuple):
-    """One signal that is not what it was."""
+    """One signal whose replayed value differs from the recorded one."""
 
     tick: int
     time_ns: int
@@ -31,18 +31,18 @@ class Difference(NamedTuple):
 
 
 Found = tuple[str, str, str]
-"""Signal, what was recorded, what was replayed."""
+"""Signal, recorded value, replayed value."""
 
 
 class Comparison:
-    """Compares byte by byte; with a tolerance, numbers may differ by that share of them, and frames by one count of a signal."""
+    """Compares byte by byte; with a tolerance, numbers may differ by that relative amount, and signals in frames by one count."""
 
     def __init__(self, codec: Codec, tolerance: float = 0.0, thinned: bool = False) -> None:
-        """`thinned`: the log left out some ticks' messages of a body."""
+        """`thinned`: the log lacks the messages of a body in some ticks."""
         self._codec, self._tolerance, self._thinned = codec, tolerance, thinned
 
     def first(self, logged: LoggedTick, messages: Sequence[Message], lines: Sequence[str]) -> Difference | None:
-        """The first difference: signals in the order in which the tick works them out, then the frames that it sent."""
+        """The first difference: signals in the order in which the tick computes them, then the frames that it sent."""
         found = self._in_signals(logged, messages)
         if found is None and logged.sent != lines:
             pairs = zip_longest(logged.sent, lines, fillvalue="")
@@ -98,7 +98,7 @@ def _words(value: Any) -> str:
 
 
 def _frame_of(line: str) -> tuple[str, int, bytes]:
-    """Bus, id and data of a line of can.log; of one that is none, an id that no frame has."""
+    """Channel, id and data of a line of can.log; for a line that is no frame, the id -1."""
     try:
         _, channel, frame, _ = line.split(" ")
         number, _, data = frame.partition("#")

@@ -1,4 +1,4 @@
-"""From the legs of a mission to one trajectory by minimum snap, with rests. Slow: runs beside the loop."""
+"""Plans one minimum-snap trajectory, with rests, from the legs of a mission. Slow: runs beside the loop."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedEr
 from firmware_py.prepare.piecewise import Piecewise
 
 _SAME = 1e-3
-"""m, and of a quaternion, below which legs do not differ."""
+"""Largest difference, in position (m) and in quaternion, at which neighbouring waypoints count as one."""
 _ANGULAR_RATE, _ANGULAR_ACCELERATION = 0.5, 0.5
-"""rad/s and rad/s^2: turning on the way is gentle, so that the tag stays readable."""
+"""rad/s and rad/s^2. Turns on the way are gentle, so that the tag stays readable."""
 _THRUSTER_SHARE = 0.6
-"""What a mission may ask of each thruster; the rest fights the current."""
+"""Share of each thruster's range that a mission may use; the rest is reserved against the current."""
 
 
 @dataclass(slots=True)
@@ -27,7 +27,7 @@ class Consecutive:
     """Trajectories one after the other, each from rest to rest."""
 
     parts: tuple[tuple[float, Piecewise], ...]
-    """Start, s, and trajectory; each rests at its end until the next begins."""
+    """Start time, s, and trajectory of each part; the end of a part is held until the next begins."""
     duration_s: float
 
     def sample(self, t_s: float) -> Setpoint:
@@ -41,7 +41,7 @@ class Consecutive:
 
 
 def plan_mission(job: PlanJob, body: Body | None, wanted: Callable[[], bool] = lambda: True) -> Plan:
-    """The plan of `job`; one that cannot be flown, or is not `wanted` any more, comes back with its reason."""
+    """The plan of `job`; for a job that is infeasible or no longer `wanted`, a plan without trajectory that states the reason."""
     parts: list[tuple[float, Piecewise]] = []
     arrivals: list[float] = []
     at_s, p_wb, q_wb = 0.0, job.p_wb, job.q_wb
@@ -67,7 +67,7 @@ def plan_mission(job: PlanJob, body: Body | None, wanted: Callable[[], bool] = l
 
 
 def _sections(legs: Sequence[Leg]) -> Iterator[list[Leg]]:
-    """Runs of legs that are flown through: cut where it stops, and where the speed changes."""
+    """Splits legs into runs without a stop: cuts after each leg with a hold, and where the speed changes."""
     section: list[Leg] = []
     for leg in legs:
         if section and (section[-1].hold_s > 0 or leg.speed_m_s != section[-1].speed_m_s):
@@ -79,7 +79,7 @@ def _sections(legs: Sequence[Leg]) -> Iterator[list[Leg]]:
 
 
 def _waypoints(p_wb: np.ndarray, q_wb: np.ndarray, section: Sequence[Leg]) -> tuple[list[Waypoint], list[int]]:
-    """The waypoints from a pose through a section, and for each leg the number of its own; equal neighbours are one."""
+    """The waypoints from a pose through a section, and for each leg the index of its waypoint; equal neighbours are merged."""
     wanted = [Waypoint(p_wb, q_wb)]
     for leg in section:
         before = wanted[-1]
@@ -96,7 +96,7 @@ def _end(points: Sequence[Waypoint]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _limits(job: PlanJob, speed_m_s: float) -> Limits:
-    """Per axis, so that the speed keeps to its bound in every direction."""
+    """The limits of a job, with the speed divided among the axes so that it holds in every direction."""
     return Limits(
         velocity=np.full(3, speed_m_s / np.sqrt(3.0)),
         acceleration=np.full(3, job.acceleration),

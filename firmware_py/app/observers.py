@@ -1,4 +1,4 @@
-"""Who looks on after each tick, in lockstep and in real time: the log, and whoever is told what happens."""
+"""Observers called after each tick, in lockstep and in real time: logging, event output and bus monitoring."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FLUSH_EVERY_S = 0.5
 
 
 def telling(say: Callable[[str], None]) -> Observer:
-    """An observer that says every event."""
+    """An observer that passes every event to `say`."""
 
     def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
         for event in outputs.events:
@@ -32,7 +32,7 @@ def event_line(time_ns: int, event: Event) -> str:
 def recording(recorder: Recorder, rate_hz: int) -> Observer:
     """An observer that writes every tick to `recorder`, in the order in which frames went over the bus.
 
-    Who is armed is with the system at once: a process that is killed then knows it when it comes back.
+    Flushes at once when a module arms or disarms, so that a restart after a kill knows which modules were armed.
     """
     flush_every = max(1, round(FLUSH_EVERY_S * rate_hz))
     was_armed: list[bool] = []
@@ -54,7 +54,7 @@ def recording(recorder: Recorder, rate_hz: int) -> Observer:
 
 
 def recording_buses(recorder: Recorder, ports: Sequence[Port], rate_hz: int) -> Observer:
-    """An observer that writes once a second to `recorder` what ports count."""
+    """An observer that writes the fault counters of the ports to `recorder` once a second."""
     for bus, port in enumerate(ports):
         recorder.expect_bus(bus, port.faults)
 
@@ -67,7 +67,7 @@ def recording_buses(recorder: Recorder, ports: Sequence[Port], rate_hz: int) -> 
 
 
 def watching_buses(ports: Sequence[Port], rate_hz: int) -> Observer:
-    """An observer that looks once a second at what ports count, and warns of every kind that grows and did not in the second before."""
+    """An observer that checks the fault counters of the ports once a second and warns of every kind that starts to grow."""
     counted = [dict(port.faults) for port in ports]
     growing: list[set[str]] = [set() for _ in ports]
 

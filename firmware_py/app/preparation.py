@@ -1,4 +1,4 @@
-"""Plans of docks and undocks with the pipelines of the bodies that there will be: slow, so a worker's."""
+"""Plans docks and undocks, with the pipelines of the resulting bodies. Slow, so it runs in a worker."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from firmware_py.prepare.docking import plan_dock, plan_undock
 
 
 def wish_of(request: DockRequest | PartRequest, bodies: Sequence[Body]) -> tuple[str, int | None]:
-    """What is wanted of which body, by its number: of several requests for the same only the newest still is."""
+    """Key of a request for the worker: its kind, and the index of the body. A newer request with the same key replaces a waiting one."""
     joint = request.joints[0] if isinstance(request, PartRequest) else request
     of_body = {module: body for body in bodies for module in body.modules}
     body = of_body.get(joint.module)
@@ -26,7 +26,7 @@ def wish_of(request: DockRequest | PartRequest, bodies: Sequence[Body]) -> tuple
 
 
 def prepare(request: DockRequest | PartRequest, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
-    """The plan for `request`, or in words why there is none; never raises for a request that cannot be met.
+    """The plan for `request`, or the reason why there is none; never raises for an infeasible request.
 
     Args:
         vehicles: by fleet index.
@@ -38,11 +38,11 @@ def prepare(request: DockRequest | PartRequest, pipeline: Pipeline, vehicles: Se
 
 
 Bodies = Mapping[int, Body]
-"""The bodies that there are, by each of their modules."""
+"""The present bodies, by module."""
 
 
 def _prepare_part(request: PartRequest, bodies: Bodies, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
-    """At the first joint where the body has come apart into two that are each whole, whichever side of it then leaves."""
+    """Plans the parting at the first joint, tried from both sides, at which the body has split into two connected bodies."""
     refusal = "they are apart already"
     for joint in (*request.joints, *map(turned, request.joints)):
         whole = bodies[joint.module]

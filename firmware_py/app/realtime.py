@@ -1,4 +1,4 @@
-"""Real time: ticks start at absolute deadlines; the inputs of a tick close when every module has answered, or at half the tick."""
+"""Real time: ticks start at absolute deadlines; the inputs of a tick close when every module has answered, or at half the period."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.rate_keeper import RateKeeper, absolute_sleeper
 
 LISTEN_NS = 200_000_000
-"""How long a bus is listened to before the first SYNC: a foreign SYNC refuses the start."""
+"""How long the buses are monitored before the first SYNC. A foreign SYNC makes the start fail."""
 OTHER_SYNC = "another SYNC producer is on the bus: stop it, or use another bus"
 
 
@@ -24,9 +24,9 @@ class RealTimeLoop:
     """Runs the firmware against the clock.
 
     Attributes:
-        requests: hands over what people asked for since the last tick, given its outputs and the time of this one.
-        observers: one that raises is dropped, with a warning among the tick's events for those after it.
-        unanswered: ticks that closed at half time because a module had not answered.
+        requests: returns the requests since the last tick, given the time of this tick and the outputs of the last.
+        observers: an observer that raises is dropped, with a warning in the tick's events for those after it.
+        unanswered: number of ticks that closed at half the period because a module had not answered.
         last: outputs of the last tick.
     """
 
@@ -41,7 +41,7 @@ class RealTimeLoop:
     _received: list[BusFrame] = field(default_factory=list)
 
     def listen(self) -> None:
-        """Listens before the first SYNC; what was heard counts for nothing else. Raises PortError when somebody else sends SYNC."""
+        """Listens before the first SYNC and discards what it received. Raises PortError when another node sends SYNC."""
         end_ns = self.clock.now_ns() + LISTEN_NS
         collector = self.firmware.collector
         self.ports[0].wait(end_ns, lambda: self._take() and collector.faults["foreign_sync"] > 0)
@@ -52,7 +52,7 @@ class RealTimeLoop:
         self.firmware.forget_heard()
 
     def run(self, stop: Callable[[int, Outputs], bool], first_tick: int = 1) -> None:
-        """Ticks until `stop` says so of a tick's number and outputs."""
+        """Ticks until `stop` returns true for a tick's number and outputs."""
         tick = first_tick
         while True:
             outputs = self.tick(tick, self.rate_keeper.wait())
@@ -79,7 +79,7 @@ class RealTimeLoop:
         return outputs
 
     def _show(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        """The tick, to every observer. The flight is worth more than any of them."""
+        """Calls every observer; drops one that raises, because the flight matters more."""
         for observer in self.observers:
             try:
                 observer(received, sent, inputs, outputs)
@@ -88,7 +88,7 @@ class RealTimeLoop:
                 outputs.events.append(Event(WARNING, f"no more {_name_of(observer)}: {type(error).__name__}: {error}"))
 
     def _take(self) -> bool:
-        """Hands every frame that is there to the collector."""
+        """Hands every frame received so far to the collector; returns True."""
         for bus, port in enumerate(self.ports):
             frames = port.receive()
             self.firmware.collector.take(bus, frames)
@@ -101,14 +101,14 @@ class RealTimeLoop:
 
 
 def _name_of(observer: Observer) -> str:
-    """Of the function that made it, or of its class."""
+    """Name of the function that made the observer, or of its class."""
     return getattr(observer, "__qualname__", type(observer).__name__).partition(".")[0]
 
 
 def open_loop(
     stack: ExitStack, firmware: Firmware, requests: Callable[[int, Outputs | None], Sequence[Request]]
 ) -> RealTimeLoop:
-    """A loop on the fleet's buses, whose ports are closed with `stack`. Raises PortError."""
+    """A loop on the fleet's buses; `stack` closes the ports. Raises PortError."""
     clock = MonotonicClock.started_now()
     arrival = threading.Event()
     ports = [

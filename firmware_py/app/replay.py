@@ -1,6 +1,6 @@
-"""`modcube replay`: what a flight took goes through the same code again; every signal and every frame must come out as it did.
+"""`modcube replay`: feeds the recorded inputs of a flight to the same code; every signal and every frame must come out the same.
 
-Same machine and same lock, same bytes. Logs that another machine wrote are compared with a tolerance.
+With the same machine and the same lock file the bytes are equal. Logs of another machine are compared with a tolerance.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from firmware_py.runtime.tick_messages import TickMessages
 from firmware_py.runtime.worker import InlineWorker
 
 TYPES = {**CORE_TYPES, **{cls.__name__: cls for cls in (Consecutive, Harmonic, Hold, Piecewise)}}
-"""What a recorded request may hold: the trajectories, and core's own."""
+"""Types that a recorded request may hold: the trajectories, and core's own types."""
 
 
 @dataclass(slots=True)
 class Outcome:
-    """How a replay went."""
+    """Result of a replay."""
 
     ticks: int = 0
     seconds: float = 0.0
-    """Length of what was replayed, on the vehicle's clock."""
+    """Length of the replayed flight, on the vehicle's clock."""
     first: Difference | None = None
     torn: str = ""
-    """Where the log ends too early; empty when it is whole."""
+    """Where the log ends too early or is damaged; empty when it is whole."""
 
 
 class DueWorker(InlineWorker):
-    """Does each job on the spot and hands its result over in the tick in which the recorded flight had it."""
+    """Runs each job inline and hands over its result in the tick in which the recorded flight received it."""
 
     due = 0
-    """Results that this tick takes."""
+    """Number of results that this tick still takes."""
 
     def _finished(self) -> list[Any]:
         if self.due == 0:
@@ -53,10 +53,10 @@ class DueWorker(InlineWorker):
 
 
 class Replay:
-    """The firmware of one log, fed with what it was fed with."""
+    """The firmware of one log, fed with its recorded inputs."""
 
     def __init__(self, log: FlightLog, tolerance: float = 0.0) -> None:
-        """Raises LogError where the log does not say what flew, and DescriptionError where that is wrong."""
+        """Raises LogError where the log holds no configuration, and DescriptionError where the configuration is invalid."""
         if log.configuration is None:
             raise LogError(f"{log.folder}: its log does not say what flew; this version's logs do")
         self._log, self._configuration = log, log.configuration
@@ -65,12 +65,12 @@ class Replay:
         self._start()
 
     def _start(self) -> None:
-        """A new process."""
+        """Starts with a new firmware, as a new process does."""
         self._worker = DueWorker()
         self._firmware = firmware_of(self._configuration, str(self._log.folder), self._worker)
 
     def run(self) -> Outcome:
-        """Replays up to the first difference or the end of the log. A gap in the ticks is a process that was killed: another went on."""
+        """Replays up to the first difference or the end of the log. At a gap in the ticks a process was killed and a new one took over."""
         outcome, before, start_ns = Outcome(), None, 0
         for logged in self._log.ticks():
             if before is None:
@@ -86,7 +86,7 @@ class Replay:
         return outcome
 
     def step(self, logged: LoggedTick) -> Difference | None:
-        """One tick; the first thing about it that is not as it was."""
+        """Replays one tick; returns its first difference."""
         tick, time_ns = logged.tick, logged.time_ns
         self._worker.due = logged.prepared
         sync = self._firmware.sync(tick, time_ns)
@@ -101,7 +101,7 @@ class Replay:
 
 
 def sent_lines(time_ns: int, frames: Sequence[BusFrame]) -> list[str]:
-    """The lines of can.log for what one tick sent, bus by bus."""
+    """The lines of can.log for the frames that one tick sent, bus by bus."""
     buses = sorted({bus for bus, _ in frames})
     return [line for bus in buses for line in candump_lines(time_ns, bus, "T", [f for b, f in frames if b == bus]).splitlines(True)]
 

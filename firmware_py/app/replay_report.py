@@ -1,4 +1,4 @@
-"""What `modcube replay` prints, and its exit status."""
+"""Output and exit status of `modcube replay`."""
 
 from __future__ import annotations
 

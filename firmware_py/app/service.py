@@ -1,6 +1,6 @@
-"""The service's report to systemd, from the tick: ready after a second of ticks, alive while they go on, how they fare.
+"""The service's reports to systemd, sent from the tick: ready after a second of ticks, watchdog while ticks go on, and a status line.
 
-A tick that hangs tells nothing, so the watchdog of modcube.service ends it and starts it anew.
+A tick that hangs sends nothing, so the watchdog of modcube.service kills and restarts the process.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.rate_keeper import RateKeeper
 
 READY_S = 1.0
-"""Of ticks, before the service calls itself ready."""
+"""Time with ticks before the service reports that it is ready."""
 ALIVE_EVERY_S = 0.1
 STATUS_EVERY_S = 1.0
 
 
 def status_text(tick: int, rate_hz: int, answered: int, armed: int, modules: int, keeper: RateKeeper) -> str:
-    """The health report: words KEY=VALUE, which flash.py and `systemctl status` show. flash.py stops no vehicle of which any is armed."""
+    """The status line, words KEY=VALUE, for flash.py and `systemctl status`. flash.py stops no vehicle with an armed module."""
     late_us = keeper.lateness.quantile_ns(0.99) // 1000
     return (
         f"tick={tick} rate_hz={rate_hz} answered={answered}/{modules} armed={armed}/{modules} late_p99_us={late_us} "
@@ -29,7 +29,7 @@ def status_text(tick: int, rate_hz: int, answered: int, armed: int, modules: int
 
 
 def reporting(notifier: Notifier, keeper: RateKeeper, rate_hz: int) -> Observer:
-    """An observer that tells the service manager; costs nothing where there is none. How many are armed it tells at once."""
+    """An observer that reports to the service manager; does nothing without one. Reports a change in the number armed at once."""
     alive_every = max(1, round(ALIVE_EVERY_S * rate_hz))
     status_every = max(1, round(STATUS_EVERY_S * rate_hz))
     ready_at = round(READY_S * rate_hz)

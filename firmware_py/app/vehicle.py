@@ -1,4 +1,4 @@
-"""The process on the vehicle: `modcube run`. It stays disarmed until it is told otherwise, and disarms before it ends."""
+"""The process on the vehicle: `modcube run`. It stays disarmed until it is asked to arm, and disarms before it ends."""
 
 from __future__ import annotations
 
@@ -48,31 +48,31 @@ if TYPE_CHECKING:
     from firmware_py.app.ground_station import GroundSide
 
 FAREWELL_TICKS = 10
-"""Ticks that go on saying `disarmed` after a stop was asked for."""
+"""Ticks that still command `disarmed` after a stop was requested."""
 ARM_EVERY_S = 1.0
-"""How often arming is tried again with `--hold`, once the pose is known."""
+"""Interval between attempts of the Operator to arm, once the pose is known."""
 FORGETFUL = "warning: --hold without --out: an e-stop in this run will not be known at the next start"
 UNTAGGED = "warning: module {} carries no [[tag]]: no camera places it, so --hold never arms it; a pilot has attitude and depth alone"
 MISUSED = (FileExistsError, NotADirectoryError, PermissionError)
-"""A folder for logs that is none, or not ours: whoever starts the vehicle is told. What else a disk may fail in, it flies without."""
+"""Errors of a log folder that is not a folder or not writable for us; these refuse the start. After other disk errors it flies unlogged."""
 STOPPED_BY = frozenset({Action.DISARM, Action.ESTOP})
-"""Requests of a person after which nothing is armed but by a person."""
+"""Requests of a person after which only a person arms any body."""
 TAKEN_BY = frozenset({Action.SET_MODE, Action.ARM, Action.MOTOR_TEST})
-"""Requests of a person after which their body is not armed but by a person."""
+"""Requests of a person after which only a person arms the body concerned."""
 REARM_S = RECENT_NS / 1e9
-"""How long REARM tries: then the flight before says nothing of where the vehicle is, as a log that is so old."""
+"""How long REARM keeps trying. After that the previous flight no longer tells where the vehicle is, as with a log of that age."""
 
 
 @dataclass(slots=True)
 class Operator:
-    """Stands in for a person: arms and holds when told to, once, and disarms when the process is asked to stop."""
+    """Stands in for a person: arms each body in `to_arm` once, to hold its place, and disarms all when the process is asked to stop."""
 
     rate_hz: int
     to_arm: set[int] = field(default_factory=set)
-    """Fleet indices of modules that are still to be armed. A body is armed where its leader is among them; a module leaves as soon as
-    anybody has armed it."""
+    """Fleet indices of modules that are still to be armed. A body is armed if its leader is among them; a module is removed as soon as it
+    is armed, by whatever request."""
     limit_s: float = math.inf
-    """How long, by the loop's ticks, `to_arm` is meant."""
+    """Time, counted in ticks, after which `to_arm` expires."""
     say: Callable[[str], None] = write_line
     stopping: bool = False
     farewell: int = 0
@@ -83,7 +83,7 @@ class Operator:
         """The requests of this tick."""
         self._ticks += 1
         if self.stopping:
-            self.farewell += 1  # and in each of its ticks all are asked: a body may be new since the one before
+            self.farewell += 1  # every body is disarmed in each of these ticks, because a body may be new since the last
             return [Request(Action.DISARM, record.body) for record in last.records] if last is not None else []
         if not self.to_arm or last is None:
             return []
@@ -96,23 +96,23 @@ class Operator:
         return [Request(Action.ARM, body) for body in placed]
 
     def _strike_out(self, last: Outputs) -> None:
-        """Who has been armed, and after an e-stop everybody, is a person's to arm."""
+        """Removes modules that have been armed, and after an e-stop all: from then on only a person arms them."""
         self.to_arm.difference_update(index for index, command in enumerate(last.modules) if command.armed)
         if any(record.state == State.ESTOP for record in last.records):
             self.to_arm.clear()
 
     def _expire(self) -> None:
-        """Whoever could not be armed for too long may be in somebody's hands by now."""
+        """Gives up arming after `limit_s`: by then the vehicle may be in somebody's hands."""
         if self.to_arm and self._ticks >= self.limit_s * self.rate_hz:
             self.to_arm.clear()
             self.say(f"not armed again: the vehicle could not within {self.limit_s:g} s (REARM)")
 
     def stop(self, *_: object) -> None:
-        """Somebody asks for the end, by a signal."""
+        """Signal handler: starts the farewell."""
         self.stopping = True
 
     def is_done(self, tick: int, outputs: Outputs) -> bool:
-        """Whether every module has been told for long enough."""
+        """Whether the farewell has lasted FAREWELL_TICKS."""
         return self.farewell >= FAREWELL_TICKS
 
 
@@ -130,8 +130,8 @@ def run_vehicle(
 
     Args:
         hold: arm as soon as the vehicle may, and hold the place.
-        out: folder for the logs; None keeps none. What is there already stays.
-        say: told every event, one line each, by a thread of its own; it may wait and fail as it likes.
+        out: folder for the logs; None keeps none. Existing logs are kept.
+        say: receives every event as one line, in its own thread; it may block and fail.
         notifier: of the service manager.
         live: serves the log's channels and a scene to viewers.
         ground: links to ground stations; parameters that they stored earlier are laid over `parameters`.
@@ -140,7 +140,7 @@ def run_vehicle(
     laid = laid_over(parameters, store)
     release_compiler()
     with ExitStack() as stack:
-        teller = Teller(say)  # before this thread takes its priority, like every thread below that is none of the loop's
+        teller = Teller(say)  # before this thread takes its priority, like every thread below that does not belong to the loop
         stack.callback(teller.close)
         move_to_own_processor = stack.enter_context(beside_the_tick())
         worker = ThreadWorker()
@@ -156,18 +156,18 @@ def run_vehicle(
         for body in firmware.pipeline.bodies:
             if not body.tag_ids.size:
                 teller.say(UNTAGGED.format(" and ".join(map(fleet.label, body.modules))))
-        logged = stack.enter_context(ExitStack())  # ends when the log and the note of an e-stop are closed
-        note = _open_note(stack, out) if out is not None else None  # before the log: of two that start at once one has the folder
+        logged = stack.enter_context(ExitStack())  # unwinds after the log and the e-stop note are closed
+        note = _open_note(stack, out) if out is not None else None  # before the log: of two processes started at once, one gets the folder
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
         recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
         observers = list(_keeping(firmware, recorder, note, live, before.stopped))
-        told: list[Observer] = [telling(teller.say)]  # after all others, which may have something to say
+        told: list[Observer] = [telling(teller.say)]  # called after all other observers, which may add events
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
         side: GroundSide | None = None
         if ground is not None:
-            from firmware_py.app.ground_station import GroundSide  # a tenth of a second, and 6 MB of messages
+            from firmware_py.app.ground_station import GroundSide  # costs a tenth of a second, and 6 MB of message classes
 
-            # Like the recorder's and the live view's, its threads start before this one takes its priority, which they would inherit.
+            # As with the recorder and the live view, its threads start before this thread takes its priority, which they would inherit.
             side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY, started=parameters))
             told.append(side.observe)
             requests = with_ground(operator, side, lambda: firmware.pipeline.bodies)
@@ -192,8 +192,8 @@ def run_vehicle(
 
 
 def _open_note(stack: ExitStack, out: Path) -> EstopNote:
-    """The note of an e-stop in the folder for logs, which nobody else has from now on. Raises DescriptionError where somebody has it."""
-    with suppress(OSError):  # said when a log is to go there
+    """The e-stop note in the folder for logs, which it locks. Raises DescriptionError where another process holds the lock."""
+    with suppress(OSError):  # reported when the log is opened there
         out.mkdir(parents=True, exist_ok=True)
     note = EstopNote(out)
     stack.callback(note.close)
@@ -203,7 +203,7 @@ def _open_note(stack: ExitStack, out: Path) -> EstopNote:
 def _keeping(
     firmware: Firmware, recorder: Recorder | None, note: EstopNote | None, live: LiveView | None, stopped: bool
 ) -> Iterator[Observer]:
-    """Who keeps each tick: the log, the note of an e-stop (`stopped`: one stands from before), the viewers."""
+    """Observers for the log, the e-stop note (`stopped`: an e-stop stands from before) and the live view."""
     fleet = firmware.fleet
     if recorder is not None:
         yield recording(recorder, fleet.rate_hz)
@@ -235,7 +235,7 @@ def _open_recorder(
 
 
 def _log_folder(out: Path, say: Callable[[str], None]) -> Path | None:
-    """A folder for a new log; None where the disk has none to give. Raises OSError where `out` cannot be meant."""
+    """A folder for a new log; None where a disk error prevents it. Raises one of MISUSED where `out` is no usable folder."""
     try:
         return make_log_folder(out)
     except MISUSED:
@@ -247,7 +247,7 @@ def _log_folder(out: Path, say: Callable[[str], None]) -> Path | None:
 
 
 def _forget_failed_start(recorder: Recorder, folder: Path, out: Path) -> None:
-    """A start that came to no tick leaves no log: a service that waits for its bus starts again and again."""
+    """Deletes the log of a start that reached no tick: a service that waits for its bus restarts again and again."""
     if recorder.ticks:
         return
     with suppress(OSError):
@@ -260,7 +260,7 @@ def _forget_failed_start(recorder: Recorder, folder: Path, out: Path) -> None:
 def _watching(
     loop: RealTimeLoop, rate_hz: int, recorder: Recorder | None, side: GroundSide | None, notifier: Notifier | None
 ) -> Iterator[Observer]:
-    """How ticks keep their deadlines, for the log, ground stations and the service manager, and what ports count, for the log."""
+    """Observers that report tick timing to the log, ground stations and the service manager, and port fault counters to the log."""
     keeper = loop.rate_keeper
     if side is not None:
         side.keeper = keeper
@@ -274,10 +274,10 @@ def _watching(
 def with_ground(
     operator: Operator, side: GroundSide, bodies: Callable[[], Sequence[Body]]
 ) -> Callable[[int, Outputs | None], list[Request]]:
-    """The operator's requests and those of ground stations; a reboot that was asked for ends the process, the service starts it anew.
+    """The requests of the operator and of ground stations. A requested reboot ends the process, which the service then restarts.
 
-    Once a ground station disarms or stops the vehicle, the operator arms nobody any more; whom it arms, tests or gives a mode is its own.
-    In the farewell nothing else than a stop is heard.
+    After a ground station disarms or stops the vehicle, the operator arms nothing any more; a body that a ground station arms, motor-tests
+    or gives a mode is left to it. During the farewell only disarm and e-stop requests are accepted.
     """
 
     def requests(time_ns: int, last: Outputs | None) -> list[Request]:

@@ -1,7 +1,7 @@
-"""The paper's way to an outline: points of the body, projected, under an alpha shape (its Algorithm 1).
+"""The paper's outline method: the alpha shape of the body's projected points (its Algorithm 1).
 
-A mode beside prepare.projected_area, so that each checks the other. Points on a lattice that includes the boundary come
-within 1 %; points drawn at random inside the body, as the paper's, fall short (`random_points` shows by how much).
+An alternative to prepare.projected_area, so that each checks the other. Points on a lattice that includes the boundary are
+accurate within 1 %; random interior points, as in the paper, underestimate (`random_points` shows by how much).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ RADIUS_IN_SPACINGS = 1.0
 and 2x2: 0.22 % rms, 0.93 % at most; above 1.2 it fills the notch of an L."""
 
 _MERGE = 1e-7
-"""m; projected points nearer than this are one."""
+"""m; projected points nearer than this are merged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,12 +107,12 @@ def alpha_shape(points: np.ndarray, radius: float) -> tuple[float, np.ndarray]:
 
 
 def lattice_method(solids: Sequence[Solid], directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The `method` of drag_table.build that takes areas from lattice points."""
+    """A `method` of drag_table.build: outlines from lattice points."""
     return outlines_of(lattice_points(solids), directions)
 
 
 def random_method(seed: int) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """The `method` of drag_table.build that takes areas from random interior points."""
+    """A `method` of drag_table.build: outlines from random interior points."""
 
     def method(solids: Sequence[Solid], directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return outlines_of(random_points(solids, np.random.default_rng(seed)), directions)

@@ -1,6 +1,6 @@
-"""Docked modules to one Body: masses, thrusters, tags and drag about the common centre of mass.
+"""Assembles docked modules into one Body: masses, thrusters, tags and drag about the common centre of mass.
 
-Runs before a body is needed (start, or when docking is requested); the tick only swaps the result in.
+Runs before the body is needed (at start, or when docking is requested); the tick only swaps the result in.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ def assemble(
     pitch_m: float = PITCH_M,
     cache: DragCache | None = None,
 ) -> Body:
-    """One rigid body out of docked modules.
+    """One rigid body made of docked modules.
 
-    The body frame has the axes of the lattice and its origin at the common centre of mass, entrained water included.
+    The body frame has the axes of the lattice and its origin at the common centre of mass, including entrained water.
 
     Args:
-        cells: (m, 3) lattice cells, whole numbers.
-        rotation: (m,) which of prepare.lattice.MATRICES turns each module into the lattice.
+        cells: (m, 3) lattice cells, integers.
+        rotation: (m,) index into prepare.lattice.MATRICES of each module's rotation to the lattice.
         vehicles: (m,) description of each module.
         modules: (m,) fleet indices; 0, 1, ... when left out.
         pitch_m: lattice pitch.
-        cache: kept drag outlines.
+        cache: cache of drag outlines.
 
     Raises:
-        DescriptionError: too many modules, two in one cell, a probe that meets no drogue, or no joint that leads to a
-            module; the modules are named by their fleet index.
+        DescriptionError: too many modules, two in one cell, a probe that meets no drogue, or a module without a joint to the
+            rest; the message names modules by their fleet index.
     """
     count = len(vehicles)
     modules = tuple(range(count)) if modules is None else tuple(int(m) for m in modules)
@@ -62,18 +62,21 @@ def assemble(
 
 
 def assemble_vehicle(vehicle: Vehicle) -> Body:
-    """The body that one module is on its own."""
+    """The body of a single module."""
     return assemble([(0, 0, 0)], [0], [vehicle])
 
 
 def assemble_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> list[Body]:
-    """The bodies that the fleet starts as, in the order of their leaders; `vehicles` by the name in the fleet file."""
+    """The initial bodies of the fleet, in the order of their leaders; `vehicles` by the name in the fleet file."""
     check_fleet(fleet, vehicles)
     return [assemble(*described(fleet, members, vehicles), members, fleet.pitch_m) for members in groups_of(fleet)]
 
 
 def check_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> None:
-    """Refuse modules that cannot be docked so, and thrusters that no frame carries. Raises DescriptionError, which names numbers."""
+    """Refuses modules that cannot be docked as described, and more thrusters than a module's frames carry.
+
+    Raises DescriptionError, which names module numbers.
+    """
     for name, vehicle in vehicles.items():
         if len(vehicle.thruster) > CHANNELS:
             raise DescriptionError(f"vehicle {name}: {len(vehicle.thruster)} thrusters; a module's frames carry {CHANNELS}")
@@ -101,7 +104,7 @@ def described(
 def place(
     cells: Sequence[Sequence[int]] | np.ndarray, rotation: Sequence[int], vehicles: Sequence[Vehicle]
 ) -> list[Placement]:
-    """Where each module sits; arguments as `assemble`."""
+    """Placement of each module; arguments as in `assemble`."""
     turned = zip(vehicles, cells, rotation, strict=True)
     return [Placement(v, (int(c[0]), int(c[1]), int(c[2])), int(r)) for v, c, r in turned]
 
@@ -150,19 +153,19 @@ def _power(vehicle: Vehicle) -> float:
 
 
 def _reach_m(vehicle: Vehicle, r_bm: np.ndarray) -> float:
-    """How far the corners of the hull's box may be from the centre of mass, m."""
+    """Upper bound of the distance from the centre of mass to the corners of the hull's box, m."""
     return float(np.linalg.norm(r_bm) + 0.5 * np.linalg.norm(vehicle.hull.size_m))
 
 
 def _righting(placement: Placement) -> np.ndarray:
-    """(3,) weight, entrained water included, times the arm from centre of mass up (-z of the module) to that of buoyancy, N m."""
+    """(3,) weight, with entrained water, times the arm from the centre of mass up (-z of the module) to that of buoyancy, N m."""
     inertial = placement.vehicle.inertial
     moment = GRAVITY * inertial.wet_kg * inertial.righting_arm_m
     return np.asarray(MATRICES[placement.rotation] @ np.array([0.0, 0.0, -moment]))
 
 
 def _righting_sigma(placements: Sequence[Placement], r_bm: np.ndarray) -> np.ndarray:
-    """(3,) how far the sum of each module's buoyancy times where it acts may be off, N m: each module is off on its own."""
+    """(3,) uncertainty of the sum over modules of buoyancy times its position, N m; the errors of the modules are independent."""
     parts = [BUOYANCY_SIGMA_N * r_bm]
     for placement in placements:
         inertial = placement.vehicle.inertial
@@ -173,7 +176,7 @@ def _righting_sigma(placements: Sequence[Placement], r_bm: np.ndarray) -> np.nda
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lump:
-    """A rigid part with the water inside: mass, centre (3,) in the lattice frame, inertia (3, 3) about the centre."""
+    """A rigid part with the water that it entrains: mass, centre (3,) in the lattice frame, inertia (3, 3) about the centre."""
 
     mass: float
     centre: np.ndarray
@@ -182,12 +185,12 @@ class _Lump:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Balance:
-    """Where docked modules balance, entrained water included.
+    """Mass and centre of mass of docked modules, including entrained water.
 
     Attributes:
-        lumps: their rigid parts; mass_kg: of all.
+        lumps: rigid parts of the modules; mass_kg: their total mass.
         centre: (3,) common centre of mass in the lattice frame, m.
-        r_bm: (m, 3) module origins from there, m.
+        r_bm: (m, 3) module origins relative to the centre of mass, m.
     """
 
     lumps: list[_Lump]
@@ -197,7 +200,7 @@ class Balance:
 
     @staticmethod
     def of(placements: Sequence[Placement], pitch_m: float) -> Balance:
-        """Where these modules balance, each at its cell of a lattice of this pitch."""
+        """The balance of these modules, each at its cell of a lattice of this pitch."""
         origins = pitch_m * np.array([p.cell for p in placements], dtype=float)
         lumps = [lump for p, origin in zip(placements, origins, strict=True) for lump in _lumps(p, origin)]
         mass_kg = sum(lump.mass for lump in lumps)
@@ -244,7 +247,7 @@ def _blocks(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
 def thruster_set(placements: Sequence[Placement], r_bm: np.ndarray) -> ThrusterSet:
     """All thrusters in module order; columns [direction; position x direction] about the centre of mass.
 
-    The paper's Jacobian with its two words put right.
+    This is the paper's Jacobian with its two terms corrected.
     """
     columns = []
     vehicles = [p.vehicle for p in placements]

@@ -1,4 +1,4 @@
-"""What a dock or an undock needs before it begins: the geometry of the two faces, and the bodies that there will be afterwards."""
+"""Plans a dock or an undock: the geometry of the two faces, and the resulting bodies."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def plan_dock(request: DockRequest, active: Body, target: Body, vehicles: Sequen
     """The plan of a dock.
 
     Args:
-        request: which faces are to meet. Of the four rotations that the pins allow, number 0 turns the active module least against the
-            target module, the others follow in quarter turns about the target face's normal.
-        active, target: the two bodies as they are.
+        request: the faces that are to meet. Of the four rotations that the pins allow, number 0 turns the active module least relative to
+            the target module; the others follow in quarter turns about the target face's normal.
+        active, target: the two present bodies.
         vehicles: by fleet index.
 
     Raises:
-        DescriptionError: the two would overlap, a probe would meet no drogue, or both faces are drogues; the modules are named.
+        DescriptionError: the two would overlap, a probe would meet no drogue, or both faces are drogues; names the modules.
     """
     turn_t = _turn_of(target, request.target_module)
     normal = _rounded(turn_t @ FACE_NORMALS[request.target_face])
@@ -66,15 +66,15 @@ def plan_undock(
     pitch_m: float = PITCH_M,
     lost: Sequence[DockRequest] = (),
 ) -> UndockPlan:
-    """The plan of parting at the joint between two modules of one body.
+    """The plan of an undock at the joint between two modules of one body.
 
-    Where other joints hold the two together as well, as in a ring, the module leaves alone, by all of its joints.
+    Where other joints also connect the two modules, as in a ring, only the requested module leaves, by all of its joints.
 
     Args:
-        lost: where a body has come apart, its open joints: then no other is opened.
+        lost: open joints of a body that has come apart; no others are then opened.
 
     Raises:
-        DescriptionError: there is no such joint, something else still holds the pieces together, or neighbours close every way out.
+        DescriptionError: there is no such joint, other joints still connect the pieces, or neighbours block every way out.
     """
     near, far = request.target_module, request.module
     joints = [joint.request for joint in joints_of(whole)]
@@ -105,10 +105,10 @@ def plan_undock(
 
 
 def _away(whole: Body, piece: set[int], steps: Sequence[np.ndarray]) -> np.ndarray:
-    """(3,) unit vector, the way that a piece leaves: along its joints, or along the free axis that leads most from the middle of the rest.
+    """(3,) unit vector along which a piece leaves: along its joints, or else along the free axis that points most away from the rest.
 
     Raises:
-        DescriptionError: neighbours close every way; they are named.
+        DescriptionError: neighbours block every way; names them.
     """
     inside = np.array([m in piece for m in whole.modules])
     outward = whole.cells[inside].mean(axis=0) - whole.cells[~inside].mean(axis=0)
@@ -125,7 +125,7 @@ def _away(whole: Body, piece: set[int], steps: Sequence[np.ndarray]) -> np.ndarr
 
 
 def _met(whole: Body, inside: np.ndarray, way: np.ndarray) -> set[int]:
-    """Modules of the rest that the modules `inside` (n,) would run into within the first pitch along `way` (3,)."""
+    """Modules of the rest with which the modules `inside` (n,) would collide within the first pitch along `way` (3,)."""
     offset = whole.cells[~inside] - whole.cells[inside][:, None]
     met = np.all((offset == 0) | (offset == np.sign(way)), axis=-1).any(axis=0)
     return {whole.modules[i] for i in np.flatnonzero(~inside)[met]}

@@ -1,7 +1,7 @@
-"""Outlines kept on disk between runs. A file that is damaged, cut short, older or of another shape is never believed.
+"""Cache of drag outlines on disk. A file that is damaged, truncated, of an older version or of another shape is never used.
 
-File: one line of text (magic, version, shape of the array), one line with the key, the SHA-256 of key and data, then
-little-endian float64.
+File: one line of text (magic, version, shape of the array), one line with the key, one with the SHA-256 of key and data,
+then little-endian float64.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 _MAGIC = "modcube drag outlines"
 
 VERSION = 1
-"""Raise it when the meaning of the figures changes: older files are then rebuilt."""
+"""Increment it when the meaning of the figures changes: older files are then rebuilt."""
 
 
 def default_folder(environment: Mapping[str, str], home: Path) -> Path:
@@ -29,10 +29,10 @@ def default_folder(environment: Mapping[str, str], home: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class DragCache:
-    """One folder of kept outlines.
+    """One folder of cached outlines.
 
     Attributes:
-        folder: where the files are; made when the first is stored.
+        folder: holds the files; created when the first is stored.
     """
 
     folder: Path
@@ -42,7 +42,7 @@ class DragCache:
         return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.drag"
 
     def load(self, key: str, shape: tuple[int, ...]) -> np.ndarray | None:
-        """The array stored under `key`, or None when there is none that can be believed."""
+        """The array stored under `key`, or None where there is no valid one."""
         try:
             raw = self.path_of(key).read_bytes()
         except OSError:
@@ -54,7 +54,7 @@ class DragCache:
         return values if bool(np.all(np.isfinite(values))) else None
 
     def store(self, key: str, values: np.ndarray) -> None:
-        """Keep `values` under `key`. A folder that cannot be written costs the next run time and is no error."""
+        """Stores `values` under `key`. A folder that cannot be written is no error; it only costs the next run time."""
         data = np.ascontiguousarray(values, dtype="<f8").tobytes()
         path = self.path_of(key)
         partial = path.with_suffix(f".{os.getpid()}.part")

@@ -1,7 +1,7 @@
 """Drag table of an assembly: outlines on the nodes of a cube-map, coefficients, rotational damping.
 
-The outlines depend on geometry alone and are kept on disk (prepare.drag_cache) under a key that is the same however the
-shape is turned or moved; coefficients, density and centre of mass are applied afterwards.
+The outlines depend only on geometry and are cached on disk (prepare.drag_cache) under a key that is invariant to rotation
+and translation of the shape; coefficients, density and centre of mass are applied afterwards.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SUBDIVISIONS = 2
 """Each triangle of a hull becomes 4^2 for the damping integral: within 0.2 % for a cube."""
 
 Outlines = Callable[[Sequence[Solid], np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Solids and (n, 3) directions to (n,) areas and (n, 3) centroids, as projected_area.areas_and_centroids."""
+"""Maps solids and (n, 3) directions to (n,) areas and (n, 3) centroids, as projected_area.areas_and_centroids does."""
 
 
 def build(
@@ -45,10 +45,10 @@ def build(
         placements: the modules.
         centre: (3,) centre of mass in the lattice frame, m, about which moments are taken.
         pitch_m: lattice pitch.
-        cache: kept outlines; None builds every time.
+        cache: cache of outlines; None computes them every time.
         mode: name of `method` in the key.
-        method: how outlines are found.
-        nodes_per_rim: grid of each side of the cube-map.
+        method: computes the outlines.
+        nodes_per_rim: grid size of each side of the cube-map.
 
     Returns:
         Arrays for core.drag_lookup; body axes are those of the lattice.
@@ -73,10 +73,10 @@ def build(
 
 
 def coefficient(placements: Sequence[Placement], directions: np.ndarray) -> np.ndarray:
-    """(...,) drag coefficient for flow along (..., 3) unit directions, the modules' own weighted by their surface.
+    """(...,) drag coefficient for flow along (..., 3) unit directions: the modules' coefficients weighted by their surface.
 
-    A quartic cubic harmonic through the values on face and edge: 1 on a face, 1/2 on an edge, 1/3 at a corner is
-    s = sum d_i^4, the same for all 24 rotations, so a module's rotation does not enter.
+    Linear in the quartic cubic harmonic s = sum d_i^4, which is 1 on a face, 1/2 on an edge and 1/3 at a corner, through the
+    values on face and edge. s is the same under all 24 rotations, so a module's rotation does not enter.
     """
     s = np.sum(directions**4, axis=-1)
     total, weights = np.zeros(s.shape), 0.0
@@ -92,7 +92,7 @@ def coefficient(placements: Sequence[Placement], directions: np.ndarray) -> np.n
 def _add_published(
     placement: Placement, turn: np.ndarray, directions: np.ndarray, position: np.ndarray, nodes: np.ndarray
 ) -> None:
-    """Add a vehicle's published quadratic damping, as the part along the flow: F . d = -sum q_i |d_i|^3."""
+    """Adds the component of a vehicle's published quadratic damping along the flow: F . d = -sum q_i |d_i|^3."""
     c = np.abs(directions @ turn) ** 3 @ placement.vehicle.drag.quadratic[:3]
     total = nodes[..., 0] + c
     share = np.divide(c, total, out=np.zeros_like(c), where=total > 0.0)[..., None]
@@ -103,9 +103,9 @@ def _add_published(
 def rotational_damping(placements: Sequence[Placement], centre: np.ndarray, pitch_m: float) -> np.ndarray:
     """(3,) quadratic damping about the body axes through `centre`, N m s^2.
 
-    The hull's surface under the law of the drag table, dF = -1/2 rho Cd max(n . v, 0) v dS with v = w x r: for unit w
-    along axis k the moment is 1/2 rho Cd times the integral of max(n . (e_k x r), 0) times the squared distance from
-    the axis. Triangles that lie on a docked face are left out.
+    Integrates the law of the drag table over the hull's surface, dF = -1/2 rho Cd max(n . v, 0) v dS with v = w x r: for unit
+    w along axis k the moment is 1/2 rho Cd times the integral of max(n . (e_k x r), 0) times the squared distance from the
+    axis. Triangles on a docked face are left out.
     """
     total = np.zeros(3)
     occupied = {p.cell for p in placements}
@@ -135,7 +135,7 @@ def _open_triangles(
 
 
 def _surface(solid: Solid, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (k, 3) and normals times area (k, 3): the mid-edge rule, of second order, on subdivided triangles."""
+    """Quadrature points (k, 3) and normals times area (k, 3): the second-order mid-edge rule on subdivided triangles."""
     corners = solid.vertices[solid.triangles[keep]]
     for _ in range(_SUBDIVISIONS):
         a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
@@ -153,7 +153,7 @@ def _part(placement: Placement) -> Part:
 def _outlines(
     placements: Sequence[Placement], pitch_m: float, cache: DragCache | None, mode: str, method: Outlines, n: int
 ) -> np.ndarray:
-    """(6, n, n, 4) area and centroid in the lattice frame, out of the canonical shape's."""
+    """(6, n, n, 4) area and centroid in the lattice frame, converted from those of the canonical shape."""
     shape = shape_key.canonical([_part(p) for p in placements], pitch_m)
     key = f"{mode} {n} {shape.key}"
     values = cache.load(key, (6, n, n, 4)) if cache else None
@@ -167,7 +167,7 @@ def _outlines(
 
 
 def _measure(solids: Sequence[Solid], directions: np.ndarray, method: Outlines) -> np.ndarray:
-    """(..., 4) area and centroid on each node. Opposite nodes see one outline, rims are shared: each is found once."""
+    """(..., 4) area and centroid on each node. Opposite nodes have the same outline and rims are shared: each is computed once."""
     flat = directions.reshape(-1, 3)
     leading = flat[np.arange(len(flat)), np.argmax(np.round(np.abs(flat), 9) > 0.0, axis=1)]
     half = np.round(flat * np.sign(leading)[:, None], 9)

@@ -1,4 +1,4 @@
-"""The outside of a module as closed solids: its box or mesh, and the boxes of what it carries."""
+"""The hull of a module as closed solids: its box or mesh, and the boxes of its payloads."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from firmware_py.description.vehicle import Vehicle
 from firmware_py.prepare.projected_area import Solid, box
 
 _CONVEX_SHARE = 1e-9
-"""A mesh counts as convex when its convex hull has its volume to this share."""
+"""Relative tolerance of the volume within which a mesh that matches its convex hull counts as convex."""
 _BOX_SHARE = 0.25
-"""How far, of an edge of the hull's box, a side of the mesh may lie from that of the box: fins do; millimetres, other axes and a
-corner as the origin do not."""
+"""Largest distance of a side of the mesh from that of the hull's box, as a share of the box's edge. Fins stay within; a mesh in
+millimetres, with other axes or with its origin at a corner does not."""
 
 
 def hull_of(vehicle: Vehicle) -> tuple[Solid, ...]:
     """Closed solids in the module frame: hull first, then payloads.
 
     Raises:
-        DescriptionError: the mesh cannot be read, is not closed, or does not fill the hull's box.
+        DescriptionError: the mesh cannot be read, is not closed or wound inconsistently, or does not match the hull's box.
     """
     hull = box(vehicle.hull.size_m)
     if vehicle.hull.mesh:
@@ -33,7 +33,7 @@ def hull_of(vehicle: Vehicle) -> tuple[Solid, ...]:
 
 def load_mesh(path: str) -> Solid:
     """The closed mesh in `path` (STL, OBJ, PLY, OFF), metres, outward normals. Raises DescriptionError, one line."""
-    import trimesh  # half a second, and only for vehicles that have a mesh
+    import trimesh  # takes half a second, and only vehicles with a mesh need it
 
     if not Path(path).is_file():
         raise DescriptionError(f"{path}: there is no such mesh")
@@ -51,7 +51,7 @@ def load_mesh(path: str) -> Solid:
 
 
 def _check_box(mesh: Solid, size_m: np.ndarray, path: str) -> None:
-    """Raises DescriptionError where a mesh does not lie about as the hull's box does; `size_m` (3,) are the box's edges."""
+    """Raises DescriptionError where a mesh does not roughly match the hull's box; `size_m` (3,) are the box's edges."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     off = np.maximum(np.abs(low + 0.5 * size_m), np.abs(high - 0.5 * size_m))
     if np.any(off > _BOX_SHARE * size_m):

@@ -1,4 +1,4 @@
-"""Whether placed modules can be docked so: cells, faces, probes and drogues, payloads. A refusal names the modules."""
+"""Checks whether placed modules can be docked as they are placed: cells, faces, probes and drogues, payloads. Errors name the modules."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from firmware_py.prepare.lattice import MATRICES, face_towards
 Cell = tuple[int, int, int]
 
 PAYLOAD_CLEARANCE_M = 1e-3
-"""A payload may reach this far into a neighbour's cell: manufacturing tolerance."""
+"""How far a payload may reach into a neighbour's cell: manufacturing tolerance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where one module sits: its vehicle, lattice cell and rotation index."""
+    """Placement of one module: its vehicle, lattice cell and rotation index."""
 
     vehicle: Vehicle
     cell: Cell
@@ -29,16 +29,16 @@ class Placement:
 
 
 def check_joints(placements: Sequence[Placement], modules: Sequence[object], pitch_m: float) -> None:
-    """Refuse placements that cannot be docked.
+    """Refuses placements that cannot be docked.
 
     Args:
         placements: the modules.
-        modules: their fleet indices, or whatever errors are to name them by.
+        modules: their fleet indices, or other names for error messages.
         pitch_m: lattice pitch.
 
     Raises:
-        DescriptionError: two modules in one cell, a payload in another's cell, a probe that meets no drogue, or a
-            module that no joint leads to.
+        DescriptionError: two modules in one cell, an unknown rotation, a payload in another module's cell, a probe that meets
+            no drogue, or a module without a joint to the rest.
     """
     for _, what in overlaps([placement.cell for placement in placements], modules):
         raise DescriptionError(what)
@@ -65,7 +65,7 @@ def _neighbour(cell: Cell, axis: int) -> Cell:
 
 
 def _joined(placements: Sequence[Placement], modules: Sequence[object], i: int, j: int, axis: int) -> bool:
-    """Whether the faces between neighbours i and j (i below j along `axis`) dock. A probe needs a drogue before it."""
+    """Whether the faces between neighbours i and j (i below j along `axis`) dock. Raises DescriptionError for a probe without a drogue."""
     step = np.eye(3)[axis]
     upper, lower = face_towards(placements[i].rotation, step), face_towards(placements[j].rotation, -step)
     kinds = placements[i].vehicle.faces[upper] + placements[j].vehicle.faces[lower]
@@ -80,7 +80,7 @@ def _joined(placements: Sequence[Placement], modules: Sequence[object], i: int, 
 
 
 def hanging_with(start: int, joints: Sequence[frozenset[int]]) -> set[int]:
-    """Modules that hang together with `start` by these joints, each between two."""
+    """Modules connected to `start` through these joints, each a pair of modules; `start` included."""
     reached, before = {start}, set[int]()
     while reached != before:
         before = reached

@@ -1,4 +1,4 @@
-"""Minimum snap through waypoints in position and attitude: closed form, OSQP under limits, time stretched to fit.
+"""Minimum snap through waypoints in position and attitude: in closed form, with OSQP under limits, with time stretched to fit.
 
 Paper, "Trajectory Planning for RS-ModCubes" (Mellinger and Kumar 2011), with continuity to the fourth derivative.
 """
@@ -21,30 +21,30 @@ from firmware_py.prepare.snap_thrust import divide, sag, usage
 __all__ = ["InfeasibleError", "Limits", "UnwantedError", "Waypoint", "distinct", "plan"]
 
 ATTITUDE_LEVER_M = 0.5
-"""One radian counts as this many metres where time is divided among the pieces."""
+"""One radian counts as this many metres when time is divided among the pieces."""
 
 FIRST_SPEED = 0.1
-"""m/s from which free durations start; what comes out does not depend on it."""
+"""Speed for the initial guess of free durations, m/s; the result does not depend on it."""
 
 MOST_LEAN = 0.2
-"""rad by which a body may lean to leave a moment to buoyancy; a fifth of a force along one axis then goes into another."""
+"""Largest lean with which a body may leave a moment to buoyancy, rad. A fifth of a force along one axis then goes into another."""
 
 _CHECK_POINTS = 48
-"""Points of each piece, or part of one, at which attitude rates and thrusters are checked; what may lie between them is added."""
+"""Intervals of each piece, or part of one, at whose ends attitude rates and thrusters are checked; a bound between the ends is added."""
 
 _LONGEST_STRETCH = 1024.0
 _STRETCH_TOLERANCE = 2e-3
 _SHORTEST_QUATERNION = 0.3
 _SAME = 1e-6
-"""m, and of a quaternion, below which waypoints do not differ."""
+"""Largest difference, in position (m) and in quaternion, at which waypoints count as equal."""
 
 
 class _UnreachableError(InfeasibleError):
-    """However slow the path is, its body cannot fly it."""
+    """The body cannot fly the path, however slow."""
 
 
 class UnwantedError(Exception):
-    """Nobody waits for the trajectory any more."""
+    """The trajectory is no longer wanted."""
 
 
 def _always() -> bool:
@@ -57,9 +57,9 @@ class Waypoint:
 
     Attributes:
         p_wb: (3,) m, world.
-        q_wb: (4,) attitude; None keeps that of the waypoint before.
-        velocity_w: (3,) m/s to pass it with; None leaves it free. The first and the last waypoint are at rest.
-        stop: come to rest there.
+        q_wb: (4,) attitude; None keeps that of the previous waypoint.
+        velocity_w: (3,) velocity at the waypoint, m/s; None leaves it free. The first and the last waypoint are at rest.
+        stop: whether to come to rest there.
     """
 
     p_wb: np.ndarray
@@ -78,21 +78,21 @@ def plan(
 ) -> Piecewise:
     """The trajectory of least snap through the waypoints, rest to rest.
 
-    Neighbours that do not differ are one waypoint, and count once in `breaks` and messages, unless each piece is given its duration.
+    Equal neighbours are merged and count once in `breaks` and messages, unless a duration is given for each piece.
 
     Args:
         waypoints: two or more.
         durations_s: of each piece; or their sum, divided for least snap; or None: as short as limits and body allow.
-        limits: what the path may do.
-        body: whose thrusters must be able to fly it, in still water, with the axes that they do not span left to buoyancy.
-        stretch: lengthen the durations until everything fits; False takes them as they are.
-        wanted: asked before each attempt, of which there are a dozen; many waypoints take seconds each.
+        limits: of the path.
+        body: must be able to fly the path with its thrusters, in still water, with the axes that they do not span left to buoyancy.
+        stretch: whether to lengthen the durations until all limits hold; False takes them as they are.
+        wanted: called before each attempt, of which there are a dozen; with many waypoints each takes seconds.
 
     Raises:
-        InfeasibleError: which limit cannot be kept, and where.
-        ValueError: too few waypoints, a velocity where the path rests, durations that do not match, or free durations without
-            anything that bounds them.
-        UnwantedError: it is not `wanted` any more.
+        InfeasibleError: states which limit cannot be kept, and where.
+        ValueError: too few waypoints, a velocity where the path rests, durations that do not match, or free durations that
+            nothing bounds.
+        UnwantedError: the trajectory is no longer `wanted`.
     """
     limits = limits or Limits()
     _check(waypoints)
@@ -118,12 +118,12 @@ def check_bounded(waypoints: Sequence[Waypoint], limits: Limits, body: Body | No
 
 
 def distinct(waypoints: Sequence[Waypoint], same: float = _SAME) -> tuple[list[Waypoint], list[int]]:
-    """Neighbours that do not differ as one waypoint, and for each of `waypoints` which of these it is.
+    """Merges equal neighbours; returns the merged waypoints, and for each of `waypoints` the index of its merged one.
 
-    Those that are passed with two velocities differ, as one that is passed and a rest do: a loop leads from one to the other.
+    Neighbours with different given velocities are not equal, and nor are a velocity and a rest: a loop leads from one to the other.
 
     Args:
-        same: m, and of a quaternion, below which they do not differ.
+        same: largest difference, in position (m) and in quaternion, at which neighbours count as equal.
     """
     attitudes = _continuous(waypoints)
     first, passed = 0, _velocity(waypoints, 0)
@@ -142,7 +142,7 @@ def distinct(waypoints: Sequence[Waypoint], same: float = _SAME) -> tuple[list[W
 
 
 def _fit(request: _Request, base: np.ndarray, free: bool) -> Piecewise:
-    """The shortest uniform stretch of `base` that fits; below 1 only where durations are free."""
+    """The trajectory with the smallest feasible stretch of all of `base`; the stretch is below 1 only where durations are free."""
     high, best = 1.0, request.try_stretch(base, 1.0)
     low = 1.0
     while best is None:
@@ -170,7 +170,7 @@ def _fit(request: _Request, base: np.ndarray, free: bool) -> Piecewise:
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """Waypoints in the form that the solver takes."""
+    """Waypoints, limits and body in the form that the solver takes."""
 
     position: Knots
     attitude: Knots
@@ -208,7 +208,7 @@ class _Request:
         return any(bound is not None and bool(np.any(np.isfinite(bound) & where)) for bound, where in bounds)
 
     def durations(self, asked: Sequence[float] | float | None) -> np.ndarray:
-        """(n - 1,) s to start from."""
+        """(n - 1,) durations to start from, s."""
         count = len(self.position.value) - 1
         if isinstance(asked, Sequence | np.ndarray):
             given = np.array(asked, dtype=float)
@@ -226,7 +226,7 @@ class _Request:
         return divide_time(knots, total)
 
     def try_stretch(self, base: np.ndarray, factor: float) -> Piecewise | None:
-        """The trajectory at `factor` times the durations, or None where it breaks something that longer ones may mend."""
+        """The trajectory at `factor` times the durations, or None where it is infeasible but longer durations may help."""
         try:
             return replace(self.attempt(base * factor), stretch=factor)
         except InfeasibleError as error:
@@ -257,7 +257,7 @@ class _Request:
         return found
 
     def _check_turning(self, grid: np.ndarray, place: Callable[[int], str]) -> None:
-        """Refuse a grid (pieces, points, 20) that turns too far or too fast; `place` as for `_check_motion`."""
+        """Refuses a grid (pieces, points, 20) that turns too far or too fast; `place` as for `_check_motion`."""
         if (shortest := float(grid[..., 19].min())) < _SHORTEST_QUATERNION:
             where = place(int(np.argmin(grid[..., 19])))
             raise InfeasibleError(f"attitude turns too far {where} (length {shortest:.2f}); add a waypoint there")
@@ -270,7 +270,7 @@ class _Request:
                 raise InfeasibleError(f"turning takes {largest:.3g} {unit} of at most {bound:g} {unit} {place(at)}")
 
     def check_standing(self) -> None:
-        """Refuse attitudes that the body cannot even hold. Raises InfeasibleError."""
+        """Refuses attitudes that the body cannot hold even at rest. Raises InfeasibleError."""
         if self.body is None:
             return
         still = np.zeros((len(self.attitude.value), 19))
@@ -278,9 +278,9 @@ class _Request:
         self._check_motion(self.body, still, lambda k: f"to stand still at waypoint {k}")
 
     def _check_motion(self, body: Body, motion: np.ndarray, place: Callable[[int], str], run: int = 1) -> None:
-        """Refuse (k, 19) motion that takes more than thrusters and buoyancy give; `place` tells in words where row k is.
+        """Refuses (k, 19) motion that needs more than thrusters and buoyancy give; `place` describes where row k is.
 
-        Each `run` of rows is a smooth motion, which is checked between them too.
+        Each `run` of rows samples a smooth motion, which is checked between the rows too.
         """
         part = divide(body, motion)
         flat = int(np.argmax(np.abs(part.lacking)))
@@ -300,7 +300,7 @@ class _Request:
 
 
 def _check(waypoints: Sequence[Waypoint]) -> None:
-    """Refuse too few waypoints, and a velocity where the path rests. Raises ValueError."""
+    """Refuses too few waypoints, and a velocity where the path rests. Raises ValueError."""
     if len(waypoints) < 2:
         raise ValueError(f"a trajectory needs two waypoints, not {len(waypoints)}")
     for k, waypoint in enumerate(waypoints):
@@ -313,7 +313,7 @@ def _rests(waypoints: Sequence[Waypoint], k: int) -> bool:
 
 
 def _velocity(waypoints: Sequence[Waypoint], k: int) -> np.ndarray | None:
-    """(3,) m/s with which waypoint k is passed, or None where it is free."""
+    """(3,) velocity at waypoint k, m/s; None where it is free."""
     return np.zeros(3) if _rests(waypoints, k) else waypoints[k].velocity_w
 
 
@@ -323,7 +323,7 @@ def _thrust_message(share: float, limit: float, where: str) -> str:
 
 
 def _largest(size: np.ndarray) -> tuple[float, int]:
-    """The largest of smooth quantities (pieces, points), crests between the points included, and the flat index of the point next to it."""
+    """The maximum of smooth quantities (pieces, points), including crests between points, and the flat index of the nearest point."""
     if size.shape[1] < 3:
         return float(size.max()), int(np.argmax(size))
     heights, _ = crests(size)
@@ -334,7 +334,7 @@ def _largest(size: np.ndarray) -> tuple[float, int]:
 
 
 def _place(found: Piecewise, fine: Piecewise, flat: int) -> str:
-    """In words, the place in `found` of a flat index into `fine.grid(_CHECK_POINTS)`, the same path in shorter pieces."""
+    """Describes the place in `found` of a flat index into the grid of `fine`, the same path in shorter pieces."""
     part, i = divmod(flat, _CHECK_POINTS + 1)
     time = fine.breaks[part] + i / _CHECK_POINTS * (fine.breaks[part + 1] - fine.breaks[part])
     piece = int(np.searchsorted(found.breaks, fine.breaks[part], side="right")) - 1
@@ -342,7 +342,7 @@ def _place(found: Piecewise, fine: Piecewise, flat: int) -> str:
 
 
 def _continuous(waypoints: Sequence[Waypoint]) -> np.ndarray:
-    """(n, 4) unit quaternions, each with the sign nearer to the one before."""
+    """(n, 4) unit quaternions, each with the sign nearer to its predecessor."""
     found = [np.array([1.0, 0.0, 0.0, 0.0])]
     for waypoint in waypoints:
         q = found[-1] if waypoint.q_wb is None else rotations.normalise(np.array(waypoint.q_wb, dtype=float))

@@ -1,7 +1,7 @@
 """Trajectories in closed form: hold, spiral, Moebius strip, circle, Lissajous figure, line. Rest to rest.
 
-Made before they are needed; `sample` runs in the tick and is compiled. Others (minimum_snap) are the same
-`Trajectory` (core.setpoint).
+Built before they are needed; `sample` runs in the tick and is compiled. Like the trajectories of minimum_snap they
+implement `Trajectory` (core.setpoint).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Hold:
     duration_s: float = 0.0
 
     def sample(self, t_s: float) -> Setpoint:
-        """The pose; `t_s` does not matter."""
+        """The pose; ignores `t_s`."""
         return self.setpoint
 
 
@@ -34,8 +34,8 @@ class Hold:
 def progress(tau, ramp):  # type: ignore[no-untyped-def]
     """Share of the way, its first and second derivative, at the share `tau` of the time (0 to 1), rest to rest.
 
-    Speed rises over the share `ramp` of the time (at most a half) as the fifth-degree smooth step, stays, and falls
-    likewise: velocity, acceleration and jerk vanish at both ends and jerk is continuous in between.
+    Speed rises over the share `ramp` of the time (at most a half) as the fifth-degree smooth step, stays constant, and falls
+    in the same way: velocity, acceleration and jerk vanish at both ends and jerk is continuous in between.
     """
     if tau <= 0.0:
         return 0.0, 0.0, 0.0
@@ -94,7 +94,7 @@ class Harmonic:
             quaternion (4) after them: q_wb = first * q_z(yaw phase) * q_x(roll phase) * last.
         duration_s: from rest to rest.
         end_phase: rad.
-        ramp_share: share of the duration in which speed rises, and again in which it falls; see `progress`.
+        ramp_share: share of the duration in which speed rises, and equally that in which it falls; see `progress`.
     """
 
     terms: np.ndarray
@@ -104,15 +104,15 @@ class Harmonic:
     ramp_share: float
 
     def sample(self, t_s: float) -> Setpoint:
-        """Wanted motion at `t_s`, world NED and wanted body frame; the ends are held."""
+        """Reference motion at `t_s`, in world NED and the reference body frame; the ends are held."""
         return as_setpoint(_harmonic(self.terms, self.head, self.duration_s, self.end_phase, self.ramp_share, t_s))
 
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
-"""Attitude of the world's axes."""
+"""Attitude with the body axes along the world axes."""
 
 LONGEST_RAMP = 0.5
-"""Speed rises for half the time and falls for the other half."""
+"""Largest ramp share: speed rises for half the time and falls for the other half."""
 
 Vector = Sequence[float] | np.ndarray
 
@@ -225,7 +225,7 @@ def lissajous(
 
 
 def line(start: Setpoint, end: Setpoint, duration_s: float) -> Harmonic:
-    """Straight from pose to pose, turning about one axis on the way; the set-points' motion does not matter."""
+    """A straight line from pose to pose that turns about one axis on the way; ignores the motion of the set-points."""
     turn = rotations.difference(end.q_wb, start.q_wb)
     angle = float(np.linalg.norm(turn))
     align = _x_axis_to(turn / angle) if angle > 0.0 else np.array(LEVEL)
@@ -236,7 +236,7 @@ def line(start: Setpoint, end: Setpoint, duration_s: float) -> Harmonic:
 
 
 def _x_axis_to(axis: np.ndarray) -> np.ndarray:
-    """Unit quaternion that turns the x axis into a unit vector, by the half-way vector."""
+    """Unit quaternion that rotates the x axis onto a unit vector, by the half-way vector."""
     if axis[0] < -1.0 + 1e-12:
         return np.array([0.0, 0.0, 0.0, 1.0])
     return np.asarray(rotations.normalise(np.array([1.0 + axis[0], 0.0, -axis[2], axis[1]])))

@@ -1,7 +1,7 @@
-"""A trajectory of polynomial pieces in position and attitude, as minimum snap makes them; sampled in the tick.
+"""A trajectory of polynomial pieces in position and attitude, as minimum snap produces; sampled in the tick.
 
-Attitude runs in the space of all quaternions and is normalised: smooth, free of singular attitudes, met at the
-waypoints, and the same however world or body axes are chosen.
+Attitude is interpolated in the space of all quaternions and then normalised: it is smooth, free of singular attitudes, exact
+at the waypoints, and independent of the choice of world and body axes.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from firmware_py.core.types import Setpoint
 
 _DEGREE = 9
 _CLOSE = 0.1
-"""Share of its length by which the quaternion changes from point to point at most, where points are close enough to tell how fast it
-turns: of a crest between them less than a thousandth is lost."""
+"""Largest change of the quaternion between neighbouring points, as a share of its length, at which the points resolve how fast it turns:
+less than a thousandth of a crest between them is lost."""
 
 
 def _halves() -> np.ndarray:
-    """(2, 10, 10) from the coefficients in u to those in the share of the first half of the piece, and of the second."""
+    """(2, 10, 10) maps from coefficients in u to those in the share of the piece's first half, and of its second half."""
     power = np.arange(_DEGREE + 1)
     second = np.array([[math.comb(i, j) for i in power] for j in power], dtype=float)
     return np.asarray(np.stack([np.eye(_DEGREE + 1), second]) * 0.5**power)
@@ -49,8 +49,8 @@ def _derivatives(c, u, rate, out):  # type: ignore[no-untyped-def]
 def _motion(d, out):  # type: ignore[no-untyped-def]
     """(19,) p, q, v, w, a, alpha of derivatives (3, 7).
 
-    With x = |x| q: w = 2 Im(q* x')/|x| and alpha = 2 Im(q* x'')/|x| - 2 w (q . x')/|x|: the part of x' along q turns
-    nothing.
+    With x = |x| q: w = 2 Im(q* x')/|x| and alpha = 2 Im(q* x'')/|x| - 2 w (q . x')/|x|, because the part of x' along q
+    causes no rotation.
     """
     n = math.sqrt(d[0, 3] ** 2 + d[0, 4] ** 2 + d[0, 5] ** 2 + d[0, 6] ** 2)
     q0, q1, q2, q3 = d[0, 3] / n, d[0, 4] / n, d[0, 5] / n, d[0, 6] / n
@@ -110,8 +110,8 @@ class Piecewise:
         coefficients: (k, 10, 7) of 1, u, ..., u^9 in the share u of each piece's duration; for x, y, z, then the four of the quaternion
             before it is normalised.
         breaks: (k + 1,) s, rising from 0.
-        method: how it was found: "closed form" or "osqp".
-        stretch: factor by which the asked durations were lengthened.
+        method: of the solution: "closed form" or "osqp".
+        stretch: factor by which the requested durations were lengthened.
         snap_cost: integral of the squared snap of the position, m^2/s^7.
     """
 
@@ -127,7 +127,7 @@ class Piecewise:
         return float(self.breaks[-1])
 
     def sample(self, t_s: float) -> Setpoint:
-        """Wanted motion at `t_s`, world NED and wanted body frame; the ends are held at rest."""
+        """Reference motion at `t_s`, in world NED and the reference body frame; the ends are held at rest."""
         return as_setpoint(_sample(self.coefficients, self.breaks, t_s))
 
     def grid(self, per_piece: int) -> np.ndarray:
@@ -135,7 +135,7 @@ class Piecewise:
         return np.asarray(_grid(self.coefficients, self.breaks, per_piece))
 
     def halved(self, which: np.ndarray) -> Piecewise:
-        """The same path, of whose pieces those of `which` (k,) are two."""
+        """The same path, with the pieces selected by `which` (k,) split in two."""
         parts = [_HALVES @ piece if cut else piece[None] for piece, cut in zip(self.coefficients, which, strict=True)]
         return replace(self, coefficients=np.concatenate(parts), breaks=np.sort(np.concatenate([self.breaks, self._middles[which]])))
 
@@ -144,17 +144,17 @@ class Piecewise:
         return np.asarray(0.5 * (self.breaks[:-1] + self.breaks[1:]))
 
     def resolved(self, per_piece: int, shortest: float) -> Piecewise:
-        """The same path in pieces so short that the points of `grid(per_piece)` do not miss a turn.
+        """The same path in pieces short enough for the points of `grid(per_piece)` to resolve its turns.
 
-        A quaternion far longer than 1, as a long piece beside a short one has, turns within a small part of its piece.
+        A quaternion far longer than 1, as in a long piece beside a short one, turns within a small part of its piece.
 
         Args:
             per_piece: of `grid`.
-            shortest: length below which a quaternion need not be told.
+            shortest: length below which a quaternion need not be resolved.
         """
         length = (grid := self.grid(per_piece))[..., 19:]
         step = np.linalg.norm(np.diff(length * grid[..., 3:7], axis=1), axis=-1)
         near = np.maximum(np.minimum(length[:, :-1, 0], length[:, 1:, 0]), shortest)
-        divisible = (self.breaks[:-1] < self._middles) & (self._middles < self.breaks[1:])  # between neighbouring floats is none
+        divisible = (self.breaks[:-1] < self._middles) & (self._middles < self.breaks[1:])  # neighbouring floats have no middle
         coarse = np.any(step > _CLOSE * near, axis=1) & divisible
         return self.halved(coarse).resolved(per_piece, shortest) if coarse.any() else self

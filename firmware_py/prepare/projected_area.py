@@ -1,6 +1,6 @@
 """Exact outline of a shape seen along a direction: area and centroid of the union of the projected hulls (shapely).
 
-The slow half of the drag table; the paper's sampling in its place is prepare.alpha.
+The slow half of the drag table. prepare.alpha is the alternative by the paper's sampling.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Solid:
         return np.asarray(0.5 * np.cross(b - a, c - a))
 
     def placed(self, rotation: np.ndarray, position: np.ndarray) -> Solid:
-        """The solid turned by a (3, 3) matrix, then moved by (3,) m."""
+        """The solid rotated by a (3, 3) matrix, then translated by (3,) m."""
         return Solid(self.vertices @ rotation.T + position, self.triangles, self.convex)
 
 
@@ -51,7 +51,7 @@ def box(size: np.ndarray) -> Solid:
 def plane_basis(directions: np.ndarray) -> np.ndarray:
     """(n, 2, 3) right-handed bases of the planes normal to (n, 3) unit directions.
 
-    Without a singular direction: Duff et al., "Building an orthonormal basis, revisited", JCGT 6 (2017).
+    Has no singular direction: Duff et al., "Building an orthonormal basis, revisited", JCGT 6 (2017).
     """
     x, y, z = directions.T
     sign = np.where(z >= 0.0, 1.0, -1.0)

@@ -1,7 +1,7 @@
-"""A name for the geometry of an assembly that does not change when the assembly is turned or moved.
+"""A key for the geometry of an assembly that is invariant to rotation and translation.
 
-Drag tables are kept under it: the shape is brought into its canonical pose (the first of 24 in order), built there, and
-read back through the rotation.
+Drag outlines are cached under it: they are computed in the canonical pose of the shape (the first of 24 in order) and
+rotated back.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ class Part:
 
     Attributes:
         cell: lattice cell.
-        rotation: which of the 24 rotations.
+        rotation: index of one of the 24 rotations.
         hull: closed solids in the module frame.
         name: the same for equal hulls.
-        size: (3,) edges where the hull is one box, whose half-turns look alike; None for any other.
+        size: (3,) edges of a hull that is one box, which half-turns leave unchanged; None for any other hull.
     """
 
     cell: tuple[int, int, int]
@@ -38,7 +38,7 @@ class Part:
     size: np.ndarray | None
 
     def token(self, turn: int) -> tuple[int, int, int, str]:
-        """Cell and looks after turning the whole shape by rotation `turn`."""
+        """Cell and appearance after the whole shape is rotated by rotation `turn`."""
         x, y, z = (round(float(c)) for c in MATRICES[turn] @ np.array(self.cell))
         rotation = int(PRODUCT[turn, self.rotation])
         if self.size is None:
@@ -51,10 +51,10 @@ class CanonicalShape:
     """A shape in its canonical pose.
 
     Attributes:
-        key: text that names the geometry.
+        key: text that identifies the geometry.
         parts: the modules in the canonical pose.
         rotation: index of the rotation from the canonical frame to the lattice frame.
-        origin: (3,) of the canonical frame in the lattice frame, in cells.
+        origin: (3,) origin of the canonical frame in the lattice frame, in cells.
     """
 
     key: str
@@ -68,7 +68,7 @@ def _text(values: np.ndarray) -> str:
 
 
 def part(vehicle: Vehicle, cell: tuple[int, int, int], rotation: int) -> Part:
-    """The part that a module of `vehicle` is."""
+    """The part for a module of `vehicle`."""
     hull = hull_of(vehicle)
     size = None if vehicle.hull.mesh or vehicle.payload else vehicle.hull.size_m
     return Part(cell, rotation, hull, _digest(hull), size)
@@ -87,7 +87,7 @@ def solids(parts: Sequence[Part], pitch_m: float) -> list[Solid]:
 
 
 def canonical(parts: Sequence[Part], pitch_m: float) -> CanonicalShape:
-    """The pose, out of 24, whose sorted list of cells and looks comes first; its lowest corner is at the origin."""
+    """The shape in the pose, out of 24, whose sorted list of cells and appearances comes first, with its lowest corner at the origin."""
     best: tuple[list[tuple[int, int, int, str]], int, tuple[int, int, int]] | None = None
     for turn in range(24):
         tokens = [p.token(turn) for p in parts]
@@ -111,7 +111,7 @@ def canonical(parts: Sequence[Part], pitch_m: float) -> CanonicalShape:
 def turned_nodes(rotation: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Indices (side, i, j), each (6, n, n), of a cube-map in frame c for the nodes of one in frame b.
 
-    `rotation` turns vectors of c into b, and so nodes of one into nodes of the other.
+    `rotation` maps vectors of c to b, and so nodes of one to nodes of the other.
     """
     directions = node_directions(n) @ MATRICES[rotation]
     signed = np.stack([s * directions[..., a] for a in range(3) for s in (1.0, -1.0)], axis=-1)

@@ -1,7 +1,7 @@
-"""Minimum snap under limits: velocity, acceleration and corridor as linear rows, solved with OSQP.
+"""Minimum snap under limits: velocity, acceleration and corridor as linear constraint rows, solved with OSQP.
 
-Rows stand at a few points of each piece; where the result breaks a limit in between, a row is added at the crest and it
-is solved again, so that the limits hold everywhere and not at samples alone.
+Each piece starts with rows at a few points. Where the result violates a limit in between, a row is added at the crest and
+the problem is solved again, so that the limits hold everywhere and not only at samples.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import scipy.sparse as sparse
 from firmware_py.prepare.snap_spline import ORDERS, TO_COEFFICIENTS, Knots, System, derivative_rows
 
 _FIRST_POINTS = 8
-"""Points of each piece that carry rows from the start."""
+"""Number of points of each piece with rows from the start."""
 
 _CHECK_POINTS = 48
-"""Points of each piece between which the crests of a limited quantity are looked for."""
+"""Number of intervals of each piece whose ends are sampled to find the crests of a limited quantity."""
 
 _MARGIN = 2e-3
-"""Share by which rows are tighter than the limit: covers the solver's tolerance, and how far a crest moves when it is pressed down."""
+"""Share by which rows are tighter than the limit. Covers the solver's tolerance, and the shift of a crest when a row limits it."""
 
 _ROUNDS = 12
 _SOLVER = {
@@ -37,7 +37,7 @@ _SOLVER = {
     "adaptive_rho_interval": 50,  # counted, not timed: the same result every time
 }
 _CORRIDOR_SIDES = 8
-"""A corridor is a prism of this many sides, inside the cylinder."""
+"""Number of sides of the prism, inside the cylinder, that represents a corridor."""
 
 
 class InfeasibleError(ValueError):
@@ -46,7 +46,7 @@ class InfeasibleError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What the trajectory may do; None leaves it free.
+    """Limits of a trajectory; None leaves a quantity free.
 
     Attributes:
         velocity: (3,) m/s, along each world axis.
@@ -54,7 +54,7 @@ class Limits:
         corridor_m: largest distance from the straight line between neighbouring waypoints.
         angular_rate: rad/s.
         angular_acceleration: rad/s^2.
-        thruster_share: share of each thruster's force that the path may ask for; the rest is for control.
+        thruster_share: share of each thruster's range that the path may use; the rest is reserved for control.
     """
 
     velocity: np.ndarray | None = None
@@ -155,7 +155,7 @@ class _Table:
 def crests(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The crests between samples (..., n) of smooth functions: (..., n - 2) heights and places, counted in samples.
 
-    Those of the parabola through a sample and its two neighbours; where it has no crest between these, the sample itself.
+    Each is the crest of the parabola through a sample and its two neighbours; without a crest between these, the sample itself.
     """
     before, at, after = values[..., :-2], values[..., 1:-1], values[..., 2:]
     bend, slope = before - 2.0 * at + after, 0.5 * (after - before)
@@ -164,7 +164,7 @@ def crests(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def worst(limits: list[Plane], coefficients: np.ndarray, durations: np.ndarray) -> tuple[float, str]:
-    """How far the worst limit is used (1 is the limit), and a sentence about it; (0, "") without limits."""
+    """Largest ratio of any limited quantity to its limit, and a description of it; (0, "") without limits."""
     if not limits:
         return 0.0, ""
     excess, where = _Table.of(limits).excess(coefficients, durations)
@@ -182,12 +182,12 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
 
     Args:
         system: durations.
-        knots: waypoints (n, 3) and what is given there.
-        limits: of `planes`.
+        knots: waypoints (n, 3) and the derivatives given there.
+        limits: result of `planes`.
         start: (n, 4, 3) solution without limits.
 
     Raises:
-        InfeasibleError: names the limit and the place that conflict.
+        InfeasibleError: names the limit and the place of the conflict.
     """
     if knots.fixed.all():
         _, what = worst(limits, system.coefficients(knots.value, start), system.durations)
@@ -248,7 +248,7 @@ class _Problem:
         solver = osqp.OSQP()
         solver.setup(self._form, self._linear, scaled, low, high, **_SOLVER)
         solver.warm_start(x=self._warm)
-        with redirect_stdout(io.StringIO()):  # "Polishing not needed" comes whatever verbose says (osqp/osqp issue 785)
+        with redirect_stdout(io.StringIO()):  # "Polishing not needed" is printed regardless of verbose (osqp/osqp issue 785)
             result = solver.solve(raise_error=False)
         if result.info.status_val not in (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE):
             certificate = result.prim_inf_cert
@@ -261,7 +261,7 @@ class _Problem:
         return np.ascontiguousarray(flat.reshape(3, n, ORDERS - 1).transpose(1, 2, 0)), -1
 
     def _rows(self, table: _Table, index: np.ndarray, u: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:
-        """Rows over all unknowns, and what the given positions and derivatives add."""
+        """Rows over all unknowns, and the constant part from the given positions and derivatives."""
         piece, order, normal = table.piece[index], table.order[index], table.normal[index]
         durations, tau = self._system.durations[piece], self._system.tau
         rows = np.zeros((len(index), 2 * ORDERS))

@@ -1,6 +1,6 @@
-"""The quadratic heart of minimum snap: ninth-degree pieces by their values and derivatives at the waypoints.
+"""The quadratic core of minimum snap: ninth-degree pieces, given by their values and derivatives at the waypoints.
 
-Unknown are velocity, acceleration, jerk and snap at each waypoint; positions are met and derivatives up to the fourth
+The unknowns are velocity, acceleration, jerk and snap at each waypoint; positions are exact and derivatives up to the fourth
 are continuous by construction. Without limits the optimum is the interpolating spline of degree seven.
 """
 
@@ -15,14 +15,14 @@ from scipy.optimize import minimize
 
 DEGREE = 9
 ORDERS = 5
-"""Position, velocity, acceleration, jerk, snap: what neighbouring pieces share."""
+"""Position, velocity, acceleration, jerk, snap: the quantities that neighbouring pieces share."""
 
 _UNKNOWN = ORDERS - 1
 
 _SHORTER, _LONGER = 100.0, 10.0
-"""How many times shorter, and longer, a piece may be than by the longest way at one speed: beyond, the form is too stiff for floats."""
+"""How much shorter, and longer, a piece may be in time than the longest one at uniform speed. Beyond, the form is too stiff for floats."""
 _TOO_STIFF = 1e3
-"""Logarithm of a cost above all others."""
+"""Log-cost returned for a form too stiff to evaluate; above all others."""
 
 
 def _falling(power: int, order: int) -> int:
@@ -33,7 +33,7 @@ def _falling(power: int, order: int) -> int:
 
 
 def _inverse(rows: list[list[Fraction]]) -> np.ndarray:
-    """Gauss-Jordan in fractions: the matrix is ill-conditioned for floats, its inverse is whole numbers over 24."""
+    """Inverse by Gauss-Jordan in fractions: the matrix is ill-conditioned for floats; its inverse has integers over 24."""
     n = len(rows)
     work = [row + [Fraction(int(i == j)) for j in range(n)] for i, row in enumerate(rows)]
     for k in range(n):
@@ -47,7 +47,7 @@ def _inverse(rows: list[list[Fraction]]) -> np.ndarray:
 
 
 def _hermite_to_coefficients() -> np.ndarray:
-    """(10, 10) from derivatives 0..4 at u = 0 and at u = 1 to coefficients of 1, u, ..., u^9."""
+    """(10, 10) map from derivatives 0..4 at u = 0 and at u = 1 to coefficients of 1, u, ..., u^9."""
     start = [[Fraction(_falling(j, o) if j == o else 0) for j in range(DEGREE + 1)] for o in range(ORDERS)]
     end = [[Fraction(_falling(j, o)) for j in range(DEGREE + 1)] for o in range(ORDERS)]
     return _inverse(start + end)
@@ -73,7 +73,7 @@ _ORDER = np.tile(np.arange(ORDERS), 2)
 
 
 def derivative_rows(u: np.ndarray, order: int) -> np.ndarray:
-    """(k, 10) rows that take coefficients to the derivative of `order` in u at (k,) u."""
+    """(k, 10) rows that map coefficients to the derivative of `order` in u at (k,) u."""
     rows = np.zeros((len(u), DEGREE + 1))
     for j in range(order, DEGREE + 1):
         rows[:, j] = _falling(j, order) * u ** (j - order)
@@ -82,7 +82,7 @@ def derivative_rows(u: np.ndarray, order: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """What is given at n waypoints for c channels.
+    """Given values at n waypoints for c channels.
 
     Attributes:
         value: (n, c) positions.
@@ -96,7 +96,7 @@ class Knots:
 
     @staticmethod
     def at_rest(value: np.ndarray) -> Knots:
-        """Velocity, acceleration and jerk vanish at both ends; all else is free."""
+        """Knots with zero velocity, acceleration and jerk at both ends; all other derivatives are free."""
         n, c = value.shape
         fixed = np.zeros((n, _UNKNOWN), dtype=bool)
         fixed[[0, -1], :3] = True
@@ -191,7 +191,7 @@ def divide_time(knots: Knots, total_s: float) -> np.ndarray:
     """(n - 1,) durations of sum `total_s` with the least snap.
 
     Args:
-        knots: waypoints and what is given there.
+        knots: waypoints and the derivatives given there.
         total_s: s.
     """
     distance = np.linalg.norm(np.diff(knots.value, axis=0), axis=1)

@@ -1,5 +1,5 @@
-"""Whether a body can fly a path: the wrench that it asks for, the share of the thrusters' range that this takes, and how far
-the body leans where a moment is left to buoyancy.
+"""Checks whether a body can fly a path: the wrench that the path needs, the share of the thrusters' range that this takes, and
+how far the body leans where a moment is left to buoyancy.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from firmware_py.core.drag_lookup import drag_wrench
 from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
 
 _FULL = 1e-6
-"""Share of a thruster's range within which it gives all that it may."""
+"""Tolerance, as a share of a thruster's limit, within which the thruster counts as saturated."""
 
 _OUTSIDE = 1e-6
-"""Share of a wrench that may be outside by rounding."""
+"""Share of a wrench that may lie outside the span through rounding."""
 _NOTHING = 1e-9
-"""N and N m that nothing has to give."""
+"""Size of a wrench that counts as zero, N and N m."""
 
 _LEAN_STEP = 1e-4
-"""rad by which attitudes are turned to see what leaning changes."""
+"""Rotation of attitudes for the finite differences by lean, rad."""
 _NO_STIFFNESS = 1e-6
-"""N m/rad that does not hold a body."""
+"""Stiffness that counts as zero, N m/rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Division:
-    """What k states of motion take, divided between thrusters and leaning.
+    """The wrench that k states of motion need, divided between thrusters and leaning.
 
     Attributes:
-        thrust: (k, 6) wrench that is left to the thrusters, within their span, N and N m.
-        lean: (k,) rad by which the body leans from the wanted attitude until it needs no more than that; infinite where
+        thrust: (k, 6) wrench left to the thrusters, within their span, N and N m.
+        lean: (k,) rad by which the body leans from the reference attitude until this wrench suffices; infinite where
             nothing keeps it from falling over.
-        lacking: (k, 6) wrench that neither gives; zero in all that the body can fly.
+        lacking: (k, 6) wrench that neither supplies; zero for motion that the body can fly.
     """
 
     thrust: np.ndarray
@@ -46,7 +46,7 @@ class Division:
 
 
 def wrenches(body: Body, motion: np.ndarray) -> np.ndarray:
-    """(k, 6) thruster wrench, body frame, that still water asks for: tau = M dnu/dt + C(nu) nu + D + g (paper eq. 2).
+    """(k, 6) thruster wrench, body frame, that the motion needs in still water: tau = M dnu/dt + C(nu) nu + D + g (paper eq. 2).
 
     Args:
         body: masses, drag, righting moment.
@@ -67,13 +67,13 @@ def wrenches(body: Body, motion: np.ndarray) -> np.ndarray:
 
 
 def divide(body: Body, motion: np.ndarray) -> Division:
-    """What thrusters that span fewer than six axes leave to buoyancy and water; with all six it is nothing.
+    """Divides the wrench between the thrusters and, where these span fewer than six axes, buoyancy and water.
 
-    The body leans about the moments N outside the span, by N s: from W + dW/ds s in the span follows K s = -N' W with the
-    stiffness K = N' dW/ds. Buoyancy makes it positive; the moment of the added mass on a body under way (Munk) may undo that.
+    The body leans by N s about the moments N outside the span: W + dW/ds s lies in the span if K s = -N' W with the stiffness
+    K = N' dW/ds. Buoyancy makes K positive; the moment of the added mass on a moving body (Munk) may undo that.
 
     Args:
-        body: its thrusters, masses, drag, righting moment.
+        body: thrusters, masses, drag, righting moment.
         motion: (k, 19) as for `wrenches`.
     """
     wanted = wrenches(body, motion)
@@ -95,7 +95,7 @@ def divide(body: Body, motion: np.ndarray) -> Division:
 
 
 def _change_by_lean(body: Body, motion: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """(k, 6) by how much the wrenches change, a radian that the body leans about `axis` (3,), body frame."""
+    """(k, 6) change of the wrenches per radian that the body leans about `axis` (3,), body frame."""
     ends = []
     for step in (_LEAN_STEP, -_LEAN_STEP):
         by, leant = rotations.exp(step * axis), motion.copy()
@@ -107,16 +107,16 @@ def _change_by_lean(body: Body, motion: np.ndarray, axis: np.ndarray) -> np.ndar
 
 
 def _matters(part: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """(k,) whether a part (k, 6) of the wrenches (k, 6) is more than rounding."""
+    """(k,) whether a part (k, 6) of the wrenches (k, 6) exceeds rounding."""
     return np.asarray(np.linalg.norm(part, axis=1) > _OUTSIDE * np.linalg.norm(wanted, axis=1) + _NOTHING)
 
 
 def sag(wanted: np.ndarray, run: int) -> np.ndarray:
-    """(k, 6) by how much the wrench beside a row sags from the line to the next one: an eighth of the second difference.
+    """(k, 6) deviation of the wrench beside a row from the straight line to the next one: an eighth of the second difference.
 
     Args:
         wanted: (k, 6) wrenches.
-        run: so many rows in a row are equally spaced samples of a smooth motion; fewer than three are no motion, and sag by nothing.
+        run: number of consecutive rows that are equally spaced samples of a smooth motion; fewer than three are no motion, with zero sag.
     """
     if run < 3:
         return np.zeros_like(wanted)
@@ -126,21 +126,21 @@ def sag(wanted: np.ndarray, run: int) -> np.ndarray:
 
 
 def usage(body: Body, wanted: np.ndarray, least: float = 0.0, sags: np.ndarray | None = None) -> tuple[float, int]:
-    """Largest share of the thrusters' range that any of the wrenches takes, and which one it is.
+    """Largest share of the thrusters' range that any of the wrenches takes, and the index of that wrench.
 
-    The share of one wrench w is the least s for which forces f with J f = w and s f_min <= f <= s f_max exist. The
-    pseudo-inverse bounds it from above; where that exceeds what any lower bound allows, a linear program finds it, whose forces,
-    divided alike, bound those of its neighbours. So a few programs do for a path, and no wrench is passed over. The share of one
-    outside the thrusters' span is infinite.
+    The share of one wrench w is the least s for which forces f with J f = w and s f_min <= f <= s f_max exist; outside the
+    thrusters' span it is infinite. The pseudo-inverse gives upper bounds. While the largest bound exceeds the largest share found,
+    a linear program finds the share there, and its forces, divided alike, bound the shares of the neighbours. A few programs
+    therefore suffice for a path, and no wrench is missed.
 
-    The share is a gauge, convex and in proportion to the wrench, so that of a sum is at most the sum of the shares: between two rows it
-    is at most the larger of theirs, and the share of what the wrench sags from the line between them.
+    The share is a gauge, convex and proportional to the wrench, so the share of a sum is at most the sum of the shares: between two
+    rows it is at most the larger of theirs plus the share of the sag from the line between them.
 
     Args:
-        body: its thrusters.
+        body: with its thrusters.
         wanted: (k, 6) wrenches.
-        least: a largest share below this need not be found; what is returned is then below it too.
-        sags: (k, 6) of `sag`; its shares are added.
+        least: share below which the maximum need not be exact; the result is then below it too.
+        sags: (k, 6) result of `sag`, whose shares are added.
     """
     pinv = body.thrusters.pinv
     between = np.zeros(len(wanted)) if sags is None else _share(body, sags @ pinv.T)
@@ -156,8 +156,8 @@ def usage(body: Body, wanted: np.ndarray, least: float = 0.0, sags: np.ndarray |
 
 
 def _bound(body: Body, wanted: np.ndarray, division: np.ndarray) -> np.ndarray:
-    """(k,) upper bounds of the shares of wrenches (k, 6): of the forces that `division` (n, 6) makes of them, infinite where these do not
-    make the wrench.
+    """(k,) upper bounds of the shares of wrenches (k, 6), from the forces that `division` (n, 6) maps them to; infinite where these forces
+    do not produce the wrench.
     """
     forces = wanted @ division.T
     above = _share(body, forces)
@@ -166,8 +166,8 @@ def _bound(body: Body, wanted: np.ndarray, division: np.ndarray) -> np.ndarray:
 
 
 def _division(body: Body, share: float, forces: np.ndarray) -> np.ndarray:
-    """(n, 6) the linear division of which `forces` (n,), the least for one wrench, are the case: those thrusters that give all of their
-    `share` go on giving alike, the others what is left to them.
+    """(n, 6) linear map from wrenches to forces that generalises `forces` (n,), the least for one wrench: thrusters saturated at their
+    `share` stay in proportion to each other, and the others supply the rest.
     """
     thrusters = body.thrusters
     limits = np.where(forces > 0.0, thrusters.f_max, thrusters.f_min)
@@ -177,12 +177,12 @@ def _division(body: Body, share: float, forces: np.ndarray) -> np.ndarray:
 
 
 def _share(body: Body, forces: np.ndarray) -> np.ndarray:
-    """(k,) largest share of its range that any thruster gives of forces (k, n), N."""
+    """(k,) largest share of its range that any thruster uses for forces (k, n), N."""
     return np.asarray(np.maximum(forces / body.thrusters.f_max, forces / body.thrusters.f_min).max(axis=1))
 
 
 def least_usage(body: Body, wrench: np.ndarray) -> tuple[float, np.ndarray]:
-    """The share of one wrench (6,), and forces (n,) with which it is reached, N, by linear program (HiGHS).
+    """The share of one wrench (6,), and forces (n,) that reach it, N, by linear program (HiGHS).
 
     The share is infinite for a wrench outside the thrusters' span.
     """

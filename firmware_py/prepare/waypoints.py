@@ -1,4 +1,4 @@
-"""Waypoint files: CSV for spreadsheets, TOML for people. Both give what minimum_snap.plan takes.
+"""Waypoint files: CSV for spreadsheets, TOML for people. Both give the input of minimum_snap.plan.
 
 CSV: a header out of x_m, y_m, z_m, qw, qx, qy, qz, vx_m_s, vy_m_s, vz_m_s, stop (0 or 1), duration_s (of the piece that
 leads there). TOML: [[waypoint]] tables, and optionally duration_s, [limits].
@@ -24,7 +24,7 @@ _VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
 _COLUMNS = (*_POSITION, *_ATTITUDE, *_VELOCITY, "stop", "duration_s")
 _UNIT_TOLERANCE = 0.01
 _SHOWN = 60
-"""Characters of what is wrong that are shown."""
+"""Longest excerpt of wrong input in a message, characters."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,7 +96,7 @@ class Mission:
         return plan(self._points, self._durations, self.limits.limits(), body, stretch)
 
     def check_bounded(self) -> None:
-        """Raises ValueError where the file itself leaves free how long its path takes: no body is to find out how fast it can be."""
+        """Raises ValueError where the file gives neither durations nor limits that bound them; a body is not needed for the check."""
         if self._durations is None:
             check_bounded(self._points, self.limits.limits())
 
@@ -143,7 +143,7 @@ def _read_csv(text: str, path: str) -> Mission:
 
 
 def _header(header: list[str], path: str) -> list[str]:
-    """The names of the columns. Raises DescriptionError where one is unknown, missing or there twice."""
+    """The names of the columns. Raises DescriptionError where one is unknown, missing or duplicated."""
     unknown = [name for name in header if name not in _COLUMNS]
     missing = [name for name in _POSITION if name not in header]
     twice = [name for at, name in enumerate(header) if name in header[:at]]

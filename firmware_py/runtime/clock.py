@@ -1,4 +1,4 @@
-"""Clocks: the only place of the firmware that reads one. Everything else is given time as integer nanoseconds."""
+"""Clocks: the only place in the firmware that reads one. All other code receives time as integer nanoseconds."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from pathlib import Path
 from typing import Protocol
 
 MACHINE_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
-"""Goes on while the machine sleeps, where the system has such a clock: a ground computer whose lid was shut for an hour finds that it has
-missed an hour, as one that stood still does, and disarms. By CLOCK_MONOTONIC it would go on with whatever it held in that place."""
+"""A clock that keeps running during suspend, where the system has one: a ground computer whose lid was shut for an hour notices that it
+missed an hour, as after any stall, and disarms. With CLOCK_MONOTONIC it would continue with the commands that it held before."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 class Clock(Protocol):
-    """Something that knows the time."""
+    """A source of time."""
 
     def now_ns(self) -> int:
-        """Nanoseconds since an arbitrary moment; never goes back."""
+        """Nanoseconds since an arbitrary moment; never decreases."""
         ...
 
 
 class MonotonicClock:
-    """The machine's MACHINE_CLOCK, which never goes back: the same for all processes of one machine."""
+    """MACHINE_CLOCK relative to an origin; never goes back, and is shared by all processes of one machine."""
 
     def __init__(self, origin_ns: int = 0) -> None:
-        """`origin_ns`: the machine's time that this clock calls zero."""
+        """`origin_ns`: the time of MACHINE_CLOCK at which this clock shows zero."""
         self.origin_ns = origin_ns
 
     @classmethod
@@ -38,7 +38,7 @@ class MonotonicClock:
 
 
 def boot_id() -> str:
-    """Of this start of the machine, which the time of day does not tell from the one before; empty where the system has none."""
+    """Identifier of this boot, which the time of day cannot tell from the previous one; empty where the system has none."""
     try:
         return _BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:
@@ -46,5 +46,5 @@ def boot_id() -> str:
 
 
 def unix_ns() -> int:
-    """The time of day, ns since 1970: for what leaves the process (signing, files), never for control."""
+    """The time of day, ns since 1970: for data that leaves the process (signing, files), never for control."""
     return time.time_ns()

@@ -1,4 +1,4 @@
-"""A disk that is full or fails: the error of a write names no file, so whoever knows the folder names that."""
+"""Errors of a full or failing disk. The error of a write names no file, so the caller that knows the folder adds its name."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
-"""What a disk answers that takes no more."""
+"""Errors of a disk that accepts no more data."""
 
 
 @contextmanager
 def writing_to(folder: Path) -> Iterator[None]:
-    """Names `folder` in the error of a disk that takes no more."""
+    """Adds the name of `folder` to a disk error (FAILURES) raised inside."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""A recorded flight read back tick by tick: what each tick took, sent and thought. Reads a torn or damaged log up to there."""
+"""Reads a recorded flight tick by tick: inputs, frames sent and signals of each tick. Reads a torn or damaged log up to the damage."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG, can
 from firmware_py.runtime.tick_messages import REQUESTS, TICK_SIGNALS, TICKS, is_of_the_machine
 
 HIGHEST_ID, LONGEST_DATA = 0x1FFF_FFFF, 64
-"""Of any frame: 29 bits, and the bytes of CAN FD."""
+"""Limits of any frame: an id of 29 bits, and the data bytes of CAN FD."""
 
 
 class LogError(DescriptionError):
-    """A log cannot be read; one line."""
+    """A log cannot be read; the text is one line."""
 
 
 class LoggedFrame(NamedTuple):
-    """One frame that came or went."""
+    """One frame that was received or sent."""
 
     bus: int
     id: int
@@ -33,7 +33,7 @@ class LoggedFrame(NamedTuple):
 
 
 def shown(text: str) -> str:
-    """A piece of a log as it stands in a line of words: quoted, in printable characters, cut short."""
+    """A piece of a log for use in a message: quoted, in printable characters, cut to SHOWN_CHARACTERS."""
     quoted = ascii(text.strip())
     return quoted if len(quoted) <= SHOWN_CHARACTERS else f"{quoted[: SHOWN_CHARACTERS - 3]}..."
 
@@ -50,18 +50,18 @@ def frame_of(line: str) -> LoggedFrame:
 
 @dataclass(slots=True)
 class LoggedTick:
-    """One tick as the log has it."""
+    """One tick as recorded in the log."""
 
     tick: int
     time_ns: int
     taken: int
-    """Frames that it took."""
+    """Number of frames that the tick took."""
     prepared: int
-    """Results of the worker that it took."""
+    """Number of worker results that the tick took."""
     messages: list[tuple[str, bytes]] = field(default_factory=list)
-    """Topic and message of everything that it thought, in order."""
+    """Topic and data of each signal message of the tick, in order."""
     requests: list[str] = field(default_factory=list)
-    """As `request_text` wrote them."""
+    """Requests, as `request_text` wrote them."""
     received: list[LoggedFrame] = field(default_factory=list)
     sent: list[str] = field(default_factory=list)
     """Lines of can.log."""
@@ -71,8 +71,8 @@ class FlightLog:
     """The log in one folder.
 
     Attributes:
-        configuration: what the firmware was made of; None where the log holds none.
-        torn: where the log ends too early or is damaged, in words; empty for a whole one. Known once `ticks` has come to its end.
+        configuration: from which the firmware was built; None where the log holds none.
+        torn: describes where the log ends too early or is damaged; empty for a whole log. Complete once `ticks` is exhausted.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -98,9 +98,9 @@ class FlightLog:
         return configuration
 
     def ticks(self) -> Iterator[LoggedTick]:
-        """Every tick that both files hold whole, in order, up to where can.log is damaged. Raises LogError where its first tick is.
+        """Every tick that both files hold whole, in order, up to any damage in can.log. Raises LogError if its first tick is damaged.
 
-        The last tick before the damage, or of a can.log that ends too early, is left out: frames that it sent may be missing.
+        The last tick before the damage, or of a can.log that ends too early, is left out, because frames that it sent may be missing.
         """
         groups, ticks = self._frames(), self._signal_ticks()
         held: LoggedTick | None = None
@@ -134,7 +134,7 @@ class FlightLog:
         self.torn = self.torn or where
 
     def _damaged_from(self, tick: LoggedTick, first: int, damage: LogError) -> str:
-        """What is wrong behind a tick whose lines begin with the `first`, and from where on can.log is not to be trusted."""
+        """Describes the damage after `tick`, whose lines start at line number `first`: from where on can.log is not trusted, and why."""
         with (self.folder / CAN_LOG).open("rb") as file:
             at = sum(map(len, islice(file, first - 1)))
         what = str(damage).removeprefix(f"{self.folder}/")
@@ -158,7 +158,7 @@ class FlightLog:
             yield now
 
     def _values(self, message: LogMessage) -> tuple[Any, ...]:
-        """Of a tick or a request."""
+        """Decoded values of a message of a tick or a request. Raises LogError."""
         try:
             return (_TICK if message.topic == TICKS else _REQUEST).values(message.data)
         except (ValueError, IndexError, DecodeError):
@@ -166,7 +166,7 @@ class FlightLog:
             raise LogError(f"{self.folder}: {SIGNAL_LOG} has {what}; it is spoilt or another version's") from None
 
     def _frames(self) -> Iterator[_Group]:
-        """The lines of can.log tick by tick; half a line at the end is left out."""
+        """The lines of can.log grouped by tick; a partial line at the end is left out."""
         with (self.folder / CAN_LOG).open(encoding="ascii", errors="replace") as file:
             before: _Group | None = None
             first = 1
@@ -179,7 +179,7 @@ class FlightLog:
                 yield before._replace(is_last=True)
 
     def _take_lines(self, group: _Group, logged: LoggedTick, groups: Iterator[_Group]) -> bool:
-        """Puts the frames of one tick where they belong; False where its last ones are missing at the end. Raises LogError on damage."""
+        """Sorts the frames of one tick into `logged`; False where frames are missing at the end of the file. Raises LogError on damage."""
         if group.stamp != candump_stamp(logged.time_ns):
             here = f"{self.folder / CAN_LOG}:{group.first}"
             raise LogError(f"{here}: frames of {shown(group.stamp)} where {SIGNAL_LOG} has tick {logged.tick}")
@@ -192,7 +192,7 @@ class FlightLog:
         return came == logged.taken
 
     def _sort_lines(self, group: _Group, logged: LoggedTick) -> None:
-        """Puts the frames of one tick where they belong. Raises LogError."""
+        """Sorts the frames of one tick into received and sent ones. Raises LogError."""
         for number, line in enumerate(group.lines, group.first):
             if line.endswith(" T\n"):
                 logged.sent.append(line)
@@ -205,13 +205,13 @@ class FlightLog:
 
 
 class _Group(NamedTuple):
-    """The lines of can.log with one stamp."""
+    """Consecutive lines of can.log with the same stamp."""
 
     stamp: str
     lines: list[str]
     is_last: bool
     first: int
-    """Number of its first line in the file, from 1 on."""
+    """Line number of the first of them in the file, from 1."""
 
 
 _TICK = Layout("Tick", TICK_SIGNALS)
@@ -223,7 +223,7 @@ def _stamp(line: str) -> str:
 
 
 def _check_mcap(path: Path) -> None:
-    """Raises LogError where a file does not begin as every MCAP log does, a torn one too."""
+    """Raises LogError where a file does not begin with the magic of MCAP, which a torn log has too."""
     with path.open("rb") as file:
         begins = file.read(len(MCAP_MAGIC))
     if begins != MCAP_MAGIC:

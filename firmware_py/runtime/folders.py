@@ -1,4 +1,4 @@
-"""Folders, as a command line names them."""
+"""Parsing of folders given on the command line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import typer
 
 
 def folder_of(text: str) -> Path:
-    """The folder called `text`; nothing, as an unset variable of a shell gives, is none."""
+    """The folder named `text`. Rejects an empty text, as an unset shell variable gives."""
     if not text:
         raise typer.BadParameter("'' is no folder; give one, or . for this one")
     return Path(text)

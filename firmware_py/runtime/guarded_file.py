@@ -1,4 +1,4 @@
-"""Files that cannot stop the vehicle: an error ends the log and nothing else, and a disk that stalls holds nobody up."""
+"""Files that cannot stop the vehicle: an error ends only the log, and a stalled disk blocks no tick."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pathlib import Path
 from queue import SimpleQueue
 
 MOST_WAITING_BYTES = 8_000_000
-"""A minute and a half of one module at 100 Hz; a disk that is farther behind ends the log."""
+"""A minute and a half of one module's log at 100 Hz; a longer backlog ends the log."""
 CLOSE_S = 5.0
 """How long the end of a run waits for a disk."""
 
 
 class GuardedFile:
-    """A file that never raises. After its first error it accepts and drops every write, and its modification time is set to 1970: such a
-    log lacks its end, and `app.last_flight`, which trusts recent logs alone, must not go by it.
+    """A file that never raises. After its first error it silently drops every write, and its modification time is set to 1970: such a log
+    lacks its end, so `app.last_flight`, which trusts only recent logs, must not use it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -29,15 +29,15 @@ class GuardedFile:
         self._position = 0
         self._file = None
         try:
-            self._file = path.open("wb", buffering=0)  # bytes given are with the system: kill -9 loses none
+            self._file = path.open("wb", buffering=0)  # unbuffered: written bytes survive kill -9
         except OSError as error:
             self.error = error
             return
         with suppress(OSError):
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed: it is being written
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # marks the log as being written until it is closed
 
     def write(self, data: bytes | bytearray) -> int:
-        """Append; always says that all was taken."""
+        """Append `data`; always returns its full length."""
         self._attempt(partial(self._append, data))
         self._position += len(data)
         return len(data)
@@ -52,14 +52,14 @@ class GuardedFile:
         return self._position
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Does nothing: the file is unbuffered."""
 
     def sync(self) -> None:
-        """What was written is to outlive a power cut too."""
+        """Syncs everything written to the disk, so that it survives a power cut."""
         self._attempt(self._to_disk)
 
     def _attempt(self, job: Callable[[], None]) -> None:
-        """Does what the disk may refuse, unless it has before."""
+        """Runs a disk operation, unless one failed before; stores its error."""
         if self.error is None:
             try:
                 job()
@@ -77,7 +77,7 @@ class GuardedFile:
                 os.utime(self._file.fileno(), ns=(0, 0))
 
     def close(self) -> None:
-        """Close; a second time does nothing."""
+        """Close; a second call does nothing."""
         if self._file is not None:
             try:
                 self._file.close()
@@ -87,7 +87,7 @@ class GuardedFile:
 
 
 class QueuedFile(GuardedFile):
-    """The same, written by a thread of its own. It is to be made before this process takes its real-time priority."""
+    """A GuardedFile written by its own thread. Create it before this process takes its real-time priority."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -116,7 +116,7 @@ class QueuedFile(GuardedFile):
         super().close()
 
     def _try(self, job: Callable[[], None], length: int = 0) -> None:
-        """By the thread: what the disk does not take ends the log."""
+        """Runs a disk operation in the thread; an error ends the log."""
         try:
             if not self._broken:
                 job()
@@ -126,6 +126,6 @@ class QueuedFile(GuardedFile):
         self._written += length
 
     def close(self) -> None:
-        """Writes what waits, for CLOSE_S at the most; a second time does nothing."""
+        """Writes what is queued, waiting at most CLOSE_S; a second call does nothing."""
         self._queue.put(None)
         self._thread.join(CLOSE_S)

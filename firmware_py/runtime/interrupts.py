@@ -1,4 +1,4 @@
-"""Ctrl-C, and SIGTERM as it: it ends a command in one line, however often it is pressed, and leaves a log that is whole."""
+"""Handling of Ctrl-C, and of SIGTERM alike: it ends a command with one line, however often it is pressed, and leaves a whole log."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from contextlib import contextmanager
 from types import FrameType
 
 INTERRUPTED = 130
-"""Exit status after Ctrl-C: 128 and SIGINT, as a shell has it."""
+"""Exit status after Ctrl-C: 128 + SIGINT, as in a shell."""
 ENDINGS = (signal.SIGINT, signal.SIGTERM)
-"""What somebody ends a command with: at its terminal, and from elsewhere."""
+"""Signals that end a command: from its terminal, and from elsewhere."""
 
 
 def endings_of_a_run() -> list[signal.Signals]:
-    """Besides ENDINGS its terminal's end, as of an ssh connection that is lost, unless whoever started the process has it ignore that."""
+    """ENDINGS and SIGHUP (the terminal ended, as when an ssh connection is lost), unless the parent process made SIGHUP ignored."""
     return [*ENDINGS] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [*ENDINGS, signal.SIGHUP]
 
 
 @contextmanager
 def handled(handler: Callable[[int, FrameType | None], object], numbers: Iterable[signal.Signals] = ENDINGS) -> Iterator[None]:
-    """These signals go to `handler` inside, and afterwards to whoever had them."""
+    """Inside, routes these signals to `handler`; restores the previous handlers afterwards."""
     before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
@@ -33,9 +33,9 @@ def handled(handler: Callable[[int, FrameType | None], object], numbers: Iterabl
 
 @contextmanager
 def ended_at_once() -> Iterator[None]:
-    """Ctrl-C inside ends the process there and then, without a word: for imports, which leave nothing behind.
+    """Ctrl-C inside ends the process at once and silently: for imports, which need no cleanup.
 
-    While compiled code is loaded LLVM calls Python back; an exception in there is swallowed, and the process crashes (SIGSEGV).
+    While compiled code is loaded, LLVM calls back into Python; an exception there is swallowed, and the process crashes (SIGSEGV).
     """
     with handled(lambda number, frame: os._exit(INTERRUPTED), [signal.SIGINT] if _is_heard() else []):
         yield
@@ -43,10 +43,10 @@ def ended_at_once() -> Iterator[None]:
 
 @contextmanager
 def interrupted_once() -> Iterator[None]:
-    """The first Ctrl-C or SIGTERM inside raises KeyboardInterrupt, and no other does, nor any after that: who was interrupted is ending.
+    """The first Ctrl-C or SIGTERM inside raises KeyboardInterrupt; further ones, also afterwards, are ignored: the process is ending.
 
-    What a library has made of it (compiled code that was called back knows only that something failed) leaves as KeyboardInterrupt too,
-    and at the end one that was lost on the way.
+    If a library turned the KeyboardInterrupt into another exception (compiled code knows only that its callback failed) or swallowed it,
+    the block still ends with KeyboardInterrupt.
     """
     pressed = False
 
@@ -73,15 +73,15 @@ def interrupted_once() -> Iterator[None]:
 
 @contextmanager
 def held_back() -> Iterator[Callable[[], None]]:
-    """Ctrl-C inside waits for the next call of what this gives, or for the end, and comes about there: nothing is left half written.
+    """Defers Ctrl-C inside until the next call of the yielded function, or the end of the block, so that nothing is left half written.
 
-    So does SIGTERM inside `interrupted_once`; elsewhere it kills, as ever.
+    Defers SIGTERM too inside `interrupted_once`; elsewhere SIGTERM kills the process as usual.
     """
     pressed: list[int] = []
     handlers = {number: signal.getsignal(number) for number in ENDINGS if _is_heard(number)}
 
     def check() -> None:
-        """Raises KeyboardInterrupt where Ctrl-C was pressed."""
+        """Calls the previous handler, which raises KeyboardInterrupt, if Ctrl-C was pressed."""
         for number in pressed[:1]:
             handler = handlers[signal.Signals(number)]
             assert callable(handler)
@@ -94,7 +94,7 @@ def held_back() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def out_of_reach() -> Iterator[None]:
-    """A process that is started inside never hears of Ctrl-C and SIGTERM; this one hears of them afterwards."""
+    """Blocks Ctrl-C and SIGTERM: a child process started inside never receives them; this process receives them afterwards."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
     try:
         yield
@@ -103,10 +103,10 @@ def out_of_reach() -> Iterator[None]:
 
 
 def _is_heard(number: signal.Signals = signal.SIGINT) -> bool:
-    """Whether a signal comes to this thread's Python: others get none, and what a shell runs in the background ignores Ctrl-C."""
+    """Whether this thread's Python handles a signal: only the main thread does, and a shell's background jobs ignore Ctrl-C."""
     return threading.current_thread() is threading.main_thread() and callable(signal.getsignal(number))
 
 
 def _would_kill(number: signal.Signals) -> bool:
-    """Whether a signal would end this process before this thread's Python hears of it."""
+    """Whether a signal has its default action in the main thread, which ends the process without any Python code."""
     return threading.current_thread() is threading.main_thread() and signal.getsignal(number) is signal.SIG_DFL

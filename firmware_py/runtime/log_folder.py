@@ -1,6 +1,6 @@
-"""Where the vehicle's process logs: into the folder that it is given, and where that holds a log, into 0002, 0003, ... in it.
+"""Log folders of the vehicle's process: the given folder, or 0002, 0003, ... in it once it holds a log.
 
-A service that is started again after a crash thus keeps the log of the crash.
+A service that restarts after a crash thus keeps the log of the crash.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _DIGITS = 4
 
 
 def make_log_folder(out: Path) -> Path:
-    """A folder for a new log: `out`, or one in it that is newer than all that are there. Raises OSError."""
+    """Creates a folder for a new log: `out`, or a folder in it with the next number. Raises OSError."""
     number = max(_numbers(out), default=_FIRST - 1) + 1
     folder = _folder(out, number)
     folder.mkdir(parents=True, exist_ok=number == _FIRST)
@@ -22,7 +22,7 @@ def make_log_folder(out: Path) -> Path:
 
 
 def log_folders(out: Path) -> list[Path]:
-    """The folders of the logs under `out`, the newest first; none where it cannot be read."""
+    """The folders of the logs under `out`, newest first; empty where `out` cannot be read."""
     try:
         return [_folder(out, number) for number in sorted(set(_numbers(out)), reverse=True)]
     except OSError:
@@ -30,7 +30,7 @@ def log_folders(out: Path) -> list[Path]:
 
 
 def _numbers(out: Path) -> list[int]:
-    """Of the logs under `out`, whose own is the first."""
+    """Numbers of the logs under `out`; a log in `out` itself is number 1."""
     if not out.is_dir():
         return []
     names = [path.name for path in out.iterdir()]

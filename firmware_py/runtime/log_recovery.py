@@ -1,6 +1,6 @@
-"""Mends a log that kill -9 or a pulled plug has torn, or that is damaged: keeps the whole ticks before it, and closes both files.
+"""Repairs a log that was torn by kill -9 or power loss, or is damaged: keeps the whole ticks before that, and closes both files.
 
-What was torn stays beside it, as `NAME.torn`, and where that is taken, as `NAME.torn2`, ....
+The original files are kept beside it as `NAME.torn`, or, where that name is taken, as `NAME.torn2` and so on.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ TORN = ".torn"
 
 
 class Recovery(NamedTuple):
-    """What was done."""
+    """Result of a recovery."""
 
     ticks: int
     """Whole ticks in the log."""
     torn: str
-    """What was wrong; empty where nothing was and nothing was done."""
+    """What was wrong; empty for a whole log, which is left unchanged."""
 
 
 def recover(folder: Path) -> Recovery:
-    """Mends the log in `folder`. Raises LogError where no tick of it is whole or its flight goes on, and OSError."""
+    """Repairs the log in `folder`. Raises LogError where no tick of it is whole or its run still writes it, and OSError."""
     log = FlightLog(folder)
     _refuse_in_flight(folder)
     ticks, last_ns = 0, 0
@@ -43,44 +43,44 @@ def recover(folder: Path) -> Recovery:
         return Recovery(ticks, "")
     if not ticks:
         raise LogError(f"{folder}: no tick of the log is whole")
-    mended = {name: folder / f"{name}.mended" for name in (SIGNAL_LOG, CAN_LOG)}  # a can.log that goes on is mended to the same ticks
+    mended = {name: folder / f"{name}.mended" for name in (SIGNAL_LOG, CAN_LOG)}  # a can.log that goes on longer is cut to the same ticks
     _cut_frames(folder / CAN_LOG, mended[CAN_LOG], candump_stamp(last_ns))
     rewrite(folder / SIGNAL_LOG, mended[SIGNAL_LOG], lambda topic, message: message.log_time <= last_ns)
     for name, path in mended.items():
-        shutil.copystat(folder / name, path)  # by its time `app.last_flight` knows how long ago the flight was
+        shutil.copystat(folder / name, path)  # `app.last_flight` takes the age of the flight from this time
         _set_aside(folder / name)
         os.replace(path, folder / name)
     return Recovery(ticks, log.torn)
 
 
 def _set_aside(path: Path) -> None:
-    """Gives a file a second name; the first stays, so that a mend that is killed leaves no log without one of its files."""
+    """Gives a file a second name and keeps the first, so that a killed recovery leaves no log without one of its files."""
     aside = _free_name(path.with_name(f"{path.name}{TORN}"))
     try:
         os.link(path, aside)
-    except OSError:  # a disk without links, as a memory stick
+    except OSError:  # a file system without hard links, such as a memory stick
         shutil.copy2(path, aside)
 
 
 def _free_name(path: Path) -> Path:
-    """`path`, or with the first number behind it where nothing is yet: what an earlier mend set aside is the only whole copy."""
+    """`path`, or else `path` with the first free number appended: files set aside by an earlier recovery are the only whole copy."""
     names = (path.with_name(f"{path.name}{number if number > 1 else ''}") for number in count(1))
     return next(each for each in names if not each.exists())
 
 
 def _refuse_in_flight(folder: Path) -> None:
-    """What still writes the log would go on in what is set aside."""
+    """Raises LogError while a run still writes the log, because it would continue in the file that is set aside."""
     with (folder / CAN_LOG).open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             raise LogError(f"{folder}: is still being written; mend it when its run has ended") from None
         except OSError:
-            return  # a disk without locks
+            return  # a file system without locks
 
 
 def rewrite(source: Path, target: Path, keep: Callable[[str, Message], bool], attach: Callable[[bytes], bytes] = bytes) -> None:
-    """Writes the messages of `source` that are to be kept, and its attachments as `attach` makes them, as the whole MCAP log `target`."""
+    """Writes a whole MCAP log `target` with the messages of `source` that `keep` selects, and its attachments passed through `attach`."""
     with target.open("wb") as file:
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start(profile="", library="modcube")
@@ -103,7 +103,7 @@ def rewrite(source: Path, target: Path, keep: Callable[[str, Message], bool], at
 
 
 def _cut_frames(source: Path, target: Path, last: str) -> None:
-    """Copies whole lines up to the last of those in a row that have the stamp `last`: what is damaged may hold them once more."""
+    """Copies `source` up to the end of the first run of lines with the stamp `last`; damaged data further on may repeat that stamp."""
     stamp, end, here = f"{last} ".encode(), 0, 0
     with source.open("rb") as file:
         for line in file:

@@ -1,6 +1,6 @@
-"""What systemd is told of the service: that it is ready, that it lives, how it fares (sd_notify(3)).
+"""Notifications of the service to systemd: ready, watchdog and status (sd_notify(3)).
 
-A datagram that never waits: 3 us. Without systemd nothing is sent.
+Sends non-blocking datagrams, 3 us each. Without systemd nothing is sent.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 
 class Notifier:
-    """The socket to the service manager, when there is one."""
+    """The socket to the service manager, if there is one."""
 
     def __init__(self, address: str = "") -> None:
         self._socket: socket.socket | None = None
@@ -24,12 +24,12 @@ class Notifier:
 
     @classmethod
     def of(cls, environment: Mapping[str, str]) -> Notifier:
-        """As the service manager's environment says."""
+        """A notifier for the socket named in the environment, NOTIFY_SOCKET."""
         return cls(environment.get("NOTIFY_SOCKET", ""))
 
     @property
     def is_heard(self) -> bool:
-        """Whether anybody listens."""
+        """Whether there is a service manager to notify."""
         return self._socket is not None
 
     def send(self, text: str) -> None:
@@ -38,10 +38,10 @@ class Notifier:
             try:
                 self._socket.send(text.encode())
             except OSError:
-                return  # full, or the manager restarts; the watchdog takes a lack of many
+                return  # full, or the manager restarts; the watchdog tolerates many lost ones
 
     def close(self) -> None:
-        """No more is sent."""
+        """Closes the socket; later calls of `send` do nothing."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None

@@ -1,4 +1,4 @@
-"""Starts ticks at absolute deadlines and counts how late they were. No drift: a late tick does not move the next."""
+"""Starts ticks at absolute deadlines and records how late they were. No drift: a late tick does not move the next."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LATENESS_EDGES_NS = tuple(int(10 ** (3 + i / 10)) for i in range(61))
 """Upper edges of the histogram's bins: 1 us to 1 s, ten to a decade (26 % wide)."""
 _COARSE = tuple(i for i in range(len(LATENESS_EDGES_NS)) if i % 10 in (0, 3, 7))
 COARSE_EDGES_NS = tuple(LATENESS_EDGES_NS[i] for i in _COARSE)
-"""Those of the bins that are shown to people: 1, 2, 5, 10 us and so on to 1 s."""
+"""Upper edges of the coarser bins shown to people: 1, 2, 5, 10 us and so on to 1 s."""
 _COARSE_STARTS = (0, *(i + 1 for i in _COARSE))
 _TIMER_ABSTIME = 1  # <time.h>
 
@@ -30,7 +30,7 @@ class _Timespec(ctypes.Structure):
 def absolute_sleeper(clock: Clock) -> Callable[[int], None]:
     """A function that sleeps until a time of MACHINE_CLOCK, ns.
 
-    By clock_nanosleep(TIMER_ABSTIME), or a relative sleep by `clock` where the C library has none.
+    Uses clock_nanosleep(TIMER_ABSTIME), or a relative sleep by `clock` where the C library lacks it.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     call = getattr(libc, "clock_nanosleep", None)
@@ -49,10 +49,10 @@ def absolute_sleeper(clock: Clock) -> Callable[[int], None]:
 
 
 class RateKeeper:
-    """Deadlines start + k * period. `wait` sleeps to the next; `finish` closes the tick.
+    """Keeps deadlines start + k * period. `wait` sleeps until the next deadline; `finish` closes the tick.
 
-    A tick that is still running at its own end is an overrun. Deadlines that have passed altogether are skipped, each
-    counted, so that after a stall ticks go on at their old phase instead of in a burst.
+    A tick that is still running at the next deadline is an overrun. Deadlines that lie a whole period or more back are skipped and
+    counted, so that after a stall ticks continue at their old phase instead of in a burst.
     """
 
     def __init__(self, period_ns: int, clock: Clock, sleep_until: Callable[[int], None]) -> None:
@@ -70,7 +70,7 @@ class RateKeeper:
         self.overruns = 0
         """Ticks that ran beyond the next deadline."""
         self.skipped = 0
-        """Deadlines that were passed over."""
+        """Deadlines that were skipped."""
         self._began_ns = 0
 
     def start(self, first_ns: int) -> None:
@@ -106,7 +106,7 @@ class Histogram:
 
     def __init__(self) -> None:
         self.counts = np.zeros(len(LATENESS_EDGES_NS) + 1, dtype=np.int64)
-        """(62,) bin i holds durations up to LATENESS_EDGES_NS[i]; the last what is longer."""
+        """(62,) bin i counts durations up to LATENESS_EDGES_NS[i]; the last bin counts longer ones."""
         self.worst_ns = 0
         self.total = 0
 
@@ -117,11 +117,11 @@ class Histogram:
         self.total += 1
 
     def coarse(self) -> np.ndarray:
-        """(20,) counts by COARSE_EDGES_NS; the last of what is longer than a second."""
+        """(20,) counts by COARSE_EDGES_NS; the last counts durations longer than a second."""
         return np.asarray(np.add.reduceat(self.counts, _COARSE_STARTS))
 
     def quantile_ns(self, share: float) -> int:
-        """Upper edge of the bin that `share` of the durations reach: at most 26 % above the true one. 0 when empty."""
+        """The `share` quantile as the upper edge of its bin: at most 26 % above the true value. 0 when empty."""
         if self.total == 0:
             return 0
         place = int(np.searchsorted(np.cumsum(self.counts), share * self.total))

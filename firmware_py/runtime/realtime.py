@@ -1,7 +1,7 @@
-"""What makes a process keep its deadlines: real-time priority, fine timers, locked memory in small pages, no garbage collection
-while it flies.
+"""Settings with which a process keeps its deadlines: real-time priority, fine timers, locked memory in small pages, no garbage
+collection in flight.
 
-None of it is required: what the system refuses is said in a line, and the process runs without.
+None is required: each setting that the system refuses is reported in one line, and the process runs without it.
 """
 
 from __future__ import annotations
@@ -17,22 +17,23 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 TICK_PRIORITY = 50
-"""SCHED_FIFO priority of the thread that ticks: where Linux puts its own interrupt threads, above ordinary threads."""
+"""SCHED_FIFO priority of the tick's thread: that of Linux's own interrupt threads, above ordinary threads."""
 READER_PRIORITY = 49
-"""Of the threads that read the buses: a flood must not keep the tick from starting."""
+"""Priority of the threads that read the buses, below the tick's so that a flood cannot keep the tick from starting."""
 GROUND_PRIORITY = 48
-"""Of the thread that talks to ground stations. An ordinary one that is put off while it holds the interpreter puts the tick off too: on a
-busy machine 4 ms at the 99th percentile, and 20 overruns in 2,100 ticks, where there are none so (tools/bench_ground.py)."""
+"""Priority of the thread that talks to ground stations. An ordinary thread that is preempted while it holds the interpreter delays the
+tick too: on a busy machine by 4 ms at the 99th percentile, with 20 overruns in 2,100 ticks; with this priority there are none
+(tools/bench_ground.py)."""
 PLANT_PRIORITY = 40
-"""Of a simulated plant on the same machine; its reader is one below it."""
+"""Priority of a simulated plant on the same machine; its reader is one below it."""
 
 SWITCH_INTERVAL_S = 1e-4
-"""Longest time that another Python thread keeps the tick waiting. Python's own 5 ms were the 99th percentile of lateness
-(5.0 ms) while a reader worked through a flood of frames."""
+"""Longest time that another Python thread keeps the tick waiting. With Python's default of 5 ms, the 99th percentile of lateness was
+5.0 ms while a reader worked through a flood of frames."""
 
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK, _PR_SET_THP_DISABLE = 1, 29, 41  # linux/prctl.h
 _LEAST_SLACK_NS = 1
-"""Of a timer; 0 would set the system's own again."""
+"""Smallest timer slack; 0 would restore the system's default."""
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # sys/mman.h
 _MADV_DONTNEED = 4  # sys/mman.h
 _MAPS = Path("/proc/self/maps")
@@ -41,14 +42,14 @@ _COMPILER = "libllvmlite"
 
 @contextmanager
 def real_time(priority: int = READER_PRIORITY) -> Iterator[list[str]]:
-    """This process in real time, as far as the system lets it. Enter it before threads start: they inherit it.
+    """Runs this process in real time, as far as the system permits. Enter it before threads start, because they inherit the settings.
 
     Args:
-        priority: SCHED_FIFO priority of this thread and of those that it starts, 1..99. The thread that ticks takes
-            TICK_PRIORITY for itself when its readers run.
+        priority: SCHED_FIFO priority of this thread and of those that it starts, 1..99. The tick's thread takes TICK_PRIORITY
+            itself once its readers run.
 
     Yields:
-        One line for each thing that the system refused; empty when all is well.
+        One line for each setting that the system refused; empty if none.
     """
     switch_interval_s = sys.getswitchinterval()
     sys.setswitchinterval(min(switch_interval_s, SWITCH_INTERVAL_S))
@@ -62,7 +63,7 @@ def real_time(priority: int = READER_PRIORITY) -> Iterator[list[str]]:
 
 
 def use_priority(priority: int) -> str:
-    """SCHED_FIFO for this thread, and for the threads that it starts from now on; "" or why not."""
+    """Sets SCHED_FIFO for this thread, and for the threads that it starts from now on; returns "" or why it could not."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
@@ -74,10 +75,10 @@ def use_priority(priority: int) -> str:
 
 @contextmanager
 def beside_the_tick() -> Iterator[Callable[[], None]]:
-    """The threads of this process, and those that are started inside, leave its last processor to the tick.
+    """Keeps the threads of this process, and those started inside, off its last processor, which is reserved for the tick.
 
     Yields:
-        A function that moves the calling thread there. Both do nothing where there is but one processor.
+        A function that moves the calling thread to that processor. Both do nothing on a single processor.
     """
     allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     if len(allowed) < 2:
@@ -97,37 +98,37 @@ def _place_threads(processors: Sequence[int]) -> None:
 
 
 def use_ordinary_priority() -> None:
-    """Back to an ordinary thread: for a process started from a real-time one, which would inherit its priority."""
+    """Resets this thread to ordinary scheduling: for a process started from a real-time one, which would inherit its priority."""
     if hasattr(os, "sched_setscheduler"):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def use_fine_timers() -> str:
-    """Timers of this thread, and of those that it starts, fire on time instead of up to 50 us late; "" or why not.
+    """Makes timers of this thread, and of those that it starts, fire on time instead of up to 50 us late; "" or why it could not.
 
-    Threads of real-time priority have no slack anyway: this is for those that may not have it.
+    Threads of real-time priority have no slack anyway: this is for threads that are refused that priority.
     """
     return _ask_kernel("fine timers", _PR_SET_TIMERSLACK, _LEAST_SLACK_NS)
 
 
 def use_small_pages() -> str:
-    """From here on the kernel joins no pages of this process to huge ones; "" or why it does.
+    """Stops the kernel from merging pages of this process into huge pages; "" or why it could not.
 
-    Its thread that joins them, of the lowest priority, keeps the process's address space to itself meanwhile. Who needs memory
-    waits for it, and it for a processor: in a flood on one processor up to 3.6 s (measured in hil/guest, every 10 s or so).
+    The kernel thread that merges them has the lowest priority and locks the process's address space meanwhile. A thread that needs memory
+    waits for it, and it waits for a processor: in a flood on one processor up to 3.6 s (measured in hil/guest, every 10 s or so).
     """
     return _ask_kernel("small pages", _PR_SET_THP_DISABLE, 1)
 
 
 def die_with(parent: int) -> None:
-    """This process is killed when the thread of the process `parent` that started it ends, however that ends."""
+    """Makes the kernel kill this process when the thread of the process `parent` that started it ends, for whatever reason."""
     _ask_kernel("end with its parent", _PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before it was asked
+    if os.getppid() != parent:  # the parent ended before the call
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _ask_kernel(what: str, option: int, value: int) -> str:
-    """Asks for `what` by prctl; "" or why not."""
+    """Requests `what` by prctl; returns "" or why it could not."""
     prctl = getattr(ctypes.CDLL(None, use_errno=True), "prctl", None)
     if prctl is None:
         return f"no {what} (not Linux)"
@@ -136,10 +137,10 @@ def _ask_kernel(what: str, option: int, value: int) -> str:
 
 
 def release_compiler() -> None:
-    """Gives the pages of the compiler's own instructions back: 50 MB that no tick needs, for every function is compiled by now.
+    """Releases the pages of the compiler's code: 50 MB that no tick needs, because every function is compiled by now.
 
-    They are a file's, never written: who compiles again after all reads them again. Its constants stay: some hold addresses
-    that were written when it was loaded.
+    The pages are file-backed and never written, so a later compilation reads them again. The compiler's constants stay: some hold
+    addresses that were written when it was loaded.
     """
     for begin, end, library in _instructions():
         if _COMPILER in library:
@@ -147,10 +148,10 @@ def release_compiler() -> None:
 
 
 def read_libraries() -> None:
-    """Reads the libraries of this process, 190 MB, into the system's cache: 0.1 s when they are there, as long as the disk takes when not.
+    """Reads the libraries of this process, 190 MB, into the page cache: 0.1 s if they are cached, otherwise as long as the disk takes.
 
-    Without, a tick waits for the disk whenever it first needs a page: from a disk that took 0.3 s for one, the fifth tick was 0.23 s
-    late, and nobody could arm the robot for the next three seconds. The compiler is left out, for nothing is compiled in flight.
+    Otherwise a tick waits for the disk whenever it first needs a page: with a disk that took 0.3 s for one, the fifth tick was 0.23 s
+    late, and the robot could not be armed for the next three seconds. Skips the compiler, because nothing is compiled in flight.
     """
     chunk = bytearray(1 << 20)
     for library in {library for _, _, library in _instructions() if _COMPILER not in library}:
@@ -160,7 +161,7 @@ def read_libraries() -> None:
 
 
 def _instructions() -> list[tuple[int, int, str]]:
-    """Begin, end and file of what this process has mapped to run; empty where the system does not tell."""
+    """Begin, end and file of each executable mapping of this process; empty where the system does not list them."""
     found = []
     with suppress(OSError):
         for line in _MAPS.read_text(errors="surrogateescape").splitlines():
@@ -172,9 +173,9 @@ def _instructions() -> list[tuple[int, int, str]]:
 
 
 def lock_memory() -> str:
-    """What this process has touched stays in memory, now and from now on; "" or why not.
+    """Locks the pages that this process has touched or will touch in memory; "" or why it could not.
 
-    With a limit on locked memory nothing is locked: later allocations would fail.
+    With a limit on locked memory nothing is locked, because later allocations would fail.
     """
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
@@ -189,7 +190,7 @@ def lock_memory() -> str:
 
 
 def unlock_memory() -> None:
-    """Ends `lock_memory`: a bench goes on after its flight."""
+    """Undoes `lock_memory`, for a bench that continues after its flight."""
     munlockall = getattr(ctypes.CDLL(None), "munlockall", None)
     if munlockall is not None:
         munlockall()
@@ -197,7 +198,7 @@ def unlock_memory() -> None:
 
 @contextmanager
 def quiet_garbage() -> Iterator[None]:
-    """No garbage collection inside: the ticks leave no cycles behind, and what was left before is collected first."""
+    """Disables garbage collection inside, after one collection: the ticks create no reference cycles."""
     gc.collect()
     gc.disable()
     try:

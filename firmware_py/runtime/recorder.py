@@ -1,12 +1,12 @@
-"""The firmware's recorder: every frame to can.log, every internal signal to signals.mcap, after the tick.
+"""The firmware's recorder: writes every frame to can.log and every internal signal to signals.mcap, after the tick.
 
-Format, enough for a replay:
+Format, sufficient for a replay:
 
-- `can.log`: one line a frame, as `candump -L -x` writes: `(0000000012.340000) can0 0E1#0011223344556677 R`. The time is
-  that of the tick which took or sent it (never a wall clock), `canN` is the fleet's bus N, R is received, T sent. Lines
-  stand in the order of the frames. canplayer and python-can read it.
-- `signals.mcap`: protobuf messages, those of `tick_messages`; log_time is the tick's time. The attachment
-  `configuration.json` is what the caller gave.
+- `can.log`: one line per frame, as `candump -L -x` writes: `(0000000012.340000) can0 0E1#0011223344556677 R`. The time is
+  that of the tick which took or sent the frame (never a wall clock), `canN` is the fleet's bus N, R is received, T sent. Lines
+  are in the order of the frames. canplayer and python-can read it.
+- `signals.mcap`: the protobuf messages of `tick_messages`; log_time is the tick's time. The attachment
+  `configuration.json` holds the configuration that the caller gave.
 
 The same run writes the same bytes. The files are whole up to the last `flush`, whatever happens after.
 """
@@ -44,23 +44,23 @@ CAN_LOG = "can.log"
 SIGNAL_LOG = "signals.mcap"
 CONFIGURATION = "configuration.json"
 TOGETHER = 10
-"""Ticks whose lines and messages are made at once where time does not matter: by code that is then at hand and not out of the cache. In
-real time each tick makes its own."""
+"""Number of ticks that are encoded in one batch when not in real time, so that the encoding code stays in the processor's cache. In real
+time each tick encodes its own lines and messages."""
 LIVE_ONLY = ("/scene", "/tf")
-"""What is drawn from other channels has no place in a log."""
+"""Topics left out of the log, because they are drawn from other channels."""
 
 _ID_TEXTS = tuple(f"{frame_id:03X}#" for frame_id in range(2048))
 
 
-@lru_cache(maxsize=1)  # all frames of a tick have one
+@lru_cache(maxsize=1)  # all frames of a tick share one stamp
 def candump_stamp(time_ns: int) -> str:
-    """The time of a line."""
+    """The time stamp of a line of can.log."""
     seconds, rest = divmod(time_ns, 1_000_000_000)
     return f"({seconds:010d}.{rest // 1000:06d})"
 
 
 def candump_lines(time_ns: int, bus: int, direction: str, frames: Iterable[tuple[int, bytes]]) -> str:
-    """One line per frame (11-bit id, data), as `candump -L -x` writes them; direction R or T."""
+    """One line per frame (11-bit id, data), as `candump -L -x` writes it; direction R or T."""
     start, end = f"{candump_stamp(time_ns)} can{bus} ", f" {direction}\n"
     return "".join([start + _ID_TEXTS[frame_id] + data.hex().upper() + end for frame_id, data in frames])
 
@@ -68,11 +68,11 @@ def candump_lines(time_ns: int, bus: int, direction: str, frames: Iterable[tuple
 class Recorder:
     """Writes both logs of one run into a folder. No call raises for a full disk: `flush` reports it once, as an Event.
 
-    Call `sent` and `received` as frames go and come, `record` once a tick after the step, `flush` every half second once the tick's
-    commands are out, `close` at the end.
+    Call `sent` and `received` in the order of the frames, `record` once per tick after the step, `flush` every half second after the
+    tick's commands are sent, `close` at the end.
 
     Attributes:
-        ticks: recorded so far.
+        ticks: number of ticks recorded so far.
     """
 
     def __init__(
@@ -85,19 +85,19 @@ class Recorder:
         """Opens both files.
 
         Args:
-            folder: where they go; None: nowhere, for signals that are only looked at live.
-            configuration: attached to the signals.
-            context: the channels' own; give one to serve them live too. Topics of LIVE_ONLY stay out of the file.
-            queued: threads of their own write the files, so that a disk that stalls holds up no tick.
+            folder: for both files; None writes none, for signals that are only viewed live.
+            configuration: attached to the signal log.
+            context: of the channels; pass one to serve them live too. Topics of LIVE_ONLY stay out of the file.
+            queued: each file is written by its own thread, so that a stalled disk blocks no tick.
         """
         kind = QueuedFile if queued else GuardedFile
         self._can = kind(folder / CAN_LOG if folder is not None else Path(os.devnull))
         self._mcap = kind(folder / SIGNAL_LOG if folder is not None else Path(os.devnull))
         self._together = 1 if queued or context is not None else TOGETHER
         self._frames: list[tuple[int, int, str, Collection[tuple[int, bytes]]]] = []
-        """What `candump_lines` is still to make lines of."""
+        """Arguments of `candump_lines` for frames whose lines are not made yet."""
         self._ticks: list[tuple[int, Inputs, Outputs]] = []
-        """Of which messages are still to be made, each with the count of frames that it took."""
+        """Ticks whose messages are not made yet: number of frames taken, inputs and outputs."""
         self._lines: list[str] = []
         self._received = 0
         self.ticks = 0
@@ -132,7 +132,7 @@ class Recorder:
         return found
 
     def expect(self, body: int, thrusters: int) -> None:
-        """Opens the channel of a body: 1.8 million instructions that the first tick then is spared."""
+        """Opens the channel of a body in advance, which saves the first tick 1.8 million instructions."""
         self._channel(body_topic(body), self._messages.body(thrusters)[0])
 
     def expect_times(self) -> None:
@@ -154,7 +154,7 @@ class Recorder:
         self._frames.append((time_ns, bus, "R", frames))
 
     def record(self, inputs: Inputs, outputs: Outputs) -> None:
-        """One tick: what it took and everything that it thought."""
+        """Records one tick: its inputs and all its signals."""
         self._ticks.append((self._received, inputs, outputs))
         self._received = 0
         self.ticks += 1
@@ -162,29 +162,29 @@ class Recorder:
             self._make()
 
     def _make(self) -> None:
-        """Lines and messages of all that waits."""
+        """Makes the lines and messages of everything pending."""
         self._lines += [candump_lines(*each) for each in self._frames]
         self._frames.clear()
         for received, inputs, outputs in self._ticks:
             for topic, layout, data in self._messages.of(received, inputs, outputs):
-                self._channel(topic, layout).base.log(data, outputs.time_ns)  # bytes, which `log` would first ask after
+                self._channel(topic, layout).base.log(data, outputs.time_ns)  # skips the type check of `log`: these are bytes
         self._ticks.clear()
 
     def record_times(self, tick: int, time_ns: int, keeper: RateKeeper) -> None:
-        """How the ticks that are done kept their deadlines. Real time only: another run is never the same."""
+        """Records how the ticks so far kept their deadlines. In real time only, because no two runs are the same."""
         data = self._times.row().encode(times_values(tick, time_ns, keeper))
         self._channel(TIMES, self._times).log(data, log_time=time_ns)
 
     def record_bus(self, bus: int, tick: int, time_ns: int, faults: Mapping[str, int]) -> None:
-        """What the port of a bus has counted so far, by kind, as `expect_bus` was told them. Real time only, as `record_times`."""
+        """Records the fault counters of a bus's port, of the kinds given to `expect_bus`. In real time only, like `record_times`."""
         data = self._buses[bus].row().encode((tick, time_ns, *faults.values()))
         self._channel(bus_topic(bus), self._buses[bus]).log(data, log_time=time_ns)
 
     def flush(self, to_disk: bool = False) -> list[Event]:
-        """Hand everything so far to the operating system; a warning, once, where that fails.
+        """Hands everything so far to the operating system; returns a warning, once, where that fails.
 
         Args:
-            to_disk: and have it write that, for a power cut: 10 ms and more, which in flight only a `queued` recorder may take.
+            to_disk: also sync to the disk, against a power cut: takes 10 ms and more, so in flight only for a `queued` recorder.
         """
         self._make()
         self._can.write("".join(self._lines).encode())
@@ -195,7 +195,7 @@ class Recorder:
         return self._failure()
 
     def check(self) -> None:
-        """For whoever needs the log: raises the OSError of a file that has failed."""
+        """Raises the OSError of a file that has failed, for callers that need the log."""
         for file in (self._can, self._mcap):
             if file.error is not None:
                 raise file.error
@@ -209,7 +209,7 @@ class Recorder:
         return [Event(WARNING, f"no more log: {failed.path.name}: {failed.error and failed.error.strerror}")]
 
     def close(self) -> list[Event]:
-        """Flush and finish both files; a warning where that fails, or failed unsaid. A second time does nothing."""
+        """Flushes and closes both files; returns a warning for any failure not reported yet. A second call does nothing."""
         if self._closed:
             return []
         self._closed = True

@@ -1,7 +1,7 @@
-"""A request as one line of JSON, exact to the last bit, and back: what the log keeps of who asked for what.
+"""Converts a request to one line of JSON, exact to the last bit, and back. The log records requests in this form.
 
-Plain values stand as they are. Everything else is an object with one key that names its type: `{"Mode": 16}`, `{"array": [...], "shape":
-[...]}`, `{"tuple": [...]}`, `{"Setpoint": {...}}`; a trajectory stands with its fields.
+Plain values are written as they are, lists as lists. Other values are objects that name their type: `{"Mode": 16}`, `{"tuple": [...]}`,
+`{"Setpoint": {...}}`, with arrays as `{"array": [...], "shape": [...]}`; a trajectory is written with its fields.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from firmware_py.core.types import Action, DockRequest, Mode, Request, Setpoint, Sticks
 
 CORE_TYPES: Mapping[str, type] = {cls.__name__: cls for cls in (DockRequest, Mode, Setpoint, Sticks)}
-"""Types of arguments that core itself knows."""
+"""Argument types defined by core itself."""
 
 
 def request_text(request: Request) -> str:
@@ -27,7 +27,7 @@ def request_text(request: Request) -> str:
 
 
 def read_request(text: str, types: Mapping[str, type] = CORE_TYPES) -> Request:
-    """The request that `request_text` wrote; `types` by name. Raises ValueError for what it does not know."""
+    """The request that `request_text` wrote; `types` by name. Raises ValueError for an unknown type."""
     plain = json.loads(text)
     return Request(Action[plain["action"]], plain["body"], _value(plain["argument"], types))
 

@@ -1,4 +1,4 @@
-"""What the vehicle's process says, a line each. It is said by a thread of its own: a reader who stops reading holds up no tick."""
+"""Prints the messages of the vehicle's process line by line, in its own thread, so that a stalled reader blocks no tick."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from collections.abc import Callable
 from queue import SimpleQueue
 
 MOST_WAITING_LINES = 1000
-"""What does not fit is dropped and counted: 100 kB of memory."""
+"""Longest queue of lines, 100 kB of memory. Further lines are dropped and counted."""
 CLOSE_S = 1.0
 """How long the end of a run waits for a reader."""
 _STDOUT = 1
 
 
 def write_line(line: str) -> None:
-    """One line on standard output. Past Python's buffer: a thread that stands still in it ends the process by an abort."""
-    data = f"{line}\n".encode(errors="backslashreplace")  # what the system calls a file need be no text
+    """Writes one line to standard output. Bypasses Python's buffer, in which a blocked thread makes the process abort at its end."""
+    data = f"{line}\n".encode(errors="backslashreplace")  # file names need not be valid text
     while data:
         data = data[os.write(_STDOUT, data) :]
 
 
 class Teller:
-    """Says lines in order, beside the loop. It is to be made before this process takes its real-time priority."""
+    """Prints lines in order, beside the loop. Create it before this process takes its real-time priority."""
 
     def __init__(self, write: Callable[[str], None] = write_line) -> None:
-        """`write` may wait as long as it likes; once it raises OSError or ValueError (nobody listens) no more is said."""
+        """`write` may block for any time; after it raises OSError or ValueError (no reader) nothing more is printed."""
         self._write = write
         self._queue: SimpleQueue[str | None] = SimpleQueue()
         self._given = self._said = self._dropped = 0
@@ -33,7 +33,7 @@ class Teller:
         self._thread.start()
 
     def say(self, line: str) -> None:
-        """Queue a line; never waits. For one thread."""
+        """Queues a line; never blocks. Call it from one thread only."""
         if self._given - self._said >= MOST_WAITING_LINES:
             self._dropped += 1
             return
@@ -41,7 +41,7 @@ class Teller:
         self._put(line)
 
     def close(self) -> None:
-        """Says what waits, for CLOSE_S at the most; a second time does nothing."""
+        """Prints what is queued, waiting at most CLOSE_S; a second call does nothing."""
         self._put_count()
         self._queue.put(None)
         self._thread.join(CLOSE_S)
@@ -61,4 +61,4 @@ class Teller:
                 self._write(line)
                 self._said += 1
         except (OSError, ValueError):
-            return  # the queue fills up, and takes no more
+            return  # from here on the queue fills up, and `say` drops further lines

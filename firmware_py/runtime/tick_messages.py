@@ -1,15 +1,15 @@
-"""The messages of one tick: everything that it took and thought. The recorder logs them, a replay compares them.
+"""The messages of one tick: all its inputs and signals. The recorder logs them, a replay compares them.
 
 Topics, in the order in which a tick writes them:
 
-- `/firmware/ticks`: its number, its time, how many frames and prepared results it took, frames dropped so far.
+- `/firmware/ticks`: tick number, time, number of frames and prepared results taken, e-stop flag, frames dropped so far.
 - `/firmware/requests`: per request its tick and one line of JSON (`request_text`).
-- `/firmware/bodyN`: all of one body, `body_signals`.
-- `/firmware/docks`: per dock under way its faces, stage and tries, both currents and both conditions.
+- `/firmware/bodyN`: all signals of one body, `body_signals`.
+- `/firmware/docks`: per dock under way its faces, stage and tries, both currents, both conditions and the position errors.
 - `/events`: severity (syslog) and text.
 
-In real time the machine has topics too, which no replay compares: `/firmware/times` says every half second how ticks kept their deadlines
-so far, `/firmware/busN` every second what the port of bus N has counted so far (frames lost, errors, how often it was opened anew).
+In real time two further topics describe the run itself, and no replay compares them: `/firmware/times` has every half second how ticks kept
+their deadlines so far, `/firmware/busN` every second the counters of the port of bus N (frames lost, errors, times reopened).
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ TIMES, BUS = "/firmware/times", "/firmware/bus"
 
 
 def bus_topic(index: int) -> str:
-    """Of the fleet's bus of that index."""
+    """Topic of the fleet's bus of that index."""
     return f"{BUS}{index}"
 
 
 def is_of_the_machine(topic: str) -> bool:
-    """Whether a topic tells of the run and not of its ticks: in another run of the same inputs it tells something else."""
+    """Whether a topic describes the run rather than its ticks, so that it differs between runs with the same inputs."""
     return topic == TIMES or topic.startswith(BUS)
 
 
 def body_topic(index: int) -> str:
-    """Of the body of that index."""
+    """Topic of the body of that index."""
     return f"/firmware/body{index}"
 
 
@@ -121,7 +121,7 @@ DOCK_SIGNALS = (
     Signal("lateral_m", unit="m"),
     Signal("position_error_m", unit="m"),
 )
-"""After tick and time the fields of a DockRecord, in their order."""
+"""Tick, time, then the fields of a DockRecord in their order."""
 
 
 BINS = len(LATENESS_EDGES_NS) + 1
@@ -138,12 +138,12 @@ TIMES_SIGNALS = (
 
 
 def bus_signals(kinds: Iterable[str]) -> tuple[Signal, ...]:
-    """Of a port that counts these kinds of faults."""
+    """Signals of a port that counts these kinds of faults."""
     return Signal("tick", kind="int"), Signal("time_ns", unit="ns", kind="int"), *(Signal(kind, kind="int") for kind in kinds)
 
 
 def times_values(tick: int, time_ns: int, keeper: RateKeeper) -> tuple[Any, ...]:
-    """Of the ticks that are done, in the order of TIMES_SIGNALS."""
+    """Values for the ticks so far, in the order of TIMES_SIGNALS."""
     late, ran = keeper.lateness, keeper.compute
     return tick, time_ns, keeper.overruns, keeper.skipped, late.worst_ns, ran.worst_ns, late.counts, ran.counts
 
@@ -157,7 +157,7 @@ class Message(NamedTuple):
 
 
 class TickMessages:
-    """Makes the messages of each tick. Same tick, same bytes."""
+    """Makes the messages of each tick; the same tick gives the same bytes."""
 
     def __init__(self) -> None:
         self.ticks = Layout("Tick", TICK_SIGNALS)
@@ -168,7 +168,7 @@ class TickMessages:
         self._bodies: dict[int, tuple[Layout, Row]] = {}
 
     def of(self, received: int, inputs: Inputs, outputs: Outputs) -> Iterator[Message]:
-        """Everything about one tick that took so many frames."""
+        """All messages of one tick, which took `received` frames."""
         tick, time_ns = outputs.tick, outputs.time_ns
         values = (tick, time_ns, received, inputs.dropped_frames, inputs.estop, len(inputs.prepared))
         yield Message(TICKS, self.ticks, self._tick_row.encode(values))
@@ -183,7 +183,7 @@ class TickMessages:
             yield Message(EVENTS, self.events, self.events.encode(tick, event.severity, event.text))
 
     def body(self, thrusters: int) -> tuple[Layout, Row]:
-        """Layout of a body with so many thrusters, and a row to fill."""
+        """Layout of a body with that many thrusters, and a row to fill."""
         if thrusters not in self._bodies:
             layout = Layout("Body", body_signals(thrusters))
             self._bodies[thrusters] = layout, layout.row()

@@ -1,8 +1,7 @@
-"""Runs slow work beside the loop; what it gives comes back as an input of a later tick. In lockstep it runs at once,
-on the spot.
+"""Runs slow work beside the loop; a result returns as an input of a later tick. In lockstep the work runs inline.
 
-Jobs are done one by one, and one begins within `submit` or `results` alone: so what the ticks took says which jobs they
-were, and a replay does the same ones. Of those that wait there is one for each wish at the most.
+Jobs run one at a time and start only inside `submit` or `results`. The results that the ticks took therefore determine which jobs ran,
+and a replay runs the same ones. At most one job per wish waits.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ Job = Callable[[], Any]
 
 
 class Worker(ABC):
-    """Takes jobs, gives results in the order in which they were begun."""
+    """Takes jobs and returns their results in the order in which the jobs were started."""
 
     def __init__(self) -> None:
         self._waiting: dict[Hashable, Job] = {}
@@ -27,15 +26,15 @@ class Worker(ABC):
         """Starts `job` now or later; never blocks for long in a real-time worker. A job must not raise.
 
         Args:
-            wish: what it is for. Another job for the same that waits is no longer wanted; one that was begun is finished.
-            first: it goes before all that wait.
+            wish: purpose of the job. A waiting job with the same wish is replaced; a job that has started is finished.
+            first: the job goes before all waiting ones.
         """
         self._waiting = {wish: job, **self._waiting} if first else self._waiting
         self._waiting[wish] = job
         self._begin_next()
 
     def results(self) -> list[Any]:
-        """What has been finished since the last call."""
+        """Results finished since the last call."""
         results = []
         while self._is_busy and (finished := self._finished()):
             results += finished
@@ -50,15 +49,15 @@ class Worker(ABC):
 
     @abstractmethod
     def _begin(self, job: Job) -> None:
-        """Does the job, now or later."""
+        """Runs the job, now or later."""
 
     @abstractmethod
     def _finished(self) -> list[Any]:
-        """The result of the job that was begun; nothing while there is none."""
+        """The result of the started job, as a list; empty while there is none."""
 
 
 class InlineWorker(Worker):
-    """Does the job on the spot: the same results in the same tick, every time."""
+    """Runs each job inline: the same results in the same tick, every time."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,7 +72,7 @@ class InlineWorker(Worker):
 
 
 class ThreadWorker(Worker):
-    """One thread beside the loop. The jobs are numpy and compiled code, which let the loop run meanwhile."""
+    """Runs jobs in one thread beside the loop. The jobs are numpy and compiled code, which let the loop run meanwhile."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -83,7 +82,7 @@ class ThreadWorker(Worker):
         self._thread.start()
 
     def close(self) -> None:
-        """Lets the running job end, and the thread with it."""
+        """Waits for the started job to finish, and ends the thread."""
         self._jobs.put(None)
         self._thread.join()
 

@@ -1,1 +1,1 @@
-"""What a body can do: reachable wrench, power, thrust variance and the shape of these spaces."""
+"""Capability of a body: reachable wrench, power, thrust variance and the shape of these spaces."""

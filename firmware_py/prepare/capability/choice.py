@@ -1,6 +1,6 @@
-"""Which shape for a task: all distinct polycubes by margin, power or variance, with what k dead thrusters leave.
+"""Chooses a shape for a task: ranks all distinct polycubes by margin, power or variance, with guarantees for k dead thrusters.
 
-The modules stay parallel to each other (so every probe meets a drogue); each shape is tried in every way it can lie.
+The modules stay parallel to each other (so every probe meets a drogue); each shape is tried in every pose.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from firmware_py.prepare.capability.wrench import WrenchSpace
 from firmware_py.prepare.drag_cache import DragCache
 
 _STILL = 1e-6
-"""N; a wrench smaller than this (torque over the lever arm) asks for nothing."""
+"""N; a wrench smaller than this (torque over the lever arm) counts as zero."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitness:
-    """One way of lying of one shape, against the task.
+    """Performance of one pose of one shape in the task.
 
     Attributes:
         cells: lattice cells.
-        margin: smallest factor by which the task's wrenches can be multiplied; below 1 the shape cannot do it.
-        power_w: mean electrical power above idle, of the allocation with the smallest sum of squares within limits.
-        variance: of a thruster's force over all thrusters and moments, N^2.
+        margin: largest factor by which all of the task's wrenches can be multiplied; below 1 the shape cannot do the task.
+        power_w: mean electrical power above idle, of the least-squares allocation within limits.
+        variance: of a thruster's force over all thrusters and wrenches, N^2.
     """
 
     cells: Cells
@@ -43,13 +43,13 @@ class Fitness:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """The best way of lying of one shape.
+    """The best pose of one shape.
 
     Attributes:
-        best: see there.
-        poses: how many ways it can lie.
-        guaranteed_margin: margin whichever `dead` thrusters give nothing.
-        guaranteed_n, guaranteed_nm: force and moment in the worst direction, whichever `dead` thrusters give nothing.
+        best: performance in that pose.
+        poses: number of distinct poses.
+        guaranteed_margin: margin whichever `dead` thrusters fail.
+        guaranteed_n, guaranteed_nm: force and moment in the worst direction, whichever `dead` thrusters fail.
         whole_n, whole_nm: the same with all thrusters alive.
     """
 
@@ -72,11 +72,11 @@ def rank(
     """Every distinct polycube of `count` modules, best first.
 
     Args:
-        cache: kept drag outlines, for trajectories.
-        progress: called with shapes done and shapes in all.
+        cache: cache of drag outlines, for trajectories.
+        progress: called with the number of shapes done and the total.
 
     Raises:
-        DescriptionError: a count without a list of shapes, or a vehicle that cannot be docked to its like.
+        DescriptionError: a count without a list of shapes, or a vehicle that cannot be docked to its own kind.
     """
     shapes = polycubes(count)
     path = task.trajectory.path() if task.trajectory else None
@@ -101,19 +101,19 @@ def rank(
 
 
 def fitness(cells: Cells, layout: Layout, wrenches: np.ndarray) -> Fitness:
-    """How one layout does against (k, 6) wrenches, N and N m."""
+    """Performance of one layout on (k, 6) wrenches, N and N m."""
     forces = least_squares_forces(layout, wrenches)
     margin = float(reach_by_programs(layout, _asked(layout, wrenches)).min(initial=np.inf))
     return Fitness(cells, margin, float(electrical_power(layout, forces).mean()), float(forces.var()))
 
 
 def _asked(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
-    """Those of the (k, 6) wrenches that ask for something."""
+    """The (k, 6) wrenches without those that count as zero."""
     return np.asarray(wrenches[np.linalg.norm(wrenches / layout.levers, axis=1) > _STILL])
 
 
 def _order(task: Task, part: Fitness) -> tuple[bool, float, float]:
-    """Sorting key: what can do the task comes first; rounded, so that rounding errors do not part like shapes."""
+    """Sorting key: feasible shapes first. Values are rounded, so that rounding errors do not order equal shapes."""
     value = {"margin": -part.margin, "power": part.power_w, "variance": part.variance}[task.rank_by]
     second = part.power_w if task.rank_by == "margin" else -part.margin
     return part.margin < 1.0, _rounded(value), _rounded(second)

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 _GAP = 1e-9
-"""Wanted distance from the optimum, in log det."""
+"""Tolerated distance from the optimum, in log det."""
 
 _GROWTH = 20.0
 """Factor of the barrier's weight from one centring to the next (Boyd and Vandenberghe, 11.3)."""
 
 _CLOSE = 0.05
-"""Squared Newton decrement below which a full step stays inside; what it leaves is this, over the barrier's weight."""
+"""Squared Newton decrement below which a full step stays inside; the error that remains is this, over the barrier's weight."""
 
 _MOST_STEPS = 200
 """Newton steps of one centring; ten are usual."""
@@ -43,7 +43,7 @@ class Ellipsoid:
 
 
 def largest_inscribed(normals: np.ndarray, offsets: np.ndarray) -> Ellipsoid:
-    """The largest ellipsoid inside {y : normals @ y <= offsets}, which must hold the origin and be bounded.
+    """The largest ellipsoid inside {y : normals @ y <= offsets}, which must contain the origin and be bounded.
 
     Args:
         normals: (m, d) rows a_i.
@@ -91,7 +91,7 @@ class _Barrier:
         return np.einsum("k,kde->de", p[:k], self._basis), p[k:]
 
     def value(self, p: np.ndarray, weight: float) -> float:
-        """Infinite outside."""
+        """Value of the barrier function; infinite outside the polytope."""
         shape, centre = self.unpack(p)
         if not np.all(np.linalg.eigvalsh(shape) > 0.0):
             return math.inf
@@ -119,9 +119,9 @@ class _Barrier:
         return gradient, hessian
 
     def centred(self, p: np.ndarray, weight: float) -> np.ndarray:
-        """Close to the minimum for one weight, by Newton's method with backtracking.
+        """A point close to the minimum for one weight, by Newton's method with backtracking.
 
-        The function is self-concordant; below _CLOSE comparing values would only compare rounding.
+        The function is self-concordant; below _CLOSE a comparison of values would only compare rounding errors.
         """
         for _ in range(_MOST_STEPS):
             gradient, hessian = self.derivatives(p, weight)

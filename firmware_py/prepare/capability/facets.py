@@ -1,8 +1,8 @@
 """Facets of the zonotope of all reachable wrenches, {J f : f_min <= f <= f_max}, in six dimensions. Compiled.
 
-Every facet's normal is orthogonal to five independent columns of J (four where J has rank 5, and so on), so all normals
-come out of the exterior products of five columns. Any y gives a true inequality y . w <= h(y), where h is the support;
-a normal too many therefore does no harm.
+Every facet's normal is orthogonal to five independent columns of J (four where J has rank 5, and so on), so the exterior
+products of five columns give all normals. Any y gives a valid inequality y . w <= h(y), where h is the support; a
+superfluous normal therefore does no harm.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _DEPENDENT = 1e-11
 """Volume of unit columns below which they count as dependent."""
 
 _PARALLEL = 1e-9
-"""Share of a wrench's size along a normal below which the facet does not bound it."""
+"""Component of a wrench along a normal, as a share of the wrench's size, below which the facet does not bound it."""
 
 
 def _wedge_table() -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +105,7 @@ def _normals(terms, start, forced, columns, smallest, out):  # type: ignore[no-u
 
 @njit("void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], int64, float64[:,::1])", cache=True)
 def _supports(normals, columns, f_min, f_max, dead, out):  # type: ignore[no-untyped-def]
-    """Supports along +y and -y, out (m, 2), less the `dead` largest contributions of single thrusters."""
+    """Supports along +y and -y, out (m, 2), minus the `dead` largest contributions of single thrusters."""
     n = columns.shape[0]
     largest = np.zeros((2, dead + 1))
     for m in range(normals.shape[0]):
@@ -148,7 +148,7 @@ def _reach(normals, supports, wrenches, tiny, out):  # type: ignore[no-untyped-d
 
 
 def subsets(layout: Layout) -> int:
-    """How many subsets of columns the facets of a layout would take."""
+    """Number of subsets of columns to enumerate for the facets of a layout."""
     forced = 6 - layout.rank
     return math.comb(len(_distinct(layout)), 5 - forced) if forced <= 5 else 0
 
@@ -173,7 +173,7 @@ def normals_of(layout: Layout) -> np.ndarray:
 
 
 def supports_of(layout: Layout, normals: np.ndarray, dead: int = 0) -> np.ndarray:
-    """(m, 2) support along each normal and against it, N, the `dead` thrusters that matter most there left out."""
+    """(m, 2) support along each normal and against it, N, without the `dead` thrusters that contribute most there."""
     out = np.zeros((len(normals), 2))
     columns = np.ascontiguousarray(layout.matrix.T)
     _supports(normals, columns, layout.f_min, layout.f_max, min(dead, layout.count), out)
@@ -191,7 +191,7 @@ def reach(layout: Layout, normals: np.ndarray, supports: np.ndarray, wrenches: n
 
 
 def _distinct(layout: Layout) -> np.ndarray:
-    """(n, 6) unit columns, torque scaled by the lever arm, parallel and idle ones left out."""
+    """(n, 6) unit columns, torque scaled by the lever arm, without parallel duplicates and thrusters that give no force."""
     columns = layout.scaled.T[(layout.f_max > 0.0) | (layout.f_min < 0.0)]
     sizes = np.linalg.norm(columns, axis=1, keepdims=True)
     unit = columns[sizes[:, 0] > 0.0] / sizes[sizes[:, 0] > 0.0]

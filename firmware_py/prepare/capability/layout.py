@@ -1,6 +1,6 @@
-"""An actuation layout: which wrench each thruster gives, how hard it may push and what that costs.
+"""An actuation layout: the wrench, force limits and power of each thruster.
 
-Columns are [direction; position x direction] about the centre of mass: the paper's Jacobian, its two words put right.
+Columns are [direction; position x direction] about the centre of mass: the paper's Jacobian with its two terms corrected.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from firmware_py.prepare.assembly import PITCH_M, Balance, place, thruster_set
 from firmware_py.prepare.joints import check_joints
 
 FRAMES = {"force": (0, 1, 2), "torque": (3, 4, 5)}
-"""Which components of a wrench each frame looks at, the others held at zero."""
+"""Components of a wrench that belong to each frame; the others are held at zero."""
 
 UNITS = {"force": "N", "torque": "N m"}
 
 NORMALISATIONS = ("physical", "unit_thrust", "equal_total_thrust")
 
 REFERENCE_THRUSTERS = 8
-"""Thrusters of the paper's module, to which `equal_total_thrust` brings every robot."""
+"""Number of thrusters of the paper's module, to whose total thrust `equal_total_thrust` scales every robot."""
 
 _RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest count as zero (torque rows scaled by the lever arm)."""
@@ -36,12 +36,12 @@ class Layout:
     """n thrusters about one centre of mass.
 
     Attributes:
-        name: for people.
+        name: for display.
         matrix: (6, n) wrench of unit forces, N and N m, body axes.
         f_min, f_max: (n,) N.
         power_forward, power_reverse: (n, 5) W over force size, no constant term; empty (n, 0) where unknown.
         passive: wrench components that buoyancy holds; they matter only in `with_passive_declared`.
-        assumption: what is assumed and not measured.
+        assumption: facts that are assumed, not measured.
     """
 
     name: str
@@ -70,13 +70,13 @@ class Layout:
 
     @property
     def lever_m(self) -> float:
-        """Root mean square lever arm, m, over which torque compares with force; 1 if there is none."""
+        """Root mean square lever arm, m, by which torque is divided to compare with force; 1 if there is none."""
         size = float(np.sqrt(np.mean(np.sum(self.matrix[3:] ** 2, axis=0))))
         return size if size > 0.0 else 1.0
 
     @property
     def levers(self) -> np.ndarray:
-        """(6,) what a wrench is divided by so that its force and torque compare: 1, and the lever arm."""
+        """(6,) divisors that make the force and torque of a wrench comparable: 1, and the lever arm."""
         return np.array([1.0, 1.0, 1.0, *[self.lever_m] * 3])
 
     @property
@@ -102,7 +102,7 @@ class Layout:
         return tuple(name for axis, name in enumerate(AXES) if not self.spans([axis]))
 
     def with_passive_declared(self) -> Layout:
-        """The layout with the passive components left out of every balance: what buoyancy holds needs no thruster."""
+        """The layout with the passive components removed from every balance, because buoyancy holds them without a thruster."""
         matrix = self.matrix.copy()
         matrix[list(self.passive)] = 0.0
         return dataclasses.replace(self, matrix=matrix)
@@ -111,7 +111,7 @@ class Layout:
         """The layout with the force limits of one of NORMALISATIONS.
 
         physical: its own, N. unit_thrust: -1 to 1 each. equal_total_thrust: -1 to 1 times 8 / n, so that all robots
-        have as much thrust in sum.
+        have the same total thrust.
         """
         if how == "physical":
             return self
@@ -164,9 +164,9 @@ def of_rows(name: str, rows: np.ndarray, f_min: float, f_max: float, curve_of: V
     """The layout of raw rows (n, 6): position about the centre of mass (m), direction of positive force.
 
     Args:
-        rows: see there.
-        f_min, f_max: N, the same for all.
-        curve_of: whose power curve the thrusters have.
+        rows: (n, 6) as above.
+        f_min, f_max: N, the same for all thrusters.
+        curve_of: vehicle whose power curve the thrusters have.
     """
     table = np.asarray(rows, dtype=float).reshape(-1, 6)
     lengths = np.linalg.norm(table[:, 3:], axis=1, keepdims=True)

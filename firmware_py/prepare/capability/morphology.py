@@ -1,4 +1,4 @@
-"""How smooth a space is: Dirichlet and Willmore energy of the star-shaped surface r(d), through spherical harmonics.
+"""Smoothness of a space: Dirichlet and Willmore energy of the star-shaped surface r(d), through spherical harmonics.
 
 The radius is taken about the wrench origin and never re-centred; harmonics are real and orthonormal, degree 10 at most
 as in the paper. E_D = sum l (l + 1) |a_lm|^2; E_W = int H^2 dA - int K dA on the fitted surface.
@@ -14,13 +14,13 @@ import numpy as np
 from firmware_py.prepare.capability.sphere import angles
 
 L_MAX = 10
-"""The paper's."""
+"""Highest degree of the harmonics, as in the paper."""
 
 LEAST_RATIO = 1e-3
-"""Smallest r_min / r_max for which the Willmore energy means anything."""
+"""Smallest r_min / r_max for which the Willmore energy is meaningful."""
 
 _CURVATURE_ERROR = 1e-3
-"""Largest relative error of int K dA = 4 pi with which a Willmore energy is believed."""
+"""Largest relative error of int K dA = 4 pi with which a Willmore energy is accepted."""
 
 _POLAR, _AZIMUTH = 128, 256
 """Nodes of the quadrature: int K is 4 pi to 1e-6 on all seven robots' spaces."""
@@ -34,9 +34,9 @@ class Shape:
         dirichlet: E_D, in the radius's unit squared.
         dirichlet_scale_free: E_D / a_00^2.
         willmore: E_W, no unit; NaN where refused.
-        refused: why, or empty.
-        total_curvature: int K dA, 4 pi for any closed surface of this kind; tells how good the quadrature is.
-        misfit: root mean square of fitted less given radius, as a share of the mean radius.
+        refused: reason why E_W is refused; empty where it is not.
+        total_curvature: int K dA, 4 pi for any closed surface of this kind; a measure of the quadrature's accuracy.
+        misfit: root mean square of fitted minus given radius, as a share of the mean radius.
     """
 
     dirichlet: float
@@ -155,7 +155,7 @@ def _orders(l_max: int) -> np.ndarray:
 
 
 def _legendre(polar: np.ndarray, l_max: int) -> np.ndarray:
-    """(n, l, m >= 0) orthonormal real harmonics without their turning.
+    """(n, l, m >= 0) orthonormal real harmonics without their azimuthal factor.
 
     Fully normalised associated Legendre functions by the standard recurrence from degree to degree (Holmes and
     Featherstone, J. Geodesy 76, 2002, eqs. 11 to 13).
@@ -176,7 +176,7 @@ def _legendre(polar: np.ndarray, l_max: int) -> np.ndarray:
 
 
 def _derivatives(polar: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First and second derivative of `_legendre` by the polar angle, the second by Legendre's equation. They need sin(polar) > 0."""
+    """First and second derivative of `_legendre` by the polar angle, the second from Legendre's equation. Require sin(polar) > 0."""
     x, s, slopes = np.cos(polar), np.sin(polar), np.zeros_like(values)
     orders = np.arange(values.shape[1])
     degrees = orders[:, None]

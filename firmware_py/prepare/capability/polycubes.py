@@ -1,4 +1,4 @@
-"""All shapes that n cubes can be docked into, and all ways a shape can lie in the lattice."""
+"""All shapes that n docked cubes can form, and all poses of a shape in the lattice."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.prepare.lattice import MATRICES
 
 MOST_CUBES = 5
-"""534 ways of lying for five cubes, 3481 for six."""
+"""Largest number of cubes with a list of shapes. Five cubes have 534 poses, six have 3481."""
 
 Cell = tuple[int, int, int]
 Cells = tuple[Cell, ...]
@@ -17,12 +17,12 @@ _STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 
 
 def polycubes(count: int) -> list[Cells]:
-    """Every distinct shape of `count` cubes, mirror images apart: 1, 1, 2, 8, 29 (OEIS A000162). Sorted.
+    """Every distinct shape of `count` cubes, mirror images counted separately: 1, 1, 2, 8, 29 (OEIS A000162). Sorted.
 
-    Two shapes are the same if one of the 24 rotations and a shift take one to the other; a robot cannot be mirrored.
+    Two shapes are the same if one of the 24 rotations and a shift map one to the other; a robot cannot be mirrored.
 
     Raises:
-        DescriptionError: no list for so many.
+        DescriptionError: more than MOST_CUBES cubes, or none.
     """
     if not 1 <= count <= MOST_CUBES:
         raise DescriptionError(f"shapes are listed for 1 to {MOST_CUBES} modules, not {count}")
@@ -33,7 +33,7 @@ def polycubes(count: int) -> list[Cells]:
 
 
 def poses(cells: Cells) -> list[Cells]:
-    """Every distinct way a shape can lie in the lattice, at most 24; sorted."""
+    """Every distinct pose of a shape in the lattice, at most 24; sorted."""
     table = np.array(cells, dtype=float)
     return sorted({_settled(table @ turn.T) for turn in MATRICES})
 
@@ -44,7 +44,7 @@ def canonical(cells: Cells) -> Cells:
 
 
 def _settled(table: np.ndarray) -> Cells:
-    """Cells shifted to non-negative corners and sorted."""
+    """Cells shifted so that the lowest corner is at the origin, and sorted."""
     whole = np.rint(table - table.min(axis=0)).astype(int)
     return tuple(sorted((int(x), int(y), int(z)) for x, y, z in whole))
 

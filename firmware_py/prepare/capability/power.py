@@ -1,7 +1,7 @@
-"""Power space and thrust variance: what a wrench of declared size costs in every direction, with f = J^+ w.
+"""Power space and thrust variance: the cost of a wrench of declared size in every direction, with f = J^+ w.
 
-P(d) = sum [P(f_i) - P(0)] with the thrusters' measured power; what the electronics draw at rest is apart. The paper's
-own figure is proportional to the number of thrusters, so it measures idle power.
+P(d) = sum [P(f_i) - P(0)] with the thrusters' measured power; the idle power of the electronics is not included. The
+paper's own figure is proportional to the number of thrusters, so it measures idle power.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class PowerSpace:
 
     Attributes:
         size: |w| of the declared wrench, N or N m.
-        directions: (k, d) unit vectors, d = 3 less what is passive.
+        directions: (k, d) unit vectors, d = 3 minus the passive components.
         forces: (k, n) N.
         power_w: (k,) W; NaN where the thrusters' power is not known.
         residual: largest |J f - w| over the directions, N and N m together; zero where the layout spans the frame.
-        over_limit: share of the directions in which some thruster passes its limit.
+        over_limit: share of the directions in which some thruster exceeds its limits.
         variance: of a thruster's force over all thrusters and the whole sphere, N^2, in closed form.
     """
 
@@ -85,7 +85,7 @@ def electrical_power(layout: Layout, forces: np.ndarray) -> np.ndarray:
 
 
 def least_squares_forces(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
-    """(k, n) forces of least squares within limits for (k, 6) wrenches; J^+ w where a wrench is out of reach."""
+    """(k, n) least-squares forces within limits for (k, 6) wrenches; J^+ w where a wrench is out of reach."""
     forces = wrenches @ np.linalg.pinv(layout.matrix, rcond=1e-9).T
     n = layout.count
     sense = np.array([0] * n + [_EQUALITY] * 6, dtype=c_int)

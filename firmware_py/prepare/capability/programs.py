@@ -13,13 +13,13 @@ from firmware_py.prepare.capability.sphere import fibonacci
 from firmware_py.prepare.capability.wrench import Section, corners_of, embed, free_components, irredundant
 
 _BATCH = 100
-"""Programs solved as one block-diagonal program: 0.13 ms each for 8 thrusters, 1.6 ms each when alone."""
+"""Number of programs solved as one block-diagonal program: 0.13 ms each for 8 thrusters, 1.6 ms each when solved alone."""
 
 _FIRST_DIRECTIONS = 40
-"""Directions in which the search for a section's facets begins."""
+"""Number of directions with which the search for a section's facets starts."""
 
 _BEYOND = 1e-9
-"""A corner of the facets found so far counts as reachable when it is this close, as a share."""
+"""Relative tolerance within which a corner of the facets found so far counts as reachable."""
 
 _MOST_ROUNDS = 100
 """Rounds of the search; six to ten are usual."""
@@ -69,23 +69,23 @@ def _batch(layout: Layout, wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 class ProgramSpace:
-    """As wrench.WrenchSpace, for any number of thrusters: every answer is a linear program."""
+    """Like wrench.WrenchSpace, for any number of thrusters: answers every query with linear programs."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
 
     def reach(self, wrenches: np.ndarray) -> np.ndarray:
-        """(k,) largest factor of each of (k, 6) wrenches; 0 for what the layout cannot push at all."""
+        """(k,) largest factor of each of (k, 6) wrenches; 0 for wrenches outside the layout's span."""
         return reach_by_programs(self.layout, wrenches)
 
     def section(self, frame: str) -> Section | None:
         """The polytope in one frame; None where the layout does not span it.
 
-        Begins with the facets that a few directions meet and then tries the corners of what these enclose: a corner
-        that cannot be reached lies beyond a facet not found yet.
+        Starts with the facets that a few directions hit, then tests the corners of the polytope that these enclose: an
+        unreachable corner lies beyond a facet not found yet.
 
         Raises:
-            RuntimeError: no end was found.
+            RuntimeError: the search did not end within _MOST_ROUNDS rounds.
         """
         components = free_components(self.layout, frame)
         if not components or not self.layout.spans(components):

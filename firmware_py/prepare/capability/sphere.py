@@ -1,4 +1,4 @@
-"""Directions spread evenly over the sphere: the paper's Algorithm 1, put right at the south pole."""
+"""Directions spread evenly over the sphere: the paper's Algorithm 1, corrected at the south pole."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def angles(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def grid(polar_count: int, azimuth_count: int) -> np.ndarray:
-    """(polar_count, azimuth_count, 3) unit vectors of a closed mesh for drawing; poles and seam come repeatedly."""
+    """(polar_count, azimuth_count, 3) unit vectors of a closed mesh for drawing; poles and seam are duplicated."""
     polar = np.linspace(0.0, np.pi, polar_count)[:, None]
     azimuth = np.linspace(0.0, 2.0 * np.pi, azimuth_count)[None]
     parts = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) * np.ones_like(azimuth)

@@ -1,4 +1,4 @@
-"""Everything that is said of one layout: both frames, all normalisations, degenerate cases named."""
+"""All capability figures of one layout: both frames, all normalisations, with degenerate cases named."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DIRECTIONS = 1000
 """Directions over the sphere, as in the paper's drag table."""
 
 FACET_SUBSETS = 250_000
-"""Up to so many subsets of columns (32 thrusters, 1 s) all facets are listed; beyond, programs find a section."""
+"""Largest number of column subsets (32 thrusters, 1 s) with which all facets are listed; beyond it, linear programs find a section."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,9 +32,9 @@ class Reach:
     """Reachable wrenches of one frame under one normalisation.
 
     Attributes:
-        degenerate: the layout cannot push in some direction of the frame, so the volume is zero.
+        degenerate: whether the layout cannot push in some direction of the frame, so that the volume is zero.
         section: the polytope, None where degenerate.
-        ellipsoid: the largest inscribed one, None where degenerate.
+        ellipsoid: the largest inscribed ellipsoid, None where degenerate.
         volume: of the ellipsoid, N^d or (N m)^d, d the frame's free components; 0 where degenerate.
         worst: smallest lambda over all directions, N or N m.
         radius: (k,) lambda over the directions of `Capability.directions`; zeros where not reachable.
@@ -52,10 +52,10 @@ class Reach:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capability:
-    """What one layout can do.
+    """Capability of one layout.
 
     Attributes:
-        layout: whose.
+        layout: the layout itself.
         rank: of its matrix.
         unreachable: degrees of freedom that cannot be pushed alone, of all six.
         directions: (k, 3).
@@ -63,7 +63,7 @@ class Capability:
         declared: the same with the passive degrees of freedom declared; empty where there are none.
         power, power_shape: by frame.
         programs_differ: largest relative difference of linear programs from facets over both frames, NaN if not run.
-        axes: (6, 2) most that can be pushed along and against each component alone, N and N m; passive ones take what they are given.
+        axes: (6, 2) largest push along and against each component alone, N and N m; passive components may take any value meanwhile.
     """
 
     layout: Layout
@@ -86,13 +86,13 @@ def characterise(
     programs: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> Capability:
-    """Both frames of one layout.
+    """The capability of one layout in both frames.
 
     Args:
-        count: directions over the sphere, at least 121.
+        count: number of directions over the sphere, at least 121.
         sizes: |w| of the power space by frame; 1 N and 1 N m when left out.
-        programs: solve the linear programs too and compare.
-        progress: called with what comes next.
+        programs: whether to solve the linear programs too and compare.
+        progress: called with a description of the next step.
     """
     directions = fibonacci(count)
     harmonics = Harmonics(directions)
@@ -126,7 +126,7 @@ def characterise(
 
 
 def wrench_space(layout: Layout) -> WrenchSpace | ProgramSpace:
-    """By facets, or by linear programs where there are too many thrusters for all facets."""
+    """The wrench space of a layout, by facets, or by linear programs where there are too many thrusters for all facets."""
     return WrenchSpace(layout) if subsets(layout) <= FACET_SUBSETS else ProgramSpace(layout)
 
 
@@ -170,7 +170,7 @@ def _reach(space: WrenchSpace | ProgramSpace, frame: str, directions: np.ndarray
 
 
 def _difference(layout: Layout, frame: str, directions: np.ndarray, exact: np.ndarray) -> float:
-    """Largest |program - facet| as a share of the facets' figure; of the largest where a direction is out of reach."""
+    """Largest |program - facet| relative to the facets' figure, or to the largest figure where a direction is out of reach."""
     programs = reach_by_programs(layout, embed(directions, FRAMES[frame]))
     scale = np.where(exact > 0.0, exact, max(float(exact.max()), float(layout.f_max.max())))
     return float(np.max(np.abs(programs - exact) / scale))
@@ -189,7 +189,7 @@ def _notes(layout: Layout) -> tuple[str, ...]:
 
 
 def to_plain(result: Capability) -> dict[str, Any]:
-    """Figures alone, for JSON; units in the names."""
+    """The figures alone, for JSON; units are in the names."""
     return {
         "name": result.layout.name,
         "thrusters": result.layout.count,
@@ -207,7 +207,7 @@ def to_plain(result: Capability) -> dict[str, Any]:
 
 
 def _number(value: float) -> float | None:
-    """JSON has no NaN and no infinity."""
+    """None for NaN and infinity, which JSON lacks."""
     return float(value) if math.isfinite(value) else None
 
 

@@ -1,6 +1,6 @@
-"""What a shape is wanted for: wrenches to hold, or a trajectory to fly, read from a task file.
+"""The task for which a shape is chosen: wrenches to hold, or a trajectory to fly, read from a task file.
 
-A task file is TOML: `wrench = [[Fx, Fy, Fz, Mx, My, Mz], ...]` or a [trajectory] table, and how to rank.
+A task file is TOML: `wrench = [[Fx, Fy, Fz, Mx, My, Mz], ...]` or a [trajectory] table, and the ranking criterion.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class TrajectoryTable:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Task:
-    """One task file. The modules' axes are the task's; how the shape lies in them is free."""
+    """One task file. The task uses the modules' axes; the pose of the shape in them is free."""
 
     name: str = quantity(help="for people")
     vehicle: str = quantity("modcube", help="vehicle name or file of every module")
@@ -73,6 +73,6 @@ def load_task(path: Path) -> Task:
 
 
 def wrenches_along(path: Trajectory, body: Body, samples: int) -> np.ndarray:
-    """(samples, 6) wrench that a body needs at even times along a trajectory, N and N m, body frame, in still water."""
+    """(samples, 6) wrench that a body needs at evenly spaced times along a trajectory, N and N m, body frame, in still water."""
     times = np.linspace(0.0, path.duration_s, samples)
     return wrenches(body, np.array([np.concatenate(path.sample(float(t))) for t in times]))

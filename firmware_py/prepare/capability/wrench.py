@@ -1,4 +1,4 @@
-"""Reachable wrench space: how far the thrusters can push in any direction, exactly, by the facets of the zonotope.
+"""Reachable wrench space: the exact limit of what the thrusters can push in any direction, from the facets of the zonotope.
 
 lambda(d) = max lambda so that J f = lambda [d; 0] (force frame) or lambda [0; d] (torque frame), f_min <= f <= f_max.
 """
@@ -13,12 +13,12 @@ from firmware_py.prepare.capability import facets
 from firmware_py.prepare.capability.layout import FRAMES, Layout
 
 _PARALLEL = 1e-9
-"""Share of the largest below which a facet's normal does not enter a frame."""
+"""Size of a facet's normal in a frame, as a share of the largest, below which the facet does not bound the frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Section:
-    """Wrenches along some components with all others zero: the polytope normals @ x <= offsets, without redundant rows.
+    """Wrenches in some components with all others zero: the polytope normals @ x <= offsets, without redundant rows.
 
     Attributes:
         components: which components of a wrench x holds.
@@ -37,7 +37,7 @@ class Section:
         return np.asarray(ratio.min(axis=1))
 
     def polygons(self) -> list[np.ndarray]:
-        """Each facet in three dimensions as its corners in order, (k, 3); the border alone in two, (k, 2)."""
+        """Corners of each facet in order, (k, 3), in three dimensions; corners of the one outline, (k, 2), in two."""
         corners = corners_of(self.normals, self.offsets)
         if len(self.components) == 2:
             return [corners[np.argsort(np.arctan2(corners[:, 1], corners[:, 0]))]]
@@ -56,15 +56,15 @@ class Section:
 
 
 class WrenchSpace:
-    """All wrenches of one layout, through the facets of its zonotope.
+    """All reachable wrenches of one layout, through the facets of its zonotope.
 
     Attributes:
-        layout: whose.
-        dead: so many thrusters give nothing, always those whose loss hurts most.
+        layout: the layout itself.
+        dead: number of thrusters that give nothing, always those whose loss costs most.
         normals: (m, 6) of facets.normals_of.
 
     Raises:
-        DescriptionError: more thrusters than facets can be found for; programs.ProgramSpace serves any number.
+        DescriptionError: too many thrusters to find all facets; programs.ProgramSpace handles any number.
     """
 
     def __init__(self, layout: Layout, dead: int = 0, normals: np.ndarray | None = None) -> None:
@@ -74,15 +74,15 @@ class WrenchSpace:
         self._supports = facets.supports_of(layout, self.normals, dead)
 
     def with_dead(self, dead: int) -> WrenchSpace:
-        """The wrenches that are left whichever `dead` thrusters give nothing (exact: see there).
+        """The wrenches that remain reachable whichever `dead` thrusters fail.
 
-        A facet of what n - dead thrusters can do is spanned by some of them, so its normal is one of the full layout's;
-        along it the worst loss is that of the `dead` largest contributions.
+        Exact: a facet of the wrenches of n - dead thrusters is spanned by some of them, so its normal is one of the full
+        layout's; along it the worst loss is that of the `dead` largest contributions.
         """
         return WrenchSpace(self.layout, dead, self.normals)
 
     def reach(self, wrenches: np.ndarray) -> np.ndarray:
-        """(k,) largest factor of each of (k, 6) wrenches; 0 for what the layout cannot push at all."""
+        """(k,) largest factor of each of (k, 6) wrenches; 0 for wrenches outside the layout's span."""
         wrenches = np.atleast_2d(np.asarray(wrenches, dtype=float))
         factor = facets.reach(self.layout, self.normals, self._supports, wrenches)
         return np.where(in_span(self.layout, wrenches), factor, 0.0)
@@ -113,7 +113,7 @@ class WrenchSpace:
 
 
 def free_components(layout: Layout, frame: str) -> tuple[int, ...]:
-    """Components of a frame whose row of the matrix is not left out (passive, declared)."""
+    """Components of a frame, without passive ones whose row of the matrix is zero (`with_passive_declared`)."""
     return tuple(c for c in FRAMES[frame] if np.any(layout.matrix[c] != 0.0) or c not in layout.passive)
 
 
@@ -130,7 +130,7 @@ def irredundant(normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, n
     from scipy.spatial import ConvexHull  # takes a third of a second to import
 
     if offsets.min() <= 1e-9 * offsets.max():
-        return normals, np.maximum(offsets, 0.0)  # zero on the border: no polar body
+        return normals, np.maximum(offsets, 0.0)  # the origin is on the border, so that there is no polar body
     polar = normals / offsets[:, None]
     if normals.shape[1] == 1:
         rows = np.array([int(np.argmax(polar[:, 0])), int(np.argmin(polar[:, 0]))])
@@ -141,7 +141,7 @@ def irredundant(normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, n
 
 
 def corners_of(normals: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """(c, d) corners of {x : normals @ x <= offsets}, the origin inside: faces of the hull of the polar points."""
+    """(c, d) corners of {x : normals @ x <= offsets} with the origin inside: faces of the hull of the polar points."""
     from scipy.spatial import ConvexHull
 
     if normals.shape[1] == 1:
