@@ -1,4 +1,4 @@
-"""How full a bus is, from the DBC alone: worst-case bits of every frame, how often it comes, the fullest tick.
+"""Load of a bus, from the DBC alone: worst-case bits and rate of every frame, and the fullest tick.
 
 Used by `tools/bus_load.py` and `modcube doctor`; nothing here runs in a tick.
 """
@@ -14,20 +14,20 @@ from firmware_py.bus.codec import Codec, MessageCodec
 BIT_RATE = 1_000_000
 """bit/s of every bus."""
 MEAN_LIMIT = 0.5
-"""Most of a bus that may be in use on average."""
+"""Highest permitted share of a bus in use on average."""
 TICK_LIMIT = 0.8
-"""Most of any one tick."""
+"""Highest permitted share of any one tick."""
 FRAME_BITS, BYTE_BITS = 55, 10
-"""A classic frame with 11-bit id and n bytes takes at most 55 + 10 n bits: 47 + 8 n, a stuff bit after each four of the
-34 + 8 n that are stuffed, and the interframe space (ISO 11898-1)."""
+"""A classic frame with 11-bit id and n bytes takes at most 55 + 10 n bits: 47 + 8 n with the interframe space, and a stuff bit
+after each four of the 34 + 8 n that are stuffed (ISO 11898-1)."""
 HEARTBEATS = 2
 """Nodes that send nothing else periodically: the firmware on a quiet bus, the e-stop box."""
 NUMBER_STEP = 3
-"""By how many ticks the slow frames of the next module are shifted."""
+"""Ticks by which the slow frames of each module are shifted against those of the module before."""
 
 
 class MessageLoad(NamedTuple):
-    """What one message takes of a bus."""
+    """Load of a bus by one message."""
 
     name: str
     bits: int
@@ -36,7 +36,7 @@ class MessageLoad(NamedTuple):
 
 
 class BusLoad(NamedTuple):
-    """What all frames take of a bus, as shares of it: on average, and in the fullest tick."""
+    """Load of a bus by all frames, as shares of its capacity: on average, and in the fullest tick."""
 
     mean: float
     fullest_tick: float
@@ -44,27 +44,27 @@ class BusLoad(NamedTuple):
 
     @property
     def is_allowed(self) -> bool:
-        """Whether both shares keep their limits."""
+        """Whether both shares are within their limits."""
         return self.mean <= MEAN_LIMIT and self.fullest_tick <= TICK_LIMIT
 
 
 def frame_bits(length: int) -> int:
-    """Most bits that a frame of `length` bytes takes on the wire, the space behind it included."""
+    """Returns the worst-case bits of a frame of `length` bytes on the wire, including the interframe space."""
     return FRAME_BITS + BYTE_BITS * length
 
 
 def slow_schedule(codec: Codec, number: int, rate_hz: int) -> list[tuple[MessageCodec, int, int]]:
-    """(message, every so many ticks, in which of them) of a module's slow frames, staggered by message and module."""
+    """Returns (message, period in ticks, phase in ticks) of a module's slow frames, staggered by message and module."""
     slow = [message for message in codec.messages if is_of_a_module(message) and not message.per_tick]
     every = [max(1, round(message.cycle_ms * rate_hz / 1000)) for message in slow]
     return [(m, n, (i + NUMBER_STEP * number) % n) for i, (m, n) in enumerate(zip(slow, every, strict=True))]
 
 
 def bus_load(codec: Codec, numbers: Sequence[int], rate_hz: int) -> BusLoad:
-    """The load of a bus with modules `numbers` at `rate_hz` ticks a second, one tag of each module in every picture.
+    """Computes the load of a bus with modules `numbers` at `rate_hz` ticks a second, one tag of each module in every picture.
 
-    The fullest tick holds all that comes in every tick, the slow frames of that tick by their schedule, and besides a
-    picture, docking commands to all modules, an e-stop and heartbeats, which come when they like.
+    The fullest tick holds the frames of every tick, the slow frames scheduled for it, and those that may come at any
+    time: a picture, docking commands to all modules, an e-stop and heartbeats.
     """
     messages = []
     for message in codec.messages:
@@ -77,12 +77,12 @@ def bus_load(codec: Codec, numbers: Sequence[int], rate_hz: int) -> BusLoad:
 
 
 def is_of_a_module(message: MessageCodec) -> bool:
-    """GYRO and everything behind it up to HEARTBEAT: by the DBC's ids what a module's MCU says."""
+    """Whether a module's MCU sends the message: in the order of the DBC's ids GYRO and all that follow, before HEARTBEAT."""
     return 0x100 >> 5 <= message.function < 0x700 >> 5
 
 
 def _senders(message: MessageCodec, modules: int) -> int:
-    """How many ids of one bus carry the message."""
+    """Returns the number of ids on one bus that carry the message."""
     return {"ESTOP": 1, "SYNC": 1, "HEARTBEAT": HEARTBEATS}.get(message.name, modules)
 
 

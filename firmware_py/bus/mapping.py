@@ -1,6 +1,6 @@
-"""Frames <-> the values of a tick: InputCollector makes Inputs of what came, OutputEncoder makes frames of Outputs.
+"""Frames <-> the values of a tick: InputCollector makes Inputs from received frames, OutputEncoder makes frames from Outputs.
 
-Stands at both ends of a tick, between the ports and the pipeline. No clock: the loop says when SYNC went out.
+Sits at both ends of a tick, between the ports and the pipeline. Has no clock: the loop passes the time at which SYNC went out.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ NS_PER_MS = 1_000_000
 REMEMBERED_TICKS = 256
 """CaptureTick has 8 bits."""
 OFFSET_SATURATED_MS = 25.5
-"""Largest CaptureOffset: the camera missed SYNCs, so the time of the picture is unknown."""
+"""Largest CaptureOffset: sent when the camera missed SYNCs, so the time of the picture is unknown."""
 USABLE_STATUS = (0, 1)
 """Sensor status OK and SATURATED; a stale or failed sensor's values are not passed on."""
 SENSOR_FAULT = 15
@@ -33,13 +33,13 @@ Row = list[float]
 
 
 class InputCollector:
-    """Collects the frames of all buses; `collect` hands over what came since the call before, as one Inputs.
+    """Collects the frames of all buses; `collect` returns those since the previous call, as one Inputs.
 
     Attributes:
         faults: frames that passed the codec's checks and were not used, by kind: `module` (not in the fleet),
             `tag_unpaired`, `tag_stale`, `tag_future`, `sensor` (its status says fault or stale), `foreign_sync` and
-            `foreign_command` (somebody else controls this bus).
-        unmet: fleet indices of modules that have not said yet how they are.
+            `foreign_command` (another node controls this bus).
+        unmet: fleet indices of modules that have not sent MCU_STATUS yet.
     """
 
     def __init__(self, fleet: Fleet, codec: Codec) -> None:
@@ -59,7 +59,7 @@ class InputCollector:
         self._names = [message.name for message in codec.messages]
         self._tag_position = self._names.index("TAG_POSITION")
         self._from_camera = frozenset((self._tag_position, self._names.index("TAG_ATTITUDE")))
-        """No sign of life of the module whose number they carry."""
+        """Messages of the camera: no sign of life of the module whose number they carry."""
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -68,11 +68,11 @@ class InputCollector:
         return {kind: sum(receiver.dropped[kind] for receiver in self._receivers) for kind in kinds}
 
     def sync_sent(self, tick: int, time_ns: int) -> None:
-        """SYNC `tick` went out at `time_ns`: what the capture times of tags count from."""
+        """Records that SYNC `tick` went out at `time_ns`, from which the capture times of tags count."""
         self._sync_ns[tick % REMEMBERED_TICKS] = time_ns
 
     def take(self, bus: int, frames: Sequence[Frame]) -> None:
-        """Takes the frames that came on bus `bus`, whatever they hold."""
+        """Takes the frames received on bus `bus`, whatever their contents."""
         if not frames:
             return
         for row in self._receivers[bus].rows(frames).tolist():
@@ -92,17 +92,17 @@ class InputCollector:
             handler(index, module, row)
 
     def all_answered(self, tick: int) -> bool:
-        """Whether MCU_STATUS of `tick` of every module is in: the inputs of the tick may close."""
+        """Whether every module's MCU_STATUS of `tick` has arrived, so that the inputs of the tick may close."""
         wanted = tick & 0xFFFF
         return all(status == wanted for status in self._status_ticks)
 
     def collect(self, tick: int, time_ns: int, requests: Sequence[Request] = ()) -> Inputs:
-        """Everything since the call before, as the Inputs of `tick`; the collector is empty afterwards."""
+        """Returns everything received since the previous call as the Inputs of `tick`, and empties the collector."""
         modules, self._modules = self._modules, [ModuleInputs() for _ in self._modules]
         wanted = tick & 0xFFFF
         for index, module in enumerate(modules):
             module.answered = self._status_ticks[index] == wanted
-            self._status_ticks[index] = None  # it answers once: the same 16 bits come again after 65536 ticks
+            self._status_ticks[index] = None  # an answer counts once: the same 16 bits recur after 65536 ticks
             if module.tags:
                 module.tags = [tag for tag in module.tags if self._is_timely(tag, time_ns)]
         self._expire_halves()
@@ -135,7 +135,7 @@ class InputCollector:
         elif name == "SYNC":
             self._foreign_sync = True
             self.faults["foreign_sync"] += 1
-        elif name != "HEARTBEAT":  # which says no more than that a node is there
+        elif name != "HEARTBEAT":  # a HEARTBEAT only says that a node is there
             self._foreign_command = True
             self.faults["foreign_command"] += 1
 
@@ -165,12 +165,12 @@ class InputCollector:
     def _take_status(self, index: int, module: ModuleInputs, row: Row) -> None:
         tick, _, _, state = row[VALUES : VALUES + 4]
         self._status_ticks[index] = int(tick)
-        if module.mcu_state != MCU_ESTOP:  # of two statuses in one tick the later does not hide that an e-stop held it
+        if module.mcu_state != MCU_ESTOP:  # a later status in the same tick must not hide an e-stop
             module.mcu_state = int(state)
         self.unmet.discard(index)
 
     def _take_tag(self, index: int, module: ModuleInputs, row: Row) -> None:
-        """Halves of one observation share the counter, and nothing else says that they belong together."""
+        """Pairs the two halves of an observation, which share the counter; nothing else marks them as belonging together."""
         key = (index, row[COUNTER])
         other = self._halves.pop(key, None)
         if other is None or other[0][MESSAGE] == row[MESSAGE]:
@@ -205,7 +205,7 @@ class InputCollector:
         return False
 
     def _expire_halves(self) -> None:
-        """The halves of an observation may fall to either side of one tick's end; a half older than that is alone."""
+        """Drops unpaired halves. Those of an observation may fall on either side of one tick's end; an older half stays alone."""
         if self._halves:
             old = [key for key, half in self._halves.items() if half[1] < self._collections]
             for key in old:
@@ -231,7 +231,7 @@ def _esc_handler(first: int) -> Callable[[int, ModuleInputs, Row], None]:
 
 
 class OutputEncoder:
-    """Frames of what the pipeline says, each with the bus that it goes out on."""
+    """Encodes the pipeline's Outputs into frames, each with the bus that it goes out on."""
 
     def __init__(self, fleet: Fleet, codec: Codec) -> None:
         self._buses = range(len(fleet.buses))
@@ -244,15 +244,15 @@ class OutputEncoder:
         self._estop_due_ns: int | None = None
 
     def sync(self, tick: int) -> list[tuple[int, Frame]]:
-        """SYNC of `tick` (modulo 2^32), one per bus."""
+        """Returns SYNC of `tick` (modulo 2^32), one frame per bus."""
         frame = self._sync.encode(0, (tick & 0xFFFFFFFF,))
         return [(bus, frame) for bus in self._buses]
 
     def frames(self, outputs: Outputs, unmet: Collection[int] = ()) -> list[tuple[int, Frame]]:
-        """Frames of one tick: ESTOP when due, then of every module its thrusters and, when due, its docking relays.
+        """Returns the frames of one tick: ESTOP when due, then for every module its thrusters and, when due, its docking relays.
 
         Args:
-            unmet: modules whose thrusters are not commanded yet: at a command they would let go of an e-stop that nobody here knows of.
+            unmet: modules whose thrusters are not commanded yet: a command would make them release an e-stop that is not known here.
         """
         frames: list[tuple[int, Frame]] = []
         if self._estop_is_due(outputs):
@@ -272,7 +272,7 @@ class OutputEncoder:
         return frames
 
     def _estop_is_due(self, outputs: Outputs) -> bool:
-        """At once when it is raised, then at 20 Hz on average whatever the tick rate."""
+        """Whether ESTOP is due: at once when raised, then at 20 Hz on average whatever the tick rate."""
         if not outputs.estop:
             self._estop_due_ns = None
             return False

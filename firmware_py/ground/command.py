@@ -11,15 +11,15 @@ ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED, COMMAND_INT_ONLY = 
 """MAV_RESULT."""
 
 Answer = int | None
-"""A MAV_RESULT, or None when it comes later."""
+"""A MAV_RESULT, or None when the answer comes later."""
 
 
 class Command(NamedTuple):
-    """One command, however it came."""
+    """One command, whichever message carried it."""
 
     number: int
     parameters: tuple[float, ...]
-    """Seven; those that are not used may be NaN."""
+    """Seven parameters; unused ones may be NaN."""
     arrival: Arrival
 
     def get(self, index: int, default: float = 0.0) -> float:

@@ -1,4 +1,4 @@
-"""Commands: COMMAND_LONG, COMMAND_INT, SET_MODE. Each is acknowledged: at once, or when the supervisor has decided."""
+"""Commands: COMMAND_LONG, COMMAND_INT, SET_MODE. Each is acknowledged at once, or when the supervisor has decided."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from firmware_py.ground.steering import Steering
 from firmware_py.ground.system import Arrival, Handler, System
 
 DECISION_NS = 400_000_000
-"""The supervisor decides within a tick or two; clients ask again after 0.5 s."""
+"""Time limit of the supervisor's decision. It decides within a tick or two; clients repeat a command after 0.5 s."""
 _FORCED = (21196, 2989)
 """Second parameter of a forced arm or disarm: MAVLink's, and ArduPilot's for arming."""
 
@@ -28,17 +28,17 @@ DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
 """User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
 SET_CURRENT, MOTOR_TEST = 224, 209
 _NEEDED = {ARM: 1, TERMINATE: 1, SET_CURRENT: 1, MOTOR_TEST: 3, DOCK: 4, UNDOCK: 4}
-"""How many of its first parameters a command must name: what is none of them would be taken for 0, which disarms or clears an e-stop."""
+"""Number of leading parameters that a command must give: one that is not finite would count as 0, which disarms or clears an e-stop."""
 
 _LEFT_OUT = 2**31 - 1
-"""What COMMAND_INT has for an x or y that is none."""
+"""COMMAND_INT's value for an x or y that is left out."""
 _PWM = 1100, 1900
-"""Ends of a motor test's throttle as a pulse, us. In % they are the identity's."""
+"""Range of a motor test's throttle as a pulse width, us. In % the range depends on the identity."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pending:
-    """A command that the supervisor decides on."""
+    """A command that waits for the supervisor's decision."""
 
     command: Command
     action: Action
@@ -75,18 +75,18 @@ class CommandService:
         }
 
     def handlers(self) -> dict[str, Handler]:
-        """By message name."""
+        """Handlers by message name."""
         return {"COMMAND_LONG": self._long, "COMMAND_INT": self._int, "SET_MODE": self._set_mode_message}
 
     def hear(self, event: Event) -> None:
-        """An event of the tick: it may refuse what is pending, of several the first whose wish is not there, else the newest."""
+        """Takes an event of the tick. A refusal applies to one pending command of that action: the first not yet done, else the newest."""
         text = event.text.removeprefix("FORCED_")
         asked = [pending for pending in self._pending if text.startswith(f"{pending.action.name} refused")]
         if asked:
             self._finish(next((pending for pending in asked if not pending.is_done()), asked[-1]), DENIED)
 
     def step(self, time_ns: int) -> None:
-        """Answer what is decided by now, also when the body is gone."""
+        """Answers pending commands that are done or timed out, also when the body is gone."""
         for pending in list(self._pending):
             if pending.is_done():
                 self._finish(pending, ACCEPTED)
@@ -98,7 +98,7 @@ class CommandService:
         self._acknowledge(pending.command, result)
 
     def _long(self, arrival: Arrival) -> None:
-        """A place is not taken: in float32 it is told to a metre or two, and has no frame."""
+        """Takes a COMMAND_LONG. A place must come as COMMAND_INT: float32 resolves it only to a metre or two, and a frame is missing."""
         m = arrival.message
         command = Command(m["command"], tuple(m[f"param{i}"] for i in range(1, 8)), arrival)
         if command.number == REPOSITION:
@@ -107,14 +107,14 @@ class CommandService:
             self._run(command)
 
     def _int(self, arrival: Arrival) -> None:
-        """Only a place is in 1e-7 deg and has a frame; in other commands x and y are the parameters 5 and 6, or left out."""
+        """Takes a COMMAND_INT. Only a place is in 1e-7 deg and has a frame; otherwise x and y are parameters 5 and 6, or left out."""
         m = arrival.message
         plain = (*(math.nan if m[name] == _LEFT_OUT else m[name] for name in ("x", "y")), m["z"])
         last = self._place(m) if m["command"] == REPOSITION else plain
         self._run(Command(m["command"], (*(m[f"param{i}"] for i in range(1, 5)), *last), arrival))
 
     def _place(self, m: Message) -> tuple[float, float, float]:
-        """Latitude and longitude, deg, and altitude above the sea, m; NaN where the message has no place."""
+        """Returns latitude and longitude, deg, and altitude above sea level, m; NaN if the message has no valid place."""
         known = m["frame"] in (*ABSOLUTE, *RELATIVE) and abs(m["x"]) <= 900_000_000 and abs(m["y"]) <= 1_800_000_000
         above_m = self._system.subject.origin.altitude_m if m["frame"] in RELATIVE else 0.0
         return (m["x"] * 1e-7, m["y"] * 1e-7, m["z"] + above_m) if known else (math.nan,) * 3
@@ -131,7 +131,7 @@ class CommandService:
             self._acknowledge(command, answer)
 
     def _refuse(self, command: Command) -> Answer:
-        """The body is gone."""
+        """Refuses a command whose body is gone."""
         self._system.refuse(command.arrival.time_ns)
         return TEMPORARILY_REJECTED
 
@@ -145,7 +145,7 @@ class CommandService:
         return None
 
     def _unless(self, reason: str, what: str, refusal: int) -> Answer:
-        """Accepted where there is no reason against it; else the reason is told, and the answer is `refusal`."""
+        """Returns ACCEPTED if `reason` is empty; otherwise reports the reason and returns `refusal`."""
         if reason:
             self._system.say(WARNING, f"{what} refused: {reason}")
         return refusal if reason else ACCEPTED
@@ -168,7 +168,7 @@ class CommandService:
         return self._enter(command, mode, number)
 
     def _set_mode_message(self, arrival: Arrival) -> None:
-        """The old message, which has no acknowledgement of its own."""
+        """Takes the old SET_MODE message, which has no acknowledgement of its own."""
         custom = arrival.message["custom_mode"]
         command = Command(SET_MODE, (arrival.message["base_mode"], *[math.nan] * 6), arrival)
         mode = self._system.subject.identity.mode(custom) if _names_mode(command) else None
@@ -234,7 +234,7 @@ class CommandService:
     def _reboot(self, command: Command) -> Answer:
         if int(command.get(1)) not in (1, 3):
             return UNSUPPORTED
-        picture = self._system.subject.picture  # of the fleet: it is one process for all of them
+        picture = self._system.subject.picture  # of the whole fleet, which one process controls
         reason = "a body is armed" if picture.any_armed else "the e-stop is not cleared" if picture.any_stopped else ""
         self.reboot_asked = self.reboot_asked or not reason
         return self._unless(reason, "reboot", DENIED)
@@ -253,13 +253,13 @@ class CommandService:
         parts = action == Action.UNDOCK and s.picture.leader(module) == s.picture.leader(target)
 
         def is_done() -> bool:
-            """A body that is disarmed undocks without a mode, where it has come apart."""
+            """Whether DOCK mode is entered, or the modules have come apart: a disarmed body undocks without that mode."""
             return s.picture.mode(s.body) == Mode.DOCK or (parts and s.picture.leader(module) != s.picture.leader(target))
 
         return self._ask(command, action, request, is_done)
 
     def _motor_test(self, command: Command) -> Answer:
-        """Motor, throttle type (0: %, 1: PWM), throttle, seconds; motors and % count from where the identity's do."""
+        """Takes motor, throttle type (0: %, 1: PWM), throttle, seconds. First motor number and resting % depend on the identity."""
         s, identity = self._system.subject, self._system.subject.identity
         motor, kind, throttle = int(command.get(1)), int(command.get(2)), command.get(3)
         low, high = _PWM if kind == 1 else (2 * identity.rest_percent - 100, 100)
@@ -274,16 +274,16 @@ class CommandService:
 
 
 def _names_mode(command: Command) -> bool:
-    """Whether the number beside MAV_MODE_FLAG is one: without its flag it is to be ignored, and flags alone choose no mode here."""
+    """Whether the custom mode counts: without CUSTOM_MODE_ENABLED it must be ignored, and flags alone select no mode here."""
     return bool(int(command.get(1)) & CUSTOM_MODE_ENABLED)
 
 
 def _outside(*wanted: tuple[str, float, float, float]) -> str:
-    """The first that is beyond its ends, in words; each is a name, a value, and the lowest and highest that there are."""
+    """Describes the first value outside its range; empty if none is. Each entry: name, value, lowest and highest allowed value."""
     return next((f"{name} {value:g}; it needs {low:g} to {high:g}" for name, value, low, high in wanted if not low <= value <= high), "")
 
 
 def _stops(command: Command) -> bool:
-    """E-stop, termination and disarm: they are taken whoever leads the body."""
+    """Whether a command is an e-stop, termination or disarm, which are accepted whoever leads the body."""
     raised = command.get(1) >= 0.5
     return command.number == ESTOP or (command.number, raised) in ((TERMINATE, True), (ARM, False))

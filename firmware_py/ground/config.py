@@ -1,4 +1,4 @@
-"""How a ground station finds the robot: links, identity, what it stores. Fixed for one run; tunables are parameters."""
+"""Configuration of the ground side: links, identity, storage. Fixed for one run; tunables are parameters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from firmware_py.ground.identity import IDENTITIES, Identity
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundConfig:
-    """One ground side."""
+    """Configuration of one ground side."""
 
     links: tuple[str, ...] = quantity(
         ("udpout:127.0.0.1:14550",),
@@ -41,27 +41,27 @@ class GroundConfig:
             raise DescriptionError(what, "dock_button")
 
     def watches(self, system: int, component: int) -> bool:
-        """Whether a ground station may be the one that must not be lost, and steer."""
+        """Whether a ground station may be the watched one, which must not be lost, and may steer."""
         return self.watch_system in (0, system) and self.watch_component in (0, component)
 
     @property
     def encoding(self) -> Identity:
-        """Of modes."""
+        """The identity, with its encoding of modes."""
         return IDENTITIES[self.identity]
 
     @property
     def parameter_file(self) -> Path | None:
-        """Where parameters are kept."""
+        """File of the stored parameters; None without a store."""
         return Path(self.store) / "parameters.toml" if self.store else None
 
     @property
     def key_file(self) -> Path | None:
-        """Where key and time stamp are kept."""
+        """File of the signing key and time stamp; None without a store."""
         return Path(self.store) / "signing.json" if self.store else None
 
 
 def load_ground(path: Path, modules: int) -> GroundConfig:
-    """The ground side in `path` of a fleet of so many modules; what it leaves out keeps its default. Raises DescriptionError, one line."""
+    """Reads `path` for a fleet of so many modules; values left out keep their defaults. Raises DescriptionError, one line."""
     table, source = read_toml(path)
     config: GroundConfig = build(GroundConfig, table, source)
     docked = config.dock_button[::2]
@@ -73,13 +73,13 @@ def load_ground(path: Path, modules: int) -> GroundConfig:
 
 
 def check_store(store: str) -> None:
-    """Refuse a folder that can neither be made nor written to; none and a disk that fails are no mistake. Raises DescriptionError."""
+    """Checks that the folder can be created or written to. An empty name and a failing disk pass. Raises DescriptionError."""
     if not store:
         return
     nearest = next(place for place in (Path(store), *Path(store).parents) if place.exists())
     try:
         TemporaryFile(dir=nearest).close()
-    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:  # the first: /proc, where nothing can be made
+    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:  # the first: in /proc nothing can be created
         raise DescriptionError(f"store {store}: {nearest}: {error.strerror}; it needs a folder that this user may write to") from None
     except OSError:
         return

@@ -1,6 +1,6 @@
-"""MAVLink messages as values: name and fields to payload and back. What is in them stands in the dialects, not here.
+"""MAVLink messages as values: name and fields to payload and back. The dialects define the messages, not this module.
 
-Definitions come from pymavlink's dialect `all` and from modcube.xml, read with the parser of mavgen itself.
+Definitions come from pymavlink's dialect `all` and from modcube.xml, read with mavgen's own parser.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class Field(NamedTuple):
 
     name: str
     letter: str
-    """As in struct."""
+    """Format character of struct."""
     length: int
-    """Of an array or a text; 0 for a single number."""
+    """Length of an array or a text; 0 for a single number."""
 
 
 class Definition:
-    """One message: how its payload is laid out."""
+    """Payload layout of one message."""
 
     def __init__(self, number: int, name: str, crc_extra: int, fields: Sequence[Field]) -> None:
         self.number, self.name, self.crc_extra, self.fields = number, name, crc_extra, tuple(fields)
@@ -43,10 +43,10 @@ class Definition:
         self.zero = {f.name: "" if f.letter == "s" else (0,) * f.length if f.length else 0 for f in fields}
 
     def encode(self, values: Mapping[str, Any]) -> bytes:
-        """The payload, trailing zeros cut off; fields not given are zero, numbers too large for theirs saturate.
+        """Returns the payload without trailing zeros. Missing fields are zero; numbers outside their field's range saturate.
 
         Raises:
-            KeyError: a field that the message does not have.
+            KeyError: the message has no such field.
         """
         if not values.keys() <= self.zero.keys():
             raise KeyError(f"{self.name} has no field {sorted(values.keys() - self.zero.keys())}")
@@ -58,7 +58,7 @@ class Definition:
         return payload.rstrip(b"\0") or b"\0"
 
     def decode(self, payload: bytes) -> dict[str, Any]:
-        """The fields of a payload; what was cut off is zero, what is longer than the message is ignored."""
+        """Returns the fields of a payload. Bytes that were cut off count as zero; bytes beyond the message's size are ignored."""
         size = self.struct.size
         raw = self.struct.unpack(payload[:size].ljust(size, b"\0"))
         if self._flat:
@@ -112,7 +112,7 @@ class Dialect:
 
 @cache
 def load_dialect() -> Dialect:
-    """The dialect of this package: `all`, and modcube.xml on top. Read once; nobody changes it."""
+    """Returns the dialect of this package: `all`, extended by modcube.xml. Read once and shared; read-only."""
     definitions = [_of_class(cls) for cls in shipped.mavlink_map.values()]
     with resources.as_file(resources.files("firmware_py.ground") / "modcube.xml") as path:
         definitions += [_of_xml(message) for message in mavparse.MAVXML(str(path), mavparse.PROTOCOL_2_0).message]
@@ -141,7 +141,7 @@ _LARGEST_FLOAT = 3.4e38
 
 
 def _fit(value: Any, field: Field) -> Any:
-    """`value` within what `field` can hold."""
+    """Returns `value` limited to the range of `field`."""
     if field.letter == "s":
         return value
     if isinstance(value, Sequence) or hasattr(value, "__len__"):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, data: bytes, mode: int = 0o644) -> None:
-    """Replace the file by `data`, or leave it as it was; when this returns it is on the disk, and so is its name. Raises OSError."""
+    """Replaces the file by `data`, or leaves it unchanged. On return both contents and directory entry are on disk. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     fresh = path.with_name(path.name + ".new")
     fresh.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Between the tank's frame and latitude, longitude and altitude: the tangent plane of WGS 84 at the configured origin.
+"""Conversion between the tank's frame and latitude, longitude, altitude: tangent plane of WGS 84 at the configured origin.
 
 Good to 1 mm within 100 m of the origin; the wire's 1e-7 degrees are 11 mm.
 """
@@ -18,19 +18,19 @@ _E2 = FLATTENING * (2 - FLATTENING)
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where the tank's reference point is on the earth."""
+    """Geodetic position of the tank's reference point."""
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
 
     def _radii(self) -> tuple[float, float]:
-        """Metres a radian of latitude and of longitude, at the origin's height."""
+        """Metres per radian of latitude and of longitude, at the origin's altitude."""
         latitude = math.radians(self.latitude_deg)
         root = math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
         north = EQUATOR_M * (1 - _E2) / root**3 + self.altitude_m
         east = (EQUATOR_M / root + self.altitude_m) * math.cos(latitude)
-        return north, max(east, 1.0)  # at a pole longitude means nothing
+        return north, max(east, 1.0)  # longitude is undefined at a pole
 
     def geodetic(self, p_w: np.ndarray) -> tuple[float, float, float]:
         """Latitude and longitude, deg, and altitude, m, of a point (3,) NED, m."""

@@ -1,4 +1,4 @@
-"""What the robot says it is. Clients choose the encoding of modes by it; the two overlap, so none is ever guessed."""
+"""Autopilot that the robot presents itself as. It decides which encoding of modes clients use; the two overlap, so none is guessed."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ _FLAGS: Mapping[Mode, int] = {
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """One encoding.
+    """One encoding of modes, with the conventions that clients expect along with it.
 
     Attributes:
         autopilot: MAV_AUTOPILOT.
-        numbers: custom mode of each mode; the first is what is reported.
-        pairs: the second and third parameter of DO_SET_MODE are a main and a sub mode, as PX4 has it.
-        mission_has_home: item 0 of a mission is the home position and is not flown, as ArduPilot has it.
-        waypoints_turn: a place in a mission may have a heading. ArduSub takes none, and its clients write 0, which is north.
+        numbers: custom modes that stand for each mode; the first is reported.
+        pairs: the second and third parameter of DO_SET_MODE are a main and a sub mode, as in PX4.
+        mission_has_home: item 0 of a mission is the home position and is not flown, as in ArduPilot.
+        waypoints_turn: a place in a mission may have a heading. ArduSub ignores it, and its clients write 0, which is north.
         first_log: number of the oldest log. QGroundControl counts from 1 for ArduPilot alone.
-        first_motor: of a motor test. ArduSub's, and who tests them, count from 0.
-        rest_percent: the throttle of a motor test at which the motor stands. ArduSub's reaches from 0, full reverse, to 100 %.
+        first_motor: number of the first motor in a motor test. ArduSub and its test clients count from 0.
+        rest_percent: throttle of a motor test at which the motor stands still. ArduSub's throttle ranges from 0, full reverse, to 100 %.
     """
 
     name: str
@@ -53,11 +53,11 @@ class Identity:
     rest_percent: float
 
     def custom_mode(self, mode: Mode) -> int:
-        """The number that HEARTBEAT carries."""
+        """The custom mode that HEARTBEAT carries."""
         return self.numbers[mode][0]
 
     def mode(self, custom: int) -> Mode | None:
-        """The mode of a number, or None."""
+        """The mode that a custom mode stands for, or None."""
         return next((mode for mode, numbers in self.numbers.items() if custom in numbers), None)
 
     def mode_of_command(self, main: float, sub: float) -> Mode | None:
@@ -113,13 +113,13 @@ ARDUSUB = Identity(
 )
 
 IDENTITIES = {identity.name: identity for identity in (GENERIC, ARDUSUB)}
-"""By the name that the command line takes."""
+"""Identities by the name that the command line takes."""
 
 SETTABLE = tuple(row.mode for row in MODE_TABLE if row.request)
-"""Modes that a person may choose; DOCK is entered by asking for it."""
+"""Modes that a person may select; DOCK is entered by a docking request instead."""
 
 NAMES: Mapping[Mode, str] = {
     Mode.MANUAL: "Manual", Mode.STABILIZE: "Stabilize", Mode.ALT_HOLD: "Depth Hold", Mode.POSHOLD: "Position Hold",
     Mode.AUTO: "Auto", Mode.GUIDED: "Guided", Mode.SURFACE: "Surface", Mode.MOTOR_DETECT: "Motor Detection",
 }  # fmt: skip
-"""What people read in a menu. QGroundControl pauses, and starts missions, by these names of a submarine's modes."""
+"""Mode names shown in menus. QGroundControl pauses and starts missions by these names of a submarine's modes."""

@@ -1,6 +1,6 @@
-"""Links to ground stations: udpout, udpin, tcpin and serial, several at once. Never blocks; the oldest frame gives way.
+"""Links to ground stations: udpout, udpin, tcpin and serial, several at once. Never blocks; a full queue drops its oldest frame.
 
-Everyone at the other end is a channel with a number of its own. Runs beside the tick, never in it.
+Every peer is a channel with a number of its own. Runs beside the tick, never in it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 from firmware_py.ground.transport import Link, LinkError, open_link
 
 TRUSTED = "+trusted"
-"""Ending of an address whose link may set the signing key."""
+"""Suffix of an address whose link may set the signing key."""
 _QUEUE_FRAMES = 256
 _MOST_PEERS = 16
 _BUSY_FRAMES = 4
-"""More that wait: a link that takes what it is given has none left after a round."""
+"""A channel with more queued frames is busy: a link that keeps up has none left after a round."""
 
 
 class Received(NamedTuple):
@@ -26,27 +26,27 @@ class Received(NamedTuple):
     channel: int
     data: bytes
     datagram: bool
-    """Frames do not go on in what comes next."""
+    """Whether frames end with the data: none continues in the next piece."""
     trusted: bool
-    """Its link may set the signing key."""
+    """Whether the link may set the signing key."""
 
 
 @dataclass(slots=True)
 class Channel:
-    """Somebody at the other end of a link."""
+    """A peer at the other end of a link."""
 
     number: int
     link: Link
     peer: Any
     trusted: bool
     believed: bool = False
-    """A frame of it was taken for true: strangers do not take its place."""
+    """Whether a frame from the peer was believed; new peers displace unbelieved ones first."""
     queue: deque[bytes] = field(default_factory=lambda: deque(maxlen=_QUEUE_FRAMES))
     dropped: int = 0
-    """Frames that gave way to newer ones."""
+    """Frames dropped in favour of newer ones."""
 
     def put(self, frame: bytes) -> None:
-        """Queue `frame`; the oldest goes when there is no room."""
+        """Queues `frame`; drops the oldest frame when the queue is full."""
         self.dropped += len(self.queue) == self.queue.maxlen
         self.queue.append(frame)
 
@@ -55,7 +55,7 @@ class Links:
     """All links of one process."""
 
     def __init__(self, addresses: Sequence[str]) -> None:
-        """Opens every address. Raises LinkError, and leaves none open."""
+        """Opens every address. Raises LinkError, and then leaves no link open."""
         self.counts: Counter[str] = Counter()
         self.channels: dict[int, Channel] = {}
         self.links: list[Link] = []
@@ -75,7 +75,7 @@ class Links:
                 self._channel(index, peer)
 
     def receive(self) -> Iterator[Received]:
-        """What came on all links, without waiting. Who is believed by what it sent keeps its place before the next stranger is met."""
+        """Yields what arrived on all links, without waiting. A caller can `believe` each peer before the next new one might displace it."""
         for index, link in enumerate(self.links):
             try:
                 got = link.receive()
@@ -85,26 +85,26 @@ class Links:
             if not link.datagram:
                 self._meet(index, link.peers())
             for peer, data in got:
-                if data and (link.datagram or (index, peer) in self._by_peer):  # one that has left, or was one too many
+                if data and (link.datagram or (index, peer) in self._by_peer):  # skips stream peers that left or were refused
                     yield Received(self._channel(index, peer), data, link.datagram, self._trusted[index])
 
     def believe(self, channel: int) -> None:
-        """A frame that came on it was taken for true."""
+        """Marks a channel as one from which a frame was believed."""
         if channel in self.channels:
             self.channels[channel].believed = True
 
     def busy(self) -> set[int]:
-        """Channels that take their time: what can wait is not sent to them now."""
+        """Returns the channels under back-pressure: messages that can wait are not sent to them now."""
         return {number for number, channel in self.channels.items() if len(channel.queue) > _BUSY_FRAMES}
 
     def send(self, channel: int | None, frame: bytes) -> None:
-        """Queue a frame for one channel, or for all of them with None."""
+        """Queues a frame for one channel, or for all channels with None."""
         for number in list(self.channels) if channel is None else [channel]:
             if number in self.channels:
                 self.channels[number].put(frame)
 
     def flush(self) -> None:
-        """Hand to the system what it takes."""
+        """Hands queued frames to the operating system, as many as it accepts."""
         for channel in self.channels.values():
             while channel.queue:
                 try:
@@ -115,13 +115,13 @@ class Links:
                 channel.queue.popleft()
 
     def take_gone(self) -> list[int]:
-        """Channels that are no more, since the last call."""
+        """Returns the channels removed since the last call."""
         gone, self._gone = self._gone, []
         return gone
 
     @property
     def dropped(self) -> int:
-        """Frames that gave way to newer ones, all channels that are there."""
+        """Frames dropped in favour of newer ones, over all present channels."""
         return sum(channel.dropped for channel in self.channels.values())
 
     def close(self) -> None:
@@ -130,7 +130,7 @@ class Links:
             link.close()
 
     def _meet(self, index: int, there: Sequence[Any]) -> None:
-        """Who has connected is a channel before it says anything, and who has left is none any more."""
+        """Makes a channel of every new connection before it sends anything, and removes the channels of peers that left."""
         for key in [key for key in self._by_peer if key[0] == index and key[1] not in there]:
             self._forget(*key)
         for peer in there:
@@ -143,14 +143,14 @@ class Links:
                 self._channel(index, peer)
 
     def _same(self, index: int) -> list[tuple[int, Any]]:
-        """Who is at the other end of a link, who was silent longest first."""
+        """Returns the keys of a link's peers, longest silent first."""
         return [key for key in self._by_peer if key[0] == index]
 
     def _strangers(self, index: int) -> list[tuple[int, Any]]:
         return [key for key in self._same(index) if not self.channels[self._by_peer[key]].believed]
 
     def _channel(self, index: int, peer: Any) -> int:
-        """Number of a peer; a new one takes the place of who was silent longest, a stranger before anybody who was believed."""
+        """Returns a peer's channel number. On a full link a new peer displaces the longest silent one, those never believed first."""
         key = (index, peer)
         if key in self._by_peer:
             self._by_peer[key] = self._by_peer.pop(key)

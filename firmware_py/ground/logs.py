@@ -1,4 +1,4 @@
-"""The last flights, fetched by a ground station: LOG_REQUEST_LIST and LOG_REQUEST_DATA over the files of one folder."""
+"""Download of the last flights' logs by a ground station: LOG_REQUEST_LIST and LOG_REQUEST_DATA over the files of one folder."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from firmware_py.ground.system import Arrival, Handler, System
 
 _PIECE = 90
 _PIECES_AT_ONCE = 20
-"""Pieces sent in one round: 0.4 s of a radio of 57,600 Bd, for which an answer waits at the most."""
+"""Pieces sent per round. They take 0.4 s on a radio of 57,600 Bd: the longest that an answer waits for them."""
 _ENTRIES_AT_ONCE = 10
-"""Of a list: half as many frames as pieces, each with a look at its file."""
+"""Entries of a list sent per round: half as many frames as pieces, since each requires a look at its file."""
 _MOST_LOGS = 100
 _SUFFIXES = (".mcap", ".log")
 
@@ -31,11 +31,11 @@ class _Listing:
     arrival: Arrival
     last: int
     next: int | None = None
-    """None before the folder was looked at."""
+    """Number of the next entry; None before the folder has been read."""
 
 
 class LogService:
-    """The logs of one process, oldest first. They go out where nothing else waits to be sent."""
+    """The logs of one process, oldest first. They are sent only to channels that are not busy."""
 
     def __init__(self, system: System, folder: Path | None) -> None:
         self._system, self._folder = system, folder
@@ -47,7 +47,7 @@ class LogService:
         self._files: list[Path] = []
 
     def handlers(self) -> dict[str, Handler]:
-        """By message name."""
+        """Handlers by message name."""
         return {
             "LOG_REQUEST_LIST": self._list,
             "LOG_REQUEST_DATA": self._data,
@@ -56,7 +56,7 @@ class LogService:
         }
 
     def step(self) -> None:
-        """Send the next entries and pieces of what is asked for."""
+        """Sends the next entries of requested lists and the next pieces of requested logs."""
         for channel, listing in list(self._listings.items()):
             if channel not in self._system.channels:
                 del self._listings[channel]
@@ -79,7 +79,7 @@ class LogService:
             self._piece(t, data[start : start + _PIECE])
         if not data or t.left <= 0:
             if t.left > 0:
-                self._piece(t, b"")  # the end of the file, as the protocol tells it
+                self._piece(t, b"")  # an empty piece marks the end of the file
             del self._transfers[t.arrival.channel]
 
     def _piece(self, t: _Transfer, data: bytes) -> None:
@@ -92,7 +92,7 @@ class LogService:
         self._listings[arrival.channel] = _Listing(arrival, arrival.message["end"])
 
     def _tell(self, listing: _Listing) -> None:
-        """The folder is looked at once for a list, not for each request of a flood."""
+        """Sends the next entries of a list. The folder is read once per list, not for each request of a flood."""
         arrival = listing.arrival
         if listing.next is None:
             self._files = self._find()

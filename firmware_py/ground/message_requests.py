@@ -1,4 +1,4 @@
-"""What clients ask about messages: which are streamed how often, and which are wanted once."""
+"""Requests of clients for messages: rates of streams, and single messages."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ _GROUPS: Mapping[int, tuple[str, ...]] = {
     11: ("VFR_HUD",),  # EXTRA2
     12: ("SYSTEM_TIME", "BATTERY_STATUS"),  # EXTRA3
 }
-"""MAV_DATA_STREAM: what ArduSub counts among each, of what there is here."""
+"""Messages of each MAV_DATA_STREAM in ArduSub, as far as they exist here."""
 _ALL = 0
 _NAMES_OF = {_ALL: tuple(chain.from_iterable(_GROUPS.values())), **_GROUPS}
 
 
 class MessageRequests:
-    """What one system is asked to send."""
+    """Requests for messages of one system."""
 
     def __init__(self, system: System, extra: Mapping[str, Callable[[Arrival], bool]]) -> None:
-        """`extra` answers REQUEST_MESSAGE for messages that are not streamed; False means it cannot."""
+        """`extra` answers REQUEST_MESSAGE for messages that are not streamed; False means that it cannot."""
         self._system, self._extra = system, extra
 
     def table(self) -> dict[int, Callable[[Command], Answer]]:
-        """By the command's number."""
+        """Command handlers by command number."""
         return {
             410: lambda c: self._request(c, "HOME_POSITION"),
             510: self._get_interval,
@@ -43,11 +43,11 @@ class MessageRequests:
         }
 
     def handlers(self) -> dict[str, Handler]:
-        """By message name."""
+        """Handlers by message name."""
         return {"REQUEST_DATA_STREAM": self._set_group}
 
     def _set_group(self, arrival: Arrival) -> None:
-        """The old way, of QGroundControl, MAVProxy and many scripts with an ArduSub: it has no answer."""
+        """Takes REQUEST_DATA_STREAM, the old way of QGroundControl, MAVProxy and many scripts with an ArduSub; it has no answer."""
         m, rates = arrival.message, self._system.channels[arrival.channel]
         if m["start_stop"] not in (_STOP, _START):
             return

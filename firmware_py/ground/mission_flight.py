@@ -1,7 +1,7 @@
-"""Missions in the water: from items to legs, a plan asked of whoever can plan, and where on it the body is.
+"""Flight of missions: turns items into legs, requests a plan for them, and follows the body along it.
 
-Planning takes a second and happens elsewhere: a PlanJob goes out, a Plan comes back, and the body tracks it. Whoever takes the body for
-something else until then ends the flight.
+Planning takes a second and happens elsewhere: a PlanJob goes out, a Plan comes back, and the body tracks it. A request that gives the body
+another task before then ends the flight.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from firmware_py.ground.system import NS_PER_S, System
 from firmware_py.ground.telemetry import ACTIVE, DONE, NO_MISSION, PAUSED, READY, mission_current
 
 _SETTLE_TICKS = 3
-"""Ticks from asking for a hold to reading where it is held."""
+"""Ticks from the request of a hold to reading where the body is held."""
 _HOLD_TICKS = 100
-"""Ticks from asking for a hold until it must be there: those that were queued while the loop took the request count too."""
+"""Ticks from the request of a hold until it must be in force; ticks queued while the loop took the request count too."""
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
 _GO_TO = -1
 """Sequence number of a leg that belongs to no mission."""
 _PRESENT = -1
-"""DO_SET_MISSION_CURRENT's number of the item that is current."""
+"""DO_SET_MISSION_CURRENT's number for the current item."""
 
 
 class Leg(NamedTuple):
@@ -46,17 +46,17 @@ class Leg(NamedTuple):
 
     sequence: int
     p_wb: np.ndarray | None
-    """(3,) m; None: where it is."""
+    """(3,) m; None: the present place."""
     yaw: float | None
-    """rad; None: as before."""
+    """rad; None: unchanged."""
     hold_s: float
-    """How long to stay; above 0 it stops there."""
+    """Time to stay; above 0 the body stops there."""
     speed_m_s: float
-    """NaN, before it is planned: as missions are flown then."""
+    """NaN, until planned: the speed of missions at that time."""
 
 
 class PlanJob(NamedTuple):
-    """What is to be planned."""
+    """A flight to be planned."""
 
     body: int
     serial: int
@@ -68,37 +68,37 @@ class PlanJob(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A planned flight; `arrivals_s` says when each leg's place is reached."""
+    """A planned flight; `arrivals_s` are the times at which the legs' places are reached."""
 
     serial: int
     trajectory: Trajectory | None
     arrivals_s: tuple[float, ...]
     reason: str = ""
-    """Why there is none."""
+    """Why there is no trajectory."""
 
 
 @dataclass(slots=True)
 class _Flight:
-    """Legs under way."""
+    """A flight under way, or waiting for its plan."""
 
     legs: tuple[Leg, ...]
     terms: tuple[Any, ...]
-    """All that its plan is made of, but where it begins."""
+    """All inputs of the plan, except the start pose."""
     arrivals_s: tuple[float, ...] = ()
     taken: int = 0
-    """System.taken when it began, and while it is followed, as of the last tick."""
+    """System.taken when the flight was requested; while it is tracked, as of the last tick."""
     members: tuple[int, ...] = ()
-    """Fleet indices of the body's modules then: it is planned for these."""
+    """Fleet indices of the body's modules when the flight was requested: it is planned for these."""
     holds: bool = False
-    """The hold in which it waits for its plan was there."""
+    """Whether the hold in which the body waits for the plan has been in force."""
     started_ns: int | None = None
     reached: int = 0
     replaced: bool = False
-    """It is of the mission before: of the one that is there now nothing is flown."""
+    """Whether the flight belongs to the previous mission; then nothing of the present one is flown."""
 
     @property
     def of_mission(self) -> bool:
-        """Whether it is one of a mission, and no way to a single place."""
+        """Whether the flight belongs to a mission, rather than going to a single place."""
         return self.legs[0].sequence != _GO_TO
 
 
@@ -109,23 +109,23 @@ class MissionFlight:
         self._system, self._parameters = system, parameters
         self.items: tuple[Item, ...] = ()
         self.jobs: list[PlanJob] = []
-        """To be planned; whoever plans takes them."""
+        """Flights to be planned; the planner takes them."""
         self._serial = 0
         self._flight: _Flight | None = None
         self._left: tuple[Leg, ...] = ()
-        """Of the mission that is paused: jumps that were made are not made again."""
+        """Legs left of a paused mission: jumps already made are not repeated."""
         self._begun_at: int | None = None
-        """The item from which it was begun last; None where a jump is to begin it there once more."""
+        """Item from which the mission was last started; None while a jump restarts it, perhaps from the same item."""
         self._plan_at_tick: int | None = None
-        """None once it is asked for."""
+        """Tick at which to request the plan; None once it is requested."""
         self._hold_by_tick = 0
         self._speed: float | None = None
         self._repeat: list[tuple[int, int]] = []
 
-    # ------------------------------------------------------------ what is asked
+    # ------------------------------------------------------------ requests
 
     def replace(self, items: tuple[Item, ...]) -> None:
-        """A new mission, ready to be started. What flies goes on, of the old one; what is still being planned of it is not flown."""
+        """Takes a new mission, ready to be started. A flight of the old one goes on; one still being planned is cancelled."""
         if self._flight is not None and self._flight.of_mission and not self._flight.arrivals_s:
             self._end_before_it_began("its mission was replaced")
         self.amend(items)
@@ -136,29 +136,30 @@ class MissionFlight:
             self._flight.replaced = self._flight.of_mission
 
     def amend(self, items: tuple[Item, ...]) -> None:
-        """The same mission with other items in it, while it does not fly: it goes on where it is."""
+        """Changes items of the mission while it is not flown; it resumes at its current item."""
         self.items, self._left = items, ()
 
     def against(self, item: Item) -> tuple[int, str]:
-        """A MAV_MISSION_RESULT and why `item` is flown nowhere, by the fence as it is now; 0: it is."""
+        """Checks `item` against the present fence. Returns a MAV_MISSION_RESULT, 0 if it can be flown, and why it cannot."""
         place = item.place(self._system.subject.origin) if item.sequence >= self._first else None
         return (0, "") if place is None else beyond_fence(place, self._parameters().fence)
 
     @property
     def awaited(self) -> int:
-        """Serial number of the job whose plan is waited for; 0: of none."""
+        """Serial number of the job whose plan is awaited; 0: none."""
         waits = self._flight is not None and self._plan_at_tick is None and not self._flight.arrivals_s
         return self._serial if waits else 0
 
     @property
     def flies(self) -> bool:
-        """Whether the mission that is there is under way."""
+        """Whether the present mission is under way."""
         return self._system.subject.progress.state == ACTIVE
 
     def start(self, first: int | None) -> str:
-        """Fly from item `first`, or go on where it stopped. What flies from there already flies on: its answer may be lost.
+        """Starts the mission at item `first`; with None resumes it where it stopped. One already started there flies on: the answer to the
+        first request may have been lost.
 
-        Returns why not, or nothing.
+        Returns why not, or an empty text.
         """
         s = self._system.subject
         self._end_if_taken()
@@ -167,7 +168,7 @@ class MissionFlight:
         if not s.armed:
             return "the vehicle is disarmed"
         if self._flight is not None and self._system.taken != self._flight.taken:
-            self._end(PAUSED)  # the next tick would, by what was asked before this: it flies on no more
+            self._end(PAUSED)  # an earlier request gave the body another task, and the next tick would end the flight
         wanted = first
         if wanted is None:
             wanted = s.progress.current if s.progress.state == PAUSED else 0
@@ -186,7 +187,7 @@ class MissionFlight:
         return ""
 
     def jump(self, index: int) -> str:
-        """Go on at item `index`, -1: at the present one, and tell which it is. Returns why not, or nothing."""
+        """Continues at item `index` (-1: the current one) and broadcasts MISSION_CURRENT. Returns why not, or an empty text."""
         s = self._system.subject
         reason = self._jump(s.progress.current if index == _PRESENT else index)
         if not reason:
@@ -205,7 +206,7 @@ class MissionFlight:
         return ""
 
     def set_speed(self, speed_m_s: float) -> str:
-        """Speed of what is planned from now on; -1: as before, -2: as the parameter says. Returns why not, or nothing."""
+        """Sets the speed of flights planned from now on; -1: unchanged, -2: the parameter's. Returns why not, or an empty text."""
         wanted = {SPEED_STAYS: self._speed, SPEED_DEFAULT: None}.get(speed_m_s, speed_m_s)
         if wanted is not None and not SLOWEST <= wanted <= FASTEST:
             return _no_speed(wanted)
@@ -213,7 +214,7 @@ class MissionFlight:
         return ""
 
     def go_to(self, latitude_deg: float, longitude_deg: float, altitude_m: float, yaw: float, speed_m_s: float) -> str:
-        """Fly to one place inside the fence; a speed of 0 or less is that of missions. Returns why not, or nothing."""
+        """Flies to one place inside the fence; a speed of 0 or less means that of missions. Returns why not, or an empty text."""
         s = self._system.subject
         if not s.armed:
             return "the vehicle is disarmed"
@@ -229,10 +230,10 @@ class MissionFlight:
         self._begin((Leg(_GO_TO, place, turned, 0.0, speed_m_s if speed_m_s > 0 else math.nan),))
         return ""
 
-    # ------------------------------------------------------------ what happens
+    # ------------------------------------------------------------ events
 
     def planned(self, plan: Plan) -> None:
-        """A plan came back; nothing is asked of a body that does something else by now."""
+        """Takes a finished plan and requests tracking, unless the body has been given another task meanwhile."""
         self._end_if_taken()
         if plan.serial != self._serial or self._flight is None:
             return
@@ -244,12 +245,12 @@ class MissionFlight:
         self._system.ask(Action.TRACK, plan.trajectory)
 
     def hear(self, event: Event) -> None:
-        """A refusal ends the flight."""
+        """Takes an event; a refusal of TRACK ends the flight that waits for it."""
         if event.text.startswith("TRACK refused") and self._flight is not None and self._flight.started_ns is None:
             self._end(PAUSED)
 
     def step(self, time_ns: int) -> None:
-        """Follow the body along its legs."""
+        """Follows the body along its legs."""
         self._end_if_taken()
         self._ask_for_plan()
         flight, s = self._flight, self._system.subject
@@ -258,14 +259,14 @@ class MissionFlight:
             if tracking and flight.started_ns is None:
                 flight.started_ns = time_ns
             if tracking:
-                flight.taken = self._system.taken  # of what was asked nothing has taken the body
+                flight.taken = self._system.taken  # no request so far has given the body another task
                 self._advance(flight, time_ns)
             elif flight.started_ns is not None:
                 self._end(PAUSED)
         self._tell_again(time_ns)
 
     def _end_if_taken(self) -> None:
-        """End a flight that did not begin when the body no longer waits for it."""
+        """Ends a flight that has not begun if the body no longer waits for it."""
         flight = self._flight
         if flight is None or flight.started_ns is not None:
             return
@@ -278,7 +279,7 @@ class MissionFlight:
         self._end(PAUSED)
 
     def _against_waiting(self, flight: _Flight) -> str:
-        """Why a flight is not waited for any more; empty while it is."""
+        """Returns why the body no longer waits for a flight; empty while it does."""
         s = self._system.subject
         mode = s.picture.mode(s.body)
         flight.holds = flight.holds or mode == Mode.POSHOLD
@@ -318,7 +319,7 @@ class MissionFlight:
         return ground.mission_acceleration, ground.mission_corridor_m, *places, *rest
 
     def _flies_already(self, legs: Sequence[Leg]) -> bool:
-        """Whether just these are under way, and none of them is reached: who asks again did not hear the answer."""
+        """Whether exactly these legs are under way and none is reached: a client repeats its request if the answer was lost."""
         flight = self._flight
         if flight is None or flight.replaced or flight.reached or flight.taken != self._system.taken:
             return False
@@ -349,7 +350,7 @@ class MissionFlight:
         if self._flies_already(legs):
             return
         s = self._system.subject
-        self._serial += 1  # a plan that is still being made is no longer wanted
+        self._serial += 1  # makes a plan still in progress obsolete
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
         self._flight = _Flight(tuple(legs), self._terms(legs), taken=self._system.taken, members=s.picture.members(s.body))
         self._plan_at_tick, self._hold_by_tick = s.picture.ticks + _SETTLE_TICKS, s.picture.ticks + _HOLD_TICKS
@@ -372,10 +373,10 @@ class MissionFlight:
     def _legs(self, first: int) -> tuple[Leg, ...]:
         origin, turns, speed = self._system.subject.origin, self._system.subject.identity.waypoints_turn, math.nan
         legs: list[Leg] = []
-        speeds = [item for item in self.items[:first] if item.speed_m_s is not None]  # one that was passed goes on to count
+        speeds = [item for item in self.items[:first] if item.speed_m_s is not None]  # speeds set by passed items stay in force
         for item in (*speeds, *flight_order(self.items, first)):
             if item.sequence < self._first:
-                continue  # home, to which a jump leads
+                continue  # home, the target of a jump
             if item.speed_m_s is not None:
                 speed = item.speed_m_s if item.speed_m_s > 0 else math.nan
             place = item.place(origin)

@@ -1,4 +1,4 @@
-"""Mission items as values: which commands and frames are flown, and in which order. Geodetic frames only.
+"""Mission items as values: supported commands and frames, and the order of flight. Geodetic frames only.
 
 QGroundControl scales LOCAL_NED wrongly, so items in it are refused.
 """
@@ -23,27 +23,27 @@ _COMMANDS = (*PLACES, DELAY, JUMP, CHANGE_SPEED)
 ABSOLUTE, RELATIVE = (0, 5), (3, 6)
 """MAV_FRAME of absolute altitude, and of altitude relative to home."""
 UNSUPPORTED_FRAME, UNSUPPORTED, INVALID_1, INVALID_X, INVALID_Y, INVALID_Z = 2, 3, 6, 10, 11, 12
-"""MAV_MISSION_RESULT; the invalid parameters count on from INVALID_1."""
+"""MAV_MISSION_RESULT; the codes of invalid parameters count up from INVALID_1."""
 SPEED_STAYS, SPEED_DEFAULT = -1.0, -2.0
-"""What DO_CHANGE_SPEED has in place of a speed."""
+"""Special values of DO_CHANGE_SPEED's speed."""
 SLOWEST, FASTEST = 0.01, 2.0
-"""m/s that may be asked for."""
+"""Range of speeds that may be requested, m/s."""
 ONE_WAY_SPEEDS = (2, 3)
-"""SPEED_TYPE of climbing and of descending alone: there are no such speeds."""
+"""SPEED_TYPE of climb speed and of descent speed, which do not exist here."""
 _MOST_STEPS = 1000
 _LONGEST_S = 86_400.0
 _BEYOND = {"north_m": INVALID_X, "east_m": INVALID_Y, "top_m": INVALID_Z, "bottom_m": INVALID_Z}
-"""What an item is refused for that lies beyond this side of the fence."""
+"""Result for an item that lies beyond the given side of the fence."""
 _ON_FENCE_M = 0.02
-"""Beyond the fence by less is on it: the wire's 1e-7 degrees are 11 mm."""
+"""Tolerance of the fence check: the wire's resolution of 1e-7 degrees is 11 mm."""
 
 
 class MissionError(ValueError):
-    """A mission cannot be flown; one line."""
+    """A mission cannot be flown; the message is one line."""
 
 
 class Item(NamedTuple):
-    """One item, as it came."""
+    """One item, as received."""
 
     sequence: int
     command: int
@@ -51,35 +51,35 @@ class Item(NamedTuple):
     parameters: tuple[float, float, float, float]
     x: int
     y: int
-    """1e-7 deg."""
+    """x and y are latitude and longitude, 1e-7 deg."""
     z: float
     autocontinue: int = 1
 
     @property
     def is_place(self) -> bool:
-        """Whether it is flown to."""
+        """Whether the item is a place to fly to."""
         return self.command in PLACES
 
     @property
     def yaw(self) -> float | None:
-        """rad, or None; a spline's fourth parameter is empty."""
+        """Heading at the place, rad, or None; a spline's fourth parameter is unused."""
         return math.radians(self.parameters[3]) if self.command != LAST_SPLINE and math.isfinite(self.parameters[3]) else None
 
     @property
     def hold_s(self) -> float:
-        """Time at the place."""
+        """Time to stay at the place."""
         if self.command in (WAYPOINT, LOITER_TIME, LAST_SPLINE) and math.isfinite(self.parameters[0]):
             return self.parameters[0]
         return 0.0
 
     @property
     def delay_s(self) -> float:
-        """Time that a delay takes."""
+        """Duration of a delay; 0 for other items."""
         return self.parameters[0] if self.command == DELAY else 0.0
 
     @property
     def speed_m_s(self) -> float | None:
-        """What a change of speed asks for; 0 or less: the default. None where it stays."""
+        """Speed that a change of speed requests; 0 or less: the default. None where the speed stays."""
         speed = self.parameters[1]
         return speed if self.command == CHANGE_SPEED and math.isfinite(speed) and speed != SPEED_STAYS else None
 
@@ -92,7 +92,7 @@ class Item(NamedTuple):
 
 
 def item_of(message: Message) -> tuple[Item, int]:
-    """The item of a MISSION_ITEM_INT or MISSION_ITEM, and a MAV_MISSION_RESULT: what is wrong with it (0: nothing)."""
+    """Returns the item of a MISSION_ITEM_INT or MISSION_ITEM, and a MAV_MISSION_RESULT for what is wrong with it (0: nothing)."""
     m = message
     degrees = m.name == "MISSION_ITEM"
     x, y = m["x"], m["y"]
@@ -128,7 +128,7 @@ def _fault(item: Item) -> int:
 
 
 def beyond_fence(place: np.ndarray, fence: Fence) -> tuple[int, str]:
-    """A MAV_MISSION_RESULT for a place (3,) NED, m, and in words which side of the fence it is beyond; 0 inside."""
+    """Checks a place (3,) NED, m. Returns a MAV_MISSION_RESULT, 0 inside, and in words which side of the fence the place is beyond."""
     for side, beyond_m in beyond(place, fence).items():
         if beyond_m > _ON_FENCE_M:
             return _BEYOND[side], f"{beyond_m:.2f} m beyond {limits_of(Fence, side).mavlink}, {getattr(fence, side):g} m"
@@ -136,10 +136,10 @@ def beyond_fence(place: np.ndarray, fence: Fence) -> tuple[int, str]:
 
 
 def flight_order(items: Sequence[Item], first: int) -> Iterator[Item]:
-    """The items as they are passed from `first` on, jumps followed.
+    """Yields the items in the order of flight from `first` on, following jumps.
 
     Raises:
-        MissionError: it never ends, or a jump leads nowhere.
+        MissionError: the mission never ends or has too many steps, or a jump has no target.
     """
     left = {item.sequence: int(item.parameters[1]) for item in items if item.command == JUMP}
     at, steps = first, 0

@@ -1,6 +1,6 @@
-"""The mission protocol: up, down, clear, set current. A transfer that breaks off leaves the old mission as it was.
+"""The mission protocol: upload, download, clear, set current. An upload that breaks off leaves the old mission unchanged.
 
-Source: MAVLink developer guide, "Mission Protocol". The vehicle asks for each item, and asks again when none comes.
+Source: MAVLink developer guide, "Mission Protocol". The vehicle requests each item, and repeats the request when no item arrives.
 """
 
 from __future__ import annotations
@@ -18,41 +18,41 @@ _MISSION = 0
 _ACCEPTED, _UNSUPPORTED, _NO_SPACE, _INVALID_SEQUENCE, _DENIED, _CANCELLED = 0, 3, 4, 13, 14, 15
 _ASK_AGAIN_NS, _MOST_ASKED = 250_000_000, 20
 _ASKED_ALIKE = 4
-"""Times that an item is asked for in one form, before the other has its turn. DroneKit hears the old one alone; others answer it in degrees
-of 32 bits, which tell a place to a metre, or refuse it.
+"""Requests for an item in one form, INT or old, before the other form is tried. DroneKit understands only the old form; other clients
+answer it with float32 degrees, which resolve a place to a metre, or refuse it.
 """
 _FLIES = "it flies, and is not changed in part"
 _AT_ONCE = (2, 3)
-"""What stands for `current` in an item of no mission: ArduPilot's way to go to a place or to an altitude at once."""
+"""Values of `current` in an item outside a mission: ArduPilot's way to go to a place or to an altitude at once."""
 
 
 @dataclass(slots=True)
 class _Upload:
-    """A mission that is coming in."""
+    """A mission upload in progress."""
 
     arrival: Arrival
     count: int
-    """Of items with those that stay before them."""
+    """Number of items to be uploaded, plus those that stay before them."""
     kind: int
     items: list[Item] = field(default_factory=list)
     rest: tuple[Item, ...] = ()
-    """Those that stay behind them."""
+    """Items that stay after the uploaded ones."""
     in_part: bool = False
     asked_ns: int = 0
     asked: int = 0
-    """Times, for the next item."""
+    """Requests made so far for the next item."""
 
     @property
     def in_old_form(self) -> bool:
-        """Whether the last request was."""
+        """Whether the last request was in the old form, MISSION_REQUEST."""
         return (self.asked - 1) // _ASKED_ALIKE % 2 == 1
 
 
 class _Ended(NamedTuple):
-    """How a mission came to its end."""
+    """The end of the last upload."""
 
     item: Arrival
-    """With which it did."""
+    """The item that ended it."""
     result: int
 
 
@@ -65,7 +65,7 @@ class MissionService:
         self._ended: _Ended | None = None
 
     def handlers(self) -> dict[str, Handler]:
-        """By message name."""
+        """Handlers by message name."""
         return {
             "MISSION_COUNT": self._count,
             "MISSION_WRITE_PARTIAL_LIST": self._write_part,
@@ -81,7 +81,7 @@ class MissionService:
         }
 
     def step(self, time_ns: int) -> None:
-        """Ask again for an item that did not come."""
+        """Repeats the request for an item that did not arrive; gives the upload up after too many requests."""
         upload = self._upload
         if upload is None or time_ns - upload.asked_ns < _ASK_AGAIN_NS:
             return
@@ -92,11 +92,11 @@ class MissionService:
         else:
             self._ask(upload, time_ns)
 
-    # ------------------------------------------------------------ up
+    # ------------------------------------------------------------ upload
 
     def _count(self, arrival: Arrival) -> None:
         count, kind = arrival.message["count"], arrival.message["mission_type"]
-        if kind != _MISSION:  # fences and rally points are not kept; none of them is fine
+        if kind != _MISSION:  # fences and rally points are not stored; an empty list is accepted
             self._acknowledge(arrival, _UNSUPPORTED if count else _ACCEPTED, kind)
             return
         if count > MOST_ITEMS:
@@ -114,7 +114,7 @@ class MissionService:
         self._ask(self._upload, arrival.time_ns)
 
     def _write_part(self, arrival: Arrival) -> None:
-        """Items that take the place of others, in a mission that does not fly: those before and behind them stay."""
+        """Starts to replace a range of items in a mission that is not being flown; the items before and after the range stay."""
         first, last, kind = (arrival.message[name] for name in ("start_index", "end_index", "mission_type"))
         known = self._flight.items
         if kind != _MISSION or not 0 <= first <= last < len(known):
@@ -126,9 +126,9 @@ class MissionService:
             self._ask(self._upload, arrival.time_ns)
 
     def _against(self, arrival: Arrival) -> str:
-        """Why no mission may come from there now, or nothing."""
+        """Returns why this client may not upload a mission now; empty if it may."""
         if self._system.is_one_of_several(arrival):
-            return "it is for all, and there are several bodies"  # they would fly to one place
+            return "it is for all, and there are several bodies"  # they would fly to the same place
         return "another station is sending one" if self._upload is not None and not _same(self._upload.arrival, arrival) else ""
 
     def _deny(self, arrival: Arrival, kind: int, reason: str) -> None:
@@ -147,7 +147,7 @@ class MissionService:
             return
         sequence = arrival.message["seq"]
         if sequence != len(upload.items):
-            return  # it came twice, or one is missing: that one is asked for again
+            return  # a duplicate, or an item was lost: the missing one is requested again
         item, fault = item_of(arrival.message)
         why = f"command {item.command}, frame {item.frame}"
         if not fault:
@@ -161,7 +161,7 @@ class MissionService:
         if len(upload.items) < upload.count:
             self._ask(upload, arrival.time_ns)
             return
-        if upload.in_part and self._flight.flies:  # it was started meanwhile
+        if upload.in_part and self._flight.flies:  # the mission was started meanwhile
             self._system.say(WARNING, f"mission refused: {_FLIES}")
             self._end(arrival, _DENIED, upload.kind)
             return
@@ -169,7 +169,10 @@ class MissionService:
         self._end(arrival, _ACCEPTED, upload.kind)
 
     def _item_of_none(self, arrival: Arrival) -> None:
-        """It is of no transfer that goes on: the last one of its sender's, whose answer was lost, or a place to go to at once."""
+        """Answers an item outside the upload in progress: a repeat of the item that ended the last one, or a place to go to at once.
+
+        An item is repeated when the answer to it was lost.
+        """
         kind = arrival.message["mission_type"]
         if self._ended is not None and _is_again(arrival, self._ended.item):
             self._acknowledge(arrival, self._ended.result, kind)
@@ -189,14 +192,14 @@ class MissionService:
         self._acknowledge(arrival, _ACCEPTED, kind)
 
     def _acknowledged(self, arrival: Arrival) -> None:
-        """Of a download: nothing to do. During an upload the client gives it up, but where it speaks of fences or rally points."""
+        """Takes MISSION_ACK: no effect after a download; cancels an upload, unless it concerns fences or rally points."""
         upload, m = self._upload, arrival.message
         if upload is None or not _brings(arrival, upload) or m["type"] == _ACCEPTED:
             return
-        if not (m["type"] == _UNSUPPORTED and upload.in_old_form):  # MAVSDK refuses the old form so, and goes on
+        if not (m["type"] == _UNSUPPORTED and upload.in_old_form):  # MAVSDK refuses the old form this way, and continues
             self._upload = None
 
-    # ------------------------------------------------------------ down
+    # ------------------------------------------------------------ download
 
     def _list(self, arrival: Arrival) -> None:
         kind = arrival.message["mission_type"]
@@ -233,7 +236,7 @@ class MissionService:
 
 
 def _sent_frame(item: Item, whole: bool) -> int:
-    """The item's frame in the INT form or not, as the message has it."""
+    """Returns the item's MAV_FRAME for a download: the INT variant for MISSION_ITEM_INT (`whole`), else the plain one."""
     if item.command in (DELAY, JUMP, CHANGE_SPEED):
         return item.frame
     pairs = {0: 5, 3: 6} if whole else {5: 0, 6: 3}
@@ -245,7 +248,7 @@ def _is_again(item: Arrival, before: Arrival) -> bool:
 
 
 def _brings(arrival: Arrival, upload: _Upload) -> bool:
-    """Whether it is of the transfer. Two stations may have one number, as all of QGroundControl have: the channel tells them apart."""
+    """Whether a message belongs to the upload. Stations may share a system id, as all QGroundControls do; the channel tells them apart."""
     told = _same(upload.arrival, arrival) and arrival.channel == upload.arrival.channel
     return told and arrival.message["mission_type"] == upload.kind
 

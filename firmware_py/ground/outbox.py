@@ -1,4 +1,4 @@
-"""What one system sends: to whom, and how often. Each channel has its own sequence and its own rates."""
+"""Messages that one system sends: to which channel, and how often. Each channel has its own sequence numbers and rates."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from firmware_py.ground.signing import Signing
 from firmware_py.ground.wire import Encoder
 
 _HURRY_NS = 100_000_000
-"""Between two of what is hurried."""
+"""Least time between two hurried messages of one name."""
 
 
 class Outgoing(NamedTuple):
@@ -22,7 +22,7 @@ class Outgoing(NamedTuple):
 
 
 class Rates:
-    """Which message is due on one channel."""
+    """Schedule of the messages on one channel."""
 
     def __init__(self, intervals_ns: Mapping[str, int], now_ns: int) -> None:
         self.intervals_ns = dict(intervals_ns)
@@ -30,7 +30,7 @@ class Rates:
         self._sent_ns: dict[str, int] = {}
 
     def set(self, name: str, interval_ns: int, now_ns: int) -> None:
-        """Send `name` every `interval_ns`; 0 ends it."""
+        """Sends `name` every `interval_ns` from now on; 0 stops it."""
         if interval_ns <= 0:
             self.intervals_ns.pop(name, None)
             self._next_ns.pop(name, None)
@@ -39,13 +39,13 @@ class Rates:
             self._next_ns[name] = now_ns
 
     def hurry(self, name: str, now_ns: int) -> None:
-        """Send `name` now, or as soon after the last one as may be, and from then on as often as before."""
+        """Makes `name` due now, or as soon after the last one as allowed; then its interval applies as before."""
         if name in self._next_ns:
             soonest_ns = self._sent_ns.get(name, now_ns - _HURRY_NS) + _HURRY_NS
             self._next_ns[name] = min(self._next_ns[name], max(now_ns, soonest_ns))
 
     def due(self, now_ns: int, among: Container[str]) -> list[str]:
-        """What is to be sent now; what was missed is not made up. What is not `among` these waits for the next call."""
+        """Returns the messages due now, and schedules the next; missed ones are not made up. Messages not in `among` stay due."""
         names = [name for name, next_ns in self._next_ns.items() if next_ns <= now_ns and name in among]
         for name in names:
             interval = self.intervals_ns[name]
@@ -55,7 +55,7 @@ class Rates:
 
 
 class Outbox:
-    """Frames of one system, until somebody takes them."""
+    """Encodes the messages of one system, and appends the frames to a list from which they are taken."""
 
     def __init__(self, dialect: Dialect, signing: Signing, system: int, frames: list[Outgoing]) -> None:
         self._dialect, self._signing = dialect, signing
@@ -64,15 +64,15 @@ class Outbox:
         self._encoders: dict[int, Encoder] = {}
 
     def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
-        """Send one message. Raises KeyError for a message or field that there is not."""
+        """Sends one message. Raises KeyError for an unknown message or field."""
         self.send_payload(channel, name, self.payload(name, values))
 
     def payload(self, name: str, values: Mapping[str, Any]) -> bytes:
-        """A message's payload, to be sent on several channels."""
+        """Encodes a message's payload, to be sent on several channels."""
         return self._dialect.by_name[name].encode(values)
 
     def send_payload(self, channel: int, name: str, payload: bytes) -> None:
-        """Send one message that is encoded already."""
+        """Sends one message that is already encoded."""
         encoder = self._encoders.get(channel)
         if encoder is None:
             encoder = self._encoders[channel] = Encoder(self._dialect, self._signing, self.system, COMPONENT_AUTOPILOT)
@@ -84,5 +84,5 @@ class Outbox:
         return "" if definition is None else definition.name
 
     def forget(self, channel: int) -> None:
-        """The channel is gone."""
+        """Forgets a channel that is gone."""
         self._encoders.pop(channel, None)

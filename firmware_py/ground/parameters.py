@@ -1,6 +1,6 @@
 """The parameter protocol over the registry of description.parameters. Everything is REAL32 on the wire.
 
-Integers on the wire are bytewise for some clients and cast for others; REAL32 is the one form that all understand.
+Some clients send integers bytewise, others cast them; REAL32 is the one form that all clients understand.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from firmware_py.ground.system import Arrival, Handler, System
 
 REAL32 = 9
 _INTEGERS = {1: "<B", 2: "<b", 3: "<H", 4: "<h", 5: "<I", 6: "<i"}
-"""MAV_PARAM_TYPE of integers that fit, and how their bytes lie in the float."""
+"""Integer types by MAV_PARAM_TYPE that fit into a float's four bytes, with their struct formats."""
 _SMALLEST_NORMAL = 1.1754944e-38
 _AT_ONCE = 5
-"""Values sent in one tick when all are asked for: a radio's buffer is small."""
+"""Values sent per tick when a client requests all: a radio's buffer is small."""
 
 
 class ParameterStore:
-    """The parameters of the process; a change is a new object."""
+    """The parameters of the process; every change makes a new object."""
 
     def __init__(self, parameters: Parameters, path: Path | None = None) -> None:
-        """Lays what `path` holds over `parameters`, with which the process was started. Raises DescriptionError."""
+        """Overlays `parameters`, with which the process was started, with the values stored in `path`. Raises DescriptionError."""
         self._path, self._started = path, parameters
         self.values = laid_over(parameters, path)
         self.names: dict[str, tuple[str, Limits]] = {
@@ -42,12 +42,12 @@ class ParameterStore:
         self.order = list(self.names)
 
     def get(self, name: str) -> float:
-        """The value of a MAVLink name. Raises KeyError."""
+        """Returns the value of the parameter with this MAVLink name. Raises KeyError."""
         return float(attrgetter(self.names[name][0])(self.values))
 
     def set(self, name: str, value: float) -> tuple[str, float]:
-        """Change one and store all that differ from the start, where it is no longer as it was; returns its name in the registry and the
-        value as kept.
+        """Changes one parameter; if its value is new, stores all parameters that differ from those at start. Returns the name in the
+        registry and the value as kept.
 
         Raises:
             DescriptionError: out of range.
@@ -70,17 +70,17 @@ class ParameterService:
     def __init__(self, system: System, store: ParameterStore, everybody: Callable[[], list[System]]) -> None:
         self._system, self._store, self._everybody = system, store, everybody
         self._to_send: dict[int, int] = {}
-        """Of each channel that asked for all: the next one."""
+        """Index of the next parameter to send, for each channel that requested all."""
 
     def handlers(self) -> dict[str, Handler]:
-        """By message name."""
+        """Handlers by message name."""
         return {"PARAM_REQUEST_LIST": self._list, "PARAM_REQUEST_READ": self._read, "PARAM_SET": self._set}
 
     def _list(self, arrival: Arrival) -> None:
         self._to_send[arrival.channel] = 0
 
     def step(self) -> None:
-        """Send the next few to everybody who asked for all, where nothing else waits to be sent."""
+        """Sends the next few values on every channel that requested all and is not busy."""
         for channel, first in list(self._to_send.items()):
             if channel in self._system.busy:
                 continue
@@ -109,11 +109,11 @@ class ParameterService:
             dotted, kept = self._store.set(name, value)
         except (DescriptionError, OSError) as error:
             stays = f"parameter {name} stays, it cannot be stored"
-            wrong = str(error).replace(self._store.names[name][0], name)  # a client knows no other name of it
+            wrong = str(error).replace(self._store.names[name][0], name)  # clients know only the MAVLink name
             self._system.say(WARNING, f"{stays}: {error.filename}: {error.strerror}" if isinstance(error, OSError) else wrong)
             self._system.send(arrival.channel, "PARAM_VALUE", self._value(name))
             return
-        self._system.ask(Action.SET_PARAMETER, (dotted, kept))  # it is for every body
+        self._system.ask(Action.SET_PARAMETER, (dotted, kept))  # applies to every body
         for system in self._everybody():
             system.broadcast("PARAM_VALUE", self._value(name))
 
@@ -125,9 +125,9 @@ class ParameterService:
 
 
 def wire_value(value: float, kind: int) -> float:
-    """What a client meant: the shortest decimal of a REAL32, or an integer that is cast or lies bytewise in the float.
+    """Returns the value that a client meant: the shortest decimal of a REAL32, or an integer, cast to the float or placed in it bytewise.
 
-    An integer's bytes make a denormal float or NaN, which nobody casts one to; so the two forms cannot be confused.
+    The bytes of an integer below 2^23 in magnitude form a denormal float or NaN, which no cast yields, so the two forms cannot be confused.
     """
     if kind in _INTEGERS and (math.isnan(value) or 0 < abs(value) < _SMALLEST_NORMAL):
         letter = _INTEGERS[kind]

@@ -1,4 +1,4 @@
-"""What is known of the fleet, gathered tick by tick from Inputs and Outputs: the one thing that telemetry reads."""
+"""State of the fleet, gathered tick by tick from Inputs and Outputs: the only source of telemetry."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from firmware_py.description.parameters import Supervision
 from firmware_py.ground.times import Times
 
 ESC_SILENT = 3
-"""EscStatus of one that is not heard."""
+"""EscStatus of an ESC that is not heard."""
 _MOST_EVENTS = 64
 
 
 @dataclass(slots=True)
 class ModulePicture:
-    """The newest of every slow reading of one module; NaN before the first."""
+    """Newest value of every slow reading of one module. Before the first: NaN, but 0 for ESCs."""
 
     voltage_v: float = math.nan
     current_a: float = math.nan
@@ -47,7 +47,7 @@ class ModulePicture:
     answered_ns: int = NEVER_NS
 
     def take(self, inputs: ModuleInputs, time_ns: int) -> None:
-        """Keep what is fresh."""
+        """Keeps the readings that `inputs` contains."""
         if inputs.gyro is not None:
             self.gyro_ns = time_ns
         if inputs.accel is not None:
@@ -77,14 +77,14 @@ class ModulePicture:
 
 
 class Picture:
-    """The fleet as the last tick left it."""
+    """State of the fleet after the last tick."""
 
     def __init__(self, modules: int, supervision: Supervision) -> None:
         self._supervision = supervision
         self.modules = [ModulePicture() for _ in range(modules)]
         self.records: dict[int, BodyRecord] = {}
         self.restarts: dict[int, int] = {}
-        """How often each body's estimate has begun anew since its first pose: what is told of it has jumped."""
+        """Restarts of each body's estimate since its first pose; with each the reported pose has jumped."""
         self.bodies: dict[int, Body] = {}
         self.time_ns = 0
         self.ticks = 0
@@ -93,10 +93,10 @@ class Picture:
         self.times: Times | None = None
         """None in lockstep."""
         self.events: deque[Event] = deque(maxlen=_MOST_EVENTS)
-        """Not yet told to anybody."""
+        """Events not yet reported."""
 
     def observe(self, inputs: Inputs, outputs: Outputs, bodies: Sequence[Body]) -> None:
-        """Take one tick in."""
+        """Takes in the results of one tick."""
         self.time_ns = outputs.time_ns
         self.ticks += 1
         self.estop = inputs.estop or outputs.estop
@@ -112,7 +112,7 @@ class Picture:
         self.events += outputs.events
 
     def _count_restart(self, record: BodyRecord, members: tuple[int, ...]) -> None:
-        """Where the estimate begins anew in this tick; also when the body is another one, by a joint more or less."""
+        """Counts a restart if the estimate restarted in this tick, or if the body gained or lost a joint."""
         last = self.records.get(record.body)
         goes_on = last is not None and members == self.members(record.body) and _goes_on(last.estimate, record.estimate)
         if record.estimate.ready and not goes_on:
@@ -123,11 +123,11 @@ class Picture:
         return self.bodies[body].modules if body in self.bodies else (body,)
 
     def leader(self, module: int) -> int:
-        """Number of the body that holds a module; the module's own when no tick has told."""
+        """Number of the body that contains a module; the module's own number if no reported body does."""
         return next((body.index for body in self.bodies.values() if module in body.modules), module)
 
     def is_armed(self, body: int) -> bool:
-        """Whether its thrusters may turn."""
+        """Whether the body's thrusters may turn."""
         record = self.records.get(body)
         return record is not None and record.state in ARMED
 
@@ -142,22 +142,22 @@ class Picture:
         return any(self.is_stopped(body) for body in self.records)
 
     def mode(self, body: int) -> Mode:
-        """How it is steered, or would be once armed."""
+        """Mode of the body, in force or for when it is armed; POSHOLD for an unknown body."""
         record = self.records.get(body)
         return Mode.POSHOLD if record is None else Mode(record.mode)
 
     def is_stopped(self, body: int) -> bool:
-        """Whether the e-stop holds it."""
+        """Whether the e-stop holds the body."""
         record = self.records.get(body)
         return self.estop or (record is not None and record.state == State.ESTOP)
 
     def is_in_failsafe(self, body: int) -> bool:
-        """Whether a fail-safe has chosen how it flies."""
+        """Whether the body is armed and a fail-safe determines how it flies."""
         record = self.records.get(body)
         return record is not None and record.state in ARMED and record.level > Level.NONE
 
     def pose_is_fresh(self, body: int) -> bool:
-        """Whether tags were seen lately."""
+        """Whether the estimate is ready and its last tag is fresh."""
         record = self.records.get(body)
         if record is None or not record.estimate.ready:
             return False
@@ -170,5 +170,5 @@ class Picture:
 
 
 def _goes_on(before: Estimate, now: Estimate) -> bool:
-    """Whether an estimate that is ready follows from that of the tick before. One that was adrift is put where the first tags say."""
+    """Whether a ready estimate continues that of the tick before. One that was adrift does not: the first tags relocate it."""
     return before.ready and not before.tag_age_ns > ADRIFT_NS >= now.tag_age_ns

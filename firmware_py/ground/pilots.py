@@ -1,5 +1,5 @@
-"""Whose sticks and set-points one system follows: one sender's at a time, until it is silent. Buttons are kept by sender: two streams do
-not mix.
+"""Arbitration of sticks and set-points for one system: one sender has control at a time, until it falls silent. Button states are kept
+per sender: two streams do not mix.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ Sender = tuple[int, int]
 
 
 class Turn:
-    """Whose messages of one kind are taken: one sender's at a time.
+    """Arbitrates messages of one kind: one sender has control at a time.
 
     Args of the constructor:
-        has: what a sender that takes over has, for people.
-        timeout_s: after so much silence another may take over.
+        has: what the sender in control has, as named in messages to people.
+        timeout_s: silence after which another sender may take over.
     """
 
     def __init__(self, system: System, has: str, timeout_s: Callable[[], float]) -> None:
@@ -28,11 +28,11 @@ class Turn:
         self._heard_ns = 0
 
     def is_over(self, time_ns: int) -> bool:
-        """Whether it is nobody's."""
+        """Whether no sender has control."""
         return self._sender is None or time_ns - self._heard_ns > self._timeout_s() * NS_PER_S
 
     def is_of(self, arrival: Arrival) -> bool:
-        """Whether it is the sender's, now that it was heard."""
+        """Registers a message. Returns whether its sender has control, which it takes when no other sender has."""
         sender = sender_of(arrival)
         if sender != self._sender and not self.is_over(arrival.time_ns):
             if sender not in self._refused:
@@ -52,11 +52,11 @@ class Turn:
 
 
 class Pilots:
-    """Everybody who sends sticks to one system.
+    """Senders of sticks to one system.
 
     Args of the constructor:
-        may_steer: whether sticks of a system and component are taken at all.
-        timeout_s: after so much silence another may have the sticks.
+        may_steer: whether sticks of a system and component are accepted at all.
+        timeout_s: silence after which another sender may take the sticks.
     """
 
     def __init__(self, system: System, may_steer: Callable[[int, int], bool], timeout_s: Callable[[], float]) -> None:
@@ -64,14 +64,14 @@ class Pilots:
         self._turn = Turn(system, "sticks", timeout_s)
         self._pressed: dict[Sender, int] = {}
         self._never: set[Sender] = set()
-        """Who was told that its sticks are not taken."""
+        """Senders already told that their sticks are not accepted."""
 
     def are_silent(self, time_ns: int) -> bool:
-        """Whether nobody has the sticks."""
+        """Whether no sender has the sticks."""
         return self._turn.is_over(time_ns)
 
     def steers(self, arrival: Arrival) -> bool:
-        """Whether a sender of sticks has them, now that it was heard."""
+        """Registers a message with sticks. Returns whether its sender has control of them."""
         sender = sender_of(arrival)
         if self._may_steer(*sender):
             return self._turn.is_of(arrival)
@@ -81,7 +81,7 @@ class Pilots:
         return False
 
     def freshly_pressed(self, arrival: Arrival, buttons: int) -> int:
-        """The buttons that the sender did not hold in its message before."""
+        """Returns those `buttons` that were not pressed in the sender's previous message."""
         sender = sender_of(arrival)
         fresh = buttons & ~self._pressed.get(sender, 0)
         self._pressed[sender] = buttons
@@ -89,5 +89,5 @@ class Pilots:
 
 
 def sender_of(arrival: Arrival) -> Sender:
-    """Who sent a message."""
+    """Returns the sender of a message."""
     return arrival.message.system, arrival.message.component

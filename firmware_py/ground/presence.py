@@ -1,4 +1,4 @@
-"""Who is there: the ground station that must not be lost, time, echo, what the vehicle can do, the signing key."""
+"""Presence: watch over the ground station that must not be lost, TIMESYNC, PING, capabilities, set-up of the signing key."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ VERSION = 0x00010000
 
 @dataclass(slots=True)
 class Watch:
-    """The ground station that must not be lost: the same for all bodies, for what tells one that it is there tells all."""
+    """The ground station that must not be lost. Shared by all bodies: a heartbeat that one of them hears counts for all."""
 
     station: Station | None = None
     heard_ns: int = 0
 
 
 class Presence:
-    """The watch over one ground station, for one system."""
+    """Presence of one system, and its watch over the ground station."""
 
     def __init__(
         self, system: System, config: GroundConfig, parameters: Callable[[], Parameters], signing: Signing, watch: Watch
@@ -42,7 +42,7 @@ class Presence:
         self._watch = watch
 
     def handlers(self) -> dict[str, Handler]:
-        """By message name."""
+        """Handlers by message name."""
         return {
             "HEARTBEAT": self._heartbeat,
             "TIMESYNC": self._timesync,
@@ -52,7 +52,7 @@ class Presence:
         }
 
     def _heartbeat(self, arrival: Arrival) -> None:
-        """A heartbeat counts when system, component and type are exactly those that are watched."""
+        """Takes a heartbeat, which counts only if system, component and type are exactly those of the watched station."""
         m = arrival.message
         station: Station = (m.system, m.component, m["type"])
         if m["type"] != TYPE_GROUND_STATION or not self._config.watches(m.system, m.component):
@@ -78,7 +78,7 @@ class Presence:
             self._system.send(arrival.channel, "PING", values)
 
     def _setup_signing(self, arrival: Arrival) -> None:
-        """Only disarmed, and on a link that is trusted. It is never forwarded and never answered."""
+        """Sets the signing key, only while every body is disarmed and on a trusted link. The message is never forwarded or acknowledged."""
         m = arrival.message
         if self._system.subject.picture.any_armed or not arrival.trusted:
             self._system.say(WARNING, "signing refused: only disarmed, and on a trusted link")
@@ -92,7 +92,7 @@ class Presence:
             self._system.say(INFORMATION, "signing key set" if any(key) else "signing is off")
 
     def _no_files(self, arrival: Arrival) -> None:
-        """There is no file service: said at once, so that clients fall back to parameters without a time-out."""
+        """Refuses file transfer at once, since there is no file service: clients fall back to parameters without a timeout."""
         asked = bytes(arrival.message["payload"])
         low, high = ((asked[0] | asked[1] << 8) + 1 & 0xFFFF).to_bytes(2, "little")
         reason = _FILE_NOT_FOUND if asked[3] == _OPEN_TO_READ else _UNKNOWN_COMMAND
@@ -101,7 +101,7 @@ class Presence:
         self._system.send(arrival.channel, "FILE_TRANSFER_PROTOCOL", values)
 
     def autopilot_version(self, arrival: Arrival) -> bool:
-        """Answer to a request of AUTOPILOT_VERSION."""
+        """Answers a request for AUTOPILOT_VERSION."""
         values = {
             "capabilities": CAPABILITIES, "flight_sw_version": VERSION, "uid": self._system.body + 1,
         }  # fmt: skip
@@ -109,7 +109,7 @@ class Presence:
         return True
 
     def available_modes(self, arrival: Arrival) -> bool:
-        """Answer to a request of AVAILABLE_MODES: one mode by its number, or all of them for 0."""
+        """Answers a request for AVAILABLE_MODES: one mode by its index, or all modes for index 0. Returns whether the index exists."""
         index, count = arrival.message["index"], len(SETTABLE)
         if index not in range(count + 1):
             return False

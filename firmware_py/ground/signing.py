@@ -1,4 +1,4 @@
-"""MAVLink 2 signing: who is believed. Verifies before it remembers anything, so a forged packet changes nothing.
+"""MAVLink 2 signing: which frames are believed. Verifies before it stores anything: a forged packet changes only counts.
 
 Source: MAVLink developer guide, "Message Signing". Times are in units of 10 us since 1 January 2015, UTC.
 """
@@ -20,14 +20,14 @@ EPOCH_S = 1_420_070_400
 """1 January 2015 as Unix time."""
 _UNITS_PER_S = 100_000
 _NEW_STREAM_UNITS = 60 * _UNITS_PER_S
-"""A stream that was never heard may be a minute behind."""
+"""How far a new stream may be behind: one minute."""
 _AHEAD_UNITS = 60 * _UNITS_PER_S
-"""A stamp may be a minute ahead of the clock."""
+"""How far a time stamp may be ahead of the clock: one minute."""
 _FLOOR_MARGIN = _UNITS_PER_S
-"""The stored time stamp is that much ahead, as long as the interval at which it is stored."""
+"""Margin by which the stored time stamp is ahead; as long as the interval at which it is stored."""
 _MOST_STREAMS = 256
 _LATEST = (1 << 48) - 1
-"""The last time stamp that there is."""
+"""Largest possible time stamp."""
 RADIO_STATUS = 109
 """The one message that is believed unsigned: radios inject it and have no key."""
 
@@ -42,47 +42,47 @@ def units_of(unix_ns: int) -> int:
 
 @dataclass(slots=True)
 class Signing:
-    """Key, time stamp, and the newest time stamp of every stream that was believed."""
+    """Key, own time stamp, and the newest time stamp of every believed stream."""
 
     key: bytes | None = None
     timestamp: int = 0
-    """Of the next frame that goes out; at least that of every believed frame."""
+    """Time stamp that the next frame sent exceeds by one; at least that of every believed frame."""
     clock: int = 0
-    """The latest time of day that was told; 0: none."""
+    """Latest time of day received by `advance`; 0: none."""
     floor: int = 0
-    """New streams start above this: nothing from before the last start is believed again."""
+    """New streams must start above this, so that no frame from before the last start is believed again."""
     streams: dict[Stream, int] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
-    """Frames by what became of them: good, unsigned, bad, ahead, replayed, old, full."""
+    """Frames by outcome: good, unsigned, bad, ahead, replayed, old, full."""
     changed: bool = False
-    """There is something to store."""
+    """Whether there is something to store."""
 
     def advance(self, unix_ns: int) -> None:
-        """Follow the clock; neither goes back, for stations went on from the time stamps that they heard."""
+        """Follows the clock. Neither clock nor time stamp goes back, since stations continue from the time stamps that they heard."""
         self.clock = max(self.clock, units_of(unix_ns))
         self.timestamp = max(self.timestamp, self.clock)
 
     def is_ahead(self, stamp: int) -> bool:
-        """Whether a time stamp is of a time to come. A clock that was not set, or is behind what is stored, cannot tell."""
+        """Whether a time stamp is in the future. False while the clock is not set or lags the stored time stamp, and so cannot tell."""
         is_set = self.clock > max(0, self.floor - _AHEAD_UNITS - _FLOOR_MARGIN)
         return is_set and stamp > self.clock + _AHEAD_UNITS
 
     def adopt(self, key: bytes, timestamp: int) -> None:
-        """Take a new key; all zeros turn signing off."""
+        """Takes a new key; all zeros turn signing off."""
         self.key = key if any(key) else None
         self.timestamp = max(self.timestamp, min(timestamp, _LATEST))
         self.streams.clear()
         self.changed = True
 
     def sign(self, frame: bytes, link: int) -> bytes:
-        """The 13 bytes that follow `frame`."""
+        """Returns the signature of 13 bytes that follows `frame`."""
         assert self.key is not None
         self.timestamp = min(self.timestamp + 1, _LATEST)
         tail = bytes([link & 0xFF]) + self.timestamp.to_bytes(6, "little")
         return tail + _digest(self.key, frame + tail)
 
     def believes(self, frame: bytes, signature: bytes, message: int, system: int, component: int) -> bool:
-        """Whether a frame with a good checksum may act. `signature` is empty when it is unsigned."""
+        """Whether a frame with a valid checksum may take effect. `signature` is empty for an unsigned frame."""
         if self.key is None:
             return True
         if not signature:
@@ -113,7 +113,7 @@ class Signing:
         return True
 
     def save(self, path: Path) -> None:
-        """Store key and time stamp in a file that only its owner may read. Raises OSError."""
+        """Stores key and time stamp in a file that only its owner may read. Raises OSError."""
         newest = max([self.floor - _FLOOR_MARGIN, *self.streams.values()])
         table = {"key": self.key.hex() if self.key else "", "timestamp": newest + _FLOOR_MARGIN}
         write_atomically(path, json.dumps(table).encode(), 0o600)
@@ -121,10 +121,10 @@ class Signing:
 
 
 def load_signing(path: Path) -> Signing:
-    """What `path` holds; no file, no key.
+    """Reads the signing state from `path`; without a file there is no key.
 
     Raises:
-        ValueError: the file is there and wrong, or others may read it; one line. Never falls back to no key.
+        ValueError: the file exists but is invalid, or others may read it; one line. Never falls back to no key.
     """
     if not path.exists():
         return Signing()

@@ -1,4 +1,4 @@
-"""The ground side without clock and sockets: bytes in, requests and frames out, telemetry. Pure, time passed in."""
+"""The ground side without clock and sockets: takes bytes, returns requests, frames and telemetry. Pure; time is passed in."""
 
 from __future__ import annotations
 
@@ -34,35 +34,35 @@ from firmware_py.ground.wire import Framer, Packet
 
 _SENDERS = 256
 _LAST_SYSTEM = 254
-"""255 is what ground stations take."""
+"""Highest system id of a body; ground stations use 255."""
 _MAY_STOP = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE", "MANUAL_CONTROL")
-"""They go to services that know what stops."""
+"""Messages that may carry a stop, accepted even for a body that is gone; their services tell what stops."""
 _STEERS_ONE = ("RC_CHANNELS_OVERRIDE", "SET_POSITION_TARGET_LOCAL_NED", "SET_ATTITUDE_TARGET")
-"""For all, they are for the one body that there is: several would be steered to one place. DroneKit sends everything to all."""
+"""Messages that may address all systems only while there is one body: several would be steered to one place. DroneKit addresses all."""
 _OF_NO_BODY = ("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END", "REQUEST_DATA_STREAM")
-"""Logs are the process's: who fetches one goes on with the same system when its body docks. Rates are the link's: some clients
-ask for them again and again.
+"""Messages that concern no body. Logs belong to the process: a client keeps fetching from the same system when its body docks. Rates
+belong to the link: some clients request them again and again.
 """
 _NEVER_SIGNED = ("RADIO_STATUS",)
-"""Taken from everybody, also with a key."""
+"""Messages accepted unsigned from everybody, also with a key."""
 _TARGETS = frozenset({"target_system", "target"})
-"""Fields of what is meant for somebody, be it for all."""
+"""Fields by which a message addresses one system or all."""
 _NEVER_FORWARDED = ("SETUP_SIGNING", *_NEVER_SIGNED)
 _STREAM_NS = 1_000_000_000
-"""What comes again within this time streams."""
+"""A message that recurs within this time counts as streaming."""
 _TORN_NS = 500_000_000
-"""A frame of which nothing more comes for so long is torn; radios that take turns pause for less within one."""
+"""Silence after which an incomplete frame counts as torn; radios that take turns pause for less within a frame."""
 
 
 class _Heard(NamedTuple):
-    """Where somebody was heard, and when each message of it that is for nobody by name came last."""
+    """Channel on which a sender was heard, and when each of its messages without target fields came last."""
 
     channel: int
     came_ns: dict[str, int]
 
 
 class Services:
-    """What one system offers."""
+    """The services of one system."""
 
     def __init__(self, station: GroundStation, system: System) -> None:
         config, store = station.config, station.store
@@ -83,8 +83,8 @@ class Services:
         self._handlers = {name: handler for part in parts for name, handler in part.handlers().items()}
 
     def take(self, arrival: Arrival, addressed: bool) -> None:
-        """A message for this system, `addressed`, or for all. A system whose body is gone hears what may stop it, and who wants logs
-        or other rates; the rest it refuses.
+        """Takes a message for this system (`addressed`) or for all. If the body is gone, only addressed messages are taken that may stop it
+        or that request logs or rates; others that are addressed are refused.
         """
         name = arrival.message.name
         handler = self._handlers.get(name)
@@ -96,7 +96,7 @@ class Services:
             self.system.refuse(arrival.time_ns)
 
     def step(self, time_ns: int) -> None:
-        """Move on what takes longer than one message."""
+        """Advances everything that takes longer than one message."""
         self.commands.step(time_ns)
         self.logs.step()
         if not self.system.body_is_known:
@@ -113,7 +113,7 @@ class GroundStation:
     def __init__(
         self, config: GroundConfig, fleet: Fleet, parameters: Parameters, signing: Signing | None = None
     ) -> None:
-        """Raises DescriptionError when the stored parameters are wrong, or there are more bodies than system ids."""
+        """Raises DescriptionError when the stored parameters are invalid, or there are more bodies than system ids."""
         last = config.first_system + len(fleet.module) - 1
         if last > _LAST_SYSTEM:
             most = _LAST_SYSTEM - len(fleet.module) + 1
@@ -129,7 +129,7 @@ class GroundStation:
         self._frames: list[Outgoing] = []
         self._framers: dict[int, Framer] = {}
         self._last_bytes: dict[int, tuple[int, bool]] = {}
-        """When bytes came last on each stream that is not silent, and whether its link may set the key."""
+        """Time of the last bytes on each stream that is not silent, and whether its link may set the key."""
         self._routes: dict[Sender, _Heard] = {}
         origin = Origin(fleet.latitude_deg, fleet.longitude_deg, fleet.altitude_m)
         self.services: dict[int, Services] = {}
@@ -141,7 +141,7 @@ class GroundStation:
     # ------------------------------------------------------------ in
 
     def observe(self, inputs: Inputs, outputs: Outputs, bodies: Sequence[Body]) -> None:
-        """Take one tick in."""
+        """Takes in the results of one tick."""
         self.picture.observe(inputs, outputs, bodies)
         for event in outputs.events:
             for services in self.services.values():
@@ -154,7 +154,7 @@ class GroundStation:
             services.step(outputs.time_ns)
 
     def _tell(self) -> None:
-        """Events as texts of the body that they are about; the first one tells what is about no body."""
+        """Sends events as texts of the body that they concern; the first present system reports those of no present body."""
         present: dict[int | None, System] = {system.body: system for system in self.present()}
         while present and self.picture.events:
             event = self.picture.events.popleft()
@@ -162,17 +162,17 @@ class GroundStation:
             speaker.say(event.severity, event.text)
 
     def spare(self, busy: Set[int]) -> None:
-        """These channels have enough to send, until the next call."""
+        """Treats these channels as busy until the next call."""
         self._busy.clear()
         self._busy.update(busy)
 
     def join(self, channel: int, time_ns: int) -> None:
-        """A channel is there; it gets the default telemetry."""
+        """Adds a channel, which gets the default telemetry."""
         for services in self.services.values():
             services.system.add_channel(channel, time_ns)
 
     def leave(self, channel: int) -> None:
-        """A channel is gone."""
+        """Removes a channel."""
         self._framers.pop(channel, None)
         self._last_bytes.pop(channel, None)
         self._routes = {sender: heard for sender, heard in self._routes.items() if heard.channel != channel}
@@ -180,7 +180,7 @@ class GroundStation:
             services.system.remove_channel(channel)
 
     def take(self, channel: int, data: bytes, time_ns: int, datagram: bool = True, trusted: bool = False) -> bool:
-        """Bytes that came on a channel; whether a frame in them was believed. Never raises on what is in them."""
+        """Takes bytes from a channel. Returns whether a frame in them was believed. Never raises on their contents."""
         if channel not in self._framers:
             self._framers[channel] = Framer(self._dialect, self.signing, self.counts)
         if not datagram:
@@ -194,23 +194,23 @@ class GroundStation:
         return any(packet.message.name not in _NEVER_SIGNED for packet in packets)
 
     def _take_torn(self, time_ns: int) -> None:
-        """What a stream has begun and does not go on with: a stop may stand behind it."""
+        """Abandons incomplete frames of streams that have fallen silent: a stop may follow in the same bytes."""
         silent = [channel for channel, (heard_ns, _) in self._last_bytes.items() if time_ns - heard_ns > _TORN_NS]
         for channel in silent:
             self._feed(channel, b"", False, time_ns, self._last_bytes.pop(channel)[1])
 
     def planned(self, body: int, plan: Plan) -> None:
-        """The plan of a job came back."""
+        """Takes the finished plan of a job."""
         self.services[self.config.first_system + body].flight.planned(plan)
 
     # ------------------------------------------------------------ out
 
     def present(self) -> list[System]:
-        """The systems that are there: one for each body."""
+        """Returns the systems whose body exists: one for each body."""
         return [s.system for s in self.services.values() if s.system.body_is_known]
 
     def requests(self) -> list[Request]:
-        """What is asked of the next tick since the last call."""
+        """Returns the requests for the next tick made since the last call."""
         asked: list[Request] = []
         for services in self.services.values():
             asked += services.system.requests
@@ -218,7 +218,7 @@ class GroundStation:
         return asked
 
     def jobs(self) -> list[PlanJob]:
-        """What is to be planned since the last call."""
+        """Returns the planning jobs added since the last call."""
         jobs: list[PlanJob] = []
         for services in self.services.values():
             jobs += services.flight.jobs
@@ -226,11 +226,11 @@ class GroundStation:
         return jobs
 
     def awaited(self) -> list[int]:
-        """Of each body the serial number of the job whose plan it waits for; 0: of none."""
+        """Returns for each body the serial number of the job whose plan it waits for; 0: none."""
         return [services.flight.awaited for services in self.services.values()]
 
     def frames(self, time_ns: int) -> list[Outgoing]:
-        """What is to be sent now: telemetry that is due, and answers."""
+        """Returns the frames to send now: due telemetry, answers and forwarded messages."""
         for system in self.present():
             system.stream(time_ns)
         sent = list(self._frames)
@@ -239,11 +239,11 @@ class GroundStation:
 
     @property
     def reboot_asked(self) -> bool:
-        """Whether a client wants the process started anew."""
+        """Whether a client has requested a restart of the process."""
         return any(services.commands.reboot_asked for services in self.services.values())
 
     def say(self, text: str) -> None:
-        """A warning to everybody."""
+        """Broadcasts a warning."""
         for system in self.present()[:1]:
             system.say(WARNING, text)
 
@@ -252,7 +252,7 @@ class GroundStation:
     def _take_packet(self, packet: Packet, channel: int, time_ns: int, trusted: bool) -> None:
         message = packet.message
         if message.system == 0 or (message.system in self.services and message.component == COMPONENT_AUTOPILOT):
-            return  # nobody, or our own echo; other components of our systems are companions
+            return  # no sender, or our own echo; other components of our systems are companions
         self._route(sender=(message.system, message.component), channel=channel)
         self.join(channel, time_ns)
         target = message.values.get("target_system", message.values.get("target", 0))
@@ -266,7 +266,7 @@ class GroundStation:
                     services.take(arrival, target == number)
 
     def _is_for_too_many(self, arrival: Arrival, target: int) -> bool:
-        """Whether it would steer several bodies at once; says so."""
+        """Whether a message would steer several bodies at once; if so, reports it."""
         present = self.present()
         if target or arrival.message.name not in _STEERS_ONE or len(present) <= 1:
             return False
@@ -275,16 +275,17 @@ class GroundStation:
         return True
 
     def _route(self, sender: Sender, channel: int) -> None:
-        """It was heard there. Of too many the one that was silent longest is forgotten."""
+        """Records that a sender was heard on a channel. Beyond the limit the longest silent sender is forgotten."""
         before = self._routes.pop(sender, None)
         self._routes[sender] = _Heard(channel, {} if before is None else before.came_ns)
         if len(self._routes) > _SENDERS:
             del self._routes[next(iter(self._routes))]
 
     def _forward(self, packet: Packet, target: int, component: int, channel: int, time_ns: int) -> None:
-        """To wherever the system that it is for was heard, of one of ours the component (0: all); what is for all, to everybody else.
+        """Forwards a packet to the channels on which its target system was heard (of ours: the target component, 0: all). A packet for all
+        systems goes to every other channel on which a sender was heard.
 
-        What streams by waits for what a slow link carries: of a companion computer's that is too much for a radio.
+        Streaming messages are not sent to busy channels: a companion computer's streams are too much for a radio.
         """
         if packet.message.name in _NEVER_FORWARDED:
             return
@@ -296,7 +297,7 @@ class GroundStation:
         self._frames += [Outgoing(other, packet.raw) for other in wanted - {channel} - waits]
 
     def _streams(self, message: Message, time_ns: int) -> bool:
-        """Whether it came a moment ago too, and does not say for whom it is. What comes seldom may be an answer: some do not say it."""
+        """Whether a message has no target fields and came a moment ago too. A rare one may be an answer: some answers have no target."""
         if message.name in NEVER_WAITS or not _TARGETS.isdisjoint(message.values):
             return False
         came_ns = self._routes[message.system, message.component].came_ns

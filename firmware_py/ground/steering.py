@@ -1,7 +1,7 @@
-"""Pilot and program at the stick: MANUAL_CONTROL, RC_CHANNELS_OVERRIDE, streamed set-points. The core decides.
+"""Steering by pilots and programs: MANUAL_CONTROL, RC_CHANNELS_OVERRIDE, streamed set-points. The core decides what to do with them.
 
-MANUAL_CONTROL: x forward, y right, z up, r clockwise seen from above, s nose up, t right side down; of +-1000, z by
-STICK_Z.
+MANUAL_CONTROL axes: x forward, y right, z up, r clockwise seen from above, s nose up, t right side down. All range over +-1000,
+except z, whose range STICK_Z selects.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ _FRAMES_WORLD, _FRAMES_BODY = (1, 7), (8, 9, 12)
 """MAV_FRAME: LOCAL_NED, LOCAL_OFFSET_NED; BODY_NED, BODY_OFFSET_NED, BODY_FRD."""
 _FRAME_OFFSETS = (7, 8, 9, 12)
 _POSITION_BIT, _VELOCITY_BIT, _ACCELERATION_BIT, _NO_YAW, _NO_YAW_RATE = 0, 3, 6, 0x400, 0x800
-"""The first of three bits, one for each axis that is left out; and POSITION_TARGET_TYPEMASK's last two."""
+"""POSITION_TARGET_TYPEMASK: number of the first of three bits, one per axis, that mark an axis as left out; masks of the last two bits."""
 _FORCES, _NO_ACCELERATION = 0x200, 7 << _ACCELERATION_BIT
-"""What stands for accelerations is N; and all three are left out."""
+"""Mask of the bit by which the acceleration fields are forces, N; mask by which all three of them are left out."""
 _RC_IGNORED = 0xFFFF
-"""A channel of RC_CHANNELS_OVERRIDE that stays as it is; 0 lets it go."""
+"""Value of a channel of RC_CHANNELS_OVERRIDE that stays as it is; 0 releases the channel."""
 BUTTONS: tuple[str, ...] = (
     "hold", "manual", "stabilize", "depth", "disarm", "", "arm", "estop", "clear_estop", "dock", "undock", "surface",
 )  # fmt: skip
-"""What each button of a joystick does, first to last."""
+"""Function of each joystick button, first to last; an empty name does nothing."""
 _BUTTON_MODES = {
     "hold": Mode.POSHOLD, "manual": Mode.MANUAL, "stabilize": Mode.STABILIZE, "depth": Mode.ALT_HOLD,
     "surface": Mode.SURFACE,
@@ -45,11 +45,11 @@ _BUTTON_ACTIONS = {
     "dock": Action.DOCK, "undock": Action.UNDOCK,
 }  # fmt: skip
 _STOPS_LAST = tuple(sorted(enumerate(BUTTONS), key=lambda button: _BUTTON_ACTIONS.get(button[1]) in STOPPING))
-"""The buttons as they are done when several are pressed at once: what stops has the last word."""
+"""Buttons in the order of execution when several are pressed at once: those that stop come last and prevail."""
 
 
 class _Override(NamedTuple):
-    """One channel as it was overridden last."""
+    """Last override of one channel."""
 
     pwm: int
     at_ns: int
@@ -60,7 +60,7 @@ _ALL_LET_GO = [_LET_GO] * 6
 
 
 class _Wanted(NamedTuple):
-    """What a streamed set-point gives; None where its mask leaves it out. What is given and no number is infinite."""
+    """Contents of a streamed set-point; None where its mask leaves a part out. Vector components given as non-finite are infinite."""
 
     position: np.ndarray | None
     """NaN on axes that are left out."""
@@ -71,14 +71,14 @@ class _Wanted(NamedTuple):
 
     @property
     def makes_sense(self) -> bool:
-        """Whether everything in it is a number, and it says where to go."""
+        """Whether all given values are finite, and a position or a velocity is among them."""
         vectors = [v for v in (self.position, self.velocity, self.acceleration) if v is not None]
         numbers = [self.rate, 0.0 if self.yaw is None else self.yaw]
         finite = not any(np.isinf(v).any() for v in vectors) and all(map(math.isfinite, numbers))
         return finite and (self.position is not None or self.velocity is not None)
 
     def turned(self, yaw: float) -> _Wanted:
-        """From the body's heading to the world."""
+        """Returns the set-point rotated from the heading frame to the world frame, for a heading of `yaw`, rad."""
         turn = from_euler(0.0, 0.0, yaw)
 
         def to_world(v: np.ndarray | None) -> np.ndarray | None:
@@ -100,7 +100,7 @@ class Steering:
         dock: DockRequest | None,
         may_steer: Callable[[int, int], bool],
     ) -> None:
-        """`dock` is what the buttons `dock` and `undock` ask for; `may_steer`: whose sticks are taken, by system and component."""
+        """`dock`: request of the buttons `dock` and `undock`; `may_steer`: whether sticks of a system and component are accepted."""
         self._system, self._parameters, self._dock = system, parameters, dock
         self._pilots = Pilots(system, may_steer, lambda: parameters().steering.stick_timeout_s)
         self._sticks = Sticks()
@@ -110,7 +110,7 @@ class Steering:
         self._setpoint: Setpoint | None = None
 
     def handlers(self) -> dict[str, Handler]:
-        """By message name."""
+        """Handlers by message name."""
         return {
             "MANUAL_CONTROL": self._manual,
             "RC_CHANNELS_OVERRIDE": self._override,
@@ -119,17 +119,17 @@ class Steering:
         }
 
     def is_neutral(self, time_ns: int) -> bool:
-        """Whether nobody holds a stick."""
+        """Whether the sticks are within the dead zone, or no pilot is active."""
         deflection = max(map(abs, (*self._sticks.force, *self._sticks.moment)))
         return self._pilots.are_silent(time_ns) or deflection <= self._parameters().steering.stick_dead
 
     def has_setpoint(self, time_ns: int) -> bool:
-        """Whether set-points stream in."""
+        """Whether the last set-point is fresh."""
         fresh_ns = self._parameters().ground.setpoint_fresh_s * NS_PER_S
         return self._setpoint_ns is not None and time_ns - self._setpoint_ns <= fresh_ns
 
     def step(self, time_ns: int) -> None:
-        """End guided mode when its set-points stay away."""
+        """Updates `neutral` of the subject; ends guided mode when its set-points time out."""
         s = self._system.subject
         s.neutral = self.is_neutral(time_ns)
         guided = s.armed and s.picture.mode(s.body) == Mode.GUIDED
@@ -141,7 +141,10 @@ class Steering:
     # ------------------------------------------------------------ pilot
 
     def _manual(self, arrival: Arrival) -> None:
-        """Sticks for all (target 0) would steer every body at once: they are nobody's, as ArduPilot has it. What stops is for all."""
+        """Takes sticks and buttons. Sticks for all systems (target 0) would steer every body at once and are ignored, as in ArduPilot.
+
+        Buttons that stop take effect whatever the target and whoever has the sticks.
+        """
         m = arrival.message
         extensions = m["enabled_extensions"]
         force = (_axis(m["x"]), _axis(m["y"]), -self._up(m["z"]))
@@ -164,9 +167,9 @@ class Steering:
         return min(max((z - _MIDDLE_UP) / _MIDDLE_UP, -1.0), 1.0)
 
     def _override(self, arrival: Arrival) -> None:
-        """ArduSub's channels: 1 pitch, 2 roll, 3 up, 4 yaw, 5 forward, 6 right. One that neither overrides nor lets go is nothing.
+        """Overrides or releases ArduSub's channels: 1 pitch, 2 roll, 3 up, 4 yaw, 5 forward, 6 right. Ignores messages that do neither.
 
-        A channel that a message leaves out stays as its sender had it, for as long as sticks count.
+        A channel that a message leaves unchanged keeps its sender's last override until the stick timeout.
         """
         now_ns, oldest_ns = arrival.time_ns, arrival.time_ns - self._parameters().steering.stick_timeout_s * NS_PER_S
         fresh = ((who, [o if o.at_ns >= oldest_ns else _LET_GO for o in kept]) for who, kept in self._overrides.items())
@@ -181,7 +184,7 @@ class Steering:
             self._overrides[sender_of(arrival)] = after
 
     def _steer(self, sticks: Sticks, arrival: Arrival) -> bool:
-        """Take the sticks of who has them. Returns whether it was the sender."""
+        """Applies `sticks` if their sender has control. Returns whether it has."""
         if not self._system.body_is_known:
             self._system.refuse(arrival.time_ns)
             return False
@@ -212,7 +215,7 @@ class Steering:
             return
         mask = m["type_mask"]
         if mask & _FORCES and mask & _NO_ACCELERATION != _NO_ACCELERATION:
-            return  # a force is no acceleration, and there is no control of forces
+            return  # forces are not accelerations, and force control is not supported
         wanted = _Wanted(
             position=_vector(m, ("x", "y", "z"), mask >> _POSITION_BIT, math.nan),
             velocity=_vector(m, ("vx", "vy", "vz"), mask >> _VELOCITY_BIT, 0.0),
@@ -237,7 +240,7 @@ class Steering:
     def _place(
         self, now: np.ndarray, position: np.ndarray | None, velocity: np.ndarray | None, time_ns: int
     ) -> np.ndarray:
-        """Where to be: as asked for; on an axis without a place further along its velocity, or as before."""
+        """Returns the position to hold: as requested; on an axis without a position moved on by the velocity, or unchanged."""
         start, elapsed_s = self._before(time_ns)
         before = now if start is None else start.p_wb
         at = self._system.subject.record.estimate.p_wb
@@ -245,7 +248,7 @@ class Steering:
         return np.asarray(moved if position is None else np.where(np.isnan(position), moved, position))
 
     def _attitude(self, now: np.ndarray, yaw: float | None, rate: float, time_ns: int) -> np.ndarray:
-        """Level at the given yaw; without one as before, turned on by the rate."""
+        """Returns the attitude to hold: level at the given yaw; without a yaw the previous attitude, turned further by the rate."""
         if yaw is not None:
             return from_euler(0.0, 0.0, yaw)
         start, elapsed_s = self._before(time_ns)
@@ -254,7 +257,7 @@ class Steering:
         return np.asarray(normalise(multiply(from_euler(0.0, 0.0, rate * elapsed_s), q)))
 
     def _before(self, time_ns: int) -> tuple[Setpoint | None, float]:
-        """The set-point before, while they stream in guided mode, and its age, s."""
+        """Returns the previous set-point and its age, s, while set-points stream in guided mode and armed; otherwise None and 0."""
         s = self._system.subject
         guided = s.armed and s.picture.mode(s.body) == Mode.GUIDED
         if self._setpoint is None or not guided or not self.has_setpoint(time_ns):
@@ -263,7 +266,7 @@ class Steering:
         return self._setpoint, (time_ns - self._setpoint_ns) / NS_PER_S
 
     def _attitude_target(self, arrival: Arrival) -> None:
-        """An attitude, held at the place where it is: the robot is omnidirectional."""
+        """Takes an attitude, and keeps the position set-point: the robot is omnidirectional."""
         m = arrival.message
         q = np.array(m["q"], dtype=float)
         if m["type_mask"] & 0x80 or not np.all(np.isfinite(q)) or not 0.5 < float(np.linalg.norm(q)) < 2.0:
@@ -276,7 +279,7 @@ class Steering:
         self._stream(Setpoint(p_wb, np.asarray(normalise(q)), zero, zero, zero, zero), arrival)
 
     def _stream(self, setpoint: Setpoint, arrival: Arrival) -> None:
-        """Follow it, where it is the sender's turn."""
+        """Requests `setpoint` if its sender has control of the set-points."""
         if self._turn.is_of(arrival):
             self._setpoint, self._setpoint_ns = setpoint, arrival.time_ns
             self._system.ask(Action.SET_POINT, setpoint)
@@ -295,7 +298,7 @@ def _is_overridden(pwm: int) -> bool:
 
 
 def _vector(message: Message, names: Sequence[str], left_out: int, instead: float) -> np.ndarray | None:
-    """(3,) as given, with `instead` on the axes whose bits of `left_out` are set; None when all are. What is no number is infinite."""
+    """Returns the named fields (3,), `instead` where bits of `left_out` are set; None if all are. Non-finite values become infinite."""
     if left_out & 7 == 7:
         return None
     given = (message[name] if math.isfinite(message[name]) else math.inf for name in names)
@@ -303,7 +306,7 @@ def _vector(message: Message, names: Sequence[str], left_out: int, instead: floa
 
 
 def _turned_where_given(p_b: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """An offset (3,) turned about the vertical. Of ahead and sideways one alone that is left out is no offset there."""
+    """Returns an offset (3,) turned about the vertical; NaN marks axes left out. If only one of ahead and sideways is, it counts as 0."""
     left_out = np.isnan(p_b)
     left_out[:2] = left_out[:2].all()
     return np.where(left_out, math.nan, rotate(turn, np.nan_to_num(p_b)))

@@ -1,6 +1,6 @@
-"""The file of parameters that ground stations changed: what differs from the start alone, so that a new release's own values count.
+"""The file of parameters changed by ground stations. It holds only values that differ from those at start: new defaults take effect.
 
-Read at the start before anything is made of the parameters, and written at every change.
+Read at start before the parameters are used, and rewritten at every change.
 """
 
 from __future__ import annotations
@@ -13,34 +13,34 @@ from firmware_py.description.schema import build, read_toml
 from firmware_py.description.toml_text import to_plain, to_toml
 
 _FEW = 8
-"""Names of stored parameters that one line holds."""
+"""Most stored parameters that `stored_line` lists by name."""
 
 
 def laid_over(parameters: Parameters, path: Path | None) -> Parameters:
-    """`parameters` with what `path` holds in their place; a file that is not there holds nothing. Raises DescriptionError."""
+    """Returns `parameters` overlaid with the values stored in `path`, if the file exists. Raises DescriptionError."""
     if path is None or not path.exists():
         return parameters
     table, source = read_toml(path)
-    build(Parameters, table, source)  # refuses what is wrong in it
+    build(Parameters, table, source)  # refuses invalid entries
     merged = {group: values | table.get(group, {}) for group, values in to_plain(parameters).items()}
     laid: Parameters = build(Parameters, merged, source)
     return laid
 
 
 def differing(parameters: Parameters, others: Parameters) -> list[str]:
-    """Names of the parameters that have another value in `others`."""
+    """Returns the names of the parameters whose value differs in `others`."""
     return [name for name, _ in registry() if attrgetter(name)(parameters) != attrgetter(name)(others)]
 
 
 def stored_line(started: Parameters, laid: Parameters, path: Path | None) -> str:
-    """How many stored values take the place of those of the start, in one line; empty when none does."""
+    """Returns one line on how many stored values replace those at start; empty when none does."""
     names = differing(laid, started)
     which = f": {', '.join(names)}" if len(names) <= _FEW else ""
     return f"stored parameters in place of shipped or given ones: {len(names)} of {path}{which}" if names else ""
 
 
 def differences_toml(parameters: Parameters, others: Parameters) -> str:
-    """The TOML text of those that have another value in `others`."""
+    """Returns as TOML those `parameters` whose value differs in `others`."""
     kept = {name.partition(".")[::2] for name in differing(parameters, others)}
     text = ""
     for group in dict.fromkeys(name.partition(".")[0] for name, _ in registry()):

@@ -1,4 +1,4 @@
-"""One MAVLink system: one body. What its services (commands, parameters, missions ...) share."""
+"""One MAVLink system, which is one body: the state that its services (commands, parameters, missions ...) share."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ NS_PER_S = 1_000_000_000
 _TEXT = 50
 """Characters of one STATUSTEXT."""
 _SELDOM_NS = 5 * NS_PER_S
-"""Between two texts about what streams in."""
+"""Least time between two refusals in text: refused messages may stream in."""
 NEVER_WAITS = ("HEARTBEAT", "STATUSTEXT")
-"""Without the one clients lose the vehicle; the other is said once."""
+"""Messages sent even to busy channels: without HEARTBEAT clients lose the vehicle, and STATUSTEXT is sent only once."""
 _AT_ONCE = ("HEARTBEAT", "MISSION_CURRENT")
-"""What is told as soon as it changes. A pilot sees arming, modes and stops in the one; a client that has sent a mission knows by the other
-that it is there, and where it begins.
+"""Messages sent as soon as they change. HEARTBEAT shows a pilot arming, modes and stops; MISSION_CURRENT tells a client that the mission
+it uploaded has arrived, and where it begins.
 """
 STOPPING = frozenset({Action.ESTOP, Action.DISARM})
-"""What reaches a module whichever body it is part of."""
+"""Actions that reach a module whichever body it is part of."""
 STEERING = STOPPING | {Action.SET_MODE, Action.HOLD, Action.DOCK, Action.UNDOCK, Action.MOTOR_TEST}
-"""By which somebody takes the body for something else."""
+"""Actions that give the body another task."""
 
 
 class Arrival(NamedTuple):
@@ -35,11 +35,11 @@ class Arrival(NamedTuple):
     channel: int
     time_ns: int
     trusted: bool
-    """Its link may set the key."""
+    """Whether the link may set the signing key."""
 
     @property
     def sender(self) -> dict[str, int]:
-        """As the target of an answer."""
+        """The sender as the target fields of an answer."""
         return {"target_system": self.message.system, "target_component": self.message.component}
 
 
@@ -53,16 +53,16 @@ class System:
     subject: Subject
     outbox: Outbox
     busy: set[int] = field(default_factory=set)
-    """Channels that take their time: what can wait is not sent to them now. One set for all systems."""
+    """Channels under back-pressure: messages that can wait are not sent to them now. One set for all systems."""
     channels: dict[int, Rates] = field(default_factory=dict)
-    """Everybody who is there, with the rates that they want."""
+    """Present channels with their message rates."""
     requests: list[Request] = field(default_factory=list)
-    """For the next tick."""
+    """Requests for the next tick."""
     taken: int = 0
-    """How often somebody asked the body for something else than what it does."""
+    """Number of STEERING actions requested so far: a change means that the body was given another task."""
     _text_number: int = 0
     _said: dict[str, Any] = field(default_factory=dict)
-    """What the last of each of `_AT_ONCE` said."""
+    """Last values of each message of `_AT_ONCE`."""
     _refused_ns: int = -_SELDOM_NS
 
     @property
@@ -72,28 +72,28 @@ class System:
 
     @property
     def body_is_known(self) -> bool:
-        """Whether a tick has told of it."""
+        """Whether the last tick reported the body."""
         return self.body in self.subject.picture.records
 
     def add_channel(self, channel: int, time_ns: int) -> None:
-        """Somebody came."""
+        """Adds a channel with the default rates, unless it is there already."""
         if channel not in self.channels:
             intervals = {name: round(NS_PER_S / hz) for name, hz in DEFAULT_HZ.items()}
             self.channels[channel] = Rates(intervals, time_ns)
 
     def remove_channel(self, channel: int) -> None:
-        """Somebody is gone."""
+        """Removes a channel that is gone."""
         self.channels.pop(channel, None)
         self.outbox.forget(channel)
 
     def ask(self, action: Action, argument: Any = None) -> None:
-        """Put a request to the next tick."""
+        """Adds a request for the next tick; those that stop go to the body that contains this body's own module."""
         self.taken += action in STEERING
         body = self.subject.leader if action in STOPPING else self.body
         self.requests.append(Request(action, body, argument))
 
     def refuse(self, time_ns: int, why: str = "") -> None:
-        """Say why the body is not steered, or who leads it that is gone; what streams in is told of seldom."""
+        """Reports why the body is not steered: `why`, or which system leads it if it is gone. Rate-limited, since messages stream in."""
         if time_ns - self._refused_ns < _SELDOM_NS:
             return
         self._refused_ns = time_ns
@@ -102,33 +102,33 @@ class System:
         self.say(WARNING, f"system {own} is not steered: {why or gone}")
 
     def is_one_of_several(self, arrival: Arrival) -> bool:
-        """Whether a message is for all, and this is not the one body that there is: they would be steered to one place."""
+        """Whether a message addresses all systems while there are several bodies, all of which it would steer to one place."""
         return arrival.message["target_system"] == 0 and len(self.subject.picture.records) > 1
 
     def send(self, channel: int, name: str, values: Mapping[str, Any]) -> None:
-        """To one channel; what is for one that is gone goes nowhere, and leaves nothing behind."""
+        """Sends a message to one channel. If the channel is gone, the message is dropped and leaves no state behind."""
         if channel in self.channels:
             self.outbox.send(channel, name, values)
 
     def broadcast(self, name: str, values: Mapping[str, Any]) -> None:
-        """To everybody."""
+        """Sends a message to all channels."""
         for channel in self.channels:
             self.outbox.send(channel, name, values)
 
     def say(self, severity: int, text: str) -> None:
-        """STATUSTEXT to everybody; long texts go in pieces."""
+        """Broadcasts a STATUSTEXT; long texts are sent in chunks."""
         pieces = [text[i : i + _TEXT] for i in range(0, len(text), _TEXT)] or [""]
         self._text_number = self._text_number % 0xFFFF + 1
         number = self._text_number if len(pieces) > 1 else 0
         if number and len(pieces[-1]) == _TEXT:
-            pieces.append("")  # by a text that is not full a client knows the last
+            pieces.append("")  # a chunk that is not full marks the last one
         for i, piece in enumerate(pieces):
             self.broadcast("STATUSTEXT", {"severity": severity, "text": piece, "id": number, "chunk_seq": i})
 
     def stream(self, time_ns: int) -> None:
-        """Send what is due on every channel; each message is made once. A slow link gets fewer of all kinds, and every heartbeat.
+        """Sends the messages due on every channel; each is built once. A slow link gets fewer of every kind, but all heartbeats.
 
-        Of `_AT_ONCE` one that says something new is due at once.
+        A message of `_AT_ONCE` is due at once when its values change.
         """
         for name in _AT_ONCE:
             before, self._said[name] = self._said.get(name), STREAMS[name](self.subject)

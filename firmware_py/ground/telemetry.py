@@ -1,4 +1,4 @@
-"""The messages that a system streams, each made from the picture of the last tick. World NED, body FRD."""
+"""Messages that a system streams, each built from the picture of the last tick. World NED, body FRD."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Values = Mapping[str, Any]
 _NAN = math.nan
 _UNKNOWN_16, _UNKNOWN_BATTERY = 0xFFFF, -1
 _UNKNOWN_TEMPERATURE = 0x7FFF
-"""As BATTERY_STATUS has it. SCALED_PRESSURE defines none, but its 0 would be water at the point of freezing."""
+"""BATTERY_STATUS's value for unknown. SCALED_PRESSURE defines none, but 0 would mean water at freezing point."""
 _STATE_STANDBY, _STATE_ACTIVE, _STATE_CRITICAL, _STATE_EMERGENCY = 3, 4, 5, 6
 _NO_GPS = 0
 """GPS_FIX_TYPE."""
@@ -33,7 +33,7 @@ NO_MISSION, READY, ACTIVE, PAUSED, DONE = 1, 2, 3, 4, 5
 
 @dataclass(slots=True)
 class Progress:
-    """Where a mission is; what MISSION_CURRENT says."""
+    """Progress of a mission, as MISSION_CURRENT reports it."""
 
     current: int = 0
     total: int = 0
@@ -42,7 +42,7 @@ class Progress:
 
 @dataclass(slots=True)
 class Subject:
-    """Whose telemetry it is."""
+    """The body whose telemetry is sent, with all that the messages are built from."""
 
     body: int
     picture: Picture
@@ -50,33 +50,33 @@ class Subject:
     origin: Origin
     progress: Progress = field(default_factory=Progress)
     mode_number: int | None = None
-    """The client's own number of the present mode, where several name the same."""
+    """Custom-mode number by which a client chose the present mode, where several numbers stand for it."""
     neutral: bool = True
-    """Nobody holds a stick."""
+    """Whether no pilot deflects a stick."""
 
     @property
     def record(self) -> BodyRecord:
-        """Of the last tick."""
+        """The body's record of the last tick."""
         return self.picture.records[self.body]
 
     @property
     def modules(self) -> Sequence[ModulePicture]:
-        """The body's own, in order."""
+        """The body's modules, in order."""
         return [self.picture.modules[m] for m in self.picture.members(self.body)]
 
     @property
     def leader(self) -> int:
-        """Number of the body that its leader's module is part of: its own, but while it is docked into another."""
+        """Number of the body that contains the module of this body's number: its own, except while docked into another body."""
         return self.picture.leader(self.body)
 
     @property
     def time_ms(self) -> int:
-        """Since start, in 32 bits: it begins anew after 49.7 days."""
+        """Time since start in 32 bits; wraps around after 49.7 days."""
         return self.picture.time_ns // 1_000_000 & 0xFFFFFFFF
 
     @property
     def time_us(self) -> int:
-        """Since start."""
+        """Time since start."""
         return self.picture.time_ns // 1_000
 
     @property
@@ -92,7 +92,7 @@ class Subject:
 
     @property
     def custom_mode(self) -> int:
-        """As the identity has it."""
+        """Number of the present mode in the identity's encoding."""
         mode = self.picture.mode(self.body)
         if self.mode_number in self.identity.numbers[mode]:
             return int(self.mode_number)
@@ -108,7 +108,7 @@ def heartbeat(s: Subject) -> list[Values]:
 
 
 def _state(s: Subject) -> int:
-    """MAV_STATE, gravest first."""
+    """Returns the MAV_STATE; the most severe condition prevails."""
     if s.picture.is_stopped(s.body):
         return _STATE_EMERGENCY
     if s.picture.is_in_failsafe(s.body):
@@ -178,7 +178,7 @@ def local_position_ned(s: Subject) -> list[Values]:
 
 
 _DIAGONAL = (0, 6, 11, 15, 18, 20)
-"""Places of a 6x6 matrix's diagonal in its upper triangle, row by row."""
+"""Indices of a 6x6 matrix's diagonal in its upper triangle, row by row."""
 
 
 def odometry(s: Subject) -> list[Values]:
@@ -242,7 +242,7 @@ def esc_status(s: Subject) -> list[Values]:
 
 
 _ESC_FAILURES = (0, 64, 4, 0)
-"""ESC_FAILURE_FLAGS of each EscStatus: none, generic, over temperature; one that is silent is offline."""
+"""ESC_FAILURE_FLAGS of each EscStatus: none, generic, over-temperature; a silent ESC has no flag, it is reported offline."""
 _BY_CAN = 4
 """ESC_CONNECTION_TYPE."""
 
@@ -258,7 +258,7 @@ def esc_info(s: Subject) -> list[Values]:
 
 
 def _online(s: Subject, m: ModulePicture, first: int) -> int:
-    """A bit for each of four ESCs that is heard, by a module that answers."""
+    """Returns a bit mask of those of the four ESCs from `first` on that are heard; 0 when their module does not answer."""
     answers = s.picture.time_ns - m.answered_ns < _SENSOR_FRESH_NS
     return sum(1 << n for n, status in enumerate(m.esc_status[first : first + 4]) if answers and status != ESC_SILENT)
 
@@ -281,7 +281,7 @@ def _pressure(s: Subject, pressure_pa: float, temperature_c: float) -> Values:
 
 
 def named_value_float(s: Subject) -> list[Values]:
-    """Docking currents, A, as DOCK0+X (module within the body, face); WRENCH_MRG, the share of thrust that is left."""
+    """Docking currents, A, as DOCK0+X (module within the body, face), and WRENCH_MRG, the busiest thruster's remaining share of range."""
     values = [
         (f"DOCK{i}{FACE_NAMES[face].upper()}", current * 1e-3)
         for i, m in enumerate(s.modules)
@@ -313,7 +313,7 @@ def gps_global_origin(s: Subject) -> list[Values]:
 
 
 def gps_raw_int(s: Subject) -> list[Values]:
-    """That there is none, as ArduSub says it: DroneKit does not begin before it has heard of a GPS."""
+    """Reports no GPS, in ArduSub's form: DroneKit does not start before it has received a GPS message."""
     unknown = dict.fromkeys(("eph", "epv", "vel", "cog"), _UNKNOWN_16)
     return [{"time_usec": s.time_us, "fix_type": _NO_GPS, "satellites_visible": 0, **unknown}]
 
@@ -367,7 +367,7 @@ STREAMS: Mapping[str, Callable[[Subject], list[Values]]] = {
     "CURRENT_MODE": current_mode,
     "SYSTEM_TIME": system_time,
 }
-"""Everything that can be streamed or asked for."""
+"""All messages that can be streamed or requested."""
 
 DEFAULT_HZ: Mapping[str, float] = {
     "HEARTBEAT": 1, "SYS_STATUS": 2, "ATTITUDE": 10, "ATTITUDE_QUATERNION": 10, "LOCAL_POSITION_NED": 10,
@@ -375,5 +375,5 @@ DEFAULT_HZ: Mapping[str, float] = {
     "ESC_STATUS": 1, "ESC_INFO": 0.5, "SCALED_PRESSURE": 1, "SCALED_PRESSURE2": 1, "NAMED_VALUE_FLOAT": 2, "DEBUG_FLOAT_ARRAY": 0.2,
     "EXTENDED_SYS_STATE": 1, "HOME_POSITION": 0.5, "GPS_RAW_INT": 0.5, "MISSION_CURRENT": 1, "CURRENT_MODE": 0.5, "SYSTEM_TIME": 0.5,
 }  # fmt: skip
-"""Before anybody asks for other rates."""
+"""Rates until a client requests others."""
 

@@ -1,4 +1,4 @@
-"""The kinds of link to a ground station: udpin, udpout, tcpin, serial. None ever blocks."""
+"""Types of link to a ground station: udpin, udpout, tcpin, serial. None ever blocks."""
 
 from __future__ import annotations
 
@@ -16,45 +16,45 @@ LOOPBACK = "127.0.0.1"
 _DATAGRAM = 65536
 _READ = 4096
 _LAST_PORT, _FASTEST_BAUD = 65535, 12_000_000
-"""16 bits; the fastest of common USB adapters (FT232H)."""
+"""Largest 16-bit port number; fastest rate of common USB adapters (FT232H)."""
 _READS_AT_ONCE = 64
-"""Datagrams taken from one socket before the next has its turn."""
+"""Most datagrams read from one socket before the next socket has its turn."""
 
 
 class LinkError(Exception):
-    """A link cannot be opened; one line."""
+    """A link cannot be opened; the message is one line."""
 
 
 class Link(Protocol):
-    """One address. `receive` and `send` never block; OSError means that it does not work now."""
+    """A link at one address. `receive` and `send` never block; they raise OSError when the link fails for now."""
 
     datagram: bool
 
     def receive(self) -> list[tuple[Any, bytes]]:
-        """What came, with the peer it came from."""
+        """Returns the received data, each piece with its peer."""
         ...
 
     def send(self, peer: Any, frame: bytes) -> bool:
-        """Whether the frame was taken; False: try again later."""
+        """Sends a frame. Returns whether it was accepted; False: try again later."""
         ...
 
     def peers(self) -> Sequence[Any]:
-        """Those who are there before they have said anything."""
+        """Returns the peers that are known before they have sent anything."""
         ...
 
     def leave(self, peer: Any) -> None:
-        """A peer is not talked to any more."""
+        """Ends communication with a peer."""
         ...
 
     def close(self) -> None:
-        """Give the port back."""
+        """Releases the port."""
         ...
 
 
 class UdpLink:
-    """udpin: answers whoever writes. udpout: writes to one address from the start, and hears nobody else.
+    """udpin: answers every sender. udpout: sends to one address from the start, and accepts data from there only.
 
-    It is not connected: that would tie it to the address that this machine has now, and mute it once it is given another.
+    The socket is not connected: that would bind it to the machine's present address, and mute it once the machine gets another.
     """
 
     datagram = True
@@ -98,16 +98,16 @@ class UdpLink:
         return [None] if self._to else []
 
     def leave(self, peer: Any) -> None:
-        """Nothing is kept of it."""
+        """Does nothing: no state is kept per peer."""
 
     def close(self) -> None:
         self._socket.close()
 
 
 def _who_answers(address: tuple[str, int]) -> tuple[str, int]:
-    """From where the answers of an address come: those of 0.0.0.0 from 127.0.0.1. A network that is not there yet is no mistake.
+    """Returns the address from which `address` answers: 127.0.0.1 for 0.0.0.0. An unreachable network is accepted: it may come up.
 
-    Raises PermissionError for a broadcast address, from which nobody answers.
+    Raises PermissionError for a broadcast address, from which no answer comes.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -121,7 +121,7 @@ def _who_answers(address: tuple[str, int]) -> tuple[str, int]:
 
 
 class TcpLink:
-    """tcpin: everyone who connects is a peer."""
+    """tcpin: every connected client is a peer."""
 
     datagram = False
 
@@ -156,7 +156,7 @@ class TcpLink:
             return b""
 
     def send(self, peer: Any, frame: bytes) -> bool:
-        """A frame that was begun is sent to its end before the next."""
+        """Sends a frame, after the rest of the previous one if that was sent in part."""
         if peer not in self._left:
             return True
         try:
@@ -185,7 +185,7 @@ class TcpLink:
 
 
 class SerialLink:
-    """A radio or a UART of the vehicle's computer. One that is unplugged is taken up again when its device is back."""
+    """A radio or a UART of the vehicle's computer. An unplugged device is reopened when it is back."""
 
     datagram = False
 
@@ -197,17 +197,17 @@ class SerialLink:
     def _open(self) -> Any:
         try:
             return serial.Serial(self._device, self._baud, timeout=0, write_timeout=0)
-        except termios.error as error:  # pulled out meanwhile: no OSError, and pyserial lets it through
+        except termios.error as error:  # unplugged meanwhile: not an OSError, and pyserial lets it through
             raise OSError(*error.args) from None
         except serial.SerialException as error:
-            if isinstance(error.__context__, termios.error):  # of which it keeps neither number nor words apart
+            if isinstance(error.__context__, termios.error):  # SerialException keeps neither its errno nor its text separately
                 raise OSError(*error.__context__.args) from None
             raise
 
     def _is_plugged(self) -> bool:
-        """Whether the device is open; opens it when it is there again."""
+        """Whether the device is open; reopens it when it is back."""
         if self._serial is None and os.path.exists(self._device):
-            with contextlib.suppress(OSError):  # udev has yet to give it to us, or it is pulled out again
+            with contextlib.suppress(OSError):  # udev has not granted access yet, or it was unplugged again
                 self._serial = self._open()
         return self._serial is not None
 
@@ -226,7 +226,7 @@ class SerialLink:
         return [(None, data)] if data else []
 
     def send(self, peer: Any, frame: bytes) -> bool:
-        """What is sent to an unplugged device is lost: nobody wants old telemetry."""
+        """Sends a frame; discards it while the device is unplugged, since old telemetry is useless."""
         if self._serial is None:
             return True
         try:
@@ -242,7 +242,7 @@ class SerialLink:
         return True
 
     def _write(self, data: bytes) -> int:
-        """Bytes that the device takes now. Not pyserial's write, which turns in a loop while it takes none."""
+        """Writes what the device accepts now; returns the number of bytes. Not pyserial's write, which busy-waits while it accepts none."""
         return os.write(self._serial.fileno(), data)
 
     def peers(self) -> Sequence[Any]:
@@ -257,10 +257,10 @@ class SerialLink:
 
 
 def open_link(address: str) -> Link:
-    """The link at `address`, without its ending `+trusted`.
+    """Opens the link at `address`, which comes without the suffix `+trusted`.
 
     Raises:
-        LinkError: no such kind of address, or it cannot be opened.
+        LinkError: the kind of address is unknown, or it cannot be opened.
     """
     try:
         if address.startswith("/"):
@@ -278,7 +278,7 @@ def open_link(address: str) -> Link:
 
 
 def _reason(error: Exception) -> str:
-    """In the system's words alone. Those of the resolver of names have numbers below 0, and their words in the error."""
+    """Returns the cause in the operating system's words. Name resolution errors have negative numbers, and their text in the error."""
     number = getattr(error, "errno", None) or 0
     if number == errno.ENOTTY:
         return "is no serial device"
@@ -286,7 +286,7 @@ def _reason(error: Exception) -> str:
 
 
 def _host(address: str, text: str) -> str:
-    """A host's name or number. Raises LinkError for what can be none."""
+    """Returns `text`, a host name or IP address. Raises LinkError when it can be neither."""
     try:
         text.encode("idna")
     except UnicodeError:
@@ -295,7 +295,7 @@ def _host(address: str, text: str) -> str:
 
 
 def _number(address: str, text: str, most: int, right: str) -> int:
-    """A port or a baud rate. Raises LinkError, which says what would be right."""
+    """Parses a port or a baud rate. Raises LinkError, which says what is expected."""
     if not (text.isascii() and text.isdecimal() and len(text) <= len(str(most)) and int(text) <= most):
         raise LinkError(f"link {address}: {text!r} is no whole number up to {most}; it needs {right}")
     return int(text)

@@ -1,4 +1,4 @@
-"""Bytes to messages and back: MAVLink 1 and 2 frames, checksum, signature. Pure; never raises on what comes in.
+"""Bytes to messages and back: MAVLink 1 and 2 frames, checksum, signature. Pure; never raises on received bytes.
 
 Not pymavlink's own parser: it stores a stream's time stamp before it verifies the signature, and its allow-unsigned
 callback also passes badly signed frames. Source: MAVLink developer guide, "Packet Serialization".
@@ -23,22 +23,22 @@ _SIGNED = 0x01
 _HEADER_1, _HEADER_2 = struct.Struct("<BBBBBB"), struct.Struct("<BBBBBBBHB")
 _CRC = struct.Struct("<H")
 _MOST_FALSE = 256
-"""Starts that begin no frame, in what comes at once: what is behind so many is garbage too, and a flood of them takes a millisecond."""
+"""Most false frame starts examined per call; everything after them counts as garbage. A flood of them takes a millisecond."""
 
 
 class Packet(NamedTuple):
-    """A message that is believed, and the bytes that it came in."""
+    """A believed message, and the bytes of its frame."""
 
     message: Message
     raw: bytes
 
 
 class _Header(NamedTuple):
-    """Of a frame, or of what looks like one."""
+    """Header of a frame, or of bytes that look like one."""
 
     size: int
     length: int
-    """Of the payload."""
+    """Length of the payload."""
     flags: int
     system: int
     component: int
@@ -46,7 +46,7 @@ class _Header(NamedTuple):
 
     @property
     def frame_size(self) -> int:
-        """Bytes of the whole frame."""
+        """Size of the whole frame, bytes."""
         return self.size + self.length + _CRC.size + (SIGNATURE_BYTES if self.flags & _SIGNED else 0)
 
 
@@ -57,10 +57,10 @@ class Framer:
         self._dialect, self._signing = dialect, signing
         self._buffer = bytearray()
         self.counts = counts
-        """Frames by what became of them: good, checksum, unknown, flags, length, refused; bytes of no frame: garbage."""
+        """Frames by outcome: good, checksum, unknown, flags, length, refused; bytes outside frames: garbage."""
 
     def feed(self, data: bytes, goes_on: bool = True) -> list[Packet]:
-        """The believed messages that `data` completes. Where it does not go on, what is begun is no frame, and may hold one."""
+        """Returns the believed packets that `data` completes. Unless `goes_on`, an incomplete frame is invalid, but may hold others."""
         self._buffer += data
         packets: list[Packet] = []
         at = false = 0
@@ -84,7 +84,7 @@ class Framer:
         return packets
 
     def _cut(self, at: int) -> tuple[Packet | None, bool]:
-        """The frame at `at`, if it is one, and whether more would have to come to tell."""
+        """Returns the frame at `at`, or None, and whether more bytes are needed to decide."""
         header = self._header(at)
         definition = None if header is None else self._definition(header)
         if header is None or definition is None:
@@ -98,7 +98,7 @@ class Framer:
         return None if found is None else found.start()
 
     def _header(self, at: int) -> _Header | None:
-        """The header at `at`, or None while it is incomplete."""
+        """Returns the header at `at`, or None while it is incomplete."""
         layout = _HEADER_1 if self._buffer[at] == _MAGIC_1 else _HEADER_2
         if len(self._buffer) - at < layout.size:
             return None
@@ -110,9 +110,9 @@ class Framer:
         return _Header(layout.size, length, flags, system, component, low | high << 16)
 
     def _definition(self, header: _Header) -> Definition | None:
-        """Of the message; None when this can be no frame: nothing more of it is waited for, a stop may stand behind one byte of noise.
+        """Returns the message's definition; None if this cannot be a frame. Its rest is not awaited: a stop may follow one byte of noise.
 
-        Only in MAVLink 2 a message may have grown. None of MAVLink 1 is 253 bytes long: that is the first byte of the next frame.
+        Only in MAVLink 2 may a message have grown. No MAVLink 1 message is 253 bytes long: that is the first byte of the next frame.
         """
         definition = self._dialect.by_number.get(header.number)
         if header.flags & ~_SIGNED:
@@ -126,7 +126,7 @@ class Framer:
         return None
 
     def _frame(self, header: _Header, definition: Definition, raw: bytes) -> Packet | None:
-        """The message; None when this is no frame; a nameless one when it is a frame that is not believed."""
+        """Returns the packet; None if the checksum is wrong; one with a nameless message if the frame is not believed."""
         end = header.size + header.length
         if checksum(raw[1:end], definition.crc_extra) != _CRC.unpack_from(raw, end)[0]:
             self.counts["checksum"] += 1
@@ -143,12 +143,12 @@ _NOT_BELIEVED = Message("", {})
 
 
 def checksum(covered: bytes, crc_extra: int) -> int:
-    """X.25 checksum of a frame without its magic byte, and of the message's own byte."""
+    """X.25 checksum of a frame without its magic byte, followed by the message's CRC_EXTRA byte."""
     return int(x25crc(covered + bytes((crc_extra,))).crc)
 
 
 class Encoder:
-    """Makes the frames of one system and component, MAVLink 2."""
+    """Makes the MAVLink 2 frames of one system and component."""
 
     def __init__(self, dialect: Dialect, signing: Signing, system: int, component: int) -> None:
         self._dialect, self._signing = dialect, signing
@@ -156,11 +156,11 @@ class Encoder:
         self._sequence = 0
 
     def encode(self, name: str, values: Mapping[str, Any], link: int = 0) -> bytes:
-        """One frame. Raises KeyError for a message or field that there is not."""
+        """Returns one frame. Raises KeyError for an unknown message or field."""
         return self.frame(name, self._dialect.by_name[name].encode(values), link)
 
     def frame(self, name: str, payload: bytes, link: int = 0) -> bytes:
-        """The frame of a payload that is encoded already."""
+        """Returns the frame of a payload that is already encoded."""
         definition = self._dialect.by_name[name]
         flags = 0 if self._signing.key is None else _SIGNED
         number, sequence = definition.number, self._sequence

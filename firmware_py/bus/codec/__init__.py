@@ -1,6 +1,6 @@
-"""The wire: can_dbc/modcube.dbc compiled once into fast encoders and decoders. Pure; no socket, no clock.
+"""The wire format: can_dbc/modcube.dbc compiled once into fast encoders and decoders. Pure; no socket, no clock.
 
-The firmware and the simulated nodes use it at both ends of every frame. cantools reads the DBC; it codes nothing here.
+The firmware and the simulated nodes use it at both ends of every frame. cantools only reads the DBC; it encodes and decodes nothing here.
 """
 
 from firmware_py.bus.codec.crc import crc8

@@ -22,17 +22,17 @@ class Codec:
 
     @classmethod
     def load(cls) -> Codec:
-        """The codec of the DBC that the package carries (20 ms; make one and pass it on)."""
+        """Loads the DBC shipped with the package (20 ms; load it once and pass it on)."""
         text = (resources.files("can_dbc") / "modcube.dbc").read_text(encoding="utf-8")
         return cls(cantools.database.load_string(text, "dbc", frame_id_mask=0x7E0))
 
     def message(self, name: str) -> MessageCodec:
-        """The message called `name`. Raises KeyError, with the names that there are."""
+        """Returns the message called `name`. Raises KeyError, which lists the known names."""
         try:
             return self._by_name[name]
         except KeyError:
             raise KeyError(f"no message {name!r}; there are {', '.join(self._by_name)}") from None
 
     def by_id(self, can_id: int) -> MessageCodec | None:
-        """The message of an 11-bit id, whatever its number; None where the DBC has none. 0x000..0x01F is ESTOP."""
+        """Returns the message of an 11-bit id, whatever its node number; None if the DBC has none. 0x000..0x01F is ESTOP."""
         return self._by_function.get(can_id >> 5) if 0 <= can_id <= 0x7FF else None

@@ -25,12 +25,12 @@ class Frame(NamedTuple):
 
 
 class CodecError(ValueError):
-    """The DBC is not what this codec can compile; one line."""
+    """This codec cannot compile the DBC; the message is one line."""
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One signal: where its bits are, and raw * factor + offset = physical."""
+    """One signal: position of its bits, and scaling: raw * factor + offset = physical."""
 
     name: str
     start: int
@@ -44,18 +44,18 @@ class Field:
 
     @property
     def is_integer(self) -> bool:
-        """Its physical value is its raw value."""
+        """Whether the physical value equals the raw value."""
         return self.factor == 1 and self.offset == 0
 
     @property
     def is_limited(self) -> bool:
-        """The DBC's limits leave out some of what its bits can hold."""
+        """Whether the DBC's limits exclude values that the bits can hold."""
         low, high = self.raw_range
         return self.raw_low > low or self.raw_high < high
 
     @property
     def raw_range(self) -> tuple[int, int]:
-        """What its bits can hold; the DBC's limits may be narrower."""
+        """Range that the bits can hold; the DBC's limits may be narrower."""
         return (-(1 << self.bits - 1), (1 << self.bits - 1) - 1) if self.signed else (0, (1 << self.bits) - 1)
 
 
@@ -83,28 +83,28 @@ class MessageCodec:
         self._head = self.length - 1 if self.protected else self.length
         ids = {number: self.function << 5 | number for number in self.numbers}
         self._ids = {number: (can_id, crc.register_of_id(can_id)) for number, can_id in ids.items()}
-        """By node number: the id, and the CRC's register behind it."""
+        """By node number: the id, and the CRC register after it."""
         self._unpack: Callable[[int], tuple[Any, ...]] = _compile(_decode_source(self.field_details))
         self._pack: Callable[[Sequence[Any]], int] = _compile(_encode_source(self.field_details))
 
     @property
     def is_limited(self) -> bool:
-        """The DBC's limits leave out values that the bits of a field can hold."""
+        """Whether the DBC's limits exclude values that the bits of a field can hold."""
         return any(field.is_limited for field in self.field_details)
 
     def id_of(self, number: int) -> int:
-        """The id of this message for node `number`. Raises ValueError where the number is not valid for it."""
+        """Returns the id of this message for node `number`. Raises ValueError if the number is not valid for it."""
         if number not in self._ids:
             raise ValueError(f"{self.name}: number {number} is not valid for it")
         return self.function << 5 | number
 
     def encode(self, number: int, values: Sequence[float] = (), counter: int = 0) -> Frame:
-        """The frame of physical `values`, one per name in `fields`, rounded to nearest, saturated at the limits.
+        """Encodes physical `values`, one per name in `fields`, rounded to nearest, saturated at the limits.
 
         Args:
             number: node number of the id, 0..31.
             values: physical values in the units of the DBC.
-            counter: modulo 16; ignored where the message carries none.
+            counter: modulo 16; ignored if the message carries none.
 
         Raises:
             ValueError: a value is NaN, there are too few or too many, or the number is not valid.
@@ -116,7 +116,7 @@ class MessageCodec:
         return self._frame(number, raw, counter)
 
     def encode_raw(self, number: int, raws: Sequence[int], counter: int = 0) -> Frame:
-        """The frame of raw integers, which need only fit their bits: what a faulty node may send.
+        """Encodes raw integers, which need only fit their bits: frames that a faulty node may send.
 
         Raises:
             ValueError: a raw value does not fit, there are too few or too many, or the number is not valid.
@@ -130,11 +130,11 @@ class MessageCodec:
         return self._frame(number, packed, counter)
 
     def decode(self, data: bytes) -> tuple[Any, ...]:
-        """Values in the order of `fields`: int where the factor is 1, else float in the DBC's unit. Checks nothing."""
+        """Returns values in the order of `fields`: int where the field is an integer, else float in the DBC's unit. Checks nothing."""
         return self._unpack(int.from_bytes(data, "little"))
 
     def decode_raw(self, data: bytes) -> tuple[int, ...]:
-        """Raw integers in the order of `fields`. Checks nothing."""
+        """Returns raw integers in the order of `fields`. Checks nothing."""
         packed = int.from_bytes(data, "little")
         bits = ((field, packed >> field.start & ((1 << field.bits) - 1)) for field in self.field_details)
         return tuple(raw - (1 << f.bits) if f.signed and raw >> (f.bits - 1) else raw for f, raw in bits)
@@ -159,7 +159,7 @@ class MessageCodec:
 
 
 def _numbers(name: str) -> frozenset[int]:
-    """Numbers that are valid for a message (can_dbc/README.md: 0 firmware, 1..29 modules, 30 e-stop box, 31 camera)."""
+    """Node numbers that are valid for a message (can_dbc/README.md: 0 firmware, 1..29 modules, 30 e-stop box, 31 camera)."""
     if name in ("ESTOP", "HEARTBEAT"):
         return frozenset(range(NUMBERS))
     return frozenset((0,)) if name == "SYNC" else frozenset(range(1, 30))
@@ -195,7 +195,7 @@ def _decode_source(fields: Sequence[Field]) -> str:
 
 
 def _encode_source(fields: Sequence[Field]) -> str:
-    """`round` of a value that passed both comparisons: NaN fails them and makes round() raise ValueError."""
+    """Source of the encoder. Only values within the limits reach round(), and NaN, which fails both comparisons: it raises ValueError."""
     lines = ["def pack(values):"]
     names = [f"v{index}" for index in range(len(fields))]
     lines.append(f"    ({''.join(name + ', ' for name in names)}) = values")
@@ -211,7 +211,7 @@ def _encode_source(fields: Sequence[Field]) -> str:
 
 
 def _compile(source: str) -> Any:
-    """The function that `source` defines: a lambda, or a def called pack."""
+    """Returns the function that `source` defines: a lambda, or a def called pack."""
     if source.startswith("lambda"):
         return eval(source, {"__builtins__": {}})
     namespace: dict[str, Any] = {"__builtins__": {"round": round}}

@@ -1,4 +1,4 @@
-"""What a node checks before it believes a frame: all frames of a call in one compiled pass."""
+"""Checks of a node before it believes a frame: all frames of a call in one compiled pass."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from firmware_py.bus.codec.database import Codec
 from firmware_py.bus.codec.message import NO_COUNTER, NUMBERS, Frame, MessageCodec
 
 KINDS = ("id", "number", "length", "crc", "counter", "range")
-"""Why a frame is dropped; a row of `Receiver.rows` begins with ~index."""
+"""Reasons to drop a frame; its row of `Receiver.rows` then begins with ~index."""
 MESSAGE, NUMBER, COUNTER, VALUES = range(4)
-"""Columns of a row; its values follow."""
+"""Columns of a row; its values begin at VALUES."""
 MOST_VALUES = 8
 _WIRE = struct.Struct("<iB8s").pack
 _WIRE_BYTES = 13
@@ -35,12 +35,12 @@ class Received(NamedTuple):
 
 
 class Receiver:
-    """Checks the frames of one bus as one node hears them; drops, counts by kind, never raises.
+    """Checks the frames of one bus as one node receives them; drops invalid ones, counts them by kind, never raises.
 
     A frame is dropped when its id is unknown, its number not valid for the message, its length wrong, its CRC wrong,
-    its counter that of the last accepted frame of the same id, or a value outside the DBC's limits (such as raw -2048
-    of a thruster). Any other step of the counter is accepted, so a node that restarts is heard from its first or second
-    frame on. ESTOP stops everyone whatever its length.
+    its counter equal to that of the last accepted frame of the same id, or a value outside the DBC's limits (such as
+    raw -2048 of a thruster). Any other step of the counter is accepted, so a node that restarts is heard from its first
+    or second frame on. ESTOP stops every node whatever its length.
     """
 
     def __init__(self, codec: Codec) -> None:
@@ -62,7 +62,7 @@ class Receiver:
     def rows(self, frames: Sequence[Frame]) -> np.ndarray:
         """(n, 3 + 8) one row for each frame: index of its message in the codec, or ~index of the kind of fault; number; counter; values.
 
-        Values stand in the order of the message's `fields`, all as floats.
+        Values are in the order of the message's `fields`, all as floats.
         """
         wire = np.frombuffer(bytearray().join([_WIRE(can_id, len(data), data) for can_id, data in frames]), dtype=np.uint8)
         rows = np.zeros((len(frames), VALUES + MOST_VALUES))
@@ -70,7 +70,7 @@ class Receiver:
         return rows
 
     def judge(self, frames: Sequence[Frame]) -> list[Received | str]:
-        """What each frame says, or the kind of its fault."""
+        """Returns the contents of each frame, or the kind of its fault."""
         found: list[Received | str] = []
         for row, frame in zip(self.rows(frames).tolist(), frames, strict=True):
             which = int(row[MESSAGE])
@@ -83,13 +83,13 @@ class Receiver:
         return found
 
     def accept(self, frame: Frame) -> Received | None:
-        """What the frame says, or None when it is dropped."""
+        """Returns the contents of the frame, or None when it is dropped."""
         received = self.judge((frame,))[0]
         return None if isinstance(received, str) else received
 
 
 def _tables(codec: Codec) -> tuple[np.ndarray, np.ndarray]:
-    """(2048, 5) of each id: message or ~kind, length, protected, number of values, CRC register behind the id; (k, 8, 7) of each field."""
+    """(2048, 5) per id: message or ~kind, length, protected, number of values, CRC register after the id; (k, 8, 7) per field."""
     ids = np.zeros((_IDS, 5), dtype=np.int64)
     ids[:, 0] = ~KINDS.index("id")
     fields = np.zeros((len(codec.messages), MOST_VALUES, 7))
@@ -106,11 +106,11 @@ def _tables(codec: Codec) -> tuple[np.ndarray, np.ndarray]:
 
 @njit("void(uint8[::1],int64[:,::1],float64[:,:,::1],int64[::1],int64[::1],float64[:,::1])", cache=True)
 def check(wire, ids, fields, counters, dropped, rows):  # type: ignore[no-untyped-def]
-    """Writes `rows`, and keeps the counters of ids (2048,) and the (6,) counts of faults.
+    """Fills `rows`; updates the counters of the ids (2048,) and the counts of faults (6,).
 
     Args:
-        wire: (13 n,) of each frame its id, four bytes little endian, its length, eight bytes of data.
-        ids, fields: of `_tables`.
+        wire: (13 n,) for each frame its id, four bytes little endian, its length, eight bytes of data.
+        ids, fields: from `_tables`.
     """
     for i in range(rows.shape[0]):
         here = wire[_WIRE_BYTES * i : _WIRE_BYTES * (i + 1)]

@@ -1,6 +1,7 @@
-"""The one way to a CAN bus: `open_port(address)` over python-can, for the firmware, the plant and the tools alike.
+"""Access to a CAN bus: `open_port(address)` over python-can, for the firmware, the plant and the tools alike.
 
-Once open a port never raises: an interface that is down, gone, full or made again is counted and recovers by itself.
+Once open, a port never raises on faults of the bus: an interface that is down, gone, full or recreated is counted, and it recovers by
+itself.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ __all__ = ["Port", "PortError", "open_port"]
 
 ADDRESSES = "virtual:NAME, udp:GROUP:PORT, socketcan:INTERFACE or slcan:DEVICE"
 READ_TIMEOUT_S = 0.05
-"""How long the reader thread sleeps without a frame; also how long it takes to close."""
+"""Longest sleep of the reader thread without a frame; also the longest time that closing takes."""
 REOPEN_EVERY = 16
-"""An interface that is there but does not open is tried again at every so-manieth read."""
+"""Reads skipped between two attempts to open an interface that is present but does not open."""
 BUS_OFF = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the id of an error frame."""
 LARGEST_ID = 0x7FF
-"""Of a classic frame. The line of an slcan adapter has room for more, and one wrong bit makes it so; a datagram of udp: for any number."""
+"""Largest id of a classic frame. A line of an slcan adapter may hold a larger one after a bit error; a datagram of udp: any number."""
 
 _DOWN = {errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EADDRNOTAVAIL}
 _GONE = {errno.ENODEV, errno.ENXIO, errno.EBADF, errno.EIO}
@@ -73,7 +74,7 @@ class Port:
             self._thread.start()
 
     def send(self, frame: Frame) -> bool:
-        """Sends one frame, or counts why not; whether the bus took it. Never waits for the bus."""
+        """Sends one frame, or counts why not. Returns whether the bus accepted it. Never waits for the bus."""
         bus = self._bus
         if bus is None:
             self._refuse_if_closed()
@@ -81,13 +82,13 @@ class Port:
             return False
         try:
             self._link.send(bus, frame)
-        except Exception as error:  # python-can lets OSError, SerialException and its own through, by back end
+        except Exception as error:  # by back end: OSError, SerialException or python-can's own
             self._failed("send", error)
             return False
         return True
 
     def receive(self) -> list[Frame]:
-        """Every frame that is there, in order; without a reader this also reopens an interface that came back."""
+        """Returns all available frames in order; without a reader this also reopens an interface that came back."""
         if self._thread is None:
             return self._drain(0.0)
         self._refuse_if_closed()
@@ -99,7 +100,7 @@ class Port:
     def wait(self, deadline_ns: int, ready: Callable[[], bool] | None = None) -> bool:
         """Blocks until `ready()` (by default: a frame waits here) or until `deadline_ns` on the port's clock.
 
-        `ready` is asked again whenever a frame arrives at any port that shares the arrival.
+        `ready` is called again whenever a frame arrives at any port that shares the arrival event.
 
         Returns:
             Whether it became ready before the deadline.
@@ -120,11 +121,11 @@ class Port:
             self._arrival.wait(left_ns * 1e-9)
 
     def has_frames(self) -> bool:
-        """Whether frames wait behind the reader."""
+        """Whether frames from the reader are waiting."""
         return bool(self._waiting)
 
     def close(self) -> None:
-        """Closes the bus; may be called again."""
+        """Closes the bus; may be called repeatedly."""
         self._closed = True
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
@@ -141,7 +142,7 @@ class Port:
     def _read_for_ever(self) -> None:
         pause = threading.Event()
         while not self._closed:
-            if self._is_lost:  # send found out; only the reader closes what the reader reads
+            if self._is_lost:  # noticed by send; only the reader may close the bus that it reads
                 self._is_lost = False
                 self._let_go()
             frames = self._drain(READ_TIMEOUT_S)
@@ -154,7 +155,7 @@ class Port:
                 pause.wait(READ_TIMEOUT_S)
 
     def _drain(self, timeout_s: float) -> list[Frame]:
-        """What is there now, after waiting up to `timeout_s` for the first."""
+        """Returns the available frames, after waiting up to `timeout_s` for the first."""
         frames: list[Frame] = []
         bus = self._bus
         if bus is None:
@@ -170,7 +171,7 @@ class Port:
                     frames.append(frame)
                 else:
                     self.faults["foreign"] += 1
-        except Exception as error:  # as in send; also what a back end makes of garbage
+        except Exception as error:  # as in send; also errors of a back end on garbage
             self._failed("receive", error)
         if not frames:
             self._look_after(bus)
@@ -244,9 +245,9 @@ def open_port(
 
     Args:
         address: virtual:NAME, udp:GROUP:PORT, socketcan:INTERFACE or slcan:DEVICE.
-        reader: a thread drains the bus all the time (real time); without it `receive` reads (lockstep).
+        reader: whether a thread drains the bus continuously (real time); without it `receive` reads (lockstep).
         now_ns: the clock that deadlines of `wait` are on, nanoseconds.
-        arrival: set whenever a frame arrives, with a reader; share one among ports to wait for all of them.
+        arrival: with a reader, the event set whenever a frame arrives; share one among ports to wait for all of them.
 
     Raises:
         PortError: the address is wrong or the bus cannot be opened.

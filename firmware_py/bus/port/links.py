@@ -1,4 +1,4 @@
-"""The kinds of bus behind a port: how each is opened over python-can, and how one frame passes."""
+"""Types of bus behind a port: how each is opened over python-can, and how it sends and reads a frame."""
 
 from __future__ import annotations
 
@@ -23,55 +23,55 @@ from firmware_py.bus.codec import Frame
 from firmware_py.bus.load import BIT_RATE
 
 WAITING_FRAMES = 4096
-"""Most frames that wait unread in a virtual bus or behind a reader; half a second of a full bus."""
+"""Most unread frames in a virtual bus or behind a reader; half a second of a full bus."""
 SOCKET_BUFFER_BYTES = 1 << 20
-"""Asked for; the kernel's default keeps 256 to 278 unread frames (measured), and gives twice that at most."""
+"""Requested receive buffer. The kernel's default holds 256 to 278 unread frames (measured); it grants at most twice that."""
 
 _CAN_FRAME = struct.Struct("=IB3x8s")
 """struct can_frame of linux/can.h: id and flags, length, payload."""
 _EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
-"""CAN_EFF_FLAG, CAN_RTR_FLAG and CAN_ERR_FLAG, in the word of the id."""
+"""CAN_EFF_FLAG, CAN_RTR_FLAG and CAN_ERR_FLAG, in the id word."""
 _FLAGS = _EXTENDED | _REMOTE | _ERROR
 
 
 class PortError(Exception):
-    """A bus cannot be opened, or is used after it was closed; one line that says what would be right."""
+    """A bus cannot be opened, or a port is misused, such as after it was closed; the message is one line that says what is expected."""
 
 
 class Link(ABC):
-    """One kind of bus: how to open it, and how one frame passes."""
+    """One type of bus: opens it, and sends and reads its frames."""
 
     def __init__(self, address: str) -> None:
         self.address = address
 
     @abstractmethod
     def open(self) -> can.BusABC:
-        """A fresh python-can bus. Raises PortError."""
+        """Opens a new python-can bus. Raises PortError."""
 
     def is_present(self) -> bool:
-        """Whether opening it again is worth a try."""
+        """Whether the interface is there, so that reopening is worth a try."""
         return True
 
     def is_same(self) -> bool:
-        """Whether the open interface is still the one of that name."""
+        """Whether the open interface is still the one that has the name now."""
         return True
 
     def close(self, bus: Any) -> None:
-        """Closes a bus of `open`, also one whose interface is gone."""
+        """Closes a bus from `open`, even if its interface is gone."""
         bus.shutdown()
 
     def send(self, bus: Any, frame: Frame) -> None:
-        """Hands one frame to `bus`; raises what python-can raises."""
+        """Hands one frame to `bus`; lets python-can's exceptions through."""
         message = can.Message(arbitration_id=frame[0], is_extended_id=False, data=frame[1])
         bus.send(message, 0.0)
 
     def read(self, bus: Any, timeout_s: float) -> Frame | can.Message | None:
-        """One frame from `bus`, or None when there is none."""
+        """Reads one frame from `bus`; returns None when there is none."""
         message: can.Message | None = bus.recv(timeout_s)
         return message
 
     def waiting(self, bus: Any, timeout_s: float) -> Iterable[Frame | can.Message]:
-        """Everything that is there, after waiting up to `timeout_s` for the first; of a bus without end, so much as would wait."""
+        """Yields the available frames, after waiting up to `timeout_s` for the first; at most WAITING_FRAMES, if the bus never pauses."""
         for _ in range(WAITING_FRAMES):
             item = self.read(bus, timeout_s)
             if item is None:
@@ -81,7 +81,7 @@ class Link(ABC):
 
 
 class _FrameQueue(SimpleQueue[Any]):
-    """What waits for one virtual port; `lost` counts what found it full."""
+    """Frames that wait for one virtual port; `lost` counts those that found it full."""
 
     lost = 0
 
@@ -90,7 +90,7 @@ class FrameBus(VirtualBus):
     """python-can's virtual bus without its copies: ports hand each other the Frame itself.
 
     Measured per frame, send and receive together: python-can 6.4 us (it deep-copies a Message for each listener and
-    locks a queue.Queue), this 0.4 us. Plain python-can buses on the same channel still hear it and are heard.
+    locks a queue.Queue), this 0.4 us. It still exchanges frames with plain python-can buses on the same channel.
     """
 
     def __init__(self, channel: str) -> None:
@@ -130,12 +130,12 @@ class VirtualLink(Link):
 
     def waiting(self, bus: Any, timeout_s: float) -> Iterable[Frame | can.Message]:
         first = self.read(bus, timeout_s) if timeout_s > 0.0 else None
-        rest = [bus.queue.get(False) for _ in range(bus.queue.qsize())]  # nobody else takes from it
+        rest = [bus.queue.get(False) for _ in range(bus.queue.qsize())]  # there is no other consumer
         return rest if first is None else [first, *rest]
 
 
 class UdpLink(Link):
-    """udp:GROUP:PORT, between processes of one machine: hop limit 0 keeps the frames on it."""
+    """udp:GROUP:PORT, between processes of one machine: hop limit 0 keeps the frames on that machine."""
 
     def __init__(self, address: str) -> None:
         super().__init__(address)
@@ -147,7 +147,7 @@ class UdpLink(Link):
             self.group, self.port = ipaddress.ip_address("0.0.0.0"), 0
         if not self.group.is_multicast or not 1 <= self.port <= 65535:
             raise PortError(f"udp:{address}: needs a multicast group and a port, udp:239.74.163.2:43113")
-        # A sender hears its own frames, and all senders of a machine share address and port: this tells them apart.
+        # A sender hears its own frames, and all senders of a machine share address and port: the token tells them apart.
         self.token = uuid.uuid4().hex[:12]
 
     def open(self) -> can.BusABC:
@@ -173,10 +173,10 @@ class UdpLink(Link):
 
 
 class SocketcanLink(Link):
-    """socketcan:INTERFACE, the kernel's. A controller that went bus-off comes back by itself with `restart-ms` set.
+    """socketcan:INTERFACE, a CAN interface of the kernel. A controller in bus-off recovers by itself if `restart-ms` is set.
 
-    Frames pass through python-can's socket without its messages. Thousands of instructions a frame, measured in
-    hil/guest: sent 9 in place of python-can's 46, received 9 in place of 55.
+    Frames pass through python-can's socket without its messages. Thousands of instructions per frame, measured in
+    hil/guest: 9 to send instead of python-can's 46, 9 to receive instead of 55.
     """
 
     def __init__(self, address: str) -> None:
@@ -191,7 +191,7 @@ class SocketcanLink(Link):
             there = f"there are {', '.join(names)}" if names else "this machine has none with can in its name"
             raise PortError(f"socketcan:{self.address}: there is no such interface; {there}") from None
         try:
-            # python-can leaks the socket of an interface that it cannot bind, so this one goes first.
+            # python-can leaks the socket of an interface that it cannot bind, so a probe goes first.
             with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
                 probe.bind((self.address,))
             bus = can.Bus(interface="socketcan", channel=self.address, ignore_config=True)
@@ -222,7 +222,7 @@ class SocketcanLink(Link):
         return self._current_index() != 0
 
     def is_same(self) -> bool:
-        """A socket of an interface that was deleted and made again stays silent for ever without an error."""
+        """Whether the interface was not recreated since it was opened: the socket of the old one would stay silent without an error."""
         return self._current_index() == self._index
 
     def _current_index(self) -> int:
@@ -238,9 +238,9 @@ class SlcanLink(Link):
     def __init__(self, address: str) -> None:
         super().__init__(address)
         self._rest = b""
-        """What the device did not take of the last line: another one cannot begin before it is through."""
+        """Rest of the last line that the device has not accepted yet: no other line may begin before it is through."""
         self._lock: int | None = None
-        """A descriptor that holds the device for this process: another one would switch the channel off, and hears no foreign SYNC."""
+        """Descriptor that locks the device for this process: a second process would switch the channel off, and hear no foreign SYNC."""
 
     def open(self) -> can.BusABC:
         self._rest = b""
@@ -259,7 +259,7 @@ class SlcanLink(Link):
             raise PortError(f"slcan:{self.address}: {_reason(error)}; {hint}") from None
 
     def _take(self) -> None:
-        """Raises BlockingIOError where another has it, before anything is sent to it."""
+        """Locks the device. Raises BlockingIOError if another process holds it, before anything is sent to it."""
         lock = os.open(self.address, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             if not os.isatty(lock):
@@ -277,7 +277,7 @@ class SlcanLink(Link):
             self._lock = None
 
     def close(self, bus: Any) -> None:
-        """python-can leaves the device open when it is gone and its last command fails."""
+        """Closes the bus, and its device too: python-can leaves that open when the device is gone and its last command fails."""
         try:
             bus.shutdown()
         finally:
@@ -287,9 +287,9 @@ class SlcanLink(Link):
                 self._give_back()
 
     def send(self, bus: Any, frame: Frame) -> None:
-        """Hands over what the device takes at once.
+        """Writes what the device accepts at once.
 
-        python-can waits until it is transmitted, and calls a frame lost whose process was interrupted for longer than its time-out.
+        python-can waits until the frame is transmitted, and reports it as lost if the process was interrupted for longer than its timeout.
         """
         device = bus.fileno()
         if self._rest:
@@ -300,7 +300,7 @@ class SlcanLink(Link):
         self._rest = line[os.write(device, line) :]
 
     def read(self, bus: Any, timeout_s: float) -> Frame | can.Message | None:
-        """python-can turns in a loop while it waits, and keeps a line that is not text: it would stumble over it for ever."""
+        """Reads one frame; discards a line that is not text. python-can busy-waits, and keeps such a line: all later reads would fail."""
         if timeout_s > 0.0 and not select.select((bus.fileno(),), (), (), timeout_s)[0]:
             return None
         try:
@@ -318,7 +318,7 @@ class SlcanLink(Link):
 
 
 def error_number(error: BaseException) -> int | None:
-    """errno behind an exception of python-can, which keeps it in one of three places."""
+    """Returns the errno behind an exception of python-can, which keeps it in one of three places."""
     for each in (error, error.__cause__):
         number = getattr(each, "error_code", None) or getattr(each, "errno", None)
         if isinstance(number, int):
