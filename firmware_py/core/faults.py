@@ -1,7 +1,8 @@
 """Detection of dead and lying thrusters: from ESC reports, from missing motion, and from modules that fall silent. Runs between estimator
 and supervisor.
 
-A thruster that was found faulty stays excluded until the body is disarmed; those of a silent module until it is heard again.
+A thruster that was found faulty stays excluded until the body is disarmed, unless leaving it out shows that something else pushes
+(`thruster_trial`); those of a silent module stay excluded until it is heard again.
 """
 
 from __future__ import annotations
@@ -160,6 +161,8 @@ class FaultDetector:
         found = self._motion.step(measured, estimate, mean_n * self._share, self.now.alive, armed, free)
         if found is not None:
             self._lose(found, "does not push as it says")
+        elif self._motion.acquitted is not None:
+            self._take_back(self._motion.acquitted)
         own = [modules[m] for m in self._modules]
         (self._hear if armed else self._hear_at_rest)(own, force_n)
         self._miss(own, armed)
@@ -234,6 +237,13 @@ class FaultDetector:
         self.now, self.changed = self._left(), True
         self._motion.forget()
         self.words.append(f"thruster {i + 1} {why}: left out")
+
+    def _take_back(self, i: int) -> None:
+        """Uses a thruster again that the motion alone had convicted."""
+        self._obeys[i] = True
+        self.now, self.changed = self._left(), True
+        self._motion.forget()
+        self.words.append(f"thruster {i + 1} is used again: the robot is pushed as much without it")
 
     def _judge(self, usable: np.ndarray) -> ThrusterFaults:
         alive = usable.copy()

@@ -186,8 +186,8 @@ class HealthMonitor:
         """The same for a pressure sensor."""
         self.topology, self.open_joints = "", tuple[frozenset[int], ...]()
         """Set by the code that watches the docked faces."""
-        self.warm = True
-        """False only if a caller clears it, for as long as compiled functions are not warmed up."""
+        self.warm = False
+        """Set by the pipeline once every stage has run: from then on nothing is compiled or read from disk in a tick."""
         self.retune(parameters)
 
     def retune(self, parameters: Parameters) -> None:

@@ -17,6 +17,7 @@ from firmware_py.core.drag_lookup import NODES, add_drag
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
 from firmware_py.core.rotations import M, V, cross, rotate_back, turned_back
+from firmware_py.core.thruster_trial import ThrusterTrial
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 
@@ -57,6 +58,9 @@ FRESH_NS = 500_000_000
 """Age of the newest tag at which judging stops: without tags, tilt and speed of a tumbling robot are known too poorly."""
 MOST = 2.6
 """Largest loss of a thruster as a multiple of its force; 2 means reversed."""
+ACQUITTALS = 2
+"""How often a thruster may be acquitted until the body is armed again. One that is stuck may look innocent, and must not come and go for
+the rest of the flight."""
 
 
 class MissingThrust:
@@ -80,14 +84,19 @@ class MissingThrust:
         )  # fmt: skip
         """Arguments sigma, tilt, doubt, drift and flow of `explain`."""
         self._period_s = period_ns * 1e-9
+        self.acquitted: int | None = None
+        """Thruster that was left out because of its motion, and that this tick showed to be innocent."""
+        self.reset()
         self.forget()
 
     def reset(self) -> None:
         """Drops any suspicion; keeps the blocks, so that the motion of the disarmed body serves as the base."""
         self._suspect, self._count = -1, 0
+        self._trial: ThrusterTrial | None = None
+        self._acquittals = [0] * len(self._columns)
 
     def forget(self) -> None:
-        """Drops all blocks and any suspicion, because the usable thrusters have changed."""
+        """Drops all blocks and any suspicion, because the usable thrusters have changed. A trial goes on."""
         self._blocks = np.full((GAP + BASE, FORCES + self._columns.shape[0] + 2), np.nan)
         self._suspect, self._count = -1, 0
         self._start_block(None)
@@ -108,6 +117,7 @@ class MissingThrust:
             force_n: (n,) believed mean forces since the last tick, N.
             free: no magnet pulls at another body, nor pushes a module of this one away.
         """
+        self.acquitted = None
         if not estimate.ready:
             return None
         self._add(measured, estimate, force_n)
@@ -117,8 +127,9 @@ class MissingThrust:
         full = self._close(estimate)
         self._start_block(self._last if self._last_n == len(self._seen) else None)
         if not (full and armed):
-            self._count = 0
+            self._count, self._trial = 0, None
             return None
+        self._judge_trial()
         return self._decide(alive)
 
     def _add(self, measured: Measured, estimate: Estimate, force_n: np.ndarray) -> None:
@@ -159,7 +170,21 @@ class MissingThrust:
             self._suspect, self._count = best, int(best >= 0)
             return None
         self._count += 1
-        return best if self._count >= self.parameters.lie_count else None
+        if self._count < self.parameters.lie_count:
+            return None
+        base, recent = (np.nanmean(blocks[:, :6], axis=0) for blocks in (self._blocks[:BASE], self._blocks[-RECENT:]))
+        self._trial = ThrusterTrial(best, base, recent - base, self._healthy[0])
+        return best
+
+    def _judge_trial(self) -> None:
+        """Shows the latest block to the trial under way; a thruster may be acquitted so many times."""
+        verdict = None if self._trial is None else self._trial.is_innocent(self._blocks[-1, :6])
+        if self._trial is None or verdict is None:
+            return
+        thruster, self._trial = self._trial.thruster, None
+        if verdict and self._acquittals[thruster] < ACQUITTALS:
+            self._acquittals[thruster] += 1
+            self.acquitted = thruster
 
     def _explain(self, alive: np.ndarray) -> int:
         """Returns the one thruster that explains the change, or -1."""

@@ -160,9 +160,10 @@ class BodyPipeline:
         armed, alive = self.supervisor.armed, self.faults.now.alive
         force, command = self.limiter.step(thrust.force_n, armed, self.supply.voltage_v, alive)
         self.lag.command(force)
-        said, may_arm = self.supervisor, self._may_arm(time_ns)
+        self.health.warm = True
+        mode, may_arm = self.supervisor, self._may_arm(time_ns)
         record = BodyRecord(
-            self.body.index, said.state, said.mode, estimate, setpoint, wrench, thrust, force, may_arm, said.level
+            self.body.index, mode.state, mode.mode, estimate, setpoint, wrench, thrust, force, may_arm, mode.level
         )
         return record, command
 

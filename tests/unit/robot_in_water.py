@@ -35,6 +35,8 @@ class Water:
         self.status = np.zeros(n, dtype=int)
         self.heard = 1.0
         self.free = True
+        self.pushed = np.zeros(6)
+        """Wrench of a wall or a hand, N and N m, body frame."""
         self.tag_age_ns = 0
         self.x = np.zeros(STATES)
         self.x[2] = 2.0
@@ -58,7 +60,7 @@ class Water:
         believed, acting = self.believed.step(), self.acts.step()
         self.believed.command(wanted)
         self.acts.command(np.where(np.abs(wanted) < self.deadband, 0.0, wanted))
-        b, tau = self.body, self.body.thrusters.matrix @ (self.gain * acting)
+        b, tau = self.body, self.body.thrusters.matrix @ (self.gain * acting) + self.pushed
         felt = propagation.inertial_acceleration(self.x, tau, *b.plant)
         self.x = propagation.step(self.x, tau, DT, *b.plant)
         estimate = Estimate(

@@ -44,6 +44,13 @@ def test_robot_that_may_not_arm_says_why(tank: Tank) -> None:
     assert any(event.text.startswith("ARM refused: ") for event in outputs.events)
 
 
+def test_robot_does_not_arm_before_every_stage_has_run_once(tank: Tank) -> None:
+    cold = "compiled code is not warm yet"
+    first, second = (tank.run(DT, Request(Action.ARM)) for _ in range(2))
+    refused = [[event.text for event in outputs.events if event.text.startswith("ARM refused: ")] for outputs in (first, second)]
+    assert [cold in text for texts in refused for text in texts] == [True, False]
+
+
 def test_record_says_whether_arm_would_be_granted(tank: Tank) -> None:
     assert not tank.run(DT).records[0].may_arm, "it has seen nothing yet"
     assert tank.run(0.5).records[0].may_arm
