@@ -1,4 +1,4 @@
-"""A collector of inputs, and the nodes that speak to it, without a bus."""
+"""An input collector and the nodes that feed it, without a bus."""
 
 from firmware_py.bus.codec import Codec, pack_quaternion
 from firmware_py.bus.mapping import InputCollector
@@ -11,7 +11,7 @@ TWO_BUSES = Fleet(module=(Module(number=1, bus=0), Module(number=1, bus=1), Modu
 
 
 class Robot:
-    """A collector with the nodes' side of the bus; each message counts on by itself, like the real nodes'."""
+    """An input collector with the nodes' side of the bus; each message has its own counter, as in the real nodes."""
 
     def __init__(self, fleet=None):
         self.collector = InputCollector(fleet or single(), CODEC)
@@ -31,7 +31,7 @@ class Robot:
                 self.say("TAG_ATTITUDE", attitude, number, counter=counter)
 
     def tick(self, tick, delay_ns=0):
-        """The Inputs of a tick whose SYNC went out at tick * TICK_NS."""
+        """Returns the Inputs of a tick whose SYNC was sent at tick * TICK_NS."""
         self.collector.sync_sent(tick, tick * TICK_NS)
         return self.collector.collect(tick, tick * TICK_NS + delay_ns)
 

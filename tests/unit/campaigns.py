@@ -1,4 +1,4 @@
-"""Campaigns whose flights take no time, for the tests of what is made of them."""
+"""Campaigns whose flights take no time, for the tests of what campaigns do with their trials."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
@@ -16,7 +16,7 @@ from hil.workers import Pool
 
 
 class PlugError(Exception):
-    """Somebody pulled the plug."""
+    """Stands for a power cut."""
 
 
 class Inline(Executor):
@@ -34,7 +34,7 @@ def trial(seed: int, rmse_m: float, outcome: str = "passed") -> Trial:
 
 
 def flying(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, str]]:
-    """Every flight takes no time; returns the (seed, bus) of those that will be flown."""
+    """Makes every flight take no time; returns the list to which each flight will add its (seed, bus)."""
     flown: list[tuple[int, str]] = []
 
     def fly(scenario: Scenario, parameters: Parameters, seed: int, bus: str, code: str) -> Trial:

@@ -1,4 +1,4 @@
-"""What the process of a vehicle of three modules writes into its can.log, by the codec's own frames."""
+"""Lines that the process of a vehicle of three modules writes into its can.log, made of the codec's own frames."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ PERIOD_NS = 10_000_000
 
 
 def lines_of(armed: Sequence[bool], tick: int = 1) -> str:
-    """What one tick writes: SYNC, an answer of each module, its commands."""
+    """Returns the lines of one tick: for each module SYNC, an answer, its commands."""
     text = ""
     for on, module in zip(armed, FLEET.module, strict=True):
         names = ("THRUSTER_CMD_A", "THRUSTER_CMD_B")
@@ -26,6 +26,6 @@ def lines_of(armed: Sequence[bool], tick: int = 1) -> str:
 
 
 def dock_line(index: int, relays: Sequence[int], tick: int = 1, direction: str = "T") -> str:
-    """What a tick writes in which the relays of a module are due."""
+    """Returns the line of the relay command of a module in one tick."""
     module = FLEET.module[index]
     return candump_lines(tick * PERIOD_NS, module.bus, direction, [CODEC.message("DOCK_CMD").encode(module.number, relays, tick)])

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "tools" / "data"
 SEVEN = ("modcube_sim", "double", "quad", "chasing_m2", "girona500", "bluerov2_heavy", "bluerov2")
 FLU_TO_FRD = np.diag([1.0, -1.0, -1.0])
-"""Of positions and of directions, on either side."""
+"""For positions and directions; symmetric, so that it may be multiplied from either side."""
 LINE = [(0, 0, 0), (0, 1, 0)]
 SQUARE = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
 
@@ -32,7 +32,7 @@ def raw(name: str) -> Layout:
 
 
 def without(layout: Layout, dead: Sequence[int]) -> Layout:
-    """What is left when these thrusters (from 0 on) give nothing."""
+    """Returns the layout without the dead thrusters, which are numbered from 0."""
     alive = np.setdiff1d(np.arange(layout.count), dead)
     own = {name: getattr(layout, name)[alive] for name in ("f_min", "f_max", "power_forward", "power_reverse")}
     return dataclasses.replace(layout, matrix=layout.matrix[:, alive], **own)

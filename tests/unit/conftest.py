@@ -1,5 +1,5 @@
-"""Fixtures of several files: the ground side's world, which a file that has one of its own keeps, a lone module, and what the
-command line refuses.
+"""Fixtures shared by several files: the world of the ground side (a file may define its own), the body of a single module, and the
+error line with which the command line refuses arguments.
 """
 
 from collections.abc import Callable
@@ -24,13 +24,13 @@ def client(world: World) -> Client:
 
 @pytest.fixture(scope="session")
 def body() -> Body:
-    """That of one module; a file that has others asks for its own."""
+    """The body of one module; a file that needs another one defines its own."""
     return assemble_vehicle(load_vehicle("modcube"))
 
 
 @pytest.fixture
 def refusal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """refusal(*arguments): the one line with which `modcube` refuses them."""
+    """refusal(*arguments): returns the one line with which `modcube` refuses them."""
     from firmware_py.cli import main  # most files do without it
 
     def run(*arguments: str) -> str:

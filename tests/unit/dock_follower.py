@@ -1,4 +1,4 @@
-"""Two pairs that dock: the active one is just where the sequence wants it."""
+"""Two pairs of modules that dock; the active pair is exactly where the sequence wants it."""
 
 import numpy as np
 
@@ -39,7 +39,7 @@ def face_of(body: Body, module: int, face: int, at: Estimate) -> tuple[np.ndarra
 
 
 class Follower:
-    """A pair's second module docks to another pair's second, whose bodies are anyhow turned; the active one is just where it is wanted."""
+    """The second module of a pair docks to the second of another, both tilted; the active pair is exactly where it is wanted."""
 
     def __init__(self, parameters: Docking = STAGED, nu: np.ndarray = STILL, comes: bool = False) -> None:
         vehicles = [load_vehicle("modcube")] * 4
@@ -66,7 +66,7 @@ class Follower:
         raise AssertionError(f"still {self.sequence.stage.name}")
 
     def astray(self, sideways_m: float = 0.0, turned_rad: float = 0.0) -> None:
-        """The active body is not where it was wanted."""
+        """Displaces the active body from where it is wanted."""
         across = np.cross(self.outward, [0.0, 0.0, 1.0])
         q_wb = multiply(self.at.q_wb, from_euler(0.0, 0.0, turned_rad))
         self.at = self.at._replace(p_wb=self.at.p_wb + sideways_m * across / np.linalg.norm(across), q_wb=q_wb)

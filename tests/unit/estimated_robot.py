@@ -1,4 +1,4 @@
-"""A robot at rest, what its sensors say, and its estimator."""
+"""A robot at rest, its sensor readings, and its estimator."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -37,7 +37,7 @@ def sensors(p_wb: np.ndarray = P_WB, q_wb: np.ndarray = Q_WB, *tags: BodyPose) -
 
 
 class Robot:
-    """A robot at rest whose estimator is stepped tick by tick; the tag is seen every second tick and 50 ms late."""
+    """A robot at rest whose estimator is stepped tick by tick; in `rest` the tag is seen every second tick and 50 ms late."""
 
     def __init__(self, body: Body, parameters: Estimation = P) -> None:
         self.estimator = Estimator(body, parameters, PERIOD)

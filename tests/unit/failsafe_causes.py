@@ -1,4 +1,4 @@
-"""Of each fail-safe: the figure that it judges, its cause just there, and parameters with which it acts alone and at once."""
+"""For each fail-safe: the figure that it judges, a health just beyond its limit, and parameters with which it alone acts, without delay."""
 
 import math
 from dataclasses import replace
@@ -21,7 +21,7 @@ FIELDS: dict[str, str] = {
     "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
     "thruster_lost": "dead", "cabin_unknown": "cabin_age_s", "battery_unknown": "battery_age_s", "battery_low": "voltage_share",
 }  # fmt: skip
-"""Which figure of Health each fail-safe judges; depth_unknown and pushed need two."""
+"""Field of Health that each fail-safe judges; depth_unknown and pushed judge two (see `spoilt`)."""
 YES: dict[str, Any] = {
     "leak": True, "foreign_sync": True, "foreign_command": True, "axis_lost": 1, "partner_lost": "0 and 1", "thruster_lost": (3,),
 }  # fmt: skip
@@ -37,7 +37,7 @@ def spoilt(name: str, value: float) -> Health:
 
 
 def bad(name: str) -> Health:
-    """`GOOD` with fail-safe `name`'s cause just there."""
+    """`GOOD` with the cause of fail-safe `name` only just present."""
     if name in YES:
         return GOOD._replace(**{FIELDS[name]: YES[name]})
     limit = getattr(P, f"{name}_limit")
@@ -45,6 +45,6 @@ def bad(name: str) -> Health:
 
 
 def quick(name: str) -> Parameters:
-    """Parameters with which only `name` acts, and at once."""
+    """Parameters with which fail-safe `name` alone acts, without delay."""
     none = {f"{row.name}_action": 0 for row in TABLE if row.name != name}
     return replace(P, **none, **{f"{name}_delay_s": 0.0})

@@ -12,7 +12,7 @@ GOOD, BETTER, BROKEN = "1.0-good", "1.1-better", "1.2-broken"
 
 
 def wheel(folder: Path, release: str) -> Path:
-    """A small wheel in the place of the project's own."""
+    """Writes a small wheel that stands in for the project's own; returns its path."""
     path = folder / f"modcube-{release.replace('-', '_')}-py3-none-any.whl"
     files = {
         "firmware_py/__init__.py": "",
@@ -28,10 +28,10 @@ def wheel(folder: Path, release: str) -> Path:
 
 
 def unit_of(release: str) -> str:
-    """The service's unit, another one in every release."""
+    """The unit file of the service, different in every release."""
     return f"[Service]\nExecStart=modcube run --of {release}\n"
 
 
 def current(fake: Path, root: str = "root") -> str | None:
-    """The release that is linked as the one that runs."""
+    """Returns the release that is linked as the current one."""
     return Device(fake / root, flash_files.run).linked(fake / root / "current")

@@ -1,4 +1,4 @@
-"""A made-up flight, written through the real recorders: the paper's spiral with known errors. For tests and looks."""
+"""A synthetic flight, written through the real recorders: the paper's spiral with known errors. For tests and for viewing."""
 
 from pathlib import Path
 
@@ -15,11 +15,11 @@ START_NS = 4_000_000_000
 """The spiral starts after 4 s of hovering."""
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 POWER_W, MARGIN = 23.0, 0.8
-"""What the supply gives and what the busiest thruster has left, all the time."""
+"""Power of the supply and margin of the busiest thruster, both constant."""
 
 
 def progress(t_s: float, duration_s: float) -> float:
-    """0 to 1, rest to rest: the quintic."""
+    """Progress from 0 to 1, rest to rest, by the quintic polynomial."""
     s = min(max(t_s / duration_s, 0.0), 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
 
@@ -49,7 +49,7 @@ def write_flight(
     noise: float = 1.0,
     seed: int = 0,
 ) -> None:
-    """Write the three logs of a flight whose truth is off the reference by `offset_m`, `tilt_rad` and noise."""
+    """Writes the three logs of a flight whose truth is off the reference by `offset_m`, `tilt_rad` and noise."""
     ticks = 1 + round((START_NS / 1e9 + duration_s) * 1e9 / PERIOD_NS)
     rng = np.random.default_rng(seed)
     error = noise * smooth(rng, ticks, np.full(3, 0.0015))
@@ -92,10 +92,10 @@ def write_pair(
     folder: Path, *, ticks: int, joined_from: int, known_from: int, offset_m: tuple[float, float, float],
     parted_from: int = 10**6, parted_known_from: int = 10**6,
 ) -> None:  # fmt: skip
-    """Write the two logs of a body of two modules, turning on its way, whose truth is `offset_m` off the reference.
+    """Writes the two logs of a body of two modules that turns on its way and whose truth is `offset_m` off the reference.
 
-    Before tick `joined_from` its leader is alone and the other module comes nearer, 0.1 mm a tick; before `known_from` the
-    firmware steers the leader's hull. So it is again from `parted_from`, which the firmware knows from `parted_known_from` on.
+    Before tick `joined_from` the leader is alone and the other module approaches at 0.1 mm per tick; before `known_from` the firmware
+    steers the leader alone. From `parted_from` the modules are apart again, which the firmware knows from `parted_known_from` on.
     """
     zero, lever = np.zeros(3), np.array([0.105, 0.0, 0.0])
     recorder = Recorder(folder)

@@ -1,6 +1,6 @@
 """Random, mutated, forged and replayed packets against a ground side, for tests/unit/test_ground_attack.py.
 
-A quarter each: noise; frames with flipped bits; frames cut, joined and repeated; random payloads with a right checksum.
+A quarter each: noise; frames with flipped bits; frames cut, joined and repeated; random payloads with a valid checksum.
 """
 
 import math
@@ -20,7 +20,7 @@ MESSAGES_A_TICK = 50
 
 
 def samples(client: Client) -> list[bytes]:
-    """Valid frames of every kind that acts."""
+    """Valid frames of every kind that has an effect."""
     nan = float("nan")
     frames = [client.pack("COMMAND_LONG", 1, 1, number, 0, *p) for number, p in COMMANDS.items()]
     frames += [
@@ -60,7 +60,7 @@ def is_sound(request: Request) -> bool:
 
 
 class Attack:
-    """Sends packets and looks at what they did."""
+    """Sends packets and checks their effects."""
 
     def __init__(self, seed: int) -> None:
         self.world = World(modules=2)
@@ -72,7 +72,7 @@ class Attack:
         self.crafted = 0
 
     def run(self, count: int) -> None:
-        """Send `count` packets. Raises AssertionError when one does what it must not."""
+        """Sends `count` packets. Raises AssertionError if one has an effect that it must not have."""
         kinds = (self._noise, self._flipped, self._cut, self._crafted)
         while self.packets < count:
             kind = kinds[self.packets % len(kinds)]
@@ -124,7 +124,7 @@ class Attack:
         return a[: int(self._rng.integers(len(a)))] + b * int(self._rng.integers(1, 3))
 
     def _crafted(self) -> bytes:
-        """A frame with a right checksum and anything in it."""
+        """Returns a frame with a valid checksum and random content."""
         definition = self._definitions[int(self._rng.integers(len(self._definitions)))]
         payload = bytearray(self._rng.bytes(int(self._rng.integers(1, 256))))
         for name in ("target_system", "target_component", "target"):
@@ -146,7 +146,7 @@ class Attack:
 
 
 def forge(count: int, seed: int) -> tuple[World, Client, int]:
-    """`count` forged and replayed packets on a keyed link. Returns how many were believed."""
+    """Sends `count` forged and replayed packets on a signed link. Returns world, genuine client, and how many packets were accepted."""
     signing = Signing(key=KEY, timestamp=NOW)
     world = World(signing=signing)
     real = world.client()
@@ -175,10 +175,10 @@ def _forged(n: int, rng: np.random.Generator, overheard: list[bytes], forger: Cl
     if kind == 1:  # a later time stamp under the old signature
         frame[-12:-6] = int(stamp + n).to_bytes(6, "little")
         return bytes(frame)
-    if kind == 2:  # a signature by chance
+    if kind == 2:  # a random signature
         frame[-12:-6] = int(stamp + n).to_bytes(6, "little")
         frame[-6:] = rng.bytes(6)
         return bytes(frame)
-    forger.mav.signing.sign_outgoing = bool(n & 4)  # a key by chance, or none
+    forger.mav.signing.sign_outgoing = bool(n & 4)  # a random key, or unsigned
     forger.mav.signing.secret_key, forger.mav.signing.timestamp = rng.bytes(32), stamp + n
     return forger.pack("COMMAND_LONG", 1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)

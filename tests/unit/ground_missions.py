@@ -1,4 +1,4 @@
-"""Missions as a client sends them, flown along a plan that stands still."""
+"""Missions as a client sends them, flown along a plan whose set-point stands still."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ PLACES = [(302084010, 1201614010, -0.4), (302084020, 1201614000, -0.3), (3020840
 
 
 class Path:
-    """A trajectory of ten seconds a leg that stands still."""
+    """A trajectory that stands still for ten seconds per leg."""
 
     duration_s = 30.0
 
@@ -31,7 +31,7 @@ def item(
 
 
 def upload(world: World, client: Client, items: list[tuple[float, ...]], kind: int = 0, target: int = 1) -> int:
-    """Send items as they are asked for; the result."""
+    """Sends items as they are requested; returns the result in the acknowledgement."""
     client.clear()
     client.send("MISSION_COUNT", target, 1, len(items), kind)
     answered = 0
@@ -47,7 +47,7 @@ def upload(world: World, client: Client, items: list[tuple[float, ...]], kind: i
 
 
 def begin(world: World, client: Client, *start: float) -> PlanJob:
-    """Arm, start by the command `start`, or by mode: what is to be planned."""
+    """Arms, and starts the mission by the command `start` or else by mode; returns what is to be planned."""
     client.command(400, 1)
     world.run(3)
     client.command(*(start or (176, 1, 4, 4)))
@@ -57,7 +57,7 @@ def begin(world: World, client: Client, *start: float) -> PlanJob:
 
 
 def go_to(world: World, client: Client) -> PlanJob:
-    """Arm, ask for a way to one place: what is to be planned."""
+    """Arms, and requests a way to one place; returns what is to be planned."""
     client.command(400, 1)
     world.run(3)
     client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 1.0, 302084010, 1201614000, -0.4)
@@ -67,7 +67,7 @@ def go_to(world: World, client: Client) -> PlanJob:
 
 
 def fly(world: World, client: Client, first_arrival_s: float = 10.0) -> PlanJob:
-    """Arm, start by mode, plan: the body tracks."""
+    """Arms, starts the mission by mode and delivers the plan, which the body then tracks; returns what was planned."""
     job = begin(world, client)
     arrivals = tuple(first_arrival_s * (i + 1) for i in range(len(job.legs)))
     world.station.planned(0, Plan(job.serial, Path(), arrivals))
@@ -76,7 +76,7 @@ def fly(world: World, client: Client, first_arrival_s: float = 10.0) -> PlanJob:
 
 
 def continued(world: World, client: Client) -> list[int]:
-    """Items that are planned when the mission is continued."""
+    """Continues the mission; returns the items that are planned."""
     client.command(193, 1)
     world.run(10)
     (job,) = world.station.jobs()

@@ -1,4 +1,4 @@
-"""What the tests of the ground link ask, and what came of it."""
+"""Requests of the ground-link tests, and their results."""
 
 from firmware_py.core.types import Action
 from tests.unit.ground_world import Client, World
@@ -7,7 +7,7 @@ NAN = float("nan")
 
 
 def acknowledged(world: World, client: Client, number: int) -> int:
-    """The result of the last acknowledgement of a command, waited for."""
+    """Waits until a command is acknowledged; returns the result of the last acknowledgement."""
     world.run_until(lambda: any(a.command == number for a in client.all("COMMAND_ACK")))
     return int([a for a in client.all("COMMAND_ACK") if a.command == number][-1].result)
 

@@ -1,4 +1,4 @@
-"""Ends of links: a port that nobody has, what came, and a ground side without a thread."""
+"""Ends of links: a free port, received messages, and a ground side without a thread."""
 
 import socket
 import time
@@ -27,7 +27,7 @@ def free_port() -> int:
 
 
 def received(links: Links, count: int) -> list[Any]:
-    """What came, waited for."""
+    """Waits for `count` messages, at most `PATIENCE_S`; returns those received."""
     got: list[Any] = []
     end = time.monotonic() + PATIENCE_S
     while len(got) < count and time.monotonic() < end:
@@ -41,17 +41,17 @@ def heartbeat(system: int = 255) -> bytes:
 
 
 def firmware_of(modules: int = 1, bodies: Sequence[Any] = ()) -> Any:
-    """What a ground side knows of its firmware."""
+    """The part of the firmware that a ground side uses."""
     return SimpleNamespace(pipeline=SimpleNamespace(bodies=list(bodies)), fleet=fleet_of(modules), parameters=Parameters())
 
 
 def side_on(*links: str, modules: int = 1) -> GroundSide:
-    """A ground side without a thread: the test pumps."""
+    """A ground side without a thread; the test calls `pump`."""
     return GroundSide(GroundConfig(links=links), firmware_of(modules, Robot(modules).bodies), ThreadPoolExecutor(1))
 
 
 def pump(side: GroundSide, robot: Robot, ticks: int = 1) -> list[Request]:
-    """What is asked meanwhile."""
+    """Runs for `ticks`; returns the requests made meanwhile."""
     asked = []
     for _ in range(ticks):
         requests = side.requests()

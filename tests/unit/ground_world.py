@@ -1,4 +1,4 @@
-"""A robot without physics behind a ground station, and a pymavlink client, joined in memory: for tests of
+"""A robot without physics behind a ground station, and a pymavlink client, connected in memory: for tests of
 firmware_py.ground.
 """
 
@@ -57,11 +57,11 @@ class Robot:
         """Reason for each action that is refused."""
         self.asked: list[Request] = []
         self.events: list[Event] = []
-        """What the next tick says."""
+        """Events of the next tick."""
         self.bodies: list[Any] = [SimpleNamespace(index=n, modules=(n,)) for n in range(modules)]
 
     def dock(self) -> None:
-        """All modules are one body from now on."""
+        """Makes all modules one body from now on."""
         self.bodies = [SimpleNamespace(index=0, modules=tuple(range(len(self.state))))]
 
     def step(self, requests: list[Request]) -> tuple[Inputs, Outputs]:
@@ -130,7 +130,7 @@ class Client:
         self.inbox: list[Any] = []
 
     def send(self, name: str, *values: Any, **fields: Any) -> None:
-        """Send a message, written as pymavlink's class of that name takes it."""
+        """Sends a message; the arguments are those of pymavlink's class of that name."""
         self.send_raw(self.pack(name, *values, **fields))
 
     def pack(self, name: str, *values: Any, **fields: Any) -> bytes:
@@ -167,7 +167,7 @@ class Client:
 
 
 class World:
-    """Robot, station and clients; `run` moves time."""
+    """Robot, station and clients; `run` advances time."""
 
     def __init__(
         self,
@@ -205,7 +205,7 @@ class World:
                 client.inbox += client.mav.parse_buffer(frame) or []
 
     def run_until(self, done: Callable[[], bool], ticks: int = 500) -> None:
-        """Run until `done`; fails after `ticks`."""
+        """Runs until `done`; fails after `ticks`."""
         for _ in range(ticks):
             if done():
                 return

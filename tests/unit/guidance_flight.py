@@ -1,4 +1,4 @@
-"""Guidance over ticks with a body that does what it is told, and what it is told."""
+"""Guidance over ticks with a body that follows its set-points, and the trajectories and sticks that it is given."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ def estimate(p: tuple[float, ...] = (0.0, 0.0, 1.0), q: np.ndarray | None = None
 
 
 class Flight:
-    """Guidance over ticks, with a body that does what it is told."""
+    """Guidance over ticks, with a body that follows its set-points exactly."""
 
     def __init__(self, parameters: Parameters | None = None) -> None:
         self.guidance = Guidance(BODY, parameters or Parameters())
@@ -54,7 +54,7 @@ class Flight:
 
 
 class Ramp:
-    """One metre north in ten seconds, from where it is told."""
+    """A trajectory one metre north in ten seconds, from `start`."""
 
     duration_s = 10.0
 

@@ -1,4 +1,4 @@
-"""A body in perfect health, to be spoilt by tests of supervisor and fail-safes."""
+"""The health of a body without faults, in which the tests of supervisor and fail-safes change single figures."""
 
 import math
 
@@ -38,11 +38,11 @@ GOOD = Health(
 )
 
 BLIND = GOOD._replace(ready=False, tag_age_s=NEVER_S, sigma_m=1e3, outside_m=math.nan)
-"""No tag was ever seen, and gravity was not felt yet."""
+"""No tag was ever seen, and gravity has not given the attitude yet."""
 UPRIGHT = BLIND._replace(ready=True)
-"""No tag was ever seen; the attitude is known by gravity."""
+"""No tag was ever seen; the attitude is known from gravity."""
 
 
 def at(health: Health, seconds: float) -> Health:
-    """The same, so long after `GOOD`."""
+    """Returns the same health, `seconds` after `GOOD`."""
     return health._replace(time_ns=GOOD.time_ns + round(seconds * 1e9))

@@ -9,7 +9,7 @@ from hil.reference_node import CNodes
 CODEC = Codec.load()
 ARMED, DISARMED = 1, 0
 PUSHES, REST = (1, 0, 2, 0, 0, 2), (1, 0, 0, 0, 0, 0)
-"""Face A pulls throughout: a joint may hang on it."""
+"""Relay states; face A pulls in both, because it may hold a joint."""
 
 
 def sync(tick: int) -> Frame:
@@ -25,5 +25,5 @@ def dock(relays: Sequence[int], counter: int) -> Frame:
 
 
 def magnets(nodes: Nodes | CNodes) -> tuple[int, ...]:
-    """The relays of the first module, in the world."""
+    """Relay states of the first module in the simulated world."""
     return tuple(nodes.world.docks.relays[0].tolist())

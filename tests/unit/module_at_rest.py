@@ -1,4 +1,4 @@
-"""What a module says that lies at rest, every sensor answering."""
+"""Inputs from a module at rest whose sensors all answer."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def resting(tick: int, requests: list[Request]) -> Inputs:
-    """What a module at rest says, every sensor answering."""
+    """Returns the inputs of one tick from such a module."""
     module = ModuleInputs(answered=True, heard=True, gyro=np.zeros(3), accel=-9.80665 * to_matrix(LEVEL)[2].copy())
     module.pressure_pa = 101325.0 + WATER_DENSITY * 9.80665 * PLACE[2]
     module.tags = [TagObservation(5, 7, tick * PERIOD_NS, np.add(PLACE, [0.0, 0.0, -0.105]), LEVEL)]

@@ -22,7 +22,7 @@ NEVER, ALWAYS = JamRule(probability_inside=0.0, probability_outside=0.0), JamRul
 def two(
     gap_m: float, lateral_m: float = 0.0, jam: JamRule = NEVER, q: np.ndarray = LEVEL, vehicle: Vehicle = VEHICLE, **world: float
 ) -> World:
-    """Module 1 before module 0's +x face, -x towards it, in calm deep water."""
+    """Module 1 in front of module 0's +x face, its -x face towards it, in calm deep water."""
     starts = [Start(np.array([0.0, 0.0, 400.0]), LEVEL), Start(np.array([0.21 + gap_m, lateral_m, 400.0]), q)]
     return World(WorldSpec(**{**CALM, **world}), OCEAN, [vehicle] * 2, starts, 0, PERIOD_NS, jam=jam)
 
@@ -51,11 +51,11 @@ SMOOTH = dataclasses.replace(
     drag=dataclasses.replace(VEHICLE.drag, cd_face=0.0, cd_edge=0.0, rotational_cd=0.0),
     inertial=dataclasses.replace(VEHICLE.inertial, righting_arm_m=0.0),
 )
-"""Hulls alone: nothing but their contact acts on them."""
+"""A bare hull, without docking faces, drag or righting arm: only contact acts on it."""
 
 
 def hulls(x_m: float, y_m: float = 0.0, roll_deg: float = 0.0, vehicle: Vehicle = SMOOTH) -> World:
-    """Two hulls along x, the second one rolled."""
+    """Two hulls along x, the second one rolled by `roll_deg`."""
     q = rotations.from_euler(np.radians(roll_deg), 0.0, 0.0)
     starts = [Start(np.array([0.0, 0.0, 400.0]), LEVEL), Start(np.array([x_m, y_m, 400.0]), q)]
     return World(WorldSpec(**CALM), OCEAN, [vehicle] * 2, starts, 0, PERIOD_NS, jam=NEVER)
@@ -65,7 +65,7 @@ SLIPPERY = dataclasses.replace(SMOOTH, faces=VEHICLE.faces)
 
 
 def start_docked(third_m: float = 100.0, tank: Tank = OCEAN, **world: float) -> World:
-    """Two modules docked along x, and a third one on beyond them."""
+    """Two modules docked along x, and a third one on the same axis at `third_m`."""
     starts = [Start(np.array([x, 0.0, 400.0]), LEVEL) for x in (0.0, 0.21, third_m)]
     places = [Place(np.array([x, 0.0, 0.0]), LEVEL.copy()) for x in (0.0, 0.21, 0.0)]
     spec = WorldSpec(**{**CALM, **world})

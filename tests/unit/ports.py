@@ -1,4 +1,4 @@
-"""What every kind of bus does, as a suite of tests that each subclasses, and what they need to do it."""
+"""The behaviour of every kind of bus, as a test suite that the tests of each kind subclass, with its helpers."""
 
 import os
 import select
@@ -15,7 +15,7 @@ from firmware_py.bus.port import PortError, open_port
 UDP = f"udp:239.74.163.2:{40_000 + os.getpid() % 20_000}"
 """A port of its own for each process: test processes run side by side."""
 PATIENCE_NS = 20_000_000_000
-"""How long a frame may take on a busy machine before a test fails; no test waits for it to pass."""
+"""Time that a frame may take on a busy machine before a test fails. No passing test waits that long."""
 FRAMES = [Frame(0x000, b""), Frame(0x7FF, bytes(range(8))), *(Frame(0x81, bytes(range(n))) for n in range(9))]
 
 
@@ -43,7 +43,7 @@ def no_channel_left_open(monkeypatch):
 
 
 def poll(condition):
-    """What `condition` says as soon as that is true."""
+    """Returns the value of `condition` as soon as that is true, or the last one after `PATIENCE_NS`."""
     deadline = time.monotonic_ns() + PATIENCE_NS
     while not (met := condition()) and time.monotonic_ns() < deadline:
         pass
@@ -51,7 +51,7 @@ def poll(condition):
 
 
 def receive(port, count):
-    """`count` frames, as soon as they are through: a bus between processes takes its time."""
+    """Returns the frames received as soon as they are at least `count`: a bus between processes needs some time."""
     frames = []
     poll(lambda: frames.extend(port.receive()) or len(frames) >= count)
     return frames
@@ -62,7 +62,7 @@ def faults(port):
 
 
 class PortSuite:
-    """What every bus does. A subclass gives `address_pair`: two addresses of the same bus."""
+    """Tests for every kind of bus. A subclass provides `address_pair`: two addresses of the same bus."""
 
     @pytest.fixture
     def pair(self, address_pair):
@@ -128,9 +128,9 @@ class PortSuite:
 
 
 class Cable:
-    """Two slcan adapters and the wire between them: passes the frames of one serial device to the other.
+    """Two slcan adapters and the wire between them: passes frames from each serial device to the other.
 
-    The devices are pseudo terminals behind links in `folder`, as udev names an adapter.
+    The devices are pseudo-terminals behind links in `folder`, in the way that udev names an adapter.
     """
 
     def __init__(self, folder):
@@ -160,12 +160,12 @@ class Cable:
                 rest = b"".join(line + b"\r" for line in lines if line[:1] == b"t")
                 while rest:
                     stopped, _, _ = select.select([self.stop_read], [other], [])
-                    if stopped:  # also where nobody reads at the other end any more
+                    if stopped:  # also if nobody reads the other end any more
                         return
                     rest = rest[os.write(other, rest) :]
 
     def stop(self):
-        """Nothing passes until `go_on`."""
+        """Stops passing frames until `go_on`."""
         os.write(self.stop_write, b"x")
         self.passes.join()
 

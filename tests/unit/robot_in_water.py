@@ -1,4 +1,4 @@
-"""A robot in water that is the model's but for what every real one is off by, and its detector of faults."""
+"""A robot in water that follows the model except for the errors that every real robot has, and its fault detector."""
 
 import numpy as np
 
@@ -16,13 +16,13 @@ from firmware_py.prepare.assembly import assemble_vehicle
 
 BODY = assemble_vehicle(load_vehicle("modcube"))
 PUSH = preload(BODY.thrusters, np.ones(8, dtype=bool), 0.6)
-"""Thrusters pushed against each other: the least that an armed robot commands, and nothing moves."""
+"""The preload: the least that an armed robot commands, with the thrusters pushing against each other, so that nothing moves."""
 TICK_NS, DT = 10_000_000, 0.01
 ZERO = np.zeros(3)
 
 
 class Water:
-    """A robot that holds its place by PD, in water that is the model's but for what every real one is off by; feedback at 10 Hz."""
+    """A robot that holds position by PD, in water that follows the model except for usual errors; ESC feedback at 10 Hz."""
 
     def __init__(self, seed: int = 0, body: Body = BODY) -> None:
         self.rng = np.random.default_rng(seed)
@@ -46,7 +46,7 @@ class Water:
         self.tick = 0
 
     def run(self, seconds: float, wanted: np.ndarray = PUSH, armed: bool = True) -> list[tuple[float, str]]:
-        """What is found, with the time since the start of this run."""
+        """Returns the faults found, each with the time since the start of this run, s."""
         found = []
         for n in range(round(seconds / DT)):
             found += [((n + 1) * DT, words) for words in self._step(wanted if armed else np.zeros(8), armed)]
@@ -96,6 +96,6 @@ class Water:
         return frames
 
     def fly(self, seconds: float = 3.0) -> None:
-        """Disarmed, then armed and healthy; nothing may be found."""
+        """Runs a second disarmed, then `seconds` armed; asserts that nothing is found."""
         assert self.run(1.0, armed=False) == []
         assert self.run(seconds) == []

@@ -1,4 +1,4 @@
-"""What the tests of the supervisor share: one in a state, requests to it, and its words."""
+"""Helpers of the supervisor tests: a supervisor in a given state, requests to it, and its event texts."""
 
 from dataclasses import replace
 from typing import Any
@@ -40,7 +40,7 @@ ARGUMENTS: dict[Action, Any] = {
 REQUESTS = {trigger: Request(action, 0, ARGUMENTS.get(action)) for action, trigger in TRIGGERS.items()} | {
     Trigger.FORCED_ARM: Request(Action.ARM, 0, True)
 }
-"""A request for each trigger that comes by one."""
+"""A request for each trigger that a request causes."""
 
 
 def supervisor_in(state: State = State.ARMED, mode: Mode = Mode.POSHOLD, parameters: Parameters = P) -> Supervisor:

@@ -1,4 +1,4 @@
-"""Tanks in which whole ticks are run: a world of the controller's own model, without the bus."""
+"""Tanks for tests that run whole ticks: a world with the controller's own model, without the bus."""
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
@@ -29,9 +29,9 @@ LOST = "fail-safe on: a docked partner is lost"
 
 
 class Tank:
-    """A world of the controller's own model: bodies with lagging thrusters, exact sensors, late tags on the top faces.
+    """A world with the controller's own model: bodies with lagging thrusters, exact sensors, late tags on the top faces.
 
-    What tick k commands acts from SYNC k + 1 on.
+    The commands of tick k act from SYNC k + 1 on.
     """
 
     def __init__(self, bodies: list[Body], parameters: Parameters | None = None, believed: list[Body] | None = None):
@@ -53,7 +53,7 @@ class Tank:
         return x
 
     def run(self, seconds: float, *requests: Request, estop: bool = False) -> Outputs:
-        """Ticks for `seconds`; requests and e-stop enter the first of them."""
+        """Runs ticks for `seconds`; requests and e-stop enter the first of them."""
         for n in range(round(seconds / DT)):
             self._tick(list(requests) if n == 0 else [], estop and n == 0)
         return self.outputs[-1]
@@ -127,14 +127,14 @@ def _body_of(cells: list[tuple[int, int, int]], first: int) -> Body:
 
 
 class Docked(Tank):
-    """A tank in which the magnets of some modules carry no current, those of others pull whatever they are told (`hung`), and some modules'
-    tags are out of sight. Joints that push apart stay in their places in pictures where they are `stuck`.
+    """A tank with faults: modules whose magnets carry no current (`weak`), whose magnets pull whatever the command (`hung`), or whose tags
+    are out of sight (`hidden`). With `stuck`, joints that push apart are still seen in their places.
     """
 
     def __init__(
         self, cells: list[tuple[int, int, int]], parameters: Parameters | None = None, delay: int = 0, apart: bool = False, each: int = 0
     ) -> None:
-        """`delay`: ticks until a plan that was asked for is there. `apart`: each module is a body of its own; `each`: so many are one."""
+        """`delay`: extra ticks until a requested plan arrives. `apart`: each module is a body of its own. `each`: modules per body."""
         count = len(cells)
         size = 1 if apart else each or count
         super().__init__([_body_of(cells[m : m + size], m) for m in range(0, count, size)], parameters)
@@ -154,7 +154,7 @@ class Docked(Tank):
         pushing = [m for m, states in enumerate(relays) if RELAY_PUSH in states and not self.stuck]
         for m, module in enumerate(modules):
             module.cabin_pressure_pa = self.cabin_pa[m]
-            if m in self.hidden or m in pushing[1:]:  # no picture shows two in their places that push each other apart
+            if m in self.hidden or m in pushing[1:]:  # modules that push each other apart are not all seen in their places
                 module.tags.clear()
             if tick % 4 == 0:
                 turned = [state == RELAY_PUSH and m not in self.hung for state in relays[m]]
@@ -173,12 +173,12 @@ class Docked(Tank):
         return outputs
 
     def fly(self) -> None:
-        """Armed, and holding its place."""
+        """Arms the first body, which then holds its place."""
         self.run(0.5)
         assert self.run(1.0, Request(Action.ARM)).records[0].state == State.ARMED
 
     def lose(self, *modules: int) -> float:
-        """These are out of sight, and their magnets carry no current; returns the time."""
+        """Takes the modules out of sight and the current from their magnets; returns the time, s."""
         self.weak |= set(modules)
         self.hidden |= set(modules)
         return len(self.outputs) * 0.01
@@ -192,8 +192,7 @@ class Docked(Tank):
 
 
 def placed(*places: tuple[float, float], parameters: Parameters | None = None, armed: tuple[int, ...] | None = None) -> Docked:
-    """Single modules at these places, north and east, m, that hold there once armed: all, or those that are named. No magnet draws current.
-    """
+    """Single modules at these places (north, east, m), which hold there once armed: all, or those in `armed`. No magnet draws current."""
     modules = range(len(places))
     tank = Docked([(0, m, 0) for m in modules], parameters, apart=True)
     tank.weak = set(modules)
@@ -205,5 +204,5 @@ def placed(*places: tuple[float, float], parameters: Parameters | None = None, a
 
 
 def before_each_other(*y_m: float, parameters: Parameters | None = None, armed: tuple[int, ...] | None = None) -> Docked:
-    """Modules in one line, the first at 0, the others so far east of it, as `placed` has them."""
+    """Modules in one line, set up as by `placed`: the first at 0, the others `y_m` east of it."""
     return placed(*((1.0, y) for y in (0.0, *y_m)), parameters=parameters, armed=armed)

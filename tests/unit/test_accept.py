@@ -1,4 +1,4 @@
-"""What `make accept` reports was measured by the run that it made, or not at all."""
+"""Figures that `make accept` reports were measured in its own run, or are missing."""
 
 import json
 import subprocess

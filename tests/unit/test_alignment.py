@@ -1,4 +1,4 @@
-"""Before the first tag: upright by gravity after a second, no place and no heading until ten tags tell the same."""
+"""Before the first tags: attitude from gravity after a second, position and heading only once ten tags agree."""
 
 import math
 
@@ -29,7 +29,7 @@ def turned_back(q_wb: np.ndarray, v_w: np.ndarray) -> np.ndarray:
 
 
 def felt(q_wb: np.ndarray, more: tuple[float, float, float] = (0.0, 0.0, 0.0), count: int = 20) -> np.ndarray:
-    """(count, 3) specific forces of a body that is at rest but for the acceleration `more`, world."""
+    """(count, 3) specific forces, body frame, of a body at rest except for the acceleration `more`, world frame."""
     return np.tile(turned_back(q_wb, np.array(more) - [0.0, 0.0, G]), (count, 1))
 
 
@@ -60,7 +60,7 @@ class Robot:
         return estimate
 
     def turn(self, rate: np.ndarray, ticks: int) -> Estimate:
-        """Turned about its centre by something that no model knows, at `rate` (3,) rad/s, body."""
+        """Turns the robot about its centre at `rate` (3,) rad/s, body frame, by something that the model does not contain."""
         for _ in range(ticks):
             self.q_wb = multiply(self.q_wb, exp(rate * PERIOD * 1e-9))
             estimate = self.step(gyro=rate)
@@ -210,7 +210,7 @@ def test_depth_that_was_not_heard_at_first_is_taken_when_it_comes(depth_m: float
 
 @pytest.mark.parametrize("accel_m_s2", [1.0, 3.0])
 def test_robot_that_is_pushed_across_when_it_stands_up_rights_itself(accel_m_s2: float) -> None:
-    """Its thrusters pushed, as its model knows: the tilt is wrong by up to 17 deg at first."""
+    """The thrusters push it, which the model contains: the tilt is wrong by up to 17 deg at first."""
     robot = Robot(from_euler(0.0, 0.0, 0.0))
     rest_tau, push = robot.tau, np.array([accel_m_s2, 0.0, 0.0])
     robot.tau = rest_tau + np.r_[BODY.mass[0, 0] * push, 0.0, 0.0, 0.0]
@@ -224,7 +224,7 @@ def test_robot_that_is_pushed_across_when_it_stands_up_rights_itself(accel_m_s2:
 
 
 def test_steady_thrust_for_a_minute_is_believed_to_drive_nobody_mad() -> None:
-    """Half stick: without bounds it was believed to do 15 m/s."""
+    """Half stick: without bounds the velocity estimate grew to 15 m/s."""
     robot = Robot(from_euler(0.1, 0.0, 0.0))
     drag, way = np.zeros(6), np.r_[0.45, np.zeros(5)]
     add_drag(BODY.drag.nodes, BODY.drag.rotational, BODY.drag.linear, way, drag)
@@ -237,7 +237,7 @@ def test_steady_thrust_for_a_minute_is_believed_to_drive_nobody_mad() -> None:
 
 
 def test_heading_that_nobody_told_is_not_learned_from_noise() -> None:
-    """A bump turned the belief by 344 deg: heading and vertical gyro bias passed for known."""
+    """Heading and vertical gyro bias used to count as known, and a bump turned the estimate by 344 deg."""
     rng, robot, q_wb = np.random.default_rng(1), Robot(from_euler(0.0, 0.0, 0.0)), []
     for tick in range(3100):
         robot.tick += 1
@@ -315,7 +315,7 @@ def test_ten_tags_that_tell_the_same_give_place_and_heading() -> None:
 
 
 def test_what_was_learned_upright_stays_when_the_place_is_told() -> None:
-    """The body is held down with 2 N that no model knows of: that is felt without any tag."""
+    """The thrusters hold the body down with 2 N against an unmodelled force, which is learnt without any tag."""
     robot = Robot()
     robot.tau = robot.tau + np.r_[turned_back(Q_WB, np.array([0.0, 0.0, 2.0])), 0.0, 0.0, 0.0]
     before = robot.rest(2000)
@@ -329,7 +329,7 @@ def test_what_was_learned_upright_stays_when_the_place_is_told() -> None:
 def test_righting_that_was_learned_stays_when_the_place_is_told() -> None:
     robot, known = Robot(), np.array([0.1, -0.05, 0.2])
     robot.rest(200)
-    for belief in (robot.estimator._anchor, robot.estimator._head):  # a push to the other side, so that nothing turns
+    for belief in (robot.estimator._anchor, robot.estimator._head):  # an opposite moment, so that nothing turns
         belief.x[22:25], belief.x[26:29] = -np.cross(known, turned_back(Q_WB, np.array([0.0, 0.0, -1.0]))), known
     before = robot.rest(1)
     after = robot.see(READY_AFTER)

@@ -18,12 +18,12 @@ from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 HOLD, SHARE_WEIGHT, PRIORITIES = 0.05, 1e3, np.array([1e2, 1e2, 1.0])
-"""A twentieth of the largest push holds; that and the moment are each a hundred times as dear as the rest of the force, and this so much
-dearer than all thrusters at their limits."""
+"""A twentieth of the largest push is the holding force. Losing it, or the moment, costs a hundred times as much as losing the rest of the
+force, and that costs SHARE_WEIGHT times as much as all thrusters at their limits."""
 PLAIN = replace(Allocation(), preload_n=0.0)
 SQUARE = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
 LOSES_RANK = {(4, 7), (5, 6), (2, 3)}
-"""Pairs without which yaw, or roll and yaw combined, cannot be made (the paper's errata)."""
+"""Pairs of thrusters without which yaw, or roll and yaw combined, cannot be produced (the paper's errata)."""
 
 
 @pytest.fixture(scope="module", params=[1, 2, 4])
@@ -59,7 +59,7 @@ def test_wrench_within_limits_is_made_exactly(body: Body) -> None:
 
 
 def test_wrench_within_limits_takes_the_least_effort(body: Body) -> None:
-    """No other way to make it has a smaller sum of squares (bounded least squares with a hard weight on the wrench)."""
+    """No other forces with that wrench have a smaller sum of squares (bounded least squares with a hard weight on the wrench)."""
     t = body.thrusters
     for wrench in wrenches(body, 10, 0.15, seed=1):
         thrust = Allocator(body, PLAIN).step(wrench)
@@ -77,13 +77,13 @@ def test_no_wrench_is_no_force(body: Body) -> None:
 
 
 def held_n(body: Body) -> float:
-    """Force that counts as much as the moment, N."""
+    """Holding force, which has the same priority as the moment, N."""
     t = body.thrusters
     return HOLD * float(np.linalg.norm(t.matrix[:3], axis=0) @ np.maximum(t.f_max, -t.f_min))
 
 
 def in_parts(body: Body, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The force that holds, the moment, the rest of the force."""
+    """The holding force, the moment, and the rest of the force, each as a (6,) wrench."""
     size, moment = float(np.linalg.norm(wrench[:3])), np.r_[np.zeros(3), wrench[3:]]
     rest = np.r_[wrench[:3] * max(0.0, size - held_n(body)) / size, 0.0, 0.0, 0.0]
     return wrench - moment - rest, moment, rest
@@ -142,7 +142,7 @@ def test_saturation_keeps_the_directions_of_force_and_moment(body: Body, size: f
 
 @pytest.mark.parametrize("size", [0.15, 1.0, 3.0, 1000.0])
 def test_thrusters_that_are_mounted_the_other_way_round_push_backwards_as_they_pushed_forwards(body: Body, size: float) -> None:
-    """So they push harder in reverse; the wrench stays as it was."""
+    """They then push harder in reverse; the wrench is the same."""
     t = body.thrusters
     turned = replace(
         t, matrix=-t.matrix, pinv=-t.pinv, f_min=-t.f_max, f_max=-t.f_min, forward=t.reverse, reverse=t.forward,
@@ -156,7 +156,7 @@ def test_thrusters_that_are_mounted_the_other_way_round_push_backwards_as_they_p
 
 
 def test_body_that_lacks_moment_leans_and_does_not_drift(single: Body) -> None:
-    """Two thrusters dead, one and a half times the moment that is left: the small force of a hover is kept as the moment is."""
+    """With two thrusters dead and 1.5 times the achievable moment asked for, the small force of a hover is kept along with the moment."""
     allocator = Allocator(single, PLAIN)
     for dead in set(itertools.combinations(range(8), 2)) - LOSES_RANK:
         allocator.set_alive(~np.isin(np.arange(8), dead))
@@ -174,7 +174,7 @@ def test_force_that_costs_no_moment_is_not_given_up_with_it(single: Body, wrench
 
 
 def best_share(body: Body, along: np.ndarray, beside: np.ndarray) -> float:
-    """The largest share of wrench `along` that can be made together with all of `beside`, by linear programming."""
+    """Largest share of wrench `along` that is feasible together with all of `beside`, by linear programming."""
     t = body.thrusters
     n = t.f_max.size
     bounds = [*zip(t.f_min, t.f_max, strict=True), (0.0, 1.0)]
@@ -183,7 +183,7 @@ def best_share(body: Body, along: np.ndarray, beside: np.ndarray) -> float:
 
 
 def test_moment_that_can_be_made_is_made_however_large_the_force(body: Body) -> None:
-    """Attitude first: a robot that is asked for 100 N a module and the moment that it can give, keeps the moment."""
+    """Attitude first: asked for 100 N per module and a feasible moment, the robot keeps the moment."""
     allocator = Allocator(body, Allocation())
     modules = len(body.modules)
     for direction in np.random.default_rng(4).normal(size=(20, 3)):
@@ -235,7 +235,7 @@ def test_sixty_four_modules_saturate_as_few_do() -> None:
             np.testing.assert_allclose(thrust.achieved, np.repeat(thrust.scale, 3) * wrench, atol=1e-5)
             free = ~np.isin(thrust.force_n, limits)
             assert thrust.scale[1] > 0.9 * thrust.scale[0] and 4 <= free.sum() < 512
-            # least effort: forces of the thrusters that are not at a limit are one wrench's, f = J^T y
+            # least effort: the forces of all thrusters that are not at a limit follow from one wrench, f = J^T y
             y = np.linalg.lstsq(whole.thrusters.matrix[:, free].T, thrust.force_n[free], rcond=1e-9)[0]
             np.testing.assert_allclose(whole.thrusters.matrix[:, free].T @ y, thrust.force_n[free], atol=1e-4)
 
@@ -332,7 +332,7 @@ def test_preload_is_worked_out_anew_when_a_thruster_dies(single: Body, dead: int
 
 
 def test_preload_is_no_larger_than_it_has_to_be(single: Body) -> None:
-    """The layout allows all eight at the same size; a search of its null space finds that."""
+    """The layout allows all eight thrusters the same preload; a search of its null space finds it."""
     force = preload(single.thrusters, np.ones(8, dtype=bool), 0.6)
     np.testing.assert_allclose(np.abs(force), 0.6, rtol=0.01)
 
@@ -342,7 +342,7 @@ def test_preload_of_none_is_none(single: Body) -> None:
 
 
 def test_preload_is_that_of_each_module_alone(body: Body) -> None:
-    """Modules may part at any time: no module may lean on another."""
+    """Modules may part at any time, so no preload may depend on another module."""
     t = body.thrusters
     force = preload(t, np.ones(t.f_max.size, dtype=bool), 0.6)
     for module in range(len(body.modules)):
@@ -386,7 +386,7 @@ def test_other_limits_count_at_once_and_are_kept_when_a_thruster_dies(single: Bo
 
 @pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
 def test_body_that_cannot_be_fed_gives_way_in_the_force_that_does_not_hold_first(body: Body, size: float) -> None:
-    """Directions kept, and no module above its supply; what is left unused is less than a step of the bisection."""
+    """Directions are kept and no module exceeds its supply; the share left unused is less than a step of the bisection."""
     plenty, allocator = Allocator(body, PLAIN), Allocator(body, PLAIN)
     fed_less = 0
     for wrench in wrenches(body, 30, size) * np.repeat([1.0, 0.2], 3):
@@ -418,7 +418,7 @@ def test_paper_s_allocation_leaves_the_supply_to_the_limiter(single: Body) -> No
 
 
 def test_body_whose_supply_cannot_feed_the_preload_leaves_it_to_the_limiter() -> None:
-    """Or one weak module would still the whole body."""
+    """Otherwise one weak module would stop the whole body."""
     pair = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
     allocator, wrench = Allocator(pair, Allocation()), np.array([3.0, 0.0, 0.0, 0.0, 0.1, 0.0])
     before = allocator.step(wrench)

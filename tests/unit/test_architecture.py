@@ -1,6 +1,6 @@
-"""The house: who may import whom, and what core must never do.
+"""Rules of the architecture: which packages may import which, and what core must never do.
 
-import-linter checks the contracts of pyproject.toml; here stands what it cannot express.
+import-linter checks the contracts of pyproject.toml; this file checks what they cannot express.
 """
 
 import ast
@@ -138,7 +138,7 @@ def test_hil_contract_forbids_the_whole_rest_of_the_firmware(contract_id: str, a
 
 @pytest.mark.parametrize("package", ["firmware_py/core", "firmware_py/bus"])
 def test_package_that_hil_may_enter_re_exports_nothing(package: str) -> None:
-    """`from firmware_py.core import X` would otherwise pass by the contracts."""
+    """Otherwise `from firmware_py.core import X` would bypass the contracts."""
     assert list(imported_modules(ROOT / package / "__init__.py")) == []
 
 

@@ -1,4 +1,4 @@
-"""Arming checks: each alone, in its words, at its boundary; which of them force passes over; and what each mode needs."""
+"""Arming checks: each alone, with its text and its boundary; which of them forced arming skips; and what each mode needs."""
 
 import math
 from dataclasses import replace
@@ -124,7 +124,7 @@ def test_check_fails_just_beyond_its_limit(field: str, limit: float) -> None:
 
 
 def test_lost_pose_is_said_once() -> None:
-    """Not also that it is old, or unsure."""
+    """The reasons do not also say that the pose is old or uncertain."""
     assert reasons(GOOD._replace(tag_age_s=8.0)) == ["pose is 8000 ms old, 500 permitted"]
     assert reasons(GOOD._replace(tag_age_s=above(8.0), sigma_m=9.0)) == ["no tag for 8.0 s"]
 

@@ -125,14 +125,14 @@ def test_turned_module_brings_its_thrusters_and_tags_along(modcube: Vehicle) -> 
 
 
 def _all(lopsided: Vehicle, count: int) -> list[Vehicle]:
-    """The first carries its payload, the others leave it behind."""
+    """`count` lopsided vehicles, of which only the first carries its payload."""
     return [lopsided] + [dataclasses.replace(lopsided, payload=())] * (count - 1)
 
 
 def _energy_of_parts(
     body_v: np.ndarray, w: np.ndarray, vehicles: list[Vehicle], cells: list[tuple[int, int, int]], turns: list[int]
 ) -> float:
-    """Kinetic energy from velocities of the parts, without a mass matrix; `body_v` is that of the lattice's origin."""
+    """Kinetic energy from the velocities of the parts, without a mass matrix; `body_v` is the velocity of the lattice's origin."""
     energy = 0.0
     for vehicle, cell, index in zip(vehicles, cells, turns, strict=True):
         turn, origin = lattice.MATRICES[index], PITCH * np.array(cell, dtype=float)
@@ -188,7 +188,7 @@ def test_coriolis_forces_do_no_work_on_any_assembly(shape: str, lopsided: Vehicl
 
 
 def test_inherited_coriolis_signs_fail_the_same_check(lopsided: Vehicle) -> None:
-    """The code that the authors reuse: pitch inertia and products of inertia have a wrong sign, in one place each."""
+    """In the code that the authors reuse, pitch inertia and products of inertia have a wrong sign, in one place each."""
     mass = assemble_vehicle(lopsided).mass
     nu = np.array([0.3, -0.2, 0.1, 0.5, -0.7, 0.4])
     _, q, r = nu[3:]
@@ -219,7 +219,7 @@ def test_righting_moments_of_the_modules_add_up(modcube: Vehicle) -> None:
 
 
 def test_doubt_of_the_righting_moment_lies_along_the_modules_own_axes(modcube: Vehicle) -> None:
-    """A level module and one on its side: arm along z of each, trim along x and y, and buoyancy off by 0.5 N where each sits."""
+    """A level module and one on its side: each with an arm error along its z, trim errors along its x and y, and buoyancy off by 0.5 N."""
     on_its_side = next(i for i, m in enumerate(lattice.MATRICES) if np.array_equal(m, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
     body = assemble([(0, 0, 0), (1, 0, 0)], [0, on_its_side], [modcube] * 2)
     arm, trim, lever = GRAVITY * 9.3 * 0.003, GRAVITY * 2.6 * 0.002, 0.5 * 0.105

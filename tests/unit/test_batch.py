@@ -1,4 +1,4 @@
-"""Many worlds in one call are what they would have been one by one."""
+"""Many worlds simulated in one call are bit-identical to the same worlds simulated one by one."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from hil.plant.world import World
 from hil.scenario import load_scenario, make_world
 
 TICKS = 1500
-"""Beyond the 1024 numbers that gusts are drawn ahead."""
+"""More than the 1024 random numbers that are drawn in advance for the gusts."""
 PERIOD_NS = 10_000_000
 
 
@@ -19,7 +19,7 @@ def worlds(count: int, scenario: str = "spiral") -> list[World]:
 
 
 def pushes(count: int, ticks: int = TICKS) -> np.ndarray:
-    """(count, ticks, 8) commands that drive the module about, and into the walls."""
+    """(count, ticks, 8) commands that drive the module around, and into the walls."""
     return np.clip(0.4 * np.cumsum(np.random.default_rng(1).standard_normal((count, ticks, 8)), axis=1) / 10.0, -1.0, 1.0)
 
 

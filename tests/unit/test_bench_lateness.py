@@ -1,4 +1,4 @@
-"""The bench's drift: what a loop would show whose ticks start later and later, for either reason."""
+"""The bench's drift figure for a loop whose ticks start ever later: after their deadlines, or because the deadlines leave their grid."""
 
 import bench_lateness as bench
 import numpy as np
@@ -12,7 +12,7 @@ EARLY, LATER = 20, 25
 
 
 def counts(late: np.ndarray) -> np.ndarray:
-    """(k, BINS) ticks so far, every half second, whose lateness is in bin late[k]."""
+    """(k, BINS) cumulative tick counts every half second; the ticks of half second k have their lateness in bin late[k]."""
     return np.cumsum(50 * np.eye(BINS, dtype=np.int64)[late], axis=0)
 
 

@@ -1,4 +1,4 @@
-"""What the best filter could keep without tags (tools/blind_floor.py), against closed forms of its two limits."""
+"""Position error of the best possible filter without tags (tools/blind_floor.py), against closed forms of its two limiting cases."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hil.safety import ICM_20602
 
 BLIND_S = 5.0
 UNKNOWN_N_M = 0.1
-"""As if nothing was known of the moments: the gyro alone tells the turning."""
+"""Large enough that the moments are as good as unknown: only the gyro measures the rotation."""
 
 
 def test_what_feels_nothing_drifts_as_the_water_does() -> None:
@@ -24,7 +24,7 @@ def test_what_feels_nothing_drifts_as_the_water_does() -> None:
     covariance = np.zeros((STATES, STATES))
     covariance[WATER : WATER + 2, WATER : WATER + 2] = (
         world.gust_m_s**2
-    )  # nobody knows the gust at the last tag, only the robot's own speed
+    )  # at the last tag only the robot's own speed is known, not the gust
     _, after = without_tags(axis, covariance, BLIND_S)
     tau, t = world.gust_time_s, BLIND_S
     decay = math.exp(-t / tau)

@@ -1,4 +1,4 @@
-"""The nearest point within a box on which six sums vanish: against another solver, and where it is hard."""
+"""Box-constrained least squares with six equality constraints: against another solver, and in hard cases."""
 
 import daqp
 import numpy as np
@@ -7,11 +7,11 @@ import pytest
 from firmware_py.core.box_program import RESIDUAL, nearest
 
 EQUALITY = 5
-"""daqp's mark of an equality row."""
+"""daqp's flag for an equality constraint."""
 
 
 def solve(rows: np.ndarray, weights: np.ndarray, goal: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(n,) the point; asserts that it is permitted."""
+    """(n,) solution; asserts that it is feasible."""
     x = np.full(goal.size, np.nan)
     left = nearest(rows, weights, goal, low, high, x)
     assert left <= RESIDUAL and np.abs(rows.T @ x).max() <= 2.0 * RESIDUAL
@@ -20,7 +20,7 @@ def solve(rows: np.ndarray, weights: np.ndarray, goal: np.ndarray, low: np.ndarr
 
 
 def by_daqp(rows: np.ndarray, weights: np.ndarray, goal: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The same; it wants sums that do not follow from each other."""
+    """(n,) solution by daqp, which needs linearly independent constraints."""
     sense = np.array([0] * goal.size + [EQUALITY] * rows.shape[1], dtype=np.int32)
     bounds = [np.r_[bound, np.zeros(rows.shape[1])] for bound in (high, low)]
     x, _, flag, _ = daqp.solve(np.diag(weights), -weights * goal, np.ascontiguousarray(rows.T), *bounds, sense)

@@ -1,4 +1,4 @@
-"""The buses are never too full: figures from the DBC, and the expanded DBC for other tools."""
+"""The load of each bus, computed from the DBC, stays within its limits; and the expanded DBC for other tools."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Many seeds of one scenario: each is flown once, and what was flown is kept."""
+"""Many seeds of one scenario: each is flown once, and finished trials are kept."""
 
 import json
 from importlib import resources

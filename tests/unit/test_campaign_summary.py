@@ -1,4 +1,4 @@
-"""What campaign.json says of many trials, and what people see of it."""
+"""The summary of many trials, in campaign.json and on the console."""
 
 import io
 import math
@@ -37,7 +37,7 @@ def test_quantiles_are_of_the_trials_and_a_metric_nobody_measured_has_none() -> 
 
 
 def test_confidence_interval_is_wilsons() -> None:
-    # 17 of 20, the paper's docking; by hand out of Wilson's formula, z = 1.96: 0.7936 +- 0.1540
+    # 17 of 20, the paper's docking; by hand from Wilson's formula, z = 1.96: 0.7936 +- 0.1540
     trials = [trial(seed, 0.001, "passed" if seed < 17 else "jammed") for seed in range(20)]
     assert summarise("dock", trials)["confidence_interval"] == pytest.approx([0.6396, 0.9476], abs=1e-4)
 

@@ -98,7 +98,7 @@ def test_guaranteed_margin_holds_whichever_thruster_dies() -> None:
 
 
 def wrench_of(body: Body, wanted: Setpoint) -> np.ndarray:
-    """(6,) that one motion takes."""
+    """(6,) wrench that one motion takes."""
     return wrenches(body, np.concatenate(wanted)[None])[0]
 
 
@@ -110,7 +110,7 @@ def test_standing_still_needs_no_wrench_and_drag_needs_one() -> None:
 
 
 def test_steady_circle_asks_for_the_pull_towards_its_middle_and_for_drag() -> None:
-    """With added mass, m v^2 / r; the robot turns with its way, so nothing else changes in its own frame."""
+    """The pull is m v^2 / r with added mass; the robot turns with its path, so nothing else changes in its own frame."""
     body, attitude = assemble_vehicle(load_vehicle("modcube")), Rotation.from_euler("xyz", [0.4, -0.3, 1.1])
     body, v, w = dataclasses.replace(body, righting=np.zeros(3)), np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.0, 0.8])
     circling = UNDER_WATER._replace(
@@ -123,7 +123,7 @@ def test_steady_circle_asks_for_the_pull_towards_its_middle_and_for_drag() -> No
 
 
 def test_trajectory_asks_for_momentums_change() -> None:
-    """Without drag, wrench over time adds up to momentum: a line from rest to rest gives none in sum."""
+    """The wrench makes up momentum and drag: from rest to rest the first half takes a push, the second half less, the ends none."""
     body = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
     line = paths.line(UNDER_WATER, UNDER_WATER._replace(p_wb=np.array([1.0, 0.5, 1.0])), 10.0)
     forces = wrenches_along(line, body, 201)
@@ -141,7 +141,7 @@ def test_trajectory_task_ranks_by_the_wrench_along_it(tmp_path: Path) -> None:
 
 
 def test_margin_that_nothing_limits_is_none_in_the_json_of_a_choice(tmp_path: Path) -> None:
-    """A robot in balance that stays where it is asks its thrusters for nothing."""
+    """A balanced robot at rest asks its thrusters for nothing."""
     path = tmp_path / "task.toml"
     path.write_text('name = "rest"\n[trajectory]\nkind = "circle"\nradius_m = 0.0\nsamples = 3\n')
     with (tmp_path / "said").open("w") as file:
@@ -178,7 +178,7 @@ def test_power_of_a_held_wrench_is_that_of_its_forces() -> None:
 
 @pytest.fixture
 def characterise(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """characterise(*arguments): what the tool prints."""
+    """characterise(*arguments): returns what the tool prints."""
 
     def run(*arguments: str) -> str:
         monkeypatch.setattr(sys, "argv", ["characterise.py", *arguments])
@@ -241,7 +241,7 @@ def test_two_vehicles_of_one_name_are_not_one_column(
 def test_space_that_rounding_left_of_none_is_called_degenerate_and_has_no_ticks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Three thrusters that pass the centre of mass by a tenth of a nanometre: all force, no torque."""
+    """Three thrusters whose axes miss the centre of mass by a tenth of a nanometre: all force, no torque."""
     drawing = importlib.import_module("characterise_draw")
     drawn: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure))

@@ -57,7 +57,7 @@ def test_spheroid_has_the_known_willmore_energy_however_it_lies(fine_harmonics: 
     fine = fine_harmonics.shape(spheroid(DIRECTIONS, axis))
     assert fine.willmore == pytest.approx(2.88524, abs=5e-5)
     assert fine.total_curvature == pytest.approx(4.0 * math.pi, rel=1e-9)
-    # The paper's degree 10 comes within half a percent.
+    # The paper's degree of 10 is accurate to half a percent.
     assert HARMONICS.shape(spheroid(DIRECTIONS, axis)).willmore == pytest.approx(2.88524, rel=5e-3)
 
 

@@ -49,7 +49,7 @@ def test_variance_in_closed_form_is_that_of_the_sampled_forces() -> None:
 def test_degenerate_vehicle_shows_how_far_it_misses_the_wrench() -> None:
     layout = one_of_seven("bluerov2")
     missed = power_space(layout, "torque", fibonacci(500)).residual
-    assert missed == pytest.approx(1.0, abs=1e-2)  # pure pitch is not given at all
+    assert missed == pytest.approx(1.0, abs=1e-2)  # pure pitch cannot be produced at all
     assert power_space(layout.with_passive_declared(), "force", fibonacci(500)).residual < 1e-9
     assert power_space(one_of_seven("modcube_sim"), "torque", fibonacci(500)).residual < 1e-9
 

@@ -50,7 +50,7 @@ def test_vehicle_file_is_its_published_layout_in_frd(vehicle: str, source: str, 
 
 
 def test_positive_thrust_of_a_vertical_thruster_lifts_a_bluerov2() -> None:
-    """Minus z in FRD."""
+    """Up is minus z in FRD."""
     assert load_vehicle("bluerov2").directions[4] == pytest.approx([0.0, 0.0, -1.0])
 
 
@@ -81,7 +81,7 @@ def t200() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def t200_side(sign: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Size of the commands on that side, with force along it and power."""
+    """Magnitude of the commands on one side of zero, with the force in that direction and the power."""
     command, force, power = t200()
     side = sign * command >= 0.0
     return sign * command[side], sign * force[side], power[side]
@@ -130,7 +130,7 @@ def test_layout_of_docked_modules_is_that_of_the_assembled_body() -> None:
 
 
 def test_thrusters_of_turned_modules_push_about_what_they_and_their_loads_weigh_together() -> None:
-    """Lumps summed one by one: two of the three modules carry a load, all weigh off their middle."""
+    """Expected values by summing point masses: two of the three modules carry a load, and all have an off-centre centre of mass."""
     plain = load_vehicle("modcube")
     off = dataclasses.replace(plain.inertial, com_m=frozen_array([0.012, -0.007, 0.02]))
     load = Payload(
@@ -175,7 +175,7 @@ def test_wrong_vehicle_file_is_refused_with_its_line(tmp_path: Path, change: tup
     match = re.match(rf"{re.escape(str(path))}:(\d+): (.+)", str(refused.value))
     assert match and "\n" not in str(refused.value)
     at = next(k for k, line in enumerate(lines, 1) if where in line)
-    assert at - 2 <= int(match[1]) <= at  # the key's line, or that of its table's head
+    assert at - 2 <= int(match[1]) <= at  # the line of the key, or of its table's header
     assert re.search("length 1|finite|out of range", match[2])
 
 

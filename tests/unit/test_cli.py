@@ -1,4 +1,4 @@
-"""The command line refuses what is wrong in one line on stderr, with status 2, and says what would be right."""
+"""The command line refuses wrong input in one line on stderr, with status 2, and says what would be right."""
 
 import errno
 import os
@@ -80,7 +80,7 @@ def test_wrong_arguments_are_refused_in_one_line(arguments: list[str], wrong: st
     "arguments", [["run", "--bus", "token:ring", "--out"], ["doctor", "--out"], ["replay"], ["clear-estop"], ["log", "recover"]]
 )
 def test_folder_without_a_name_is_refused(arguments: list[str], tmp_path: Path, refusal: Callable[..., str]) -> None:
-    """As an unset variable of a shell gives it; it is not the working directory."""
+    """An empty name, as from an unset shell variable, does not mean the working directory."""
     assert "'' is no folder; give one, or . for this one" in refusal(*arguments, "")
 
 
@@ -155,7 +155,7 @@ def find_the_disk_full(*_: object) -> None:
 def test_full_disk_ends_the_bench_in_one_line_with_the_folder(
     command: str, writer: type, write: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Callable[..., str]
 ) -> None:
-    """The firmware's own log fails in silence, for a vehicle flies on without it; a bench has no use for such a flight."""
+    """A full disk does not stop the firmware, because a vehicle flies on without its log; on the bench such a flight is useless."""
     if writer is GuardedFile:
         monkeypatch.setattr(hil.bench.Bench, "fly", lambda *_: 1.0)
     monkeypatch.setattr(writer, write, find_the_disk_full)
@@ -172,7 +172,7 @@ def test_full_disk_is_told_in_one_line_where_nobody_knows_the_folder(
 
 
 def test_interrupt_during_the_imports_is_silent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Those of the command line itself, of which `modcube` knows nothing yet when it starts."""
+    """The imports of the command line itself, which `modcube` has not loaded yet when it starts."""
 
     class Interrupted(ModuleType):
         def __getattr__(self, name: str) -> object:
@@ -213,7 +213,7 @@ def test_list_names_every_scenario_with_one_line_of_help(printed: Callable[..., 
 
 @pytest.fixture
 def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """printed(*arguments): what `modcube` prints when asked so."""
+    """printed(*arguments): returns what `modcube` prints for these arguments."""
 
     def run(*arguments: str) -> str:
         monkeypatch.setattr("sys.argv", ["modcube", *arguments])
@@ -278,7 +278,7 @@ def test_groups_of_parameters_are_printed_alone(refusal: Callable[..., str], pri
 def test_campaigns_of_different_robots_have_folders_of_their_own(
     options: list[str], folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """None refuses to begin for the trials of the other."""
+    """So that none refuses to begin because of another's trials."""
     taken: list[Path] = []
 
     def fly(scenario: object, parameters: object, seeds: object, pool: object, out: Path, progress: object) -> None:
@@ -298,7 +298,7 @@ def test_campaigns_of_different_robots_have_folders_of_their_own(
 def test_flights_of_different_seeds_have_folders_of_their_own(
     options: list[str], folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """None replaces the other."""
+    """So that neither overwrites the other."""
     taken: list[object] = []
 
     def fly(*arguments: object) -> None:

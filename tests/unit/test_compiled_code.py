@@ -1,4 +1,4 @@
-"""Compiled code is never older than what it was made of, and always finds a place."""
+"""Compiled code is never older than its sources, and there is always a folder for it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_compiled_code_older_than_any_source_that_it_may_have_taken_in_is_forgot
 
 @pytest.mark.parametrize(("changed", "stays"), [(200, True), (300, False)])
 def test_compiled_code_older_than_a_constant_that_it_holds_is_forgotten(tmp_path: Path, changed: float, stays: bool) -> None:
-    """The file of the constant has no compiled code of its own."""
+    """The file that defines the constant has no compiled code of its own."""
     written(tmp_path / "mine" / "sums.py", 200, "from mine.sizes import LENGTH\nfrom mine.words import hello\n")
     written(tmp_path / "mine" / "sizes.py", changed, "LENGTH = 8\n")
     written(tmp_path / "mine" / "words.py", 300)
@@ -78,7 +78,7 @@ def test_compiled_code_that_can_be_kept_nowhere_goes_to_a_folder_for_this_run(tm
 def test_home_of_somebody_else_is_no_place_for_compiled_code_and_does_not_stop_the_import(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As after sudo -E, or in a service with another's HOME: nothing in there can even be asked after."""
+    """As after sudo -E, or in a service with another user's HOME: even stat fails for everything in there."""
     home = tmp_path / "home"
     home.mkdir()
     stat, access = os.stat, os.access

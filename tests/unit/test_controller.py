@@ -1,4 +1,4 @@
-"""The control law by inverse dynamics: in the equations of motion its wrench must give the motion that was wanted."""
+"""The inverse-dynamics control law: in the equations of motion, its wrench must produce the wanted motion."""
 
 import math
 from dataclasses import replace
@@ -34,7 +34,7 @@ def body(request: pytest.FixtureRequest) -> Body:
 
 
 def believed(p_wb: np.ndarray, q_wb: np.ndarray, nu: np.ndarray, disturbance: np.ndarray | None = None) -> Estimate:
-    """disturbance: (6,) force in the world, moment in the body."""
+    """Returns an estimate. disturbance: (6,) force in the world frame, moment in the body frame."""
     zero, d = np.zeros(3), np.zeros(6) if disturbance is None else disturbance
     return Estimate(p_wb, q_wb, nu, d[:3].copy(), d[3:].copy(), zero, zero, 0, math.nan, 0, 0, True)
 
@@ -51,7 +51,7 @@ def velocity_of(setpoint: Setpoint) -> np.ndarray:
 
 
 def acceleration_of(setpoint: Setpoint) -> np.ndarray:
-    """(6,) dnu/dt in the turning body frame that the set-point asks for."""
+    """(6,) dnu/dt in the rotating body frame that the set-point asks for."""
     turn = Rotation.from_quat(setpoint.q_wb[[1, 2, 3, 0]])
     nu = velocity_of(setpoint)
     return np.r_[turn.inv().apply(setpoint.a_w) - np.cross(nu[3:], nu[:3]), setpoint.alpha_b]
@@ -61,7 +61,7 @@ def acceleration_of(setpoint: Setpoint) -> np.ndarray:
 
 
 def surprise(body: Body, parameters: Control, q_wb: np.ndarray) -> float:
-    """Largest difference between the acceleration that the wrench gives and the wanted one, with no error at all."""
+    """Largest difference between the acceleration that the wrench produces and the wanted one, at zero tracking error."""
     setpoint = moving(q_wb)
     disturbance = np.array([2.0, -1.0, 0.5, 0.1, 0.2, -0.1])
     nu = velocity_of(setpoint)
@@ -75,7 +75,7 @@ def surprise(body: Body, parameters: Control, q_wb: np.ndarray) -> float:
 @pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
 @pytest.mark.parametrize("law", ["model", "paper"])
 def test_robot_on_its_path_accelerates_as_the_path_does(body: Body, law: str, q_wb: np.ndarray) -> None:
-    if law == "paper":  # its g(eta) is zero by design of the robot
+    if law == "paper":  # the paper's g(eta) is zero by design of its robot
         body = replace(body, righting=np.zeros(3))
     assert surprise(body, Control(law=law), q_wb) < 1e-12
 
@@ -89,7 +89,7 @@ def test_feed_forward_of_the_wrong_sign_or_none_would_be_noticed(body: Body, spo
 
 @pytest.mark.parametrize("term", ["mass", "righting", "drag"])
 def test_model_that_is_not_the_robots_would_be_noticed(body: Body, term: str) -> None:
-    """The controller of a robot with one term of the wrong sign or size, on the right robot."""
+    """The controller's model has one term of the wrong sign or size; the robot is the right one."""
     spoilt = {
         "mass": replace(body, mass=1.1 * body.mass),
         "righting": replace(body, righting=-body.righting),
@@ -149,7 +149,7 @@ def test_quaternion_of_either_sign_is_the_same_attitude(body: Body) -> None:
 
 
 def test_paper_law_feeds_measured_velocity_into_drag_and_the_default_does_not(body: Body) -> None:
-    """At rest it wants no drag made up; pushed at 0.5 m/s the paper's law cancels the water's own damping."""
+    """With the set-point at rest the default compensates no drag; the paper's law cancels the water's damping of a push at 0.5 m/s."""
     nu = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     hold = rest_at(np.zeros(3), LEVEL)
     pushed = believed(np.zeros(3), LEVEL, nu)
@@ -184,24 +184,24 @@ def without_drag(body: Body) -> Body:
 
 @pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
 def test_wanted_rates_are_turned_from_the_attitude_that_is_wanted_into_the_one_that_is(body: Body, q_wb: np.ndarray) -> None:
-    """A quarter turn off its set-point, the robot is to turn about the same axes of the world all the same."""
+    """A quarter turn off its set-point, the robot must still turn about the same world axes."""
     aim = rest_at(np.zeros(3), multiply(q_wb, from_euler(0.0, 0.0, 0.5 * math.pi)))
     turning = aim._replace(w_b=np.array([0.3, -0.2, 0.5]))
     still, c = believed(np.zeros(3), q_wb, np.zeros(6)), Control()
     controller = Controller(without_drag(body), c)
     extra = controller.step(turning, aim, still) - controller.step(aim, aim, still)
-    damping = 2.0 * c.attitude_damping * c.attitude_bandwidth * np.array([0.2, 0.3, 0.5])  # its x is the robot's y, its y the robot's -x
+    damping = 2.0 * c.attitude_damping * c.attitude_bandwidth * np.array([0.2, 0.3, 0.5])  # set-point x is robot y, its y robot -x
     np.testing.assert_allclose(extra, body.mass @ np.r_[np.zeros(3), damping], atol=1e-9)
 
 
 @pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
 def test_feed_forward_of_a_turn_is_told_in_the_attitude_that_is(body: Body, q_wb: np.ndarray) -> None:
-    """Euler's equations about the centre of mass of the wanted turn, a quarter turn off it, by numpy."""
+    """Against Euler's equations of the wanted turn about the centre of mass, in numpy; the robot is a quarter turn off its set-point."""
     aim = rest_at(np.zeros(3), multiply(q_wb, from_euler(0.0, 0.0, 0.5 * math.pi)))
     turning = aim._replace(w_b=np.array([0.3, -0.2, 0.5]), alpha_b=np.array([-0.7, 0.4, 0.9]))
     controller, still = Controller(without_drag(body), Control()), believed(np.zeros(3), q_wb, np.zeros(6))
     extra = controller.step(aim, turning, still) - controller.step(aim, aim, still)
-    w, alpha = np.array([0.2, 0.3, 0.5]), np.array([-0.4, -0.7, 0.9])  # its x is the robot's y, its y the robot's -x
+    w, alpha = np.array([0.2, 0.3, 0.5]), np.array([-0.4, -0.7, 0.9])  # set-point x is robot y, its y robot -x
     momentum = body.mass[:, 3:] @ w
     euler = body.mass[:, 3:] @ alpha + np.r_[np.cross(w, momentum[:3]), np.cross(w, momentum[3:])]
     np.testing.assert_allclose(extra, euler, atol=1e-12)
@@ -247,7 +247,7 @@ def test_robot_comes_home_from_far_away_and_any_attitude(body: Body, start: np.n
 
 
 def test_steady_run_with_current_is_followed_without_error(body: Body) -> None:
-    """0.3 m/s through the water against a known disturbance: nothing is left for the feedback to do."""
+    """At 0.3 m/s through the water, against a known disturbance, nothing is left for the feedback to correct."""
     setpoint = Setpoint(np.zeros(3), LEVEL, np.array([0.3, 0.1, 0.0]), np.zeros(3), np.zeros(3), np.zeros(3))
     disturbance = np.array([1.0, 0.0, -0.5, 0.0, 0.0, 0.0])
     x = np.zeros(STATES)

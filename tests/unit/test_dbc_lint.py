@@ -1,4 +1,4 @@
-"""The DBC has the messages of the table below, and makes none of the mistakes that cantools loads without a word.
+"""The DBC has the messages of the table below, and none of the mistakes that cantools loads without complaint.
 
 Each rule is tried on a DBC that breaks it (the negative controls at the end).
 """
@@ -122,7 +122,7 @@ def unknown_nodes(database):
 
 
 def missing_units(database):
-    """A scaled value has a unit, unless it is a share: a number of size 1 at most."""
+    """A scaled value has a unit, unless it is a share: a number of magnitude 1 at most."""
     return [
         f"{message.name}.{signal.name}"
         for message in database.messages

@@ -1,4 +1,4 @@
-"""The picture of a dock names the stages as the sequence does, and says where it knows no true gap."""
+"""The plot of a dock names the stages as the sequence does, and says where the true gap is known."""
 
 import itertools
 
@@ -15,7 +15,7 @@ def test_stages_are_named_by_their_numbers() -> None:
 
 
 def flown(stages: dict[str, int]) -> tuple[Columns, Columns]:
-    """A dock, and the truth of it, that goes through these stages, each for so many ticks."""
+    """Returns the signals and the truth of a dock that goes through these stages, each for the given number of ticks."""
     stage = np.repeat([STAGES.index(name) for name in stages], list(stages.values()))
     time_ns, none, one = 10_000_000 * np.arange(1, len(stage) + 1), np.zeros(len(stage), int), np.ones(len(stage))
     docks = {name: none for name in ("module_a", "current_holds", "position_holds")} | {"stage": stage, "time_ns": time_ns}
@@ -42,7 +42,7 @@ def test_stages_tell_their_try_where_there_are_several() -> None:
 
 
 def test_legend_says_from_when_to_when_the_true_gap_is_known() -> None:
-    """The plant has none of modules that are far from each other or locked."""
+    """The plant gives no gap for modules that are far apart or locked."""
     docks, truth = flown({"approach": 30})
     known = np.where((np.arange(30) > 9) & (np.arange(30) < 20), 0.1, np.nan)
     figure = docking(docks, truth | {"gap_m": known}, 0)

@@ -1,4 +1,4 @@
-"""The body that others dock to: it feels no blow, comes to meet one of them, and goes back where it was."""
+"""The target of docks: it feels no jolt, comes to meet one active body, and goes back to where it was."""
 
 from itertools import cycle
 
@@ -26,7 +26,7 @@ def test_pilot_of_the_target_feels_no_blow_when_another_docks_to_it() -> None:
     sticks = Request(Action.STICKS, 0, Sticks((0.2, 0.0, 0.0)))
     tank.run(0.03, sticks, Request(Action.SET_MODE, 0, Mode.ALT_HOLD), Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     (dock,) = tank.pipeline.formation.docking._docks
-    dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just come
+    dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just arrived
     for _ in range(300):
         if len(tank.shape) == 2:
             tank.run(0.01, *([sticks] if len(tank.outputs) % 10 == 5 else []))
@@ -160,7 +160,7 @@ def test_dock_whose_way_leads_through_a_third_body_is_refused(approach: str) -> 
 
 
 def test_dock_whose_target_would_come_through_a_third_body_is_refused() -> None:
-    """Who docks goes level to the stand-off; the target, which comes half of that way, has somebody at its side."""
+    """The active body goes level to the stand-off; the target, which comes half of that way, has another body beside it."""
     tank = placed((1.0, 0.0), (2.0, 1.5), (1.0, 0.45))
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 1, 0, 0, 0, True)))
     assert tank.when("dock refused: module 0, which is to meet it, would come too near to module 2")
@@ -192,7 +192,7 @@ def test_dock_waits_while_a_third_body_is_on_its_way_and_then_goes_on() -> None:
 
 
 def test_dock_says_of_each_module_once_that_it_waits_though_two_are_as_near() -> None:
-    """Noise tells which of two modules that are on the way is the nearer."""
+    """Noise decides which of two modules on the way is the nearer one."""
     tank = placed((1.0, 0.0), (1.0, 2.0), (1.6, 0.9), (1.6, 1.3))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     met = cycle([2, 3])
@@ -204,11 +204,11 @@ def test_dock_says_of_each_module_once_that_it_waits_though_two_are_as_near() ->
 
 LEVEL, DIAGONAL = (from_euler(0.0, 0.0, yaw) for yaw in (0.0, 0.25 * np.pi))
 CLEAR_M = 2.0**0.5 * PITCH_M
-"""Level cubes whose centres are so far apart do not touch, whichever way they are turned."""
+"""Distance of the centres at which level cubes do not touch, whatever their headings."""
 
 
 def send(module: int, north_m: float, east_m: float, q_wb: np.ndarray = LEVEL) -> Request:
-    """A module to another place at the depth of all."""
+    """A request that sends a module to another place at the common depth."""
     return Request(Action.HOLD, module, rest_at(np.array([north_m, east_m, 0.8]), q_wb))
 
 
@@ -272,7 +272,7 @@ def test_dock_that_cannot_go_back_to_make_room_is_given_way_to_by_the_other() ->
 
 @pytest.mark.slow
 def test_earlier_of_two_docks_makes_room_where_the_later_one_s_room_is_on_its_way() -> None:
-    """Its target is sent elsewhere, and its new way leads through the place from where the other came."""
+    """The earlier dock's target is sent elsewhere, so that its new way leads through the place where the later dock began."""
     tank = placed((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0), parameters=Parameters().replace("docking.timeout_s", 30.0))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     tank.run(1.0, Request(Action.DOCK, 3, DockRequest(3, 1, 2, 0)))
@@ -287,7 +287,7 @@ def test_earlier_of_two_docks_makes_room_where_the_later_one_s_room_is_on_its_wa
 
 @pytest.mark.slow
 def test_dock_to_a_target_that_comes_to_meet_another_waits_until_it_is_there() -> None:
-    """It went before the face, which was then in the way that the target came, and so ended the other's dock."""
+    """It used to go in front of the face, into the target's way, and so ended the other's dock."""
     tank = placed((1.0, 0.0), (2.4, 1.4), (1.75, -0.3))
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     outputs = tank.run(10.0, Request(Action.DOCK, 2, DockRequest(2, 1, 0, 0)))
@@ -297,7 +297,7 @@ def test_dock_to_a_target_that_comes_to_meet_another_waits_until_it_is_there() -
 
 @pytest.mark.slow
 def test_straight_line_to_a_target_that_comes_to_meet_another_is_drawn_once_it_is_there() -> None:
-    """It was drawn at once, to where the target was never to be again."""
+    """It used to be drawn at once, to a place that the target was leaving for good."""
     tank = placed((1.0, 0.0), (2.4, 1.4), (1.75, -0.3), parameters=Parameters().replace("docking.approach", "straight"))
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     tank.run(0.1, Request(Action.DOCK, 2, DockRequest(2, 1, 0, 0)))

@@ -1,4 +1,4 @@
-"""What is told of docks: wishes obeyed one after the other, with the faces that they name, and joins that were none."""
+"""Metrics of docks: wishes obeyed one after the other, with the faces that they name, and joins declared falsely."""
 
 import dataclasses
 from pathlib import Path
@@ -37,7 +37,7 @@ def test_wishes_are_obeyed_one_after_the_other(wishes: list[bool], runs: str, ob
 
 
 def truth_of(bodies: list[tuple[tuple[int, ...], ...]], places: list[list[float]]) -> dict[str, Columns]:
-    """Logs of three modules, level, that hang together as `bodies` says, for equal shares of the run."""
+    """Logs of three level modules; each entry of `bodies` says how they are joined during an equal share of the run."""
     share = len(TICKS) // len(bodies)
     truths: dict[str, Columns] = {"/plant/docks": {"tick": TICKS}}
     for m, place in enumerate(places):
@@ -52,7 +52,7 @@ def truth_of(bodies: list[tuple[tuple[int, ...], ...]], places: list[list[float]
 
 
 def asked(*steps: Step) -> Scenario:
-    """Three modules, numbered from 1."""
+    """A scenario of three modules with these steps; its modules are numbered from 1."""
     third = load_scenario("dock-third")
     return dataclasses.replace(third, step=steps)
 
@@ -71,7 +71,7 @@ def test_dock_counts_with_the_faces_that_were_named() -> None:
 
 
 def test_module_that_is_undocked_and_docked_to_another_of_the_same_body_is_as_asked() -> None:
-    """From one end of a pair to the other."""
+    """The module moves from one end of a pair to the other."""
     moved = [((0, 1, 2),), PAIR, PAIR, ((0, 1, 2),)]
     places = [[0.0, 0.0, 0.4], [0.21, 0.0, 0.4], [-0.21, 0.0, 0.4]]
     undock, dock = Step(do="undock", module=3, target_module=2), Step(do="dock", module=3, face="+x", target_module=1, target_face="-x")
@@ -114,11 +114,11 @@ def test_join_of_others_than_those_that_hang_together_is_a_false_one(module_a: i
 def test_join_that_no_dock_declared_is_found_by_the_number_of_bodies() -> None:
     signals = {"/firmware/body0": {"tick": TICKS}, "/firmware/body1": {"tick": TICKS[:30]}, "/firmware/body2": {"tick": TICKS}}
     assert _false_declarations(truth_of([APART], PLACES), signals) == 1
-    assert _false_declarations(truth_of([APART, PAIR], PLACES), signals) == 1  # thirty ticks in, and true from fifty
+    assert _false_declarations(truth_of([APART, PAIR], PLACES), signals) == 1  # declared after thirty ticks, true after fifty
 
 
 def test_step_of_the_thrusters_counts_in_every_join_of_modules_that_part_and_dock_again() -> None:
-    """By 0.2 N in the first, and by 0.7 N in the second, a tick after the faces have locked."""
+    """The step is 0.2 N in the first join and 0.7 N in the second, a tick after the faces have locked."""
     truths = truth_of([APART, PAIR, APART, PAIR], PLACES)
     for module, thrusters in enumerate((8, 8, 6)):  # the third is of another kind, and stays away
         truths[f"/plant/module{module}"]["force_n"] = np.zeros((100, thrusters))
@@ -136,7 +136,7 @@ def test_step_of_the_thrusters_counts_in_every_join_of_modules_that_part_and_doc
 
 
 def test_place_of_a_joined_body_counts_from_when_the_firmware_knows_it() -> None:
-    """A pair that is docked from the start waits for its first tags with a set-point at the origin."""
+    """A pair docked from the start waits for its first tags with its set-point at the origin; those ticks do not count."""
     ready = TICKS > 30
     true = {"tick": TICKS, "member": np.ones((100, 2)), "p_wb": np.tile([0.3, 0.0, 0.4], (100, 1))}
     setpoint = np.where(ready[:, None], [0.3, 0.002, 0.4], 0.0)
@@ -155,7 +155,7 @@ def test_place_of_a_joined_body_counts_beside_a_robot_with_fewer_thrusters() -> 
 
 
 def test_body_of_which_the_target_has_the_higher_number_is_judged_as_any_other() -> None:
-    """The plant names it by its lowest module, 0; the firmware by its first, which is the target's, 1."""
+    """The plant names the body by its lowest module, 0; the firmware by its first module, which is the target's, 1."""
     truths = truth_of([APART, PAIR, APART, PAIR], PLACES)
     for module in range(3):
         truths[f"/plant/module{module}"]["force_n"] = np.zeros((100, 8))

@@ -1,4 +1,4 @@
-"""The docking detector: both conditions, believed late and lost with their measurements; many pairs at once as each alone."""
+"""The docking detector: both conditions, debounced and lost when measurements go stale; many pairs at once behave as each alone."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ TICK_NS, PITCH_M = 10_000_000, 0.21
 P = Docking()
 TAG = 5
 LEVERS, TURN = [np.array([0.02, -0.01, -0.1]) * way for way in (1.0, -0.5, 0.7, -1.0)], from_euler(0.3, -0.2, 1.0)
-"""Of every module's one tag: its place in the module, and module frame to tag frame."""
+"""Of each module's only tag: its position in the module, and the rotation from module frame to tag frame."""
 TAGS: TagTable = {(m, TAG): np.r_[LEVERS[m], TURN] for m in range(4)}
 ROW = [FacePair(m, 0, m + 1, 1, np.array([PITCH_M, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])) for m in range(3)]
 """Four modules in a row, the +x face of each against the -x face of the next."""
@@ -27,12 +27,12 @@ ROW = [FacePair(m, 0, m + 1, 1, np.array([PITCH_M, 0.0, 0.0]), np.array([1.0, 0.
 
 @dataclass
 class Row:
-    """The four modules, and what they and the camera say in each tick."""
+    """The four modules, and what they and the camera report in each tick."""
 
     attitude: np.ndarray = field(default_factory=lambda: from_euler(0.2, -0.1, 2.0))
     gaps_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     currents_ma: list[float] = field(default_factory=lambda: [100.0, -100.0, 100.0])
-    """Of both magnets of each joint."""
+    """Current of both magnets of each joint."""
     noise_m: float = 0.0
     camera: bool = True
     tick: int = 0
@@ -57,7 +57,7 @@ class Row:
         return TagObservation(TAG, 7, self.tick * TICK_NS - 40_000_000, p_wt, multiply(self.attitude, conjugate(TURN)))
 
     def watch(self, bank: PairBank, seconds: float) -> list[PairStatus]:
-        """The status of every pair after so long."""
+        """Steps `bank` for `seconds`; returns the status of every pair."""
         for _ in range(round(seconds / 0.01)):
             time_ns, modules = self.hear()
             bank.step(time_ns, modules, ModulePoses(modules, TAGS))
@@ -107,7 +107,7 @@ def test_dock_needs_more_than_seventy_milliamperes_of_either_sign(row: Row, curr
 
 @pytest.mark.parametrize("debounce_ms", [100.0, 120.0])
 def test_current_is_believed_by_the_first_measurement_after_the_debounce(row: Row, debounce_ms: float) -> None:
-    """Heard every 40 ms, from 40 ms on: at 160 ms."""
+    """Currents arrive every 40 ms, from 40 ms on, so the condition holds at 160 ms."""
     bank = PairBank(ROW[:1], replace(P, debounce_ms=debounce_ms))
     assert [row.watch(bank, 0.01)[0].current for _ in range(16)] == [False] * 15 + [True]
 
@@ -124,7 +124,7 @@ def test_pair_of_which_nothing_was_heard_neither_holds_nor_is_open(row: Row) -> 
 @pytest.mark.parametrize("silent", [0, 1])
 @pytest.mark.parametrize("heard_s", [0.0, 1.0])
 def test_current_of_one_face_alone_does_not_count(row: Row, silent: int, heard_s: float) -> None:
-    """Whichever module is silent, and whether or not it was ever heard: no longer than currents are fresh."""
+    """Whichever module is silent, and whether or not it was ever heard, its current counts only while it is fresh."""
     detector, seen = PairDetector(ROW[0], P), list[bool]()
     while len(seen) < 200:
         time_ns, modules = row.hear()
@@ -140,7 +140,7 @@ def test_current_of_one_face_alone_does_not_count(row: Row, silent: int, heard_s
 
 @pytest.mark.parametrize("faces", [(0, 1), (2, 3), (4, 5), (5, 0)])
 def test_current_of_every_face_is_heard(row: Row, faces: tuple[int, int]) -> None:
-    """Three come in a frame; those of all other faces are none."""
+    """A frame carries three currents; those of all other faces are zero."""
     bank = PairBank([ROW[0]._replace(face_a=faces[0], face_b=faces[1])], P)
     for _ in range(100):
         time_ns, modules = row.hear()
@@ -172,7 +172,7 @@ def test_module_that_is_not_in_the_picture_is_not_placed_by_its_neighbours(row: 
 
 
 def test_newest_of_several_pictures_counts(row: Row) -> None:
-    """Those that came in one tick, the older ones of modules that were still apart."""
+    """Two pictures arrive in one tick; the older one shows the modules still apart."""
     bank = PairBank(ROW, P)
     for _ in range(100):
         row.gaps_m = [0.05, 0.05, 0.05]
@@ -215,7 +215,7 @@ def test_joint_keeps_the_time_of_the_last_picture_that_showed_it_in_its_place(ro
 def test_joint_is_open_by_what_is_measured_and_never_by_silence(
     row: Row, gap_m: float, current_ma: float, camera: bool, state: int
 ) -> None:
-    """Apart where all that is measured says so, loose where something speaks against it; and closed once it is closed again."""
+    """Apart if all fresh measurements say so, loose if one of them contradicts; and CLOSED again once the joint is closed."""
     assert CLOSED < LOOSE < APART
     bank = PairBank(ROW[:1], P)
     row.watch(bank, 1.0)
@@ -229,7 +229,7 @@ def test_joint_is_open_by_what_is_measured_and_never_by_silence(
 
 
 def test_what_is_not_seen_any_more_is_not_believed(row: Row) -> None:
-    """A coasted pose never counts, and no current is one that is old."""
+    """A coasted pose never counts, and neither does a stale current."""
     bank = PairBank(ROW, P)
     row.watch(bank, 1.0)
     row.camera = False
@@ -250,7 +250,7 @@ def test_pair_that_still_moves_is_not_settled(row: Row) -> None:
 
 
 def test_drift_of_a_pair_is_between_the_means_of_its_newest_pictures_and_those_before(row: Row) -> None:
-    """Eight and eight of the thirty-two whose mean is the error."""
+    """Eight pictures each, out of the thirty-two whose mean is the error."""
     bank, rng, gaps_m = PairBank(ROW[:1], P), np.random.default_rng(2), list[float]()
     while len(gaps_m) < 100:
         row.gaps_m[0] = rng.uniform(0.0, 0.004)
@@ -283,7 +283,7 @@ def test_locked_pair_is_found_in_noise_and_through_flipped_tags(row: Row) -> Non
 
 @pytest.mark.parametrize("flip", [(math.pi / 2, 0.0, 0.0), (0.0, math.pi / 2, 0.0), (0.0, 0.0, -math.pi / 2)])
 def test_flipped_tag_that_is_off_by_a_quarter_turn_opens_no_joint(row: Row, flip: tuple[float, float, float]) -> None:
-    """Seen from 45 degrees; its module would be seventy millimetres off, one picture in five."""
+    """One picture in five shows such a tag, seen from 45 degrees; its module would be seventy millimetres off."""
     bank = PairBank(ROW[:1], P)
     for n in range(400):
         time_ns, modules = row.hear()
@@ -295,7 +295,7 @@ def test_flipped_tag_that_is_off_by_a_quarter_turn_opens_no_joint(row: Row, flip
 
 @pytest.mark.parametrize("turn", [from_euler(0.0, 0.0, math.pi / 2), from_euler(math.pi, 0.0, 0.0)])
 def test_modules_that_are_docked_turned_are_found_so(row: Row, turn: np.ndarray) -> None:
-    """As the pair says that they are turned, and no other way."""
+    """Only with the rotation that the pair specifies."""
     tags: TagTable = {(0, TAG): TAGS[0, TAG], (1, TAG): np.r_[rotate(conjugate(turn), LEVERS[1]), multiply(TURN, turn)]}
     for q_ab, found in ((turn, True), (np.array([1.0, 0.0, 0.0, 0.0]), False)):
         bank = PairBank([ROW[0]._replace(q_ab=q_ab)], P)
@@ -347,7 +347,7 @@ def test_joints_go_on_when_other_joints_come_and_go(row: Row) -> None:
 @pytest.mark.parametrize(("cell", "turns"), [((0, 1, 0), (0, 2)), ((0, 1, 0), (0, 14)), ((0, 0, 1), (0, 3)), ((0, 0, 1), (0, 21))])
 @pytest.mark.parametrize("swapped", [False, True])
 def test_joint_of_modules_that_sit_turned_is_told_in_their_own_frames(cell: tuple[int, ...], turns: tuple[int, int], swapped: bool) -> None:
-    """Whichever comes first in the body: the other's centre is a pitch before the face that is turned to it."""
+    """Whichever module comes first in the body, the other's centre is one pitch in front of the face that is turned to it."""
     vehicles, cells, modules = [load_vehicle("modcube")] * 2, [(0, 0, 0), cell], [5, 6]
     if swapped:
         cells, turns = cells[::-1], turns[::-1]

@@ -1,4 +1,4 @@
-"""The docking sequence alone: a straight dock begun near ends as any other, and a dock that is refused at once moves nobody."""
+"""The docking sequence alone: a dock that begins near ends like any other, and a dock that is aborted at once moves no body."""
 
 import math
 
@@ -18,7 +18,7 @@ from tests.unit.dock_follower import DRIFT, NEITHER, STAGED, TICK_NS, TILTED, Fo
 
 
 def begin(parameters: Docking, gap_m: float, comes: bool = True) -> tuple[DockingSequence, np.ndarray, np.ndarray]:
-    """A sequence, and where target and active body are: `gap_m` apart along the target's +x."""
+    """Returns a sequence and the positions of target and active body, `gap_m` apart along the target's +x."""
     target, active = (assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [m]) for m in (0, 1))
     plan = plan_dock(DockRequest(1, 1, 0, 0), active, target, [load_vehicle("modcube")] * 2)
     sequence = DockingSequence(plan, active, target, parameters, 0, comes)
@@ -31,7 +31,7 @@ def begin(parameters: Docking, gap_m: float, comes: bool = True) -> tuple[Dockin
 def test_quarter_turns_are_counted_about_the_targets_face_outwards(
     quarter_turns: int, target_face: int, face: int, target_turn: int
 ) -> None:
-    """From the least rotation that lays the active face on the target's: none for opposite faces, else the shortest way."""
+    """Counted from the smallest rotation that brings the active face onto the target's: none for opposite faces, else the shortest way."""
     vehicles = [load_vehicle("modcube")] * 2
     target, active = assemble([(0, 0, 0)], [target_turn], vehicles[:1], [0]), assemble([(0, 0, 0)], [4], vehicles[:1], [1])
     plan = plan_dock(DockRequest(1, face, 0, target_face, quarter_turns), active, target, vehicles)
@@ -111,7 +111,7 @@ def test_body_that_is_off_its_stand_off_is_brought_there_before_it_is_aligned(of
     assert sequence.stage == Stage.ALIGN
 
 
-# ---------------------------------------------------------------- bodies of several modules, anyhow turned
+# ---------------------------------------------------------------- bodies of several modules, in any attitude
 
 
 def test_pair_is_led_so_that_its_module_stands_before_the_face_of_a_tilted_pair() -> None:
@@ -148,7 +148,7 @@ def test_tilted_target_comes_half_of_the_way_in_the_world(approach: str) -> None
     left = STAGED.standoff_m if approach == "staged" else 0.0
     np.testing.assert_allclose(steering.meets, 0.5 * (way - left * dock.outward), atol=1e-9)
     np.testing.assert_array_equal(dock.sequence.meets_at_w, dock.there.p_wb + steering.meets)
-    if approach == "straight":  # it meets the target where that comes to rest
+    if approach == "straight":  # it meets the target where the target comes to rest
         dock.until(Stage.PUSH)
         np.testing.assert_allclose(dock.at.p_wb + rotate(dock.at.q_wb, r_a), centre + PITCH_M * dock.outward + steering.meets, atol=0.002)
         np.testing.assert_allclose(dock.step().active.v_w, -STAGED.contact_speed_m_s * dock.outward, atol=1e-9)
@@ -179,7 +179,7 @@ def test_jam_that_a_camera_too_slow_makes_is_told_by_the_parameter_that_helps() 
 
 
 def test_approach_that_waits_to_the_end_of_its_time_is_no_jam_and_is_over() -> None:
-    """It was: magnets pushed at whatever stood there, and all was tried anew."""
+    """It used to count as a jam: the magnets pushed at whatever stood there, and the dock was tried again."""
     dock = Follower(Docking(timeout_s=20.0))
     dock.until(Stage.APPROACH)
     while dock.sequence.stage == Stage.APPROACH:
@@ -190,7 +190,7 @@ def test_approach_that_waits_to_the_end_of_its_time_is_no_jam_and_is_over() -> N
 
 @pytest.mark.parametrize(("approach", "waiting"), [("staged", Stage.APPROACH), ("straight", Stage.PRE_APPROACH)])
 def test_time_that_an_approach_waited_is_not_taken_from_what_it_has_to_dock(approach: str, waiting: Stage) -> None:
-    """One that waited 19 of 20 s was called a jam before it was there, and let go with magnets that push."""
+    """An approach that waited 19 of 20 s used to count as a jam before it arrived, and let go with pushing magnets."""
     dock = Follower(Docking(timeout_s=20.0, approach=approach))
     while dock.sequence.stage != waiting:
         dock.step()
@@ -215,7 +215,7 @@ def test_approach_that_is_to_make_room_goes_back_and_begins_anew() -> None:
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_who_waits_or_makes_room_at_its_stand_off_does_not_go_on_from_there(approach: str) -> None:
-    """It aligned, which nobody is waited with: it came before the face, made room anew, and so on for ever; or drew its line too early."""
+    """It used to align, where nothing waits: it came before the face, made room again, and so on endlessly; or drew its line too early."""
     ready, dock = Follower(), Follower(Docking(approach=approach))
     ready.until(Stage.APPROACH)
     dock.at = ready.at

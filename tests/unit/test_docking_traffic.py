@@ -1,4 +1,4 @@
-"""Right of way among docks under way: one is before its face, and another's way leads there."""
+"""Right of way among docks under way: one body is in front of its target's face, and another's way leads past there."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,8 @@ Place = tuple[float, float]
 VEHICLES = [load_vehicle("modcube")] * 4
 BODIES = [assemble([(0, 0, 0)], [0], VEHICLES[:1], [m]) for m in range(4)]
 BESIDE, AWAY, BACK, THERE = (0.24, 0.05), (0.6, -0.3), (-0.6, 0.5), (0.06, 0.9)
-"""Of the body that is on its way past the other's face: beside the target, and farther off; of the other: clear of that way, and on it."""
+"""Places where docks began. Of the body that passes the other's face: beside the target, and farther off; of the other: clear of that way,
+and on it."""
 
 
 def room(at: Place) -> Wish:
@@ -38,7 +39,7 @@ def dock(request: DockRequest, began: Place, stage: Stage, makes_room: bool = Fa
 def waits(
     began: tuple[Place, Place], stage: Stage = Stage.APPROACH, makes_room: bool = False, passer_first: bool = True
 ) -> tuple[Wish | None, Wish | None]:
-    """What the passer glides by, module 2, which goes to 3, and what the one before its face does, module 1, which docks to 0."""
+    """Wishes, or None, of the passer (module 2, on its way to 3) and of the body before its target's face (module 1, docking to 0)."""
     passer = dock(DockRequest(2, 2, 3, 3), began[0], Stage.PRE_APPROACH)
     before = dock(DockRequest(1, 3, 0, 2), began[1], stage, makes_room)
     places = [(0.0, 0.0), (0.0, 0.33), BESIDE, (0.04, 1.36)]
@@ -83,7 +84,7 @@ def test_room_is_made_until_it_is_there_and_not_begun_by_one_that_is_on_no_way_i
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_straight_approach_does_not_wait_for_who_is_beside_a_stand_off_that_it_does_not_go_to(approach: str) -> None:
-    """It waited there before it had set off, until its time was over."""
+    """It used to wait for that body before it had set off, until it timed out."""
     mine = dock(DockRequest(1, 3, 0, 2), BACK, Stage.PRE_APPROACH)
     places = [(0.0, 0.0), (-0.8, 0.3), (0.25, 0.5)]
     estimates = {m: (BODIES[m], estimate(np.array([*place, 0.0]))) for m, place in enumerate(places)}

@@ -1,4 +1,4 @@
-"""The ways that bodies go to a dock: whom they come too near to, and where they end."""
+"""Ways of bodies to a dock: which bodies they come too near to, and where they end."""
 
 import math
 
@@ -34,7 +34,7 @@ from tests.unit.dock_follower import LEVEL, STAGED, Follower, estimate, face_of
 )
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
 def test_way_to_the_stand_off_is_free_where_it_keeps_clear_of_the_target(start: tuple[float, ...], is_free: bool, yaw: float) -> None:
-    """The whole scene turned by `yaw` is the same scene."""
+    """Turning the whole scene by `yaw` changes nothing."""
     target, active = (assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [m]) for m in (0, 1))
     plan = plan_dock(DockRequest(1, 1, 0, 0), active, target, [load_vehicle("modcube")] * 2)
     q_wb = from_euler(0.0, 0.0, yaw)
@@ -44,7 +44,7 @@ def test_way_to_the_stand_off_is_free_where_it_keeps_clear_of_the_target(start: 
 
 
 def test_module_beside_the_one_that_is_docked_to_may_be_in_the_way() -> None:
-    """A bar of two along y, docked to at its first module's +x face: the way from behind leads past the second."""
+    """The target is a bar of two along y, and the dock is to its first module's +x face: the way from behind leads past the second."""
     vehicles = [load_vehicle("modcube")] * 3
     bar, active = assemble([(0, 0, 0), (0, 1, 0)], [0, 0], vehicles[:2], [0, 1]), assemble([(0, 0, 0)], [0], vehicles[:1], [2])
     plan = plan_dock(DockRequest(2, 1, 0, 0), active, bar, vehicles)
@@ -73,7 +73,7 @@ def test_third_body_is_met_where_the_way_ends_too(approach: str, third_m: tuple[
 
 
 def way_past(third_m: tuple[float, ...], length_m: float, cells: list[tuple[int, int, int]]) -> int | None:
-    """Whom a body of these cells meets that goes so far along +x, from half of that before the origin; the third body is module 9."""
+    """Module that a body of these cells meets on a way of `length_m` along +x, centred on the origin; the third body is module 9."""
     vehicle = load_vehicle("modcube")
     body, third = assemble(cells, [0] * len(cells), [vehicle] * len(cells)), assemble([(0, 0, 0)], [0], [vehicle], [9])
     half = np.array([0.5 * length_m, 0.0, 0.0])
@@ -132,7 +132,7 @@ def test_way_of_bodies_whose_places_nobody_knows_is_judged_by_nobody(lost: int) 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(60))
 def test_module_that_comes_too_near_on_the_way_is_found_however_both_bodies_are_turned(seed: int) -> None:
-    """Against the way as scipy has it: straight, and turning evenly."""
+    """Against the same way by scipy: a straight line, with a constant turn rate."""
     dock, rng, standoff_m = Follower(), np.random.default_rng(seed), STAGED.standoff_m
     target, active, plan = dock.target, dock.active, dock.plan
     there, at = (estimate(rng.normal(0.0, 0.35, 3))._replace(q_wb=Rotation.random(rng=rng).as_quat()[[3, 0, 1, 2]]) for _ in range(2))

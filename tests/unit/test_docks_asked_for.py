@@ -1,4 +1,4 @@
-"""Docks as people ask for them: twice, both at once, from afar, and no longer."""
+"""Docks as operators request them: twice, two at once, from afar, and called off."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
     tank.run(0.03, *(Request(Action.DOCK, request.module, request) for request in wanted))
     assert len(tank.pipeline.formation.docking._docks) == 2
     for dock in tank.pipeline.formation.docking._docks:
-        dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if they had just come
+        dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if they had just arrived
     outputs = tank.run(2.0)
     assert [record.stage for outputs in tank.outputs for record in outputs.docks].count(Stage.DOCKED) == 2
     assert tank.shape == [(0, 1), (2,)]
@@ -100,7 +100,7 @@ def test_body_whose_dock_is_over_may_dock_again() -> None:
 
 @pytest.mark.parametrize("wanted", [DockRequest(2, 3, 0, 2), DockRequest(2, 2, 1, 3)], ids=["of the target", "of who docks"])
 def test_dock_to_a_face_that_another_dock_is_to_close_is_refused(wanted: DockRequest) -> None:
-    """Both would swim to one place, and hit each other there."""
+    """Both bodies would go to the same place and collide there."""
     tank = before_each_other(0.6, 1.2)
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     outputs = tank.run(0.1, Request(Action.DOCK, 2, wanted))
@@ -109,7 +109,7 @@ def test_dock_to_a_face_that_another_dock_is_to_close_is_refused(wanted: DockReq
 
 
 def test_dock_that_would_bring_a_module_where_another_dock_brings_one_is_refused() -> None:
-    """Two pairs go to two faces of one robot, and the second module of each to one place, off its corner."""
+    """Two pairs go to two faces of one robot, and the second modules of both would end at the same place, off its corner."""
     tank = Docked([(0, 0, 0), (-1, 0, 0), (0, 0, 0), (1, 0, 0), (0, 0, 0), (0, 1, 0)], each=2)
     for state, (north, east) in zip(tank.states, [(1.0, 0.0), (1.2, 0.6), (1.8, 0.1)], strict=True):
         state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
@@ -159,7 +159,7 @@ WANTED = Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
 
 
 def on_its_approach(delay: int = 0) -> Docked:
-    """Two modules, of which one has been told to dock to the other, and comes nearer. `delay`: ticks that each plan takes."""
+    """Two modules, one of which docks to the other and is in its approach. `delay`: extra ticks that each plan takes."""
     tank = before_each_other(0.6)
     tank._delay = delay
     tank.run(0.02 + 0.01 * delay, WANTED)
@@ -222,7 +222,7 @@ def test_robot_that_docks_to_one_that_is_disarmed_is_disarmed_and_says_so(armed:
     tank.run(0.5, *(Request(Action.ARM, m) for m in range(1 - armed, 2)))
     tank.run(0.03, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     (dock,) = tank.pipeline.formation.docking._docks
-    dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just come
+    dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just arrived
     outputs = tank.run(2.0)
     assert tank.shape == [(0, 1)] and outputs.records[0].state == (State.ARMED if armed else State.DISARMED)
     assert any("docked to a body that is not armed" in words for _, words in tank.said) is not bool(armed)

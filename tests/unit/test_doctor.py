@@ -1,4 +1,4 @@
-"""The doctor tells what is wrong with a machine or a bus, and what to do about it; the service reports how it fares."""
+"""The doctor reports what is wrong with a machine or a bus, and what to do about it; the service reports its status."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ def test_service_tells_that_it_is_ready_alive_and_how_it_fares(tmp_path: Path) -
 
 
 def test_service_is_ready_once_after_a_second_at_every_rate() -> None:
-    """One that never says so is killed by systemd after 90 s, in flight."""
+    """systemd kills a service that never reports ready after 90 s, in flight."""
     keeper = RateKeeper(PERIOD_NS, MonotonicClock(), lambda deadline_ns: None)
     for rate_hz in range(50, 401):
         said: list[str] = []
@@ -272,7 +272,7 @@ def test_service_is_ready_once_after_a_second_at_every_rate() -> None:
 
 
 def test_service_says_at_once_that_a_module_is_armed_and_that_it_is_not() -> None:
-    """flash.py asks before it stops the service; a second is long."""
+    """flash.py checks this before it stops the service; a report once a second would be too slow."""
     said: list[str] = []
     notifier: Any = SimpleNamespace(is_heard=True, send=said.append)
     observe = reporting(notifier, RateKeeper(PERIOD_NS, MonotonicClock(), lambda deadline_ns: None), 100)

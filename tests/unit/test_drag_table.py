@@ -1,4 +1,4 @@
-"""Drag of a body out of its table: against direct sums, symmetric, kept on disk and never believed when damaged."""
+"""Drag of a body from its table: checked against direct sums, symmetric, cached on disk and never trusted when damaged."""
 
 import dataclasses
 import itertools
@@ -60,7 +60,7 @@ def direct(vehicle: Vehicle, cells: list[tuple[int, int, int]], d: np.ndarray) -
     parts = [shape_key.part(vehicle, c, 0) for c in cells]
     areas, centroids = areas_and_centroids(shape_key.solids(parts, PITCH), d)
     face, edge = vehicle.drag.cd_face, vehicle.drag.cd_edge
-    # Through the values on face (s = 1) and edge (s = 1/2), linear in s = sum d^4.
+    # Linear in s = sum d^4, through the values on face (s = 1) and edge (s = 1/2).
     cd = edge + (face - edge) * 2.0 * (np.sum(d**4, axis=1) - 0.5)
     middle = PITCH * np.mean(cells, axis=0)
     across = middle - (d @ middle)[:, None] * d
@@ -162,7 +162,7 @@ def test_turning_a_cube_meets_the_closed_form_damping(modcube: Vehicle) -> None:
 
 
 def test_longer_body_is_damped_more_and_docked_faces_do_not_count(modcube: Vehicle) -> None:
-    """About its long axis a line of two turns like two cubes; about the others far harder."""
+    """About its long axis a line of two is damped like two cubes, about the others far more."""
     one = assemble_vehicle(modcube).drag.rotational
     two = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [modcube] * 2).drag.rotational
     assert two[0] == pytest.approx(2.0 * one[0], rel=1e-9)
@@ -191,7 +191,7 @@ def test_published_damping_is_used_in_place_of_areas(modcube: Vehicle) -> None:
 
 @pytest.mark.parametrize("columns", [[1, 2, 0], [2, 0, 1]])
 def test_published_damping_turns_with_its_module(columns: list[int], modcube: Vehicle) -> None:
-    """The module's x lies along another axis of the body, its y along the third: each axis takes its own damping along."""
+    """The module's axes lie along other axes of the body, and each keeps its own damping."""
     quadratic, linear = frozen_array([18.18, 21.66, 36.99, 1.55, 2.56, 3.57]), frozen_array([4.0, 6.0, 5.0, 0.1, 0.2, 0.3])
     drag = dataclasses.replace(modcube.drag, quadratic=quadratic, linear=linear)
     rotation = next(i for i, m in enumerate(lattice.MATRICES) if np.array_equal(m, np.eye(3)[columns]))

@@ -1,4 +1,4 @@
-"""What the estimator makes of a robot at rest or in steady motion: silence, biases, trim, and the time between tags."""
+"""The estimator on a robot at rest or in steady motion: missing sensors, biases, trim, and the time between tags."""
 
 import math
 from dataclasses import replace
@@ -63,7 +63,7 @@ def test_pose_is_carried_through_two_seconds_without_a_tag(body: Body) -> None:
 
 
 def test_depth_is_followed_at_once_while_no_tag_comes(body: Body) -> None:
-    """Waiting for late tags is no reason to know the depth of half a second ago."""
+    """Waiting for late tags must not delay the depth by half a second."""
     robot = Robot(body)
     robot.rest(300)
     for _ in range(100):
@@ -74,7 +74,7 @@ def test_depth_is_followed_at_once_while_no_tag_comes(body: Body) -> None:
 
 
 def test_head_and_anchor_believe_the_same(body: Body) -> None:
-    """What runs on ahead has fused what the anchor is to fuse, in the same order."""
+    """The head, which runs ahead, has fused what the anchor will fuse, in the same order."""
     robot = Robot(body)
     robot.rest(301)
     for tick in range(80):
@@ -101,20 +101,20 @@ def test_head_leaves_the_anchor_after_a_quarter_of_a_second_and_hurries(body: Bo
 
 
 def test_gyro_turns_the_robot_between_tags(body: Body) -> None:
-    """What the gyro felt since the last picture shows in the same tick, whatever the thruster model says."""
+    """What the gyro measured since the last picture shows in the same tick, whatever the thruster model says."""
     robot = Robot(body)
     robot.rest(200)
     rate = np.array([0.0, 0.0, 0.5])
     for _ in range(10):
         estimate = robot.step(sensors()._replace(gyro=rate))
     np.testing.assert_allclose(estimate.nu[3:], rate, atol=5e-3)
-    turned = 0.095 * rate  # the ten ticks, less half the one in which it began
+    turned = 0.095 * rate  # the ten ticks, less half of the one in which the turn began
     np.testing.assert_allclose(difference(estimate.q_wb, Q_WB), turned, atol=4e-3)
 
 
 def test_turn_that_no_model_foresees_is_followed_to_its_end(body: Body) -> None:
-    """A second at 2 rad/s^2 that no thruster made: half a tick of each tick's share was lost, half a degree in all."""
-    robot = Robot(replace(body, righting=np.zeros(3)))  # nor any righting moment, which would ask for more
+    """A second at 2 rad/s^2 that no thruster made: each tick's increment used to lose half a tick, half a degree in all."""
+    robot = Robot(replace(body, righting=np.zeros(3)))  # without a righting moment, which would act on top
     robot.rest(301)
     axis, alpha = np.array([0.0, 0.6, 0.8]), 2.0
     for tick in range(1, 101):
@@ -155,7 +155,7 @@ def test_gyro_bias_is_learned(body: Body) -> None:
 
 
 def test_tag_fixes_the_datum_of_the_depth(body: Body) -> None:
-    """Weather moves the pressure sensor's zero by 10 cm; the robot does not follow it."""
+    """Weather shifts the pressure sensor's zero by 10 cm; the estimate does not follow it."""
     robot = Robot(body)
     for _ in range(500):
         seen = [tag(robot.time_ns - 5 * PERIOD)] if robot.tick % 2 else []
@@ -164,7 +164,7 @@ def test_tag_fixes_the_datum_of_the_depth(body: Body) -> None:
 
 
 def test_current_and_trim_are_learned_as_a_disturbance(body: Body) -> None:
-    """The thrusters hold the robot against 2 N in the world and a trim moment: both are named in the estimate."""
+    """The thrusters hold the robot against a force in the world, 2 N north, and a trim moment; the estimate shows both."""
     force_w, moment_b = np.array([2.0, -1.0, 0.5]), np.array([0.05, -0.08, 0.02])
     robot = Robot(body)
     robot.tau = robot.tau - np.r_[world(Q_WB).inv().apply(force_w), moment_b]
@@ -175,7 +175,7 @@ def test_current_and_trim_are_learned_as_a_disturbance(body: Body) -> None:
 
 
 def test_velocity_of_a_steady_run_is_found(body: Body) -> None:
-    """0.2 m/s ahead, tags 50 ms late: position without lag, velocity within a centimetre a second."""
+    """0.2 m/s ahead, tags 50 ms late: position without lag, velocity within 1 cm/s."""
     velocity_w = world(Q_WB).apply([0.2, 0.0, 0.0])
     robot = Robot(body)
     nu = np.r_[0.2, np.zeros(5)]
@@ -208,7 +208,7 @@ def disturbance_doubt(vehicle: str, current_walk: float, speed_m_s: float) -> fl
     robot.rest(100)
     way = np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0])
     add_drag(body.drag.nodes, body.drag.rotational, body.drag.linear, way, robot.tau)
-    robot.tau = 2.0 * holding(body) - robot.tau  # what drag takes off
+    robot.tau = 2.0 * holding(body) - robot.tau  # thrust that makes up for the drag
     robot.estimator._anchor.x[7:10] = way[:3]
     for _ in range(900):
         robot.step(Measured(np.zeros(3), None, None, []))
@@ -218,7 +218,7 @@ def disturbance_doubt(vehicle: str, current_walk: float, speed_m_s: float) -> fl
 
 @pytest.mark.parametrize("vehicle", ["modcube", "bluerov2_heavy"])
 def test_robot_under_way_doubts_the_current_by_its_drag_and_one_at_rest_does_not(vehicle: str) -> None:
-    """Two random walks add up in quadrature; the second is the current's doubt times the slope of the drag, as far as the speed is kept."""
+    """Two random walks add in quadrature; the second is that of the current times the slope of the drag, as far as the speed is kept."""
     body = assemble_vehicle(load_vehicle(vehicle))
     walked = math.sqrt(disturbance_doubt(vehicle, 0.02, CRUISE_M_S) ** 2 - disturbance_doubt(vehicle, 0.0, CRUISE_M_S) ** 2)
     assert walked == pytest.approx(0.02 * body.drag.cruise_slope / body.mass[0, 0] * math.sqrt(9.0), rel=0.1)
@@ -227,7 +227,7 @@ def test_robot_under_way_doubts_the_current_by_its_drag_and_one_at_rest_does_not
 
 @pytest.mark.parametrize("spoil", ["state", "covariance", "negative variance"])
 def test_estimate_that_is_no_number_any_longer_is_given_up_and_found_again(body: Body, spoil: str) -> None:
-    """Whatever sensors had to say for that: a NaN in the filter would stay there for ever."""
+    """Whatever the sensors sent to cause it: a NaN in the filter would never go away by itself."""
     robot = Robot(body)
     robot.rest(200)
     if spoil == "state":

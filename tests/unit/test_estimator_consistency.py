@@ -1,4 +1,4 @@
-"""The estimator against a plain Kalman filter that gets everything in time order, and against its own claims."""
+"""The estimator against a plain Kalman filter that gets everything in time order, and against its own covariance."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -33,14 +33,14 @@ def body() -> Body:
 
 
 def tag_of(x: np.ndarray, capture_ns: int, noise: np.ndarray | None = None, lever: np.ndarray = LEVER) -> BodyPose:
-    """What a tag says of a robot in state `x`; noise (6,) of position and attitude."""
+    """Tag measurement of a robot in state `x`; noise (6,) of position and attitude."""
     e = np.zeros(6) if noise is None else noise
     p_wt = x[:3] + Rotation.from_quat(x[[4, 5, 6, 3]]).apply(lever) + e[:3]
     return BodyPose(capture_ns, p_wt, lever, multiply(x[3:7].copy(), exp(e[3:].copy())), 1)
 
 
 def inertial_of(x: np.ndarray, moved: np.ndarray, rng: np.random.Generator | None = None, accel_noise: float = 0.0) -> Measured:
-    """What gyro, accelerometer and pressure sensor say of a robot in state `x` that accelerates by `moved` (3,)."""
+    """Measurements of gyro, accelerometer and pressure sensor of a robot in state `x` that accelerates by `moved` (3,)."""
     down = Rotation.from_quat(x[[4, 5, 6, 3]]).inv().apply([0.0, 0.0, 1.0])
     noise = np.zeros(7) if rng is None else rng.normal(size=7)
     gyro = x[10:13] + x[13:16] + P.gyro_sigma * noise[:3]
@@ -64,7 +64,7 @@ def still(body: Body, x: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Flight:
-    """A drawn flight: per tick the truth, the wrench, and what the sensors say; tags by the tick of their arrival."""
+    """A randomly drawn flight: truth, wrench and measurements of each tick; tags are in the tick of their arrival."""
 
     truth: list[np.ndarray] = field(default_factory=list)
     tau: list[np.ndarray] = field(default_factory=list)
@@ -76,7 +76,7 @@ class Flight:
 
 
 def process_sigma(body: Body, p: Estimation, x: np.ndarray) -> np.ndarray:
-    """(28,) root spectral density of what the model leaves out of a robot in state x, from the parameters' own words."""
+    """(28,) root spectral density of the process noise of a robot in state x, from the definitions of the parameters."""
     m, j = np.diag(body.mass)[:3], np.diag(body.mass)[3:]
     rate = np.linalg.norm(x[10:13])
     drag_slope = 2.0 * body.drag.nodes[..., 0].mean() * np.hypot(np.linalg.norm(x[7:10]), body.reach_m * rate)
@@ -87,7 +87,7 @@ def process_sigma(body: Body, p: Estimation, x: np.ndarray) -> np.ndarray:
 
 
 def accel_sigma(body: Body, p: Estimation, x: np.ndarray) -> float:
-    """Noise of the accelerometer of a robot in state x, from the parameters' own words."""
+    """Noise of the accelerometer of a robot in state x, from the definitions of the parameters."""
     fastest = np.hypot(np.linalg.norm(x[7:10]), body.reach_m * np.linalg.norm(x[10:13]))
     return float(np.hypot(p.accel_sigma, p.accel_under_way * fastest))
 
@@ -112,7 +112,7 @@ def fly(
         before, surprise = x, np.zeros(ERRORS)
         if k:
             surprise = process_sigma(body, p, x) * np.sqrt(DT) * rng.normal(size=ERRORS)
-            surprise[3:6] = 0.5 * DT * surprise[9:12]  # what turned it in this tick has turned it for half of it
+            surprise[3:6] = 0.5 * DT * surprise[9:12]  # a rate gained evenly over this tick has turned it for half of that time
             x = propagation.inject(propagation.step(x, tau, DT, *body.plant), surprise)
         while taken < len(pictures) and pictures[taken] <= t:
             capture = pictures[taken]
@@ -123,13 +123,13 @@ def fly(
             taken += 1
         flight.truth.append(x)
         flight.tau.append(tau)
-        moved = propagation.inertial_acceleration(x, tau, *body.plant) + surprise[6:9] / DT  # felt, though no model foresaw it
+        moved = propagation.inertial_acceleration(x, tau, *body.plant) + surprise[6:9] / DT  # measured, although not in the model
         flight.measured.append(inertial_of(x, moved, rng, accel_sigma(body, p, x))._replace(tags=arriving.pop(k, [])))
     return flight
 
 
 class InOrder:
-    """A textbook Kalman filter on the error state: every event in the order in which it happened, nothing ever late.
+    """A textbook Kalman filter on the error state: it gets every event in the order in which it happened, nothing late.
 
     Measurement Jacobians by finite differences of its own models; the standard covariance update, (I - K H) P.
     """
@@ -151,7 +151,7 @@ class InOrder:
         return Rotation.from_quat(x[[4, 5, 6, 3]])
 
     def move(self, tau: np.ndarray, to_ns: int) -> float:
-        """Returns for how long, s."""
+        """Propagates to `to_ns`; returns for how long, s."""
         dt = (to_ns - self.time_ns) * 1e-9
         if dt > 0.0:
             f = np.vstack([propagation.transition(self.x, tau, dt, *self.plant), np.eye(ERRORS)[propagation.MOVING :]])
@@ -165,7 +165,7 @@ class InOrder:
         return dt
 
     def _correct(self, residual: Callable[[np.ndarray], np.ndarray], noise: np.ndarray, shared: np.ndarray | None = None) -> None:
-        """shared: (28, m) covariance of error and noise (Anderson and Moore, Optimal Filtering, 1979, section 5.5)."""
+        """Fuses a measurement. shared: (28, m) covariance of error and noise (Anderson and Moore, Optimal Filtering, 1979, section 5.5)."""
         h = 1e-6
         moved = [(propagation.inject(self.x, h * e), propagation.inject(self.x, -h * e)) for e in np.eye(ERRORS)]
         jacobian = np.array([(residual(below) - residual(above)) / (2 * h) for above, below in moved]).T
@@ -176,9 +176,9 @@ class InOrder:
         self.covariance = self.covariance - gain @ (jacobian @ self.covariance + m.T)
 
     def hear(self, measured: Measured, tau: np.ndarray, elapsed: float, whole: bool = True) -> None:
-        """The inertial sensors and depth of one tick, or of a part of it, which the accelerometer alone tells of.
+        """Fuses the inertial sensors and depth of one tick; for a part of a tick (not `whole`), the accelerometer alone.
 
-        How thrusters and drag accelerate the robot is taken as known; the noise of the process is felt.
+        The acceleration by thrusters and drag is taken as known; the accelerometer measures the process noise.
         """
         if elapsed <= 0.0:
             return
@@ -200,7 +200,7 @@ class InOrder:
         self._correct(residual, noise, shared)
 
     def see(self, tag: BodyPose) -> None:
-        """One tag; its attitude error is compared at first order, as an error of the body."""
+        """Fuses one tag; its attitude residual, a rotation vector in the body frame, is taken at first order."""
 
         def residual(x: np.ndarray) -> np.ndarray:
             turn = self._turn(x)
@@ -212,7 +212,7 @@ class InOrder:
 
 
 def in_order(body: Body, flight: Flight, p: Estimation = P) -> InOrder:
-    """The reference, run over all tags that arrived by the end, stopped at the newest of them."""
+    """The reference filter, run over all tags that arrived by the end, stopped at the newest of them."""
     tags = sorted((tag for measured in flight.measured for tag in measured.tags), key=lambda tag: tag.capture_ns)
     reference = InOrder(body, tags[0], p)
     waiting = tags[1:]
@@ -272,7 +272,7 @@ def test_same_inputs_give_the_same_bytes(body: Body) -> None:
         assert all(np.asarray(u).tobytes() == np.asarray(v).tobytes() for u, v in zip(a, b, strict=True))
 
 
-# ---------------------------------------------------------------- what it claims about itself
+# ---------------------------------------------------------------- its own covariance
 
 
 @pytest.fixture(scope="module")
@@ -282,11 +282,11 @@ def drawn(body: Body) -> list[tuple[Flight, list[Estimate]]]:
 
 
 SETTLED = 100
-"""Ticks."""
+"""Ticks after which the filter counts as settled."""
 
 
 def test_innovations_are_as_large_as_the_filter_expects(drawn: list[tuple[Flight, list[Estimate]]]) -> None:
-    """Mean NIS over degrees of freedom is 1 for a filter whose model is the world's: within four sigma of that here."""
+    """Mean NIS per degree of freedom is 1 for a filter whose model is that of the world: here within four sigma of 1."""
     settled = [e for _, estimates in drawn for e in estimates[SETTLED:] if e.nis_dof]
     dof = sum(e.nis_dof for e in settled)
     mean = sum(e.nis for e in settled) / dof
@@ -307,7 +307,7 @@ def test_errors_are_as_large_as_the_sigmas_say(drawn: list[tuple[Flight, list[Es
 
 
 def sigmas_under_way(body: Body, rate_hz: int, speed_m_s: float) -> np.ndarray:
-    """(6,) of the pose a second after the last tag, at a tick rate, by IMUs whose noise has the same density at each."""
+    """(6,) sigmas of the pose a second after the last tag, for a tick rate; the IMU's noise density is the same at every rate."""
     period_ns, per_sample = 1_000_000_000 // rate_hz, np.sqrt(rate_hz * DT)
     told = replace(P, gyro_sigma=P.gyro_sigma * per_sample, accel_sigma=P.accel_sigma * per_sample)
     estimator, x, seen, tag_ns = Estimator(body, told, period_ns), start_state(), 0, 20_000_000
@@ -326,14 +326,14 @@ def sigmas_under_way(body: Body, rate_hz: int, speed_m_s: float) -> np.ndarray:
 
 @pytest.mark.parametrize("speed_m_s", [0.0, 1.0], ids=["at rest", "under way"])
 def test_filter_is_as_sure_at_every_tick_rate(body: Body, speed_m_s: float) -> None:
-    """Only noise that every sample draws anew is averaged away by more samples; a mass that is not as believed is none."""
+    """More samples average out only noise that is drawn afresh for each; the error of a wrong mass is not of that kind."""
     usual = sigmas_under_way(body, 100, speed_m_s)
     for rate_hz in (50, 200, 400):
         np.testing.assert_allclose(sigmas_under_way(body, rate_hz, speed_m_s), usual, rtol=0.06, err_msg=f"{rate_hz} Hz")
 
 
 def test_narrowest_gate_refuses_few_good_tags(body: Body) -> None:
-    """NIS of six axes is distributed as chi squared: 1.4 % lie beyond 4 squared."""
+    """The NIS of six axes has a chi-squared distribution: 1.4 % lie beyond 4 squared."""
     narrowest = replace(P, tag_gate=limits_of(Estimation, "tag_gate").low)
     _, estimates = run(body, fly(body, 4.0, 1, lambda n: 45.0), narrowest)
     tags = estimates[-1].rejected + sum(e.nis_dof for e in estimates) / 6
@@ -348,7 +348,7 @@ def test_estimate_is_better_than_the_tags(drawn: list[tuple[Flight, list[Estimat
 
 
 def test_wrong_lever_arm_of_the_tag_would_be_noticed(body: Body, drawn: list[tuple[Flight, list[Estimate]]]) -> None:
-    """A tag believed 3 cm from where it is does not pass the bound on the error."""
+    """A tag assumed 3 cm from where it is fails the bound on the error."""
     flight = drawn[0][0]
     off = np.array([0.0, 0.03, 0.0])
     wrong = [m._replace(tags=[tag._replace(lever_b=tag.lever_b + off) for tag in m.tags]) for m in flight.measured]
@@ -358,9 +358,10 @@ def test_wrong_lever_arm_of_the_tag_would_be_noticed(body: Body, drawn: list[tup
 
 
 def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
-    """At 0.7 m/s a filter that believes water to push along refuses good tags; the right one refuses none.
+    """At 0.7 m/s a filter whose drag has the wrong sign refuses good tags; the right one refuses none.
 
-    With the shipped figures, which believe the accelerometer more than the model, it keeps its place and takes the drag for a disturbance.
+    With the shipped parameters, which trust the accelerometer more than the model, the wrong filter keeps its place and takes the drag for
+    a disturbance.
     """
     pushed = replace(body, drag=replace(body.drag, nodes=-body.drag.nodes))
     believing = replace(P, accel_process=0.012, force_walk=0.015, current_walk=0.0, alpha_turning=0.0)
@@ -376,7 +377,7 @@ def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
 
 
 def test_wrong_arm_and_trim_are_learned_by_tilting(body: Body) -> None:
-    """A robot that pitches up by half a radian and comes back knows the moment of every pitch, nose down too: up to 0.45 N m here."""
+    """After pitching up by half a radian and back, the filter knows the moment at every pitch, nose down too: up to 0.45 N m here."""
     x, estimator, rng = start_state(), Estimator(body, P, PERIOD), np.random.default_rng(2)
     x[3:7], x[26:29] = from_euler(0.0, 0.0, 0.0), 2.0 * body.righting_sigma * np.array([1.0, 0.0, -1.0])
     for k in range(1200):
@@ -396,7 +397,7 @@ def test_wrong_arm_and_trim_are_learned_by_tilting(body: Body) -> None:
 
 @pytest.mark.slow
 def test_righting_of_a_robot_that_hovers_is_found_by_no_noise() -> None:
-    """Five minutes under the controller, gyro, tags and water noisy: as unknown as before, and nothing has been made of the jitter."""
+    """Five minutes under the controller, with noisy gyro, tags and water, leave its z as unknown as before; jitter is not learnt."""
     body = assemble([(0, 0, 0)], [0], [load_vehicle("modcube")])
     x, rng, estimator, controller = start_state(), np.random.default_rng(2), Estimator(body, P, PERIOD), Controller(body, Control())
     x[3:7], x[26:29] = from_euler(0.0, 0.0, 0.5), body.righting_sigma * np.array([1.0, -1.0, 0.0])

@@ -1,4 +1,4 @@
-"""Tags that are wrong, late or few: refused or weighed by the estimator, which finds the robot again by good ones."""
+"""Wrong, late or few tags: the estimator refuses or weights them, and finds the robot again from good ones."""
 
 import math
 
@@ -48,7 +48,7 @@ def test_robot_that_was_carried_away_is_found_again_after_half_a_second(body: Bo
 
 
 def rest_pushed(body: Body, ticks: int, q_wb: np.ndarray = Q_WB) -> tuple[Robot, Estimate]:
-    """A robot that stands as Q_WB, held against a moment that its description has not, and seen as `q_wb`; and what it believes then."""
+    """A robot at attitude Q_WB, held against a moment that its description lacks, and seen as `q_wb`; and its last estimate."""
     robot = Robot(body)
     robot.tau = robot.tau - np.r_[np.zeros(3), PUSH]
     for _ in range(ticks):
@@ -58,11 +58,11 @@ def rest_pushed(body: Body, ticks: int, q_wb: np.ndarray = Q_WB) -> tuple[Robot,
 
 
 PUSH = np.array([0.09, -0.045, 0.02])
-"""N m, such as of an arm and a trim that nobody has measured."""
+"""N m, as from an arm and a trim that were not measured."""
 
 
 def test_robot_that_was_carried_away_still_knows_what_pushes_it(body: Body) -> None:
-    """The place is lost, and no more: its controller would let the arm turn it until all was learnt anew."""
+    """Only the position is lost: otherwise the arm would turn the robot until the moment was learnt again."""
     robot, estimate = rest_pushed(body, 1000)
     np.testing.assert_allclose(estimate.moment_b, PUSH, atol=2e-3)
     there = P_WB + np.array([0.8, -0.6, 0.3])
@@ -74,7 +74,7 @@ def test_robot_that_was_carried_away_still_knows_what_pushes_it(body: Body) -> N
 
 @pytest.mark.parametrize("spoilt", [5.0, -5.0, np.nan])
 def test_moment_that_nobody_could_believe_is_forgotten_with_the_place(body: Body, spoilt: float) -> None:
-    """It may be why the tags were refused."""
+    """The moment may be the reason why the tags were refused."""
     robot = Robot(body)
     robot.rest(100)
     there = P_WB + np.array([0.8, -0.6, 0.3])
@@ -88,7 +88,7 @@ def test_moment_that_nobody_could_believe_is_forgotten_with_the_place(body: Body
 
 @pytest.mark.parametrize("ticks", [20, 60, 200])
 def test_robot_that_was_seen_askew_is_upright_at_once_when_it_is_seen_well(body: Body, ticks: int) -> None:
-    """Tags that had another tilt than gravity: biases took up what did not fit, and would tilt what comes."""
+    """Tags whose tilt contradicted gravity: biases absorbed the difference, and would tilt the following estimates."""
     robot, _ = rest_pushed(body, ticks, multiply(Q_WB, exp(np.array([0.3, 0.0, 0.0]))))
     for _ in range(RESET_AFTER):
         estimate = robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD)))
@@ -108,7 +108,7 @@ def test_good_tags_between_bad_ones_keep_the_pose(body: Body) -> None:
 
 
 def test_tag_older_than_one_that_counted_is_refused(body: Body) -> None:
-    """In order is the only order: the picture that was overtaken is of no use any more."""
+    """Pictures are fused in time order only: one that was overtaken is not used any more."""
     robot = Robot(body)
     robot.rest(60)
     robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - 3 * PERIOD)))
@@ -118,7 +118,7 @@ def test_tag_older_than_one_that_counted_is_refused(body: Body) -> None:
 
 
 def test_tag_older_than_the_window_is_refused(body: Body) -> None:
-    """Half a second, and the tick that the filter is behind."""
+    """The window is half a second, plus the tick by which the filter lags behind."""
     robot = Robot(body)
     robot.rest(60)
     for _ in range(70):
@@ -129,7 +129,7 @@ def test_tag_older_than_the_window_is_refused(body: Body) -> None:
 
 
 def test_picture_with_more_tags_weighs_more(body: Body) -> None:
-    """The noise of a mean falls with the root of the number of tags in it."""
+    """The noise of a mean falls with the square root of the number of tags in it."""
     moved = []
     for count in (1, 4, 16):
         robot = Robot(body)

@@ -1,4 +1,4 @@
-"""The note of an e-stop that stands: on the disk before the plug is pulled, on a disk that is full, and however it was spoilt."""
+"""The note of a standing e-stop: on disk before the plug is pulled, even on a full disk, and read safely however damaged."""
 
 import dataclasses
 import errno
@@ -20,7 +20,7 @@ from tests.unit.ground_world import Robot
 
 
 class Flight:
-    """Ticks in some state, one after the other, noted in a folder."""
+    """Successive ticks, each in a given state, noted in a folder."""
 
     def __init__(self, folder: Path, recorder: Recorder | None = None, stands: bool = False) -> None:
         self.note = EstopNote(folder)
@@ -82,7 +82,7 @@ def test_stop_is_noted_on_a_disk_that_was_full_before_it_came(tmp_path: Path, mo
 
 
 def test_note_never_changes_its_length(tmp_path: Path) -> None:
-    """Or a full disk would have no room for it."""
+    """Otherwise a full disk would have no room for it."""
     assert len(STANDS) == len(CLEAR)
     for stands in (False, True, False):
         write_note(tmp_path, stands)
@@ -150,7 +150,7 @@ def test_stop_is_noted_in_a_folder_that_was_removed_in_flight(tmp_path: Path) ->
 
 
 def test_note_of_somebody_else_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such as of root, who ran the vehicle once."""
+    """For example a note of root's, who once ran the vehicle."""
     write_note(tmp_path, False)
     opened = Path.open
 
@@ -165,7 +165,7 @@ def test_note_of_somebody_else_is_replaced(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_each_stop_is_noted_for_a_person_may_have_cleared_the_one_before_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While the process went on, which still knows of it."""
+    """The process ran on meanwhile, and still remembers that stop."""
     written: list[bool] = []
     monkeypatch.setattr(EstopNote, "write", lambda note, stands: written.append(stands))
     flight = Flight(tmp_path, stands=True)
@@ -175,7 +175,7 @@ def test_each_stop_is_noted_for_a_person_may_have_cleared_the_one_before_by_hand
 
 
 def test_note_is_taken_where_folders_have_no_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As over some networks: nothing has failed that an operator is to hear of."""
+    """As on some network file systems: this is no failure to report to an operator."""
 
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
@@ -188,7 +188,7 @@ def test_note_is_taken_where_folders_have_no_locks(tmp_path: Path, monkeypatch: 
 
 @pytest.mark.parametrize("is_there", [True, False])
 def test_folder_is_one_vehicle_s_while_that_runs(tmp_path: Path, is_there: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whose e-stop nobody else clears; also where the vehicle itself had to make the folder."""
+    """Nobody else can clear that vehicle's e-stop, also where the vehicle itself had to make the folder."""
     folder, held, hold = tmp_path / "log", threading.Event(), estop_note.hold
 
     def hold_and_tell(path: Path) -> int | None:

@@ -1,4 +1,4 @@
-"""Fail-safes: of each the limit, the delay, the modes, the action and what ends it, to the nanosecond and the last bit."""
+"""Fail-safes: limit, delay, modes, action and end of each, to the nanosecond and the last bit."""
 
 import math
 from dataclasses import replace
@@ -237,7 +237,7 @@ def test_every_alarm_has_its_words(name: str) -> None:
     ],
 )
 def test_fail_safe_that_ends_while_its_cause_lasts_says_that_it_does(health: Health, armed: bool, says: str) -> None:
-    """It told a pilot that "no tag" was over who still saw none."""
+    """It used to tell a pilot that "no tag" was over while there still was none."""
     failsafes = Failsafes(quick("tag_lost"))
     failsafes.step(GOOD._replace(tag_age_s=9.0), Mode.POSHOLD, False, True)
     failsafes.step(at(health, 1.0), Mode.MANUAL, False, armed)

@@ -1,4 +1,4 @@
-"""The judge of the matrix of faults: every promise, broken alone, is named; flights are made up."""
+"""The judge of the fault matrix, on synthetic flights: each promise that is broken alone is named."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ Change = Callable[[Flight], object]
 
 
 def held(mode: Mode = Mode.POSHOLD) -> Flight:
-    """Twenty seconds in which the robot is where it should be."""
+    """A flight of twenty seconds in which the robot stays at its set-point."""
     q = np.tile([1.0, 0.0, 0.0, 0.0], (TICKS, 1))
     firmware = {
         "tick": np.arange(1, TICKS + 1), "time_ns": PERIOD_NS * np.arange(1, TICKS + 1), "state": np.full(TICKS, int(State.ARMED)),
@@ -33,14 +33,14 @@ def held(mode: Mode = Mode.POSHOLD) -> Flight:
 
 
 def broken(row: str, change: Change = lambda flight: None, mode: str = "POSHOLD") -> tuple[str, ...]:
-    """What the judge says of a flight that was changed."""
+    """Returns the promises that the judge finds broken in a changed flight."""
     flight = held(Mode[mode])
     change(flight)
     return judge(BY_NAME[row], mode, flight, VEHICLE).broken
 
 
 def after(seconds: float, name: str, value: object) -> Change:
-    """The signal `name` is `value` from so long after the fault on."""
+    """A change that sets the signal `name` to `value` from `seconds` after the fault on."""
 
     def change(flight: Flight) -> None:
         columns = flight.truth if name in flight.truth else flight.firmware
