@@ -1,4 +1,4 @@
-"""Dead thrusters: found in time by what their ESCs say, and never where all is well."""
+"""Dead thrusters are detected in time from what their ESCs report, and never on a healthy robot."""
 
 import numpy as np
 import pytest
@@ -94,14 +94,14 @@ def test_two_feedbacks_of_a_clear_standstill_are_enough_and_one_is_not(water: Wa
 
 @pytest.mark.parametrize("thruster", range(8))
 def test_thruster_whose_esc_claims_twice_its_force_is_believed_to_push_as_it_was_told(water: Water, thruster: int) -> None:
-    """Or the motion would miss the force that was only claimed, and blame it."""
+    """Otherwise the motion would miss the force that the ESC only claimed, and the thruster would be blamed."""
     water.fly(1.0)
     water.speed_factor[thruster] = 1.4
     assert water.run(4.0, 2.0 * PUSH) == []
 
 
 def test_slow_thruster_below_its_deadband_is_healthy(water: Water) -> None:
-    """At 0.09 N no propeller turns."""
+    """No propeller turns at 0.09 N."""
     assert water.run(2.0, 0.15 * PUSH) == []
 
 

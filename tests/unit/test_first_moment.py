@@ -1,4 +1,4 @@
-"""Who waits at a terminal while numba compiles is told so, once; who reads a pipe is not."""
+"""A notice that numba compiles appears once on a terminal, and never in a pipe."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from firmware_py.__main__ import COMPILING, NO_PLACE, NO_ROOM, compiling_told, m
 
 
 class Terminal(io.StringIO):
-    """Somebody looks."""
+    """Output that counts as a terminal."""
 
     def isatty(self) -> bool:
         return True
@@ -33,7 +33,7 @@ def test_the_first_function_that_is_compiled_is_announced(out, said):
 def test_a_function_that_an_earlier_process_has_compiled_is_not(tmp_path):
     file = tmp_path / "adding.py"
     file.write_text("from numba import njit\n@njit('int64(int64)', cache=True)\ndef add(x):\n    return x + 1\n", encoding="utf-8")
-    for said in (f"{COMPILING}\n", ""):  # the second finds what the first left in the cache beside the file
+    for said in (f"{COMPILING}\n", ""):  # the second run finds the cache that the first left beside the file
         with compiling_told(out := Terminal()):
             assert runpy.run_path(str(file))["add"](1) == 2
         assert out.getvalue() == said
@@ -50,7 +50,7 @@ def test_compiled_code_without_any_place_is_one_line(monkeypatch, capsys):
 
 
 def test_disk_that_is_full_at_the_first_start_is_one_line(monkeypatch, capsys):
-    """numba raises what it met when it kept the first function."""
+    """numba passes on the error that it met when it cached the first function."""
 
     def full():
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -1,4 +1,4 @@
-"""A thruster's load-cell measurement becomes a curve that a vehicle file takes."""
+"""A thruster's load-cell measurement becomes a curve that a vehicle file accepts."""
 
 import importlib
 import sys
@@ -16,7 +16,7 @@ POWERS = np.arange(1, 6)
 
 
 def measured(noise_n: float = 0.0, voltage_v: float = 12.0, idle_w: float = 0.0) -> dict[str, np.ndarray]:
-    """41 points of the vehicle's own curve, measured at another voltage, electronics included."""
+    """41 points of the vehicle's own curve, as measured at another voltage and with the electronics' power included."""
     u = np.linspace(-1.0, 1.0, 41)
     force = np.where(u > 0.0, np.abs(u)[:, None] ** POWERS @ LIKE.forward, -(np.abs(u)[:, None] ** POWERS @ LIKE.reverse))
     force[np.abs(force) < LIKE.deadband_n] = 0.0
@@ -54,7 +54,7 @@ def test_power_without_a_point_at_rest_is_taken_as_it_is() -> None:
 
 
 def test_noise_does_not_make_the_curve_fall() -> None:
-    """The schema refuses a curve that falls; so wild points must not give one."""
+    """The schema refuses a falling curve, so wild points must not produce one."""
     for seed in range(5):
         points = measured()
         wild = 1.5 * np.random.default_rng(seed).standard_normal(41)
@@ -64,7 +64,7 @@ def test_noise_does_not_make_the_curve_fall() -> None:
         assert np.all(np.diff(np.linspace(0.0, 1.0, 500)[:, None] ** POWERS @ curve.forward) > 0.0)
 
 
-@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])  # a spreadsheet's
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])  # a spreadsheet's byte-order mark
 def test_file_that_is_written_is_a_vehicle_files_curve(
     mark: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,7 +154,7 @@ def test_curve_of_an_earlier_fit_is_replaced(tmp_path: Path, monkeypatch: pytest
 
 
 def refused(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], complaint: str, *options: str) -> None:
-    """bench.csv in `folder` gives that complaint, and no curve."""
+    """Asserts that bench.csv in `folder` is refused with `complaint`, in one line, and leaves no curve."""
     monkeypatch.setattr(sys, "argv", ["fit_thruster", str(folder / "bench.csv"), "--out", str(folder / "curve.toml"), *options])
     assert tool.main() == 2
     said = capsys.readouterr().err

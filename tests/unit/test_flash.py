@@ -1,4 +1,4 @@
-"""A vehicle keeps a release that runs: whatever fails or is interrupted while it is flashed, over a pretended ssh."""
+"""Flashing over a fake ssh: the vehicle keeps a release that runs, whatever fails or is interrupted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flash_payload import Payload
 
 from tests.unit.flash_releases import BETTER, BROKEN, GOOD, current, wheel
 
-# Takes its options away, dies where it is told to, and runs the rest here.
+# Strips its options, dies where FAKE_DIE says, and runs the remaining words here.
 SSH = """#!/bin/sh
 while [ "${1#-}" != "$1" ]; do case $1 in -o|-p|-i) shift 2;; *) shift;; esac; done
 host=$1; shift
@@ -51,7 +51,7 @@ case $* in
 esac
 exit 0
 """
-# systemd's folder is one of the pretended vehicle.
+# Redirects systemd's folder to one of the fake vehicle.
 ELSEWHERE = """#!/bin/sh
 for word; do shift; set -- "$@" "$(echo "$word" | sed "s|^/etc/systemd/system|$FAKE/etc|")"; done
 exec {real} "$@"
@@ -60,7 +60,7 @@ exec {real} "$@"
 
 @pytest.fixture
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A pretended vehicle: its files in FAKE/root, its commands in FAKE/bin."""
+    """A fake vehicle with its files in FAKE/root and its commands in FAKE/bin."""
     shims = tmp_path / "bin"
     shims.mkdir()
     (tmp_path / "sitecustomize.py").write_text("import time\ntime.sleep = lambda seconds: None\n")
@@ -79,7 +79,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def put(fake: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """put(release, *more words): flashes a release; returns the exit status."""
+    """Provides put(release, *more words), which flashes a release and returns the exit status."""
 
     def put(release: str, *words: str, die: str = "", host: str = "robot@sub") -> int:
         (fake / "calls").unlink(missing_ok=True)
@@ -150,7 +150,7 @@ def test_connection_lost_in_a_rollback_says_that_the_vehicle_goes_on(
 
 @pytest.mark.slow
 def test_python_in_the_home_of_the_vehicle_is_found(put: Callable[..., int], fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """docs/jetson.md: quoted, so that it is the vehicle's shell that knows whose home it is."""
+    """docs/jetson.md: the path is quoted, so that the vehicle's shell expands it to the home on the vehicle."""
     monkeypatch.setenv("HOME", str(fake))
     (fake / "old_python").touch()
     (fake / "python3.12").symlink_to(sys.executable)
@@ -180,7 +180,7 @@ def test_first_release_without_health_leaves_none(put: Callable[..., int], fake:
 def test_vehicle_that_is_or_may_be_armed_is_left_alone_unless_told_otherwise(
     put: Callable[..., int], fake: Path, capsys: pytest.CaptureFixture[str], report: str, says: str
 ) -> None:
-    """Its service would be stopped, in flight. A release of before it said so says nothing."""
+    """Flashing would stop the vehicle's service in flight. A release that predates the armed report says nothing."""
     assert put(GOOD) == put(BETTER) == 0
     (fake / "armed").write_text(report)
     restarts = (fake / "restarts").read_text()
@@ -235,7 +235,7 @@ def calls_of_a_flash(put: Callable[..., int], fake: Path) -> int:
 def test_connection_lost_at_any_call_leaves_a_release_that_runs(
     put: Callable[..., int], fake: Path, how: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Lost before the command ran, in the midst of what it was sent, or before its answer came."""
+    """Connection lost before the command ran, in the middle of its input, or before its answer arrived."""
     calls = calls_of_a_flash(put, fake)
     assert calls == 7
     for call in range(1, calls + 1):

@@ -21,7 +21,7 @@ from tests.unit.flash_releases import BETTER, BROKEN, GOOD, current, unit_of, wh
 
 
 class PowerCut(BaseException):
-    """The plug is pulled."""
+    """Simulated power cut."""
 
 
 class Machine:
@@ -38,7 +38,7 @@ class Machine:
         self.sick: set[str] = set()
         self.enabled: set[str] = set()
         self.loaded: dict[str, str] = {}
-        """Units as systemd read them last."""
+        """Units as systemd last read them."""
 
     def step(self, name: str) -> None:
         self.steps.append(name)
@@ -55,7 +55,7 @@ class Machine:
         words = [word for word in command if word not in ("sudo", "-n")]
         if "show" not in words:
             if words[0] == "install":
-                Path(words[-1]).write_text("")  # as it stands when the power goes amid it
+                Path(words[-1]).write_text("")  # content if the power fails during the install
             self.step(" ".join(words[:2]))
             self.obey(words)
             return ""
@@ -64,7 +64,7 @@ class Machine:
         return f"ActiveState={state}\nMainPID=1\nNRestarts=0\nStatusText=tick={self.tick} {self.says}\n"
 
     def obey(self, words: list[str]) -> None:
-        """What a command does here."""
+        """Simulates the effect of a command."""
         if words[0] == "install":
             Path(words[-1]).write_text(Path(words[-2]).read_text())
         elif words[0] == "mv":
@@ -77,7 +77,7 @@ class Machine:
             raise RefusedError("systemctl restart: failed")
 
     def units(self) -> dict[str, str]:
-        """Texts by name in systemd's folder."""
+        """Unit texts by file name in systemd's folder."""
         return {path.name: path.read_text() for path in flash_device.UNIT_FOLDER.glob("*.service")}
 
     def device(self) -> Device:
@@ -103,7 +103,7 @@ def etc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def boot_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
-    """The power is back: systemd reads its units, and the guard runs before the service."""
+    """Returns the vehicle after the power is back: systemd has read its units, and the guard has run before the service."""
     after = f"after {flash_files.boot_id()}"
     monkeypatch.setattr(flash_files, "boot_id", lambda: after)
     machine = Machine(root)
@@ -139,7 +139,7 @@ def test_power_cut_at_any_step_brings_a_release_up_that_runs(tmp_path: Path, mon
         assert not device.trial.exists()
         if confirmed != GOOD:
             device.activate(GOOD)
-    assert cut >= 25  # every step of a whole flash was cut, and every command that the vehicle ran
+    assert cut >= 25  # every step of a whole flash was cut, including every command that the vehicle ran
 
 
 def test_power_cut_at_any_step_of_going_back_is_made_good_by_the_next_boot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,7 +159,7 @@ def test_power_cut_at_any_step_of_going_back_is_made_good_by_the_next_boot(tmp_p
 
 @pytest.mark.slow
 def test_first_flash_cut_at_any_step_is_made_whole_by_the_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A unit that is there already, and neither read by systemd nor enabled, is no reason to do less."""
+    """A unit file left by the cut flash, which systemd has neither read nor enabled, does not stop the second flash from doing both."""
     for cut in range(200):
         root = tmp_path / str(cut)
         monkeypatch.setattr(flash_device, "UNIT_FOLDER", root / "systemd")
@@ -179,7 +179,7 @@ def test_first_flash_cut_at_any_step_is_made_whole_by_the_second(tmp_path: Path,
 
 
 def test_units_are_back_before_the_service_is_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It may be that systemd refused the unit on trial and has not so much as queued the service."""
+    """systemd may have refused the unit on trial without even queueing the service."""
     Machine(tmp_path).install_and_activate(GOOD)
     abandon(tmp_path, BETTER)
     steps = boot_again(tmp_path, monkeypatch).steps
@@ -187,7 +187,7 @@ def test_units_are_back_before_the_service_is_asked_for_again(tmp_path: Path, mo
 
 
 def abandon(root: Path, release: str) -> None:
-    """A flash whose process was killed while it waited for the health report."""
+    """Simulates a flash whose process is killed while it waits for the health report."""
     machine = Machine(root)
     machine.dies_in = "health"
     with pytest.raises(PowerCut):
@@ -211,7 +211,7 @@ def test_release_whose_watcher_died_is_never_what_the_next_flash_goes_back_to(tm
 def test_first_release_whose_watcher_died_is_not_taken_for_a_proven_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     abandon(tmp_path, GOOD)
     device = boot_again(tmp_path, monkeypatch).device()
-    assert device.linked(device.current) == GOOD and device.status()["trial"]  # there is nothing better
+    assert device.linked(device.current) == GOOD and device.status()["trial"]  # there is no better release
     with pytest.raises(RefusedError, match="there is no earlier release to go back to"):
         device.roll_back()
     machine = Machine(tmp_path)
@@ -259,7 +259,7 @@ def test_release_whose_watcher_died_is_taken_back_at_the_next_start(tmp_path: Pa
 
 
 def test_trial_that_says_nothing_of_the_release_before_leaves_it_as_it_is(tmp_path: Path) -> None:
-    """As an earlier flasher wrote it."""
+    """An earlier flasher wrote such trial files."""
     machine = Machine(tmp_path)
     machine.install_and_activate(GOOD)
     machine.install_and_activate(BETTER)
@@ -310,7 +310,7 @@ def test_service_that_has_ended_is_not_armed_whatever_it_said_last(tmp_path: Pat
 
 
 def test_service_that_ticks_not_yet_can_be_replaced(tmp_path: Path) -> None:
-    """systemd forgets the report at every start: a release that never comes to a tick has none."""
+    """systemd clears the status report at every start, so a release that never reaches a tick has none."""
     assert flash_device.in_flight({"ActiveState": "activating", "StatusText": ""}) == ""
 
 

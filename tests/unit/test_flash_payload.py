@@ -1,4 +1,4 @@
-"""What is shipped: the lock, wheels for the vehicle's machine, compiled code, units."""
+"""The shipped payload: the lock, wheels for the vehicle's machine, compiled code, units."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_compiled_code_is_carried_over_only_if_all_its_sources_are_the_same(tmp_
     cache = old / "firmware_py" / "core" / "__pycache__"
     cache.mkdir()
     (cache / "fast.run-1.py311.nbi").write_text("index")
-    for folder in (old, new):  # compiled by a decorator of another file: it does not say numba
+    for folder in (old, new):  # compiled by a decorator from another file, so it does not mention numba
         (folder / "firmware_py" / "core" / "decorated.py").write_text("")
     (cache / "decorated.run-1.py311.nbi").write_text("index")
     assert flash_files.carry_compiled(old, new)
@@ -89,7 +89,7 @@ def test_enabled_interface_is_set_up_at_boot_and_whenever_it_is_plugged_in(tmp_p
         pytest.skip("systemctl is missing")
     folder = tmp_path / "etc" / "systemd" / "system"
     shutil.copytree(flash_payload.ROOT / "firmware_py" / "deploy", folder)
-    for unit in ("modcube-can@can1", "modcube"):  # as docs/jetson.md has it, and as a flash does
+    for unit in ("modcube-can@can1", "modcube"):  # as docs/jetson.md instructs, and as a flash does
         subprocess.run(["systemctl", f"--root={tmp_path}", "enable", "--quiet", unit], check=True)
     for name in ("can0", "can1"):
         for wanting in ("multi-user.target", f"sys-subsystem-net-devices-{name}.device"):

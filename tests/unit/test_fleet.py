@@ -91,7 +91,7 @@ WRONG = {
 
 
 def on_one_bus(text: str) -> str:
-    """The text, behind a first line that names a bus, unless it names some."""
+    """Returns `text`, preceded by a line that names a bus unless it names some."""
     return text if "buses" in text else f'buses = ["virtual:a"]\n{text}'
 
 

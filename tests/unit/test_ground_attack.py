@@ -15,7 +15,7 @@ from tests.unit.ground_world import Client, World
 
 
 def assert_in_control(world: World, station: Client) -> None:
-    """The station clears the e-stop, arms and disarms: each is acknowledged, and the robot does it."""
+    """Asserts that the station can clear the e-stop, arm and disarm: each command is acknowledged and carried out."""
     for number, parameter, state in ((31013, 0, State.DISARMED), (400, 1, State.ARMED), (400, 0, State.DISARMED)):
         station.clear()
         station.command(number, parameter)
@@ -45,12 +45,12 @@ def test_forged_and_replayed_packets_are_refused_and_the_real_station_stays_in_c
 
 
 FALSE_STARTS = (b"\xfe", b"\xfd", b"\xfe\xfe\xfe\xfe\xfe\x83", b"\xfd\xff\0\0\0\1\1\0\0\0", b"\xfd\1\0\0\0\1\1\xff\xff\xff")
-"""Too long, with flags that nobody knows, of a message that is long, of one that has grown, of one that there is not."""
+"""A length too great for its message, unknown flags, a long message, a message that has grown, and an unknown message."""
 
 
 @pytest.mark.parametrize("false_start", FALSE_STARTS)
 def test_flood_of_false_starts_is_given_up_after_a_while(false_start: bytes) -> None:
-    """65,000 bytes that all look like the start of a frame would cost 0.2 s, before any signature."""
+    """65,000 bytes that all look like the start of a frame would cost 0.2 s, before any signature check."""
     counts: Counter[str] = Counter()
     framer = Framer(load_dialect(), Signing(), counts)
     assert framer.feed(false_start * (65_000 // len(false_start))) == []

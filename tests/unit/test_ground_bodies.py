@@ -1,4 +1,4 @@
-"""Several bodies, each a system of its own: what one of them is told or refused is no other's; docked ones are their leader's system."""
+"""Several bodies, each its own MAVLink system: commands and refusals stay separate; docked bodies form their leader's system."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ def test_docked_bodies_are_their_leaders_system_with_everything_of_every_module(
 
 
 def test_undock_of_a_disarmed_body_is_accepted_once_it_is_two(world: World, client: Client) -> None:
-    """It enters no mode."""
+    """A disarmed body enters no mode, so only the split shows that the undock was accepted."""
     apart = world.robot.bodies
     world.robot.dock()
     world.run(10)
@@ -87,7 +87,7 @@ def test_undock_of_a_disarmed_body_is_accepted_once_it_is_two(world: World, clie
 
 
 def test_undock_of_modules_that_are_apart_is_not_accepted_before_it_is_refused(world: World, client: Client) -> None:
-    """A tick that was over when it was asked for decides nothing."""
+    """A tick that had ended before the request decides nothing about it."""
     world.run(10)
     client.command(31011, 0, 0, 1, 1)
     world.run(2)
@@ -109,7 +109,7 @@ def test_parted_bodies_are_two_systems_again(world: World, client: Client) -> No
 
 @pytest.fixture
 def docked(world: World, client: Client) -> World:
-    """Both armed, then one body, which system 1 leads."""
+    """Two armed bodies that have docked; system 1 leads."""
     for target in (1, 2):
         client.command(400, 1, target=target)
     world.run(3)
@@ -187,7 +187,7 @@ def test_what_is_for_all_is_not_refused_by_a_docked_system(docked: World, client
 
 
 def test_body_that_has_parted_watches_the_station_that_all_watch(world: World, client: Client) -> None:
-    """It watched whoever it heard first, and told by that one that nobody is lost: the watched station's loss stopped no body."""
+    """Regression: a parted body took heartbeats from the first station it heard, so the loss of the watched one stopped no body."""
     other, apart = world.client(254), world.robot.bodies
     client.heartbeat()
     world.robot.dock()
@@ -212,12 +212,12 @@ GOES_TO_PLACES = {
     "MISSION_COUNT": ((0, 0, 1), "MISSION_ACK", "type", mavlink.MAV_MISSION_DENIED),
     "MISSION_WRITE_PARTIAL_LIST": ((0, 0, 0, 0), "MISSION_ACK", "type", mavlink.MAV_MISSION_DENIED),
 }
-"""Each for all, and how it is refused where there are several."""
+"""Messages addressed to all systems, and how each is refused where there are several bodies."""
 
 
 @pytest.mark.parametrize("name", GOES_TO_PLACES)
 def test_place_that_is_for_all_is_gone_to_by_the_one_body_and_of_several_by_none(world: World, client: Client, name: str) -> None:
-    """Both planned a way to it."""
+    """Regression: both bodies planned a path to the one place."""
     values, answer, field, denied = GOES_TO_PLACES[name]
     for system in (1, 2):
         upload(world, client, [item(0, PLACES[0])], target=system)

@@ -1,4 +1,4 @@
-"""Commands: what each does, what is refused and in which words; through pymavlink's own encoder and parser."""
+"""Commands: the effect of each, refusals and their wording; through pymavlink's own encoder and parser."""
 
 import math
 
@@ -43,7 +43,7 @@ def test_every_command_is_acknowledged_when_all_its_parameters_are_left_out() ->
 @pytest.mark.parametrize("number", [185, 209, 224, 400, 31010, 31011])
 @pytest.mark.parametrize("nothing", [NAN, math.inf])
 def test_command_that_does_not_say_what_is_denied(world: World, client: Client, number: int, nothing: float) -> None:
-    """One that named neither 0 nor 1 disarmed the robot, or cleared its e-stop."""
+    """Regression: a command that named neither 0 nor 1 disarmed the robot, or cleared its e-stop."""
     ask(world, client, 400, 1)
     ask(world, client, 185, 1)
     before = len(world.robot.asked)
@@ -89,7 +89,7 @@ def test_return_and_land_both_surface(world: World, client: Client, number: int)
 
 
 def test_loiter_holds_the_place(world: World, client: Client) -> None:
-    """MAVProxy's `loiter`, as ArduSub takes it."""
+    """MAVProxy's `loiter`, handled as ArduSub does."""
     world.robot.mode[0] = Mode.MANUAL
     assert ask(world, client, mavlink.MAV_CMD_NAV_LOITER_UNLIM) == mavlink.MAV_RESULT_ACCEPTED
     assert world.robot.mode[0] == Mode.POSHOLD
@@ -97,7 +97,7 @@ def test_loiter_holds_the_place(world: World, client: Client) -> None:
 
 @pytest.mark.parametrize(("component", "is_heard"), [(191, True), (1, False)])
 def test_companion_computer_of_the_same_system_is_heard_and_an_echo_is_not(world: World, component: int, is_heard: bool) -> None:
-    """MAVLink gives the computers of a vehicle its system id, and each a component id of its own."""
+    """MAVLink gives a vehicle's computers its system id, and each computer its own component id."""
     companion = world.client(system=1, component=component)
     companion.command(400, 1)
     world.run(3)
@@ -115,7 +115,7 @@ def test_what_is_for_a_companion_computer_goes_where_it_was_heard(world: World, 
 
 
 def test_what_is_for_all_of_a_system_reaches_its_companion_computer_too(world: World, client: Client) -> None:
-    """As MAVLink has it routed; another system's computer does not hear it."""
+    """MAVLink's routing rule; another system's computer does not receive the command."""
     companion, other = world.client(system=1, component=191), world.client(system=7, component=191)
     for each in (companion, other):
         each.heartbeat(mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
@@ -129,7 +129,7 @@ def test_each_companion_computer_and_each_station_of_one_system_hears_what_is_fo
     stations = [client, world.client(component=230)]
     companions = [world.client(system=1, component=component) for component in (191, 100)]
     stranger = world.client(system=7)
-    for stranger.mav.srcComponent in range(1, 256):  # however many names one gives itself
+    for stranger.mav.srcComponent in range(1, 256):  # however many component ids one sender uses
         stranger.heartbeat()
     for each in (*stations, *companions):
         each.heartbeat(mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
@@ -282,7 +282,7 @@ def test_parameters_of_a_command_without_a_place_are_plain_in_command_int() -> N
 
 
 def test_parameters_that_a_command_int_leaves_out_are_none() -> None:
-    """INT32_MAX stands where there is no number (MAVLink, COMMAND_INT): both bodies moved, which nobody had asked for."""
+    """INT32_MAX marks an omitted value (MAVLink, COMMAND_INT). Regression: it was taken for a value, and both bodies moved unasked."""
     world = World(modules=2)
     client = world.client()
     client.send("COMMAND_INT", 1, 1, 0, 31010, 0, 0, 0, 0, 1, 1, 2**31 - 1, 2**31 - 1, NAN)
@@ -335,7 +335,7 @@ def test_motor_test_of_no_thruster_or_beyond_full_throttle_is_denied(world: Worl
     ("kind", "throttle", "share"), [(0, 50, 0.0), (0, 60, 0.2), (0, 100, 1.0), (0, 0, -1.0), (1, 1500, 0.0), (1, 1700, 0.5)]
 )
 def test_ardusub_identity_counts_motors_from_0_and_its_middle_is_50_percent(kind: int, throttle: float, share: float) -> None:
-    """As ArduSub does, and with it QGroundControl's page of motors and BlueOS's: the thruster beside the one that was meant turned."""
+    """As in ArduSub and the motor pages of QGroundControl and BlueOS. Regression: the thruster next to the intended one turned."""
     world = World(config=GroundConfig(identity="ardusub"))
     client = world.client()
     client.command(209, 0, kind, throttle, 1.0, 1, 2)

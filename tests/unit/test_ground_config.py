@@ -1,4 +1,4 @@
-"""How the command line and a file say what the ground side is."""
+"""Configuration of the ground side from the command line and a file."""
 
 from pathlib import Path
 

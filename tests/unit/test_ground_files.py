@@ -1,4 +1,4 @@
-"""A file is replaced whole or stays as it was, and a disk that refuses is left no litter."""
+"""A file is replaced whole or stays as it was, and a write that the disk refuses leaves nothing behind."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""Links over loopback: several at once, routed by system, bounded, opened anew and refused in one line."""
+"""Links over loopback: several at once, routed by system, bounded, reopened, and refused in one line."""
 
 import re
 import socket
@@ -60,7 +60,7 @@ def test_udpout_speaks_first_and_survives_that_nobody_listens() -> None:
 
 
 def test_robot_on_udpout_is_tied_to_no_address_of_its_own_and_hears_nobody_but_its_station() -> None:
-    """One that was given another address by its network was mute until it was started anew."""
+    """Regression: a robot whose network gave it another address was mute until restarted."""
     station, stranger = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     station.bind(("127.0.0.1", 0))
     station.settimeout(PATIENCE_S)

@@ -1,4 +1,4 @@
-"""Logs: listed, fetched piece by piece, and never in the way of anything else."""
+"""Logs: listed, fetched piece by piece, and never in the way of other traffic."""
 
 import os
 from pathlib import Path
@@ -22,7 +22,7 @@ def test_each_of_two_clients_has_its_list_of_logs(tmp_path: Path) -> None:
 
 
 def test_each_of_two_clients_has_the_log_that_it_fetches(tmp_path: Path) -> None:
-    """And ends no other's."""
+    """A LOG_REQUEST_END from a third client ends neither transfer."""
     data = bytes(i % 251 for i in range(20_000))
     (tmp_path / "can.log").write_bytes(data)
     world = World(config=GroundConfig(logs=str(tmp_path)))
@@ -72,7 +72,7 @@ def test_flood_of_requests_for_the_list_of_logs_looks_at_the_folder_once(tmp_pat
 
 
 def test_log_that_is_being_fetched_comes_to_its_end_though_its_body_docks_meanwhile(tmp_path: Path) -> None:
-    """And what was lost of it is sent again: a client knows the log by the system that listed it."""
+    """Lost pieces are sent again too: a client identifies the log by the system that listed it."""
     data = bytes(i % 251 for i in range(20_000))
     (tmp_path / "can.log").write_bytes(data)
     world = World(2, GroundConfig(logs=str(tmp_path)))
@@ -91,7 +91,7 @@ def test_log_that_is_being_fetched_comes_to_its_end_though_its_body_docks_meanwh
 
 @pytest.mark.parametrize(("identity", "first"), [("generic", 0), ("ardusub", 1)])
 def test_logs_are_listed_and_fetched(identity: str, first: int, tmp_path: Path) -> None:
-    """QGroundControl finds no log whose number is that of their count, unless the autopilot is ArduPilot: it missed the newest."""
+    """QGroundControl finds no log whose number equals their count, unless the autopilot is ArduPilot. Regression: it missed the newest."""
     (tmp_path / "flight1").mkdir()
     data = bytes(i % 251 for i in range(9_999))
     (tmp_path / "flight1" / "signals.mcap").write_bytes(data)

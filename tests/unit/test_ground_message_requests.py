@@ -1,4 +1,4 @@
-"""What clients ask about messages: rates of one, of a group, and what is wanted once."""
+"""Clients' requests about messages: the rate of one, the rates of a group, and single messages."""
 
 from collections import Counter
 
@@ -14,7 +14,7 @@ from tests.unit.ground_world import Client, World
 
 
 def sent(world: World, ticks: int = 1) -> Counter[int]:
-    """How many frames of each message number went out."""
+    """Number of frames sent, by message number."""
     counts: Counter[int] = Counter()
     for _ in range(ticks):
         inputs, outputs = world.robot.step(world.station.requests())
@@ -25,7 +25,7 @@ def sent(world: World, ticks: int = 1) -> Counter[int]:
 
 @pytest.mark.parametrize("name", sorted(STREAMS.keys() - {"HEARTBEAT"}))
 def test_every_message_stops_comes_once_and_streams_as_it_is_asked_to(world: World, client: Client, name: str) -> None:
-    world.station.picture.times = Times(0.1, (1,) * 20, (1,) * 20)  # of a loop on a clock; in lockstep nobody is late
+    world.station.picture.times = Times(0.1, (1,) * 20, (1,) * 20)  # as of a loop that runs on a clock; in lockstep no tick is late
     number = load_dialect().by_name[name].number
     client.command(511, number, -1)
     assert not sent(world, 210)[number]

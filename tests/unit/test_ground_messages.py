@@ -1,4 +1,4 @@
-"""What a client hears, message by message, and the rates and messages that it may ask for; through pymavlink's own parser."""
+"""Telemetry as a client receives it, message by message, and the rates and messages it may request; through pymavlink's own parser."""
 
 import math
 from dataclasses import replace
@@ -58,15 +58,15 @@ def test_every_streamed_message_arrives_with_the_robots_values(world: World, cli
     named = {m.name: m.value for m in client.all("NAMED_VALUE_FLOAT")}
     assert named["DOCK0+X"] == pytest.approx(0.1) and named["WRENCH_MRG"] == 0.75
     assert client.last("CURRENT_MODE").custom_mode == px4(4, 3)
-    assert client.all("DEBUG_FLOAT_ARRAY") == [] and client.last("SYS_STATUS").load == 0  # nobody is late in lockstep
+    assert client.all("DEBUG_FLOAT_ARRAY") == [] and client.last("SYS_STATUS").load == 0  # no tick is late in lockstep
 
 
 ROLL, PITCH, YAW = 0.1, -0.2, 0.3
-"""Of the robot that stands still; the rotation is written out here, and not the firmware's."""
+"""Attitude of the robot, which stands still. The rotation is written out here, so as not to use the firmware's."""
 
 
 def told_of_motion() -> dict[tuple[str, str], float]:
-    """What a robot at 12.5 m above the sea tells of its motion, by message and field, in MAVLink's units: rad, cm/s, mm, deg and so on."""
+    """Expected telemetry by message and field for an origin 12.5 m above the sea, in MAVLink's units: rad, cm/s, mm, deg and so on."""
     ahead, below = (
         np.array([[math.cos(YAW), -math.sin(YAW), 0], [math.sin(YAW), math.cos(YAW), 0], [0, 0, 1]])
         @ [[math.cos(PITCH), 0, math.sin(PITCH)], [0, 1, 0], [-math.sin(PITCH), 0, math.cos(PITCH)]]
@@ -114,7 +114,7 @@ def test_time_of_each_message_is_that_of_its_tick(world: World, client: Client) 
 
 
 def test_all_that_dronekit_waits_for_comes_by_itself(world: World, client: Client) -> None:
-    """By default: parameters, gps_0, armed, mode and attitude. The first it asks for."""
+    """By default DroneKit waits for parameters, gps_0, armed, mode and attitude. It requests the parameters itself."""
     world.run(200)
     assert client.all("HEARTBEAT") and client.all("ATTITUDE")
     gps = client.last("GPS_RAW_INT")
@@ -192,7 +192,7 @@ def test_system_status_tells_of_health_and_of_readiness_to_arm(world: World, cli
 
 
 def test_heartbeat_tells_at_once_of_another_mode_of_arming_and_of_an_emergency_stop(world: World, client: Client) -> None:
-    """A pilot saw each up to a second later. ArduSub sends one more too."""
+    """Regression: a pilot saw each change up to a second later. ArduSub sends one extra heartbeat too."""
     world.run(130)
     for number, *parameters in ((400, 1), (176, 1, 1), (31012,)):
         client.clear()
@@ -208,7 +208,7 @@ def test_heartbeat_tells_at_once_of_another_mode_of_arming_and_of_an_emergency_s
 
 
 def test_heartbeat_of_what_changes_in_every_tick_leaves_room_on_a_radio(world: World, client: Client) -> None:
-    """Two stations that fight about the mode filled it: a heartbeat waits for nothing else, and a hundred went out in a second."""
+    """Regression: two stations that fought over the mode filled the radio with a hundred heartbeats a second, which take precedence."""
     client.clear()
     for tick in range(200):
         world.robot.mode[0] = (Mode.POSHOLD, Mode.MANUAL)[tick % 2]
@@ -251,7 +251,7 @@ def test_robot_that_no_camera_has_seen_knows_its_attitude_and_depth_and_no_headi
 
 
 def test_esc_messages_decode_with_a_dialect_that_mavgen_made(world: World, client: Client, tmp_path: Path) -> None:
-    """An independent reading: mavgen's own code, made from the XML that the repository keeps."""
+    """An independent decoder: mavgen's own code, generated from the XML in the repository."""
     import importlib.util
 
     xml = Path(__file__).parents[2] / "firmware_py" / "ground" / "modcube.xml"
@@ -302,7 +302,7 @@ def test_every_definition_has_pymavlinks_layout() -> None:
 
 
 def test_no_message_of_the_old_protocol_is_as_long_as_the_first_byte_of_the_new_one_says() -> None:
-    """A length of 253 is therefore no length: the Framer goes on behind it."""
+    """A length byte of 253 is therefore the start of the next frame, where the Framer resumes."""
     assert 0xFD not in {d.struct.size for d in load_dialect().by_number.values() if d.number < 256}
 
 

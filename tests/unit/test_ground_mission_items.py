@@ -1,4 +1,4 @@
-"""What items say, each by itself and together: what is refused when it comes, and the legs that become of the rest."""
+"""Mission items, singly and together: which are refused on arrival, and the legs that result from the rest."""
 
 import math
 
@@ -134,7 +134,7 @@ def test_ardupilots_missions_begin_with_home_which_is_not_flown() -> None:
 
 @pytest.mark.parametrize(("identity", "yaw"), [("generic", 0.0), ("ardusub", None)])
 def test_fourth_parameter_of_a_waypoint_turns_the_robot_but_for_clients_of_an_ardusub(identity: str, yaw: float | None) -> None:
-    """QGroundControl writes 0 there for an ArduPilot, which turns by none."""
+    """QGroundControl writes 0 in this parameter for an ArduPilot, which ignores it."""
     world = World(config=GroundConfig(identity=identity))
     client = world.client()
     upload(world, client, [item(i, place, p=(0, 0, 0, 0)) for i, place in enumerate(PLACES)])

@@ -1,4 +1,4 @@
-"""Missions over links that lose, repeat and overtake, from two stations at once: what is kept is always one station's whole mission."""
+"""Missions over links that lose, repeat and reorder, from two stations at once: the stored mission is always one station's, and whole."""
 
 from random import Random
 from typing import Any
@@ -15,7 +15,7 @@ RESEND_TICKS = 150
 
 
 class Planner:
-    """A station that brings its mission up as the protocol has it: it answers requests, and asks anew while nothing comes."""
+    """A station that uploads its mission by the protocol: it answers requests, and retransmits its last message while nothing arrives."""
 
     def __init__(self, world: World, client: Client, items: list[tuple[float, ...]], random: Random) -> None:
         self._world, self._client, self._random = world, client, random
@@ -27,7 +27,7 @@ class Planner:
         self._sent_tick = -RESEND_TICKS
 
     def step(self) -> None:
-        """One tick: what arrives here, what is said, and what arrives there."""
+        """Runs one tick: queues the robot's messages, delivers what is due in either direction, and retransmits after a timeout."""
         tick = self._world.robot.tick
         told, self._read = self._client.inbox[self._read :], len(self._client.inbox)
         for message in told:
@@ -53,7 +53,7 @@ class Planner:
         self._lay_out(self._client.pack(*self._last), tick)
 
     def _lay_out(self, what: Any, tick: int) -> None:
-        """It is lost, comes once or twice, and at any time."""
+        """Queues a message for delivery: lost, once or twice, each time after a random delay."""
         for _ in range(1 + (self._random.random() < REPEAT)):
             if self._random.random() >= LOSS:
                 self._on_the_way.append((tick + self._random.randint(0, LATEST_TICKS), what))

@@ -1,4 +1,4 @@
-"""A flight while its plan is being made: what ends it before it begins, and what comes too late."""
+"""Flights whose plan is still being made: what ends them before they begin, and plans that arrive too late."""
 
 from types import SimpleNamespace
 
@@ -24,7 +24,7 @@ def test_a_plan_that_cannot_be_made_is_told_and_the_body_holds(world: World, cli
 
 @pytest.mark.parametrize("ticks", [1, 10])
 def test_plan_that_comes_after_something_else_was_asked_for_is_not_flown(world: World, client: Client, ticks: int) -> None:
-    """Until the hold is settled nothing new is planned: a plan that comes meanwhile is the one before's, as is one that comes later."""
+    """Nothing new is planned until the hold has settled. The old request's plan arrives before that, or later."""
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     old = begin(world, client)
     client.command(224, 2)
@@ -35,7 +35,7 @@ def test_plan_that_comes_after_something_else_was_asked_for_is_not_flown(world: 
 
 
 def planning(world: World, client: Client) -> PlanJob:
-    """Armed, the mission started, its plan under way."""
+    """Arms, starts the mission and returns the job that is being planned."""
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     job = begin(world, client)
     client.clear()
@@ -92,7 +92,7 @@ def test_flight_that_is_being_planned_ends_when_a_fail_safe_changes_the_mode(wor
 def test_flight_that_is_being_planned_ends_when_its_mission_is_replaced(
     world: World, client: Client, places: list[tuple[int, int, float]]
 ) -> None:
-    """The body flew, minutes later, what its operator had cleared."""
+    """Regression: minutes later, the body flew the mission that its operator had cleared."""
     job = planning(world, client)
     assert world.station.awaited() == [job.serial]
     upload(world, client, [item(i, place) for i, place in enumerate(places)])
@@ -122,7 +122,7 @@ def test_mission_that_comes_on_the_way_to_a_place_is_not_begun_by_choosing_its_i
 
 
 def test_plan_that_nobody_waits_for_any_more_is_not_made_to_its_end(world: World, client: Client) -> None:
-    """One of 150 places takes most of a minute, and the next waited behind it."""
+    """Planning 150 places takes most of a minute. Regression: the next plan waited for its end."""
     asked = iter([True, True, False])
     plan = plan_mission(planning(world, client), None, lambda: next(asked))
     assert plan.trajectory is None and next(asked, "no more") == "no more"
@@ -193,7 +193,7 @@ def test_mission_that_starts_from_another_mode_waits_for_its_hold(world: World, 
     client.command(176, 1, 1)
     world.run(3)
     client.command(176, 1, 4, 4)
-    for _ in range(20):  # ticks that were queued while the loop took the request
+    for _ in range(20):  # ticks that were queued before the loop took up the request
         inputs, outputs = world.robot.step([])
         world.station.observe(inputs, outputs, world.robot.bodies)
     assert world.robot.mode[0] == Mode.MANUAL and not world.station.jobs()

@@ -1,4 +1,4 @@
-"""The mission protocol: items go up and come down, get lost, come late, and are written over in part."""
+"""The mission protocol: items are uploaded and downloaded, get lost, arrive late, and are overwritten in part."""
 
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
@@ -39,7 +39,7 @@ def test_an_item_that_is_lost_is_asked_for_again(world: World, client: Client) -
 
 
 def test_client_that_knows_only_the_old_request_for_an_item_brings_its_mission_up(world: World, client: Client) -> None:
-    """DroneKit, for ArduPilot sends no other; it answers in degrees."""
+    """DroneKit is such a client, because ArduPilot sends no other request; it answers in degrees."""
     client.send("MISSION_COUNT", 1, 1, 3, 0)
     answered = 0
     for _ in range(400):
@@ -52,7 +52,7 @@ def test_client_that_knows_only_the_old_request_for_an_item_brings_its_mission_u
 
 
 def test_client_that_refuses_the_old_request_for_an_item_goes_on_with_the_new_one(world: World, client: Client) -> None:
-    """As MAVSDK does."""
+    """MAVSDK does so."""
     client.send("MISSION_COUNT", 1, 1, 1, 0)
     world.run_until(lambda: bool(client.all("MISSION_REQUEST")))
     client.send("MISSION_ACK", 1, 1, mavlink.MAV_MISSION_UNSUPPORTED, 0)
@@ -65,7 +65,7 @@ def test_client_that_refuses_the_old_request_for_an_item_goes_on_with_the_new_on
 
 
 def test_items_of_two_stations_of_one_number_do_not_mix(world: World, client: Client) -> None:
-    """As two of QGroundControl have it: the later transfer takes the place of the other."""
+    """Two QGroundControls have the same number; the later transfer replaces the earlier one."""
     other = world.client()
     client.send("MISSION_COUNT", 1, 1, 2, 0)
     other.send("MISSION_COUNT", 1, 1, 2, 0)
@@ -78,7 +78,7 @@ def test_items_of_two_stations_of_one_number_do_not_mix(world: World, client: Cl
 
 
 def test_last_item_that_comes_again_is_answered_again_while_another_station_sends_a_mission(world: World, client: Client) -> None:
-    """Its mission was taken, the answer was lost, and it was told of nothing."""
+    """Regression: a station whose mission was accepted, but whose acknowledgement was lost, was never told."""
     other = world.client(254)
     assert upload(world, client, [item(0, PLACES[0])]) == mavlink.MAV_MISSION_ACCEPTED
     other.send("MISSION_COUNT", 1, 1, 2, 0)
@@ -104,7 +104,7 @@ def test_station_that_sends_a_mission_while_another_one_does_is_denied_in_words(
 @pytest.mark.parametrize("current", [2, 3])
 @pytest.mark.parametrize("name", ["MISSION_ITEM", "MISSION_ITEM_INT"])
 def test_item_that_is_a_place_to_go_to_at_once_is_refused_and_told_of(world: World, client: Client, name: str, current: int) -> None:
-    """ArduPilot's way before there was a command for it: DroneKit's simple_goto, and QGroundControl before 4.3."""
+    """ArduPilot's way before there was a command for it, used by DroneKit's simple_goto and by QGroundControl before 4.3."""
     client.send(name, 1, 1, 0, 3, 16, current, 1, 0, 0, 0, 0, 30, 120, -0.4)
     world.run(1)
     assert client.last("MISSION_ACK").type == mavlink.MAV_MISSION_UNSUPPORTED and "COMMAND_INT" in client.texts
@@ -112,7 +112,7 @@ def test_item_that_is_a_place_to_go_to_at_once_is_refused_and_told_of(world: Wor
 
 @pytest.mark.parametrize("last", [item(1, PLACES[1]), item(1, PLACES[1], command=22)])
 def test_last_item_that_comes_again_is_answered_again(world: World, client: Client, last: tuple[float, ...]) -> None:
-    """A client whose acknowledgement was lost sends it until it hears one."""
+    """A client whose acknowledgement was lost resends its last item until it receives one."""
     result = upload(world, client, [item(0, PLACES[0]), last])
     for number, answers in ((1, [result]), (0, [])):
         client.clear()
@@ -123,7 +123,7 @@ def test_last_item_that_comes_again_is_answered_again(world: World, client: Clie
     client.clear()
     client.send("MISSION_ITEM_INT", *last, 0)
     world.run(2)
-    assert [ack.type for ack in client.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED]  # of the clearing alone
+    assert [ack.type for ack in client.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED]  # only for MISSION_CLEAR_ALL
 
 
 @pytest.mark.parametrize(("kind", "asked_again"), [(0, 0), (1, 1), (2, 1)])

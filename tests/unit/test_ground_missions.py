@@ -1,4 +1,4 @@
-"""A mission that flies: begun, followed along the plan, paused, gone on with, jumped in and replaced by another."""
+"""A mission in flight: started, followed along the plan, paused, resumed, jumped in, and replaced by another."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_mission_starts_by_mode_holds_first_and_tracks_the_plan(world: World, cl
 
 
 def test_mission_that_came_and_one_that_begins_are_told_at_once(world: World, client: Client) -> None:
-    """A client that armed and started it within the second saw no item of it."""
+    """Regression: a client that armed and started the mission within the second saw none of its items."""
     world.run(150)
     client.clear()
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
@@ -96,7 +96,7 @@ def test_mission_that_is_paused_in_its_last_hold_goes_on_with_that_alone(world: 
 
 @pytest.mark.parametrize("index", [2, 0, -1])
 def test_client_that_sets_the_current_item_hears_at_once_which_it_is(world: World, client: Client, index: int) -> None:
-    """Also on a link where nothing streams: a client takes it for the answer."""
+    """Also on a link where nothing streams: clients take this message for the answer."""
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     client.command(511, mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, -1)
     world.run(2)
@@ -166,7 +166,7 @@ def test_mission_that_flies_is_not_begun_anew_when_it_is_asked_for_again(world: 
 
 @pytest.mark.parametrize(("identity", "first", "begun"), [("generic", 0, 0), ("generic", 1, 1), ("ardusub", 0, 1)])
 def test_start_that_comes_again_because_its_answer_was_lost_does_not_begin_the_mission_anew(identity: str, first: int, begun: int) -> None:
-    """It stopped, and flew again from the beginning. ArduSub, which flies it already, does nothing either."""
+    """Regression: the robot stopped and flew again from the beginning. ArduSub also ignores a start of the mission that it flies."""
     world = World(config=GroundConfig(identity=identity))
     client = world.client()
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
@@ -195,7 +195,7 @@ def test_start_that_comes_again_because_its_answer_was_lost_does_not_begin_the_m
 def test_start_right_behind_what_takes_the_body_for_something_else_is_flown(
     world: World, client: Client, taken_by: tuple[int, ...], again: tuple[int, ...], planned: list[int]
 ) -> None:
-    """A radio brings both at once: the start was granted, for it still flew, and then it was paused for good."""
+    """A radio delivers both at once. Regression: the start was granted because the mission still flew, and the pause then was for good."""
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)
     world.run(1200)
@@ -223,7 +223,7 @@ def test_start_that_comes_again_behind_a_mode_that_is_refused_does_not_begin_the
 def test_jump_that_comes_again_because_its_answer_was_lost_flies_on(
     world: World, client: Client, by_message: bool, flown_ticks: int
 ) -> None:
-    """It stopped, and was planned anew for each repetition, from the place to which it had come."""
+    """Regression: the robot stopped and was replanned at each repetition, from where it had got to."""
 
     def jump() -> None:
         client.send(*(("MISSION_SET_CURRENT", 1, 1, 1) if by_message else ("COMMAND_LONG", 1, 1, 224, 0, 1, *[0] * 6)))
@@ -256,7 +256,7 @@ def test_jump_to_the_item_that_is_flown_to_takes_up_another_speed(world: World, 
 
 
 def test_jump_after_the_same_mission_was_sent_anew_flies_the_new_one(world: World, client: Client) -> None:
-    """Of the old one nobody is told what is reached, nor that it is complete."""
+    """Neither items reached nor completion are reported for the old mission."""
     mission = [item(i, place) for i, place in enumerate(PLACES)]
     upload(world, client, mission)
     fly(world, client)
@@ -327,7 +327,7 @@ def test_mission_that_came_while_another_flew_is_started_from_its_beginning(worl
     fly(world, client)
     world.run(1100)
     upload(world, client, [item(i, place) for i, place in enumerate(reversed(PLACES[:2]))])
-    world.run(1000)  # the old one goes on past the new one's end
+    world.run(1000)  # the old mission continues past the new one's end
     client.clear()
     world.run(110)
     now = client.last("MISSION_CURRENT")

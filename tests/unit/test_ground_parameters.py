@@ -1,4 +1,4 @@
-"""Parameters over MAVLink: all REAL32, ranges kept, saved whole or not at all."""
+"""Parameters over MAVLink: all REAL32, ranges enforced, saved whole or not at all."""
 
 import math
 import struct
@@ -14,7 +14,7 @@ from firmware_py.ground.parameters import ParameterStore, wire_value
 from tests.unit.ground_world import Client, World
 
 SHIPPED = float(np.float32(Parameters().control.position_bandwidth))
-"""As MAVLink carries it."""
+"""The shipped value in MAVLink's precision."""
 EXPOSED = [limits.mavlink for _, limits in registry() if limits.mavlink]
 
 
@@ -24,7 +24,7 @@ def world(tmp_path: Path) -> World:
 
 
 def put(world: World, client: Client, name: str, value: float, kind: int = 9) -> float:
-    """Set one and return what was echoed."""
+    """Sets one parameter and returns the echoed value."""
     client.clear()
     client.send("PARAM_SET", 1, 1, name.encode(), value, kind)
     world.run(2)
@@ -65,7 +65,7 @@ def test_parameter_that_is_set_on_one_body_is_told_by_all_for_it_is_theirs_too()
 
 
 def test_value_that_a_parameter_has_already_is_echoed_and_not_stored_again(world: World, client: Client, tmp_path: Path) -> None:
-    """What a client sends again because the echo was lost waits for no disk."""
+    """A value resent because the echo was lost does not wait for the disk."""
     assert put(world, client, "POS_BW", 2.75) == 2.75
     (tmp_path / "parameters.toml").unlink()
     assert put(world, client, "POS_BW", 2.75) == 2.75

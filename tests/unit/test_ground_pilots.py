@@ -1,4 +1,4 @@
-"""Several who send sticks: one has them at a time, and what stops is taken from everybody."""
+"""Several senders of sticks: one has control at a time, and a stop is accepted from everybody."""
 
 import pytest
 
@@ -10,7 +10,7 @@ ARM_BUTTON, DISARM_BUTTON, ESTOP_BUTTON = 1 << 6, 1 << 4, 1 << 7
 
 
 def sticks(world: World) -> list[float]:
-    """Forward stick of everything that was taken."""
+    """Forward stick of each accepted request."""
     return [r.argument.force[0] for r in world.robot.asked if r.action == Action.STICKS]
 
 
@@ -50,7 +50,7 @@ def test_sticks_of_another_than_the_watched_station_are_never_taken() -> None:
 
 
 def test_station_whose_sticks_are_never_taken_is_told_so_once() -> None:
-    """It moved its sticks, nothing moved, and nobody said why."""
+    """Regression: a station moved its sticks, nothing moved, and no message said why."""
     world = World(config=GroundConfig(watch_system=255))
     other = world.client(77)
     for _ in range(100):
@@ -78,12 +78,12 @@ def test_sticks_pass_to_another_only_after_the_timeout() -> None:
 
 
 def places(world: World) -> list[float]:
-    """x of every set-point that was taken."""
+    """x of each accepted set-point."""
     return [r.argument.p_wb[0] for r in world.robot.asked if r.action == Action.SET_POINT]
 
 
 def test_set_points_of_two_do_not_mix_and_pass_to_the_other_after_the_first_is_silent() -> None:
-    """The other may be an attitude, too, and a companion computer that is not the watched station."""
+    """The second sender may also send attitudes; the first may be a companion computer instead of the watched station."""
     world = World(config=GroundConfig(watch_system=255))
     first, other = world.client(254), world.client(255)
     for _ in range(10):
@@ -124,7 +124,7 @@ def test_estop_and_disarm_buttons_are_taken_from_everybody(watched: int) -> None
 
 @pytest.mark.parametrize(("together", "last"), [(DISARM_BUTTON | ARM_BUTTON, Action.DISARM), (ESTOP_BUTTON | 1 << 8, Action.ESTOP)])
 def test_of_buttons_that_are_pressed_together_what_stops_counts(world: World, client: Client, together: int, last: Action) -> None:
-    """Disarm and arm armed the robot, and an e-stop was cleared before any module had heard of it."""
+    """Regression: disarm with arm armed the robot, and an e-stop was cleared before any module had received it."""
     client.send("MANUAL_CONTROL", 1, 0, 0, 500, 0, together)
     world.run(1)
     assert len(buttons(world)) == 2 and buttons(world)[-1] == last
@@ -157,12 +157,12 @@ STEERS = {
     "SET_POSITION_TARGET_LOCAL_NED": (0, 0, 0, 1, 0xDF8, 0.3, 0.1, 0.4, *[0.0] * 8),
     "SET_ATTITUDE_TARGET": (0, 0, 0, 0x7, [1.0, 0.0, 0.0, 0.0], 0, 0, 0, 0.5),
 }
-"""Each for all, as DroneKit sends whatever it sends."""
+"""Messages addressed to all systems, as all of DroneKit's are."""
 
 
 @pytest.mark.parametrize("name", STEERS)
 def test_what_steers_and_is_for_all_steers_the_one_body_and_of_several_none(name: str) -> None:
-    """Several would be steered to one place."""
+    """Otherwise several bodies would be steered to one place."""
     world = World(2)
     client = world.client()
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""Places: degrees and metres about the tank's origin, and the way to one that a client asks for."""
+"""Places: geodetic and local coordinates about the tank's origin, and paths to a place that a client requests."""
 
 import math
 
@@ -15,7 +15,7 @@ from tests.unit.ground_world import Client, World
 
 
 def test_places_are_about_the_tanks_origin() -> None:
-    """Against the series of metres a degree of WGS 84 (Defense Mapping Agency; valid to 0.01 m)."""
+    """Checked against the series for metres per degree of WGS 84 (Defense Mapping Agency; valid to 0.01 m)."""
     f = math.radians(30.2084)
     north = 111132.92 - 559.82 * math.cos(2 * f) + 1.175 * math.cos(4 * f) - 0.0023 * math.cos(6 * f)
     east = 111412.84 * math.cos(f) - 93.5 * math.cos(3 * f) + 0.118 * math.cos(5 * f)
@@ -51,7 +51,7 @@ def test_reposition_is_as_fast_as_it_asks_for(world: World, client: Client, aske
 
 
 def test_reposition_that_comes_again_because_its_answer_was_lost_flies_on(world: World, client: Client) -> None:
-    """It stopped, and was planned anew for each repetition."""
+    """Regression: the robot stopped and was replanned at each repetition."""
 
     def go(yaw: float = NAN, x: int = 302084010) -> list[PlanJob]:
         client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, yaw, x, 1201614000, -0.4)

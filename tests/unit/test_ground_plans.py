@@ -1,4 +1,4 @@
-"""Plans made beside the ground side: in a process that may die, and none that nobody waits for."""
+"""Planning beside the ground side: in a process that may die, and only plans that are still awaited."""
 
 import multiprocessing
 import os
@@ -27,7 +27,7 @@ def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_
     with closing(side_on(f"udpin:127.0.0.1:{free_port()}")) as side:
         monkeypatch.setattr(side.station, "planned", lambda body, plan: plans.put(plan))
         side._executor = killed
-        for _ in range(2):  # the second finds the new one
+        for _ in range(2):  # the second job meets the new executor
             side.station.services[1].flight.jobs.append(_NOTHING)
             side.pump()
         wait([future for _, future in side._plans], PATIENCE_S)
@@ -36,7 +36,7 @@ def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_
 
 
 def test_plans_that_nobody_waits_for_any_more_are_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A client that moves the robot's goal on five times a second waited minutes for the last one."""
+    """Regression: a client that moved the robot's goal five times a second waited minutes for the last plan."""
     may_end, planned = threading.Event(), list[tuple[int, int]]()
 
     def plan(job: PlanJob, body: object) -> Plan:
@@ -60,7 +60,7 @@ def test_plans_that_nobody_waits_for_any_more_are_not_made(monkeypatch: pytest.M
 
 
 def test_planning_process_ends_a_plan_that_its_body_does_not_wait_for_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And goes on with the next, which waited behind it for as long as it took."""
+    """The process then makes the next plan. Regression: that plan waited until the abandoned one was complete."""
     leg = Leg(0, np.ones(3), None, 0.0, 0.3)
     with closing(GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",)), firmware_of())) as side:
         plans: list[Plan] = []
@@ -75,12 +75,12 @@ def test_planning_process_ends_a_plan_that_its_body_does_not_wait_for_any_more(m
 
 
 def test_robot_that_is_stopped_waits_for_no_plan_that_is_being_made() -> None:
-    """The service manager gives it five seconds, and kills what is not through: its log is torn then."""
+    """The service manager allows the robot five seconds, then kills the process, which tears its log."""
     firmware = firmware_of()
     with GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",)), firmware) as side:
         while not isinstance(side._executor, ProcessPoolExecutor):
             time.sleep(0.01)
-        side._executor.submit(os.getpid).result()  # it is there
+        side._executor.submit(os.getpid).result()  # the planning process is up
         side._executor.submit(time.sleep, 60.0)
         start = time.monotonic()
     assert time.monotonic() - start < PATIENCE_S

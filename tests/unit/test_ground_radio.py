@@ -1,4 +1,4 @@
-"""A radio on a serial line: it is slow, takes nothing for a while, and is pulled out and plugged in again."""
+"""A radio on a serial line that is slow, accepts nothing for a while, and is unplugged and plugged in again."""
 
 import math
 import os
@@ -26,7 +26,7 @@ from tests.unit.ground_world import Robot, World
 
 
 def test_radio_that_takes_nothing_holds_up_nobody() -> None:
-    """pyserial's own write would turn in a loop."""
+    """pyserial's own write would spin."""
     ours, theirs = pty.openpty()
     port = free_port()
     with (
@@ -46,7 +46,7 @@ def test_radio_that_takes_nothing_holds_up_nobody() -> None:
 
 
 def test_radio_status_makes_nobody_believed() -> None:
-    """It is taken unsigned from everybody."""
+    """RADIO_STATUS is accepted unsigned from anybody."""
     station = World().station
     mav = mavlink.MAVLink(None, srcSystem=51, srcComponent=68)
     assert not station.take(3, bytes(mavlink.MAVLink_radio_status_message(0, 0, 0, 0, 0, 0, 0).pack(mav)), 0)
@@ -55,7 +55,7 @@ def test_radio_status_makes_nobody_believed() -> None:
 
 @pytest.mark.parametrize("noise", [b"\xfd", b"\xfe", b"\xfd\xfd", b"\xfe\xfe", b"\xfe\xfd", b"\xfd\x00\xfe"])
 def test_stop_behind_noise_that_looks_like_the_start_of_a_frame_is_heard_at_once(noise: bytes) -> None:
-    """It waited until as much had come as the length told that stood in the noise: at a heartbeat a second for ten seconds."""
+    """Regression: the Framer waited for as many bytes as the length in the noise stated: ten seconds at a heartbeat a second."""
     world = World()
     client = world.client()
     stop = client.pack("COMMAND_LONG", 1, 1, 31012, 0, *[0] * 7)
@@ -66,7 +66,7 @@ def test_stop_behind_noise_that_looks_like_the_start_of_a_frame_is_heard_at_once
 
 @pytest.mark.parametrize("signing", [Signing(), Signing(key=KEY, timestamp=NOW)])
 def test_stop_behind_a_byte_of_the_old_protocol_is_heard_at_once_whatever_its_number(signing: Signing) -> None:
-    """At 3 of 256 it was taken for the beginning of the longest messages that there are."""
+    """Regression: for 3 of 256 sequence numbers the byte was taken for the start of one of the longest messages."""
     station = World(signing=signing).station
     client = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
     client.signing.secret_key, client.signing.timestamp, client.signing.sign_outgoing = KEY, NOW, signing.key is not None
@@ -76,11 +76,11 @@ def test_stop_behind_a_byte_of_the_old_protocol_is_heard_at_once_whatever_its_nu
 
 
 TORN = bytes(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251).pack(mavlink.MAVLink(None, 255, 190)))[:20]
-"""The beginning of a frame of 260 bytes."""
+"""The first 20 bytes of a frame of 266 bytes."""
 
 
 def test_stop_behind_a_torn_frame_is_heard_once_nothing_more_comes_of_it() -> None:
-    """It waited for the rest: with a heartbeat a second for ten seconds."""
+    """Regression: the Framer waited for the rest of the torn frame: ten seconds at a heartbeat a second."""
     world = World()
     client = world.client()
     stop = client.pack("COMMAND_LONG", 1, 1, 31012, 0, *[0] * 7)
@@ -90,7 +90,7 @@ def test_stop_behind_a_torn_frame_is_heard_once_nothing_more_comes_of_it() -> No
 
 
 def test_stop_behind_a_torn_frame_in_one_datagram_is_heard_at_once() -> None:
-    """As bridges from a radio to a network send it: it was thrown away with what it stood behind."""
+    """Bridges from a radio to a network send such datagrams. Regression: the stop was discarded with the torn frame before it."""
     world = World()
     client = world.client()
     stop = client.pack("COMMAND_LONG", 1, 1, 31012, 0, *[0] * 7)
@@ -130,7 +130,7 @@ def test_frame_that_comes_in_parts_is_put_together_while_they_follow_each_other(
 
 def test_frame_of_the_old_protocol_is_no_longer_than_its_message_and_one_of_the_new_may_have_grown() -> None:
     station = World().station
-    heartbeat_1 = b"\xfe\x0a\x00\xff\xbe\x00" + bytes(8)  # ten bytes, where there are nine
+    heartbeat_1 = b"\xfe\x0a\x00\xff\xbe\x00" + bytes(8)  # ten payload bytes; HEARTBEAT has nine
     assert not station.take(0, heartbeat_1, 0, datagram=False) and station.counts["length"] == 1
     grown = bytes([10, *heartbeat()[2:10], *bytes(9), 7])
     frame = b"\xfd" + grown + checksum(grown, mavlink.MAVLink_heartbeat_message.crc_extra).to_bytes(2, "little")
@@ -138,7 +138,7 @@ def test_frame_of_the_old_protocol_is_no_longer_than_its_message_and_one_of_the_
 
 
 def test_frame_with_a_flag_that_nobody_here_knows_is_not_believed() -> None:
-    """As MAVLink has it: it may mean anything, also that the payload is another one."""
+    """MAVLink: such a flag may mean anything, even another payload."""
     station = World().station
     unknown = bytes([9, 0x02, *heartbeat()[3:-2]])
     frame = b"\xfd" + unknown + checksum(unknown, mavlink.MAVLink_heartbeat_message.crc_extra).to_bytes(2, "little")
@@ -147,7 +147,7 @@ def test_frame_with_a_flag_that_nobody_here_knows_is_not_believed() -> None:
 
 
 class SlowLink:
-    """A radio that carries so many bytes a tick."""
+    """A radio that carries a limited number of bytes a tick."""
 
     datagram = False
 
@@ -155,7 +155,7 @@ class SlowLink:
         self.bytes_per_tick, self.room, self.frames = bytes_per_tick, 0.0, list[bytes]()
 
     def receive(self) -> list[tuple[Any, bytes]]:
-        """Once in a tick."""
+        """Adds one tick's bytes to the budget; called once a tick."""
         self.room = min(self.room + self.bytes_per_tick, 300.0)
         return []
 
@@ -170,7 +170,7 @@ class SlowLink:
         return [None]
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Does nothing: there is nothing to release."""
 
 
 def test_radio_slower_than_what_streams_gets_less_of_everything_and_every_heartbeat_and_text(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,17 +186,17 @@ def test_radio_slower_than_what_streams_gets_less_of_everything_and_every_heartb
         assert not side.links.dropped
     parser = mavlink.MAVLink(None)
     got = Counter((m.get_srcSystem(), m.get_type()) for frame in radio.frames for m in parser.parse_buffer(frame))
-    names = {name for name, hz in DEFAULT_HZ.items() if hz >= 1} - {"ESC_STATUS"}  # pymavlink here knows none
+    names = {name for name, hz in DEFAULT_HZ.items() if hz >= 1} - {"ESC_STATUS"}  # pymavlink does not know it here
     for system in (1, 2, 3, 4):
         assert 21 <= got[system, "HEARTBEAT"] <= 24
         assert all(got[system, name] >= 3 for name in names)
-        assert got[system, "ATTITUDE"] < 100  # of 230
+        assert got[system, "ATTITUDE"] < 100  # of the 230 due
     assert got[1, "STATUSTEXT"] == 20
     assert got[1, "PARAM_VALUE"] >= 20
 
 
 def test_what_a_companion_computer_streams_to_all_leaves_a_radio_its_telemetry_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A hundred estimates a second filled its queue: the station heard one message of each kind and every answer four seconds late."""
+    """Regression: a hundred estimates a second filled the radio's queue; the station got one message of each kind, and answers 4 s late."""
     radio, cable, robot = SlowLink(57.6), SlowLink(math.inf), Robot()
     links = iter((radio, cable))
     monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address: next(links))
@@ -210,7 +210,7 @@ def test_what_a_companion_computer_streams_to_all_leaves_a_radio_its_telemetry_a
         mavlink.MAVLink_manual_control_message(255, 0, 0, 0, 0, 0),
     )
     said = {30: (*seldom, *often), 60: often}
-    """By the tick of each second."""
+    """Messages by tick within each second."""
     with closing(side_on("radio", "cable")) as side:
         side.station.take(0, heartbeat(), 0)
         for second in range(10):
@@ -242,7 +242,7 @@ def test_serial_link_carries_frames_both_ways() -> None:
 
 
 class Radio:
-    """A serial device behind a link, as udev names one: plugged in until it is pulled."""
+    """A serial device behind a symbolic link, as udev names it: plugged in until it is pulled."""
 
     def __init__(self, name: Path) -> None:
         self.ours, self._theirs = pty.openpty()
@@ -260,13 +260,13 @@ def test_radio_that_is_pulled_and_plugged_in_again_is_taken_up_again(tmp_path: P
     radio = Radio(name)
     with closing(Links([f"{name},115200"])) as links:
         radio.pull()
-        for _ in range(3):  # the first finds out
+        for _ in range(3):  # the first pass detects it
             links.send(None, b"to nobody")
             links.flush()
             assert list(links.receive()) == []
         assert links.counts["send"] + links.counts["receive"] == 1
         radio = Radio(name)
-        assert list(links.receive()) == []  # opens it
+        assert list(links.receive()) == []  # reopens it
         os.write(radio.ours, heartbeat())
         assert b"".join(r.data for r in received(links, 1)) == heartbeat()
         links.send(None, b"answer")
@@ -285,12 +285,12 @@ def test_radio_that_is_pulled_while_it_is_taken_up_again_is_waited_for(tmp_path:
         with monkeypatch.context() as pulled:
             pulled.setattr(termios, "tcflush", broken)
             assert list(links.receive()) == []
-        assert list(links.receive()) == []  # opens it
+        assert list(links.receive()) == []  # reopens it
         os.write(radio.ours, heartbeat())
         assert b"".join(r.data for r in received(links, 1)) == heartbeat()
     radio.pull()
 
 
 def broken(descriptor: int, queue: int) -> None:
-    """As a device answers that is no more."""
+    """Fails as a device that is gone does."""
     raise termios.error(5, "Input/output error")

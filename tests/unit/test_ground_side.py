@@ -1,4 +1,4 @@
-"""The ground side beside the tick: who is believed, what is handed over in time, and what fails without harm."""
+"""The ground side beside the tick: who is trusted, what is handed over in time, and failures that do no harm."""
 
 import socket
 import struct
@@ -78,7 +78,7 @@ def test_tcp_client_that_breaks_off_is_no_channel_any_more() -> None:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         client.close()
         side.links.send(None, b"x")
-        side.links.flush()  # it is found here to be gone
+        side.links.flush()  # the loss is detected here
         pump(side, robot, 2)
         assert not side.links.channels
 
@@ -96,7 +96,7 @@ def test_stop_is_handed_over_however_much_else_is_asked() -> None:
 
 
 def test_parameters_that_come_at_once_all_reach_the_flight_of_a_fleet() -> None:
-    """Each was asked for once for each body: of a hundred with four bodies 36 were echoed, and told to all, and never flown by."""
+    """Regression: requested once per body, 36 of a hundred parameters with four bodies were echoed, announced to all, and never applied."""
     client = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
     with closing(side_on("udpin:127.0.0.1:0", modules=4)) as side:
         pump(side, robot := Robot(4), 2)
@@ -136,7 +136,7 @@ def test_a_tick_only_hands_over_its_results() -> None:
 
 
 def test_stop_that_comes_behind_something_that_fails_is_heard(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In one round, on one link."""
+    """Both arrive in one round, on one link."""
     firmware = firmware_of()
     port = free_port()
     side = GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{port}",)), firmware, ThreadPoolExecutor(1))
@@ -159,7 +159,7 @@ def test_ground_side_in_which_something_fails_says_so_once_and_goes_on_to_hear_a
     said: Queue[str] = Queue()
     port = free_port()
     side = GroundSide(GroundConfig(links=(f"udpin:127.0.0.1:{port}",)), firmware, ThreadPoolExecutor(1), say=said.put)
-    monkeypatch.setattr(side.station, what, None)  # whatever is done with it fails, in every round
+    monkeypatch.setattr(side.station, what, None)  # every use of it fails, in every round
     estop = mavlink.MAVLink_command_long_message(1, 1, 31012, 0, 1, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None, srcSystem=255))
     end, asked = time.monotonic() + PATIENCE_S, []
     with side, closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as client:

@@ -1,4 +1,4 @@
-"""Signing: once keyed only the key holder acts; the two defects of pymavlink's parser are not there."""
+"""Signing: with a key set only its holder can act; the two defects of pymavlink's parser are absent."""
 
 import hashlib
 from pathlib import Path
@@ -223,7 +223,7 @@ def test_a_clock_that_is_behind_what_is_stored_locks_nobody_out() -> None:
 
 
 def test_station_that_followed_a_clock_which_was_ahead_may_stop_the_robot_when_that_is_set_right() -> None:
-    """A time server sets the robot's clock in flight; the station goes on from the newest time stamp that it heard."""
+    """A time server corrects the robot's clock in flight; the station continues from the newest time stamp it heard."""
     signing = Signing(key=KEY)
     signing.advance(NOW_NS + 3_600 * 1_000_000_000)
     world = World(signing=signing)

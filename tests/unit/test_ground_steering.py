@@ -1,4 +1,4 @@
-"""Sticks, set-points and missions of a client, and what becomes of them."""
+"""Sticks, set-points and missions from a client, and their effect."""
 
 import math
 
@@ -85,7 +85,7 @@ def test_rc_channel_beyond_its_ends_is_a_full_stick(world: World, client: Client
 
 
 def test_rc_channel_that_is_left_out_stays_until_it_is_let_go_or_old(world: World, client: Client) -> None:
-    """As a script does that sends one channel at a time: UINT16_MAX ignores, 0 releases (MAVLink, RC_CHANNELS_OVERRIDE)."""
+    """A script may send one channel at a time: UINT16_MAX ignores, 0 releases (MAVLink, RC_CHANNELS_OVERRIDE)."""
 
     def force(channel: int, pwm: int) -> tuple[float, ...]:
         channels = [65535] * 8
@@ -109,7 +109,7 @@ def send_target(client: Client, mask: int, frame: int = 1, **values: float) -> N
 
 
 def fly_by_velocity(world: World, client: Client) -> None:
-    """Armed, and in GUIDED: the first set-point has come."""
+    """Arms, sends a first set-point and enters GUIDED."""
     ask(world, client, 400, 1)
     send_target(client, 0xDC7, vx=0.1)
     ask(world, client, 176, 1, 6)
@@ -140,7 +140,7 @@ def test_velocities_move_no_place_before_guided_mode_is_entered(world: World, cl
 
 
 def test_set_point_that_comes_just_after_they_stayed_away_begins_where_the_robot_is(world: World, client: Client) -> None:
-    """The hold is asked for, and the mode is still the old one."""
+    """The hold has been requested, but the mode is still the old one."""
     fly_by_velocity(world, client)
     world.robot.refuse[Action.SET_MODE] = "not now"
     for gap in (51, 60):
@@ -204,7 +204,7 @@ def test_body_frame_setpoints_turn_with_the_body(world: World, client: Client) -
 @pytest.mark.parametrize("roll", [-1e-3, 1e-3])
 @pytest.mark.parametrize("pitch", [-1.570, -1.572])
 def test_robot_that_looks_straight_down_goes_ahead_where_its_top_looks(world: World, client: Client, roll: float, pitch: float) -> None:
-    """Whatever the last milliradian of its attitude: its Euler angles turn round by that."""
+    """A milliradian of attitude makes no difference, although the Euler angles flip there."""
     world.robot.q_wb[0] = np.asarray(multiply(from_euler(0.0, pitch, 0.3), from_euler(0.0, 0.0, roll)))
     world.run(1)
     send_target(client, 0xDC7, frame=8, vx=0.2)

@@ -1,4 +1,4 @@
-"""The thin walk: HEARTBEAT and ATTITUDE reach a real MAVLink client over loopback."""
+"""End-to-end smoke test: HEARTBEAT and ATTITUDE reach a real MAVLink client over loopback."""
 
 import os
 from contextlib import closing

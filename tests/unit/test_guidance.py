@@ -1,4 +1,4 @@
-"""Guidance when the mode, the body or its place changes: nothing jumps, and it goes on from where the robot is."""
+"""Guidance when the mode, the body or its place changes: nothing jumps, and guidance continues from where the robot is."""
 
 import itertools
 import math
@@ -16,7 +16,7 @@ from tests.unit.guidance_flight import FLOWN, LEVEL, WRENCH, ZERO, Flight, Ramp,
 
 @pytest.mark.parametrize("modes", list(itertools.product(FLOWN, FLOWN)), ids=lambda pair: "-".join(m.name for m in pair))
 def test_no_change_of_mode_jumps(modes: tuple[Mode, Mode]) -> None:
-    """Neither the set-point nor the wrench, with sticks held over and a body that moves."""
+    """Neither the set-point nor the wrench jumps, with sticks held over and a moving body."""
     flight = Flight()
     for mode in modes:
         flight.do(Effect.ENTER_MODE, mode)

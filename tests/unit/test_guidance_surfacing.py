@@ -1,4 +1,4 @@
-"""Guidance of a robot that surfaces, and of one whose world moves when tags come, go and come back."""
+"""Guidance of a robot that surfaces, and of one whose world frame moves when tags appear, vanish and return."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_surfacing_robot_lifts_blindly_when_it_must() -> None:
 
 @pytest.mark.parametrize("mode", [Mode.STABILIZE, Mode.ALT_HOLD, Mode.SURFACE])
 def test_first_tags_move_the_set_point_with_the_world(mode: Mode) -> None:
-    """They tell another place and heading: the robot, which is where it was, is not to go back to what it believed before."""
+    """The first tags give another place and heading. The robot has not moved, and must not return to where it believed itself before."""
     flight = Flight()
     flight.do(Effect.ENTER_MODE, mode)
     flight.run(2.0, health=UPRIGHT)

@@ -1,4 +1,4 @@
-"""Guidance along trajectories, streams of points and to single points: begun, led and stopped smoothly."""
+"""Guidance along trajectories, streams of points and to single points: smooth starts, motion and stops."""
 
 import math
 
@@ -66,7 +66,7 @@ def test_streamed_points_are_followed_and_a_stream_that_ends_stops_the_robot() -
 
 
 def test_speed_that_the_body_cannot_make_leads_no_set_point_away_that_it_would_run_after() -> None:
-    """Somebody holds it, or 8 m/s were asked for: when the speed ends, so does the motion."""
+    """A hand holds the body, or 8 m/s were requested: when the speed set-points end, so does the motion."""
     flight, nan = Flight(), np.full(3, np.nan)
     flight.do(Effect.ENTER_MODE, Mode.GUIDED)
     for _ in range(50):

@@ -1,4 +1,4 @@
-"""Health: ages, means and worst cases of what the modules of a body say."""
+"""Health: ages, means and worst cases of the readings of a body's modules."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ ZERO = np.zeros(3)
 
 
 class Ear:
-    """A monitor and its ticks. Modules 1 and 3 of a fleet of four."""
+    """A health monitor with a clock, for modules 1 and 3 of a fleet of four."""
 
     def __init__(self, body: Body = BODY) -> None:
         self.monitor = HealthMonitor(body, Parameters(), TICK_NS)
@@ -73,7 +73,7 @@ def test_silence_is_counted_per_module() -> None:
 
 
 def test_e_stop_that_holds_a_module_of_another_body_is_heard_until_that_falls_silent_or_lets_go() -> None:
-    """Modules 0 and 2 are of other bodies, on another bus maybe: whoever pressed it there wants all to stop."""
+    """Modules 0 and 2 belong to other bodies, perhaps on another bus: whoever pressed the e-stop there wants everything to stop."""
     ear = Ear()
     stopped, free = here(mcu_state=4), here(mcu_state=1)
     assert ear.hear(here(), here(), others=stopped).stopped == (0, 2)
@@ -146,7 +146,7 @@ def test_supply_that_sags_for_one_reading_is_not_low_and_one_that_stays_low_is_w
 
 
 def test_readings_of_battery_and_cabin_are_as_old_as_the_module_s_that_was_silent_of_them_longest() -> None:
-    """A sensor that died an hour ago tells neither of an empty battery nor of a hot cabin."""
+    """A sensor that died an hour ago indicates neither an empty battery nor a hot cabin."""
     ear, well = Ear(), {"voltage_v": 12.0, "cabin_temperature_c": 31.0}
     health = ear.hear(here(**well), here())
     assert min(health.battery_age_s, health.cabin_age_s) > NEVER_S
@@ -198,7 +198,7 @@ def test_wet_sensor_that_flickers_is_a_leak_all_the_time() -> None:
 
 
 def test_body_that_takes_over_knows_what_its_modules_said_and_when_people_were_heard() -> None:
-    """The module that was number 3 of the fleet, alone; and the pair again."""
+    """Taken over by a body of module 3 alone, and then by the pair again."""
     whole = Ear()
     sticks = Request(Action.STICKS, 0, Sticks((0.5, 0.0, 0.0)))
     whole.dropped = 1000
@@ -288,7 +288,7 @@ def test_innovations_and_refusals_are_means_of_a_second() -> None:
 
 
 def test_tags_that_the_papers_estimator_accepts_count_though_it_tells_no_innovations() -> None:
-    """One that is newer, in a tick without a refusal; none in a tick says nothing, as of the other estimator."""
+    """A newer tag in a tick without a refusal counts as accepted; no tag in a tick says nothing, as with the other estimator."""
     ear = Ear()
     silence = {"nis": math.nan, "nis_dof": 0}
     for n in range(1, 301):
@@ -373,7 +373,7 @@ def test_joined_body_remembers_a_frame_of_somebody_else_that_one_of_its_parts_he
 
 
 def test_push_is_told_as_the_current_that_would_push_so_sideways_on_the_mean_of_a_second() -> None:
-    """What lifts or sinks the body is a payload, and depth tells where that takes it."""
+    """A vertical push comes from a payload, and its effect shows in the depth."""
     ear, current_m_s = Ear(), 0.7
     push_n = BODY.drag.mean * current_m_s**2
     force = push_n * np.array([0.6, -0.8, 0.0]) + np.array([0.0, 0.0, 50.0])
@@ -392,7 +392,7 @@ def test_push_upon_a_body_whose_drag_is_linear_too_is_no_more_current_than_there
 
 @pytest.mark.parametrize("speed_m_s", [-0.2, 0.3, 0.9])
 def test_push_upon_a_body_under_way_is_no_more_current_than_there_is(speed_m_s: float) -> None:
-    """Against 0.4 m/s a traveller at 0.2 m/s feels twice what one that rests does."""
+    """Against 0.4 m/s, a body that moves at 0.2 m/s feels twice the push of one at rest."""
     ear, current_m_s = Ear(), 0.4
     through_m_s = speed_m_s - current_m_s
     push_n = BODY.drag.mean * (speed_m_s * abs(speed_m_s) - through_m_s * abs(through_m_s))
@@ -407,7 +407,7 @@ def test_push_upon_a_body_without_drag_is_no_current() -> None:
 
 
 def test_module_that_leaves_a_large_body_feels_the_current_that_this_one_felt() -> None:
-    """It took over the force on all of it: a module that parted out of sight in 0.4 m/s let go of its place."""
+    """Regression: the module took over the force on the whole body; one that parted without tags in 0.4 m/s gave up its place."""
     row = assemble([(0, k, 0) for k in range(4)], [0] * 4, [load_vehicle("modcube")] * 4, [1, 3, 0, 2])
     whole, part, current_m_s = Ear(row), Ear(SINGLE), 0.4
     whole.hear()

@@ -1,4 +1,4 @@
-"""The bench's command line: what does not apply is refused in one line, and nothing flies."""
+"""The bench's command line: an option that does not apply is refused in one line, and nothing flies."""
 
 import json
 from importlib import resources
@@ -30,7 +30,7 @@ def status_of(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
 
 @pytest.fixture
 def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
-    """With what the matrix of faults was asked to fly; it flies nothing."""
+    """Arguments with which the fault matrix was asked to fly; it flies nothing."""
     asked: list[tuple[object, ...]] = []
 
     def fly(pool: object, out: Path, seed: int, progress: object) -> list[Cell]:
@@ -46,7 +46,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
 def test_matrix_of_faults_refuses_what_it_does_not_take(
     option: list[str], flown: list[object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Even where it is the usual value: who gives it believes that it counts."""
+    """Even with its default value: whoever gives the option expects it to count."""
     assert status_of(["campaign", "faults", *option], monkeypatch) == 2
     line = capsys.readouterr().err
     assert f"campaign faults: {option[0]} does not apply" in line
@@ -94,7 +94,7 @@ def test_help_names_every_bus_that_a_flight_takes(monkeypatch: pytest.MonkeyPatc
 def test_folder_without_a_name_is_refused(
     command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As an unset variable of a shell gives it; it is not the working directory."""
+    """An unset shell variable gives an empty name, which does not mean the working directory."""
     monkeypatch.chdir(tmp_path)
     assert status_of([*command, "--out", ""], monkeypatch) == 2
     line = capsys.readouterr().err
@@ -189,7 +189,7 @@ def test_refused_flight_leaves_the_one_before_as_it_was(
 
 
 def with_mesh(mesh: str) -> str:
-    """The text of a vehicle whose hull is in that file."""
+    """Returns the text of a vehicle file whose hull is the file `mesh`."""
     vehicle = Path(str(resources.files("firmware_py"))) / "vehicles" / "modcube.toml"
     return vehicle.read_text(encoding="utf-8").replace("[hull]", f'[hull]\nmesh = "{mesh}"')
 
@@ -257,5 +257,5 @@ def test_flight_replaces_an_earlier_one_even_if_that_was_killed(tmp_path: Path) 
         check_folder(killed)
     (judged / "result.json").write_text('{"checks": []}')
     check_folder(judged)
-    with TruthRecorder(killed, (8,)):  # and not a tick of it
+    with TruthRecorder(killed, (8,)):  # no tick is recorded
         check_folder(killed)

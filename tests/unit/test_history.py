@@ -1,4 +1,4 @@
-"""The last half second: every sample is found again under its time, through the ring's seam and over skipped ticks."""
+"""The last half second: every sample is found by its time, across the ring's seam and over skipped ticks."""
 
 import numpy as np
 import pytest

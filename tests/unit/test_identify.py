@@ -1,4 +1,4 @@
-"""Parts of tools/identify.py on made-up data: no flight."""
+"""Parts of tools/identify.py on synthetic data, without a flight."""
 
 import dataclasses
 import sys
@@ -29,7 +29,7 @@ def test_noise_of_a_sensor_is_found_beside_its_motion() -> None:
 
 
 def test_window_sees_a_rate_as_the_slope_of_its_integral() -> None:
-    """Both sides of the equations go through the same window: a jump of the moment shows alike in both."""
+    """Both sides of the equations pass the same window, so a jump of the moment appears alike in both."""
     h, dt = model.HALF_WINDOW, 0.01
     jump = (np.arange(60) >= 30).astype(float)
     rate = np.concatenate([[0.0], np.cumsum(0.5 * (jump[1:] + jump[:-1]))])[:, None] * dt
@@ -55,7 +55,7 @@ def test_whole_excitation_is_a_scenario_that_stays_in_its_tank(tmp_path: Path) -
     assert np.linalg.norm(task.amplitude_m[:2]) < scenario.tank.radius_m - 0.2
     assert task.centre_m[2] + task.amplitude_m[2] < scenario.tank.depth_m - 0.2
     assert task.yaw_turns and task.roll_turns
-    assert {check.metric for check in scenario.check} == {"estimate_position_rmse_m", "warnings"}  # a flight that a fail-safe ended fails
+    assert {check.metric for check in scenario.check} == {"estimate_position_rmse_m", "warnings"}  # a flight ended by a fail-safe fails
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_weight_that_makes_no_sense_is_refused(text: str) -> None:
 def made_up(
     weight: model.Weight | None = None, com_m: tuple[float, float, float] = (0.0, 0.0, 0.0), depth_m: float = 1.5
 ) -> model.Equations:
-    """Half a minute of tumbling at random commands; nothing is measured yet."""
+    """Half a minute of tumbling at random commands, without measurements yet."""
     vehicle, count, dt = load_vehicle("modcube"), 3001, 0.01
     vehicle = dataclasses.replace(vehicle, inertial=dataclasses.replace(vehicle.inertial, com_m=frozen_array(com_m)))
     body, t, rng = assemble_vehicle(vehicle), np.arange(count) * dt, np.random.default_rng(0)
@@ -132,7 +132,7 @@ def test_gusts_are_found_beside_the_drag_and_leave_it_alone() -> None:
     assert np.diag(covariance) == pytest.approx(1.0)
     gusts = 0.05 * np.linalg.cholesky(covariance) @ rng.standard_normal((len(covariance), 3))
     noise = np.repeat([0.003, 0.006], 3) * rng.standard_normal((len(flight.time_s), 6))
-    for _ in range(20):  # what is expected depends on what was measured
+    for _ in range(20):  # the prediction depends on the measurement
         flight.measured = flight.predict(x | {"gust": gusts.ravel()}) + noise
     found = fit.fit([flight], fit.Reference(0, 0.02))
     assert found.gust_m_s == pytest.approx(0.05, rel=0.35)
@@ -150,7 +150,7 @@ def test_rows_at_the_surface_are_left_out_and_a_log_of_nothing_else_is_refused()
 
 
 def hang(flight: model.Equations, x: dict[str, np.ndarray], lever: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """(n, 6) what is measured with the weight at `lever` from the centre of mass; `flight` has it there without one."""
+    """(n, 6) measurements with the weight at `lever` from the centre of mass; in `flight` it hangs at the centre of mass itself."""
     flight.measured = flight.predict(x) + noise
     pull = flight._loaded[:, None] * (2.0 * flight._down - 0.22 * flight.measured[:, :3])
     moved = flight.predict(x) + noise
@@ -256,7 +256,7 @@ def test_vehicle_that_is_written_is_the_vehicle(name: str, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("loads", [0, 1, 2])
 def test_what_a_vehicle_carries_is_written_once(loads: int) -> None:
-    """A fit that found the vehicle as it was gives the vehicle as it was."""
+    """A fit that changed nothing gives the vehicle unchanged."""
     box = Payload(name="box", dry_kg=1.5, entrained_kg=0.2, size_m=np.array([0.1, 0.1, 0.2]), position_m=np.array([0.0, 0.05, 0.15]))
     vehicle = dataclasses.replace(load_vehicle("modcube"), payload=(box,) * loads)
     found = quantities.fitted_vehicle(SimpleNamespace(value=model.beginning(vehicle).get), vehicle, vehicle.curve, "none")

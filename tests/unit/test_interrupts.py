@@ -1,4 +1,4 @@
-"""Ctrl-C, pressed once and again: where it comes about and where it waits."""
+"""Ctrl-C, pressed once and again: where it takes effect, and where it waits."""
 
 import signal
 import threading
@@ -12,7 +12,7 @@ from firmware_py.runtime.interrupts import held_back, interrupted_once, out_of_r
 
 @pytest.fixture(autouse=True)
 def handler() -> Iterator[None]:
-    """The usual ones, and after the test those of before."""
+    """Installs the default handlers, and restores the previous ones after the test."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler), signal.signal(signal.SIGTERM, signal.SIG_DFL)
     yield
     for number, usual in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
@@ -32,13 +32,13 @@ def test_only_the_first_press_interrupts_and_those_while_it_ends_do_nothing() ->
             press()
             ended.append("orderly")
     press()
-    assert ended == ["orderly"] and signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # a handler of Python's would be gone before it is
+    assert ended == ["orderly"] and signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # a Python handler would be removed before exit
 
 
 @pytest.mark.parametrize("background", [False, True])
 def test_termination_from_elsewhere_is_a_press_that_waits_as_any(background: bool) -> None:
     if background:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts what it runs in the background
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts background processes
     done = []
     with pytest.raises(KeyboardInterrupt), interrupted_once(), held_back() as check:
         press(signal.SIGTERM)
@@ -56,7 +56,7 @@ def test_termination_stays_as_it_was_where_nobody_sent_it() -> None:
 
 
 def test_what_a_library_makes_of_an_interrupt_is_one() -> None:
-    """Compiled code that calls Python back says: SystemError: returned a result with an exception set."""
+    """Compiled code that calls Python back raises SystemError: returned a result with an exception set."""
     with pytest.raises(KeyboardInterrupt), interrupted_once():
         try:
             press()
@@ -125,7 +125,7 @@ def test_other_threads_and_ignored_interrupts_are_left_alone() -> None:
     thread = threading.Thread(target=elsewhere)
     thread.start()
     thread.join()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts what it runs in the background
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts background processes
     with interrupted_once(), held_back() as check:
         press()
         check()

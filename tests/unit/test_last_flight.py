@@ -1,4 +1,4 @@
-"""How the process before ended, by what its can.log says was sent last: the frames are the codec's own, the file is torn as it comes."""
+"""How the previous process ended, by the last commands in its can.log: frames from the codec itself, files torn at any place."""
 
 import errno
 import os
@@ -39,7 +39,7 @@ def in_flight(out: Path, now_ns: int = NOW_NS) -> frozenset[int]:
 def test_modules_that_were_told_armed_last_were_in_flight(tmp_path: Path) -> None:
     write(tmp_path, lines_of([False] * 3) + lines_of([True, False, True], 2))
     assert in_flight(tmp_path) == {0, 2}
-    assert found(tmp_path) == LastFlight(frozenset({0, 2}))  # of magnets nothing was said
+    assert found(tmp_path) == LastFlight(frozenset({0, 2}))  # nothing was sent about magnets
 
 
 def test_process_that_disarmed_before_it_ended_was_not(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ def test_torn_last_line_is_left_out(tmp_path: Path, cut: int) -> None:
     write(tmp_path, text[:-cut])
     assert in_flight(tmp_path) == {0, 1, 2}
     write(tmp_path, text + lines_of([False] * 3, 2)[:-cut])
-    assert in_flight(tmp_path) == set()  # the other half of the command had been written
+    assert in_flight(tmp_path) == set()  # the other half of the command is intact
 
 
 def test_only_the_end_of_a_long_log_is_read_and_lines_that_hold_no_frame_are_passed_over(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_newest_log_counts(tmp_path: Path) -> None:
 
 
 def test_log_of_a_process_that_sent_nothing_says_nothing_and_the_one_before_counts(tmp_path: Path) -> None:
-    """Such as one that was stopped while it started."""
+    """For example one that was stopped during its start."""
     write(tmp_path, lines_of([True] * 3))
     (tmp_path / "0002").mkdir()
     write(tmp_path / "0003", "")
@@ -99,7 +99,7 @@ def test_log_of_a_process_that_sent_nothing_says_nothing_and_the_one_before_coun
 def test_log_that_a_full_disk_ended_before_its_flight_says_nothing_nor_do_those_before_it(
     tmp_path: Path, queued: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it lacks may be a DISARM."""
+    """The missing end may hold a DISARM."""
     write(tmp_path, lines_of([True] * 3), unix_ns())
     (tmp_path / "0002").mkdir()
     append = GuardedFile._append
@@ -129,7 +129,7 @@ def test_flight_that_left_no_log_makes_those_before_it_old(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("boot", ["another-start", ""])
 def test_flight_before_the_machine_was_started_anew_arms_nobody(tmp_path: Path, boot: str) -> None:
-    """A clock without a battery says that seconds have passed, and the vehicle may be on a bench by now."""
+    """A clock without a battery indicates that only seconds have passed, and the vehicle may be on a bench by now."""
     write(tmp_path, lines_of([True] * 3) + dock_line(0, (1, 0, 0, 0, 0, 0)), boot=boot)
     for now in (BOOT, boot):
         then = last_flight(tmp_path, FLEET, CODEC, NOW_NS, now)
@@ -168,7 +168,7 @@ def test_missing_or_unreadable_log_says_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", [0x00, 0x7F, 0xFF])
 def test_start_of_a_log_may_be_spoilt_anywhere(tmp_path: Path, value: int) -> None:
-    """A wrong bit in a length makes it astronomical; a process that ended by that would end at every start."""
+    """A wrong bit in a length makes it astronomical; a process that crashed on it would crash at every start."""
     write(tmp_path, lines_of([True] * 3))
     whole = (tmp_path / SIGNAL_LOG).read_bytes()
     for at in range(len(whole)):
@@ -184,7 +184,7 @@ def test_magnets_that_were_told_to_pull_last_pulled(tmp_path: Path) -> None:
     assert found(tmp_path).pulling == {(0, 0), (0, 5), (2, 3)}
     assert found(tmp_path).let_go == {(module, face) for module in range(3) for face in range(6)} - found(tmp_path).pulling
     write(tmp_path, text + dock_line(0, (0,) * 6, 2)[:-1])
-    assert found(tmp_path).pulling == {(0, 0), (0, 5), (1, 1), (2, 3)}  # a torn line is left out
+    assert found(tmp_path).pulling == {(0, 0), (0, 5), (1, 1), (2, 3)}  # the torn line is left out
 
 
 def test_log_that_is_old_says_nothing_of_magnets(tmp_path: Path) -> None:
@@ -195,7 +195,7 @@ def test_log_that_is_old_says_nothing_of_magnets(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rate_hz", [100, 400])
 def test_end_of_the_log_holds_a_dock_cmd_of_every_module(tmp_path: Path, rate_hz: int) -> None:
-    """DOCK_CMD comes ten times a second; the busiest tick of a module is 14 frames of 45 bytes."""
+    """DOCK_CMD is sent ten times a second; the busiest tick of a module is 14 frames of 45 bytes."""
     every = rate_hz // 10
     tick = lines_of([True] * 3) + "(0000000000.010000) can0 0C1#0011223344556677 R\n" * 14
     write(tmp_path, "".join(dock_line(i, (1,) * 6) for i in range(3)) + tick * every)

@@ -1,4 +1,4 @@
-"""Least power: the same wrench within the same limits, on the same sides, for less; and what is left of the thrusters' range."""
+"""Least power: the same wrench within the same limits, with the same signs, for less power; and the thrusters' remaining range."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def heavy() -> Body:
 
 
 def wrenches(body: Body, count: int, seed: int = 0) -> np.ndarray:
-    """Random wrenches well within what the body can do."""
+    """Random wrenches well within the body's capability."""
     draw = np.random.default_rng(seed).normal(size=(count, 6))
     reach = float(body.thrusters.f_max[0]) / 10.0
     return 0.12 * reach * len(body.modules) * draw * np.repeat([12.0, 0.8], 3)
@@ -40,7 +40,7 @@ def power(body: Body, force: np.ndarray) -> float:
 
 
 def sides(body: Body, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) range of each thruster on its side of zero, clear of the deadband where it was clear before."""
+    """(n,) lower and upper force of each thruster on its side of zero, clear of the deadband where it was clear before."""
     t = body.thrusters
     low = np.where(base > 0.0, np.minimum(base, t.deadband_n), t.f_min)
     return low, np.where(base > 0.0, t.f_max, np.maximum(base, -t.deadband_n))
@@ -73,7 +73,7 @@ def test_thrusters_keep_their_side_and_stay_clear_of_the_deadband(body: Body) ->
 
 @pytest.mark.parametrize("vehicle", ["modcube", "bluerov2_heavy"])
 def test_power_is_the_least_that_another_solver_finds(vehicle: str) -> None:
-    """Sequential least squares of scipy on the same problem; curves of fifth order as well as of second."""
+    """SLSQP (sequential least squares) of scipy on the same problem, with curves of fifth as well as of second order."""
     body = assemble_vehicle(load_vehicle(vehicle))
     t, allocator = body.thrusters, LeastPower(body.thrusters, np.ones(8, dtype=bool))
     free = np.linalg.svd(t.matrix)[2][6:].T

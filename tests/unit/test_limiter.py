@@ -1,4 +1,4 @@
-"""The last word on every thruster: force, slew, supply power and arm state, densely around each boundary."""
+"""The final limits of every thruster: force, slew, supply power and arm state, sampled densely around each boundary."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ from firmware_py.prepare.assembly import assemble
 DT = 0.01
 NOMINAL = np.array([12.0, 12.0])
 QUICK = parameters.Limiter(slew_n_per_s=1e4)
-"""Any force within one tick."""
+"""Slew limit that permits any force within one tick."""
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def rich(body: Body) -> Body:
 
 
 def force_of(body: Body, command: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """(n,) what the curves of the vehicle file make of commands."""
+    """(n,) forces that the curves of the vehicle file give for commands, times `scale`."""
     t = body.thrusters
     rows = np.where(command[:, None] >= 0.0, t.forward, t.reverse)
     size = [np.polyval(np.r_[row[::-1], 0.0], abs(u)) for row, u in zip(rows, command, strict=True)]
@@ -55,7 +55,7 @@ def power_of(body: Body, force: np.ndarray, module: int) -> float:
 
 
 def around(value: float) -> list[float]:
-    """A boundary, and both sides of it from one bit away to far."""
+    """A boundary, and values on both sides of it from one bit away to far."""
     steps = [0.0, *(s * abs(value) * 10.0**-e for e in (12, 9, 6, 3, 1) for s in (-1, 1))]
     return sorted({np.nextafter(value, -np.inf), np.nextafter(value, np.inf), *(value + step for step in steps)})
 
@@ -179,7 +179,7 @@ def test_robot_that_arms_again_starts_from_nothing(rich: Body) -> None:
 
 
 def supply_for(body: Body, force: np.ndarray, factor: float) -> Body:
-    """The body with supplies that give `factor` of the power that `force` asks of each module."""
+    """The body with supplies that give `factor` times the power that `force` needs in each module."""
     needed = [power_of(body, force, module) for module in (0, 1)]
     return replace(body, supply_power_w=factor * np.array(needed))
 
@@ -198,7 +198,7 @@ def test_supply_never_gives_more_than_it_has(body: Body, factor: float) -> None:
 
 @pytest.mark.parametrize("factor", [0.3, 0.7, 0.95])
 def test_supply_limit_shrinks_all_forces_of_the_module_alike(body: Body, factor: float) -> None:
-    """So the direction of its wrench stays; and little of the supply is left unused."""
+    """So the direction of its wrench is kept; and little of the supply is left unused."""
     wanted = np.random.default_rng(3).uniform(-8.0, 10.0, 16)
     limited = supply_for(body, wanted, factor)
     force, _ = Limiter(limited, QUICK, 1.0).step(wanted.copy(), True, NOMINAL)
@@ -211,7 +211,7 @@ def test_supply_limit_shrinks_all_forces_of_the_module_alike(body: Body, factor:
 
 @pytest.mark.parametrize("share", [1.0, 0.75, 0.5, 0.125])
 def test_supply_that_is_just_enough_is_used_to_the_last_bit(body: Body, share: float) -> None:
-    """One watt-bit less is the next smaller 4096th of the forces."""
+    """One bit less power gives the next smaller 4096th of the forces."""
     t, wanted = body.thrusters, np.full(16, 4.0)
     exact = float(total_power(wanted[:8] * share, t.power_forward[:8].copy(), t.power_reverse[:8].copy()))
     for supply, kept in ((exact, share), (np.nextafter(exact, 0.0), share - 2.0**-12)):
@@ -239,7 +239,7 @@ def test_wanted_forces_are_not_written_to(body: Body) -> None:
 
 @pytest.mark.parametrize("volts", [9.0, 10.5, 12.0, 14.0, 16.0])
 def test_sagging_supply_is_made_up_for(rich: Body, volts: float) -> None:
-    """Force goes with voltage to the 1.2 (T200 at 12 and 16 V); the command makes the force that was wanted."""
+    """Force scales with voltage to the power 1.2 (T200 at 12 and 16 V); the command makes the wanted force."""
     wanted = np.linspace(0.5, 4.0, 16) * np.resize([1.0, -1.0], 16)
     force, command = Limiter(rich, QUICK, 1.0).step(wanted, True, np.array([volts, volts]))
     np.testing.assert_array_equal(force, wanted)
@@ -262,7 +262,7 @@ def test_absurd_voltage_counts_as_nominal(rich: Body, volts: float) -> None:
 @pytest.mark.parametrize("volts", [8.0, 10.0, 11.99, 12.0, 14.0])
 @pytest.mark.parametrize("wanted", [-100.0, 100.0])
 def test_no_more_force_is_believed_than_the_supply_can_make(rich: Body, volts: float, wanted: float) -> None:
-    """A full command gives what it gives at this voltage; more than the limit is never asked for."""
+    """The full command makes the force available at this voltage; more than the limit is never requested."""
     scale = (volts / 12.0) ** 1.2
     full = float(force_of(rich, np.full(16, np.sign(wanted)), scale)[0])
     force, command = Limiter(rich, QUICK, 1.0).step(np.full(16, wanted), True, np.full(2, volts))
@@ -308,7 +308,7 @@ def test_magnet_may_be_on_for_ever_at_full_duty() -> None:
 
 
 def test_magnet_that_is_on_too_long_rests_until_it_is_half_cool() -> None:
-    """On it loses 0.75 s a second of its 2 s, off it gains 0.25 s a second: so 11 ticks on, 17 off, then 6 and 18."""
+    """A magnet loses 0.75 s a second of its 2 s while on, and gains 0.25 s a second while off: so 11 ticks on, 17 off, then 6 and 18."""
     magnets = MagnetLimiter(MAGNETS, 0.25)
     seen = [magnets.step(ON) for _ in range(60)]
     assert {state for states in seen for state in states} == {0, 1, 2}
@@ -319,7 +319,7 @@ def test_magnet_that_is_on_too_long_rests_until_it_is_half_cool() -> None:
 
 
 def test_magnet_rests_when_its_account_is_just_empty_and_lights_when_it_is_just_half_full() -> None:
-    """At half duty and ticks of a second: 2 s, 1.5, 1, 0.5, 0; then 0.5, 1."""
+    """At half duty and ticks of a second the account reads 2 s, 1.5, 1, 0.5, 0; then 0.5, 1."""
     magnets = MagnetLimiter(parameters.Limiter(relay_on_s=2.0, relay_duty=0.5), 1.0)
     assert [magnets.step(ON) == ON for _ in range(9)] == [True] * 4 + [False] * 2 + [True] * 2 + [False]
 
@@ -380,7 +380,7 @@ def test_magnets_that_are_on_take_their_power() -> None:
 
 @pytest.mark.parametrize("magnets_w", [10.0, 30.0, 40.0, 50.0])
 def test_thrusters_have_what_the_magnets_leave(body: Body, magnets_w: float) -> None:
-    """Of a supply that just sufficed without magnets too."""
+    """This also holds for a supply that just sufficed without magnets."""
     limiter = Limiter(replace(body, supply_power_w=np.array([40.0, 40.0])), QUICK, 1.0)
     too_much = np.full(16, 5.0)
     enough, _ = limiter.step(too_much, True, NOMINAL)

@@ -1,4 +1,4 @@
-"""Parameters set in flight: they take effect at once, nothing jumps, and what is wrong is refused in words."""
+"""Parameters set in flight take effect at once without a jump; wrong values are refused with a reason."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_value_out_of_range_is_refused_in_words_and_changes_nothing(flying: Pipe
 
 
 def test_limits_set_in_flight_are_those_of_every_stage_from_that_tick_on(flying: Pipeline) -> None:
-    """A step that only kept what it was built with would fly on by the old ones."""
+    """A stage that kept the values it was built with would continue with the old limits."""
     chain = flying.formation.chains[0]
     wanted = {
         "limiter.force_share": 0.2, "limiter.slew_n_per_s": 20.0, "fence.east_m": 0.1, "failsafes.ground_lost_limit": 0.5,

@@ -1,4 +1,4 @@
-"""A viewer on the WebSocket sees the log's channels and the scene; without one a tick draws nothing."""
+"""A viewer on the WebSocket receives the log's channels and the scene; without one a tick draws nothing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FLEET = single()
 
 
 class Viewer:
-    """A Foxglove client by hand: RFC 6455, protocol foxglove.sdk.v1."""
+    """A hand-written Foxglove client: RFC 6455, protocol foxglove.sdk.v1."""
 
     def __init__(self, address: str) -> None:
         host, port = address.removeprefix("ws://").split(":")
@@ -83,7 +83,7 @@ class Viewer:
         self._socket.sendall(head + mask + bytes(byte ^ mask[i % 4] for i, byte in enumerate(text)))
 
     def message(self) -> tuple[str, bytes]:
-        """The next message: topic, payload."""
+        """Returns the topic and payload of the next message."""
         while True:
             opcode, data = self.frame()
             if opcode == 2 and data[0] == 1:

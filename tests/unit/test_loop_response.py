@@ -1,4 +1,4 @@
-"""The measured open loop against what it says of the closed one, and margins of loops that are known."""
+"""The measured open loop against the closed loop that it predicts, and margins of loops with known ones."""
 
 import importlib
 from typing import Any
@@ -29,7 +29,7 @@ def test_margins_of_an_integrator_with_delay_are_the_known_ones() -> None:
 
 
 def test_loop_that_may_also_lose_gain_shows_the_nearer_margin() -> None:
-    """PID on a double integrator: unstable where the gain falls, too."""
+    """PID on a double integrator, which also becomes unstable when the gain falls."""
     w = np.geomspace(0.1, 100.0, 400)
     s = 1j * w
     loop = 4.0 * (s + 1.0) ** 2 / s**3
@@ -50,7 +50,7 @@ def test_axis_that_no_thruster_pushes_is_not_controlled() -> None:
 
 
 def judged(pitch: Response) -> list[dict[str, Any]]:
-    """What tools/margins.py says of good loops and that one, nominal and worst."""
+    """Rows of tools/margins.py, which are also printed, for good loops with `pitch` as the pitch loop, nominal and worst."""
     tool = importlib.import_module("margins")
     loops = [pitch if name == "pitch" else ideal(2.0, 0.2) for name in AXES]
     rows: list[dict[str, Any]] = tool.rows({1: {tool.NOMINAL: loops}})
@@ -99,7 +99,7 @@ def test_corners_are_all_eight() -> None:
 
 
 def swing(gain: float) -> float:
-    """Growth of the surge force of a loop of so much more gain, over ten seconds after a push."""
+    """Growth of the surge force over ten seconds after a push, with `gain` times the loop's gain."""
     loop, given = Loop(1, Parameters()), np.zeros(6)
     swings = []
     for tick in range(3600):
@@ -112,7 +112,7 @@ def swing(gain: float) -> float:
 
 @pytest.mark.slow
 def test_loop_that_one_decibel_more_makes_swing_shows_less_than_that_and_one_that_swings_shows_none() -> None:
-    """The first crosses -180 degrees above the last frequency that is measured."""
+    """The first loop crosses -180 degrees above the highest measured frequency."""
     hard = Parameters().replace("control.position_bandwidth", 8.0).replace("control.position_damping", 3.5)
     assert margins(measure(1, hard)[SURGE]).gain_db < 1.0
     swinging = [margins(response) for response in measure(1, hard, Scale(0.85, 0.85, 1.15))]

@@ -1,4 +1,4 @@
-"""Axes that a body lacks or has lost with its thrusters: what is kept of a wrench, and what it can still make."""
+"""Axes that a body lacks or has lost with its thrusters: the part of a wrench that is kept, and what the body can still make."""
 
 import dataclasses
 import itertools
@@ -17,7 +17,7 @@ from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.robot_in_water import BODY, TICK_NS, ZERO, Water
 
 LOST_AXES = {(4, 7): 1, (5, 6): 1, (2, 3): 1}
-"""The paper's errata: pairs without which an axis cannot be made."""
+"""The paper's errata: pairs without which axes are lost, and the number of those axes."""
 
 
 @pytest.mark.parametrize("pair", list(itertools.combinations(range(8), 2)), ids=str)
@@ -38,7 +38,7 @@ def test_axes_that_are_lost_with_a_pair_are_those_of_the_errata(pair: tuple[int,
 
 @pytest.mark.parametrize(("name", "offset_m"), [("bluerov2_heavy", 0.0), ("bluerov2_heavy", 0.001), ("modcube_sim", 0), ("chasing_m2", 0)])
 def test_force_that_is_lost_whole_costs_no_moment(name: str, offset_m: float) -> None:
-    """The diagonal pair of horizontal thrusters: the pseudo-inverse of a rounding error asked for 1e16 N m, and the robot spun."""
+    """A diagonal horizontal pair. Regression: the pseudo-inverse of a rounding error asked for 1e16 N m, and the robot spun."""
     vehicle = load_vehicle(name)
     inertial = dataclasses.replace(vehicle.inertial, com_m=vehicle.inertial.com_m + np.array([0.0, offset_m, 0.0]))
     body = assemble_vehicle(dataclasses.replace(vehicle, inertial=inertial))
@@ -56,7 +56,7 @@ def test_force_that_is_lost_whole_costs_no_moment(name: str, offset_m: float) ->
 
 @pytest.mark.parametrize(("wanted", "made"), [([200.0, 200.0, 0, 0, 0, 0], [64.84, 64.84]), ([60.0, 60.0, 0, 0, 0.5, 0], [60.0, 60.0])])
 def test_healthy_robot_that_lacks_an_axis_makes_the_force_that_it_can(wanted: list[float], made: list[float]) -> None:
-    """BlueROV2 cannot pitch, and its surge pitches it a little: saturated, nothing was left of it."""
+    """BlueROV2 cannot pitch, and its surge pitches it a little. Regression: in saturation nothing was left of the force."""
     body = assemble_vehicle(load_vehicle("bluerov2"))
     chain = BodyPipeline(body, Parameters(), TICK_NS)
     assert chain.faults.now.lost_axes == 0 and np.linalg.matrix_rank(body.thrusters.matrix) == 5
@@ -66,7 +66,7 @@ def test_healthy_robot_that_lacks_an_axis_makes_the_force_that_it_can(wanted: li
 
 
 def test_robot_of_five_thrusters_makes_the_force_that_it_can() -> None:
-    """Girona 500 cannot roll, and its sway rolls it a little: saturated, nothing was left of it."""
+    """Girona 500 cannot roll, and its sway rolls it a little. Regression: in saturation nothing was left of the force."""
     chain = BodyPipeline(assemble_vehicle(load_vehicle("girona500")), Parameters(), TICK_NS)
     thrust = chain._allocate(np.array([600.0, 100.0, 0.0, 0.0, 0.0, 0.0]), 0)
     np.testing.assert_allclose(thrust.achieved[:3], [269.1, 44.85, 0.0], atol=0.5)

@@ -1,4 +1,4 @@
-"""Relays of the docking faces: both sides of a joint, told at once when they change, and ten times a second."""
+"""Relays of the docking faces: both sides of a joint switch; states are sent at once on change, and ten times a second."""
 
 from firmware_py.core.magnet_relays import MagnetRelays
 from firmware_py.core.types import RELAY_PULL, DockRequest
@@ -10,7 +10,7 @@ JOINT = DockRequest(2, 1, 0, 4)
 
 
 def told(relays: MagnetRelays, ticks: range) -> dict[int, list[int]]:
-    """The modules that are told of their relays, by the tick."""
+    """Modules whose relay states are sent, by tick; ticks without any are left out."""
     due = {tick: relays.due(tick * TICK_NS) for tick in ticks}
     return {tick: modules for tick, modules in due.items() if modules}
 

@@ -1,4 +1,4 @@
-"""What a module says reaches its own Inputs, each tick; and what strangers on the bus say."""
+"""Frames from a module reach its own Inputs in each tick; and the effect of strangers on the bus."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What the pipeline says reaches every module, each tick."""
+"""Outputs of the pipeline reach every module in each tick."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_every_module_is_told_its_thrusters_in_every_tick():
 
 
 def test_no_module_is_commanded_before_it_has_said_how_it_is():
-    """At a command that says disarmed it would let go of an e-stop that was raised before the start."""
+    """A command that says disarmed would make the module release an e-stop raised before the start."""
     robot, encoder = Robot(TWO_BUSES), OutputEncoder(TWO_BUSES, CODEC)
     robot.say("GYRO", (0.0, 0.0, 0.0, 0), number=1, bus=1)
     robot.say("MCU_STATUS", (0, 1, 0, 4), number=2, bus=1)

@@ -1,4 +1,4 @@
-"""Two frames of a tag become one observation of the time of its picture, or none."""
+"""The two frames of a tag become one observation at the capture time of its picture, or none."""
 
 import re
 import textwrap

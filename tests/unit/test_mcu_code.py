@@ -1,4 +1,4 @@
-"""The microcontrollers' C and the firmware's Python say the same on the wire: every message, both ways, raw."""
+"""The microcontrollers' C and the firmware's Python agree on the wire: every message, both ways, raw."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is miss
 
 
 class Drops(ctypes.Structure):
-    """struct modcube_receiver."""
+    """Mirrors struct modcube_receiver."""
 
     _fields_ = (
         ("number", ctypes.c_uint8),
@@ -37,7 +37,7 @@ class Drops(ctypes.Structure):
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """The generated code, compiled without a warning."""
+    """The generated code, compiled without a warning and loaded."""
     folder = tmp_path_factory.mktemp("mcu")
     assert generate_mcu_code.main([str(folder)]) == 0
     sources = [str(folder / "modcube.c"), str(folder / "modcube_wire.c")]
@@ -126,7 +126,7 @@ def test_physical_values_become_the_same_raw_ones_in_c(library: ctypes.CDLL, mes
 
 
 def broken(message: MessageCodec, frame: Frame, rng: np.random.Generator) -> Frame:
-    """A frame as a bad bus may deliver it."""
+    """The frame as a faulty bus may deliver it."""
     kind, data = int(rng.integers(6)), bytearray(frame.data)
     if kind == 0 and data:
         data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))

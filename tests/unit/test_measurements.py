@@ -1,4 +1,4 @@
-"""Sensors of several modules, each turned and displaced in its body, become one measurement of the body."""
+"""Sensors of several modules, each rotated and displaced in the body, become one measurement of the body."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ Q_WB = from_euler(0.4, -1.2, 2.0)
 P_WB = np.array([1.0, -2.0, 0.7])
 R_WB = Rotation.from_quat(Q_WB[[1, 2, 3, 0]])
 ORIGINS_B = 0.21 * (CELLS - CELLS.mean(axis=0))
-"""Equal modules: their common centre of mass is the mean."""
+"""Origin of each module from the common centre of mass, which is the mean because the modules are equal."""
 PERIOD = 10_000_000
 GYRO_SIGMA, ACCEL_SIGMA = 0.002, 0.05
 SUBSETS = [(0,), (1,), (2,), (0, 2), (0, 1, 2)]
@@ -32,7 +32,7 @@ SUBSETS = [(0,), (1,), (2,), (0, 2), (0, 1, 2)]
 
 @pytest.fixture(scope="module")
 def body() -> Body:
-    """An L of three whose modules all sit differently, and are counted differently in the fleet."""
+    """An L of three modules, each in another orientation, and in another order than the fleet's."""
     return assemble(CELLS, ROTATIONS, [load_vehicle("modcube")] * 3, FLEET_INDEX)
 
 
@@ -46,7 +46,7 @@ def silent() -> list[ModuleInputs]:
 
 
 def tag_seen(module: int, face: int, capture_ns: int = CAPTURE, turn: np.ndarray | None = None) -> TagObservation:
-    """What a perfect camera says of the tag on `face` of module `module`, from the vehicle file alone."""
+    """The report of a perfect camera for the tag on `face` of module `module`, from the vehicle file alone."""
     tag = next(t for t in load_vehicle("modcube").tag if t.id == face)
     r_bm = Rotation.from_matrix(np.array(MATRICES[ROTATIONS[module]]))
     p_wt = P_WB + R_WB.apply(ORIGINS_B[module] + r_bm.apply(np.array(tag.position_m)))
@@ -99,7 +99,7 @@ def test_two_pictures_are_two_poses_oldest_first(measurements: Measurements) -> 
 
 @pytest.mark.parametrize("flipped", [0, 1, 2, 3])
 def test_flipped_tag_among_four_is_left_out(measurements: Measurements, flipped: int) -> None:
-    """A planar tag's pose has a second solution, tens of degrees off; the other tags of the picture outvote it."""
+    """The pose of a planar tag has a second solution, tens of degrees off; the other tags of the picture outvote it."""
     flip = np.array([0.7, 0.0, 0.0])
     seen = [(0, tag_seen(0, face, turn=flip if k == flipped else None)) for k, face in enumerate((5, 4, 0, 2))]
     (pose,) = fuse_tags(measurements, *seen)
@@ -117,7 +117,7 @@ def test_noise_of_a_degree_is_not_a_flip(measurements: Measurements) -> None:
 
 @pytest.mark.parametrize("second_hand", [0, 1])
 def test_tag_told_through_another_one_pulls_by_its_weight(measurements: Measurements, second_hand: int) -> None:
-    """Wherever it stands in the picture: place, lever and attitude."""
+    """Place, lever and attitude, whichever tag comes first in the picture."""
     off, turn = np.array([0.03, -0.02, 0.05]), np.array([0.0, 0.1, -0.05])
     far = tag_seen(2, 0, turn=turn)
     far = far._replace(quality=SECOND_HAND, p_wt=far.p_wt + off)
@@ -132,7 +132,7 @@ def test_tag_told_through_another_one_pulls_by_its_weight(measurements: Measurem
 
 
 def test_picture_is_as_exact_as_it_says(measurements: Measurements) -> None:
-    """The spread of a full and a second-hand tag's mean is that of one tag over the root of what it says to be worth."""
+    """The mean of a full and a second-hand tag scatters by one tag's sigma over the root of the worth that the picture reports."""
     rng, sigma = np.random.default_rng(0), 0.002
     near, far = tag_seen(0, 5), tag_seen(0, 4)._replace(quality=SECOND_HAND)
     off = []
@@ -159,7 +159,7 @@ def test_tag_that_the_vehicle_does_not_carry_is_not_believed(measurements: Measu
 
 
 def test_lever_of_the_wrong_module_would_be_noticed(measurements: Measurements) -> None:
-    """The same frames under another module's number put the body elsewhere: the tests above do look at the lever."""
+    """The same frames under another module's number place the body elsewhere, so the tests above do check the lever."""
     (pose,) = fuse_tags(measurements, (2, tag_seen(1, 5)))
     assert np.linalg.norm(pose.p_wt - R_WB.apply(pose.lever_b) - P_WB) > 0.1
 
@@ -191,7 +191,7 @@ def test_rates_and_forces_are_turned_into_the_body_and_averaged_over_those_heard
 def turning(
     measurements: Measurements, heard: tuple[int, ...], rate: np.ndarray, alpha: np.ndarray, rng: np.random.Generator | None = None
 ) -> Measured:
-    """Measurements of the modules `heard` of a body that turns at `rate` (3,), which grows by `alpha` (3,), and is pushed."""
+    """Measurements by the modules `heard` of a body that is pushed, and turns at `rate` (3,), which grows by `alpha` (3,)."""
     modules = silent()
     for module in heard:
         noise = np.zeros(6) if rng is None else rng.normal(size=6)
@@ -209,7 +209,7 @@ RATE, ALPHA = np.array([0.1, -0.4, 0.9]), np.array([1.0, 0.5, -0.7])
 @pytest.mark.parametrize("heard", SUBSETS)
 @pytest.mark.parametrize("period_ns", [2_500_000, PERIOD, 20_000_000])
 def test_specific_force_of_a_turn_that_quickens_is_that_of_the_centre_of_mass(body: Body, heard: tuple[int, ...], period_ns: int) -> None:
-    """At any rate of ticks, a quarter of a second into it."""
+    """At any tick rate, a quarter of a second into the turn."""
     measurements = Measurements(body, period_ns)
     for k in range(round(0.25e9) // period_ns):
         measured = turning(measurements, heard, RATE + ALPHA * k * period_ns * 1e-9, ALPHA)
@@ -218,7 +218,7 @@ def test_specific_force_of_a_turn_that_quickens_is_that_of_the_centre_of_mass(bo
 
 
 def test_imus_around_the_centre_of_mass_are_averaged_and_nothing_else(body: Body) -> None:
-    """To the last bit: as if no gyro had told of the turn."""
+    """To the last bit, as if no gyro had reported the turn."""
     measurements, deaf = Measurements(body, PERIOD), Measurements(body, PERIOD)
     for k in range(20):
         modules = silent()
@@ -272,11 +272,11 @@ def test_depth_is_that_of_the_centre_of_mass_in_any_attitude(measurements: Measu
 BIASES = np.array([
     [0.01, -0.02, 0.005, 0.05, -0.06, 0.03, 0.02], [0.0, 0.01, -0.01, -0.02, 0.04, 0.01, -0.03], [-0.02, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0],
 ])  # fmt: skip
-"""Of each module's gyro, accelerometer, both in the axes of the body, and depth."""
+"""Biases of each module's gyro and accelerometer, both in the axes of the body, and depth."""
 
 
 def biased(measurements: Measurements, heard: tuple[int, ...], rate: np.ndarray, failed: int | None = None) -> np.ndarray:
-    """(7,) measured of a body that turns at `rate`, whose sensors have biases, less what is true; the accelerometer of one has failed."""
+    """(7,) measured less true values of a body that turns at `rate` with biased sensors; the accelerometer of `failed` reads zeros."""
     modules = silent()
     for module in heard:
         here, (gyro, accel, depth_m) = modules[FLEET_INDEX[module]], np.split(BIASES[module], [3, 6])
@@ -292,18 +292,18 @@ def biased(measurements: Measurements, heard: tuple[int, ...], rate: np.ndarray,
 
 @pytest.mark.parametrize("heard", SUBSETS)
 def test_mean_keeps_its_bias_when_modules_fall_silent(body: Body, heard: tuple[int, ...]) -> None:
-    """Which the estimator has learnt by then, while the body stood still."""
+    """The estimator has learnt that bias by then, while the body stood still."""
     measurements = Measurements(body, PERIOD)
     for _ in range(100):
         before = biased(measurements, (0, 1, 2), np.zeros(3))
     np.testing.assert_allclose(before, BIASES.mean(axis=0), atol=1e-9)
     after = [biased(measurements, heard, np.zeros(3)) for _ in range(30)]
     np.testing.assert_allclose([of_imu[:6] for of_imu in after], np.tile(before[:6], (30, 1)), atol=1e-3)
-    np.testing.assert_allclose(after[-1][6], before[6], atol=1e-3)  # whether a pressure sensor is silent shows after its turn
+    np.testing.assert_allclose(after[-1][6], before[6], atol=1e-3)  # a silent pressure sensor shows only after its turn
 
 
 def test_pressure_sensors_that_are_heard_in_turns_are_told_apart(body: Body) -> None:
-    """Until one falls silent, each is taken as it comes: the estimator knows what they tell on the mean."""
+    """Until one falls silent, each reading is used as it is: the estimator knows their mean bias."""
     measurements, each = Measurements(body, PERIOD), BIASES[:, 6]
 
     def hear(module: int) -> float:
@@ -324,7 +324,7 @@ def test_pressure_sensors_that_are_heard_in_turns_are_told_apart(body: Body) -> 
 
 @pytest.mark.parametrize("after", [0, 200])
 def test_imu_that_fails_teaches_nothing_before_it_is_found(body: Body, after: int) -> None:
-    """It tells zeros until the watch before this stage takes it away: gravity off, which is no bias."""
+    """The IMU reads zeros until the sensor watch before this stage removes it: off by gravity, which is no bias."""
     measurements = Measurements(body, PERIOD)
     for _ in range(after):
         biased(measurements, (0, 1, 2), np.zeros(3))
@@ -335,21 +335,21 @@ def test_imu_that_fails_teaches_nothing_before_it_is_found(body: Body, after: in
 
 
 def test_body_that_turns_tells_nothing_of_how_its_sensors_differ(body: Body) -> None:
-    """What turning adds at the place of each is no bias."""
+    """The centripetal acceleration at each sensor's place is no bias."""
     measurements = Measurements(body, PERIOD)
     for _ in range(100):
         biased(measurements, (0, 1, 2), RATE)
-    measurements.fuse(silent(), Q_WB)  # or it would tell of the turn's sudden end
+    measurements.fuse(silent(), Q_WB)  # or the turn's sudden end would be measured
     np.testing.assert_allclose(biased(measurements, (1,), np.zeros(3)), BIASES[1], atol=1e-3)
 
 
 @pytest.mark.parametrize("heard", [(0,), (1,), (2,)])
 def test_body_that_swings_at_once_takes_no_angular_acceleration_for_a_bias(body: Body, heard: tuple[int, ...]) -> None:
-    """For as long as it turns so slowly that its sensors are compared."""
+    """For as long as it turns so slowly that its sensors are compared with each other."""
     measurements, alpha = Measurements(body, PERIOD), 0.5 * ALPHA
     for k in range(6):
         turning(measurements, (0, 1, 2), alpha * k * PERIOD * 1e-9, alpha)
-    measurements.fuse(silent(), Q_WB)  # or it would tell of the turn's sudden end
+    measurements.fuse(silent(), Q_WB)  # or the turn's sudden end would be measured
     measured = turning(measurements, heard, np.zeros(3), np.zeros(3))
     assert measured.accel is not None
     np.testing.assert_allclose(measured.accel, PUSHED, atol=1e-3)

@@ -1,4 +1,4 @@
-"""The figures of a flight: known errors give known metrics, and nothing is left out."""
+"""The metrics of a flight: known errors give known values, and nothing is left out."""
 
 import dataclasses
 import json
@@ -58,7 +58,7 @@ def test_estimate_beside_the_truth_shows_that_distance_and_angle_and_leaves_thre
 def test_thrust_is_rooted_and_refused_tags_are_counted(tmp_path: Path) -> None:
     flight = spiral_of(tmp_path, noise=0.0)
     flight.firmware["commanded_n"][:] = np.where(np.arange(501) % 2 == 0, 3.0, 1.0)[:, None]
-    flight.firmware["rejected"][:] = np.repeat([7, 9, 2], 167)  # a body that joins counts anew
+    flight.firmware["rejected"][:] = np.repeat([7, 9, 2], 167)  # a joined body starts its count again
     metrics = flight_metrics(flight)
     assert metrics["thrust_rms_n"] == pytest.approx(math.sqrt((251 * 9 + 250) / 501))
     assert metrics["tags_rejected"] == 2
@@ -177,7 +177,7 @@ def test_every_warning_counts_but_waiting_for_the_first_tags() -> None:
 
 
 def test_truth_is_told_of_the_body_that_the_firmware_steers(tmp_path: Path) -> None:
-    """Faces lock before it knows, and open before it knows: the way of other modules is no error of what it steers."""
+    """Faces lock and open before the firmware knows it: motion of the other modules is no error of the body that it steers."""
     times = {"joined_from": 40, "known_from": 60, "parted_from": 120, "parted_known_from": 150}
     write_pair(tmp_path, ticks=200, offset_m=(0.003, 0.0, -0.004), **times)
     flight = read_flight(tmp_path)

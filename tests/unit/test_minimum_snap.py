@@ -1,4 +1,4 @@
-"""Minimum snap without limits: against B-splines and other divisions of the time, and through waypoints that coincide."""
+"""Minimum snap without limits: against B-splines and other divisions of the time, and through coincident waypoints."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Minimum snap within limits: against an active-set solver, stretched no more than they ask, and refused."""
+"""Minimum snap within limits: against an active-set solver, stretched no more than the limits require, and refused."""
 
 import dataclasses
 import itertools
@@ -39,7 +39,7 @@ def test_limited_path_of_a_hundred_waypoints_keeps_limits_and_waypoints() -> Non
 
 
 def _row(piece: int, u: float, order: int, times: np.ndarray) -> np.ndarray:
-    """Derivative of one piece as a row over the plain coefficients of all pieces."""
+    """A derivative of one piece, as a row over the plain coefficients of all pieces."""
     found = np.zeros(10 * len(times))
     for j in range(order, 10):
         found[10 * piece + j] = math.perm(j, order) * u ** (j - order) / times[piece] ** order
@@ -62,7 +62,7 @@ def _equalities(points: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _least_snap_by_active_set(points: np.ndarray, times: np.ndarray, bound: float) -> float:
-    """Plain coefficients, equalities taken out by their null space, acceleration bounded on dense samples, daqp."""
+    """Least snap in plain coefficients: equalities removed by their null space, acceleration bounded at dense samples, solved by daqp."""
     count = len(times)
     form = np.zeros((10 * count, 10 * count))
     for k, i, j in itertools.product(range(count), range(4, 10), range(4, 10)):
@@ -224,7 +224,7 @@ def test_turning_keeps_its_limit_between_the_points_where_it_is_checked(limits: 
 
 
 def test_path_is_looked_at_in_no_shorter_pieces_than_time_can_tell() -> None:
-    """A piece of a day beside one of a nanosecond throws the quaternion far off, which turns back within no time at its end."""
+    """A piece of a day beside one of a nanosecond throws the quaternion far off, and it returns within no time at the end of the piece."""
     found = plan(poses(4), [1e-9, 1e5, 1.0], stretch=False)
     assert np.all(np.diff(found.resolved(48, 0.3).breaks) > 0.0)
     with pytest.raises(InfeasibleError, match="turning takes"):
@@ -242,7 +242,7 @@ def test_velocity_where_the_path_rests_is_refused(k: int) -> None:
 
 
 def test_solver_that_need_not_polish_says_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    """In the terminal of a flight, among what the robot says."""
+    """The words would appear in the terminal of a flight, among the robot's own."""
     points = [Waypoint(np.array([0.0, 0.0, 0.5])), Waypoint(np.array([1.0, 0.0, 0.5]), stop=True), Waypoint(np.array([1.0, 1.0, 0.5]))]
     assert plan(points, None, Limits(velocity=np.full(3, 1.5))).method == "osqp"
     assert capfd.readouterr().out == ""

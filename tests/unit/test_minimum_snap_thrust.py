@@ -1,4 +1,4 @@
-"""Minimum snap within what the thrusters can do: the wrench along a path, its usage, and the time it takes."""
+"""Minimum snap within the thrusters' limits: the wrench along a path, its usage, and the time the path takes."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ def test_thrusters_keep_their_share_between_the_points_where_it_is_checked(one: 
 
 
 def test_wrench_along_a_path_is_that_of_the_equations_of_motion(one: Body) -> None:
-    """Momentum in the world, by differences: the wrench less drag and righting moment is its rate of change."""
+    """Checks the wrench by differences: less drag and righting moment, it is the rate of change of the momentum in the world."""
     body = dataclasses.replace(one, righting=np.array([0.0, 0.0, -0.1]))
     found, h = paths.moebius((0, 0, 1.5), 20.0), 1e-5
 
@@ -72,7 +72,7 @@ def test_least_usage_of_the_thrusters_is_between_the_bounds(one: Body) -> None:
 
 @pytest.mark.slow
 def test_worst_force_that_the_thrusters_reach_is_the_paper_s(one: Body) -> None:
-    """Errata: at least 22.9 N in the worst direction, at 10 and -8 N."""
+    """The paper's errata: at least 22.9 N in the worst direction, with limits of 10 and -8 N."""
     d = np.random.default_rng(7).normal(size=(150, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     reach = [1.0 / least_usage(one, np.concatenate([x, np.zeros(3)]))[0] for x in d]

@@ -1,4 +1,4 @@
-"""Lying thrusters: found by the thrust that the motion misses, and none blamed for what the water does."""
+"""Lying thrusters are found by the thrust that the motion misses, and none is blamed for the effects of the water."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_lying_thruster_is_found_within_two_seconds(thruster: int, gain: float) 
 
 
 def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_sees_no_tag_and_is_when_it_sees_one_again() -> None:
-    """Blind it knows its tilt and speed too badly."""
+    """Without tags the robot's tilt and speed are known too poorly."""
     water = Water(seed=2)
     water.fly()
     water.tag_age_ns = 600_000_000
@@ -43,7 +43,7 @@ def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_sees_no_tag_and_is
 
 
 def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_touches_the_surface() -> None:
-    """There water pushes that no model here knows. Half the diagonal of the module's box is 0.17 m."""
+    """Near the surface the water pushes in ways that no model here covers. Half the diagonal of the module's box is 0.17 m."""
     found = {}
     for depth_m in (0.1, 0.3):
         water = Water(seed=2)
@@ -56,7 +56,7 @@ def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_touches_the_surfac
 
 @pytest.mark.parametrize("every", [1, 10])
 def test_thruster_is_not_judged_by_the_motion_of_a_robot_from_which_magnets_push_another(every: int) -> None:
-    """A second of that looked like a thruster that does not push, in one undock of seven. One tick of it spoils a block."""
+    """A second of such a push looked like a thruster that does not push, in one undock of seven. One tick of it spoils a block."""
     water = Water(seed=2)
     water.fly()
     water.gain[2] = 0.0
@@ -88,7 +88,7 @@ def test_lying_thruster_is_found_although_frames_are_lost() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_healthy_robot_that_is_pushed_about_has_no_liar(seed: int) -> None:
-    """Forces that change twice a second, gains and deadbands off as real ones, a disturbance that turns with the body."""
+    """Forces that change twice a second, realistic errors of gains and deadbands, and a disturbance that turns with the body."""
     water = Water(seed)
     assert water.run(1.0, armed=False) == []
     rng = np.random.default_rng(100 + seed)
@@ -99,7 +99,7 @@ def test_healthy_robot_that_is_pushed_about_has_no_liar(seed: int) -> None:
 
 @pytest.mark.parametrize("thruster", range(8))
 def test_weak_thruster_whose_speed_says_so_does_not_lie_and_one_that_says_too_little_does(thruster: int) -> None:
-    """Half the force comes with 71 % of the speed."""
+    """Half the force goes with 71 % of the speed."""
     found = {}
     for gain, speed in ((0.5, 0.5**0.5), (0.0, 0.9)):
         water = Water(seed=thruster)
@@ -112,7 +112,7 @@ def test_weak_thruster_whose_speed_says_so_does_not_lie_and_one_that_says_too_li
 
 @pytest.mark.parametrize("name", ["modcube", "bluerov2_heavy", "girona500"])
 def test_motion_of_a_body_whose_water_is_heavier_along_one_axis_than_along_another_misses_no_thrust(name: str) -> None:
-    """What the model leaves out of a healthy body's motion, a Munk moment say, would be blamed on a thruster."""
+    """Anything missing from the model of a healthy body's motion, for example a Munk moment, would be blamed on a thruster."""
     b = assemble_vehicle(load_vehicle(name))
     rng = np.random.default_rng(5)
     x, tau, modelled = np.zeros(STATES), rng.normal(size=6), np.zeros(6)
@@ -125,8 +125,8 @@ def test_motion_of_a_body_whose_water_is_heavier_along_one_axis_than_along_anoth
 
 
 def test_a_thruster_is_not_blamed_for_a_wall_that_the_robot_leans_on() -> None:
-    """Three hundred places on its hull where something solid pushes and rubs, and thrusters that push back: six were blamed before what
-    one thruster leaves unexplained had to be noise."""
+    """Three hundred places on its hull where something solid pushes and rubs, and thrusters that push back. Regression: six were blamed
+    until what one thruster leaves unexplained had to be noise."""
     rng, thrusters, blamed = np.random.default_rng(8), BODY.thrusters, 0
     for _ in range(300):
         watch = MissingThrust(BODY, Faults(), TICK_NS)
@@ -158,7 +158,7 @@ def test_a_thruster_that_lies_is_told_from_noise_of_the_size_that_is_foreseen() 
 
 @pytest.mark.parametrize("coriolis", [0.0, 1.0, 10.0])
 def test_a_thruster_is_not_blamed_for_a_change_that_is_small_beside_the_coriolis_wrench(coriolis: float) -> None:
-    """Masses are known to a tenth, the speed through water that drifts to less: so is what both do on a fast curve."""
+    """Masses are known to a tenth, the speed through drifting water less well, and the Coriolis wrench of a fast curve no better."""
     watch = MissingThrust(BODY, Faults(), TICK_NS)
     watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.3
     lost = -3.0 * BODY.thrusters.matrix[:, 2]
@@ -170,7 +170,7 @@ def test_a_thruster_is_not_blamed_for_a_change_that_is_small_beside_the_coriolis
 @pytest.mark.parametrize(("column", "most"), [(CROSSED, 0.5), (MUNK, 0.2)])
 @pytest.mark.parametrize("sign", [-1.0, 0.0, 1.0])
 def test_a_thruster_is_not_blamed_for_what_the_water_does_to_a_body_that_turns_under_way(column: int, most: float, sign: float) -> None:
-    """Flow across the turn brakes it, and masses that differ from axis to axis turn it: neither is in the model of a cube."""
+    """Flow across the turn brakes it, and masses that differ between axes turn the body: neither is in the model of a cube."""
     watch = MissingThrust(BODY, Faults(), TICK_NS)
     watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.3
     watch._blocks[-RECENT:, :6] = -2.0 * BODY.thrusters.matrix[:, 2]

@@ -1,4 +1,4 @@
-"""`modcube run --hold` and REARM arm each body once: whoever takes it over, disarms or stops it has the last word."""
+"""`modcube run --hold` and REARM arm each body once; whoever takes it over, disarms or stops it has the last word."""
 
 import math
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ MINUTE = round(REARM_S * RATE_HZ)
 
 
 class Waiting(Robot):
-    """A robot whose pose may not be known yet."""
+    """A robot whose pose may still be unknown."""
 
     ready = True
     tag_age_ns = 0
@@ -28,7 +28,7 @@ class Waiting(Robot):
 
 
 class Flight:
-    """A robot, its operator, and a ground station that asks for what `asks` holds, each once."""
+    """A robot, its operator, and a ground station that makes each request in `asks` once."""
 
     def __init__(self, modules: int = 1, to_arm: set[int] | None = None, limit_s: float = math.inf) -> None:
         self.robot = Waiting(modules)
@@ -53,7 +53,7 @@ class Flight:
 
     @property
     def arms(self) -> list[int]:
-        """Bodies that were asked to arm, in order."""
+        """Bodies asked to arm, in order."""
         return [request.body for request in self.robot.asked if request.action == Action.ARM]
 
 
@@ -182,7 +182,7 @@ def test_only_the_bodies_that_were_meant_are_armed() -> None:
 
 @pytest.mark.parametrize(("ticks", "arms"), [(MINUTE - 1, [0]), (MINUTE, [])])
 def test_flight_that_was_broken_off_is_taken_up_within_a_minute_or_never(ticks: int, arms: list[int]) -> None:
-    """An hour later, a camera that sees the first tag may see it in somebody's hands."""
+    """An hour later, the robot may be in somebody's hands when a camera sees its first tag."""
     flight = Flight(limit_s=REARM_S)
     flight.robot.ready = False
     flight.run(ticks - 2)

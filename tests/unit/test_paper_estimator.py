@@ -1,4 +1,4 @@
-"""The paper's tag-only filter: it follows a steady run, is late by the tags' delay, and refuses flips."""
+"""The paper's tag-only filter follows a steady run, lags by the tags' delay, and refuses flips."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def seen(capture_ns: int, p_wb: np.ndarray = P_WB, q_wb: np.ndarray = Q_WB) -> M
 
 
 def run(body: Body, velocity_w: np.ndarray, ticks: int) -> tuple[Estimate, np.ndarray]:
-    """A steady run with a tag in every second tick; the last estimate, and where the robot was."""
+    """Simulates a steady run with a tag in every second tick; returns the last estimate and the true place."""
     estimator = TagOnlyEstimator(body, PAPER, PERIOD)
     for k in range(ticks):
         p = P_WB + velocity_w * k * 0.01
@@ -51,7 +51,7 @@ def test_paper_estimator_follows_a_steady_turn(body: Body) -> None:
 
 
 def test_paper_estimator_does_not_make_up_for_delay(body: Body) -> None:
-    """It takes a picture for the present: 50 ms at 0.2 m/s are 10 mm behind."""
+    """The filter treats a picture as current: 50 ms at 0.2 m/s lag by 10 mm."""
     estimator = TagOnlyEstimator(body, PAPER, PERIOD)
     for k in range(1000):
         p = P_WB + np.array([0.2, 0.0, 0.0]) * k * 0.01
@@ -100,7 +100,7 @@ def test_paper_estimator_begins_anew_where_tags_stay_elsewhere_and_forgives_flip
 
 
 def noisy(k: int, rng: np.random.Generator) -> Measured:
-    """Two tags in three ticks of a robot that runs and turns."""
+    """Measurement in tick `k` of a robot that runs and turns, with tags in two ticks of three."""
     if k % 3 == 2:
         return NOTHING
     q = multiply(Q_WB, exp(np.array([0.0, 0.3, 0.1]) * k * 0.01 + rng.normal(0.0, 0.009, 3)))
@@ -108,7 +108,7 @@ def noisy(k: int, rng: np.random.Generator) -> Measured:
 
 
 def settled(body: Body, rng: np.random.Generator) -> TagOnlyEstimator:
-    """After five seconds."""
+    """The filter after five seconds."""
     estimator = TagOnlyEstimator(body, PAPER, PERIOD)
     for k in range(500):
         estimator.step(k * PERIOD, noisy(k, rng), np.zeros(6))
@@ -128,7 +128,7 @@ def test_paper_estimator_that_goes_on_in_another_estimates_the_same(body: Body) 
 
 
 def test_paper_estimator_of_a_parted_body_hardly_jumps(body: Body) -> None:
-    """What the magnets' push makes unknown is added to what the filter knew, not a metre, which makes it jump by 0.4 m/s."""
+    """The uncertainty of the magnets' push is added to the filter's own; a metre in its place makes the filter jump by 0.4 m/s."""
     peaks = []
     for seed in range(5):
         rng = np.random.default_rng(seed)
@@ -142,7 +142,7 @@ def test_paper_estimator_of_a_parted_body_hardly_jumps(body: Body) -> None:
 
 
 def test_paper_estimators_covariance_stands_where_that_of_a_body_belongs(body: Body) -> None:
-    """Velocity in the body's axes: the world's down, which tags tell worst, is where the robot has it."""
+    """Velocity is in the body's axes: the world's down, which tags measure worst, lies where the robot's attitude puts it."""
     estimator = settled(body, np.random.default_rng(3))
     covariance = estimator.motion.covariance
     assert covariance.shape == (ERRORS, ERRORS)

@@ -33,7 +33,7 @@ def test_every_shipped_set_is_within_its_bounds(name: str) -> None:
 
 
 def test_numbers_have_a_mavlink_name_each_of_their_own() -> None:
-    """MAVLink: at most 16 characters; words cannot be sent as a float and have none."""
+    """MAVLink names have at most 16 characters; words cannot be sent as a float and have none."""
     names = [limits.mavlink for limits in REGISTRY.values() if not limits.choices]
     assert len(set(names)) == len(names)
     assert all(re.fullmatch(r"[A-Z][A-Z0-9_]{0,15}", name) for name in names)
@@ -63,7 +63,7 @@ def test_bound_of_every_tunable_is_permitted_and_beyond_is_not(name: str) -> Non
 
 
 def test_whole_number_becomes_what_the_tunable_is() -> None:
-    """An int where a float was makes compiled functions of the tick refuse their arguments, in flight."""
+    """An int in place of a float makes the tick's compiled functions refuse their arguments in flight."""
     for name in ("control.attitude_bandwidth", "docking.current_threshold_ma", "failsafes.leak_action"):
         kind = type(attrgetter(name)(Parameters()))
         for value in (2, 2.0):
